@@ -1,0 +1,74 @@
+"""Rays, projection and scaling of pinhole cameras: one pixel-centre convention for all of them.
+
+Pixel (i, j) (column i, row j) covers [i, i+1) x [j, j+1) and is sampled at its centre, +0.5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from bench.types import Camera, Rays, check_shape
+
+
+def pixel_grid(width: int, height: int, device: torch.device | str = "cpu") -> Tensor:
+    """Centres of all pixels, row by row: [height * width, 2] as (u, v)."""
+    u = torch.arange(width, device=device, dtype=torch.float32) + 0.5
+    v = torch.arange(height, device=device, dtype=torch.float32) + 0.5
+    return torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1).reshape(-1, 2)
+
+
+def cast(camera: Camera, pixels: Tensor | None = None) -> Rays:
+    """Rays through continuous `pixels` [R, 2] as (u, v), or through all pixel centres, row by row.
+
+    Directions are rotated (x, y, 1): not normalised, so that the ray parameter is z-depth.
+    """
+    if pixels is None:
+        pixels = pixel_grid(camera.width, camera.height, camera.c2w.device)
+    check_shape("pixels", pixels, None, 2)
+    x = (pixels[:, 0] - camera.cx) / camera.fx
+    y = (pixels[:, 1] - camera.cy) / camera.fy
+    local = torch.stack((x, y, torch.ones_like(x)), dim=-1)
+    rotation = camera.c2w[:, :3].to(local.dtype)
+    directions = local @ rotation.T
+    return Rays(camera.c2w[:, 3].to(local.dtype).expand_as(directions), directions)
+
+
+def unproject(camera: Camera, pixels: Tensor, depth: Tensor) -> Tensor:
+    """World points [R, 3] at z-depth `depth` [R] behind continuous `pixels` [R, 2] (Eq. 6)."""
+    rays = cast(camera, pixels)
+    return rays.origins + depth[:, None] * rays.directions
+
+
+def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Continuous pixels [R, 2] and z-depth [R] of world `points` [R, 3] (Eq. 7, 9).
+
+    Where the depth is not positive the pixel is meaningless: the caller must reject it.
+    """
+    check_shape("points", points, None, 3)
+    rotation, centre = camera.c2w[:, :3].to(points.dtype), camera.c2w[:, 3].to(points.dtype)
+    local = (points - centre) @ rotation  # R^T (p - c), row vectors
+    depth = local[:, 2]
+    safe = torch.where(depth > 0, depth, torch.ones_like(depth))
+    u = camera.fx * local[:, 0] / safe + camera.cx
+    v = camera.fy * local[:, 1] / safe + camera.cy
+    return torch.stack((u, v), dim=-1), depth
+
+
+def scale_camera(camera: Camera, width: int, height: int) -> Camera:
+    """The same view on a grid of `width` x `height` pixels.
+
+    With centres at +0.5 every intrinsic scales by the same factor, so 1/4 and back is exact.
+    """
+    sx, sy = width / camera.width, height / camera.height
+    return replace(
+        camera,
+        fx=camera.fx * sx,
+        fy=camera.fy * sy,
+        cx=camera.cx * sx,
+        cy=camera.cy * sy,
+        width=width,
+        height=height,
+    )

@@ -1,0 +1,200 @@
+"""The contracts between the ruler and what it measures, and the glossary of symbols.
+
+| symbol   | meaning                                             | unit, shape, axes                     |
+|----------|-----------------------------------------------------|---------------------------------------|
+| c2w      | camera-to-world, OpenCV axes (x right, y down, z forward) | [3, 4], scene units             |
+| fx fy cx cy | intrinsics                                       | pixels; pixel (i, j) spans [i, i+1) x [j, j+1), centre at +0.5 |
+| o, d     | ray origin and direction; d has camera z = 1        | [R, 3], so t below is z-depth         |
+| t        | position along a ray, o + t d                       | z-depth, scene units                  |
+| sigma    | volume density                                      | 1 / scene unit                        |
+| delta    | length of a sample's interval, t-step * norm(d)     | scene units                           |
+| alpha    | opacity, 1 - exp(-sigma delta) of a sample or sum w of a ray | [0, 1]                       |
+| T        | transmittance in front of a sample                  | [0, 1]                                |
+| w        | T * alpha, the weight of a sample                   | [0, 1]                                |
+| rgb      | colour, linear in the stored sRGB values            | [H, W, 3], [0, 1]                     |
+| depth    | sum w t / sum w; +inf where alpha is below `EMPTY_ALPHA` | [H, W], scene units              |
+| K        | channels of a feature map, the first three are RGB  |                                       |
+| L        | preceding frames a method with memory looks back on |                                       |
+
+Scene units: every scene is normalised so that what is to be rendered lies in the unit cube
+[0, 1]^3; `Scene.unit_length` converts a length back to the data set's own unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+EMPTY_ALPHA = 1e-3
+"""Opacity below which a pixel is empty: its depth is +inf and it is never unprojected."""
+
+
+class SteerbenchError(Exception):
+    """An error a user can act on: the message names what was expected, what came, what to do.
+
+    The command line prints the message alone, without a traceback, and exits with status 2.
+    """
+
+
+class Unavailable(SteerbenchError):
+    """Something asked for by name cannot be used here; the message says why and how to get it."""
+
+
+def check_shape(name: str, value: Tensor, *shape: int | None) -> None:
+    """Raise `ValueError` unless `value` has `shape`; None stands for any size along that axis."""
+    if value.dim() != len(shape) or any(
+        want is not None and want != got for want, got in zip(shape, value.shape, strict=True)
+    ):
+        want_text = ", ".join("any" if size is None else str(size) for size in shape)
+        raise ValueError(f"{name}: expected shape [{want_text}], got {list(value.shape)}")
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera. `c2w` is [3, 4] float32 in scene units; intrinsics are in pixels."""
+
+    c2w: Tensor
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Rays:
+    """`origins` [R, 3] and `directions` [R, 3] with camera z = 1, so that t is z-depth."""
+
+    origins: Tensor
+    directions: Tensor
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One rendered picture: `rgb` [H, W, 3], `depth` [H, W] (+inf where empty), `alpha` [H, W]."""
+
+    rgb: Tensor
+    depth: Tensor
+    alpha: Tensor
+
+
+@dataclass(frozen=True)
+class Split:
+    """Cameras and their pictures, `images[n]` uint8 [H, W, 3 or 4] (4: straight alpha)."""
+
+    cameras: Sequence[Camera]
+    images: Sequence[Tensor]
+    names: Sequence[str]
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything a method may learn from and everything it is scored on.
+
+    Attributes:
+        name: short name, as it stands in result rows.
+        splits: "train" and "test" at least.
+        background: rgb [3] in [0, 1] onto which RGBA pictures and predictions are composited.
+        bounds: [2, 3] lower and upper corner of what is to be rendered, inside the unit cube.
+        unit_length: length of one scene unit in the data set's own unit.
+        digest: content hash of cameras, pictures and normalisation.
+    """
+
+    name: str
+    splits: Mapping[str, Split]
+    background: Tensor
+    bounds: Tensor
+    unit_length: float
+    digest: str
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How much work a training may do. Counted in steps, never in seconds, so that it repeats.
+
+    Attributes:
+        name: as it stands in result rows.
+        steps: optimiser steps of the (pre-)training of a field.
+        samples: field samples a step aims at; the number of rays follows from it.
+        frames: at most this many test frames are rendered and scored (0: all).
+    """
+
+    name: str
+    steps: int
+    samples: int
+    frames: int = 0
+
+
+class Log(Protocol):
+    """What a training talks to: messages, progress with the time left, and its stage folders."""
+
+    def info(self, message: str) -> None:
+        """Say one line to the person at the terminal."""
+
+    def progress(self, label: str, total: int) -> AbstractContextManager[Progress]:
+        """A progress bar with the time left, for work of `total` steps."""
+
+    def stage_dir(self, kind: str, key: Mapping[str, object]) -> Path:
+        """The folder of a trained stage, `outputs/stages/<kind>-<hash of key>`; made if missing."""
+
+
+class Progress(Protocol):
+    """The handle of a running progress bar."""
+
+    def advance(self, steps: int = 1, note: str = "") -> None:
+        """Count `steps` as done; `note` is a short figure shown beside the bar ("31.2 dB")."""
+
+
+class Probe(Protocol):
+    """Owns every clock and counter of a measurement; handed down to what is measured."""
+
+    def stage(self, name: str) -> AbstractContextManager[None]:
+        """Time a stage. Synchronises the device; a stage may be entered many times a frame."""
+
+    def count(self, name: str, done: int, dense: int | None = None) -> None:
+        """Add `done` units of work; `dense` is what a method that skips nothing would have done."""
+
+
+class Method(Protocol):
+    """A radiance-field renderer."""
+
+    name: str
+
+    def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
+        """Train, or load the stages that a training with the same content hash left behind."""
+
+    def reset(self) -> None:
+        """Forget preceding frames: a new sequence starts."""
+
+    def render(self, camera: Camera, probe: Probe) -> Frame:
+        """Render one frame of the current sequence."""
+
+    def sizes(self) -> dict[str, int]:
+        """Bytes by component: what a file of the model would need."""
+
+    def settings(self) -> dict[str, str]:
+        """The resolved `device`, `backend`, `engine` and `precision`, for the result rows."""
+
+
+@dataclass
+class NullProbe:
+    """A probe that measures nothing, for training and for pictures."""
+
+    counts: dict[str, int] = field(default_factory=dict)
+
+    def stage(self, name: str) -> AbstractContextManager[None]:
+        """Do not time."""
+        return torch.autograd.profiler.record_function(name)
+
+    def count(self, name: str, done: int, dense: int | None = None) -> None:
+        """Do not count."""

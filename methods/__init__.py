@@ -1,0 +1,1 @@
+"""What is measured: radiance-field methods and the kernels they stand on."""

@@ -1,0 +1,1 @@
+"""What is claimed: tables, figures and pages made from the store alone."""

@@ -1,0 +1,1 @@
+"""What is varied: Hydra configurations and the `steerbench` command line."""
