@@ -1,0 +1,60 @@
+# Set-up, demo and checks of steerbench. `make help` lists the targets.
+#
+#   PYTHON=python3.12      the interpreter to build the environment from (3.11 or newer)
+#   VENV=.venv             where the environment lives
+#   PIP_ARGS="..."         further arguments for pip, e.g. an index of CPU-only wheels of torch
+#   DEMO_ARGS="..."        overrides for the demo, e.g. DEMO_ARGS="seed=1 scene=wires"
+
+SHELL := /bin/sh
+.DEFAULT_GOAL := help
+.PHONY: help install demo test lint format clean
+
+VENV ?= .venv
+BIN := $(VENV)/bin
+PYTHON ?=
+PIP_ARGS ?=
+DEMO_ARGS ?=
+
+# A complete interpreter is one that is new enough and can make environments with pip in them.
+SUITS := import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))
+
+help: ## show this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' Makefile
+
+install: $(VENV)/.installed ## make $(VENV) and install steerbench into it, versions pinned
+
+demo: install ## build a scene, train on it, render it, write outputs/demo/report.md
+	@$(BIN)/steerbench run +experiment=demo $(DEMO_ARGS)
+
+test: lint ## lint, then all tests
+	$(BIN)/python -m pytest
+
+lint: install ## ruff and mypy
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: install ## let ruff put the sources in order
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean: ## remove the environment and caches; outputs/ stays
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find bench methods reports sweeps tests -name __pycache__ -prune -exec rm -rf {} +
+
+# The stamp is written last: an interrupted installation is taken up again by the next call.
+$(VENV)/.installed: pyproject.toml constraints.txt
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || { \
+	  for candidate in $(or $(PYTHON),python3.11 python3.12 python3.13 python3 python); do \
+	    if $$candidate -c '$(SUITS)' >/dev/null 2>&1; then found=$$candidate; break; fi; \
+	  done; \
+	  if [ -z "$$found" ]; then \
+	    echo "steerbench needs Python 3.11 or newer with the venv and ensurepip modules;" \
+	         "none of '$(or $(PYTHON),python3.11 python3.12 python3.13 python3 python)' is one." \
+	         "Install it (Debian, Ubuntu: the package python3-venv too) or name one:" \
+	         "make PYTHON=/path/to/python3" >&2; exit 1; \
+	  fi; \
+	  echo "making $(VENV) with $$($$found --version)"; \
+	  $$found -m venv --clear $(VENV); }
+	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e ".[dev]"
+	@touch $@
