@@ -72,3 +72,14 @@ def scale_camera(camera: Camera, width: int, height: int) -> Camera:
         width=width,
         height=height,
     )
+
+
+def crop_camera(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
+    """The camera of the `width` x `height` pixels whose first is column `left`, row `top`."""
+    return replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=width, height=height)
+
+
+def move_camera(camera: Camera, scale: float, offset: Tensor) -> Camera:
+    """The same view after every world point x became scale * x + offset (`offset` [3])."""
+    centre = scale * camera.c2w[:, 3:].double() + offset.to(camera.c2w.device).double()[:, None]
+    return replace(camera, c2w=torch.cat((camera.c2w[:, :3], centre.float()), dim=1))

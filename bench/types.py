@@ -108,6 +108,8 @@ class Scene:
         bounds: [2, 3] lower and upper corner of what is to be rendered, inside the unit cube.
         unit_length: length of one scene unit in the data set's own unit.
         digest: content hash of cameras, pictures and normalisation.
+        origin: [3] the corner (0, 0, 0) of the unit cube in the data set's own coordinates:
+            data set point = origin + unit_length * scene point; the axes stay.
     """
 
     name: str
@@ -116,6 +118,7 @@ class Scene:
     bounds: Tensor
     unit_length: float
     digest: str
+    origin: Tensor = field(default_factory=lambda: torch.zeros(3))
 
 
 @dataclass(frozen=True)

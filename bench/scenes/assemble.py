@@ -1,0 +1,74 @@
+"""From described views to a Scene: the last step that all loaders share."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import torch
+
+from bench.cameras import move_camera
+from bench.scenes.bounds import Box
+from bench.scenes.images import Picture, View, decode_all
+from bench.types import Log, Scene, Split, SteerbenchError
+
+BACKGROUNDS = {"white": 1.0, "black": 0.0}
+
+
+def decode_splits(
+    views: Mapping[str, Sequence[View]], downscale: int, log: Log
+) -> dict[str, list[Picture]]:
+    """The pictures of every split, each read and decoded once."""
+    if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
+        raise SteerbenchError(f"downscale: expected a whole number from 1, got {downscale!r}")
+    pictures = iter(
+        decode_all([view for split in views.values() for view in split], downscale, log)
+    )
+    return {name: [next(pictures) for _ in split] for name, split in views.items()}
+
+
+def assemble(
+    name: str,
+    views: Mapping[str, Sequence[View]],
+    pictures: Mapping[str, Sequence[Picture]],
+    box: Box,
+    *,
+    background: str,
+    camera_files: Iterable[Path],
+) -> Scene:
+    """The scene in units in which `box` fills the unit cube.
+
+    The digest covers the bytes of `camera_files` and of all picture files, the background, the
+    resolution and the place of the box.
+    """
+    if background not in BACKGROUNDS:
+        names = " or ".join(BACKGROUNDS)
+        raise SteerbenchError(f"background: expected {names}, got {background!r}")
+    splits = {
+        split: Split(
+            cameras=[
+                move_camera(picture.camera, 1 / box.side, -box.origin / box.side)
+                for picture in pictures[split]
+            ],
+            images=[picture.image for picture in pictures[split]],
+            names=[view.name for view in views[split]],
+        )
+        for split in views
+    }
+    digest = hashlib.sha256(repr((background, box.origin.tolist(), box.side)).encode())
+    for path in camera_files:
+        digest.update(hashlib.sha256(path.read_bytes()).digest())
+    for split in pictures:
+        for picture in pictures[split]:
+            size = f"{split} {picture.camera.width} {picture.camera.height} "
+            digest.update(size.encode() + picture.sha256.encode())
+    return Scene(
+        name=name,
+        splits=splits,
+        background=torch.full((3,), BACKGROUNDS[background]),
+        bounds=box.in_unit_cube(),
+        unit_length=box.side,
+        digest=digest.hexdigest(),
+        origin=box.origin.float(),
+    )

@@ -1,0 +1,124 @@
+"""NeRF-Synthetic: `transforms_{train,val,test}.json` beside RGBA pictures."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from bench.scenes.assemble import assemble, decode_splits
+from bench.scenes.bounds import Box, cube, hull_box, parse_box
+from bench.scenes.files import (
+    data_folder,
+    frames_of,
+    inside,
+    number,
+    opengl_to_opencv,
+    read_json,
+    rigid_pose,
+    unexpected,
+)
+from bench.scenes.images import Picture, View, image_size
+from bench.types import Camera, Log, Scene
+
+HALF_EXTENT = 1.5
+"""The objects of NeRF-Synthetic lie in [-1.5, 1.5]^3."""
+
+
+def load(
+    path: str | Path,
+    *,
+    downscale: int = 1,
+    background: str = "white",
+    bounds: str | list = "auto",
+    name: str | None = None,
+    log: Log,
+) -> Scene:
+    """Read a scene folder.
+
+    Args:
+        path: the folder with the `transforms_*.json`.
+        downscale: average blocks of this many pixels squared; what does not fill a block, at the
+            right and the bottom, is left out.
+        background: "white" or "black", what RGBA pictures are composited onto.
+        bounds: what fills the unit cube. "auto": the box of the visual hull of the training masks,
+            or [-1.5, 1.5]^3 when there is no mask; "full": [-1.5, 1.5]^3; or [[x, y, z], [x, y, z]].
+        name: the scene's name in result rows; the folder's name when not given.
+
+    A split other than train and test none of whose pictures exist is left out.
+    Raises SteerbenchError naming file and field when anything is not as it should be.
+    """
+    root = data_folder(path)
+    views = {}
+    for split in ("train", "val", "test"):
+        found = read_split(root, split, log)
+        if found:
+            views[split] = found
+    pictures = decode_splits(views, downscale, log)
+    return assemble(
+        name or root.name,
+        views,
+        pictures,
+        scene_box(bounds, pictures["train"], log),
+        background=background,
+        camera_files=[root / camera_file(split) for split in views],
+    )
+
+
+def camera_file(split: str) -> str:
+    """The name of a split's camera file."""
+    return f"transforms_{split}.json"
+
+
+def read_split(root: Path, split: str, log: Log) -> list[View]:
+    """The views of a split; none when it is optional and its pictures are not there."""
+    optional = split == "val"
+    path = root / camera_file(split)
+    if optional and not path.exists():
+        return []
+    record = read_json(root, path.name)
+    frames = frames_of(record, path)
+    fields = [f"{path}: frames[{i}]" for i in range(len(frames))]
+    files = [
+        picture_path(root, frame["file_path"], f"{field}.file_path")
+        for frame, field in zip(frames, fields, strict=True)
+    ]
+    missing = [i for i, file in enumerate(files) if not file.is_file()]
+    if optional and len(missing) == len(files):
+        log.info(f"{path.name}: none of its {len(files)} pictures are there, split left out")
+        return []
+    if missing:
+        raise unexpected(
+            f"{fields[missing[0]]}.file_path", "a picture", f"no file {files[missing[0]]}"
+        )
+    width, height = image_size(files[0])
+    angle = number(record.get("camera_angle_x"), f"{path}: camera_angle_x", 0, math.pi)
+    focal = width / 2 / math.tan(angle / 2)
+    views = []
+    for frame, field, file in zip(frames, fields, files, strict=True):
+        pose = opengl_to_opencv(
+            rigid_pose(frame.get("transform_matrix"), f"{field}.transform_matrix")
+        )
+        camera = Camera(pose.float(), focal, focal, width / 2, height / 2, width, height)
+        views.append(View(str(file.relative_to(root)), file, camera))
+    return views
+
+
+def picture_path(root: Path, file_path: str, where: str) -> Path:
+    """The picture that a `file_path` with or without its extension means."""
+    path = inside(root, file_path, where)
+    return path if path.is_file() else inside(root, f"{file_path}.png", where)
+
+
+def scene_box(bounds: str | list, train: list[Picture], log: Log) -> Box:
+    """The box in the data set's units that `bounds` asks for."""
+    space = cube(HALF_EXTENT)
+    if bounds == "full":
+        return space
+    if bounds != "auto":
+        return parse_box(bounds)
+    hull = hull_box([p.camera for p in train], [p.image for p in train], space)
+    if hull is None:
+        log.info(
+            f"bounds: the training pictures hold no masks, taking [-{HALF_EXTENT}, {HALF_EXTENT}]^3"
+        )
+    return hull or space

@@ -1,0 +1,103 @@
+"""What part of a data set's space is rendered, and its place in the unit cube."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bench.cameras import project
+from bench.types import Camera, SteerbenchError
+
+MARGIN = 0.05
+"""The box of a visual hull grows by this share of its longest side, half of it at each end."""
+
+CELLS = 64
+"""Cells along each side of the cube in which a visual hull is looked for."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned box in the data set's units: `lower` and `upper` corner, [3] float64."""
+
+    lower: Tensor
+    upper: Tensor
+
+    @property
+    def side(self) -> float:
+        """The longest side: the length of one scene unit."""
+        return (self.upper - self.lower).max().item()
+
+    @property
+    def origin(self) -> Tensor:
+        """The data set's coordinates of the corner (0, 0, 0) of the unit cube, [3] float64."""
+        return (self.lower + self.upper) / 2 - self.side / 2
+
+    def in_unit_cube(self) -> Tensor:
+        """[2, 3] float32 corners after the longest side fills the unit cube, centred."""
+        corners = torch.stack((self.lower, self.upper))
+        return ((corners - self.origin) / self.side).float().clamp(0, 1)
+
+    def grown(self, share: float) -> Box:
+        """The box with `share` of its longest side more along every axis."""
+        return Box(self.lower - share * self.side / 2, self.upper + share * self.side / 2)
+
+
+def cube(half: float) -> Box:
+    """[-half, half]^3."""
+    return Box(torch.full((3,), -half).double(), torch.full((3,), half).double())
+
+
+def parse_box(value: object) -> Box:
+    """A box from a user's [[x0, y0, z0], [x1, y1, z1]]."""
+    try:
+        corners = torch.tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError) as error:
+        raise SteerbenchError(
+            f"bounds: expected auto, full or two corners, got {value!r}"
+        ) from error
+    if corners.shape != (2, 3) or not corners.isfinite().all() or (corners[1] <= corners[0]).any():
+        raise SteerbenchError(
+            f"bounds: expected a lower and an upper corner [x, y, z], got {value!r}"
+        )
+    return Box(corners[0], corners[1])
+
+
+def hull_box(cameras: Sequence[Camera], images: Sequence[Tensor], space: Box) -> Box | None:
+    """The box of the visual hull of the pictures' masks (alpha > 0) inside `space`.
+
+    Conservative: a cell is dropped only where its whole projection, and one pixel around it, lies
+    inside a picture and shows nothing. None when the pictures are opaque or nothing is left.
+    """
+    if any(image.shape[2] < 4 for image in images):
+        return None
+    size = (space.upper - space.lower) / CELLS
+    cells = torch.cartesian_prod(*(torch.arange(CELLS, dtype=torch.float32),) * 3)
+    steps = torch.cartesian_prod(*(torch.tensor((0.0, 1.0)),) * 3)
+    for camera, image in zip(cameras, images, strict=True):
+        corners = space.lower + size * (cells[:, None] + steps)  # [M, 8, 3]
+        cells = cells[maybe_seen(camera, image[..., 3] > 0, corners.float())]
+    if not len(cells) or all((image[..., 3] == 255).all() for image in images):
+        return None
+    lower = space.lower + size * cells.amin(0)
+    upper = space.lower + size * (cells.amax(0) + 1)
+    return Box(lower, upper).grown(MARGIN)
+
+
+def maybe_seen(camera: Camera, mask: Tensor, corners: Tensor) -> Tensor:
+    """[M] bool: may a cell with these `corners` [M, 8, 3] hold something that `mask` [H, W] shows?"""
+    pixels, depth = project(camera, corners.reshape(-1, 3))
+    pixels, depth = pixels.reshape(-1, 8, 2), depth.reshape(-1, 8)
+    first = pixels.amin(1).floor() - 1
+    last = pixels.amax(1).floor() + 2  # one past the last pixel
+    limit = first.new_tensor((camera.width, camera.height))
+    inside = ((first >= 0) & (last <= limit)).all(1) & (depth > 0).all(1)
+    (u0, v0), (u1, v1) = (edge[inside].long().unbind(1) for edge in (first, last))
+    # A summed-area table counts the mask's pixels in any rectangle with four look-ups.
+    table = torch.nn.functional.pad(mask.int(), (1, 0, 1, 0)).cumsum(0).cumsum(1)
+    count = table[v1, u1] - table[v0, u1] - table[v1, u0] + table[v0, u0]
+    seen = torch.ones(len(corners), dtype=torch.bool)
+    seen[inside] = count > 0
+    return seen

@@ -1,0 +1,91 @@
+"""Undoing a lens: the picture a pinhole with the same intrinsics would have taken."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+from kornia.geometry.calibration import distort_points
+from kornia.geometry.transform import remap
+from torch import Tensor
+
+from bench.cameras import crop_camera, pixel_grid
+from bench.scenes.files import unexpected
+from bench.types import Camera
+
+
+def undistort(
+    image: Tensor, camera: Camera, coefficients: tuple[float, ...], where: Path
+) -> tuple[Tensor, Camera]:
+    """The pinhole picture and its camera.
+
+    Args:
+        image: uint8 [H, W, C].
+        camera: intrinsics of the distorted picture; they stay those of the pinhole.
+        coefficients: OpenCV's (k1, k2, p1, p2, k3).
+        where: the picture, for messages.
+
+    The result is cropped to a rectangle in which every pixel was seen: no invented border.
+    Raises SteerbenchError when the coefficients fold the picture over itself.
+    """
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    try:
+        source, left, top = pinhole_window(camera.width, camera.height, intrinsics, coefficients)
+    except ValueError as error:
+        expected = "a lens distortion that can be undone"
+        raise unexpected(where, expected, f"{coefficients}: {error}") from error
+    planes = image.permute(2, 0, 1)[None].float()
+    # kornia counts from the centre of the first pixel, we from its corner.
+    u, v = (source - 0.5).unbind(-1)
+    sampled = remap(planes, u[None], v[None], align_corners=True)
+    straight = sampled[0].permute(1, 2, 0).round().to(torch.uint8).contiguous()
+    return straight, crop_camera(camera, left, top, source.shape[1], source.shape[0])
+
+
+@lru_cache(maxsize=2)  # most captures have one lens
+def pinhole_window(
+    width: int, height: int, intrinsics: tuple[float, ...], coefficients: tuple[float, ...]
+) -> tuple[Tensor, int, int]:
+    """Where in the distorted picture the pixels of the pinhole's lie, for those that lie in it.
+
+    Returns [h, w, 2] as (u, v), and the column and row of its first pixel.
+    """
+    fx, fy, cx, cy = intrinsics
+    matrix = torch.tensor(((fx, 0, cx), (0, fy, cy), (0, 0, 1)), dtype=torch.float64)
+    lens = torch.tensor(coefficients, dtype=torch.float64)
+    points = distort_points(pixel_grid(width, height).double(), matrix, lens)
+    source = points.reshape(height, width, 2).float()
+    if (area_of_cells(source) <= 0).any():
+        raise ValueError("it folds the picture over itself")
+    left, top, right, bottom = seen_rectangle(source)
+    return source[top:bottom, left:right], left, top
+
+
+def area_of_cells(source: Tensor) -> Tensor:
+    """Signed area of the distorted cells between neighbouring pixels: [height - 1, width - 1]."""
+    across, down = source[:-1, 1:] - source[:-1, :-1], source[1:, :-1] - source[:-1, :-1]
+    return across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0]
+
+
+def seen_rectangle(source: Tensor) -> tuple[int, int, int, int]:
+    """left, top, right, bottom of a rectangle of pixels that all lie in the distorted picture.
+
+    Starts from the whole picture and takes off the side with the largest unseen share until
+    nothing unseen is left on the border.
+    """
+    height, width = source.shape[:2]
+    limit = source.new_tensor((width, height)) - 0.5  # last pixel centre: bilinear needs no border
+    unseen = ((source < 0.5) | (source > limit)).any(-1)
+    left, top, right, bottom = 0, 0, width, height
+    while left < right and top < bottom:
+        part = unseen[top:bottom, left:right].float()
+        shares = torch.stack(
+            (part[:, 0].mean(), part[0].mean(), part[:, -1].mean(), part[-1].mean())
+        )
+        if not part.any():
+            return left, top, right, bottom
+        worst = int(shares.argmax())
+        left, top = left + (worst == 0), top + (worst == 1)
+        right, bottom = right - (worst == 2), bottom - (worst == 3)
+    raise ValueError("it leaves no pixel")

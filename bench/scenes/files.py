@@ -1,0 +1,136 @@
+"""Reading a data set's files: nothing outside its folder, and every fault named.
+
+A `where` is what an error message starts with: the file, and the field inside it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from bench.types import SteerbenchError
+
+ORTHONORMAL_TOLERANCE = 1e-3
+"""Largest entry of R^T R - I: poses are stored with three digits or more."""
+
+
+def unexpected(where: str | Path, expected: str, got: object) -> SteerbenchError:
+    """The error that says what was expected at `where` and what came."""
+    return SteerbenchError(f"{where}: expected {expected}, got {got}")
+
+
+def data_folder(path: str | Path) -> Path:
+    """The data set's folder with all links resolved; SteerbenchError when it is not one."""
+    root = Path(path).expanduser()
+    if not root.is_dir():
+        raise unexpected(root, "a folder", "a file" if root.exists() else "nothing there")
+    return root.resolve()
+
+
+def inside(root: Path, relative: str, where: str | Path) -> Path:
+    """`root / relative`, refused when it lies outside `root` (.., an absolute path, a link)."""
+    path = (root / relative).resolve()
+    if not path.is_relative_to(root):
+        raise unexpected(where, f"a path inside {root}", repr(relative))
+    return path
+
+
+def read_text(root: Path, relative: str) -> str:
+    """The text of a file of the data set."""
+    path = inside(root, relative, root / relative)
+    if not path.is_file():
+        raise unexpected(path, "a file", "nothing there")
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise unexpected(path, "a readable text file", error) from error
+
+
+def read_json(root: Path, relative: str) -> dict:
+    """The object in a JSON file of the data set."""
+    path = root / relative
+    try:
+        value = json.loads(read_text(root, relative))
+    except json.JSONDecodeError as error:
+        at = f"{path}: line {error.lineno}, column {error.colno}"
+        raise unexpected(at, "JSON", error.msg) from error
+    except (RecursionError, ValueError) as error:
+        raise unexpected(path, "JSON", error) from error
+    if not isinstance(value, dict):
+        raise unexpected(path, "a JSON object", type(value).__name__)
+    return value
+
+
+def frames_of(record: Mapping, path: Path) -> list[dict]:
+    """The frame list of a `transforms*.json`: not empty, every frame an object with a path."""
+    frames = record.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise unexpected(f"{path}: frames", "a list with at least one frame", describe(frames))
+    for index, frame in enumerate(frames):
+        where = f"{path}: frames[{index}]"
+        if not isinstance(frame, dict):
+            raise unexpected(where, "an object", describe(frame))
+        if not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
+            raise unexpected(f"{where}.file_path", "a path", describe(frame.get("file_path")))
+    return frames
+
+
+def number(value: object, where: str, low: float = -math.inf, high: float = math.inf) -> float:
+    """A finite number with low < value < high."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        # Comparing before converting: an integer of hundreds of digits has no float.
+        if low < value < high and abs(value) < sys.float_info.max:
+            return float(value)
+    limits = [f"above {low:g}"] * (low > -math.inf) + [f"below {high:g}"] * (high < math.inf)
+    raise unexpected(
+        where, " ".join(("a finite number", " and ".join(limits))).rstrip(), describe(value)
+    )
+
+
+def numbers(text: str, where: str | Path) -> list[list[float]]:
+    """The numbers of a text file, line by line, empty lines left out."""
+    try:
+        return [
+            [float(word) for word in line.split()] for line in text.splitlines() if line.split()
+        ]
+    except ValueError as error:
+        raise unexpected(where, "numbers", error) from error
+
+
+def rigid_pose(value: object, where: str) -> Tensor:
+    """A camera-to-world matrix from nested lists 4x4 (or 3x4): [3, 4] float64, checked.
+
+    The rotation must be orthonormal and right-handed, the last row (0, 0, 0, 1).
+    """
+    rows = value if isinstance(value, list) else []
+    if len(rows) not in (3, 4) or any(not isinstance(r, list) or len(r) != 4 for r in rows):
+        raise unexpected(where, "a 4x4 matrix", describe(value))
+    cells = [[number(x, f"{where}[{i}][{j}]") for j, x in enumerate(r)] for i, r in enumerate(rows)]
+    if len(cells) == 4 and cells[3] != [0, 0, 0, 1]:
+        raise unexpected(f"{where}[3]", "[0, 0, 0, 1]", cells[3])
+    matrix = torch.tensor(cells[:3], dtype=torch.float64)
+    rotation = matrix[:, :3]
+    error = (rotation.T @ rotation - torch.eye(3, dtype=torch.float64)).abs().max().item()
+    if error > ORTHONORMAL_TOLERANCE:
+        raise unexpected(where, "an orthonormal rotation", f"one that is off by {error:.2g}")
+    if torch.linalg.det(rotation) < 0:
+        raise unexpected(where, "a right-handed rotation", "a mirrored one")
+    return matrix
+
+
+def opengl_to_opencv(pose: Tensor) -> Tensor:
+    """Camera-to-world [3, 4] from OpenGL axes (y up, z backward) to OpenCV's (y down, z forward)."""
+    return pose * pose.new_tensor((1, -1, -1, 1))
+
+
+def describe(value: object) -> str:
+    """A value as it stands in a message: short, and naming its type when it is a container."""
+    if isinstance(value, list | dict):
+        return f"{type(value).__name__} of {len(value)}"
+    return "nothing" if value is None else repr(value)

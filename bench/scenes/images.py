@@ -1,0 +1,128 @@
+"""Pictures of a data set: read once, decoded in parallel, kept as 8-bit tensors."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from bench.cameras import crop_camera, scale_camera
+from bench.scenes.distortion import undistort
+from bench.scenes.files import unexpected
+from bench.types import Camera, Log
+
+
+@dataclass(frozen=True)
+class View:
+    """A picture that a data set describes: `camera` in the data set's units, OpenCV axes.
+
+    `distortion` is (k1, k2, p1, p2, k3) of OpenCV's lens model, empty for a pinhole.
+    """
+
+    name: str
+    path: Path
+    camera: Camera
+    distortion: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A decoded view: `image` uint8 [H, W, 3 or 4], its pinhole `camera`, hash of its file."""
+
+    image: Tensor
+    camera: Camera
+    sha256: str
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height in pixels, from the file's header alone."""
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise unexpected(path, "a picture", error) from error
+
+
+def decode_all(views: Sequence[View], downscale: int, log: Log) -> list[Picture]:
+    """Read, undistort and downscale every view, in parallel; the order stays."""
+    with (
+        log.progress("decode pictures", len(views)) as bar,
+        ThreadPoolExecutor(max_workers=os.cpu_count()) as pool,
+    ):
+        futures = [pool.submit(decode, view, downscale) for view in views]
+        pictures = []
+        try:
+            for future in futures:
+                pictures.append(future.result())
+                bar.advance()
+        finally:  # the first fault ends the load: what still waits is not decoded
+            pool.shutdown(wait=False, cancel_futures=True)
+    return pictures
+
+
+def decode(view: View, downscale: int) -> Picture:
+    """One view as a pinhole picture at 1 / downscale of its resolution."""
+    try:
+        content = view.path.read_bytes()
+    except OSError as error:
+        raise unexpected(view.path, "a readable picture", error) from error
+    image = decode_bytes(content, view.path)
+    camera = view.camera
+    if image.shape[:2] != (camera.height, camera.width):
+        expected = f"{camera.width} x {camera.height} pixels"
+        raise unexpected(view.path, expected, f"{image.shape[1]} x {image.shape[0]}")
+    if any(view.distortion):
+        image, camera = undistort(image, camera, view.distortion, view.path)
+    image, camera = shrink(image, camera, downscale, view.path)
+    return Picture(image, camera, hashlib.sha256(content).hexdigest())
+
+
+def decode_bytes(content: bytes, path: Path) -> Tensor:
+    """The 8-bit picture in `content` as uint8 [H, W, 3], or [H, W, 4] when it has an alpha."""
+    try:
+        with Image.open(io.BytesIO(content)) as image:
+            if image.mode.startswith(("I", "F")):
+                raise unexpected(path, "8 bits a channel", f"mode {image.mode}")
+            mode = "RGBA" if image.has_transparency_data else "RGB"
+            return torch.from_numpy(np.array(image.convert(mode)))
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise unexpected(path, "a whole picture", error) from error
+
+
+def shrink(image: Tensor, camera: Camera, factor: int, where: Path) -> tuple[Tensor, Camera]:
+    """Average blocks of `factor` x `factor` pixels; colours weigh by their alpha.
+
+    Columns and rows that do not fill a block, at the right and the bottom, are left out, so that
+    the camera of what remains is exact. Means are rounded to the nearest 8-bit value.
+    """
+    if factor == 1:
+        return image, camera
+    height, width = camera.height // factor, camera.width // factor
+    if not height or not width:
+        got = f"{camera.width} x {camera.height}"
+        raise unexpected(where, f"at least {factor} x {factor} pixels for this downscale", got)
+    blocks = image[: height * factor, : width * factor].long()
+    blocks = blocks.reshape(height, factor, width, factor, -1)
+    if image.shape[2] == 3:
+        small = rounded_ratio(blocks.sum((1, 3)), torch.tensor(factor**2))
+    else:
+        alpha = blocks[..., 3:]
+        mass = alpha.sum((1, 3))
+        colour = rounded_ratio((blocks[..., :3] * alpha).sum((1, 3)), mass.clamp(min=1))
+        small = torch.cat((colour, rounded_ratio(mass, torch.tensor(factor**2))), dim=-1)
+    camera = crop_camera(camera, 0, 0, width * factor, height * factor)
+    return small.to(torch.uint8), scale_camera(camera, width, height)
+
+
+def rounded_ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
+    """numerator / denominator of integers, rounded to the nearest integer, halves up."""
+    return (2 * numerator + denominator) // (2 * denominator)
