@@ -31,19 +31,11 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from bench.errors import SteerbenchError as SteerbenchError
+from bench.errors import Unavailable as Unavailable
+
 EMPTY_ALPHA = 1e-3
 """Opacity below which a pixel is empty: its depth is +inf and it is never unprojected."""
-
-
-class SteerbenchError(Exception):
-    """An error a user can act on: the message names what was expected, what came, what to do.
-
-    The command line prints the message alone, without a traceback, and exits with status 2.
-    """
-
-
-class Unavailable(SteerbenchError):
-    """Something asked for by name cannot be used here; the message says why and how to get it."""
 
 
 def check_shape(name: str, value: Tensor, *shape: int | None) -> None:
