@@ -1,0 +1,118 @@
+"""The log of a person at a terminal: messages, progress with the time left, stage folders."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from datetime import timedelta
+from pathlib import Path
+
+from rich import progress
+from rich.console import Console
+
+from bench.results import content_key, explained
+
+PLAIN_INTERVAL_S = 10.0
+"""Between two lines of progress where there is no terminal to draw a bar on."""
+
+WORTH_A_LINE_S = 2.0
+"""Work that took longer leaves a line behind when it is done."""
+
+
+class ConsoleLog:
+    """`bench.types.Log` on standard error, so that standard output holds the results alone.
+
+    Args:
+        root: `outputs`; trained stages go to `stages/` in it.
+        quiet: say nothing and draw nothing.
+        clock: seconds, from any beginning.
+    """
+
+    def __init__(
+        self, root: Path, quiet: bool = False, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._root = root
+        self._console = Console(stderr=True, quiet=quiet)
+        self._clock = clock
+        self._bars = progress.Progress(
+            progress.TextColumn("{task.description}", markup=False),
+            progress.BarColumn(),
+            progress.TaskProgressColumn(),
+            progress.TimeElapsedColumn(),
+            progress.TimeRemainingColumn(),
+            progress.TextColumn("{task.fields[note]}", markup=False),
+            console=self._console,
+            transient=True,
+            get_time=clock,
+            disable=quiet or not self._console.is_terminal,
+        )
+
+    def info(self, message: str) -> None:
+        """Print one line, above the progress bars."""
+        self._console.print(message, markup=False, highlight=False, soft_wrap=True)
+
+    @contextmanager
+    def progress(self, label: str, total: int) -> Iterator[_Bar]:
+        """Show a bar, or without a terminal a line now and then; bars may nest."""
+        bar = _Bar(self.info, self._bars, label, total, self._clock)
+        self._bars.start()
+        try:
+            yield bar
+            bar.report_done()
+        finally:
+            bar.remove()
+            if not self._bars.tasks:
+                self._bars.stop()
+
+    def stage_dir(self, kind: str, key: Mapping[str, object]) -> Path:
+        """`stages/<kind>-<hash of key>`, made if missing; SteerbenchError where it cannot be."""
+        folder = self._root / "stages" / f"{kind}-{content_key(key)[:12]}"
+        with explained(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+
+class _Bar:
+    """One running bar; see `bench.types.Progress`."""
+
+    def __init__(
+        self,
+        say: Callable[[str], None],
+        bars: progress.Progress,
+        label: str,
+        total: int,
+        clock: Callable[[], float],
+    ) -> None:
+        self._say, self._bars, self._label, self._clock = say, bars, label, clock
+        self._id = bars.add_task(label, total=total, note="")
+        self._begun = self._said = clock()
+
+    def advance(self, steps: int = 1, note: str = "") -> None:
+        self._bars.update(self._id, advance=steps, note=note)
+        if self._bars.disable and self._clock() - self._said >= PLAIN_INTERVAL_S:
+            self._said = self._clock()
+            task = self._task()
+            left = _duration(task.time_remaining) if task.time_remaining is not None else "?"
+            done = f"{task.percentage:.0f} %, {_duration(self._elapsed())} elapsed, {left} left"
+            self._say(", ".join(filter(None, (f"{self._label}: {done}", note))))
+
+    def report_done(self) -> None:
+        """Leave a line behind, if the work was worth one."""
+        if self._elapsed() > WORTH_A_LINE_S:
+            done = f"{self._label}: done in {_duration(self._elapsed())}"
+            self._say(", ".join(filter(None, (done, self._task().fields["note"]))))
+
+    def remove(self) -> None:
+        """Take the bar off the screen."""
+        self._bars.remove_task(self._id)
+
+    def _elapsed(self) -> float:
+        return self._clock() - self._begun
+
+    def _task(self) -> progress.Task:
+        return next(task for task in self._bars.tasks if task.id == self._id)
+
+
+def _duration(seconds: float) -> str:
+    return str(timedelta(seconds=round(seconds)))

@@ -1,0 +1,138 @@
+"""Where the backbone weights of LPIPS come from, and what to do when there are none.
+
+The folders `weights_dir`, `$STEERBENCH_WEIGHTS` and torch's hub cache are searched in this order
+for torchvision's file or for one that holds its `features.*` alone; then torchvision's file is
+downloaded into the cache. A file that carries its SHA-256 in its name is checked against it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import re
+import tempfile
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from bench.types import Log, SteerbenchError, Unavailable
+
+ADDRESS = "https://download.pytorch.org/models/"
+TIMEOUT_S = 10.0
+CHUNK_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class Backbone:
+    """Names of a backbone's file: torchvision's own, and one with its `features.*` alone."""
+
+    published: str
+    features: str
+
+
+BACKBONES = {
+    "alex": Backbone("alexnet-owt-7be5be79.pth", "alexnet_features.pth"),
+    "vgg": Backbone("vgg16-397923af.pth", "vgg16_features.pth"),
+    "squeeze": Backbone("squeezenet1_1-b8a52dc0.pth", "squeezenet1_1_features.pth"),
+}
+
+_unreachable: list[str] = []  # why the download failed: one attempt a process is enough
+
+
+def locate(net: str, weights_dir: Path | None, log: Log) -> Path:
+    """The weight file of backbone `net`, downloaded if need be.
+
+    Raises:
+        SteerbenchError: `net` is unknown, or `weights_dir` is not a folder.
+        Unavailable: no such file anywhere and the download failed, or the file is damaged.
+    """
+    if net not in BACKBONES:
+        raise SteerbenchError(f"LPIPS net: expected one of {', '.join(BACKBONES)}, got {net!r}")
+    if weights_dir is not None and not weights_dir.is_dir():
+        raise SteerbenchError(f"weights_dir: expected a folder, got {weights_dir}")
+    backbone = BACKBONES[net]
+    for folder in _folders(weights_dir):
+        for name in (backbone.features, backbone.published):
+            if (folder / name).is_file():
+                return _verified(folder / name)
+    try:
+        return _download(backbone.published, log)
+    except OSError as error:
+        raise Unavailable(
+            f"LPIPS ({net}) has no backbone weights: neither {backbone.published} nor "
+            f"{backbone.features} lies in {', '.join(map(str, _folders(weights_dir)))}, and "
+            f"the download of {ADDRESS}{backbone.published} failed ({error}). Fetch that file on "
+            "a machine with a network and pass its folder as weights_dir=DIR or in "
+            "$STEERBENCH_WEIGHTS."
+        ) from error
+
+
+def load_features(net: str, weights_dir: Path | None, log: Log) -> tuple[Path, dict[str, Tensor]]:
+    """The weight file of backbone `net` and what it holds; raises as `locate` does."""
+    path = locate(net, weights_dir, log)
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        raise Unavailable(
+            f"{path}: expected a torch state dict, could not read one; fetch the file again "
+            f"from {ADDRESS}{BACKBONES[net].published}"
+        ) from error
+    if not isinstance(state, dict):
+        raise Unavailable(f"{path}: expected a torch state dict, got a {type(state).__name__}")
+    return path, state
+
+
+def _folders(weights_dir: Path | None) -> list[Path]:
+    def named() -> Iterator[Path]:
+        if weights_dir is not None:
+            yield weights_dir
+        if folder := os.environ.get("STEERBENCH_WEIGHTS"):
+            yield Path(folder)
+        yield Path(torch.hub.get_dir()) / "checkpoints"
+
+    return list(named())
+
+
+def _verified(path: Path) -> Path:
+    """`path`, unless its name promises a SHA-256 that its bytes do not have."""
+    promised = re.search(r"-([0-9a-f]{8})\.pth$", path.name)
+    if promised is None:
+        return path
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if not digest.startswith(promised[1]):
+        raise Unavailable(
+            f"{path}: expected a SHA-256 that begins with {promised[1]}, got {digest[:8]}; "
+            "the file is damaged: delete it, and it is fetched again"
+        )
+    return path
+
+
+def _download(name: str, log: Log) -> Path:
+    """Fetch a published file into torch's hub cache; raises OSError, at once after a failure."""
+    if _unreachable:
+        raise OSError(_unreachable[0])
+    target = Path(torch.hub.get_dir()) / "checkpoints" / name
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with (
+            tempfile.TemporaryDirectory(dir=target.parent) as folder,
+            urllib.request.urlopen(ADDRESS + name, timeout=TIMEOUT_S) as response,
+        ):
+            partial = Path(folder) / name
+            size = int(response.headers["Content-Length"])
+            with partial.open("wb") as file, log.progress(f"downloading {name}", size) as progress:
+                while chunk := response.read(CHUNK_BYTES):
+                    file.write(chunk)
+                    progress.advance(len(chunk))
+            _verified(partial).replace(target)
+    except OSError as error:
+        _unreachable.append(str(error))
+        raise
+    return target

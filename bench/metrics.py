@@ -1,0 +1,144 @@
+"""Picture quality: PSNR, SSIM and LPIPS of one picture against its reference.
+
+Every function takes two float pictures [H, W, 3] in [0, 1] and returns a Python float. None of
+them clips or rounds: that is the protocol's choice, made with `quantise`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+from pathlib import Path
+from types import ModuleType
+
+import torch
+from skimage.metrics import structural_similarity
+from torch import Tensor
+
+from bench.lpips_weights import load_features
+from bench.types import Log, SteerbenchError, Unavailable, check_shape
+
+SSIM_SIDE = 11
+"""Side of the Gaussian window, and so the smallest side of a picture that has an SSIM."""
+
+LPIPS_SIDE = {"alex": 31, "vgg": 16, "squeeze": 17}
+"""Smallest side, in pixels, whose deepest feature map still holds one position."""
+
+
+def quantise(image: Tensor) -> Tensor:
+    """Clip to [0, 1] and round to the 256 levels of an 8-bit file, halves to the even level."""
+    return image.clamp(0.0, 1.0).mul(255.0).round().div(255.0)
+
+
+def psnr(image: Tensor, reference: Tensor) -> float:
+    """Peak signal-to-noise ratio in dB for a peak of 1; +inf where the pictures are equal."""
+    _check_pair(image, reference)
+    mse = (image.double() - reference.double()).square().mean().item()
+    return -10.0 * math.log10(mse) if mse > 0.0 else math.inf
+
+
+def ssim(image: Tensor, reference: Tensor, window: str = "gaussian") -> float:
+    """Structural similarity, k1 = .01, k2 = .03, per channel, then the mean.
+
+    `window` is "gaussian" (11 x 11, sigma 1.5, population covariance; Wang et al. 2004) or
+    "uniform" (7 x 7, sample covariance; the default of scikit-image, used by NSVF and KiloNeRF).
+    The mean is taken over the valid region, where the window lies inside the picture.
+
+    Raises:
+        SteerbenchError: a side is shorter than the window.
+    """
+    _check_pair(image, reference)
+    _check_side(f"SSIM ({window})", image, SSIM_SIDE)
+    variants: dict[str, dict[str, object]] = {
+        "gaussian": {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False},
+        "uniform": {"win_size": 7},
+    }
+    value = structural_similarity(
+        image.double().cpu().numpy(),
+        reference.double().cpu().numpy(),
+        data_range=1.0,
+        channel_axis=-1,
+        **variants[window],
+    )
+    return float(value)
+
+
+class Lpips:
+    """LPIPS v0.1 (Zhang et al. 2018) with a named backbone; a lower value is more similar.
+
+    The linear layers come with the `lpips` package, the backbone from `bench.lpips_weights`.
+    Runs in float32 on the device of the pictures, which are mapped to [-1, 1] as published.
+
+    Args:
+        net: "alex", "vgg" or "squeeze".
+        weights_dir: folder to look into first, or None.
+        log: told of a download.
+
+    Raises:
+        Unavailable: the backbone weights cannot be had, or are not those of this network.
+    """
+
+    def __init__(self, net: str, weights_dir: Path | None, log: Log) -> None:
+        self.net = net
+        path, features = load_features(net, weights_dir, log)
+        with warnings.catch_warnings():  # lpips calls torchvision with deprecated arguments
+            warnings.simplefilter("ignore", UserWarning)
+            model = _lpips_package().LPIPS(net=net, version="0.1", pnet_rand=True, verbose=False)
+        # lpips cuts the backbone into slices but keeps torchvision's index of every layer.
+        names = {name: re.sub(r"^slice\d+", "features", name) for name in model.net.state_dict()}
+        try:
+            model.net.load_state_dict({name: features[source] for name, source in names.items()})
+        except (KeyError, RuntimeError) as error:
+            raise Unavailable(
+                f"{path}: expected the `features.*` weights LPIPS ({net}) needs; {error}"
+            ) from error
+        self._model = model.requires_grad_(False).to(memory_format=torch.channels_last)
+
+    @torch.inference_mode()
+    def __call__(self, image: Tensor, reference: Tensor) -> float:
+        """LPIPS between two pictures [H, W, 3] in [0, 1]."""
+        _check_pair(image, reference)
+        _check_side(f"LPIPS ({self.net})", image, LPIPS_SIDE[self.net])
+        pair = torch.stack((image, reference)).float().permute(0, 3, 1, 2)  # channels last
+        distance = self._model.to(image.device)(pair[:1], pair[1:], normalize=True)
+        return float(distance.item())
+
+
+_torchvision_operators: torch.library.Library | None = None
+
+
+def _lpips_package() -> ModuleType:
+    """Import `lpips`, which imports torchvision for its network definitions alone.
+
+    Torchvision's binary does not load beside a torch built for another device; its import then
+    stops at two operators it finds undeclared. Declaring them lets the definitions through.
+    """
+    global _torchvision_operators
+    try:
+        import torchvision  # noqa: F401
+    except RuntimeError as error:
+        if "operator torchvision::" not in str(error):
+            raise
+        _torchvision_operators = torch.library.Library("torchvision", "DEF")
+        for name in ("nms", "qnms"):
+            _torchvision_operators.define(
+                f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor"
+            )
+    import lpips
+
+    return lpips
+
+
+def _check_pair(image: Tensor, reference: Tensor) -> None:
+    check_shape("image", image, None, None, 3)
+    check_shape("reference", reference, *image.shape)
+
+
+def _check_side(metric: str, image: Tensor, side: int) -> None:
+    height, width, _ = image.shape
+    if min(height, width) < side:
+        raise SteerbenchError(
+            f"{metric} needs pictures of at least {side} x {side} pixels, got {width} x {height}: "
+            "use a smaller scene.downscale, or a protocol without this metric"
+        )

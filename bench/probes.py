@@ -1,0 +1,159 @@
+"""The clock, the counters and the memory meter of a measurement."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+OTHER = "other"
+"""The stage that is charged while a frame is in no stage."""
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """What one frame took.
+
+    Attributes:
+        stages_ns: own time of each stage, and of `other`; a stage inside another is named
+            "outer/inner", and its time is not in that of "outer".
+        done: units of work by counter.
+        dense: what a method that skips nothing would have done, for the counters that say so.
+    """
+
+    stages_ns: dict[str, int]
+    done: dict[str, int]
+    dense: dict[str, int]
+
+    @property
+    def total_ns(self) -> int:
+        """Time from the beginning to the end of the frame: every nanosecond has its stage."""
+        return sum(self.stages_ns.values())
+
+
+class StageClock:
+    """The probe of a measurement: charges every nanosecond of a frame to exactly one stage.
+
+    The clock is read only when a stage begins or ends, after the device has finished its work;
+    the time since the last reading goes to the innermost stage that was open. So the stages and
+    `other` add up to the frame by construction.
+    """
+
+    def __init__(self, device: str, clock: Callable[[], int] = time.perf_counter_ns) -> None:
+        self.frames: list[FrameRecord] = []
+        self._device = torch.device(device)
+        self._clock = clock
+        self._open: list[str] | None = None  # names of the open stages; None outside a frame
+        self._last = 0
+        self._begin()
+
+    @contextmanager
+    def frame(self) -> Iterator[None]:
+        """Delimit one frame; its record is kept unless the body raises."""
+        if self._open is not None:
+            raise RuntimeError("a frame may not begin inside a frame")
+        self._begin()
+        self._open = []
+        self._last = self._now()
+        try:
+            yield
+            self._charge()
+            self.frames.append(FrameRecord(dict(self._ns), dict(self._done), dict(self._dense)))
+        finally:
+            self._open = None
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time a stage of the current frame; see `bench.types.Probe`."""
+        if self._open is None:
+            raise RuntimeError(f"stage {name!r} was entered outside a frame")
+        if name == OTHER:
+            raise ValueError(f"a stage may not be named {OTHER!r}: that is the remainder")
+        self._charge()
+        self._open.append(name)
+        try:
+            yield
+        finally:
+            self._charge()
+            self._open.pop()
+
+    def count(self, name: str, done: int, dense: int | None = None) -> None:
+        """Add work to the current frame; see `bench.types.Probe`."""
+        self._done[name] += done
+        if dense is not None:
+            self._dense[name] += dense
+
+    def _begin(self) -> None:
+        self._ns: defaultdict[str, int] = defaultdict(int, {OTHER: 0})
+        self._done: defaultdict[str, int] = defaultdict(int)
+        self._dense: defaultdict[str, int] = defaultdict(int)
+
+    def _now(self) -> int:
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        return self._clock()
+
+    def _charge(self) -> None:
+        now = self._now()
+        self._ns["/".join(self._open or ()) or OTHER] += now - self._last
+        self._last = now
+
+
+class MemoryMeter:
+    """Peak memory over all regions measured with it: `with meter: ...`, as often as needed.
+
+    Attributes:
+        peak_bytes: the highest peak so far.
+        source: in words, what was read; it belongs beside the figure, because the memory of a
+            device, of a process while it renders, and of a process since it began are three
+            different things.
+    """
+
+    def __init__(self, device: str) -> None:
+        self.peak_bytes = 0
+        self._device = torch.device(device)
+        if self._device.type == "cuda":
+            self.source = "peak allocated on the device while rendering"
+        elif _reset_high_water_mark():
+            self.source = "peak resident memory of the process while rendering"
+        else:
+            self.source = "peak resident memory of the process since it began"
+
+    def __enter__(self) -> None:
+        if self._device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(self._device)
+        else:
+            _reset_high_water_mark()
+
+    def __exit__(self, *exception: object) -> None:
+        if self._device.type == "cuda":
+            peak = torch.cuda.max_memory_allocated(self._device)
+        else:
+            peak = _process_peak_bytes()
+        self.peak_bytes = max(self.peak_bytes, peak)
+
+
+def _reset_high_water_mark() -> bool:
+    """Let the peak resident memory of this process begin anew; False where the system cannot."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return False
+    return True
+
+
+def _process_peak_bytes() -> int:
+    """Peak resident memory since the last reset, or since the process began."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+        return int(line.split()[1]) * 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024

@@ -1,0 +1,139 @@
+"""What counts as one fair measurement, as an object with a name that stands in every row."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from bench import metrics
+from bench.lpips_weights import locate
+from bench.types import Log, Scene, SteerbenchError, Unavailable
+
+BACKGROUNDS = {"white": 1.0, "black": 0.0}
+
+
+@dataclass(frozen=True)
+class EvaluationProtocol:
+    """How pictures are scored and how frames are timed; the defaults are `steerbench-1`.
+
+    A protocol that differs from the defaults needs a name of its own, so that rows of two
+    protocols are never taken for one.
+
+    Attributes:
+        name: as it stands in result rows.
+        rounding: of the prediction before scoring: "8bit" (clip, then round) or "none".
+        ssim: window of the SSIM, see `bench.metrics.ssim`.
+        lpips: backbones of LPIPS, each with a metric `lpips_<net>` of its own.
+        background: "white" or "black": what pictures with an opacity channel are composited on.
+        warmup: frames rendered before the timed sequence, spread over the trajectory.
+        memory: "steady": a method keeps its preceding frames along the trajectory; "cold": it is
+            reset before every frame.
+    """
+
+    name: str = "steerbench-1"
+    rounding: str = "8bit"
+    ssim: str = "gaussian"
+    lpips: tuple[str, ...] = ("alex", "vgg")
+    background: str = "white"
+    warmup: int = 3
+    memory: str = "steady"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "lpips", tuple(self.lpips))  # a list, when read from YAML
+        choices = {
+            "rounding": ("8bit", "none"),
+            "ssim": ("gaussian", "uniform"),
+            "background": tuple(BACKGROUNDS),
+            "memory": ("steady", "cold"),
+        }
+        for option, allowed in choices.items():
+            if getattr(self, option) not in allowed:
+                raise SteerbenchError(
+                    f"protocol.{option}: expected {' or '.join(allowed)}, "
+                    f"got {getattr(self, option)!r}"
+                )
+        if self.warmup < 0:
+            raise SteerbenchError(f"protocol.warmup: expected 0 or more, got {self.warmup}")
+        default = {field.name: field.default for field in fields(self)}
+        changed = [key for key, value in default.items() if getattr(self, key) != value]
+        if changed and self.name == default["name"]:
+            raise SteerbenchError(
+                f"protocol.{changed[0]} differs from what {self.name} says: give the changed "
+                "protocol a name of its own (protocol.name=...)"
+            )
+
+    @property
+    def metric_names(self) -> tuple[str, ...]:
+        """Names of what `score` returns, in the order of the table."""
+        return ("psnr", "ssim", *(f"lpips_{net}" for net in self.lpips))
+
+    def check_scene(self, scene: Scene) -> None:
+        """Raise `SteerbenchError` if the scene is composited on another background."""
+        wanted = torch.full((3,), BACKGROUNDS[self.background])
+        if not torch.equal(scene.background.cpu().float(), wanted):
+            got = ", ".join(f"{value:g}" for value in scene.background.tolist())
+            raise SteerbenchError(
+                f"protocol {self.name} scores on {self.background}, but scene {scene.name} has "
+                f"background [{got}]: change scene.background, or use another protocol"
+            )
+
+    def find_lpips(self, weights_dir: Path | None, log: Log) -> dict[str, bool]:
+        """For which backbones weights can be had: part of what a run's rows depend on."""
+        return {net: _is_available(net, weights_dir, log) for net in self.lpips}
+
+    def load_lpips(
+        self, weights_dir: Path | None, log: Log
+    ) -> tuple[dict[str, metrics.Lpips], dict[str, str]]:
+        """LPIPS by backbone, and by metric why one is missing; the log is told of the latter."""
+        loaded, missing = {}, {}
+        for net in self.lpips:
+            try:
+                loaded[net] = metrics.Lpips(net, weights_dir, log)
+            except Unavailable as error:
+                missing[f"lpips_{net}"] = str(error)
+                log.info(f"lpips_{net}: n/a. {error}")
+        return loaded, missing
+
+    def score(
+        self,
+        rgb: Tensor,
+        reference: Tensor,
+        background: Tensor,
+        lpips: Mapping[str, metrics.Lpips],
+    ) -> dict[str, float]:
+        """Every metric of a prediction `rgb` [H, W, 3] against its ground truth.
+
+        `reference` is uint8 [H, W, 3 or 4]; straight alpha is composited on `background` [3].
+        NaN stands for a backbone missing from `lpips`.
+        """
+        image = metrics.quantise(rgb.float()) if self.rounding == "8bit" else rgb.float()
+        truth = composite(reference.to(rgb.device), background)
+        scores = {
+            "psnr": metrics.psnr(image, truth),
+            "ssim": metrics.ssim(image, truth, self.ssim),
+        }
+        for net in self.lpips:
+            scores[f"lpips_{net}"] = lpips[net](image, truth) if net in lpips else math.nan
+        return scores
+
+
+def _is_available(net: str, weights_dir: Path | None, log: Log) -> bool:
+    try:
+        locate(net, weights_dir, log)
+    except Unavailable:
+        return False
+    return True
+
+
+def composite(picture: Tensor, background: Tensor) -> Tensor:
+    """An 8-bit `picture` [H, W, 3 or 4] as float [H, W, 3] over `background` [3]."""
+    values = picture.float() / 255.0
+    if values.shape[-1] == 3:
+        return values
+    rgb, alpha = values[..., :3], values[..., 3:]
+    return rgb * alpha + background.to(values) * (1.0 - alpha)

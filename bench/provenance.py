@@ -1,0 +1,72 @@
+"""Where a row comes from: the code, the commit and the machine that made it."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import platform
+import re
+import subprocess
+from importlib import metadata
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+MEASURING_PACKAGES = ("bench", "methods")
+VERSIONS_OF = ("torch", "numpy", "numba", "scikit-image", "lpips")
+
+
+@functools.cache
+def code_digest() -> str:
+    """SHA-256 of every source file that can change a row: paths and bytes of bench and methods."""
+    digest = hashlib.sha256()
+    for package in MEASURING_PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            content = path.read_bytes()
+            digest.update(f"{path.relative_to(ROOT).as_posix()} {len(content)}\n".encode())
+            digest.update(content)
+    return digest.hexdigest()
+
+
+@functools.cache
+def commit() -> str:
+    """The commit of a git checkout, with `-dirty` after changes; else the installed version."""
+    try:
+        # An installed copy may lie inside a repository that has nothing to do with it.
+        _git("ls-files", "--error-unmatch", __file__)
+        return _git("describe", "--always", "--dirty", "--abbrev=12", "--exclude=*")
+    except (OSError, subprocess.CalledProcessError):
+        return metadata.version("steerbench")
+
+
+def machine() -> dict[str, object]:
+    """The machine and the versions of what it runs, for the record of a run."""
+    import torch  # here, because reading the store needs no torch
+
+    return {
+        "cpu": _cpu_model(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
+        "gpus": [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())],
+        "cuda": torch.version.cuda,
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "versions": {name: metadata.version(name) for name in VERSIONS_OF},
+    }
+
+
+def _git(*arguments: str) -> str:
+    done = subprocess.run(
+        ["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=True
+    )
+    return done.stdout.strip()
+
+
+def _cpu_model() -> str:
+    try:
+        text = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        return platform.processor()
+    model = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
+    return model[1] if model else platform.machine()

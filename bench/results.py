@@ -1,0 +1,206 @@
+"""The store of runs, `outputs/runs/<key>/`, and the one tidy table made of all of them.
+
+A run folder holds `rows.csv` (one metric per row, `COLUMNS`), `frames.csv` (one frame per row),
+`record.json` (what the key was made of, commit, machine, what the figures mean) and `pictures/`.
+It appears under its key only when it is whole.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import shutil
+import time
+import uuid
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from PIL import Image
+
+from bench.errors import SteerbenchError
+from bench.provenance import code_digest as code_digest
+from bench.provenance import commit, machine
+
+SCHEMA_VERSION = 1
+"""Of record.json and rows.csv; a folder of another version is reported and left alone."""
+
+COLUMNS = [
+    *("run", "method", "scene", "split", "trajectory", "resolution", "protocol", "budget"),
+    *("metric", "unit", "value", "n", "lo", "hi"),
+    *("device", "backend", "engine", "precision", "seed", "commit"),
+]
+"""`value` is a mean over `n` frames with its 95 % interval [lo, hi], or a single figure (n = 1,
+no interval); NaN with n = 0 is a figure that could not be had."""
+
+FIGURES = {"value": "float64", "lo": "float64", "hi": "float64", "n": "int64", "seed": "int64"}
+RECORD = "record.json"
+PARTIAL = ".partial-"
+STALE_S = 24 * 3600.0
+
+
+def content_key(parts: Mapping[str, object]) -> str:
+    """SHA-256 of `parts`, whatever their order; they hold what JSON can hold, and no NaN."""
+    text = json.dumps(parts, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@contextmanager
+def explained(folder: Path) -> Iterator[None]:
+    """Turn what the system says when `folder` cannot be written into an error for the user."""
+    try:
+        yield
+    except OSError as error:
+        raise SteerbenchError(
+            f"cannot write to {error.filename or folder}: {error.strerror or error}; nothing was "
+            "kept of it. Make room, correct the permissions, or choose another folder "
+            "with outputs=DIR"
+        ) from error
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What one run found out.
+
+    Attributes:
+        rows: one metric per row, `COLUMNS` without `run` and `commit`.
+        frames: one frame per row; NaN where a figure does not exist for that frame.
+        pictures: uint8 [H, W, 3] by the name of the file, without `.png`.
+        record: what the figures mean: JSON values only.
+    """
+
+    rows: pd.DataFrame
+    frames: pd.DataFrame
+    pictures: dict[str, np.ndarray]
+    record: dict[str, object]
+
+
+class Store:
+    """All runs under `root` (`outputs`)."""
+
+    def __init__(self, root: Path) -> None:
+        self.folder = root / "runs"
+
+    def key(self, parts: Mapping[str, object]) -> str:
+        """The name of the run that is made of `parts`: everything that can change its rows."""
+        return content_key(parts)[:16]
+
+    def find(self, key: str) -> Path | None:
+        """The folder of a whole run, or None."""
+        folder = self.folder / key
+        return folder if (folder / RECORD).is_file() else None
+
+    def save(self, parts: Mapping[str, object], measurement: Measurement) -> str:
+        """Write the run that is made of `parts`, and return its key; raises as `write` does."""
+        key = self.key(parts)
+        record = {
+            "schema_version": SCHEMA_VERSION,
+            "run": key,
+            "commit": commit(),
+            "machine": machine(),
+            "made_of": parts,
+            **measurement.record,
+        }
+        rows = measurement.rows.assign(run=key, commit=commit())[COLUMNS]
+        with self.write(key) as folder:
+            rows.to_csv(folder / "rows.csv", index=False, lineterminator="\n")
+            measurement.frames.to_csv(folder / "frames.csv", index=False, lineterminator="\n")
+            (folder / "pictures").mkdir()
+            for name, pixels in measurement.pictures.items():
+                Image.fromarray(pixels).save(folder / "pictures" / f"{name}.png")
+            (folder / RECORD).write_text(json.dumps(record, indent=2, allow_nan=False) + "\n")
+        return key
+
+    @contextmanager
+    def write(self, key: str) -> Iterator[Path]:
+        """A temporary folder that becomes the run `key` when the body ends without an exception.
+
+        When another process has finished the same run meanwhile, that one stays.
+
+        Raises:
+            SteerbenchError: no space, no permission, or `outputs` is no folder.
+        """
+        with explained(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._sweep()
+            partial = self.folder / f"{PARTIAL}{key}-{uuid.uuid4().hex[:8]}"
+            partial.mkdir()
+            try:
+                yield partial
+                for path in [*partial.rglob("*"), partial]:
+                    _sync(path)
+                self._publish(partial, key)
+            finally:
+                shutil.rmtree(partial, ignore_errors=True)
+
+    def rows(self, report: Callable[[str], object] = warnings.warn) -> pd.DataFrame:
+        """Every row of every run, `COLUMNS`; `report` is told of runs that cannot be read."""
+        header = ",".join(COLUMNS)
+        bodies = []
+        for path in sorted(self.folder.glob(f"*/{RECORD}")):
+            schema = _schema_version(path)
+            first, _, body = (path.parent / "rows.csv").read_text().partition("\n")
+            if schema == SCHEMA_VERSION and first == header:
+                bodies.append(body)
+            else:
+                report(
+                    f"{path.parent}: left out, its rows have schema {schema}; "
+                    f"this version reads schema {SCHEMA_VERSION}"
+                )
+        return pd.read_csv(
+            io.StringIO("\n".join((header, "".join(bodies)))),
+            dtype={column: FIGURES.get(column, "str") for column in COLUMNS},
+            keep_default_na=False,
+            na_values={column: ["", "nan"] for column in ("value", "lo", "hi")},
+        )
+
+    def frames(self, run: str) -> pd.DataFrame:
+        """Every frame of a run."""
+        path = self._existing(run) / "frames.csv"
+        return pd.read_csv(path, dtype={"name": "str"})
+
+    def record(self, run: str) -> dict[str, object]:
+        """What a run was made of, and on which machine."""
+        return json.loads((self._existing(run) / RECORD).read_text())
+
+    def _publish(self, partial: Path, key: str) -> None:
+        try:
+            partial.replace(self.folder / key)
+        except OSError:
+            if self.find(key) is None:
+                raise
+        _sync(self.folder)
+
+    def _sweep(self) -> None:
+        """Delete what killed processes left behind; a day is longer than any writing takes."""
+        for folder in self.folder.glob(f"{PARTIAL}*"):
+            if time.time() - folder.stat().st_mtime > STALE_S:
+                shutil.rmtree(folder, ignore_errors=True)
+
+    def _existing(self, run: str) -> Path:
+        folder = self.find(run)
+        if folder is None:
+            raise SteerbenchError(f"no run {run!r} in {self.folder}: see `steerbench results`")
+        return folder
+
+
+def _schema_version(record: Path) -> object:
+    try:
+        return json.loads(record.read_text())["schema_version"]
+    except (ValueError, KeyError, TypeError):
+        return None
+
+
+def _sync(path: Path) -> None:
+    """Have the system write a file or folder to the disk now."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,241 @@
+"""One run: Method x Scene x Trajectory x Protocol -> rows.
+
+Quality, time and memory of a run come from the same rendering of the same frames.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pandas as pd
+import torch
+from scipy import stats
+from torch import Tensor
+
+from bench.metrics import Lpips, quantise
+from bench.probes import FrameRecord, MemoryMeter, StageClock
+from bench.protocol import EvaluationProtocol, composite
+from bench.results import Measurement
+from bench.trajectories import Trajectory, spread
+from bench.types import Budget, Frame, Log, Method, Scene, SteerbenchError, check_shape
+
+CONFIDENCE = 0.95
+QUANTILES = (50, 95, 99)
+ERROR_RANGE = 0.1
+"""Absolute error, mean over the channels, that the brightest colour of an error map stands for."""
+
+UNITS = {
+    "psnr": "dB",
+    "frame_ms": "ms",
+    "fps": "1/s",
+    "stage_ms": "ms",
+    "work": "1/frame",
+    "size_bytes": "B",
+    "peak_bytes": "B",
+    "train_s": "s",
+}
+"""By the name of a metric up to its first dot; what is not listed has none."""
+
+
+def measure(
+    method: Method,
+    scene: Scene,
+    trajectory: Trajectory,
+    protocol: EvaluationProtocol,
+    budget: Budget,
+    log: Log,
+    *,
+    seed: int,
+    weights_dir: Path | None = None,
+    pictures: int = 3,
+) -> Measurement:
+    """Fit `method` to `scene`, render `trajectory` under the clock and score it.
+
+    Args:
+        seed: for the rows; the method was made with it.
+        weights_dir: where to look first for the backbones of LPIPS.
+        pictures: how many frames, evenly spread, are kept as ground truth, rendering, error map.
+
+    Raises:
+        SteerbenchError: the scene does not suit the protocol, or the method rendered values that
+            are not finite.
+    """
+    protocol.check_scene(scene)
+    lpips, missing = protocol.load_lpips(weights_dir, log)
+    begun = time.perf_counter()
+    method.fit(scene, budget, log)
+    train_s = time.perf_counter() - begun
+
+    meter = MemoryMeter(method.settings()["device"])
+    frames, images = _render(method, scene, trajectory, protocol, lpips, meter, log, pictures)
+    summary = [
+        *_frame_rows(frames, protocol),
+        *(_single(f"size_bytes.{part}", size) for part, size in method.sizes().items()),
+        _single("size_bytes.total", sum(method.sizes().values())),
+        _single("peak_bytes", meter.peak_bytes),
+        _single("train_s", train_s),
+    ]
+    rows = pd.DataFrame(summary).assign(
+        unit=lambda table: [UNITS.get(name.split(".")[0], "1") for name in table["metric"]],
+        method=method.name,
+        scene=scene.name,
+        split=trajectory.split,
+        trajectory=trajectory.name,
+        resolution=trajectory.resolution,
+        protocol=protocol.name,
+        budget=budget.name,
+        seed=seed,
+        **method.settings(),
+    )
+    record: dict[str, Any] = {
+        "protocol": asdict(protocol),
+        "budget": asdict(budget),
+        "scene": {"name": scene.name, "digest": scene.digest, "unit_length": scene.unit_length},
+        "missing": missing,
+        "peak_bytes": meter.source,
+        "error_map": f"absolute error, mean over the channels, black 0 to yellow {ERROR_RANGE}",
+    }
+    return Measurement(rows, frames, images, record)
+
+
+def _render(
+    method: Method,
+    scene: Scene,
+    trajectory: Trajectory,
+    protocol: EvaluationProtocol,
+    lpips: dict[str, Lpips],
+    meter: MemoryMeter,
+    log: Log,
+    pictures: int,
+) -> tuple[pd.DataFrame, dict[str, np.ndarray]]:
+    """Warm up, then render the sequence in its order; each frame is scored and let go."""
+    steps, split = trajectory.steps, scene.splits[trajectory.split]
+    clock = StageClock(method.settings()["device"])
+    warmup, shown = spread(len(steps), protocol.warmup), spread(len(steps), pictures)
+    table: list[dict[str, Any]] = []
+    images: dict[str, np.ndarray] = {}
+    with torch.no_grad(), log.progress("rendering", len(warmup) + len(steps)) as progress:
+        method.reset()
+        for index in warmup:
+            with clock.frame():
+                method.render(steps[index].camera, clock)
+            progress.advance(note="warming up")
+        method.reset()
+        for index, step in enumerate(steps):
+            if protocol.memory == "cold":
+                method.reset()
+            with meter, clock.frame():
+                frame = method.render(step.camera, clock)
+            _check_frame(frame, step.camera.height, step.camera.width, method.name, index)
+            figures = {"frame": index, **_times_and_work(clock.frames[-1])}
+            if step.truth is not None:
+                truth = split.images[step.truth]
+                figures["name"] = split.names[step.truth]
+                figures |= protocol.score(frame.rgb, truth, scene.background, lpips)
+                if index in shown:
+                    images |= _pictures(index, frame.rgb, composite(truth, scene.background))
+            table.append(figures)
+            progress.advance(note=_mean_psnr(table))
+    return _frame_table(table, protocol), images
+
+
+def _check_frame(frame: Frame, height: int, width: int, method: str, index: int) -> None:
+    """A picture with a NaN in it has no score, and a table may not invent one."""
+    check_shape("rgb", frame.rgb, height, width, 3)
+    broken = int((~torch.isfinite(frame.rgb)).any(dim=-1).sum())
+    if broken:
+        raise SteerbenchError(
+            f"{method} rendered {broken} of {height * width} pixels of frame {index} as NaN or "
+            "infinite: the training is broken; train again with a lower learning rate or another "
+            "seed"
+        )
+
+
+def _times_and_work(record: FrameRecord) -> dict[str, Any]:
+    """One frame's columns: its time, that of its stages, its work."""
+    return {
+        "frame_ms": record.total_ns / 1e6,
+        **{f"stage_ms.{name}": ns / 1e6 for name, ns in record.stages_ns.items()},
+        **{f"work.{name}": done for name, done in record.done.items()},
+        **{f"work.{name}.dense": dense for name, dense in record.dense.items()},
+    }
+
+
+def _frame_table(table: list[dict[str, Any]], protocol: EvaluationProtocol) -> pd.DataFrame:
+    """One row per frame: a stage or counter a frame never touched is 0, a score it lacks NaN."""
+    frames = pd.DataFrame(table)
+    touched = [name for name in map(str, frames) if name.startswith(("stage_ms.", "work."))]
+    touched.sort(key=lambda name: (name.startswith("work."), name == "stage_ms.other"))
+    columns = ["frame", "name", *protocol.metric_names, "frame_ms", *touched]
+    return frames.reindex(columns=columns).fillna(dict.fromkeys(touched, 0))
+
+
+def _frame_rows(frames: pd.DataFrame, protocol: EvaluationProtocol) -> list[dict[str, Any]]:
+    """Mean and interval of every column, quantiles of the frame time, frames a second."""
+    rows = [_mean(name, frames[name]) for name in (*protocol.metric_names, "frame_ms")]
+    ms = rows[-1]
+    rows += [
+        _single(f"frame_ms.p{percent}", np.percentile(frames["frame_ms"], percent))
+        for percent in QUANTILES
+    ]
+    rows.append({"metric": "fps", "n": ms["n"]} | _rate(ms))
+    done = {"frame", "name", *(row["metric"] for row in rows)}
+    return rows + [_mean(name, frames[name]) for name in map(str, frames) if name not in done]
+
+
+def _mean(metric: str, values: pd.Series) -> dict[str, Any]:
+    """Mean over the frames that have a value, with the t-interval of that mean.
+
+    The interval needs two frames and finite values; it takes the frames as independent, which
+    neighbours on a path are not quite.
+    """
+    known = values.dropna().to_numpy(dtype=float)
+    value = known.mean() if len(known) else math.nan
+    half = math.nan
+    if len(known) > 1 and np.isfinite(known).all():
+        quantile = stats.t.ppf(0.5 + CONFIDENCE / 2, len(known) - 1)
+        half = quantile * known.std(ddof=1) / math.sqrt(len(known))
+    return {
+        "metric": metric,
+        "value": value,
+        "n": len(known),
+        "lo": value - half,
+        "hi": value + half,
+    }
+
+
+def _rate(ms: dict) -> dict[str, float]:
+    """Frames a second of a mean time; the interval exists where that of the time is positive."""
+    slowest, fastest = ms["hi"], ms["lo"] if ms["lo"] > 0 else math.nan
+    return {"value": 1000 / ms["value"], "lo": 1000 / slowest, "hi": 1000 / fastest}
+
+
+def _single(metric: str, value: float) -> dict[str, Any]:
+    """A figure of the whole run."""
+    return {"metric": metric, "value": float(value), "n": 1, "lo": math.nan, "hi": math.nan}
+
+
+def _mean_psnr(table: list[dict[str, Any]]) -> str:
+    scores = [row["psnr"] for row in table if "psnr" in row]
+    return f"{np.mean(scores):.2f} dB" if scores else ""
+
+
+def _pictures(index: int, rgb: Tensor, truth: Tensor) -> dict[str, np.ndarray]:
+    """Ground truth, rendering and error map of a frame, as 8-bit pictures by file name."""
+    rendering, truth = quantise(rgb).cpu(), truth.cpu()
+    error = (rendering - truth).abs().mean(dim=-1) / ERROR_RANGE
+    return {
+        f"{index:04d}-truth": _bytes(truth),
+        f"{index:04d}-rendered": _bytes(rendering),
+        f"{index:04d}-error": matplotlib.colormaps["inferno"](error.numpy(), bytes=True)[..., :3],
+    }
+
+
+def _bytes(image: Tensor) -> np.ndarray:
+    return image.mul(255.0).round().to(torch.uint8).numpy()

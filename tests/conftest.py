@@ -1,0 +1,135 @@
+"""What all tests share: devices, a poisoned `torch.empty`, a quiet log, a tiny scene and method."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from bench.console import ConsoleLog
+from bench.types import Budget, Camera, Frame, Log, Probe, Scene, Split
+
+DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+
+
+@pytest.fixture(params=DEVICES)
+def device(request: pytest.FixtureRequest) -> str:
+    """Every device of this machine in turn."""
+    return request.param
+
+
+@pytest.fixture(scope="session", autouse=True)
+def poisoned_empty() -> Iterator[None]:
+    """Fill what `torch.empty` and its kin return with NaN: an output nobody wrote then shows."""
+    with pytest.MonkeyPatch.context() as patch:
+        for owner, name in ((torch, "empty"), (torch, "empty_like"), (Tensor, "new_empty")):
+            patch.setattr(owner, name, _poisoning(getattr(owner, name)))
+        yield
+
+
+def _poisoning(allocate):
+    def allocate_poisoned(*args, **kwargs):
+        tensor = allocate(*args, **kwargs)
+        return tensor.fill_(math.nan) if tensor.is_floating_point() else tensor
+
+    return allocate_poisoned
+
+
+@pytest.fixture
+def quiet_log(tmp_path: Path) -> Log:
+    """A log that says nothing and keeps its stages under `tmp_path`."""
+    return ConsoleLog(tmp_path / "outputs", quiet=True)
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path | None:
+    """The folder with weights and data sets, `$STEERBENCH_DATA` or `../shared`; None without."""
+    root = Path(os.environ.get("STEERBENCH_DATA", Path(__file__).parents[2] / "shared"))
+    return root if root.is_dir() else None
+
+
+@pytest.fixture
+def tiny_scene() -> Scene:
+    """Four training and six test pictures of 40 x 32 noise with straight alpha, on white."""
+    splits = {"train": _tiny_split(4, seed=1), "test": _tiny_split(6, seed=2)}
+    bounds = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    return Scene("tiny", splits, torch.ones(3), bounds, unit_length=3.0, digest="0123456789abcdef")
+
+
+def _tiny_split(count: int, seed: int) -> Split:
+    generator = torch.Generator().manual_seed(seed)
+    images = [
+        torch.randint(256, (32, 40, 4), dtype=torch.uint8, generator=generator)
+        for _ in range(count)
+    ]
+    return Split(
+        [_orbit(i / count) for i in range(count)], images, [f"r_{i}" for i in range(count)]
+    )
+
+
+def _orbit(turn: float) -> Camera:
+    """A camera 2 units from the middle of the unit cube, looking at it."""
+    angle = 2 * math.pi * turn
+    forward = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
+    down = torch.tensor([0.0, 0.0, -1.0])
+    rotation = torch.stack((torch.linalg.cross(down, forward), down, forward), dim=1)
+    centre = torch.full((3,), 0.5) - 2.0 * forward
+    return Camera(torch.cat((rotation, centre[:, None]), dim=1), 60.0, 60.0, 20.0, 16.0, 40, 32)
+
+
+class OffsetMethod:
+    """Renders the ground truth of the camera plus `offset`; `calls` lists what it was asked."""
+
+    name = "offset"
+
+    def __init__(self, device: str, offset: float) -> None:
+        self.calls: list[str] = []
+        self._device, self._offset = device, offset
+
+    def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
+        self.calls.append("fit")
+        test = scene.splits["test"]
+        self._known = [
+            (name, camera, _on_white(image))
+            for name, camera, image in zip(test.names, test.cameras, test.images, strict=True)
+        ]
+
+    def reset(self) -> None:
+        self.calls.append("reset")
+
+    def render(self, camera: Camera, probe: Probe) -> Frame:
+        name, _, picture = next(known for known in self._known if known[1] is camera)
+        self.calls.append(name)
+        with probe.stage("look-up"):
+            rgb = picture.to(self._device)
+            with probe.stage("add"):
+                rgb = rgb + self._offset
+        probe.count("pixels", done=rgb[..., 0].numel() // 4, dense=rgb[..., 0].numel())
+        return Frame(rgb, torch.full_like(rgb[..., 0], math.inf), torch.zeros_like(rgb[..., 0]))
+
+    def sizes(self) -> dict[str, int]:
+        return {"offset": 4, "table": 100}
+
+    def settings(self) -> dict[str, str]:
+        return {
+            "device": self._device,
+            "backend": "reference",
+            "engine": "torch",
+            "precision": "fp32",
+        }
+
+
+def _on_white(image: Tensor) -> Tensor:
+    rgba = image.double() / 255.0
+    return (rgba[..., :3] * rgba[..., 3:] + 1.0 - rgba[..., 3:]).float()
+
+
+@pytest.fixture
+def offset_method(device: str) -> OffsetMethod:
+    """A method whose every figure is known: 8 levels brighter than the ground truth."""
+    return OffsetMethod(device, 8 / 255)
