@@ -1,0 +1,10 @@
+"""Operations of radiance-field rendering, each as a plain torch reference beside fast backends.
+
+A kernel is a folder: `__init__` holds its signature and meaning, `reference` the plain torch
+version (any dtype, any device, differentiable: the oracle of all others), `cpu` the numba version.
+All backends of a kernel have the same signature.
+"""
+
+from methods.kernels.dispatch import BACKENDS, availability, resolve
+
+__all__ = ["BACKENDS", "availability", "resolve"]

@@ -1,0 +1,65 @@
+"""Volume rendering of samples into pixels (Max 1995; SteerNeRF Eq. 2 and 3).
+
+    alpha_i = 1 - exp(-sigma_i delta_i),  T_i = prod_{j<i} (1 - alpha_j),  w_i = T_i alpha_i
+    values = sum w_i f_i + (1 - sum w_i) background,  depth_sum = sum w_i t_i,  alpha = sum w_i
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from bench.types import check_shape
+from methods.kernels.dispatch import implementation
+
+STOP = 1e-4
+"""Transmittance below which a ray ends: what lies behind changes a pixel by less than this."""
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Composited rays: `values` [R, K], `depth_sum` [R] (sum w t, not divided), `alpha` [R]."""
+
+    values: Tensor
+    depth_sum: Tensor
+    alpha: Tensor
+
+
+def composite(
+    sigma: Tensor,
+    values: Tensor,
+    t: Tensor,
+    delta: Tensor,
+    offsets: Tensor,
+    *,
+    background: Tensor | None = None,
+    stop: float = STOP,
+    carry: Pixels | None = None,
+    backend: str = "auto",
+) -> Pixels:
+    """Composite samples of R rays (ray by ray, front to back; see `march.Samples`).
+
+    Differentiable in `sigma` and `values`.
+
+    Args:
+        sigma: [S] density, not negative.
+        values: [S, K] colour or features.
+        t, delta: [S] position and interval of the samples.
+        offsets: [R + 1] int64.
+        background: [K] or [R, K], shines through with 1 - alpha; None: black.
+        stop: samples behind a transmittance of at most `stop` have no weight; 0 uses all.
+        carry: what lies in front of these samples, composited without a background. Constant:
+            no gradient flows into it.
+    """
+    count = len(sigma)
+    check_shape("values", values, count, None)
+    check_shape("t", t, count)
+    check_shape("delta", delta, count)
+    pixels = implementation("composite", backend, sigma.device).composite(
+        sigma, values, t, delta, offsets, stop, carry
+    )
+    if background is None:
+        return pixels
+    shine = (1 - pixels.alpha)[:, None] * background
+    return Pixels(pixels.values + shine, pixels.depth_sum, pixels.alpha)

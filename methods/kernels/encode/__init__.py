@@ -1,0 +1,130 @@
+"""Multi-resolution hash-grid encoding of positions (Müller et al. 2022, Section 3).
+
+Level l has scale_l = N_min b^l - 1 and res_l = ceil(scale_l) + 1 vertices along an axis; a position
+x in [0, 1]^3 lies at p = scale_l x + 1/2, its cell is floor(p), its trilinear weights frac(p)
+(the conventions of tiny-cuda-nn, `common_device.h` and `grid.h`). A level whose res^3 vertices fit
+into 2^log2_table entries is dense, x + y res + z res^2; the others are hashed,
+(x ^ y * 2654435761 ^ z * 805459861) mod 2^log2_table in 32-bit arithmetic. The half-cell stagger
+makes a dense level's last vertex spill one entry over; its index wraps around.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from bench.types import check_shape
+from methods.kernels.dispatch import implementation
+
+PRIMES = (1, 2654435761, 805459861)
+
+
+@dataclass(frozen=True)
+class HashGrid:
+    """The shape of a hash-grid table.
+
+    Attributes:
+        levels: number of resolutions.
+        features: F, channels an entry holds.
+        log2_table: log2 of T, the largest number of entries of a level.
+        n_min: vertices along an axis at the coarsest level.
+        n_max: vertices along an axis at the finest level.
+    """
+
+    levels: int = 16
+    features: int = 2
+    log2_table: int = 19
+    n_min: int = 16
+    n_max: int = 1024
+
+    def __post_init__(self) -> None:
+        if not (self.levels >= 1 and self.features >= 1 and 3 <= self.log2_table <= 24):
+            raise ValueError(f"levels, features >= 1 and log2_table in 3..24, got {self}")
+        if not 2 <= self.n_min <= self.n_max:
+            raise ValueError(f"expected 2 <= n_min <= n_max, got {self}")
+
+    @cached_property
+    def scales(self) -> tuple[float, ...]:
+        """Grid cells along the unit cube, of each level."""
+        growth = math.log(self.n_max / self.n_min) / max(self.levels - 1, 1)
+        return tuple(self.n_min * math.exp(level * growth) - 1 for level in range(self.levels))
+
+    @cached_property
+    def resolutions(self) -> tuple[int, ...]:
+        """Vertices along an axis, of each level."""
+        # Rounding first keeps n_max, a product of logs and exps, from becoming n_max + 1.
+        return tuple(math.ceil(round(scale, 6)) + 1 for scale in self.scales)
+
+    @cached_property
+    def sizes(self) -> tuple[int, ...]:
+        """Table entries of each level, a multiple of 8."""
+        return tuple(min(-(-(res**3) // 8) * 8, 1 << self.log2_table) for res in self.resolutions)
+
+    @cached_property
+    def dense(self) -> tuple[bool, ...]:
+        """Whether a level stores every vertex."""
+        return tuple(
+            res**3 <= size for res, size in zip(self.resolutions, self.sizes, strict=True)
+        )
+
+    @cached_property
+    def offsets(self) -> tuple[int, ...]:
+        """First table entry of each level, and the number of all entries at the end."""
+        starts = [0]
+        for size in self.sizes:
+            starts.append(starts[-1] + size)
+        return tuple(starts)
+
+    @property
+    def entries(self) -> int:
+        """Entries of the whole table."""
+        return self.offsets[-1]
+
+    @property
+    def channels(self) -> int:
+        """Channels of an encoded position, level by level."""
+        return self.levels * self.features
+
+
+def encode(
+    positions: Tensor,
+    table: Tensor,
+    grid: HashGrid,
+    *,
+    packed: Tensor | None = None,
+    grad_buffer: Tensor | None = None,
+    backend: str = "auto",
+) -> Tensor:
+    """Encode `positions` [N, 3] with `table` [entries, F]: [N, levels * F], level by level.
+
+    Positions are clamped to [0, 1]; NaN counts as 0, so that no bad position reaches the memory
+    of another. Differentiable in `table`; in `positions` only with backend="reference".
+
+    Args:
+        packed: `pack(table)`, read in place of `table` when given (half the memory traffic;
+            F = 2 only). The output is then bfloat16; its gradient goes to `table`.
+        grad_buffer: [entries, F]; when given, the gradient of `table` is added to it in place,
+            and autograd sees none: a training step then neither allocates nor clears a second
+            table.
+    """
+    check_shape("positions", positions, None, 3)
+    check_shape("table", table, grid.entries, grid.features)
+    if packed is not None:
+        if grid.features != 2:
+            raise ValueError(f"packed tables hold 2 features an entry, the grid has {grid}")
+        check_shape("packed", packed, grid.entries)
+    if grad_buffer is not None:
+        check_shape("grad_buffer", grad_buffer, grid.entries, grid.features)
+    return implementation("encode", backend, positions.device).encode(
+        positions, table, grid, packed=packed, grad_buffer=grad_buffer
+    )
+
+
+def pack(table: Tensor) -> Tensor:
+    """Two bfloat16 features in one int32 word, the first in the low half: [entries, 2] -> [entries]."""
+    check_shape("table", table, None, 2)
+    return table.detach().to(torch.bfloat16).contiguous().view(torch.int32).squeeze(-1)

@@ -1,0 +1,148 @@
+"""Ray marching through an occupancy grid: samples where something may be, nothing elsewhere.
+
+A ray enters the unit cube, or its window, at t_0 and is divided into steps of one world length:
+t_k = t_0 + (k + phase) step / norm(d), phase 1/2 (midpoint rule) or a jitter in [0, 1). Sample k
+exists where the cell at o + t_k d is occupied. The set of samples does not depend on how empty
+space is skipped, so every backend returns the same ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from bench.types import check_shape
+from methods.kernels.dispatch import implementation
+
+MAX_SAMPLES = 1024
+"""Most samples of a ray; a step of sqrt(3) / 1024 crosses the unit cube with as many."""
+
+BRICK = 4
+"""Cells along the side of a brick, the 64 cells of one word of `Occupancy.words`."""
+
+
+class Occupancy:
+    """Which cells of the unit cube may hold matter.
+
+    `cells` [G, G, G] bool is indexed (x, y, z); G is a multiple of 16. The derived pyramid lets a
+    ray leave an empty brick of 4^3 cells, or an empty block of 4^3 bricks, in one step.
+    """
+
+    def __init__(self, cells: Tensor) -> None:
+        size = cells.shape[0]
+        check_shape("cells", cells, size, size, size)
+        if size % BRICK**2:
+            raise ValueError(f"cells: expected a side that is a multiple of 16, got {size}")
+        self.cells = cells.bool()
+
+    @property
+    def resolution(self) -> int:
+        """Cells along a side."""
+        return self.cells.shape[0]
+
+    @cached_property
+    def words(self) -> Tensor:
+        """One bit a cell, one int64 word a brick: [G/4, G/4, G/4]."""
+        return _pack_bricks(self.cells)
+
+    @cached_property
+    def blocks(self) -> Tensor:
+        """One bit a brick, one int64 word a block of 4^3 bricks: [G/16, G/16, G/16]."""
+        return _pack_bricks(self.words != 0)
+
+    @cached_property
+    def bounds(self) -> Tensor:
+        """Corners of the box around all occupied cells, [2, 3]; empty (lower > upper) if none."""
+        size = self.resolution
+        lower, upper = torch.ones(3), torch.zeros(3)
+        for axis in range(3):
+            other = [a for a in range(3) if a != axis]
+            filled = self.cells.any(dim=other[1]).any(dim=other[0]).nonzero()
+            if len(filled):
+                lower[axis], upper[axis] = filled[0] / size, (filled[-1] + 1) / size
+        return torch.stack((lower, upper))
+
+    @property
+    def fraction(self) -> float:
+        """Share of cells that are occupied."""
+        return self.cells.float().mean().item()
+
+
+def _pack_bricks(bits: Tensor) -> Tensor:
+    """64 bits a word: bit x + 4 y + 16 z of a word is the cell (x, y, z) of its 4^3 brick."""
+    side = bits.shape[0] // BRICK
+    cells = bits.view(side, BRICK, side, BRICK, side, BRICK).permute(0, 2, 4, 5, 3, 1)
+    weight = torch.ones(64, dtype=torch.int64, device=bits.device).bitwise_left_shift(
+        torch.arange(64, device=bits.device)
+    )
+    return (cells.reshape(side, side, side, 64).long() * weight).sum(dim=-1)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Samples of R rays, ray by ray, front to back.
+
+    Attributes:
+        offsets: [R + 1] int64, ray r owns samples offsets[r] to offsets[r + 1].
+        ray: [S] int32, the ray a sample belongs to.
+        t: [S] position along the ray (z-depth for rays of `bench.cameras.cast`).
+        delta: [S] length of the interval a sample stands for, scene units.
+        positions: [S, 3] in the unit cube.
+        resume: [R] int32, the step to go on from; -1 where the ray has no more samples.
+    """
+
+    offsets: Tensor
+    ray: Tensor
+    t: Tensor
+    delta: Tensor
+    positions: Tensor
+    resume: Tensor
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+
+def march(
+    origins: Tensor,
+    directions: Tensor,
+    occupancy: Occupancy,
+    step: float,
+    *,
+    window: Tensor | None = None,
+    jitter: Tensor | None = None,
+    start: Tensor | None = None,
+    limit: int = MAX_SAMPLES,
+    backend: str = "auto",
+) -> Samples:
+    """Sample rays `origins` + t `directions` ([R, 3] each) inside the unit cube.
+
+    Not differentiable. A ray that misses the cube, has no direction or is not finite gets none.
+
+    Args:
+        step: world length of a step, scene units.
+        window: [R, 2] nearest and farthest t; None: [0, inf).
+        jitter: [R] phase of a ray's samples in [0, 1); None: 1/2.
+        start: [R] int32 step to begin with, `Samples.resume` of an earlier call with the same rays;
+            a negative one ends the ray; None: 0.
+        limit: at most so many samples a ray.
+    """
+    rays = len(origins)
+    check_shape("origins", origins, None, 3)
+    check_shape("directions", directions, rays, 3)
+    if window is None:
+        window = origins.new_tensor((0.0, torch.inf)).expand(rays, 2)
+    if jitter is None:
+        jitter = origins.new_full((1,), 0.5).expand(rays)
+    if start is None:
+        start = torch.zeros(1, dtype=torch.int32, device=origins.device).expand(rays)
+    check_shape("window", window, rays, 2)
+    check_shape("jitter", jitter, rays)
+    check_shape("start", start, rays)
+    if not step > 0:
+        raise ValueError(f"step: expected a positive length, got {step}")
+    return implementation("march", backend, origins.device).march(
+        origins, directions, occupancy, step, window, jitter, start, limit
+    )

@@ -1,0 +1,55 @@
+"""Adam that leaves alone what got no gradient (Kingma & Ba 2015; sparse as in tiny-cuda-nn).
+
+A table entry none of whose features got a gradient keeps its value and moments: dense Adam would
+go on moving it by momentum, and would read and write the whole table every step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bench.types import check_shape
+from methods.kernels.dispatch import implementation
+
+
+@dataclass
+class AdamState:
+    """First and second moment of a table [entries, F] and each entry's own step counter."""
+
+    first: Tensor
+    second: Tensor
+    steps: Tensor
+
+    @classmethod
+    def like(cls, table: Tensor) -> AdamState:
+        """A fresh state for `table`."""
+        return cls(
+            torch.zeros_like(table),
+            torch.zeros_like(table),
+            torch.zeros(len(table), dtype=torch.int32, device=table.device),
+        )
+
+
+def sparse_adam_(
+    table: Tensor,
+    grad: Tensor,
+    state: AdamState,
+    rate: float,
+    *,
+    betas: tuple[float, float] = (0.9, 0.99),
+    eps: float = 1e-15,
+    packed: Tensor | None = None,
+    backend: str = "auto",
+) -> None:
+    """Update, in place, the entries of `table` [entries, F] whose `grad` is not zero; clear `grad`.
+
+    The bias correction goes by the entry's own number of steps. `packed`, the bfloat16 copy of
+    the table (`encode.pack`), is brought up to date when given.
+    """
+    check_shape("grad", grad, *table.shape)
+    implementation("adam", backend, table.device).sparse_adam_(
+        table, grad, state, rate, betas, eps, packed
+    )

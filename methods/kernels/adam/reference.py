@@ -1,0 +1,35 @@
+"""Sparse Adam in plain torch."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from methods.kernels.adam import AdamState
+from methods.kernels.encode import pack
+
+
+@torch.no_grad()
+def sparse_adam_(
+    table: Tensor,
+    grad: Tensor,
+    state: AdamState,
+    rate: float,
+    betas: tuple[float, float],
+    eps: float,
+    packed: Tensor | None,
+) -> None:
+    """See `methods.kernels.adam.sparse_adam_`."""
+    touched = (grad != 0).any(dim=-1).nonzero().squeeze(-1)
+    gradient = grad[touched]
+    state.steps[touched] += 1
+    steps = state.steps[touched, None].to(table.dtype)
+    first = betas[0] * state.first[touched] + (1 - betas[0]) * gradient
+    second = betas[1] * state.second[touched] + (1 - betas[1]) * gradient * gradient
+    state.first[touched], state.second[touched] = first, second
+    unbiased = first / (1 - betas[0] ** steps)
+    scale = (second / (1 - betas[1] ** steps)).sqrt() + eps
+    table[touched] -= rate * unbiased / scale
+    grad.zero_()
+    if packed is not None:
+        packed[touched] = pack(table[touched])

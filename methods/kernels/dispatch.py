@@ -1,0 +1,63 @@
+"""Which backend serves a call: by name, or by the device of the tensors. Never a silent fallback."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import importlib.util
+from functools import cache
+from types import ModuleType
+
+import torch
+
+from bench.types import Unavailable
+
+BACKENDS = ("reference", "cpu", "gpu")
+
+
+@cache
+def availability() -> dict[str, str]:
+    """For each backend, "" where it can be used here, else why not and how to get it."""
+    reasons = dict.fromkeys(BACKENDS, "")
+    if importlib.util.find_spec("numba") is None:
+        reasons["cpu"] = "numba is not installed: pip install numba"
+    reasons["gpu"] = "no GPU kernels yet: CUDA tensors are served by the reference backend"
+    return reasons
+
+
+def resolve(backend: str, device: torch.device | str) -> str:
+    """The name of the backend that will serve tensors on `device`.
+
+    `auto` goes by the device alone: CPU tensors to `cpu`, all others to `reference`.
+
+    Raises:
+        Unavailable: the backend asked for by name is unknown, cannot be used here, or does not
+            serve this device.
+    """
+    kind = torch.device(device).type
+    if backend == "auto":
+        return "cpu" if kind == "cpu" else "reference"
+    if backend not in BACKENDS:
+        near = difflib.get_close_matches(backend, BACKENDS, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise Unavailable(
+            f"backend={backend!r}: expected auto or one of {', '.join(BACKENDS)}{hint}"
+        )
+    if reason := availability()[backend]:
+        raise Unavailable(f"backend={backend!r} cannot be used here: {reason}")
+    if backend == "cpu" and kind != "cpu":
+        raise Unavailable(
+            f"backend='cpu' serves CPU tensors, these are on {kind!r}: "
+            "use backend=auto or device=cpu"
+        )
+    return backend
+
+
+def implementation(kernel: str, backend: str, device: torch.device) -> ModuleType:
+    """The module that implements `kernel` (a folder beside this file) for tensors on `device`."""
+    return _load(kernel, resolve(backend, device))
+
+
+@cache
+def _load(kernel: str, backend: str) -> ModuleType:
+    return importlib.import_module(f"methods.kernels.{kernel}.{backend}")

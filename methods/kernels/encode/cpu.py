@@ -1,0 +1,295 @@
+"""Hash-grid encoding with numba: 16 samples to an AVX-512 register, table reads as gathers.
+
+A level of a chunk of samples is done in three short passes over buffers that stay in the
+first-level cache: indices and weights of the eight corners, gather, blend. Each pass is a loop that
+LLVM can vectorise: the buffers are flat, with corner k at the constant distance k * CHUNK, because
+only then can it prove that they do not overlap.
+
+Forward: a thread takes a chunk and walks the levels. Backward: a thread takes a level and walks the
+chunks, so that no two threads ever add to the same entry: no atomics, and the same sums every run.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numba import get_num_threads, njit, prange
+from torch import Tensor
+
+from methods.kernels.encode import PRIMES, HashGrid
+
+CHUNK = 256  # samples; 256 * (8 indices + 8 weights + 8 values) * 4 bytes = 24 KiB
+
+u32, i32, f32 = np.uint32, np.int32, np.float32
+PRIME_Y, PRIME_Z = u32(PRIMES[1]), u32(PRIMES[2])
+
+# Reordering and fused multiply-adds are allowed; assuming that no NaN comes is not: `_load`
+# turns one into 0 before it can become an address.
+FAST = {"contract", "reassoc", "nsz", "arcp"}
+
+
+def encode(
+    positions: Tensor,
+    table: Tensor,
+    grid: HashGrid,
+    *,
+    packed: Tensor | None = None,
+    grad_buffer: Tensor | None = None,
+) -> Tensor:
+    """See `methods.kernels.encode.encode`. Not differentiable in `positions`."""
+    if positions.requires_grad:
+        raise ValueError("backend 'cpu' gives no gradient for positions: use backend='reference'")
+    if positions.dtype != torch.float32 or table.dtype != torch.float32:
+        raise ValueError(
+            f"backend 'cpu' encodes float32, got positions {positions.dtype} and table "
+            f"{table.dtype}: use backend='reference'"
+        )
+    return _Encode.apply(positions.contiguous(), table, grid, packed, grad_buffer)
+
+
+class _Encode(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, positions, table, grid, packed, grad_buffer):  # type: ignore[no-untyped-def]
+        ctx.save_for_backward(positions)
+        ctx.grid, ctx.grad_buffer = grid, grad_buffer
+        levels = _level_arrays(grid)
+        if packed is None:
+            features = torch.empty(len(positions), grid.channels)
+            _encode_float(positions.numpy(), table.detach().numpy(), *levels, features.numpy())
+            return features
+        words = torch.empty(len(positions), grid.levels, dtype=torch.int32)
+        _encode_packed(
+            positions.numpy(), _unsigned(packed), *levels, _unsigned(words)
+        )
+        return words.view(torch.bfloat16)
+
+    @staticmethod
+    def backward(ctx, grad):  # type: ignore[no-untyped-def]
+        (positions,) = ctx.saved_tensors
+        grid, buffer = ctx.grid, ctx.grad_buffer
+        target = torch.zeros(grid.entries, grid.features) if buffer is None else buffer
+        _scatter(
+            positions.numpy(),
+            grad.T.contiguous().float().numpy(),  # a level then reads only its own channels
+            *_level_arrays(grid),
+            target.numpy(),
+            get_num_threads(),
+        )
+        return None, target if buffer is None else None, None, None, None
+
+
+def _unsigned(words: Tensor) -> np.ndarray:
+    return words.numpy().view(np.uint32)
+
+
+def _level_arrays(grid: HashGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Scale, vertices along an axis (0: hashed) and first entry of each level."""
+    strides = [res if dense else 0 for res, dense in zip(grid.resolutions, grid.dense, strict=True)]
+    return (
+        np.array(grid.scales, np.float32),
+        np.array(strides, np.uint32),
+        np.array(grid.offsets, np.int64),
+    )
+
+
+@njit(cache=True, fastmath=FAST)
+def _load(positions, first, count, xyz):  # type: ignore[no-untyped-def]
+    """Positions [first, first + count) clamped to [0, 1], NaN as 0, axis by axis."""
+    for axis in range(3):
+        for i in range(count):
+            value = positions[first + i, axis]
+            value = value if value > f32(0) else f32(0)
+            xyz[axis * CHUNK + i] = value if value < f32(1) else f32(1)
+
+
+@njit(cache=True, fastmath=FAST)
+def _weights(x, y, z, scale):  # type: ignore[no-untyped-def]
+    """Cell and trilinear weights of a position: weights along y and z come multiplied."""
+    px, py, pz = x * scale + f32(0.5), y * scale + f32(0.5), z * scale + f32(0.5)
+    ix, iy, iz = i32(px), i32(py), i32(pz)
+    fx, fy, fz = px - f32(ix), py - f32(iy), pz - f32(iz)
+    gx, gy, gz = f32(1) - fx, f32(1) - fy, f32(1) - fz
+    return u32(ix), u32(iy), u32(iz), gx, fx, gy * gz, fy * gz, gy * fz, fy * fz
+
+
+@njit(cache=True, fastmath=FAST)
+def _corners_hashed(xyz, count, scale, mask, index, weight):  # type: ignore[no-untyped-def]
+    for i in range(count):
+        ix, iy, iz, gx, fx, w00, w10, w01, w11 = _weights(
+            xyz[i], xyz[CHUNK + i], xyz[2 * CHUNK + i], scale
+        )
+        x1 = u32(ix + u32(1))
+        y0, z0 = u32(iy * PRIME_Y), u32(iz * PRIME_Z)
+        y1, z1 = u32(y0 + PRIME_Y), u32(z0 + PRIME_Z)
+        h00, h10, h01, h11 = u32(y0 ^ z0), u32(y1 ^ z0), u32(y0 ^ z1), u32(y1 ^ z1)
+        index[i] = u32(ix ^ h00) & mask
+        index[CHUNK + i] = u32(x1 ^ h00) & mask
+        index[2 * CHUNK + i] = u32(ix ^ h10) & mask
+        index[3 * CHUNK + i] = u32(x1 ^ h10) & mask
+        index[4 * CHUNK + i] = u32(ix ^ h01) & mask
+        index[5 * CHUNK + i] = u32(x1 ^ h01) & mask
+        index[6 * CHUNK + i] = u32(ix ^ h11) & mask
+        index[7 * CHUNK + i] = u32(x1 ^ h11) & mask
+        weight[i], weight[CHUNK + i] = gx * w00, fx * w00
+        weight[2 * CHUNK + i], weight[3 * CHUNK + i] = gx * w10, fx * w10
+        weight[4 * CHUNK + i], weight[5 * CHUNK + i] = gx * w01, fx * w01
+        weight[6 * CHUNK + i], weight[7 * CHUNK + i] = gx * w11, fx * w11
+
+
+@njit(cache=True, fastmath=FAST)
+def _wrap(entry, size):  # type: ignore[no-untyped-def]
+    """entry mod size, for entry < 2 size."""
+    return u32(entry - size) if entry >= size else entry
+
+
+@njit(cache=True, fastmath=FAST)
+def _corners_dense(xyz, count, scale, stride, size, index, weight):  # type: ignore[no-untyped-def]
+    slice_ = u32(stride * stride)
+    for i in range(count):
+        ix, iy, iz, gx, fx, w00, w10, w01, w11 = _weights(
+            xyz[i], xyz[CHUNK + i], xyz[2 * CHUNK + i], scale
+        )
+        b00 = u32(ix + u32(u32(iy * stride) + u32(iz * slice_)))
+        b10, b01 = u32(b00 + stride), u32(b00 + slice_)
+        b11 = u32(b01 + stride)
+        index[i] = _wrap(b00, size)
+        index[CHUNK + i] = _wrap(u32(b00 + u32(1)), size)
+        index[2 * CHUNK + i] = _wrap(b10, size)
+        index[3 * CHUNK + i] = _wrap(u32(b10 + u32(1)), size)
+        index[4 * CHUNK + i] = _wrap(b01, size)
+        index[5 * CHUNK + i] = _wrap(u32(b01 + u32(1)), size)
+        index[6 * CHUNK + i] = _wrap(b11, size)
+        index[7 * CHUNK + i] = _wrap(u32(b11 + u32(1)), size)
+        weight[i], weight[CHUNK + i] = gx * w00, fx * w00
+        weight[2 * CHUNK + i], weight[3 * CHUNK + i] = gx * w10, fx * w10
+        weight[4 * CHUNK + i], weight[5 * CHUNK + i] = gx * w01, fx * w01
+        weight[6 * CHUNK + i], weight[7 * CHUNK + i] = gx * w11, fx * w11
+
+
+@njit(cache=True)
+def _corners(xyz, count, scale, stride, size, index, weight):  # type: ignore[no-untyped-def]
+    if stride:
+        _corners_dense(xyz, count, scale, stride, size, index, weight)
+    else:
+        _corners_hashed(xyz, count, scale, u32(size - u32(1)), index, weight)
+
+
+@njit(cache=True)
+def _gather(level_table, index, count, value):  # type: ignore[no-untyped-def]
+    for corner in range(8):
+        for i in range(count):
+            value[corner * CHUNK + i] = level_table[index[corner * CHUNK + i]]
+
+
+@njit(cache=True, fastmath=FAST)
+def _blend(value, weight, count, blended):  # type: ignore[no-untyped-def]
+    for i in range(count):
+        total = f32(0)
+        for corner in range(8):
+            total += weight[corner * CHUNK + i] * value[corner * CHUNK + i]
+        blended[i] = total
+
+
+@njit(cache=True)
+def round_to_bf16(value):  # type: ignore[no-untyped-def]
+    """Bits of a float32 rounded to nearest even bfloat16, in the high half."""
+    bits = f32(value).view(np.uint32)
+    tie_to_even = u32(u32(bits >> u32(16)) & u32(1))
+    return u32(u32(bits + u32(0x7FFF)) + tie_to_even)
+
+
+@njit(cache=True, fastmath=FAST)
+def _blend_packed(word, weight, count, blended):  # type: ignore[no-untyped-def]
+    for i in range(count):
+        low, high = f32(0), f32(0)
+        for corner in range(8):
+            pair = word[corner * CHUNK + i]
+            w = weight[corner * CHUNK + i]
+            low += w * u32(pair << u32(16)).view(np.float32)
+            high += w * u32(pair & u32(0xFFFF0000)).view(np.float32)
+        blended[i] = u32(
+            u32(round_to_bf16(low) >> u32(16)) | u32(round_to_bf16(high) & u32(0xFFFF0000))
+        )
+
+
+@njit(cache=True, parallel=True)
+def _encode_packed(positions, table, scales, strides, offsets, out):  # type: ignore[no-untyped-def]
+    total, levels = out.shape
+    for chunk in prange((total + CHUNK - 1) // CHUNK):
+        first = chunk * CHUNK
+        count = min(CHUNK, total - first)
+        xyz = np.empty(3 * CHUNK, np.float32)
+        index, word = np.empty(8 * CHUNK, np.uint32), np.empty(8 * CHUNK, np.uint32)
+        weight = np.empty(8 * CHUNK, np.float32)
+        blended = np.empty((levels, CHUNK), np.uint32)
+        _load(positions, first, count, xyz)
+        for level in range(levels):
+            begin, end = offsets[level], offsets[level + 1]
+            _corners(xyz, count, scales[level], strides[level], u32(end - begin), index, weight)
+            _gather(table[begin:end], index, count, word)
+            _blend_packed(word, weight, count, blended[level])
+        for i in range(count):
+            for level in range(levels):
+                out[first + i, level] = blended[level, i]
+
+
+@njit(cache=True, parallel=True)
+def _encode_float(positions, table, scales, strides, offsets, out):  # type: ignore[no-untyped-def]
+    total, channels = out.shape
+    levels, features = len(scales), table.shape[1]
+    for chunk in prange((total + CHUNK - 1) // CHUNK):
+        first = chunk * CHUNK
+        count = min(CHUNK, total - first)
+        xyz = np.empty(3 * CHUNK, np.float32)
+        index = np.empty(8 * CHUNK, np.uint32)
+        weight, value = np.empty(8 * CHUNK, np.float32), np.empty(8 * CHUNK, np.float32)
+        blended = np.empty((channels, CHUNK), np.float32)
+        _load(positions, first, count, xyz)
+        for level in range(levels):
+            begin, end = offsets[level], offsets[level + 1]
+            _corners(xyz, count, scales[level], strides[level], u32(end - begin), index, weight)
+            for feature in range(features):
+                _gather(table[begin:end, feature], index, count, value)
+                _blend(value, weight, count, blended[level * features + feature])
+        for i in range(count):
+            for channel in range(channels):
+                out[first + i, channel] = blended[channel, i]
+
+
+@njit(cache=True)
+def _scatter_pairs(index, weight, count, first, second, target):  # type: ignore[no-untyped-def]
+    for i in range(count):
+        for corner in range(8):
+            entry, w = index[corner * CHUNK + i], weight[corner * CHUNK + i]
+            target[entry, 0] += w * first[i]
+            target[entry, 1] += w * second[i]
+
+
+@njit(cache=True)
+def _scatter_one(index, weight, count, grad, target):  # type: ignore[no-untyped-def]
+    for i in range(count):
+        for corner in range(8):
+            target[index[corner * CHUNK + i]] += weight[corner * CHUNK + i] * grad[i]
+
+
+@njit(cache=True, parallel=True)
+def _scatter(positions, grad, scales, strides, offsets, target, workers):  # type: ignore[no-untyped-def]
+    """Adjoint of `_encode_float`: target[corner] += weight * grad; grad is [channels, N]."""
+    total, features = len(positions), target.shape[1]
+    for worker in prange(workers):
+        xyz = np.empty(3 * CHUNK, np.float32)
+        index, weight = np.empty(8 * CHUNK, np.uint32), np.empty(8 * CHUNK, np.float32)
+        # Every workers-th level, because fine levels miss the cache and cost the most.
+        for level in range(worker, len(scales), workers):
+            begin, end = offsets[level], offsets[level + 1]
+            for first in range(0, total, CHUNK):
+                count = min(CHUNK, total - first)
+                _load(positions, first, count, xyz)
+                _corners(xyz, count, scales[level], strides[level], u32(end - begin), index, weight)
+                part = grad[level * features : (level + 1) * features, first : first + count]
+                if features == 2:
+                    _scatter_pairs(index, weight, count, part[0], part[1], target[begin:end])
+                else:
+                    for feature in range(features):
+                        column = target[begin:end, feature]
+                        _scatter_one(index, weight, count, part[feature], column)

@@ -1,0 +1,217 @@
+"""Ray marching with numba: a ray leaves empty cells, bricks and blocks in one step each.
+
+Samples are found once. A chunk of rays writes the t of its samples into its own part of a scratch
+array, whose pages cost nothing until they are written; when all counts are known, the samples are
+moved to their place.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numba import njit, prange
+from torch import Tensor
+
+from methods.kernels.march import Occupancy, Samples
+
+CHUNK = 64  # rays
+f32 = np.float32
+UNIT_CUBE = np.array([[0, 0, 0], [1, 1, 1]], np.float32)
+
+
+def march(
+    origins: Tensor,
+    directions: Tensor,
+    occupancy: Occupancy,
+    step: float,
+    window: Tensor,
+    jitter: Tensor,
+    start: Tensor,
+    limit: int,
+) -> Samples:
+    """See `methods.kernels.march.march`."""
+    if origins.dtype != torch.float32:
+        raise ValueError(f"backend 'cpu' marches float32, got {origins.dtype}")
+    origins, directions = origins.contiguous(), directions.contiguous()
+    rays = len(origins)
+    most = min(limit, math.ceil(math.sqrt(3) / step) + 1)
+    scratch = torch.empty(-(-rays // CHUNK) * CHUNK * most)
+    counts = torch.empty(rays, dtype=torch.int64)
+    resume = torch.empty(rays, dtype=torch.int32)
+    _find(
+        origins.numpy(),
+        directions.numpy(),
+        occupancy.words.numpy(),
+        occupancy.blocks.numpy(),
+        occupancy.bounds.numpy(),
+        f32(step),
+        window.contiguous().numpy(),
+        jitter.contiguous().numpy(),
+        start.contiguous().numpy(),
+        most,
+        scratch.numpy(),
+        counts.numpy(),
+        resume.numpy(),
+    )
+    offsets = torch.zeros(rays + 1, dtype=torch.int64)
+    torch.cumsum(counts, dim=0, out=offsets[1:])
+    total = int(offsets[-1])
+    t, positions = torch.empty(total), torch.empty(total, 3)
+    ray = torch.empty(total, dtype=torch.int32)
+    _place(
+        origins.numpy(),
+        directions.numpy(),
+        scratch.numpy(),
+        most,
+        offsets.numpy(),
+        t.numpy(),
+        positions.numpy(),
+        ray.numpy(),
+    )
+    return Samples(offsets, ray, t, torch.full((total,), step), positions, resume)
+
+
+@njit(cache=True)
+def _cross(origin, direction, box):  # type: ignore[no-untyped-def]
+    """Where a ray enters and leaves a box; enter > leave where it misses (slab test)."""
+    enter, leave = f32(-np.inf), f32(np.inf)
+    for axis in range(3):
+        if direction[axis] == 0:
+            if origin[axis] < box[0, axis] or origin[axis] > box[1, axis]:
+                return f32(np.inf), f32(-np.inf)
+        else:
+            slope = f32(1) / direction[axis]
+            a = (box[0, axis] - origin[axis]) * slope
+            b = (box[1, axis] - origin[axis]) * slope
+            enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
+    return enter, leave
+
+
+@njit(cache=True)
+def _empty_side(words, blocks, x, y, z):  # type: ignore[no-untyped-def]
+    """Cells along the side of the largest empty cube of the pyramid around a cell; 0: occupied."""
+    if blocks[x >> 4, y >> 4, z >> 4] == 0:
+        return 16
+    word = words[x >> 2, y >> 2, z >> 2]
+    if word == 0:
+        return 4
+    bit = (x & 3) + ((y & 3) << 2) + ((z & 3) << 4)
+    return 0 if (word >> bit) & 1 else 1
+
+
+@njit(cache=True)
+def _cell(coordinate, size):  # type: ignore[no-untyped-def]
+    return min(max(int(coordinate * f32(size)), 0), size - 1)
+
+
+@njit(cache=True)
+def _leave_slab(origin, slope, cell, side, width):  # type: ignore[no-untyped-def]
+    """t at which a ray leaves, along one axis, the aligned `side` cells that contain `cell`."""
+    corner = cell & ~(side - 1)
+    if slope > 0:
+        corner += side
+    return (f32(corner) * width - origin) * slope if slope != 0 else f32(np.inf)
+
+
+@njit(cache=True)
+def _march_ray(origin, direction, words, blocks, bounds, step, near, far, phase, k, limit, out):  # type: ignore[no-untyped-def]
+    """Write the t of a ray's samples to `out`; return their number and the step to resume from."""
+    ox, oy, oz = origin
+    dx, dy, dz = direction
+    length = f32(math.sqrt(float(dx) ** 2 + float(dy) ** 2 + float(dz) ** 2))
+    enter, leave = _cross(origin, direction, UNIT_CUBE)
+    near, far = max(enter, near), min(leave, far)
+    if not (near < far and length > 0 and near > -np.inf):
+        return 0, -1
+    step_t, steps_per_t = step / length, length / step
+    size = words.shape[0] * 4
+    width = f32(1) / f32(size)
+    sx = f32(1) / dx if dx != 0 else f32(0)
+    sy = f32(1) / dy if dy != 0 else f32(0)
+    sz = f32(1) / dz if dz != 0 else f32(0)
+
+    # Skip what lies before the box of occupied cells, with a step to spare for rounding.
+    enter, leave = _cross(origin, direction, bounds)
+    if not enter <= leave:
+        return 0, -1
+    k = max(k, int((enter - near) * steps_per_t) - 1)
+    far = min(far, leave + step_t)
+
+    count = 0
+    while True:
+        t = near + (f32(k) + phase) * step_t
+        if not t < far:
+            return count, -1
+        x, y, z = _cell(ox + t * dx, size), _cell(oy + t * dy, size), _cell(oz + t * dz, size)
+        side = _empty_side(words, blocks, x, y, z)
+        if side == 0:
+            out[count] = t
+            count += 1
+            k += 1
+            if count == limit:
+                return count, k
+        else:
+            leave = min(
+                _leave_slab(ox, sx, x, side, width),
+                _leave_slab(oy, sy, y, side, width),
+                _leave_slab(oz, sz, z, side, width),
+            )
+            # Rounded down, so that the first step outside the cube is never passed over.
+            k = max(k + 1, int((leave - near) * steps_per_t - phase))
+
+
+@njit(cache=True, parallel=True)
+def _find(  # type: ignore[no-untyped-def]
+    origins,
+    directions,
+    words,
+    blocks,
+    bounds,
+    step,
+    window,
+    jitter,
+    start,
+    most,
+    scratch,
+    counts,
+    resume,
+):
+    rays = len(origins)
+    for chunk in prange((rays + CHUNK - 1) // CHUNK):
+        used = chunk * CHUNK * most
+        for ray in range(chunk * CHUNK, min(rays, (chunk + 1) * CHUNK)):
+            count, again = 0, -1
+            if start[ray] >= 0:
+                count, again = _march_ray(
+                    origins[ray],
+                    directions[ray],
+                    words,
+                    blocks,
+                    bounds,
+                    step,
+                    window[ray, 0],
+                    window[ray, 1],
+                    jitter[ray],
+                    np.int64(start[ray]),
+                    most,
+                    scratch[used:],
+                )
+            counts[ray], resume[ray] = count, again
+            used += count
+
+
+@njit(cache=True, parallel=True)
+def _place(origins, directions, scratch, most, offsets, t, positions, ray_of):  # type: ignore[no-untyped-def]
+    rays = len(origins)
+    for chunk in prange((rays + CHUNK - 1) // CHUNK):
+        shift = chunk * CHUNK * most - offsets[chunk * CHUNK]
+        for ray in range(chunk * CHUNK, min(rays, (chunk + 1) * CHUNK)):
+            for sample in range(offsets[ray], offsets[ray + 1]):
+                t[sample] = scratch[sample + shift]
+                ray_of[sample] = ray
+                for axis in range(3):
+                    positions[sample, axis] = (
+                        origins[ray, axis] + t[sample] * directions[ray, axis]
+                    )

@@ -1,0 +1,68 @@
+"""Ray marching in plain torch: test every step of every ray, keep those in occupied cells."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from methods.kernels.march import Occupancy, Samples
+
+
+def march(
+    origins: Tensor,
+    directions: Tensor,
+    occupancy: Occupancy,
+    step: float,
+    window: Tensor,
+    jitter: Tensor,
+    start: Tensor,
+    limit: int,
+) -> Samples:
+    """See `methods.kernels.march.march`."""
+    entry, leave = _cross_unit_cube(origins, directions)
+    near, far = torch.maximum(entry, window[:, 0]), torch.minimum(leave, window[:, 1])
+    # In float64, where every backend rounds to the same float32.
+    length = directions.double().norm(dim=-1).to(directions.dtype)
+    # A true division: `step / length` would multiply by the reciprocal, an ulp away.
+    step_t = torch.full_like(length, step) / length
+    alive = (near < far) & step_t.isfinite() & near.isfinite() & (start >= 0)
+
+    count = torch.where(alive, (far - near) / step_t, 0).ceil().clamp(min=0)
+    k = torch.arange(int(count.max()) if len(count) else 0, device=origins.device)
+    t = near[:, None] + (k + jitter[:, None]) * step_t[:, None]  # [R, K]
+    positions = origins[:, None] + t[..., None] * directions[:, None]  # [R, K, 3]
+    candidate = alive[:, None] & (t < far[:, None]) & (k >= start[:, None])
+    candidate &= _occupied(torch.where(candidate[..., None], positions, 0), occupancy)
+
+    rank = candidate.cumsum(dim=1)
+    kept = candidate & (rank <= limit)
+    per_ray = kept.sum(dim=1)
+    full = (per_ray == limit) & (per_ray > 0)
+    last = (kept * (k + 1)).amax(dim=1) if len(k) else per_ray
+    ray = kept.nonzero()[:, 0]
+    return Samples(
+        offsets=torch.cat((per_ray.new_zeros(1), per_ray.cumsum(dim=0))),
+        ray=ray.int(),
+        t=t[kept],
+        delta=torch.full_like(t[kept], step),
+        positions=positions[kept],
+        resume=torch.where(full, last, -1).int(),
+    )
+
+
+def _cross_unit_cube(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Where rays enter and leave [0, 1]^3; enter > leave where they miss it (slab test)."""
+    parallel = directions == 0
+    slope = 1 / torch.where(parallel, 1, directions)
+    first, second = -origins * slope, (1 - origins) * slope
+    inside = (origins >= 0) & (origins <= 1)
+    outside = torch.where(inside, -torch.inf, torch.inf)
+    lower = torch.where(parallel, outside, torch.minimum(first, second))
+    upper = torch.where(parallel, -outside, torch.maximum(first, second))
+    return lower.amax(dim=-1), upper.amin(dim=-1)
+
+
+def _occupied(positions: Tensor, occupancy: Occupancy) -> Tensor:
+    size = occupancy.resolution
+    cell = (positions * size).long().clamp(0, size - 1)
+    return occupancy.cells[cell[..., 0], cell[..., 1], cell[..., 2]]
