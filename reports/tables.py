@@ -1,0 +1,131 @@
+"""The rows of a run as tables of text: for the terminal, for a page.
+
+Units are those of the field: dB, milliseconds, MB = 10^6 bytes. Every LPIPS column names its
+network. A figure that could not be had reads `n/a`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import pandas as pd
+
+NOT_AVAILABLE = "n/a"
+
+QUALITY = {
+    "psnr": ("PSNR, dB ↑", 2),
+    "ssim": ("SSIM ↑", 4),
+    "lpips_alex": ("LPIPS alex ↓", 4),
+    "lpips_vgg": ("LPIPS vgg ↓", 4),
+    "lpips_squeeze": ("LPIPS squeeze ↓", 4),
+}
+"""Label and decimals of each metric of a picture; the arrow points to better."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """`lines` of text under `columns`.
+
+    The first column is a label; the others are figures, or text when `figures` is False.
+    """
+
+    title: str
+    columns: tuple[str, ...]
+    lines: tuple[tuple[str, ...], ...]
+    figures: bool = True
+
+    def markdown(self) -> str:
+        """The table in GitHub's Markdown, without its title."""
+        rule = ("---", *("---:" if self.figures else "---" for _ in self.columns[1:]))
+        return "\n".join(f"| {' | '.join(line)} |" for line in (self.columns, rule, *self.lines))
+
+
+def overview(rows: pd.DataFrame) -> Table:
+    """One line per run: quality, speed, size."""
+    shown = [metric for metric in QUALITY if (rows["metric"] == metric).any()]
+    lines = []
+    for run, of_run in rows.groupby("run", sort=False):
+        value = _values(of_run)
+        first = of_run.iloc[0]
+        lines.append(
+            (
+                f"{first['method']} ({str(run)[:8]})",
+                f"{first['scene']}, {first['resolution']}",
+                *(number(value.get(metric), QUALITY[metric][1]) for metric in shown),
+                number(value.get("frame_ms"), 1),
+                number(value.get("fps"), 2),
+                megabytes(value.get("size_bytes.total")),
+                number(value.get("train_s"), 0),
+            )
+        )
+    labels = (QUALITY[metric][0] for metric in shown)
+    columns = ("method (run)", "scene", *labels, "ms / frame ↓", "FPS ↑", "MB ↓", "trained, s")
+    return Table("Overview", columns, tuple(lines))
+
+
+def blocks(rows: pd.DataFrame) -> list[Table]:
+    """The tables of one run: quality, time by stage, memory."""
+    return [_quality(rows), _time(rows), _memory(rows)]
+
+
+def _values(rows: pd.DataFrame, prefix: str = "", column: str = "value") -> dict[str, float]:
+    """Figures of one run by metric, for metrics that begin with `prefix`, which is cut off."""
+    return {
+        metric.removeprefix(prefix): figure
+        for metric, figure in zip(rows["metric"], rows[column], strict=True)
+        if metric.startswith(prefix)
+    }
+
+
+def _quality(rows: pd.DataFrame) -> Table:
+    value, low, high, frames = (_values(rows, column=name) for name in ("value", "lo", "hi", "n"))
+    lines = []
+    for metric, (label, decimals) in QUALITY.items():
+        if metric in value:
+            known = math.isfinite(low[metric])
+            ends = (number(end[metric], decimals) for end in (low, high))
+            lines.append(
+                (label, number(value[metric], decimals), " – ".join(ends) if known else "")
+            )
+    title = f"Quality, mean of {frames['psnr']} frames"
+    return Table(title, ("metric", "mean", "95 % interval"), tuple(lines))
+
+
+def _time(rows: pd.DataFrame) -> Table:
+    value, stages = _values(rows), _values(rows, "stage_ms.")
+    total = value["frame_ms"]
+    lines = [(name, number(ms, 2), share(ms, total)) for name, ms in stages.items()]
+    lines.append(("frame", number(total, 2), share(sum(stages.values()), total)))
+    lines += [
+        (f"frame, {quantile}", number(value[f"frame_ms.{quantile}"], 2), "")
+        for quantile in ("p50", "p95", "p99")
+    ]
+    lines.append(("FPS", number(value["fps"], 2), ""))
+    return Table("Time of a frame", ("stage", "mean ms", "share"), tuple(lines))
+
+
+def _memory(rows: pd.DataFrame) -> Table:
+    value, sizes = _values(rows), _values(rows, "size_bytes.")
+    total = sizes.pop("total")
+    lines = [(name, megabytes(size)) for name, size in sizes.items()]
+    lines.append(("model", megabytes(total)))
+    lines.append(("peak, rendering", megabytes(value["peak_bytes"])))
+    return Table("Memory", ("component", "MB"), tuple(lines))
+
+
+def number(value: float | None, decimals: int) -> str:
+    """A figure with `decimals`, or `n/a` where there is none."""
+    if value is None or math.isnan(value):
+        return NOT_AVAILABLE
+    return f"{value:,.{decimals}f}"
+
+
+def megabytes(size: float | None) -> str:
+    """Bytes as MB = 10^6 bytes."""
+    return number(None if size is None else size / 1e6, 2)
+
+
+def share(part: float, whole: float) -> str:
+    """`part` as a percentage of `whole`."""
+    return f"{number(100 * part / whole, 1)} %" if whole else NOT_AVAILABLE

@@ -1,0 +1,154 @@
+"""The command `steerbench`: what can be asked for, and how errors and signals end it.
+
+Exit statuses: 0 done, 1 a measured kernel is wrong (or a bug, with its traceback), 2 an error
+the user can act on, 130 interrupted, 141 the reader of a pipe went away, 143 terminated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import os
+import re
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from bench.errors import SteerbenchError
+from sweeps.names import unknown
+
+EXAMPLES = """\
+examples
+  steerbench run +experiment=demo              train on an embedded scene, write a page about it
+  steerbench run scene=blender scene.path=DIR  the same on your copy of a NeRF-Synthetic scene
+  steerbench run --help                        all choices and settings
+  steerbench list                              what there is, and what of it is usable here
+  steerbench results --format csv              every number measured so far
+"""
+
+# What the disk refuses: worth a plain sentence, not a traceback.
+REFUSALS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR}
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser that names the nearest option when one does not exist."""
+
+    def error(self, message: str) -> NoReturn:
+        wrong = re.match(r"unrecognized arguments: (--?[\w-]+)", message)
+        if wrong:
+            raise unknown("option", wrong[1], re.findall(r"--?[a-z][\w-]*", self.format_usage()))
+        raise SteerbenchError(f"{message}\n{self.format_usage().rstrip()}")
+
+
+def main() -> None:
+    """Run the command line and exit with its status."""
+    signal.signal(signal.SIGTERM, _terminate)
+    sys.exit(guard(dispatch, sys.argv[1:]))
+
+
+def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
+    """Run `command` and turn what ends it into an exit status and at most one message."""
+    try:
+        status = command(argv)
+        sys.stdout.flush()
+        return status
+    except SteerbenchError as error:
+        return _fail(str(error), 2)
+    except KeyboardInterrupt:
+        return _fail("interrupted", 130)
+    except BrokenPipeError:
+        # Python flushes standard output once more at exit; let it do so into nothing.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except OSError as error:
+        if error.errno not in REFUSALS:
+            raise
+        return _fail(f"{error.filename}: {error.strerror}", 2)
+
+
+def dispatch(argv: Sequence[str]) -> int:
+    """Hand `argv` to its subcommand, which is imported only then."""
+    if argv[:1] == ["run"] or argv[:1] in (["-sc"], ["--shell-completion"]):
+        from sweeps import run
+
+        return run.main(argv[1:] if argv[0] == "run" else argv)
+    parser = _parser()
+    commands = ["run", "list", "results", "kernels", "scenes"]
+    if argv and not argv[0].startswith("-") and argv[0] not in commands:
+        raise unknown("command", argv[0], commands)
+    options = parser.parse_args(argv)
+    if options.command is None:
+        parser.print_help()
+        return 0
+    return options.command(options)
+
+
+def _parser() -> Parser:
+    parser = Parser(
+        prog="steerbench",
+        description="Radiance-field renderers measured under one ruler.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(command=None)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    commands.add_parser("run", help="train, render, measure; print and store the table")
+
+    listing = commands.add_parser("list", help="methods, scenes, backends, engines")
+    listing.set_defaults(command=_list)
+
+    results = commands.add_parser("results", help="print all that was measured")
+    results.add_argument("--outputs", type=Path, default=Path("outputs"), metavar="DIR")
+    results.add_argument("--format", choices=["table", "csv", "json"], default="table")
+    for column in ("method", "scene", "metric"):
+        results.add_argument(f"--{column}", help=f"only rows of this {column}")
+    results.set_defaults(command=_results)
+
+    kernels = commands.add_parser("kernels", help="throughput and error of every kernel")
+    kernels.add_argument("--filter", default="", help="only kernels whose name contains this")
+    kernels.add_argument("--repeats", type=int, default=5, help="timed calls of each (default 5)")
+    kernels.set_defaults(command=_kernels)
+
+    scenes = commands.add_parser("scenes", help="look after copies of data sets")
+    actions = scenes.add_subparsers(title="actions", metavar="ACTION", required=True)
+    verify = actions.add_parser("verify", help="compare with the official checksums")
+    verify.add_argument("path", type=Path, help="folder of one scene or of all of NeRF-Synthetic")
+    verify.set_defaults(command=_verify)
+    return parser
+
+
+def _list(options: argparse.Namespace) -> int:
+    from sweeps import catalogue
+
+    return catalogue.main()
+
+
+def _results(options: argparse.Namespace) -> int:
+    from sweeps import results
+
+    chosen = {name: getattr(options, name) for name in ("method", "scene", "metric")}
+    return results.main(options.outputs, options.format, chosen)
+
+
+def _kernels(options: argparse.Namespace) -> int:
+    from sweeps import kernels
+
+    return kernels.main(options.filter, options.repeats)
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from sweeps import verify
+
+    return verify.main(options.path)
+
+
+def _terminate(signum: int, frame: object) -> NoReturn:
+    """Leave through every `finally`, so that checkpoints are kept and temporary files are not."""
+    sys.exit(128 + signum)
+
+
+def _fail(message: str, status: int) -> int:
+    print(f"steerbench: {message}", file=sys.stderr)
+    return status

@@ -1,0 +1,36 @@
+"""`steerbench kernels`: error and throughput of every kernel; a wrong kernel has no throughput."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from bench.errors import SteerbenchError
+from reports.tables import Table
+from sweeps.terminal import console, rich_table
+
+COLUMNS = ("kernel", "case", "backend", "dtype", "error", "tolerance", "ms", "M items/s", "ratio")
+"""`ratio`: time of the reference backend over that of this one, same case, same run."""
+
+
+def main(chosen: str, repeats: int) -> int:
+    """Print a table and, as the last line, the same rows as JSON; 1 if any kernel is wrong."""
+    from methods.kernels.benchmark import main_rows
+
+    if repeats < 1:
+        raise SteerbenchError(f"--repeats: expected 1 or more, got {repeats}")
+    rows = main_rows(chosen, repeats)
+    if not rows:
+        raise SteerbenchError(f"--filter: no kernel has {chosen!r} in its name")
+    console().print(rich_table(Table("Kernels", COLUMNS, tuple(_line(row) for row in rows))))
+    print(json.dumps(rows))
+    return int(any(row["status"] != "ok" for row in rows))
+
+
+def _line(row: Mapping[str, Any]) -> tuple[str, ...]:
+    labels = (row["kernel"], row["case"], row["backend"], row["dtype"])
+    errors = (f"{row['error']:.1e}", f"{row['tolerance']:.1e}")
+    if row["status"] != "ok":
+        return (*labels, *errors, row["status"], "", "")
+    return (*labels, *errors, f"{row['ms']:.2f}", f"{row['mitems_s']:.2f}", f"{row['ratio']:.1f}x")

@@ -1,0 +1,57 @@
+"""What is wrong with the overrides of `steerbench run`, in the words of who typed them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from bench.errors import SteerbenchError
+from sweeps.names import unknown
+
+CONFIGS = Path(__file__).parent / "configs"
+
+
+def explain(error: HydraException | OmegaConfBaseException, argv: Sequence[str]) -> SteerbenchError:
+    """Translate an error of Hydra's; names that do not exist come with the nearest that do."""
+    if isinstance(error, OverrideParseException):
+        return SteerbenchError(
+            f"cannot read '{error.override}': settings are written key=value, "
+            f"for example seed=1 or scene=wires ({error.message.splitlines()[0]})"
+        )
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
+        group, _, name = error.missing_cfg_file.rpartition("/")
+        return unknown(group, name, error.options)
+    key = re.match(r"Could not override '([^']+)'", str(error))
+    if key:
+        return unknown("setting", key[1], _settings(argv))
+    causes = [error, error.__cause__] if error.__cause__ else [error]
+    lines = [line.strip() for cause in causes for line in str(cause).splitlines()]
+    return SteerbenchError("; ".join(line for line in lines if line))
+
+
+def _settings(argv: Sequence[str]) -> list[str]:
+    """All that can be set, given the choices (scene=blender) in `argv`."""
+    groups = [path.name for path in CONFIGS.iterdir() if path.is_dir()]
+    choices = [
+        argument
+        for argument in argv
+        if (CONFIGS / f"{argument.replace('=', '/', 1)}.yaml").is_file()
+    ]
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        config = OmegaConf.to_container(compose("run", overrides=choices), resolve=False)
+    assert isinstance(config, dict)
+    return [*groups, *_leaves(config)]
+
+
+def _leaves(config: Mapping, prefix: str = "") -> Iterator[str]:
+    for key, value in config.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{key}.")
+        elif not key.startswith("_"):
+            yield f"{prefix}{key}"

@@ -1,0 +1,63 @@
+"""`steerbench run`: Hydra composes the configuration of every job and runs it."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from bench.errors import SteerbenchError
+from sweeps.overrides import CONFIGS, explain
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run what the overrides and flags in `argv` ask for: one job, a sweep, or Hydra's own help.
+
+    In a sweep a job that fails is named at once and the others still run.
+
+    Raises:
+        SteerbenchError: a setting or a choice does not exist, or a job failed.
+    """
+    failures: list[SteerbenchError | OmegaConfBaseException] = []
+
+    def job(config: DictConfig) -> None:
+        from sweeps.measurement import execute  # loads torch: not for --help or completion
+
+        overrides = HydraConfig.get().overrides.task
+        try:
+            execute(config, ["steerbench", "run", *overrides])
+        except (SteerbenchError, OmegaConfBaseException) as error:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                print(f"steerbench: failed: {' '.join(overrides)}: {error}", file=sys.stderr)
+                raise
+            failures.append(error)
+
+    # Hydra's parser takes the overrides in one piece only: flags first, whatever was typed.
+    sys.argv = [sys.argv[0], *sorted(argv, key=_is_override)]
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors instead of printing them
+    _hide_subcommand_from_completion()
+    try:
+        hydra.main(str(CONFIGS), "run", version_base="1.3")(job)()
+        if failures:
+            raise failures[0]
+    except (HydraException, OmegaConfBaseException) as error:
+        raise explain(error, argv) from error
+    return 0
+
+
+def _is_override(argument: str) -> bool:
+    return argument.startswith("~") or ("=" in argument and not argument.startswith("-"))
+
+
+def _hide_subcommand_from_completion() -> None:
+    """Hydra's completion knows no subcommands: show it `steerbench a=b` for `... run a=b`."""
+    program, _, rest = os.environ.get("COMP_LINE", "").lstrip().partition(" ")
+    if rest.lstrip().startswith("run "):
+        os.environ["COMP_LINE"] = f"{program} {rest.lstrip().removeprefix('run ')}"

@@ -1,0 +1,29 @@
+"""Tables at the terminal."""
+
+from __future__ import annotations
+
+import sys
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table as RichTable
+
+from reports.tables import Table
+
+PIPE_WIDTH = 200
+"""Columns of text where there is no terminal to ask: wide enough for every table."""
+
+
+def console() -> Console:
+    """Standard output; tables are not cut to 80 columns when it is a file or a pipe."""
+    return Console(width=None if sys.stdout.isatty() else PIPE_WIDTH, highlight=False)
+
+
+def rich_table(table: Table) -> RichTable:
+    """`table` with labels and text to the left and figures to the right."""
+    grid = RichTable(title=table.title, title_justify="left")
+    for index, column in enumerate(table.columns):
+        grid.add_column(column, justify="right" if index and table.figures else "left")
+    for line in table.lines:
+        grid.add_row(*map(escape, line))
+    return grid
