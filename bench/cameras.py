@@ -83,3 +83,10 @@ def move_camera(camera: Camera, scale: float, offset: Tensor) -> Camera:
     """The same view after every world point x became scale * x + offset (`offset` [3])."""
     centre = scale * camera.c2w[:, 3:].double() + offset.to(camera.c2w.device).double()[:, None]
     return replace(camera, c2w=torch.cat((camera.c2w[:, :3], centre.float()), dim=1))
+
+
+def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
+    """Camera-to-world [3, 4] at `eye`, looking at `target`, with `up` upward in the picture."""
+    forward = torch.nn.functional.normalize(target - eye, dim=0)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
+    return torch.stack((right, torch.linalg.cross(forward, right), forward, eye), dim=1)

@@ -10,6 +10,7 @@ import torch
 
 from bench.cameras import move_camera
 from bench.scenes.bounds import Box
+from bench.scenes.files import whole_number
 from bench.scenes.images import Picture, View, decode_all
 from bench.types import Log, Scene, Split, SteerbenchError
 
@@ -20,8 +21,7 @@ def decode_splits(
     views: Mapping[str, Sequence[View]], downscale: int, log: Log
 ) -> dict[str, list[Picture]]:
     """The pictures of every split, each read and decoded once."""
-    if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
-        raise SteerbenchError(f"downscale: expected a whole number from 1, got {downscale!r}")
+    whole_number(downscale, "downscale", 1)
     pictures = iter(
         decode_all([view for split in views.values() for view in split], downscale, log)
     )

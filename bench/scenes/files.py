@@ -93,6 +93,13 @@ def number(value: object, where: str, low: float = -math.inf, high: float = math
     )
 
 
+def whole_number(value: object, where: str, low: int) -> int:
+    """An integer from `low` on."""
+    if isinstance(value, int) and not isinstance(value, bool) and value >= low:
+        return value
+    raise unexpected(where, f"a whole number from {low} on", describe(value))
+
+
 def numbers(text: str, where: str | Path) -> list[list[float]]:
     """The numbers of a text file, line by line, empty lines left out."""
     try:

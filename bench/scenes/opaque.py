@@ -1,0 +1,160 @@
+"""Models of opaque solids under one fixed light."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from bench.scenes.raytrace import Band, Span, Traced
+from bench.scenes.solids import Carved, Shape, unit
+from bench.scenes.textures import Texture
+
+LIGHT = (0.45, -0.55, 0.70)
+"""Direction to the light; of length 1 to three digits, and normalised where it is used."""
+
+LIFT = 1e-4
+"""A shadow ray starts this far above its surface, in the model's units."""
+
+SKY, GROUND, SUN = 0.52, 0.24, 0.62
+"""Light from above, from below, and from the light's direction, as shares of a surface's colour."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A solid in its place.
+
+    Attributes:
+        shape: in its own frame.
+        texture: colour at points of that frame.
+        centre: of the frame, in the model's units.
+        turn: degrees about x, then y, then z.
+        gloss: height of the highlight, 0 for a matt surface.
+        sharpness: exponent of the highlight.
+    """
+
+    shape: Shape
+    texture: Texture
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gloss: float = 0.0
+    sharpness: float = 60.0
+    frame: Tensor = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "frame", rotation(*self.turn))
+
+    def box(self) -> Tensor:
+        """Corners of a box around the part, [8, 3]."""
+        signs = torch.cartesian_prod(*(torch.tensor((-1.0, 1.0)),) * 3)
+        corners = signs * torch.tensor(self.shape.extent())
+        return corners @ self.frame.T + torch.tensor(self.centre)
+
+
+class Solids:
+    """A model of opaque parts: the nearest surface is seen, with opacity 1.
+
+    The light is a point at infinity, so shadows are hard and exact.
+    """
+
+    def __init__(self, parts: Sequence[Part]) -> None:
+        self.parts = parts
+        self.casters = shadow_casters(parts)
+
+    def boxes(self) -> Tensor:
+        """Corners of a box around each part, [P, 8, 3]."""
+        return torch.stack([part.box() for part in self.parts])
+
+    def trace(self, band: Band, spans: Sequence[Span]) -> Traced:
+        """The nearest surface of all, shaded once it is known."""
+        shape = (band.y.shape[0], *band.x.shape[1:])
+        depth = band.x.new_full(shape, math.inf)
+        owner = torch.full(shape, -1, dtype=torch.int16, device=depth.device)
+        for number, first, last in spans:
+            part, columns = self.parts[number], slice(first, last)
+            frame = part.frame.to(depth)
+            centre = torch.tensor(part.centre).to(depth)
+            x, y, z = ((band.origin - centre) @ frame).tolist()
+            found = part.shape.hit((x, y, z), band.directions(frame, columns))
+            nearest = depth[:, columns]
+            owner[:, columns].masked_fill_(found < nearest, number)
+            torch.minimum(nearest, found, out=nearest)
+        seen = owner >= 0
+        rgb = depth.new_zeros(*shape, 3)
+        for number, first, last in spans:
+            rays = (owner[:, first:last] == number).nonzero(as_tuple=True)
+            if len(rays[0]):
+                row, column, sample = rays[0], rays[1] + first, rays[2]
+                x, y = band.x[0, column, sample], band.y[row, 0, sample]
+                directions = torch.stack((x, y, torch.ones_like(x)), 1) @ band.rotation.T
+                points = band.origin + depth[row, column, sample, None] * directions
+                rgb[row, column, sample] = self.shade(number, points, directions)
+        return Traced(rgb, seen.to(depth.dtype), depth.masked_fill_(~seen, 0))
+
+    def shade(self, number: int, points: Tensor, directions: Tensor) -> Tensor:
+        """Colours [N, 3] of a part's `points` seen along `directions`: Lambert and Blinn-Phong."""
+        part = self.parts[number]
+        frame, light = part.frame.to(points), unit(points.new_tensor((LIGHT,)))
+        local = (points - points.new_tensor(part.centre)) @ frame
+        normals = part.shape.normal(local) @ frame.T
+        toward = -unit(directions)
+        # The side of the surface that is looked at is the one that is lit.
+        facing = (normals * toward).sum(1, keepdim=True)
+        normals = torch.where(facing < 0, -normals, normals)
+        height = 0.5 + 0.5 * normals[:, 2:]
+        sun = (normals * light).sum(1, keepdim=True)
+        lit = sun[:, 0] > 0
+        lit[lit.clone()] = ~self.shadowed(number, (points + LIFT * normals)[lit])
+        sun = sun * lit[:, None]
+        colour = part.texture(local) * (GROUND + (SKY - GROUND) * height + SUN * sun)
+        if part.gloss:
+            half = unit(toward + light)
+            highlight = (normals * half).sum(1, keepdim=True).clamp(min=0) ** part.sharpness
+            colour = colour + part.gloss * highlight * lit[:, None]
+        return colour.clamp(max=1)
+
+    def shadowed(self, number: int, points: Tensor) -> Tensor:
+        """[N] bool: is another part between these points of part `number` and the light?"""
+        dark = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+        light = unit(points.new_tensor((LIGHT,)))
+        for caster in (self.parts[k] for k in self.casters[number]):
+            frame = caster.frame.to(points)
+            x, y, z = ((points - points.new_tensor(caster.centre)) @ frame).unbind(1)
+            u, v, w = (light @ frame)[0].unbind(0)
+            dark |= caster.shape.hit((x, y, z), (u, v, w)) < math.inf
+        return dark
+
+
+def shadow_casters(parts: Sequence[Part]) -> list[list[int]]:
+    """For each part, the parts that may stand between it and the light.
+
+    Seen from the light the boxes of the two overlap, and the caster's reaches nearer to it. A
+    convex part does not shadow itself: its dark side faces away from the light.
+    """
+    toward = unit(torch.tensor((LIGHT,)))[0]
+    across = unit(torch.linalg.cross(toward, torch.tensor((0.0, 0.0, 1.0)))[None])[0]
+    axes = torch.stack((across, torch.linalg.cross(toward, across), toward), dim=1)
+    boxes = torch.stack([part.box() for part in parts]) @ axes
+    low, high = boxes.amin(1), boxes.amax(1)
+    overlap = ((low[:, None, :2] < high[None, :, :2]) & (high[:, None, :2] > low[None, :, :2])).all(
+        2
+    )
+    candidates = overlap & (high[None, :, 2] > low[:, None, 2])
+    for number, part in enumerate(parts):
+        candidates[number, number] = isinstance(part.shape, Carved)
+    return [row.nonzero()[:, 0].tolist() for row in candidates]
+
+
+def rotation(x: float, y: float, z: float) -> Tensor:
+    """[3, 3] rotation by degrees about x, then y, then z."""
+    turns = torch.eye(3, dtype=torch.float64)
+    for axis, degrees in enumerate((x, y, z)):
+        c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+        turn = torch.eye(3, dtype=torch.float64)
+        a, b = (axis + 1) % 3, (axis + 2) % 3
+        turn[a, a], turn[a, b], turn[b, a], turn[b, b] = c, -s, s, c
+        turns = turn @ turns
+    return turns.float()

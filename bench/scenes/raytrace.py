@@ -1,0 +1,153 @@
+"""Exact pictures of analytic models: every sub-pixel ray is solved in closed form.
+
+A picture is worked through in bands of rows; each part of a model is asked only about the columns
+that its bounding box can cover in a band.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from bench.cameras import project
+from bench.types import EMPTY_ALPHA, Camera, Frame, SteerbenchError
+
+BAND_RAYS = 1 << 18
+"""Rays of a band: enough to hide the cost of a call, few enough to stay in the cache."""
+
+Span = tuple[int, int, int]
+"""A part's number, the first column it can cover in a band, and one past the last."""
+
+
+@dataclass(frozen=True)
+class Band:
+    """The rays of some rows of a picture, [rows, W, S]: a pencil from `origin` [3].
+
+    The direction at image-plane coordinates x [1, W, S] and y [rows, 1, S] is rotation (x, y, 1).
+    """
+
+    origin: Tensor
+    rotation: Tensor
+    x: Tensor
+    y: Tensor
+
+    def directions(self, frame: Tensor, columns: slice) -> tuple[Tensor, Tensor, Tensor]:
+        """Components of the directions of some columns along the columns of `frame` [3, 3]."""
+        matrix = (frame.T @ self.rotation).tolist()
+        x = self.x[:, columns]
+        across, down, ahead = ([row[i] for row in matrix] for i in range(3))
+        u, v, w = ((x * across[i] + ahead[i]) + self.y * down[i] for i in range(3))
+        return u, v, w
+
+
+@dataclass(frozen=True)
+class Traced:
+    """What rays [rows, W, S] see: `rgb` (times opacity), `alpha`, and `depth` (times opacity)."""
+
+    rgb: Tensor
+    alpha: Tensor
+    depth: Tensor
+
+
+class Model(Protocol):
+    """Something with parts that a band of rays can be traced through."""
+
+    def boxes(self) -> Tensor:
+        """Corners of a box around each part, [P, 8, 3]."""
+
+    def trace(self, band: Band, spans: Sequence[Span]) -> Traced:
+        """What the rays see of the parts in `spans`; outside its span a part is not seen."""
+
+
+def render(model: Model, camera: Camera, background: Tensor, samples: int) -> Frame:
+    """The picture of `model`, averaged over `samples` rays a pixel, a power of two.
+
+    `camera` is in the model's units and `background` [3] is what the rays that see nothing show.
+    Of a pixel's rays, alpha is the mean opacity, depth the mean z-depth weighted by opacity
+    (+inf where alpha is below EMPTY_ALPHA), and rgb the mean colour. One sample is the centre's.
+    """
+    device = camera.c2w.device
+    offsets = sample_offsets(samples).to(device)
+    x = (torch.arange(camera.width, device=device)[:, None] + offsets[:, 0] - camera.cx) / camera.fx
+    y = (
+        torch.arange(camera.height, device=device)[:, None] + offsets[:, 1] - camera.cy
+    ) / camera.fy
+    rgb = torch.zeros(camera.height, camera.width, 3, device=device)
+    alpha = torch.zeros(camera.height, camera.width, device=device)
+    depth = torch.zeros(camera.height, camera.width, device=device)
+    rows = max(BAND_RAYS // (camera.width * samples), 1)
+    boxes = ProjectedBoxes(camera, model.boxes().to(device))
+    for top in range(0, camera.height, rows):
+        bottom = min(top + rows, camera.height)
+        spans = boxes.spans(top, bottom)
+        if not spans:
+            continue
+        first, last = min(span[1] for span in spans), max(span[2] for span in spans)
+        band = Band(camera.c2w[:, 3], camera.c2w[:, :3], x[None, first:last], y[top:bottom, None])
+        traced = model.trace(band, [(part, a - first, b - first) for part, a, b in spans])
+        rgb[top:bottom, first:last] = traced.rgb.mean(2)
+        alpha[top:bottom, first:last] = traced.alpha.mean(2)
+        depth[top:bottom, first:last] = traced.depth.mean(2)
+    empty = alpha < EMPTY_ALPHA
+    depth = (depth / alpha.clamp(min=EMPTY_ALPHA)).masked_fill(empty, math.inf)
+    return Frame(rgb + (1 - alpha)[..., None] * background.to(device), depth, alpha)
+
+
+def sample_offsets(samples: int) -> Tensor:
+    """[samples, 2] places in a pixel, Hammersley's: no two share a row or a column of the pixel."""
+    if samples < 1 or samples & (samples - 1):
+        raise SteerbenchError(f"samples: expected a power of two, got {samples}")
+    bits = samples.bit_length() - 1
+    index = torch.arange(samples)
+    reversed_index = sum(
+        (((index >> bit) & 1) << (bits - 1 - bit) for bit in range(bits)), torch.zeros_like(index)
+    )
+    return (torch.stack((index, reversed_index), dim=1) + 0.5) / samples
+
+
+class ProjectedBoxes:
+    """The bounding boxes of a model's parts as a camera sees them."""
+
+    def __init__(self, camera: Camera, boxes: Tensor) -> None:
+        pixels, depth = project(camera, boxes.reshape(-1, 3))
+        self.width = camera.width
+        self.in_front = (depth.reshape(-1, 8) > 0).all(1)
+        self.behind = (depth.reshape(-1, 8) <= 0).all(1)
+        pairs = torch.combinations(torch.arange(8, device=boxes.device))
+        # A convex outline lies in the hull of the segments between all pairs of its corners.
+        corners = pixels.reshape(-1, 8, 2)
+        self.start, self.end = corners[:, pairs[:, 0]], corners[:, pairs[:, 1]]  # [P, 28, 2]
+
+    def spans(self, top: int, bottom: int) -> list[Span]:
+        """The parts that may show in rows top <= row < bottom, each with its columns.
+
+        A part that reaches behind the camera may show anywhere, one that lies behind it nowhere.
+        """
+        u0, v0 = self.start.unbind(-1)
+        u1, v1 = self.end.unbind(-1)
+        rise = torch.where(v1 == v0, torch.ones_like(v0), v1 - v0)
+        low = ((top - 1 - v0) / rise).clamp(0, 1)  # one pixel of room for rounding
+        high = ((bottom + 1 - v0) / rise).clamp(0, 1)
+        meets = (torch.minimum(v0, v1) <= bottom + 1) & (torch.maximum(v0, v1) >= top - 1)
+        flat = v0 == v1
+        ends = torch.stack(
+            (
+                u0 + torch.where(flat, torch.zeros_like(low), low) * (u1 - u0),
+                u0 + torch.where(flat, torch.ones_like(high), high) * (u1 - u0),
+            )
+        )
+        first = ends.masked_fill(~meets, math.inf).amin((0, 2)).floor() - 1
+        last = ends.masked_fill(~meets, -math.inf).amax((0, 2)).ceil() + 1
+        first = torch.where(self.in_front, first, torch.zeros_like(first)).clamp(min=0)
+        last = torch.where(self.in_front, last, torch.full_like(last, self.width))
+        last = last.clamp(max=self.width).masked_fill(self.behind, 0)
+        return [
+            (part, int(a), int(b))
+            for part, (a, b) in enumerate(zip(first.tolist(), last.tolist(), strict=True))
+            if a < b
+        ]

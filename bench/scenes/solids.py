@@ -1,0 +1,314 @@
+"""Shapes that a ray meets in closed form.
+
+Every shape is centred, in its own frame. Rays come as components, three origins and three
+directions that broadcast: a camera has one origin (three floats) and many directions, a light at
+infinity one direction and many origins. Positions along a ray are its parameter t; where a ray
+misses, t is +inf. Points are [N, 3].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+Triple = tuple[float, float, float]
+Origin = Triple | tuple[Tensor, Tensor, Tensor]
+Directions = tuple[Tensor, Tensor, Tensor]
+
+
+class Shape(Protocol):
+    """A solid."""
+
+    def extent(self) -> Triple:
+        """Half sizes of a box around the shape."""
+
+    def hit(self, origin: Origin, directions: Directions) -> Tensor:
+        """The first crossing of the surface at t > 0, +inf where there is none."""
+
+    def distance(self, points: Tensor) -> Tensor:
+        """[N]: 0 on the surface, negative inside; near the surface about the distance to it."""
+
+    def normal(self, points: Tensor) -> Tensor:
+        """[N, 3]: outward unit normals at points of the surface."""
+
+
+class Convex:
+    """A shape that a ray crosses in one interval."""
+
+    def interval(self, origin: Origin, directions: Directions) -> tuple[Tensor, Tensor]:
+        """Where rays enter and leave: enter > leave where they miss."""
+        raise TypeError(f"{type(self).__name__} has no interval")
+
+    def hit(self, origin: Origin, directions: Directions) -> Tensor:
+        """The nearer end of the interval that lies in front of the camera."""
+        enter, leave = self.interval(origin, directions)
+        first = torch.where(enter > 0, enter, leave)
+        return first.masked_fill_((enter > leave) | (first <= 0), math.inf)
+
+
+@dataclass(frozen=True)
+class Ellipsoid(Convex):
+    """Semi-axes along x, y, z."""
+
+    radii: Triple
+
+    def extent(self) -> Triple:
+        """Its semi-axes."""
+        return self.radii
+
+    def interval(self, origin: Origin, directions: Directions) -> tuple[Tensor, Tensor]:
+        """In the space where it is the unit sphere, from the point nearest to its centre."""
+        o = [x / r for x, r in zip(origin, self.radii, strict=True)]
+        d = [x / r for x, r in zip(directions, self.radii, strict=True)]
+        return ball_interval(o, d, 1.0)
+
+    def distance(self, points: Tensor) -> Tensor:
+        """First-order distance: (|q| - 1) / |grad|, q in units of the semi-axes."""
+        radii = points.new_tensor(self.radii)
+        length = (points / radii).norm(dim=1)
+        return (length - 1) * length / (points / radii**2).norm(dim=1).clamp(min=1e-12)
+
+    def normal(self, points: Tensor) -> Tensor:
+        """Gradient of |q|^2."""
+        return unit(points / points.new_tensor(self.radii) ** 2)
+
+
+@dataclass(frozen=True)
+class Box(Convex):
+    """Half sizes along x, y, z."""
+
+    half: Triple
+
+    def extent(self) -> Triple:
+        """Its half sizes."""
+        return self.half
+
+    def interval(self, origin: Origin, directions: Directions) -> tuple[Tensor, Tensor]:
+        """Three slabs."""
+        slabs = [slab(*axis) for axis in zip(origin, directions, self.half, strict=True)]
+        enter = torch.maximum(torch.maximum(slabs[0][0], slabs[1][0]), slabs[2][0])
+        leave = torch.minimum(torch.minimum(slabs[0][1], slabs[1][1]), slabs[2][1])
+        return enter, leave
+
+    def distance(self, points: Tensor) -> Tensor:
+        """Largest of the three distances to a pair of faces."""
+        return (points.abs() - points.new_tensor(self.half)).amax(1)
+
+    def normal(self, points: Tensor) -> Tensor:
+        """The axis of the nearest face."""
+        axis = (points.abs() - points.new_tensor(self.half)).argmax(1)
+        return torch.nn.functional.one_hot(axis, 3).to(points.dtype) * points.sign()
+
+
+@dataclass(frozen=True)
+class Cylinder(Convex):
+    """Capped, along z."""
+
+    radius: float
+    half: float
+
+    def extent(self) -> Triple:
+        """Of its box."""
+        return (self.radius, self.radius, self.half)
+
+    def interval(self, origin: Origin, directions: Directions) -> tuple[Tensor, Tensor]:
+        """The round wall and the slab between the caps."""
+        wall = ball_interval(origin[:2], directions[:2], self.radius)
+        caps = slab(origin[2], directions[2], self.half)
+        return torch.maximum(wall[0], caps[0]), torch.minimum(wall[1], caps[1])
+
+    def distance(self, points: Tensor) -> Tensor:
+        """The larger of the distances to the wall and to the caps."""
+        return torch.maximum(
+            points[:, :2].norm(dim=1) - self.radius, points[:, 2].abs() - self.half
+        )
+
+    def normal(self, points: Tensor) -> Tensor:
+        """Of the wall or of a cap, whichever is nearer."""
+        on_wall = points[:, :2].norm(dim=1) - self.radius > points[:, 2].abs() - self.half
+        wall = unit(points * points.new_tensor((1, 1, 0)))
+        cap = points.sign() * points.new_tensor((0, 0, 1))
+        return torch.where(on_wall[:, None], wall, cap)
+
+
+@dataclass(frozen=True)
+class Capsule(Convex):
+    """All points within `radius` of the segment from -half to half along z."""
+
+    radius: float
+    half: float
+
+    def extent(self) -> Triple:
+        """Of its box."""
+        return (self.radius, self.radius, self.half + self.radius)
+
+    def interval(self, origin: Origin, directions: Directions) -> tuple[Tensor, Tensor]:
+        """The union of an open cylinder and two balls: convex, so the outermost ends."""
+        wall = ball_interval(origin[:2], directions[:2], self.radius)
+        caps = slab(origin[2], directions[2], self.half)
+        enter, leave = torch.maximum(wall[0], caps[0]), torch.minimum(wall[1], caps[1])
+        missed = enter > leave
+        enter, leave = enter.masked_fill(missed, math.inf), leave.masked_fill(missed, -math.inf)
+        for end in (-self.half, self.half):
+            ball = ball_interval((origin[0], origin[1], origin[2] - end), directions, self.radius)
+            enter, leave = torch.minimum(enter, ball[0]), torch.maximum(leave, ball[1])
+        return enter, leave
+
+    def distance(self, points: Tensor) -> Tensor:
+        """To the segment, less the radius."""
+        return self.from_axis(points).norm(dim=1) - self.radius
+
+    def normal(self, points: Tensor) -> Tensor:
+        """Away from the segment."""
+        return unit(self.from_axis(points))
+
+    def from_axis(self, points: Tensor) -> Tensor:
+        """Vectors from the nearest point of the segment."""
+        x, y, z = points.unbind(1)
+        return torch.stack((x, y, z - z.clamp(-self.half, self.half)), dim=1)
+
+
+@dataclass(frozen=True)
+class Shifted(Convex):
+    """A convex shape moved by `offset`: an operand of `Carved` or `Common`."""
+
+    shape: Box | Ellipsoid | Cylinder | Capsule
+    offset: Triple
+
+    def extent(self) -> Triple:
+        """Of a centred box that holds the moved shape."""
+        x, y, z = (abs(o) + e for o, e in zip(self.offset, self.shape.extent(), strict=True))
+        return (x, y, z)
+
+    def interval(self, origin: Origin, directions: Directions) -> tuple[Tensor, Tensor]:
+        """From the origin moved back."""
+        x, y, z = (o - s for o, s in zip(origin, self.offset, strict=True))
+        return self.shape.interval((x, y, z), directions)
+
+    def distance(self, points: Tensor) -> Tensor:
+        """At the points moved back."""
+        return self.shape.distance(points - points.new_tensor(self.offset))
+
+    def normal(self, points: Tensor) -> Tensor:
+        """At the points moved back."""
+        return self.shape.normal(points - points.new_tensor(self.offset))
+
+
+@dataclass(frozen=True)
+class Common(Convex):
+    """What two convex shapes share."""
+
+    first: Box | Ellipsoid | Cylinder | Capsule | Shifted
+    second: Box | Ellipsoid | Cylinder | Capsule | Shifted
+
+    def extent(self) -> Triple:
+        """The smaller of the two, axis by axis."""
+        x, y, z = map(min, self.first.extent(), self.second.extent())
+        return (x, y, z)
+
+    def interval(self, origin: Origin, directions: Directions) -> tuple[Tensor, Tensor]:
+        """Entered when both are entered, left when either is left."""
+        a = self.first.interval(origin, directions)
+        b = self.second.interval(origin, directions)
+        return torch.maximum(a[0], b[0]), torch.minimum(a[1], b[1])
+
+    def distance(self, points: Tensor) -> Tensor:
+        """The larger of the two."""
+        return torch.maximum(self.first.distance(points), self.second.distance(points))
+
+    def normal(self, points: Tensor) -> Tensor:
+        """Of the shape whose surface it is."""
+        first = self.first.distance(points) > self.second.distance(points)
+        return torch.where(first[:, None], self.first.normal(points), self.second.normal(points))
+
+
+@dataclass(frozen=True)
+class Carved:
+    """A convex `body` with the convex `bites` taken out of it."""
+
+    body: Box | Ellipsoid | Cylinder | Capsule | Common
+    bites: Sequence[Shifted]
+
+    def extent(self) -> Triple:
+        """Of the body."""
+        return self.body.extent()
+
+    def hit(self, origin: Origin, directions: Directions) -> Tensor:
+        """The nearest end of any operand's interval that is a surface of the difference.
+
+        An end of the body counts outside all bites; an end of a bite counts inside the body and
+        outside the other bites.
+        """
+        operands = [self.body, *self.bites]
+        intervals = [operand.interval(origin, directions) for operand in operands]
+        nearest = torch.full_like(intervals[0][0], math.inf)
+        for own, (enter, leave) in enumerate(intervals):
+            crossed = enter <= leave
+            for t in (enter, leave):
+                surface = crossed & (t > 0) & (t < nearest)
+                for other, (a, b) in enumerate(intervals):
+                    if other != own:
+                        within = (a < t) & (t < b)
+                        surface &= within if other == 0 else ~within
+                nearest = torch.where(surface, t, nearest)
+        return nearest
+
+    def distance(self, points: Tensor) -> Tensor:
+        """Inside the body and outside every bite."""
+        bites = torch.stack([-bite.distance(points) for bite in self.bites])
+        return torch.maximum(self.body.distance(points), bites.amax(0))
+
+    def normal(self, points: Tensor) -> Tensor:
+        """Of the operand whose surface it is; a bite's normal points into the bite."""
+        nearest = self.body.distance(points).abs()
+        normal = self.body.normal(points)
+        for bite in self.bites:
+            distance = bite.distance(points).abs()
+            normal = torch.where((distance < nearest)[:, None], -bite.normal(points), normal)
+            nearest = torch.minimum(distance, nearest)
+        return normal
+
+
+def ball_interval(
+    origin: Sequence, directions: Sequence[Tensor], radius: float
+) -> tuple[Tensor, Tensor]:
+    """Where rays are within `radius` of 0, in as many dimensions as there are components.
+
+    Measured from the ray's point nearest to 0: the textbook's b^2 - 4 a c loses a thin wire seen
+    from afar to rounding. A direction of length 0 stays at the origin for ever.
+    """
+    a = sum_of_products(directions, directions).clamp_(min=1e-30)
+    middle = -sum_of_products(origin, directions) / a
+    nearest = [torch.add(d * middle, o) for o, d in zip(origin, directions, strict=True)]
+    gap = radius * radius - sum_of_products(nearest, nearest)
+    reach = (gap.clamp(min=0) / a).sqrt_()
+    missed = gap < 0
+    return (middle - reach).masked_fill_(missed, math.inf), (middle + reach).masked_fill_(
+        missed, -math.inf
+    )
+
+
+def slab(origin: float | Tensor, direction: Tensor, half: float) -> tuple[Tensor, Tensor]:
+    """Where rays are within `half` of 0 along one axis."""
+    # A ray along the slab never leaves it or never enters: a tiny slope says so without 0 / 0.
+    slope = torch.where(direction.abs() < 1e-12, torch.full_like(direction, 1e-12), direction)
+    low, high = (-half - origin) / slope, (half - origin) / slope
+    return torch.minimum(low, high), torch.maximum(low, high)
+
+
+def sum_of_products(first: Sequence, second: Sequence) -> Tensor:
+    """Dot product by components."""
+    total = first[0] * second[0]
+    for a, b in zip(first[1:], second[1:], strict=True):
+        total = total + a * b
+    return total
+
+
+def unit(vectors: Tensor) -> Tensor:
+    """[N, 3] scaled to length 1; a zero vector stays zero."""
+    return torch.nn.functional.normalize(vectors, dim=1)

@@ -1,0 +1,151 @@
+"""Procedural colours: functions of a point in a part's own frame, [N, 3] -> [N, 3] in [0, 1]."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cache
+
+import torch
+from torch import Tensor
+
+Colour = tuple[float, float, float]
+Texture = Callable[[Tensor], Tensor]
+
+
+def plain(colour: Colour) -> Texture:
+    """One colour."""
+    return lambda points: points.new_tensor(colour).expand(len(points), 3)
+
+
+def checker(first: Colour, second: Colour, size: float) -> Texture:
+    """Cubes of side `size`, alternating."""
+    # The shift keeps faces at round coordinates away from the border between two cubes.
+    return lambda points: pick(((points / size + 0.137).floor().sum(1) % 2) < 1, first, second)
+
+
+def polar_checker(first: Colour, second: Colour, sectors: int, ring: float) -> Texture:
+    """Sectors around z and rings (or levels) of width `ring`, alternating."""
+
+    def texture(points: Tensor) -> Tensor:
+        x, y, z = points.unbind(1)
+        sector = (angle(x, y) * sectors / (2 * math.pi)).floor()
+        level = ((x * x + y * y).sqrt() / ring + 0.29).floor() + (z / ring + 0.29).floor()
+        return pick((sector + level) % 2 < 1, first, second)
+
+    return texture
+
+
+def spiral(first: Colour, second: Colour, stripes: int, twist: float) -> Texture:
+    """Stripes around z that turn `twist` radians per unit of height."""
+
+    def texture(points: Tensor) -> Tensor:
+        x, y, z = points.unbind(1)
+        phase = (angle(x, y) + twist * z) * stripes / (2 * math.pi)
+        return pick(phase - phase.floor() < 0.5, first, second)
+
+    return texture
+
+
+def chevrons(first: Colour, second: Colour, period: float, slope: float) -> Texture:
+    """Zigzag stripes along x that repeat every `period`."""
+
+    def texture(points: Tensor) -> Tensor:
+        x, _, z = points.unbind(1)
+        phase = x / period + slope * ((z / period - (z / period).floor()) - 0.5).abs()
+        return pick(phase - phase.floor() < 0.5, first, second)
+
+    return texture
+
+
+def pips(ground: Colour, dot: Colour, spacing: float, radius: float) -> Texture:
+    """Dots on a lattice; on a face of a box, round ones."""
+
+    def texture(points: Tensor) -> Tensor:
+        cell = (points / spacing).round() * spacing
+        return pick((points - cell).norm(dim=1) < radius, dot, ground)
+
+    return texture
+
+
+def eye(iris: Colour) -> Texture:
+    """White, with an iris and a pupil that look along -y."""
+
+    def texture(points: Tensor) -> Tensor:
+        facing = -points[:, 1] / points.norm(dim=1)
+        inner = pick(facing > math.cos(0.32), (0.02, 0.02, 0.03), iris)
+        white = points.new_tensor((0.97, 0.96, 0.93))
+        return torch.where((facing > math.cos(0.62))[:, None], inner, white)
+
+    return texture
+
+
+def marble(ground: Colour, vein: Colour, scale: float) -> Texture:
+    """Veins: a sine along x, bent by noise."""
+
+    def texture(points: Tensor) -> Tensor:
+        bend = noise(points * scale) + 0.5 * noise(points * (2.1 * scale))
+        wave = torch.sin((points[:, 0] + 0.6 * points[:, 2]) * 2 * scale + 5 * bend).abs()
+        return mix(wave.clamp(max=0.55) / 0.55, vein, ground)
+
+    return texture
+
+
+def wood(light: Colour, dark: Colour, rings: float) -> Texture:
+    """Year rings around an axis along x that runs outside the part, bent by noise."""
+
+    def texture(points: Tensor) -> Tensor:
+        _, y, z = points.unbind(1)
+        radius = torch.hypot(y + 0.7, 2 * z + 0.4) + 0.08 * noise(points * 3)
+        phase = radius * rings
+        return mix((phase - phase.floor()) ** 2, light, dark)
+
+    return texture
+
+
+def mottled(first: Colour, second: Colour, scale: float) -> Texture:
+    """Two octaves of noise between two colours."""
+
+    def texture(points: Tensor) -> Tensor:
+        share = 0.65 * noise(points * scale) + 0.35 * noise(points * (4.3 * scale))
+        return mix(share, first, second)
+
+    return texture
+
+
+def noise(points: Tensor) -> Tensor:
+    """[N] in [0, 1]: random values at whole coordinates, smooth between, period 32."""
+    table = lattice().to(points.device, points.dtype)
+    cell = points.floor()
+    part = points - cell
+    # Trilinear at a place that slows down towards the cell's borders: no creases there.
+    place = (cell + part * part * (3 - 2 * part)) / (table.shape[-1] - 1)
+    place = (place - place.floor()) * 2 - 1  # [-1, 1] spans the table from first to last vertex
+    values = torch.nn.functional.grid_sample(
+        table[None, None], place[None, None, None], align_corners=True
+    )
+    return values.reshape(-1)
+
+
+@cache
+def lattice() -> Tensor:
+    """[33, 33, 33] random values whose last planes repeat the first."""
+    values = torch.rand(32, 32, 32, generator=torch.Generator().manual_seed(1))
+    return torch.nn.functional.pad(values[None, None], (0, 1) * 3, mode="circular")[0, 0]
+
+
+def angle(x: Tensor, y: Tensor) -> Tensor:
+    """Azimuth in [-pi, pi]."""
+    return torch.atan2(y, x)
+
+
+def pick(condition: Tensor, first: Colour, second: Colour) -> Tensor:
+    """`first` where `condition` [N], else `second`: [N, 3]."""
+    palette = torch.tensor((second, first), device=condition.device)
+    return palette[condition.long()]
+
+
+def mix(share: Tensor, first: Colour, second: Colour) -> Tensor:
+    """From `first` at share 0 to `second` at share 1: [N, 3]."""
+    start, end = share.new_tensor(first), share.new_tensor(second)
+    return start + share[:, None] * (end - start)
