@@ -17,7 +17,7 @@ from torch import Tensor
 from methods.kernels.march import Occupancy, Samples
 
 CHUNK = 64  # rays
-f32 = np.float32
+f32, f64 = np.float32, np.float64
 UNIT_CUBE = np.array([[0, 0, 0], [1, 1, 1]], np.float32)
 
 
@@ -120,7 +120,7 @@ def _march_ray(origin, direction, words, blocks, bounds, step, near, far, phase,
     """Write the t of a ray's samples to `out`; return their number and the step to resume from."""
     ox, oy, oz = origin
     dx, dy, dz = direction
-    length = f32(math.sqrt(float(dx) ** 2 + float(dy) ** 2 + float(dz) ** 2))
+    length = f32(math.sqrt(f64(dx) ** 2 + f64(dy) ** 2 + f64(dz) ** 2))
     enter, leave = _cross(origin, direction, UNIT_CUBE)
     near, far = max(enter, near), min(leave, far)
     if not (near < far and length > 0 and near > -np.inf):

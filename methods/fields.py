@@ -1,0 +1,127 @@
+"""A hash-grid field: position and view direction to density and K features (SteerNeRF Eq. 4)."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from methods.kernels.encode import HashGrid, encode, pack
+from methods.kernels.spherical import CHANNELS as DIRECTION_CHANNELS
+from methods.kernels.spherical import spherical_harmonics
+
+Precision = Literal["bf16", "fp32"]
+
+GEOMETRY_CHANNELS = 16
+"""Outputs of the density network; the first is log density, all feed the feature network."""
+
+LOG_DENSITY_CLAMP = 15.0
+"""The gradient of exp is taken at a log density clamped to +- this (as torch-ngp and ngp_pl do)."""
+
+
+class HashField(nn.Module):
+    """Hash-grid encoding, a density network (32-64-16) and a feature network (32-64-64-K).
+
+    No biases, ReLU between layers, exp for density, sigmoid for features (Instant-NGP, Section 5.4;
+    ngp_pl `networks.py`).
+
+    With precision "bf16" the table is read as packed bfloat16 and the matrix products are bfloat16
+    with float32 accumulation; parameters, gradients of the table and outputs stay float32.
+    """
+
+    def __init__(
+        self,
+        grid: HashGrid,
+        channels: int = 3,
+        *,
+        hidden: int = 64,
+        precision: Precision = "bf16",
+        backend: str = "auto",
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        self.grid, self.channels, self.precision, self.backend = grid, channels, precision, backend
+        table = torch.empty(grid.entries, grid.features).uniform_(-1e-4, 1e-4, generator=generator)
+        self.table = nn.Parameter(table)
+        sizes = {
+            "density_in": (hidden, grid.channels),
+            "density_out": (GEOMETRY_CHANNELS, hidden),
+            "feature_in": (hidden, DIRECTION_CHANNELS + GEOMETRY_CHANNELS),
+            "feature_mid": (hidden, hidden),
+            "feature_out": (channels, hidden),
+        }
+        self.layers = nn.ParameterDict(
+            {name: _xavier_uniform(*size, generator) for name, size in sizes.items()}
+        )
+        self.register_buffer(
+            "packed", pack(table) if precision == "bf16" else None, persistent=False
+        )
+        self.grad_buffer: Tensor | None = None  # set by a training that updates the table sparsely
+
+    def repack(self) -> None:
+        """Bring the packed copy up to date after the table was changed from outside."""
+        if self.packed is not None:
+            self.packed.copy_(pack(self.table))
+
+    def encode_directions(self, directions: Tensor) -> Tensor:
+        """Spherical harmonics [R, 16] of ray `directions` [R, 3] of any length."""
+        unit = functional.normalize(directions, dim=-1)
+        return spherical_harmonics(unit, backend=self.backend).to(self._compute_dtype)
+
+    def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """Density [S] float32 and geometry channels [S, 16] at `positions` [S, 3]."""
+        features = encode(
+            positions,
+            self.table,
+            self.grid,
+            packed=self.packed,
+            grad_buffer=self.grad_buffer,
+            backend=self.backend,
+        )
+        hidden = self._linear(features, "density_in").relu_()
+        geometry = self._linear(hidden, "density_out")
+        return _ClampedExp.apply(geometry[:, 0].float()), geometry
+
+    def features(self, geometry: Tensor, directions: Tensor) -> Tensor:
+        """Features [S, K] float32 of samples with encoded view `directions` [S, 16]."""
+        hidden = self._linear(torch.cat((directions, geometry), dim=-1), "feature_in").relu_()
+        hidden = self._linear(hidden, "feature_mid").relu_()
+        return self._linear(hidden, "feature_out").float().sigmoid()
+
+    def sizes(self) -> dict[str, int]:
+        """Bytes of table and networks at the precision in which they are read."""
+        width = 2 if self.precision == "bf16" else 4
+        networks = sum(layer.numel() for layer in self.layers.values())
+        return {"hash_table": self.table.numel() * width, "field_networks": networks * width}
+
+    @property
+    def _compute_dtype(self) -> torch.dtype:
+        return torch.bfloat16 if self.precision == "bf16" else self.table.dtype
+
+    def _linear(self, inputs: Tensor, layer: str) -> Tensor:
+        return functional.linear(inputs, self.layers[layer].to(self._compute_dtype))
+
+
+def _xavier_uniform(
+    outputs: int, inputs: int, generator: torch.Generator | None
+) -> nn.Parameter:
+    bound = math.sqrt(6 / (outputs + inputs))
+    weights = torch.empty(outputs, inputs).uniform_(-bound, bound, generator=generator)
+    return nn.Parameter(weights)
+
+
+class _ClampedExp(torch.autograd.Function):
+    """exp, whose gradient neither vanishes nor overflows far from 0."""
+
+    @staticmethod
+    def forward(ctx, log_density):  # type: ignore[no-untyped-def]
+        ctx.save_for_backward(log_density)
+        return log_density.exp()
+
+    @staticmethod
+    def backward(ctx, grad):  # type: ignore[no-untyped-def]
+        (log_density,) = ctx.saved_tensors
+        return grad * log_density.clamp(-LOG_DENSITY_CLAMP, LOG_DENSITY_CLAMP).exp()

@@ -1,0 +1,135 @@
+"""Volume rendering of a field along rays: all samples at once to train, in rounds to render."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bench.types import Probe, Rays
+from methods.fields import HashField
+from methods.kernels.composite import STOP, Pixels, composite
+from methods.kernels.march import Occupancy, march
+from methods.occupancy import STEP
+
+CHUNK_RAYS = 1 << 14
+"""Rays rendered together: their samples of a round should stay in the last-level cache."""
+
+ROUND_SAMPLES = (4, 8, 16, 32)
+"""Samples a ray may take in a round; the last number repeats."""
+
+
+def render_batch(
+    field: HashField, rays: Rays, occupancy: Occupancy, jitter: Tensor, background: Tensor
+) -> tuple[Pixels, int]:
+    """Render `rays` differentiably with all their samples; also the number of samples.
+
+    Args:
+        jitter: [R] phase of the samples of each ray, in [0, 1).
+        background: [K] or [R, K].
+    """
+    samples = march(
+        rays.origins, rays.directions, occupancy, STEP, jitter=jitter, backend=field.backend
+    )
+    sigma, geometry = field.density(samples.positions)
+    directions = field.encode_directions(rays.directions)[samples.ray]
+    values = field.features(geometry, directions)
+    pixels = composite(
+        sigma,
+        values,
+        samples.t,
+        samples.delta,
+        samples.offsets,
+        background=background,
+        backend=field.backend,
+    )
+    return pixels, len(samples)
+
+
+@dataclass
+class _Canvas:
+    """Pixels under construction, without background."""
+
+    values: Tensor
+    depth_sum: Tensor
+    alpha: Tensor
+
+    @classmethod
+    def blank(cls, rays: int, channels: int, device: torch.device) -> _Canvas:
+        return cls(
+            torch.zeros(rays, channels, device=device),
+            torch.zeros(rays, device=device),
+            torch.zeros(rays, device=device),
+        )
+
+    def take(self, index: Tensor) -> Pixels:
+        return Pixels(self.values[index], self.depth_sum[index], self.alpha[index])
+
+    def put(self, index: Tensor, pixels: Pixels) -> None:
+        self.values[index] = pixels.values
+        self.depth_sum[index] = pixels.depth_sum
+        self.alpha[index] = pixels.alpha
+
+
+@torch.no_grad()
+def render_rays(
+    field: HashField, rays: Rays, occupancy: Occupancy, probe: Probe, *, stop: float = STOP
+) -> Pixels:
+    """Render `rays` in rounds, so that samples behind the early stop are hardly ever evaluated.
+
+    Values are not composited onto a background. A round takes the next few samples of the rays
+    that are still open, evaluates and composites them, and drops the rays that are done.
+    """
+    device = rays.origins.device
+    canvas = _Canvas.blank(len(rays.origins), field.channels, device)
+    for first in range(0, len(rays.origins), CHUNK_RAYS):
+        alive = torch.arange(first, min(first + CHUNK_RAYS, len(rays.origins)), device=device)
+        start = torch.zeros(len(alive), dtype=torch.int32, device=device)
+        turn = 0
+        while len(alive):
+            limit = ROUND_SAMPLES[min(turn, len(ROUND_SAMPLES) - 1)]
+            alive, start = _render_round(
+                field, rays, occupancy, probe, canvas, alive, start, limit, stop
+            )
+            turn += 1
+    return Pixels(canvas.values, canvas.depth_sum, canvas.alpha)
+
+
+def _render_round(
+    field: HashField,
+    rays: Rays,
+    occupancy: Occupancy,
+    probe: Probe,
+    canvas: _Canvas,
+    alive: Tensor,
+    start: Tensor,
+    limit: int,
+    stop: float,
+) -> tuple[Tensor, Tensor]:
+    """One round of the rays `alive` from their steps `start`; those left and where they go on."""
+    with probe.stage("march"):
+        origins, directions = rays.origins[alive], rays.directions[alive]
+        samples = march(
+            origins, directions, occupancy, STEP, start=start, limit=limit, backend=field.backend
+        )
+    probe.count("samples", len(samples))
+    if len(samples) == 0:
+        return alive[:0], start[:0]
+    with probe.stage("field"):
+        sigma, geometry = field.density(samples.positions)
+        values = field.features(geometry, field.encode_directions(directions)[samples.ray])
+    with probe.stage("composite"):
+        pixels = composite(
+            sigma,
+            values,
+            samples.t,
+            samples.delta,
+            samples.offsets,
+            stop=stop,
+            carry=canvas.take(alive),
+            backend=field.backend,
+        )
+        canvas.put(alive, pixels)
+        left = (samples.resume >= 0) & (1 - pixels.alpha > stop)
+        return alive[left], samples.resume[left]
