@@ -41,7 +41,7 @@ def load(
             right and the bottom, is left out.
         background: "white" or "black", what RGBA pictures are composited onto.
         bounds: what fills the unit cube. "auto": the box of the visual hull of the training masks,
-            or [-1.5, 1.5]^3 when there is no mask; "full": [-1.5, 1.5]^3; or [[x, y, z], [x, y, z]].
+            or [-1.5, 1.5]^3 without masks; "full": [-1.5, 1.5]^3; or [[x, y, z], [x, y, z]].
         name: the scene's name in result rows; the folder's name when not given.
 
     A split other than train and test none of whose pictures exist is left out.

@@ -36,10 +36,14 @@ def undistort(
         expected = "a lens distortion that can be undone"
         raise unexpected(where, expected, f"{coefficients}: {error}") from error
     planes = image.permute(2, 0, 1)[None].float()
+    alpha = planes[:, 3:] / 255
+    planes[:, :3] *= alpha if alpha.numel() else 1  # between pixels, colours weigh by their alpha
     # kornia counts from the centre of the first pixel, we from its corner.
     u, v = (source - 0.5).unbind(-1)
-    sampled = remap(planes, u[None], v[None], align_corners=True)
-    straight = sampled[0].permute(1, 2, 0).round().to(torch.uint8).contiguous()
+    planes = remap(planes, u[None], v[None], align_corners=True)
+    alpha = planes[:, 3:] / 255
+    planes[:, :3] /= alpha.clamp(min=1e-6) if alpha.numel() else 1
+    straight = planes[0].permute(1, 2, 0).round().clamp(0, 255).to(torch.uint8).contiguous()
     return straight, crop_camera(camera, left, top, source.shape[1], source.shape[0])
 
 

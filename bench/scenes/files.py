@@ -85,7 +85,8 @@ def number(value: object, where: str, low: float = -math.inf, high: float = math
     """A finite number with low < value < high."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         # Comparing before converting: an integer of hundreds of digits has no float.
-        if low < value < high and abs(value) < sys.float_info.max:
+        fits = low < value < high and abs(value) < sys.float_info.max
+        if fits:
             return float(value)
     limits = [f"above {low:g}"] * (low > -math.inf) + [f"below {high:g}"] * (high < math.inf)
     raise unexpected(
@@ -132,7 +133,7 @@ def rigid_pose(value: object, where: str) -> Tensor:
 
 
 def opengl_to_opencv(pose: Tensor) -> Tensor:
-    """Camera-to-world [3, 4] from OpenGL axes (y up, z backward) to OpenCV's (y down, z forward)."""
+    """Camera-to-world [3, 4] from OpenGL axes (y up, z backward) to OpenCV's (down, forward)."""
     return pose * pose.new_tensor((1, -1, -1, 1))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 from bench.scenes.media import Ball, Cloud
 from bench.scenes.opaque import Part, Solids
@@ -169,7 +170,7 @@ def helix() -> list[Part]:
         (0.45 * math.cos(0.35 * k), 0.45 * math.sin(0.35 * k), -0.7 + 1.4 * k / steps)
         for k in range(steps + 1)
     ]
-    return [wire(a, b, 0.010, GOLD) for a, b in zip(points[:-1], points[1:], strict=True)]
+    return [wire(a, b, 0.010, GOLD) for a, b in pairwise(points)]
 
 
 def wheel() -> list[Part]:

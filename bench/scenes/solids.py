@@ -11,13 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 Triple = tuple[float, float, float]
-Origin = Triple | tuple[Tensor, Tensor, Tensor]
+Origin = tuple[Any, Any, Any]  # floats or tensors
 Directions = tuple[Tensor, Tensor, Tensor]
 
 

@@ -1,0 +1,117 @@
+"""NSVF's layout, also used for Tanks & Temples: `bbox.txt intrinsics.txt pose/*.txt rgb/*`."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import torch
+
+from bench.scenes.assemble import assemble, decode_splits
+from bench.scenes.bounds import MARGIN, Box
+from bench.scenes.files import (
+    data_folder,
+    inside,
+    number,
+    numbers,
+    read_text,
+    rigid_pose,
+    unexpected,
+)
+from bench.scenes.images import View, image_size
+from bench.types import Camera, Log, Scene
+
+SPLITS = {"0": "train", "1": "val", "2": "test"}
+"""What the first character of a picture's name means."""
+
+PICTURE_NAME = re.compile(r"[012]_.*\.(png|jpg|jpeg)", re.IGNORECASE)
+
+
+def load(
+    path: str | Path,
+    *,
+    downscale: int = 1,
+    background: str = "white",
+    log: Log,
+) -> Scene:
+    """Read a scene folder.
+
+    Args:
+        path: the folder with `bbox.txt`, `intrinsics.txt`, `pose/` and `rgb/`.
+        downscale: average blocks of this many pixels squared; what does not fill a block, at the
+            right and the bottom, is left out.
+        background: "white" or "black", what RGBA pictures are composited onto.
+
+    Pictures are named 0_* (train), 1_* (val) and 2_* (test), poses alike; poses have OpenCV axes.
+    Without any 2_* the 1_* are the test split, as in Tanks & Temples. The box of `bbox.txt`, with a
+    margin of 5 % of its longest side, fills the unit cube.
+    Raises SteerbenchError naming file and field when anything is not as it should be.
+    """
+    root = data_folder(path)
+    box = read_box(root)
+    files = picture_files(root)
+    width, height = image_size(files[0])
+    focal_x, focal_y, cx, cy = read_intrinsics(root)
+    views: dict[str, list[View]] = {}
+    camera_files = [root / "bbox.txt", root / "intrinsics.txt"]
+    for file in files:
+        relative = f"pose/{file.stem}.txt"
+        camera_files.append(root / relative)
+        where = f"{root / relative}"
+        pose = rigid_pose(numbers(read_text(root, relative), where), where)
+        camera = Camera(pose.float(), focal_x, focal_y, cx, cy, width, height)
+        view = View(f"rgb/{file.name}", file, camera)
+        views.setdefault(SPLITS[file.name[0]], []).append(view)
+    if "test" not in views and "val" in views:
+        log.info(f"{root / 'rgb'}: no pictures 2_*, so 1_* are the test split")
+        views["test"] = views.pop("val")
+    for split, prefix in (("train", "0_*"), ("test", "2_* or 1_*")):
+        if split not in views:
+            raise unexpected(root / "rgb", f"pictures {prefix}", "none")
+    pictures = decode_splits(views, downscale, log)
+    return assemble(
+        root.name, views, pictures, box, background=background, camera_files=camera_files
+    )
+
+
+def read_box(root: Path) -> Box:
+    """The box of `bbox.txt`, x0 y0 z0 x1 y1 z1 and a voxel size that is not used, with a margin."""
+    path = root / "bbox.txt"
+    values = [x for row in numbers(read_text(root, path.name), path) for x in row]
+    if len(values) not in (6, 7):
+        raise unexpected(path, "x0 y0 z0 x1 y1 z1 and a voxel size", f"{len(values)} numbers")
+    corners = [number(x, f"{path}: number {i + 1}") for i, x in enumerate(values[:6])]
+    lower, upper = torch.tensor(corners, dtype=torch.float64).reshape(2, 3)
+    if (upper <= lower).any():
+        raise unexpected(path, "each upper bound above its lower", corners)
+    return Box(lower, upper).grown(MARGIN)
+
+
+def read_intrinsics(root: Path) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy in pixels, from either form of `intrinsics.txt`.
+
+    A 4x4 or 3x3 matrix, or a first line "f cx cy 0" with other things below it.
+    """
+    path = root / "intrinsics.txt"
+    rows = numbers(read_text(root, path.name), path)
+    if [len(row) for row in rows] in ([4] * 4, [3] * 3):
+        values = {"fx": rows[0][0], "fy": rows[1][1], "cx": rows[0][2], "cy": rows[1][2]}
+    elif rows and len(rows[0]) == 4:
+        values = {"fx": rows[0][0], "fy": rows[0][0], "cx": rows[0][1], "cy": rows[0][2]}
+    else:
+        got = f"lines of {[len(row) for row in rows]} numbers"
+        raise unexpected(path, 'a 4x4 or 3x3 matrix or a first line "f cx cy 0"', got)
+    fx, fy = (number(values[name], f"{path}: {name}", 0) for name in ("fx", "fy"))
+    cx, cy = (number(values[name], f"{path}: {name}") for name in ("cx", "cy"))
+    return fx, fy, cx, cy
+
+
+def picture_files(root: Path) -> list[Path]:
+    """The pictures of all splits, by name."""
+    folder = inside(root, "rgb", root / "rgb")
+    if not folder.is_dir():
+        raise unexpected(folder, "a folder of pictures", "nothing there")
+    names = sorted(path.name for path in folder.iterdir() if PICTURE_NAME.fullmatch(path.name))
+    if not names:
+        raise unexpected(folder, "pictures named 0_*, 1_* or 2_*", "none")
+    return [inside(root, f"rgb/{name}", folder / name) for name in names]

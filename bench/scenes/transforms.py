@@ -1,0 +1,172 @@
+"""A hand-held capture: the `transforms.json` of instant-ngp and nerfstudio."""
+
+from __future__ import annotations
+
+import math
+from collections import ChainMap
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+
+from bench.scenes.assemble import assemble, decode_splits
+from bench.scenes.bounds import Box
+from bench.scenes.files import (
+    data_folder,
+    describe,
+    frames_of,
+    inside,
+    number,
+    opengl_to_opencv,
+    read_json,
+    rigid_pose,
+    unexpected,
+    whole_number,
+)
+from bench.scenes.images import View, image_size
+from bench.types import Camera, Log, Scene
+
+CAMERA_FILE = "transforms.json"
+
+NGP_SCALE, NGP_OFFSET = 0.33, (0.5, 0.5, 0.5)
+"""instant-ngp's unit cube holds scale * x + offset of the file's coordinates x."""
+
+PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
+
+LENS = ("k1", "k2", "p1", "p2", "k3")
+OTHER_LENSES = ("k4", "k5", "k6", "is_fisheye", "ftheta_p0", "rolling_shutter")
+
+
+def load(
+    path: str | Path,
+    *,
+    split_every: int = 8,
+    aabb_scale: float | None = None,
+    downscale: int = 1,
+    background: str = "white",
+    log: Log,
+) -> Scene:
+    """Read a capture folder.
+
+    Args:
+        path: the folder with `transforms.json`.
+        split_every: in the order of their names, pictures 0, split_every, 2 * split_every ... are
+            the test split and all others the training.
+        aabb_scale: how many sides of instant-ngp's unit cube, x * 0.33 + 0.5, fill ours; by
+            default what the file says, or 1. The file's own `scale` and `offset` are heeded.
+        downscale: average blocks of this many pixels squared; what does not fill a block, at the
+            right and the bottom, is left out.
+        background: "white" or "black", what RGBA pictures are composited onto.
+
+    Intrinsics of a frame go before those of the file. Lens distortion is undone, and pictures are
+    cropped to what the lens saw. Frames without a picture are named once and left out.
+    Raises SteerbenchError naming file and field when anything is not as it should be.
+    """
+    whole_number(split_every, "split_every", 2)
+    root = data_folder(path)
+    record = read_json(root, CAMERA_FILE)
+    views = sorted(read_views(root, record, log), key=lambda view: view.name)
+    splits = {
+        "train": [view for i, view in enumerate(views) if i % split_every],
+        "test": views[::split_every],
+    }
+    if not splits["train"]:
+        got = f"{len(views)} pictures, each of which split_every={split_every} makes a test"
+        raise unexpected(root / CAMERA_FILE, "a picture to train on", got)
+    box = capture_box(root / CAMERA_FILE, record, aabb_scale)
+    return assemble(
+        root.name,
+        splits,
+        decode_splits(splits, downscale, log),
+        box,
+        background=background,
+        camera_files=[root / CAMERA_FILE],
+    )
+
+
+def read_views(root: Path, record: dict, log: Log) -> list[View]:
+    """The views of all frames whose picture is there."""
+    path = root / CAMERA_FILE
+    views, missing = [], []
+    for index, frame in enumerate(frames_of(record, path)):
+        where = f"{path}: frames[{index}]"
+        file = inside(root, frame["file_path"], f"{where}.file_path")
+        if not file.is_file():
+            missing.append(frame["file_path"])
+            continue
+        pose = opengl_to_opencv(
+            rigid_pose(frame.get("transform_matrix"), f"{where}.transform_matrix")
+        )
+        settings = ChainMap(frame, record)
+        camera = read_camera(settings, pose, file, where)
+        lens = tuple(number(settings.get(name, 0.0), f"{where}.{name}") for name in LENS)
+        refuse_other_lenses(settings, where)
+        views.append(View(str(file.relative_to(root)), file, camera, lens if any(lens) else ()))
+    if not views:
+        raise unexpected(f"{path}: frames", "pictures", f"none of {len(missing)} files is there")
+    if missing:
+        total = len(views) + len(missing)
+        log.info(
+            f"{path}: {len(missing)} of {total} pictures are not there, left out: "
+            + ", ".join(missing)
+        )
+    return views
+
+
+def read_camera(settings: Mapping, pose: torch.Tensor, file: Path, where: str) -> Camera:
+    """The pinhole of a frame; what is not said about its size the picture's header tells.
+
+    Focal lengths come from fl_x and fl_y or from camera_angle_x and camera_angle_y; the vertical
+    one is the horizontal when missing, and the principal point the middle.
+    """
+    size = dict(zip(("w", "h"), image_size(file), strict=True))
+    width, height = (number(settings.get(k, size[k]), f"{where}.{k}", 0) for k in ("w", "h"))
+    fx = focal(settings, "x", width, where)
+    if fx is None:
+        raise unexpected(f"{where}.fl_x", "a focal length, or camera_angle_x", "neither")
+    fy = focal(settings, "y", height, where) or fx
+    cx = number(settings.get("cx", width / 2), f"{where}.cx", 0, width)
+    cy = number(settings.get("cy", height / 2), f"{where}.cy", 0, height)
+    return Camera(pose.float(), fx, fy, cx, cy, int(width), int(height))
+
+
+def focal(settings: Mapping, axis: str, size: float, where: str) -> float | None:
+    """Focal length in pixels along an axis of `size` pixels; None when nothing is said."""
+    if f"fl_{axis}" in settings:
+        return number(settings[f"fl_{axis}"], f"{where}.fl_{axis}", 0)
+    if f"camera_angle_{axis}" in settings:
+        angle = number(settings[f"camera_angle_{axis}"], f"{where}.camera_angle_{axis}", 0, math.pi)
+        return size / 2 / math.tan(angle / 2)
+    return None
+
+
+def refuse_other_lenses(settings: Mapping, where: str) -> None:
+    """Raise when the lens needs more than OpenCV's k1 k2 p1 p2 k3.
+
+    nerfstudio and OpenCV mean different things by k4 and above: undoing one for the other would
+    bend every picture.
+    """
+    model = settings.get("camera_model", "OPENCV")
+    if model not in PINHOLE_MODELS:
+        raise unexpected(
+            f"{where}.camera_model", f"one of {', '.join(PINHOLE_MODELS)}", describe(model)
+        )
+    for name in OTHER_LENSES:
+        if settings.get(name):
+            raise unexpected(f"{where}.{name}", "a lens of k1 k2 p1 p2 k3", settings[name])
+
+
+def capture_box(path: Path, record: dict, aabb_scale: float | None) -> Box:
+    """The cube around instant-ngp's unit cube, `aabb_scale` times as large, in the file's units."""
+    scale = number(record.get("scale", NGP_SCALE), f"{path}: scale", 0)
+    offset = record.get("offset", list(NGP_OFFSET))
+    if not isinstance(offset, list) or len(offset) != 3:
+        raise unexpected(f"{path}: offset", "three numbers", describe(offset))
+    offset = [number(x, f"{path}: offset[{i}]") for i, x in enumerate(offset)]
+    if aabb_scale is None:
+        sides = number(record.get("aabb_scale", 1), f"{path}: aabb_scale", 0)
+    else:
+        sides = number(aabb_scale, "aabb_scale", 0)
+    middle = (0.5 - torch.tensor(offset, dtype=torch.float64)) / scale
+    half = sides / scale / 2
+    return Box(middle - half, middle + half)
