@@ -16,6 +16,9 @@ from bench.results import content_key, explained
 PLAIN_INTERVAL_S = 10.0
 """Between two lines of progress where there is no terminal to draw a bar on."""
 
+DRAW_INTERVAL_S = 0.2
+"""Between two drawings of a bar."""
+
 WORTH_A_LINE_S = 2.0
 """Work that took longer leaves a line behind when it is done."""
 
@@ -44,6 +47,7 @@ class ConsoleLog:
             progress.TextColumn("{task.fields[note]}", markup=False),
             console=self._console,
             transient=True,
+            auto_refresh=False,  # by a thread, which would run beside what is being measured
             get_time=clock,
             disable=quiet or not self._console.is_terminal,
         )
@@ -86,16 +90,17 @@ class _Bar:
     ) -> None:
         self._say, self._bars, self._label, self._clock = say, bars, label, clock
         self._id = bars.add_task(label, total=total, note="")
-        self._begun = self._said = clock()
+        self._begun = self._shown = clock()
 
     def advance(self, steps: int = 1, note: str = "") -> None:
         self._bars.update(self._id, advance=steps, note=note)
-        if self._bars.disable and self._clock() - self._said >= PLAIN_INTERVAL_S:
-            self._said = self._clock()
-            task = self._task()
-            left = _duration(task.time_remaining) if task.time_remaining is not None else "?"
-            done = f"{task.percentage:.0f} %, {_duration(self._elapsed())} elapsed, {left} left"
-            self._say(", ".join(filter(None, (f"{self._label}: {done}", note))))
+        plain = self._bars.disable
+        if self._clock() - self._shown >= (PLAIN_INTERVAL_S if plain else DRAW_INTERVAL_S):
+            self._shown = self._clock()
+            if plain:
+                self._say(self._line())
+            else:
+                self._bars.refresh()
 
     def report_done(self) -> None:
         """Leave a line behind, if the work was worth one."""
@@ -106,6 +111,13 @@ class _Bar:
     def remove(self) -> None:
         """Take the bar off the screen."""
         self._bars.remove_task(self._id)
+        self._bars.refresh()
+
+    def _line(self) -> str:
+        task = self._task()
+        left = "?" if task.time_remaining is None else _duration(task.time_remaining)
+        done = f"{task.percentage:.0f} %, {_duration(self._elapsed())} elapsed, {left} left"
+        return ", ".join(filter(None, (f"{self._label}: {done}", task.fields["note"])))
 
     def _elapsed(self) -> float:
         return self._clock() - self._begun

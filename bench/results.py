@@ -25,7 +25,6 @@ import pandas as pd
 from PIL import Image
 
 from bench.errors import SteerbenchError
-from bench.provenance import code_digest as code_digest
 from bench.provenance import commit, machine
 
 SCHEMA_VERSION = 1

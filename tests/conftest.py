@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import math
 import os
+import re
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import pytest
 import torch
 from torch import Tensor
 
 from bench.console import ConsoleLog
+from bench.lpips_weights import BACKBONES
+from bench.metrics import _lpips_package
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene, Split
+
+hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("repeatable")
 
 DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
 
@@ -35,7 +43,8 @@ def poisoned_empty() -> Iterator[None]:
 def _poisoning(allocate):
     def allocate_poisoned(*args, **kwargs):
         tensor = allocate(*args, **kwargs)
-        return tensor.fill_(math.nan) if tensor.is_floating_point() else tensor
+        with torch.no_grad():
+            return tensor.fill_(math.nan) if tensor.is_floating_point() else tensor
 
     return allocate_poisoned
 
@@ -133,3 +142,19 @@ def _on_white(image: Tensor) -> Tensor:
 def offset_method(device: str) -> OffsetMethod:
     """A method whose every figure is known: 8 levels brighter than the ground truth."""
     return OffsetMethod(device, 8 / 255)
+
+
+@pytest.fixture(scope="session")
+def lpips_weights(shared_data: Path | None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the backbones of LPIPS: the real ones where they are, else random ones."""
+    real = os.environ.get("STEERBENCH_WEIGHTS") or (shared_data and shared_data / "lpips")
+    if real and Path(real).is_dir():
+        return Path(real)
+    folder = tmp_path_factory.mktemp("weights")
+    with warnings.catch_warnings():  # torchvision deprecates how lpips calls it
+        warnings.simplefilter("ignore", UserWarning)
+        for net, backbone in BACKBONES.items():
+            state = _lpips_package().LPIPS(net=net, pnet_rand=True, verbose=False).net.state_dict()
+            names = {name: re.sub(r"^slice\d+", "features", name) for name in state}
+            torch.save({names[name]: state[name] for name in state}, folder / backbone.features)
+    return folder

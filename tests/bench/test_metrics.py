@@ -1,0 +1,212 @@
+"""Metrics against closed forms, plain re-computations and the identities they must obey."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from bench.metrics import LPIPS_SIDE, SSIM_SIDE, Lpips, psnr, quantise, ssim
+from bench.types import SteerbenchError, Unavailable
+
+UNIT = st.floats(0.0, 1.0)
+
+
+def noise(height: int, width: int, seed: int = 0, device: str = "cpu") -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(height, width, 3, generator=generator).to(device)
+
+
+def test_quantise_keeps_the_256_levels_and_clips_the_rest(device):
+    levels = torch.arange(256, device=device) / 255
+    assert torch.equal(quantise(levels), levels)
+    beyond = torch.tensor([-math.inf, -0.2, 1.2, math.inf], device=device)
+    assert quantise(beyond).tolist() == [0, 0, 1, 1]
+
+
+def test_quantise_rounds_halves_to_the_even_level():
+    halves = torch.tensor([0.5, 1.5, 2.5], dtype=torch.float64) / 255
+    assert (quantise(halves) * 255).round().tolist() == [0, 2, 2]
+
+
+@given(UNIT)
+def test_quantise_moves_a_value_by_at_most_half_a_level(value):
+    moved = quantise(torch.tensor(value, dtype=torch.float64)).item() - value
+    assert abs(moved) <= 0.5 / 255 + 1e-15
+
+
+@given(st.floats(1e-4, 1.0))
+def test_psnr_of_a_constant_offset_is_its_closed_form(offset):
+    reference = torch.zeros(5, 7, 3, dtype=torch.float64)
+    assert psnr(reference + offset, reference) == pytest.approx(-20 * math.log10(offset), abs=1e-9)
+
+
+def test_psnr_is_symmetric_and_infinite_for_equal_pictures(device):
+    a, b = noise(9, 8, 1, device), noise(9, 8, 2, device)
+    assert psnr(a, b) == psnr(b, a)
+    assert psnr(a, a) == math.inf
+
+
+def test_psnr_refuses_pictures_of_different_size():
+    with pytest.raises(ValueError, match=r"reference: expected shape \[4, 5, 3\], got \[5, 4, 3\]"):
+        psnr(noise(4, 5), noise(5, 4))
+
+
+def plain_ssim(a: Tensor, b: Tensor, weights: Tensor, correction: float) -> float:
+    """Wang et al. 2004, Eq. 13, summed window by window over the valid region."""
+    side = weights.shape[0]
+    windows = [
+        picture.double().unfold(0, side, 1).unfold(1, side, 1) for picture in (a, b)
+    ]  # [H', W', 3, side, side]
+
+    def mean(values: Tensor) -> Tensor:
+        return (values * weights).sum(dim=(-2, -1))
+
+    mean_a, mean_b = map(mean, windows)
+    var_a, var_b = (
+        correction * (mean(w * w) - m * m) for w, m in zip(windows, (mean_a, mean_b), strict=True)
+    )
+    covariance = correction * (mean(windows[0] * windows[1]) - mean_a * mean_b)
+    c1, c2 = 0.01**2, 0.03**2
+    luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
+    structure = (2 * covariance + c2) / (var_a + var_b + c2)
+    return (luminance * structure).mean().item()
+
+
+def test_gaussian_ssim_is_the_plain_computation_over_the_valid_region(device):
+    a = noise(19, 23, 3, device)
+    b = (0.7 * a + 0.3 * noise(19, 23, 4, device)).clamp(0, 1)
+    x = torch.arange(11, dtype=torch.float64, device=device) - 5
+    line = torch.exp(-(x**2) / (2 * 1.5**2))
+    weights = torch.outer(line, line) / line.sum() ** 2
+    # Two orders of summing 121 products in float64, divided by numbers no smaller than c2.
+    assert ssim(a, b) == pytest.approx(plain_ssim(a, b, weights, 1.0), abs=1e-10)
+
+
+def test_uniform_ssim_is_the_plain_computation_with_sample_covariance():
+    a = noise(16, 13, 5)
+    b = (0.7 * a + 0.3 * noise(16, 13, 6)).clamp(0, 1)
+    weights = torch.full((7, 7), 1 / 49, dtype=torch.float64)
+    assert ssim(a, b, "uniform") == pytest.approx(plain_ssim(a, b, weights, 49 / 48), abs=1e-10)
+
+
+@given(UNIT, UNIT)
+def test_ssim_of_constant_pictures_is_the_luminance_term(a, b):
+    pictures = [torch.full((11, 11, 3), value, dtype=torch.float64) for value in (a, b)]
+    c1 = 0.01**2
+    assert ssim(*pictures) == pytest.approx((2 * a * b + c1) / (a * a + b * b + c1), abs=1e-9)
+
+
+@pytest.mark.parametrize("window", ["gaussian", "uniform"])
+def test_ssim_of_a_picture_with_itself_is_one(window):
+    assert ssim(noise(12, 14), noise(12, 14), window) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_ssim_of_a_picture_smaller_than_its_window_says_so():
+    with pytest.raises(SteerbenchError, match="at least 11 x 11 pixels, got 30 x 10"):
+        ssim(noise(SSIM_SIDE - 1, 30), noise(SSIM_SIDE - 1, 30))
+
+
+# Layers of the two backbones as published (Krizhevsky 2014; Simonyan & Zisserman 2014, D):
+# index of the convolution in torchvision's `features`, stride, padding; "pool" before the next
+# one; True where LPIPS reads the activation.
+ALEX = [(0, 4, 2, True), "pool", (3, 1, 2, True), "pool", *((i, 1, 1, True) for i in (6, 8, 10))]
+VGG = [
+    *((0, 1, 1, False), (2, 1, 1, True), "pool"),
+    *((5, 1, 1, False), (7, 1, 1, True), "pool"),
+    *((10, 1, 1, False), (12, 1, 1, False), (14, 1, 1, True), "pool"),
+    *((17, 1, 1, False), (19, 1, 1, False), (21, 1, 1, True), "pool"),
+    *((24, 1, 1, False), (26, 1, 1, False), (28, 1, 1, True)),
+]
+SHAPES = {
+    "alex": {
+        0: (64, 3, 11),
+        3: (192, 64, 5),
+        6: (384, 192, 3),
+        8: (256, 384, 3),
+        10: (256, 256, 3),
+    },
+    "vgg": {
+        0: (64, 3, 3),
+        7: (128, 128, 3),
+        14: (256, 256, 3),
+        21: (512, 512, 3),
+        28: (512, 512, 3),
+    },
+}
+
+
+def plain_lpips(net: str, features: dict, heads: dict, a: Tensor, b: Tensor) -> float:
+    """Zhang et al. 2018, Eq. 1, layer by layer from the weights."""
+    shift = torch.tensor([-0.030, -0.088, -0.188]).view(3, 1, 1)
+    scale = torch.tensor([0.458, 0.448, 0.450]).view(3, 1, 1)
+    x = (2 * torch.stack((a, b)).permute(0, 3, 1, 2) - 1 - shift) / scale
+    distance, read = 0.0, 0
+    for layer in ALEX if net == "alex" else VGG:
+        if layer == "pool":
+            x = F.max_pool2d(x, 3 if net == "alex" else 2, 2)
+            continue
+        index, stride, padding, is_read = layer
+        weight, bias = features[f"features.{index}.weight"], features[f"features.{index}.bias"]
+        x = F.relu(F.conv2d(x, weight, bias, stride, padding))
+        if is_read:
+            unit = x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-10)
+            head = heads[f"lin{read}.model.1.weight"].view(-1, 1, 1)
+            distance += (head * (unit[0] - unit[1]).square()).sum(dim=0).mean().item()
+            read += 1
+    assert read == 5
+    return distance
+
+
+@pytest.mark.parametrize(("net", "file"), [("alex", "alexnet"), ("vgg", "vgg16")])
+def test_lpips_is_the_published_formula_on_the_named_backbone(
+    net, file, lpips_weights, quiet_log, device
+):
+    features = torch.load(lpips_weights / f"{file}_features.pth", weights_only=True)
+    for index, (out, into, side) in SHAPES[net].items():
+        assert features[f"features.{index}.weight"].shape == (out, into, side, side)
+    package = Path(importlib.util.find_spec("lpips").origin).parent
+    heads = torch.load(package / "weights" / "v0.1" / f"{net}.pth", "cpu", weights_only=True)
+    a = noise(50, 44, 7)
+    b = (a + 0.2 * (noise(50, 44, 8) - 0.5)).clamp(0, 1)
+    measured = Lpips(net, lpips_weights, quiet_log)(a.to(device), b.to(device))
+    # float32 convolutions of up to 4,608 products a position: relative error below 1e-4.
+    assert measured == pytest.approx(plain_lpips(net, features, heads, a, b), rel=1e-3)
+
+
+@pytest.mark.parametrize("net", ["alex", "vgg", "squeeze"])
+def test_lpips_is_zero_for_equal_pictures_down_to_the_smallest_size(net, lpips_weights, quiet_log):
+    lpips, side = Lpips(net, lpips_weights, quiet_log), LPIPS_SIDE[net]
+    assert lpips(noise(side, side), noise(side, side)) == 0.0
+    assert lpips(noise(side, side, 1), noise(side, side, 2)) > 0.0
+    with pytest.raises(SteerbenchError, match=f"LPIPS \\({net}\\) needs .* at least {side} x"):
+        lpips(noise(side - 1, side), noise(side - 1, side))
+
+
+def test_lpips_is_symmetric(lpips_weights, quiet_log):
+    lpips = Lpips("alex", lpips_weights, quiet_log)
+    a, b = noise(40, 40, 1), noise(40, 40, 2)
+    assert lpips(a, b) == pytest.approx(lpips(b, a), rel=1e-6)
+
+
+def test_lpips_refuses_the_weights_of_another_network(lpips_weights, quiet_log, tmp_path):
+    path = tmp_path / "vgg16_features.pth"
+    path.write_bytes((lpips_weights / "alexnet_features.pth").read_bytes())
+    with pytest.raises(Unavailable, match=r"vgg16_features.pth: expected the `features"):
+        Lpips("vgg", tmp_path, quiet_log)
+
+
+def test_scores_do_not_depend_on_the_strides_of_the_picture(lpips_weights, quiet_log):
+    a, b = noise(40, 36, 1), noise(40, 36, 2)
+    strided = a.permute(1, 0, 2).contiguous().permute(1, 0, 2)
+    lpips = Lpips("alex", lpips_weights, quiet_log)
+    for metric in (psnr, ssim, lpips):
+        assert np.isclose(metric(strided, b), metric(a, b), rtol=1e-9, atol=0)

@@ -1,0 +1,171 @@
+"""The clock charges every nanosecond once; the meter sees what a region allocates."""
+
+from __future__ import annotations
+
+import itertools
+import mmap
+from collections.abc import Iterable
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bench import probes
+from bench.probes import MemoryMeter, StageClock
+
+
+def clock_reading(times: Iterable[int]) -> StageClock:
+    """A clock that reads the given times, one at every beginning and end."""
+    readings = iter(times)
+    return StageClock("cpu", clock=lambda: next(readings))
+
+
+def test_own_times_of_nested_and_repeated_stages_are_told_apart():
+    clock = clock_reading([100, 101, 103, 107, 115, 131, 163, 227])
+    with clock.frame():  # 100
+        with clock.stage("field"), clock.stage("encode"):  # 101, 103; 107, 115
+            pass
+        with clock.stage("field"):  # 131 to 163
+            pass
+    # 227
+    (frame,) = clock.frames
+    assert frame.stages_ns == {
+        "field": (103 - 101) + (115 - 107) + (163 - 131),
+        "field/encode": 107 - 103,
+        "other": (101 - 100) + (131 - 115) + (227 - 163),
+    }
+    assert frame.total_ns == 227 - 100
+
+
+STAGES = st.recursive(
+    st.just(()), lambda inner: st.lists(st.tuples(st.sampled_from("abc"), inner), max_size=4)
+)
+
+
+@given(STAGES, st.lists(st.integers(0, 10**9), min_size=1))
+def test_stages_and_other_add_up_to_the_frame_whatever_the_nesting(tree, steps):
+    readings = []
+
+    def read() -> int:
+        readings.append((readings[-1] if readings else 0) + steps[len(readings) % len(steps)])
+        return readings[-1]
+
+    clock = StageClock("cpu", clock=read)
+
+    def enter(stages) -> None:
+        for name, inner in stages:
+            with clock.stage(name):
+                enter(inner)
+
+    with clock.frame():
+        enter(tree)
+    (frame,) = clock.frames
+    assert frame.total_ns == readings[-1] - readings[0]
+    assert all(ns >= 0 for ns in frame.stages_ns.values())
+
+
+def test_counters_add_up_within_a_frame_and_begin_anew_in_the_next():
+    clock = clock_reading(itertools.count())
+    with clock.frame():
+        clock.count("samples", 3, dense=10)
+        clock.count("samples", 4, dense=10)
+        clock.count("rays", 5)
+    with clock.frame():
+        clock.count("rays", 1)
+    assert clock.frames[0].done == {"samples": 7, "rays": 5}
+    assert clock.frames[0].dense == {"samples": 20}
+    assert clock.frames[1].done == {"rays": 1}
+    assert clock.frames[1].dense == {}
+
+
+def test_a_frame_that_raises_leaves_no_record_and_the_clock_usable():
+    clock = clock_reading(itertools.count())
+    with pytest.raises(KeyError), clock.frame(), clock.stage("field"):
+        raise KeyError("from the method")
+    with clock.frame():
+        pass
+    (frame,) = clock.frames
+    assert frame.stages_ns == {"other": 1}
+
+
+def test_a_stage_outside_a_frame_a_frame_in_a_frame_and_a_stage_named_other_are_refused():
+    clock = clock_reading(itertools.count())
+    with (
+        pytest.raises(RuntimeError, match="'field' was entered outside a frame"),
+        clock.stage("field"),
+    ):
+        pass
+    with clock.frame():
+        with pytest.raises(RuntimeError, match="inside a frame"), clock.frame():
+            pass
+        with pytest.raises(ValueError, match="'other'"), clock.stage("other"):
+            pass
+
+
+def test_the_device_finishes_its_work_before_every_reading(monkeypatch):
+    events = []
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda device: events.append("synchronise"))
+
+    def read() -> int:
+        events.append("read")
+        return len(events)
+
+    clock = StageClock("cuda", clock=read)
+    with clock.frame(), clock.stage("field"):
+        pass
+    assert events == ["synchronise", "read"] * 4
+
+
+def test_the_real_clock_measures_on_the_device(device):
+    clock = StageClock(device)
+    with clock.frame(), clock.stage("product"):
+        torch.ones(64, 64, device=device) @ torch.ones(64, 64, device=device)
+    assert clock.frames[0].stages_ns["product"] > 0
+
+
+SIZE = 64 << 20
+SLACK = 8 << 20  # the kernel adds up resident pages in batches for every core
+
+
+def touch(size: int) -> None:
+    """Write to `size` bytes fresh from the system: an allocator may have some left to give."""
+    with mmap.mmap(-1, size) as region:
+        for page in range(0, size, mmap.PAGESIZE):
+            region[page] = 1
+
+
+def test_the_peak_of_a_process_grows_by_what_a_region_touches():
+    idle, busy = MemoryMeter("cpu"), MemoryMeter("cpu")
+    with idle:
+        pass
+    with busy:
+        touch(SIZE)
+    assert busy.peak_bytes >= idle.peak_bytes + SIZE - SLACK
+
+
+def test_the_highest_of_several_regions_is_kept():
+    meter = MemoryMeter("cpu")
+    with meter:
+        touch(SIZE)
+    first = meter.peak_bytes
+    with meter:
+        pass
+    assert meter.peak_bytes == first
+
+
+def test_the_source_says_when_the_peak_includes_what_came_before(monkeypatch):
+    assert "while rendering" in MemoryMeter("cpu").source
+    monkeypatch.setattr(probes, "_reset_high_water_mark", lambda: False)
+    assert "since it began" in MemoryMeter("cpu").source
+
+
+def test_on_a_gpu_the_meter_reads_the_allocator(monkeypatch):
+    calls = []
+    monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda device: calls.append("reset"))
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: 12345)
+    meter = MemoryMeter("cuda")
+    with meter:
+        assert calls == ["reset"]
+    assert meter.peak_bytes == 12345
+    assert "device" in meter.source

@@ -1,0 +1,97 @@
+"""A protocol is what its name says, and scores as it says."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import hydra
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from bench.metrics import psnr, quantise
+from bench.protocol import EvaluationProtocol, composite
+from bench.types import SteerbenchError
+
+CONFIGS = Path(__file__).parents[2] / "sweeps" / "configs" / "protocol"
+WHITE = torch.ones(3)
+QUICK = EvaluationProtocol(name="quick", lpips=())
+
+
+def test_the_configuration_of_steerbench_1_is_the_default():
+    config = OmegaConf.load(CONFIGS / "steerbench-1.yaml")
+    assert hydra.utils.instantiate(config) == EvaluationProtocol()
+
+
+def test_a_changed_protocol_may_not_keep_the_name():
+    with pytest.raises(SteerbenchError, match=r"protocol\.ssim differs from what steerbench-1"):
+        EvaluationProtocol(ssim="uniform")
+    assert EvaluationProtocol(name="nsvf", ssim="uniform").ssim == "uniform"
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("rounding", "floor"), ("ssim", "ms"), ("background", "grey"), ("memory", "warm")],
+)
+def test_an_unknown_choice_names_the_option_and_what_is_allowed(option, value):
+    with pytest.raises(SteerbenchError, match=f"protocol.{option}: expected .* got '{value}'"):
+        EvaluationProtocol(**{"name": "mine", option: value})
+
+
+def test_a_negative_warmup_is_refused():
+    with pytest.raises(SteerbenchError, match=r"protocol\.warmup"):
+        EvaluationProtocol(name="mine", warmup=-1)
+
+
+def test_a_picture_is_composited_with_its_straight_alpha(device):
+    picture = torch.tensor([[[255, 0, 51, 0], [255, 0, 51, 255], [255, 0, 51, 102]]]).byte()
+    background = torch.tensor([1.0, 0.5, 0.0], device=device)
+    expected = [[1.0, 0.5, 0.0], [1.0, 0.0, 0.2], [1.0, 0.3, 0.08]]
+    got = composite(picture.to(device), background)[0].cpu()
+    torch.testing.assert_close(got, torch.tensor(expected), atol=1e-7, rtol=0)
+    rgb = composite(picture[..., :3].to(device), background)[0].cpu()
+    torch.testing.assert_close(rgb, torch.tensor([[1.0, 0.0, 0.2]] * 3), atol=1e-7, rtol=0)
+
+
+def test_the_prediction_is_clipped_and_rounded_and_the_ground_truth_is_not(device):
+    reference = torch.randint(256, (16, 16, 4), dtype=torch.uint8)
+    truth = composite(reference, WHITE)
+    prediction = truth + 0.3 * torch.randn(16, 16, 3)
+    scores = QUICK.score(prediction.to(device), reference, WHITE, {})
+    assert scores["psnr"] == pytest.approx(psnr(quantise(prediction), truth), rel=1e-9)
+    raw = replace(QUICK, rounding="none").score(prediction.to(device), reference, WHITE, {})
+    assert raw["psnr"] == pytest.approx(psnr(prediction, truth), rel=1e-9)
+    assert raw["psnr"] != scores["psnr"]
+
+
+def test_every_metric_is_scored_and_a_missing_backbone_is_nan():
+    protocol = EvaluationProtocol()
+    picture = torch.zeros(12, 12, 3, dtype=torch.uint8)
+    halves = {"vgg": lambda image, reference: 0.5}
+    scores = protocol.score(torch.zeros(12, 12, 3), picture, WHITE, halves)
+    assert tuple(scores) == protocol.metric_names == ("psnr", "ssim", "lpips_alex", "lpips_vgg")
+    assert math.isnan(scores["lpips_alex"])
+    assert scores["lpips_vgg"] == 0.5
+
+
+def test_backbones_that_cannot_be_had_are_named_with_the_reason(
+    monkeypatch, tmp_path, quiet_log, lpips_weights
+):
+    monkeypatch.setattr("bench.lpips_weights._unreachable", ["no network"])
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.delenv("STEERBENCH_WEIGHTS", raising=False)
+    (tmp_path / "alexnet_features.pth").symlink_to(lpips_weights / "alexnet_features.pth")
+    protocol = EvaluationProtocol()
+    assert protocol.find_lpips(tmp_path, quiet_log) == {"alex": True, "vgg": False}
+    loaded, missing = protocol.load_lpips(tmp_path, quiet_log)
+    assert list(loaded) == ["alex"]
+    assert list(missing) == ["lpips_vgg"]
+    assert "no network" in missing["lpips_vgg"]
+
+
+def test_a_scene_on_another_background_is_refused(tiny_scene):
+    QUICK.check_scene(tiny_scene)
+    with pytest.raises(SteerbenchError, match=r"scores on white, but scene tiny .* \[0, 0, 0\]"):
+        QUICK.check_scene(replace(tiny_scene, background=torch.zeros(3)))
