@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bench.types import Probe, Rays
+from bench.cameras import cast, pixel_grid, project
+from bench.types import Camera, Probe, Rays
 from methods.fields import HashField
 from methods.kernels.composite import STOP, Pixels, composite
 from methods.kernels.march import Occupancy, march
@@ -18,6 +19,25 @@ CHUNK_RAYS = 1 << 14
 
 ROUND_SAMPLES = (4, 8, 16, 32)
 """Samples a ray may take in a round; the last number repeats."""
+
+
+def rays_at_matter(camera: Camera, occupancy: Occupancy) -> tuple[Tensor, Rays]:
+    """The pixels that may see an occupied cell, as indices [P] row by row, and their rays.
+
+    They are the pixels in the box around the projected corners of the occupied box; all of them
+    when one of its corners is not in front of the camera.
+    """
+    device = camera.c2w.device
+    corners = torch.cartesian_prod(*occupancy.bounds.to(device).T)
+    corner_pixels, depth = project(camera, corners)
+    size = torch.tensor((camera.width, camera.height), device=device)
+    low, high = torch.zeros_like(size), size
+    if (depth > 0).all():
+        low = torch.minimum(corner_pixels.amin(dim=0).floor().clamp(min=0), size).long()
+        high = torch.minimum(corner_pixels.amax(dim=0).ceil().clamp(min=0), size).long()
+    grid = pixel_grid(*(high - low).tolist(), device=device) + low
+    column, row = grid.long().unbind(dim=-1)
+    return row * camera.width + column, cast(camera, grid)
 
 
 def render_batch(
