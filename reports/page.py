@@ -25,7 +25,7 @@ def write_page(store: Store, runs: Sequence[str], folder: Path) -> Path:
         SteerbenchError: a run is not in the store, or `folder` cannot be written to.
     """
     records: dict[str, Any] = {run: store.record(run) for run in runs}
-    rows = store.rows()
+    rows = store.rows(report=lambda unreadable: None)  # others, which are not asked for
     rows = rows[rows["run"].isin(runs)]
     pictures = folder / "pictures"
     with explained(folder):
@@ -96,7 +96,7 @@ def _pictures(frames: pd.DataFrame, shown: Mapping[int, str]) -> tables.Table:
     by_frame = frames.set_index("frame")
     lines = tuple(
         (
-            f"{by_frame.loc[frame, 'name']}, {by_frame.loc[frame, 'psnr']:.2f} dB",
+            f"{by_frame.at[frame, 'name']!s}, {by_frame.loc[frame, 'psnr']:.2f} dB",
             *(f"![{caption}](pictures/{stem}-{panel}.png)" for panel, caption in PANELS.items()),
         )
         for frame, stem in shown.items()

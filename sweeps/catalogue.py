@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
 from importlib import metadata
 
@@ -17,7 +18,7 @@ EXTRAS = {"openvino": "openvino", "onnxruntime": "onnx", "tensorrt": "tensorrt"}
 """Engines that run the networks of a method beside torch, and the extra that installs each."""
 
 
-def main() -> int:
+def main(options: argparse.Namespace) -> int:
     """Print the choices of `steerbench run`, then the backends of the kernels and the engines."""
     from methods.kernels import availability
 

@@ -1,13 +1,15 @@
 """The command `steerbench`: what can be asked for, and how errors and signals end it.
 
-Exit statuses: 0 done, 1 a measured kernel is wrong (or a bug, with its traceback), 2 an error
-the user can act on, 130 interrupted, 141 the reader of a pipe went away, 143 terminated.
+Exit statuses: 0 done, 1 a check failed (a kernel is wrong, a file differs) or a bug (with its
+traceback), 2 an error the user can act on, 130 interrupted, 141 the reader of a pipe went away,
+143 terminated.
 """
 
 from __future__ import annotations
 
 import argparse
 import errno
+import importlib
 import os
 import re
 import signal
@@ -28,17 +30,16 @@ examples
   steerbench results --format csv              every number measured so far
 """
 
+COMMANDS = ("run", "list", "results", "kernels", "scenes")
+
 # What the disk refuses: worth a plain sentence, not a traceback.
 REFUSALS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR}
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that names the nearest option when one does not exist."""
+    """An argument parser whose errors end the program as all others do."""
 
     def error(self, message: str) -> NoReturn:
-        wrong = re.match(r"unrecognized arguments: (--?[\w-]+)", message)
-        if wrong:
-            raise unknown("option", wrong[1], re.findall(r"--?[a-z][\w-]*", self.format_usage()))
         raise SteerbenchError(f"{message}\n{self.format_usage().rstrip()}")
 
 
@@ -75,14 +76,16 @@ def dispatch(argv: Sequence[str]) -> int:
 
         return run.main(argv[1:] if argv[0] == "run" else argv)
     parser = _parser()
-    commands = ["run", "list", "results", "kernels", "scenes"]
-    if argv and not argv[0].startswith("-") and argv[0] not in commands:
-        raise unknown("command", argv[0], commands)
-    options = parser.parse_args(argv)
-    if options.command is None:
+    if argv and not argv[0].startswith("-") and argv[0] not in COMMANDS:
+        raise unknown("command", argv[0], COMMANDS)
+    options, unread = parser.parse_known_args(argv)
+    if unread:
+        known = re.findall(r"--[\w-]+", options.parser.format_help())
+        raise unknown("argument", unread[0], set(known))
+    if options.module is None:
         parser.print_help()
         return 0
-    return options.command(options)
+    return importlib.import_module(f"sweeps.{options.module}").main(options)
 
 
 def _parser() -> Parser:
@@ -92,56 +95,31 @@ def _parser() -> Parser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.set_defaults(command=None)
+    parser.set_defaults(module=None, parser=parser)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     commands.add_parser("run", help="train, render, measure; print and store the table")
 
     listing = commands.add_parser("list", help="methods, scenes, backends, engines")
-    listing.set_defaults(command=_list)
+    listing.set_defaults(module="catalogue", parser=listing)
 
     results = commands.add_parser("results", help="print all that was measured")
     results.add_argument("--outputs", type=Path, default=Path("outputs"), metavar="DIR")
     results.add_argument("--format", choices=["table", "csv", "json"], default="table")
     for column in ("method", "scene", "metric"):
         results.add_argument(f"--{column}", help=f"only rows of this {column}")
-    results.set_defaults(command=_results)
+    results.set_defaults(module="results", parser=results)
 
     kernels = commands.add_parser("kernels", help="throughput and error of every kernel")
     kernels.add_argument("--filter", default="", help="only kernels whose name contains this")
     kernels.add_argument("--repeats", type=int, default=5, help="timed calls of each (default 5)")
-    kernels.set_defaults(command=_kernels)
+    kernels.set_defaults(module="kernels", parser=kernels)
 
     scenes = commands.add_parser("scenes", help="look after copies of data sets")
     actions = scenes.add_subparsers(title="actions", metavar="ACTION", required=True)
     verify = actions.add_parser("verify", help="compare with the official checksums")
     verify.add_argument("path", type=Path, help="folder of one scene or of all of NeRF-Synthetic")
-    verify.set_defaults(command=_verify)
+    verify.set_defaults(module="verify", parser=verify)
     return parser
-
-
-def _list(options: argparse.Namespace) -> int:
-    from sweeps import catalogue
-
-    return catalogue.main()
-
-
-def _results(options: argparse.Namespace) -> int:
-    from sweeps import results
-
-    chosen = {name: getattr(options, name) for name in ("method", "scene", "metric")}
-    return results.main(options.outputs, options.format, chosen)
-
-
-def _kernels(options: argparse.Namespace) -> int:
-    from sweeps import kernels
-
-    return kernels.main(options.filter, options.repeats)
-
-
-def _verify(options: argparse.Namespace) -> int:
-    from sweeps import verify
-
-    return verify.main(options.path)
 
 
 def _terminate(signum: int, frame: object) -> NoReturn:

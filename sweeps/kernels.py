@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 from collections.abc import Mapping
 from typing import Any
@@ -14,15 +15,15 @@ COLUMNS = ("kernel", "case", "backend", "dtype", "error", "tolerance", "ms", "M 
 """`ratio`: time of the reference backend over that of this one, same case, same run."""
 
 
-def main(chosen: str, repeats: int) -> int:
+def main(options: argparse.Namespace) -> int:
     """Print a table and, as the last line, the same rows as JSON; 1 if any kernel is wrong."""
+    if options.repeats < 1:
+        raise SteerbenchError(f"--repeats: expected 1 or more, got {options.repeats}")
     from methods.kernels.benchmark import main_rows
 
-    if repeats < 1:
-        raise SteerbenchError(f"--repeats: expected 1 or more, got {repeats}")
-    rows = main_rows(chosen, repeats)
+    rows = main_rows(options.filter, options.repeats)
     if not rows:
-        raise SteerbenchError(f"--filter: no kernel has {chosen!r} in its name")
+        raise SteerbenchError(f"--filter: no kernel has {options.filter!r} in its name")
     console().print(rich_table(Table("Kernels", COLUMNS, tuple(_line(row) for row in rows))))
     print(json.dumps(rows))
     return int(any(row["status"] != "ok" for row in rows))

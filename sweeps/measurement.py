@@ -121,9 +121,12 @@ def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any
 
 def _show(store: Store, run: str, explain: bool) -> None:
     """Print the tables of one run and, unless the log just said so, why a figure is missing."""
-    rows = store.rows()
+    rows = store.rows(report=lambda unreadable: None)  # `steerbench results` tells of those
+    rows = rows[rows["run"] == run]
+    what = rows.iloc[0][["method", "scene", "trajectory", "resolution", "budget", "protocol"]]
     out = console()
-    out.print(Columns([rich_table(table) for table in blocks(rows[rows["run"] == run])]))
+    out.print(f"{', '.join(what)}, seed {rows.iloc[0]['seed']}: run {run}", style="bold")
+    out.print(Columns([rich_table(table) for table in blocks(rows)]))
     missing: Any = store.record(run)["missing"] if explain else {}
     for metric, reason in missing.items():
         out.print(f"{metric}: n/a. {reason}", markup=False, soft_wrap=True)

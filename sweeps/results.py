@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+import argparse
+import math
 import sys
-from collections.abc import Mapping
-from pathlib import Path
 
 import pandas as pd
 
 from bench.errors import SteerbenchError
 from bench.results import Store
-from reports.tables import Table
+from reports.tables import NOT_AVAILABLE, Table
 from sweeps.names import unknown
 from sweeps.terminal import console, rich_table
 
-PEOPLE = (
+SHOWN = (
     "run",
     "method",
     "scene",
@@ -29,42 +29,40 @@ PEOPLE = (
 )
 """The columns shown as a table; csv and json have all of them."""
 
+FILTERS = ("method", "scene", "metric")
 
-def main(outputs: Path, form: str, chosen: Mapping[str, str | None]) -> int:
-    """Print the rows below `outputs` as "table", "csv" or "json".
 
-    Args:
-        outputs: where runs are kept.
-        form: one of the three.
-        chosen: by column, the value that is wanted; None: all.
+def main(options: argparse.Namespace) -> int:
+    """Print the rows below `options.outputs` as a table, csv or json, all or those asked for.
 
     Raises:
-        SteerbenchError: nothing was measured, or nothing of what is wanted.
+        SteerbenchError: nothing was measured, or nothing of what is asked for.
     """
-    rows = Store(outputs).rows(report=lambda message: print(message, file=sys.stderr))
+    rows = Store(options.outputs).rows(report=lambda message: print(message, file=sys.stderr))
     if rows.empty:
-        raise SteerbenchError(f"{outputs}: no runs yet; `steerbench run` makes one")
-    for column, value in chosen.items():
-        if value is not None:
-            if value not in set(rows[column]):
-                raise unknown(column, value, set(rows[column]))
-            rows = rows[rows[column] == value]
-    if form == "csv":
+        raise SteerbenchError(f"{options.outputs}: no runs yet; `steerbench run` makes one")
+    for column in FILTERS:
+        wanted = getattr(options, column)
+        if wanted is not None:
+            if wanted not in set(rows[column]):
+                raise unknown(column, wanted, set(rows[column]))
+            rows = rows[rows[column] == wanted]
+    if options.format == "csv":
         rows.to_csv(sys.stdout, index=False)
-    elif form == "json":
-        rows.to_json(sys.stdout, orient="records", indent=1)
+    elif options.format == "json":
+        rows.to_json(sys.stdout, orient="records", indent=1, double_precision=15)
         print()
     else:
-        console().print(rich_table(Table(str(outputs), PEOPLE, _lines(rows))))
+        console().print(rich_table(Table(str(options.outputs), SHOWN, _lines(rows))))
     return 0
 
 
 def _lines(rows: pd.DataFrame) -> tuple[tuple[str, ...], ...]:
-    shown = rows.assign(run=rows["run"].str[:8])[list(PEOPLE)]
-    return tuple(
-        tuple(
-            "n/a" if pd.isna(cell) else f"{cell:.6g}" if isinstance(cell, float) else str(cell)
-            for cell in line
-        )
-        for line in shown.itertuples(index=False)
-    )
+    shown = rows.assign(run=rows["run"].str[:8])[list(SHOWN)]
+    return tuple(tuple(map(_text, line)) for line in shown.itertuples(index=False))
+
+
+def _text(cell: object) -> str:
+    if isinstance(cell, float):
+        return NOT_AVAILABLE if math.isnan(cell) else f"{cell:.6g}"
+    return str(cell)

@@ -14,9 +14,15 @@ PIPE_WIDTH = 200
 """Columns of text where there is no terminal to ask: wide enough for every table."""
 
 
+class _Output(Console):
+    def on_broken_pipe(self) -> None:
+        """Leave it to the command line to end the program; rich would exit by itself."""
+        raise BrokenPipeError
+
+
 def console() -> Console:
     """Standard output; tables are not cut to 80 columns when it is a file or a pipe."""
-    return Console(width=None if sys.stdout.isatty() else PIPE_WIDTH, highlight=False)
+    return _Output(width=None if sys.stdout.isatty() else PIPE_WIDTH, highlight=False)
 
 
 def rich_table(table: Table) -> RichTable:

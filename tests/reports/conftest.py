@@ -1,0 +1,73 @@
+"""Rows and a stored run whose figures are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from bench.protocol import EvaluationProtocol
+from bench.results import COLUMNS, Store
+from bench.run import measure
+from bench.trajectories import from_split
+from bench.types import Budget
+
+FIGURES = {
+    "psnr": (30.456, 29.5, 31.5),
+    "ssim": (0.98765, 0.98, 0.99),
+    "lpips_alex": (float("nan"),) * 3,
+    "frame_ms": (200.0, 190.0, 210.0),
+    "frame_ms.p50": (199.0, float("nan"), float("nan")),
+    "frame_ms.p95": (220.0, float("nan"), float("nan")),
+    "frame_ms.p99": (230.0, float("nan"), float("nan")),
+    "fps": (5.0, 4.76, 5.26),
+    "stage_ms.field": (150.0, 140.0, 160.0),
+    "stage_ms.other": (50.0, 45.0, 55.0),
+    "size_bytes.table": (25_000_000.0, float("nan"), float("nan")),
+    "size_bytes.total": (25_200_000.0, float("nan"), float("nan")),
+    "peak_bytes": (1e9, float("nan"), float("nan")),
+    "train_s": (61.0, float("nan"), float("nan")),
+}
+
+
+@pytest.fixture
+def rows() -> pd.DataFrame:
+    """The rows of one run."""
+    lines = [
+        {"metric": metric, "value": value, "lo": low, "hi": high}
+        for metric, (value, low, high) in FIGURES.items()
+    ]
+    table = pd.DataFrame(lines).assign(
+        run="0123456789abcdef", method="ngp", scene="totem", resolution="64x48", n=7
+    )
+    return table.reindex(columns=COLUMNS)
+
+
+@pytest.fixture
+def store(tmp_path: Path, offset_method, tiny_scene, quiet_log) -> Store:
+    """A store with one run, key `stored_run`, six frames, three of them pictured."""
+    measurement = measure(
+        offset_method,
+        tiny_scene,
+        from_split(tiny_scene),
+        EvaluationProtocol(name="quick", lpips=()),
+        Budget("none", steps=0, samples=1),
+        quiet_log,
+        seed=5,
+    )
+    record = {
+        **measurement.record,
+        "command": "steerbench run method=offset",
+        "missing": {"lpips_alex": "no weights were found"},
+    }
+    store = Store(tmp_path)
+    store.save({"what": "offset"}, replace(measurement, record=record))
+    return store
+
+
+@pytest.fixture
+def stored_run(store: Store) -> str:
+    """The key of the run in `store`."""
+    return store.rows()["run"].iloc[0]

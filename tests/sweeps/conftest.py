@@ -1,0 +1,70 @@
+"""`steerbench` as a person would call it, in a directory of its own, with quick stand-ins."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from sweeps import cli
+
+HERE = Path(__file__).parent
+QUICK = ["method=grey", "scene=white", "budget=none", "protocol=quick"]
+STAND_INS = ["--config-dir", str(HERE / "configs"), *QUICK]
+
+
+class Outcome(NamedTuple):
+    """What a call of `steerbench` left behind."""
+
+    status: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def steerbench(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> Callable[..., Outcome]:
+    """Call the command line within this process; the working directory is `tmp_path`."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(HERE)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # which `run` sets: restored after the test
+    monkeypatch.setattr(sys, "argv", ["steerbench"])
+
+    def call(*argv: str) -> Outcome:
+        try:
+            status = cli.guard(cli.dispatch, list(argv))
+        except SystemExit as ended:  # argparse and Hydra leave this way after --help
+            status = int(ended.code or 0)
+        return Outcome(status, *capfd.readouterr())
+
+    return call
+
+
+@pytest.fixture
+def run(steerbench: Callable[..., Outcome]) -> Callable[..., Outcome]:
+    """Call `steerbench run` with the stand-ins and further arguments."""
+    return lambda *argv: steerbench("run", *STAND_INS, *argv)
+
+
+@pytest.fixture
+def spawn(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
+    """Start `steerbench run` with the stand-ins as a process of its own in `tmp_path`."""
+
+    def start(*argv: str) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [Path(sys.executable).with_name("steerbench"), "run", *STAND_INS, *argv],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(HERE), "OMP_NUM_THREADS": "1"},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    return start

@@ -1,0 +1,113 @@
+"""The door: help, lists, results, and how the wrong word is answered."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from bench.results import COLUMNS
+
+
+def test_without_a_command_the_help_shows_every_command_and_examples(steerbench):
+    outcome = steerbench()
+    assert outcome.status == 0
+    for word in ("run", "list", "results", "kernels", "scenes", "+experiment=demo"):
+        assert word in outcome.out
+
+
+def test_help_of_run_lists_choices_settings_and_examples(run):
+    outcome = run("--help")
+    assert outcome.status == 0
+    for text in ("steerbench run -m seed=0,1,2", "method: grey", "totem", "seed: 0", "-sc install"):
+        assert text in outcome.out
+
+
+def test_list_shows_every_choice_with_what_it_is(steerbench):
+    out = steerbench("list").out
+    assert "scene=blender" in out
+    assert "NeRF-Synthetic" in out
+    assert "+experiment=demo" in out
+    for name in ("reference", "cpu", "gpu", "torch", "openvino", "onnxruntime", "tensorrt"):
+        assert name in out
+
+
+def test_list_says_how_to_get_an_engine_that_is_not_installed(steerbench, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert 'pip install -c constraints.txt -e ".[onnx]"' in steerbench("list").out
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["resuts"], "unknown command 'resuts'. Did you mean results?"),
+        (["results", "--fromat", "csv"], "unknown argument '--fromat'. Did you mean --format?"),
+        (["results", "--format", "cvs"], "invalid choice: 'cvs'"),
+        (["kernels", "--repeats", "0"], "--repeats: expected 1 or more, got 0"),
+        (["scenes", "verfy", "x"], "invalid choice: 'verfy'"),
+    ],
+)
+def test_a_wrong_word_is_answered_with_what_there_is(steerbench, argv, message):
+    outcome = steerbench(*argv)
+    assert outcome.status == 2
+    assert message in outcome.err
+
+
+def test_results_before_any_run_say_so(steerbench):
+    outcome = steerbench("results")
+    assert outcome.status == 2
+    assert "no runs yet" in outcome.err
+
+
+def test_results_are_the_same_in_every_format(steerbench, run):
+    run("seed=4")
+    csv = pd.read_csv(io.StringIO(steerbench("results", "--format", "csv").out))
+    loaded = pd.DataFrame(json.loads(steerbench("results", "--format", "json").out))
+    table = steerbench("results").out
+    assert list(csv.columns) == list(loaded.columns) == COLUMNS
+    pd.testing.assert_frame_equal(csv, loaded, check_dtype=False, rtol=1e-14)
+    for metric in csv["metric"]:
+        assert metric in table
+
+
+def test_results_can_be_narrowed_down(steerbench, run):
+    run("seed=4")
+    out = steerbench("results", "--format", "csv", "--metric", "psnr", "--method", "grey").out
+    assert pd.read_csv(io.StringIO(out))["metric"].tolist() == ["psnr"]
+    assert "Did you mean psnr" in steerbench("results", "--metric", "psn").err
+
+
+@pytest.mark.parametrize(
+    ("line", "completed"),
+    [
+        ("steerbench run trajectory=", ["trajectory=test"]),
+        ("steerbench run +experiment=", ["+experiment=demo"]),
+        ("steerbench run thre", ["threads="]),
+    ],
+)
+def test_bash_completes_what_follows_run(tmp_path, line, completed):
+    """Through the function that `steerbench run -sc install=bash` defines, as on pressing TAB."""
+    words = line.split()
+    script = f"""
+        eval "$(steerbench run -sc install=bash)"
+        COMP_LINE="{line}" COMP_POINT={len(line)} COMP_CWORD={len(words) - 1}
+        hydra_bash_completion
+        printf '%s\\n' "${{COMPREPLY[@]}}"
+    """
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    done = subprocess.run(
+        ["bash", "-c", script],
+        cwd=tmp_path,
+        env={**os.environ, "PATH": path},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.split() == completed
+    assert done.stderr == ""

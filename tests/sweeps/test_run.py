@@ -1,0 +1,114 @@
+"""`steerbench run`: from overrides to a table, a stored run and a page."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+
+def stored(tmp_path: Path) -> list[Path]:
+    """The folders of whole runs."""
+    return sorted(path.parent for path in tmp_path.glob("outputs/runs/*/record.json"))
+
+
+def test_a_run_prints_its_table_and_is_stored(run, tmp_path):
+    outcome = run()
+    assert outcome.status == 0
+    assert outcome.err == ""
+    # Grey 0.5 rounds to 128/255: PSNR = -20 log10(127 / 255) = 6.05 dB.
+    assert "6.05" in outcome.out
+    for title in ("Quality", "Time of a frame", "Memory"):
+        assert title in outcome.out
+    assert len(stored(tmp_path)) == 1
+
+
+def test_a_run_that_is_stored_is_not_measured_again(run, tmp_path):
+    first = run()
+    (folder,) = stored(tmp_path)
+    before = (folder / "rows.csv").stat()
+    second = run()
+    assert (folder / "rows.csv").stat() == before
+    assert str(folder.relative_to(tmp_path)) in second.err
+    assert second.out == first.out
+
+
+@pytest.mark.parametrize("change", ["seed=1", "method.level=0.25", "scene.frames=3"])
+def test_what_changes_rows_makes_another_run(run, tmp_path, change):
+    run()
+    run(change)
+    assert len(stored(tmp_path)) == 2
+
+
+def test_moving_data_or_report_makes_no_other_run(run, tmp_path):
+    (tmp_path / "moved").mkdir()
+    run()
+    run("scene.path=moved", "report=elsewhere")
+    assert len(stored(tmp_path)) == 1
+
+
+def test_the_record_holds_the_command_that_was_typed(run, tmp_path):
+    run("seed=3", "scene.path=.")
+    (folder,) = stored(tmp_path)
+    command = json.loads((folder / "record.json").read_text())["command"]
+    assert command.startswith("steerbench run ")
+    assert command.endswith("seed=3 scene.path=.")
+
+
+def test_a_report_is_written_where_it_is_asked_for(run, tmp_path):
+    outcome = run("report=pages/first")
+    assert "pages/first/report.md" in outcome.err
+    assert "6.05" in (tmp_path / "pages/first/report.md").read_text()
+
+
+def test_nothing_but_outputs_is_left_behind(run, tmp_path):
+    run()
+    run("-m", "seed=0,1")
+    assert [path.name for path in tmp_path.iterdir()] == ["outputs"]
+    assert {path.name for path in (tmp_path / "outputs").iterdir()} == {"runs", "stages", "sweeps"}
+
+
+def test_a_sweep_takes_flags_after_overrides_and_runs_every_combination(run, tmp_path):
+    outcome = run("seed=0,1", "-m", "scene.frames=2,3")
+    assert outcome.status == 0
+    assert len(stored(tmp_path)) == 4
+
+
+def test_a_job_that_fails_does_not_take_the_sweep_along(run, tmp_path):
+    outcome = run("-m", "method.level=0.5,7,0.25")
+    assert outcome.status == 2
+    assert "method.level=7: method.level: expected 0 to 1, got 7" in outcome.err
+    assert len(stored(tmp_path)) == 2
+
+
+def test_an_error_is_one_line_and_stores_nothing(run, tmp_path):
+    outcome = run("method.level=7")
+    assert outcome.status == 2
+    assert outcome.err == "steerbench: method.level: expected 0 to 1, got 7\n"
+    assert stored(tmp_path) == []
+
+
+def test_outputs_that_cannot_be_written_are_named(run, tmp_path):
+    (tmp_path / "a-file").touch()
+    outcome = run("outputs=a-file/below")
+    assert outcome.status == 2
+    assert "a-file/below" in outcome.err
+    assert "outputs=DIR" in outcome.err
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("seed=one", "seed: expected int, got 'one'"),
+        ("seed=-1", "seed: expected 0 or more, got -1"),
+        ("threads=0", "threads: expected 1 or more, or null, got 0"),
+        ("device=gpu", "device: expected auto, cpu, cuda or cuda:N, got gpu"),
+        ("report=3", "report: expected str | None, got 3"),
+        ("scene.frames=many", "scene.frames: expected int, got 'many'"),
+        ("budget.steps=true", "budget.steps: expected int, got True"),
+    ],
+)
+def test_a_setting_of_the_wrong_kind_is_named_with_what_was_expected(run, argument, message):
+    outcome = run(argument)
+    assert (outcome.status, outcome.err) == (2, f"steerbench: {message}\n")

@@ -1,0 +1,155 @@
+"""The project's own files agree with each other and with what is installed."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import tomllib
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import get_object
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from sweeps.cli import COMMANDS
+
+ROOT = Path(__file__).parent.parent
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+CONFIGS = ROOT / "sweeps" / "configs"
+EXTRAS = PYPROJECT["project"]["optional-dependencies"]
+
+
+def pins() -> dict[str, str]:
+    """Version by name, of every line of constraints.txt."""
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    exact = [line for line in lines if line and not line.startswith("#")]
+    return dict(re.fullmatch(r"([a-z0-9-]+)==([\w.]+)", line).groups() for line in exact)
+
+
+def closure(requirements: list[str]) -> Iterator[Requirement]:
+    """The requirements, and those of whatever is installed for them."""
+    seen, pending = set(), [Requirement(text) for text in requirements]
+    while pending:
+        requirement = pending.pop()
+        yield requirement
+        for extra in ("", *requirement.extras):
+            name = (canonicalize_name(requirement.name), extra)
+            if name not in seen:
+                seen.add(name)
+                needed = map(Requirement, metadata.requires(requirement.name) or [])
+                pending += [
+                    other
+                    for other in needed
+                    if not other.marker or other.marker.evaluate({"extra": extra})
+                ]
+
+
+def test_every_package_on_disk_is_listed_and_nothing_else():
+    listed = PYPROJECT["tool"]["setuptools"]["packages"]
+    found = {
+        str(path.parent.relative_to(ROOT)).replace(os.sep, ".")
+        for top in ("bench", "methods", "reports", "sweeps")
+        for path in (ROOT / top).rglob("__init__.py")
+    }
+    assert sorted(listed) == sorted(found)
+
+
+def test_every_configuration_is_shipped():
+    patterns = PYPROJECT["tool"]["setuptools"]["package-data"]["sweeps"]
+    shipped = {path for pattern in patterns for path in (ROOT / "sweeps").glob(pattern)}
+    assert shipped == {path for path in CONFIGS.rglob("*") if path.is_file()}
+
+
+def test_everything_that_is_installed_for_the_project_is_pinned():
+    requirements = [*PYPROJECT["project"]["dependencies"], *EXTRAS["dev"]]
+    needed = {canonicalize_name(requirement.name) for requirement in closure(requirements)}
+    assert needed - pins().keys() == set()
+
+
+def test_every_pin_suits_the_range_in_pyproject():
+    texts = [*PYPROJECT["project"]["dependencies"]]
+    texts += [text for extra, wanted in EXTRAS.items() if extra != "tensorrt" for text in wanted]
+    for requirement in map(Requirement, texts):
+        version = pins()[canonicalize_name(requirement.name)]
+        assert requirement.specifier.contains(version), f"{requirement}: pinned to {version}"
+
+
+def test_extras_are_those_that_are_promised():
+    assert set(EXTRAS) == {"openvino", "onnx", "tensorrt", "ray", "slurm", "dev"}
+
+
+def test_continuous_integration_runs_make_test():
+    script = ROOT / ".ci" / "run"
+    assert os.access(script, os.X_OK)
+    assert "make test" in script.read_text()
+
+
+def test_the_changelog_tells_of_the_current_version():
+    version = PYPROJECT["project"]["version"]
+    assert f"## {version}" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_make_explains_which_python_it_needs(tmp_path):
+    done = subprocess.run(
+        ["make", "install", f"VENV={tmp_path / 'venv'}", "PYTHON=no-such-python"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode != 0
+    assert "needs Python 3.11 or newer" in done.stderr
+    assert "no-such-python" in done.stderr
+
+
+def readme_commands() -> list[list[str]]:
+    """The commands in README's shell blocks, split into words."""
+    blocks = re.findall(r"```sh\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    lines = re.sub(r"\\\n\s*", " ", "".join(blocks)).splitlines()
+    return [words for line in lines if (words := shlex.split(line, comments=True))]
+
+
+def test_every_command_of_the_readme_exists():
+    targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    commands = readme_commands()
+    assert ["make", "demo"] in commands
+    for program, *words in commands:
+        if program == "make":
+            assert {word for word in words if "=" not in word} <= set(targets)
+        if Path(program).name == "steerbench":
+            assert words[0] in COMMANDS or words[0].startswith("-")
+
+
+def test_every_run_of_the_readme_composes():
+    runs = [words[2:] for words in readme_commands() if words[1:2] == ["run"]]
+    assert runs
+    for words in runs:
+        overrides = [word for word in words if not word.startswith("-")]
+        if "-m" not in words and "-sc" not in words:
+            with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+                compose("run", overrides=overrides)
+
+
+def choices() -> list[str]:
+    """Every `group=name` of the configurations."""
+    groups = ("method", "scene", "trajectory", "protocol", "budget")
+    return [f"{group}={path.stem}" for group in groups for path in (CONFIGS / group).glob("*.yaml")]
+
+
+@pytest.mark.parametrize("choice", choices())
+def test_every_choice_composes_to_something_that_exists(choice):
+    group, _, _ = choice.partition("=")
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        assert callable(get_object(compose("run", overrides=[choice])[group]._target_))
+
+
+@pytest.mark.parametrize("choice", choices())
+def test_every_choice_says_what_it_is(choice):
+    text = (CONFIGS / f"{choice.replace('=', '/')}.yaml").read_text()
+    assert text.startswith("# ")
