@@ -8,6 +8,7 @@ downloaded into the cache. A file that carries its SHA-256 in its name is checke
 from __future__ import annotations
 
 import hashlib
+import http.client
 import os
 import pickle
 import re
@@ -109,7 +110,7 @@ def _verified(path: Path) -> Path:
     if not digest.startswith(promised[1]):
         raise Unavailable(
             f"{path}: expected a SHA-256 that begins with {promised[1]}, got {digest[:8]}; "
-            "the file is damaged: delete it, and it is fetched again"
+            "the file is damaged: delete it and fetch it again"
         )
     return path
 
@@ -126,13 +127,13 @@ def _download(name: str, log: Log) -> Path:
             urllib.request.urlopen(ADDRESS + name, timeout=TIMEOUT_S) as response,
         ):
             partial = Path(folder) / name
-            size = int(response.headers["Content-Length"])
+            size = int(response.headers.get("Content-Length", 0))
             with partial.open("wb") as file, log.progress(f"downloading {name}", size) as progress:
                 while chunk := response.read(CHUNK_BYTES):
                     file.write(chunk)
                     progress.advance(len(chunk))
             _verified(partial).replace(target)
-    except OSError as error:
+    except (OSError, http.client.HTTPException) as error:
         _unreachable.append(str(error))
-        raise
+        raise OSError(str(error)) from error
     return target

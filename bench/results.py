@@ -142,14 +142,14 @@ class Store:
         """Every row of every run, `COLUMNS`; `report` is told of runs that cannot be read."""
         header = ",".join(COLUMNS)
         bodies = []
-        for path in sorted(self.folder.glob(f"*/{RECORD}")):
-            schema = _schema_version(path)
-            first, _, body = (path.parent / "rows.csv").read_text().partition("\n")
+        for folder in sorted(self.folder.glob("[!.]*")):
+            schema = _schema_version(folder)
+            first, _, body = _text(folder / "rows.csv").partition("\n")
             if schema == SCHEMA_VERSION and first == header:
                 bodies.append(body)
             else:
                 report(
-                    f"{path.parent}: left out, its rows have schema {schema}; "
+                    f"{folder}: left out, its rows have schema {schema}; "
                     f"this version reads schema {SCHEMA_VERSION}"
                 )
         return pd.read_csv(
@@ -162,11 +162,11 @@ class Store:
     def frames(self, run: str) -> pd.DataFrame:
         """Every frame of a run."""
         path = self._existing(run) / "frames.csv"
-        return pd.read_csv(path, dtype={"name": "str"})
+        return pd.read_csv(path, dtype={"name": "str"}, keep_default_na=False, na_values=[""])
 
     def record(self, run: str) -> dict[str, object]:
         """What a run was made of, and on which machine."""
-        return json.loads((self._existing(run) / RECORD).read_text())
+        return json.loads((self._existing(run) / RECORD).read_text(encoding="utf-8"))
 
     def _publish(self, partial: Path, key: str) -> None:
         try:
@@ -189,11 +189,16 @@ class Store:
         return folder
 
 
-def _schema_version(record: Path) -> object:
+def _schema_version(folder: Path) -> object:
     try:
-        return json.loads(record.read_text())["schema_version"]
+        return json.loads(_text(folder / RECORD))["schema_version"]
     except (ValueError, KeyError, TypeError):
         return None
+
+
+def _text(path: Path) -> str:
+    """What a file holds; nothing where there is no such file."""
+    return path.read_text(encoding="utf-8") if path.is_file() else ""
 
 
 def _sync(path: Path) -> None:

@@ -6,7 +6,6 @@ Quality, time and memory of a run come from the same rendering of the same frame
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -68,10 +67,7 @@ def measure(
     """
     protocol.check_scene(scene)
     lpips, missing = protocol.load_lpips(weights_dir, log)
-    begun = time.perf_counter()
     method.fit(scene, budget, log)
-    train_s = time.perf_counter() - begun
-
     meter = MemoryMeter(method.settings()["device"])
     frames, images = _render(method, scene, trajectory, protocol, lpips, meter, log, pictures)
     summary = [
@@ -79,7 +75,7 @@ def measure(
         *(_single(f"size_bytes.{part}", size) for part, size in method.sizes().items()),
         _single("size_bytes.total", sum(method.sizes().values())),
         _single("peak_bytes", meter.peak_bytes),
-        _single("train_s", train_s),
+        _single("train_s", method.train_s),
     ]
     rows = pd.DataFrame(summary).assign(
         unit=lambda table: [UNITS.get(name.split(".")[0], "1") for name in table["metric"]],

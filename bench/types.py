@@ -161,9 +161,16 @@ class Probe(Protocol):
 
 
 class Method(Protocol):
-    """A radiance-field renderer."""
+    """A radiance-field renderer.
+
+    Attributes:
+        name: as it stands in result rows.
+        train_s: seconds the training took, over all the processes it was continued in; `fit`
+            knows it also when it only loads.
+    """
 
     name: str
+    train_s: float
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Train, or load the stages that a training with the same content hash left behind."""

@@ -95,6 +95,7 @@ class OffsetMethod:
     """Renders the ground truth of the camera plus `offset`; `calls` lists what it was asked."""
 
     name = "offset"
+    train_s = 0.0
 
     def __init__(self, device: str, offset: float) -> None:
         self.calls: list[str] = []
@@ -102,6 +103,7 @@ class OffsetMethod:
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         self.calls.append("fit")
+        self.train_s = 12.5
         test = scene.splits["test"]
         self._known = [
             (name, camera, _on_white(image))

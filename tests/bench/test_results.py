@@ -1,0 +1,201 @@
+"""The store shows whole runs only, and gives back exactly what was put in."""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from bench import results
+from bench.results import COLUMNS, Measurement, Store, content_key
+from bench.types import SteerbenchError
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=8,
+)  # fmt: skip
+PARTS = st.dictionaries(st.text(), JSON, max_size=4)
+
+
+def measurement(values: list[float], text: str = "plain") -> Measurement:
+    """One row per value; `text` stands in the columns of text."""
+    words = ("method", "scene", "split", "trajectory", "resolution", "protocol", "budget")
+    kind = ("unit", "device", "backend", "engine", "precision")
+    rows = pd.DataFrame(
+        {
+            **dict.fromkeys((*words, *kind), text),
+            "metric": [f"metric_{i}" for i in range(len(values))],
+            "value": values,
+            "n": 1,
+            "lo": math.nan,
+            "hi": math.nan,
+            "seed": 0,
+        }
+    )
+    frames = pd.DataFrame({"frame": [0, 1], "name": ["007", "NA"], "psnr": [30.25, math.nan]})
+    picture = np.arange(60, dtype=np.uint8).reshape(4, 5, 3)
+    return Measurement(rows, frames, {"0000-truth": picture}, {"note": "as measured"})
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "outputs")
+
+
+@given(PARTS, st.randoms())
+def test_the_order_of_the_parts_does_not_change_the_key(parts, random):
+    shuffled = list(parts.items())
+    random.shuffle(shuffled)
+    assert content_key(parts) == content_key(dict(shuffled))
+
+
+@given(PARTS, PARTS)
+def test_different_parts_have_different_keys(one, other):
+    same = json.dumps(one, sort_keys=True) == json.dumps(other, sort_keys=True)
+    assert (content_key(one) == content_key(other)) == same
+
+
+def test_parts_that_do_not_repeat_are_refused():
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        content_key({"rate": math.nan})
+    with pytest.raises(TypeError, match="not JSON serializable"):
+        content_key({"scene": object()})
+
+
+def test_a_saved_run_is_found_with_its_rows_frames_record_and_pictures(store):
+    saved = measurement([1.5, math.nan])
+    key = store.save({"seed": 0}, saved)
+    assert key == store.key({"seed": 0})
+    folder = store.find(key)
+    assert sorted(path.name for path in folder.iterdir()) == [
+        *("frames.csv", "pictures", "record.json", "rows.csv")
+    ]
+    rows = store.rows()
+    assert list(rows.columns) == COLUMNS
+    assert set(rows["run"]) == {key}
+    assert rows["metric"].tolist() == ["metric_0", "metric_1"]
+    pd.testing.assert_frame_equal(store.frames(key), saved.frames)
+    record = store.record(key)
+    assert record["made_of"] == {"seed": 0}
+    assert record["note"] == "as measured"
+    with Image.open(folder / "pictures" / "0000-truth.png") as picture:
+        assert np.array_equal(np.asarray(picture), saved.pictures["0000-truth"])
+
+
+@given(st.lists(st.floats(width=64), min_size=1))
+def test_values_come_back_bit_for_bit(tmp_path_factory, values):
+    store = Store(tmp_path_factory.mktemp("outputs"))
+    store.save({}, measurement(values))
+    np.testing.assert_array_equal(store.rows()["value"].to_numpy(), values)
+
+
+@pytest.mark.parametrize("text", ["12e4567", "007", "nan", "NA", "", 'a "quoted", comma\nand line'])
+def test_text_stays_text(store, text):
+    store.save({}, measurement([1.0], text))
+    row = store.rows().iloc[0]
+    assert (row["method"], row["precision"]) == (text, text)
+
+
+def test_the_rows_of_several_runs_stand_below_each_other(store):
+    keys = {store.save({"seed": seed}, measurement([seed, 2.0])) for seed in range(3)}
+    rows = store.rows()
+    assert len(rows) == 6
+    assert set(rows["run"]) == keys
+
+
+def test_an_empty_store_has_no_rows_but_all_columns(store):
+    rows = store.rows()
+    assert rows.empty
+    assert list(rows.columns) == COLUMNS
+
+
+def test_a_run_cannot_be_seen_before_it_is_whole(store):
+    with store.write("abc") as folder:
+        (folder / "record.json").write_text("{}")
+        assert store.find("abc") is None
+        assert store.rows().empty
+    assert store.find("abc") is not None
+
+
+@pytest.mark.parametrize("exception", [ValueError, KeyboardInterrupt, SystemExit])
+def test_a_run_that_is_interrupted_leaves_nothing(store, exception):
+    def write() -> None:
+        with store.write("abc") as folder:
+            (folder / "record.json").write_text("{}")
+            raise exception
+
+    with pytest.raises(exception):
+        write()
+    assert list(store.folder.iterdir()) == []
+
+
+def test_of_two_processes_with_the_same_run_the_first_to_finish_stays(store):
+    with store.write("abc") as late:
+        (late / "record.json").write_text('{"by": "late"}')
+        with store.write("abc") as early:
+            (early / "record.json").write_text('{"by": "early"}')
+    assert store.record("abc") == {"by": "early"}
+    assert [path.name for path in store.folder.iterdir()] == ["abc"]
+
+
+def test_what_a_killed_process_left_is_ignored_and_deleted_after_a_day(store):
+    store.folder.mkdir(parents=True)
+    fresh, stale = store.folder / ".partial-abc-1", store.folder / ".partial-def-2"
+    for folder in (fresh, stale):
+        folder.mkdir()
+        (folder / "record.json").write_text("{}")
+    before = time.time() - results.STALE_S - 60
+    os.utime(stale, (before, before))
+    assert store.rows().empty
+    store.save({}, measurement([1.0]))
+    assert fresh.exists()
+    assert not stale.exists()
+
+
+def test_a_run_of_another_schema_is_reported_and_left_out(store):
+    kept, foreign, damaged = (store.save({"seed": i}, measurement([1.0])) for i in range(3))
+    record = store.folder / foreign / "record.json"
+    record.write_text(record.read_text().replace('"schema_version": 1', '"schema_version": 99'))
+    (store.folder / damaged / "record.json").write_text("{")
+    reports: list[str] = []
+    assert set(store.rows(report=reports.append)["run"]) == {kept}
+    assert any(foreign in line and "schema 99" in line for line in reports)
+    assert any(damaged in line for line in reports)
+    with pytest.warns(UserWarning, match="left out"):
+        store.rows()
+
+
+def test_an_unknown_run_is_a_clear_error(store):
+    with pytest.raises(SteerbenchError, match="no run 'abc' in"):
+        store.frames("abc")
+    with pytest.raises(SteerbenchError, match="no run 'abc' in"):
+        store.record("abc")
+
+
+def test_outputs_that_is_a_file_is_a_clear_error(tmp_path):
+    (tmp_path / "outputs").write_text("in the way")
+    with pytest.raises(SteerbenchError, match=r"cannot write to .*outputs.*outputs=DIR"):
+        Store(tmp_path / "outputs").save({}, measurement([1.0]))
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES, errno.EROFS])
+def test_a_disk_that_refuses_is_a_clear_error_and_leaves_nothing(store, monkeypatch, code):
+    def refuse(handle: int) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    with pytest.raises(SteerbenchError, match=os.strerror(code)):
+        store.save({}, measurement([1.0]))
+    assert list(store.folder.iterdir()) == []

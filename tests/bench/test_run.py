@@ -1,0 +1,229 @@
+"""A measurement reports what really happened, and nothing it could not find out."""
+
+from __future__ import annotations
+
+import math
+import weakref
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from bench.metrics import psnr, quantise
+from bench.protocol import EvaluationProtocol, composite
+from bench.results import COLUMNS, Store
+from bench.run import measure
+from bench.trajectories import from_split
+from bench.types import Budget, SteerbenchError
+
+QUICK = EvaluationProtocol(name="quick", lpips=(), warmup=2)
+BUDGET = Budget("tiny", steps=1, samples=1)
+
+
+@pytest.fixture
+def run(tiny_scene, quiet_log):
+    """`measure` on the tiny scene's test split, with anything replaced that a test is about."""
+
+    def measured(method, **changes):
+        arguments = {"scene": tiny_scene, "trajectory": from_split(tiny_scene), "protocol": QUICK}
+        return measure(
+            method, **arguments | {"budget": BUDGET, "log": quiet_log, "seed": 5} | changes
+        )
+
+    return measured
+
+
+def value(rows, metric: str) -> float:
+    (found,) = rows.loc[rows["metric"] == metric, "value"]
+    return found
+
+
+def row(rows, metric: str) -> dict:
+    (found,) = rows[rows["metric"] == metric].to_dict("records")
+    return found
+
+
+def test_the_rows_have_every_column_of_the_store_but_what_the_store_adds(
+    run, offset_method, device
+):
+    rows = run(offset_method).rows
+    assert set(rows.columns) == set(COLUMNS) - {"run", "commit"}
+    constant = {
+        "method": "offset",
+        "scene": "tiny",
+        "split": "test",
+        "trajectory": "test",
+        "resolution": "40x32",
+        "protocol": "quick",
+        "budget": "tiny",
+        "device": device,
+        "backend": "reference",
+        "engine": "torch",
+        "precision": "fp32",
+        "seed": 5,
+    }
+    for column, expected in constant.items():
+        assert set(rows[column]) == {expected}
+    assert not rows["metric"].duplicated().any()
+
+
+def test_quality_is_the_mean_over_the_frames_of_the_protocols_scores(
+    run, offset_method, tiny_scene
+):
+    measured = run(offset_method)
+    scores = []
+    for image in tiny_scene.splits["test"].images:
+        truth = composite(image, tiny_scene.background)
+        scores.append(psnr(quantise(truth + 8 / 255), truth))
+    assert measured.frames["psnr"].tolist() == pytest.approx(scores, rel=1e-9)
+    assert value(measured.rows, "psnr") == pytest.approx(np.mean(scores), rel=1e-9)
+    assert row(measured.rows, "psnr")["unit"] == "dB"
+    assert measured.frames["name"].tolist() == tiny_scene.splits["test"].names
+
+
+def test_the_interval_is_that_of_student(run, offset_method, tiny_scene):
+    measured = run(offset_method, trajectory=from_split(tiny_scene, limit=2))
+    first, second = measured.frames["psnr"]
+    found = row(measured.rows, "psnr")
+    # Of two values the standard error is half their distance; t(0.975, 1) = tan(0.475 pi).
+    half = math.tan(0.475 * math.pi) * abs(first - second) / 2
+    assert found["n"] == 2
+    assert found["hi"] - found["value"] == pytest.approx(half, rel=1e-6)
+    assert found["value"] - found["lo"] == pytest.approx(half, rel=1e-6)
+
+
+def test_one_frame_has_a_value_and_no_interval(run, offset_method, tiny_scene):
+    found = row(run(offset_method, trajectory=from_split(tiny_scene, limit=1)).rows, "psnr")
+    assert found["n"] == 1
+    assert math.isfinite(found["value"])
+    assert math.isnan(found["lo"])
+    assert math.isnan(found["hi"])
+
+
+def test_the_stages_of_every_frame_and_of_the_mean_add_up_to_the_total(run, offset_method):
+    measured = run(offset_method)
+    stages = [name for name in measured.frames if name.startswith("stage_ms.")]
+    assert stages == ["stage_ms.look-up", "stage_ms.look-up/add", "stage_ms.other"]
+    sums = measured.frames[stages].sum(axis=1)
+    np.testing.assert_allclose(sums, measured.frames["frame_ms"], rtol=1e-12)
+    total = sum(value(measured.rows, stage) for stage in stages)
+    assert total == pytest.approx(value(measured.rows, "frame_ms"), rel=1e-12)
+
+
+def test_frames_a_second_follow_from_the_mean_time_and_its_interval(run, offset_method):
+    measured = run(offset_method)
+    ms, fps = row(measured.rows, "frame_ms"), row(measured.rows, "fps")
+    times = measured.frames["frame_ms"]
+    assert ms["value"] == pytest.approx(times.mean())
+    assert fps["value"] == pytest.approx(1000 / times.mean())
+    assert fps["lo"] == pytest.approx(1000 / ms["hi"])
+    assert math.isnan(fps["hi"]) or fps["hi"] == pytest.approx(1000 / ms["lo"])
+    assert value(measured.rows, "frame_ms.p50") == pytest.approx(times.median())
+    assert value(measured.rows, "frame_ms.p99") <= times.max()
+
+
+def test_work_and_sizes_are_reported_as_counted(run, offset_method):
+    rows = run(offset_method).rows
+    assert value(rows, "work.pixels") == 40 * 32 / 4
+    assert value(rows, "work.pixels.dense") == 40 * 32
+    assert value(rows, "size_bytes.offset") == 4
+    assert value(rows, "size_bytes.table") == 100
+    assert value(rows, "size_bytes.total") == 104
+    assert value(rows, "peak_bytes") > 0
+    assert value(rows, "train_s") == 12.5
+
+
+def test_warm_up_frames_come_first_and_are_forgotten_before_the_sequence(run, offset_method):
+    measured = run(offset_method)
+    sequence = [f"r_{i}" for i in range(6)]
+    assert offset_method.calls == ["fit", "reset", "r_0", "r_5", "reset", *sequence]
+    assert len(measured.frames) == 6
+
+
+def test_cold_means_that_every_frame_is_the_first_of_its_sequence(run, offset_method):
+    run(offset_method, protocol=replace(QUICK, memory="cold", warmup=0))
+    frames = [call for i in range(6) for call in ("reset", f"r_{i}")]
+    assert offset_method.calls == ["fit", "reset", "reset", *frames]
+
+
+def test_a_backbone_that_cannot_be_had_leaves_nan_and_its_reason(
+    run, offset_method, monkeypatch, tmp_path, lpips_weights
+):
+    monkeypatch.setattr("bench.lpips_weights._unreachable", ["no network"])
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.delenv("STEERBENCH_WEIGHTS", raising=False)
+    (tmp_path / "alexnet_features.pth").symlink_to(lpips_weights / "alexnet_features.pth")
+    measured = run(offset_method, protocol=EvaluationProtocol(), weights_dir=tmp_path)
+    assert row(measured.rows, "lpips_alex")["n"] == 6
+    assert value(measured.rows, "lpips_alex") > 0
+    assert row(measured.rows, "lpips_vgg")["n"] == 0
+    assert math.isnan(value(measured.rows, "lpips_vgg"))
+    assert "no network" in measured.record["missing"]["lpips_vgg"]
+
+
+def test_frames_without_ground_truth_are_timed_but_not_scored(run, offset_method, tiny_scene):
+    whole = from_split(tiny_scene)
+    steps = tuple(replace(s, truth=None) if i < 4 else s for i, s in enumerate(whole.steps))
+    measured = run(offset_method, trajectory=replace(whole, steps=steps))
+    assert row(measured.rows, "psnr")["n"] == 2
+    assert row(measured.rows, "frame_ms")["n"] == 6
+    unscored = replace(whole, steps=tuple(replace(s, truth=None) for s in whole.steps))
+    assert math.isnan(value(run(offset_method, trajectory=unscored).rows, "psnr"))
+
+
+def test_pictures_show_ground_truth_rendering_and_error(run, offset_method, tiny_scene):
+    pictures = run(offset_method, pictures=2).pictures
+    assert list(pictures) == [
+        *("0000-truth", "0000-rendered", "0000-error"),
+        *("0005-truth", "0005-rendered", "0005-error"),
+    ]
+    truth, rendered = (pictures[f"0000-{kind}"].astype(int) for kind in ("truth", "rendered"))
+    assert truth.shape == rendered.shape == pictures["0000-error"].shape == (32, 40, 3)
+    assert set(np.unique((rendered - truth)[truth < 247])) <= {7, 8, 9}  # two roundings
+    assert not run(offset_method, pictures=0).pictures
+
+
+def test_a_rendering_with_nan_in_it_stops_the_run(run, offset_method):
+    def broken(camera, probe):
+        frame = type(offset_method).render(offset_method, camera, probe)
+        frame.rgb[3, 4, 1] = math.nan
+        return frame
+
+    offset_method.render = broken
+    with pytest.raises(SteerbenchError, match="offset rendered 1 of 1280 pixels of frame 0"):
+        run(offset_method)
+
+
+def test_a_scene_on_another_background_stops_the_run_before_training(
+    run, offset_method, tiny_scene
+):
+    with pytest.raises(SteerbenchError, match="background"):
+        run(offset_method, scene=replace(tiny_scene, background=torch.zeros(3)))
+    assert offset_method.calls == []
+
+
+def test_frames_are_let_go_once_they_are_scored(run, offset_method):
+    alive: list[weakref.ref] = []
+    most = 0
+
+    def watched(camera, probe):
+        nonlocal most
+        most = max(most, sum(reference() is not None for reference in alive))
+        frame = type(offset_method).render(offset_method, camera, probe)
+        alive.append(weakref.ref(frame.rgb))
+        return frame
+
+    offset_method.render = watched
+    run(offset_method)
+    assert len(alive) == 8
+    assert most <= 1
+
+
+def test_a_measurement_survives_the_store(run, offset_method, tmp_path):
+    measured, store = run(offset_method), Store(tmp_path)
+    key = store.save({"seed": 5}, measured)
+    stored = store.rows().drop(columns=["run", "commit"])
+    for column in ("value", "lo", "hi", "n"):
+        np.testing.assert_array_equal(stored[column], measured.rows[column])
+    assert store.frames(key).columns.tolist() == measured.frames.columns.tolist()
