@@ -19,11 +19,18 @@ from torch import Tensor
 from bench.lpips_weights import load_features
 from bench.types import Log, SteerbenchError, Unavailable, check_shape
 
-SSIM_SIDE = 11
-"""Side of the Gaussian window, and so the smallest side of a picture that has an SSIM."""
+SMALLEST_SIDE = {"ssim": 11, "lpips_alex": 31, "lpips_vgg": 16, "lpips_squeeze": 17}
+"""In pixels: SSIM needs room for its window, LPIPS one position in the deepest feature map."""
 
-LPIPS_SIDE = {"alex": 31, "vgg": 16, "squeeze": 17}
-"""Smallest side, in pixels, whose deepest feature map still holds one position."""
+
+def check_size(metric: str, width: int, height: int) -> None:
+    """Raise `SteerbenchError` if `metric` does not exist for pictures of this size."""
+    side = SMALLEST_SIDE[metric]
+    if min(width, height) < side:
+        raise SteerbenchError(
+            f"{metric} needs pictures of at least {side} x {side} pixels, got {width} x {height}: "
+            "use a smaller scene.downscale, or a protocol without this metric"
+        )
 
 
 def quantise(image: Tensor) -> Tensor:
@@ -46,10 +53,10 @@ def ssim(image: Tensor, reference: Tensor, window: str = "gaussian") -> float:
     The mean is taken over the valid region, where the window lies inside the picture.
 
     Raises:
-        SteerbenchError: a side is shorter than the window.
+        SteerbenchError: a side is shorter than 11 pixels.
     """
     _check_pair(image, reference)
-    _check_side(f"SSIM ({window})", image, SSIM_SIDE)
+    check_size("ssim", image.shape[1], image.shape[0])
     variants: dict[str, dict[str, object]] = {
         "gaussian": {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False},
         "uniform": {"win_size": 7},
@@ -99,7 +106,7 @@ class Lpips:
     def __call__(self, image: Tensor, reference: Tensor) -> float:
         """LPIPS between two pictures [H, W, 3] in [0, 1]."""
         _check_pair(image, reference)
-        _check_side(f"LPIPS ({self.net})", image, LPIPS_SIDE[self.net])
+        check_size(f"lpips_{self.net}", image.shape[1], image.shape[0])
         pair = torch.stack((image, reference)).float().permute(0, 3, 1, 2)  # channels last
         distance = self._model.to(image.device)(pair[:1], pair[1:], normalize=True)
         return float(distance.item())
@@ -133,12 +140,3 @@ def _lpips_package() -> ModuleType:
 def _check_pair(image: Tensor, reference: Tensor) -> None:
     check_shape("image", image, None, None, 3)
     check_shape("reference", reference, *image.shape)
-
-
-def _check_side(metric: str, image: Tensor, side: int) -> None:
-    height, width, _ = image.shape
-    if min(height, width) < side:
-        raise SteerbenchError(
-            f"{metric} needs pictures of at least {side} x {side} pixels, got {width} x {height}: "
-            "use a smaller scene.downscale, or a protocol without this metric"
-        )

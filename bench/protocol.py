@@ -12,6 +12,7 @@ from torch import Tensor
 
 from bench import metrics
 from bench.lpips_weights import locate
+from bench.trajectories import Trajectory
 from bench.types import Log, Scene, SteerbenchError, Unavailable
 
 BACKGROUNDS = {"white": 1.0, "black": 0.0}
@@ -72,8 +73,13 @@ class EvaluationProtocol:
         """Names of what `score` returns, in the order of the table."""
         return ("psnr", "ssim", *(f"lpips_{net}" for net in self.lpips))
 
-    def check_scene(self, scene: Scene) -> None:
-        """Raise `SteerbenchError` if the scene is composited on another background."""
+    def check(self, scene: Scene, trajectory: Trajectory) -> None:
+        """Refuse, before any training, what could not be scored after it.
+
+        Raises:
+            SteerbenchError: the scene is composited on another background, or a frame is smaller
+                than a metric's window.
+        """
         wanted = torch.full((3,), BACKGROUNDS[self.background])
         if not torch.equal(scene.background.cpu().float(), wanted):
             got = ", ".join(f"{value:g}" for value in scene.background.tolist())
@@ -81,6 +87,10 @@ class EvaluationProtocol:
                 f"protocol {self.name} scores on {self.background}, but scene {scene.name} has "
                 f"background [{got}]: change scene.background, or use another protocol"
             )
+        for camera in (step.camera for step in trajectory.steps):
+            metrics.check_size("ssim", camera.width, camera.height)
+            for net in self.lpips:
+                metrics.check_size(f"lpips_{net}", camera.width, camera.height)
 
     def find_lpips(self, weights_dir: Path | None, log: Log) -> dict[str, bool]:
         """For which backbones weights can be had: part of what a run's rows depend on."""

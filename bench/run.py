@@ -65,8 +65,8 @@ def measure(
         SteerbenchError: the scene does not suit the protocol, or the method rendered values that
             are not finite.
     """
-    protocol.check_scene(scene)
     lpips, missing = protocol.load_lpips(weights_dir, log)
+    protocol.check(scene, trajectory)
     method.fit(scene, budget, log)
     meter = MemoryMeter(method.settings()["device"])
     frames, images = _render(method, scene, trajectory, protocol, lpips, meter, log, pictures)

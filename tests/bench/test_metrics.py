@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from bench.metrics import LPIPS_SIDE, SSIM_SIDE, Lpips, psnr, quantise, ssim
+from bench.metrics import SMALLEST_SIDE, Lpips, psnr, quantise, ssim
 from bench.types import SteerbenchError, Unavailable
 
 UNIT = st.floats(0.0, 1.0)
@@ -112,7 +112,7 @@ def test_ssim_of_a_picture_with_itself_is_one(window):
 
 def test_ssim_of_a_picture_smaller_than_its_window_says_so():
     with pytest.raises(SteerbenchError, match="at least 11 x 11 pixels, got 30 x 10"):
-        ssim(noise(SSIM_SIDE - 1, 30), noise(SSIM_SIDE - 1, 30))
+        ssim(noise(10, 30), noise(10, 30))
 
 
 # Layers of the two backbones as published (Krizhevsky 2014; Simonyan & Zisserman 2014, D):
@@ -184,10 +184,10 @@ def test_lpips_is_the_published_formula_on_the_named_backbone(
 
 @pytest.mark.parametrize("net", ["alex", "vgg", "squeeze"])
 def test_lpips_is_zero_for_equal_pictures_down_to_the_smallest_size(net, lpips_weights, quiet_log):
-    lpips, side = Lpips(net, lpips_weights, quiet_log), LPIPS_SIDE[net]
+    lpips, side = Lpips(net, lpips_weights, quiet_log), SMALLEST_SIDE[f"lpips_{net}"]
     assert lpips(noise(side, side), noise(side, side)) == 0.0
     assert lpips(noise(side, side, 1), noise(side, side, 2)) > 0.0
-    with pytest.raises(SteerbenchError, match=f"LPIPS \\({net}\\) needs .* at least {side} x"):
+    with pytest.raises(SteerbenchError, match=f"lpips_{net} needs .* at least {side} x"):
         lpips(noise(side - 1, side), noise(side - 1, side))
 
 

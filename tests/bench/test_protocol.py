@@ -11,8 +11,10 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from bench.cameras import scale_camera
 from bench.metrics import psnr, quantise
 from bench.protocol import EvaluationProtocol, composite
+from bench.trajectories import from_split
 from bench.types import SteerbenchError
 
 CONFIGS = Path(__file__).parents[2] / "sweeps" / "configs" / "protocol"
@@ -92,6 +94,16 @@ def test_backbones_that_cannot_be_had_are_named_with_the_reason(
 
 
 def test_a_scene_on_another_background_is_refused(tiny_scene):
-    QUICK.check_scene(tiny_scene)
+    QUICK.check(tiny_scene, from_split(tiny_scene))
+    black = replace(tiny_scene, background=torch.zeros(3))
     with pytest.raises(SteerbenchError, match=r"scores on white, but scene tiny .* \[0, 0, 0\]"):
-        QUICK.check_scene(replace(tiny_scene, background=torch.zeros(3)))
+        QUICK.check(black, from_split(black))
+
+
+def test_frames_too_small_for_a_metric_are_refused(tiny_scene):
+    trajectory = from_split(tiny_scene)
+    small = replace(trajectory.steps[0], camera=scale_camera(trajectory.steps[0].camera, 20, 16))
+    shrunk = replace(trajectory, steps=(*trajectory.steps, small))
+    QUICK.check(tiny_scene, shrunk)
+    with pytest.raises(SteerbenchError, match=r"lpips_alex needs .* 31 x 31 pixels, got 20 x 16"):
+        EvaluationProtocol().check(tiny_scene, shrunk)
