@@ -1,0 +1,88 @@
+"""A log that remembers what it was told, and a small NeRF-Synthetic folder to break."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+
+class RememberingLog:
+    """`messages` are the lines said, `done` the steps counted by all progress bars."""
+
+    def __init__(self) -> None:
+        self.messages: list[str] = []
+        self.done = 0
+
+    def info(self, message: str) -> None:
+        self.messages.append(message)
+
+    @contextmanager
+    def progress(self, label: str, total: int) -> Iterator[RememberingLog]:
+        yield self
+
+    def advance(self, steps: int = 1, note: str = "") -> None:
+        self.done += steps
+
+    def stage_dir(self, kind: str, key: Mapping[str, object]) -> Path:
+        raise AssertionError("loading a scene trains nothing")
+
+
+@pytest.fixture
+def log() -> RememberingLog:
+    """Remembers what it was told."""
+    return RememberingLog()
+
+
+@pytest.fixture
+def picture() -> Callable[..., np.ndarray]:
+    """Random 8-bit values [height, width, channels] for a seed."""
+
+    def make(seed: int, width: int = 8, height: int = 6, channels: int = 4) -> np.ndarray:
+        generator = np.random.default_rng(seed)
+        return generator.integers(0, 256, (height, width, channels), dtype=np.uint8)
+
+    return make
+
+
+@pytest.fixture
+def pose() -> Callable[[int], list[list[float]]]:
+    """OpenGL camera-to-world, 4x4, 4 units from 0 and looking at it from four sides; z is up."""
+
+    def make(k: int) -> list[list[float]]:
+        c, s = [(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)][k % 4]
+        return [[c, 0, s, 4 * s], [s, 0, -c, -4 * c], [0, 1, 0, 0.0], [0, 0, 0, 1]]
+
+    return make
+
+
+@pytest.fixture
+def edit_json() -> Callable[[Path, Callable[[dict], object]], None]:
+    """Apply a change to the object in a JSON file."""
+
+    def edit(path: Path, change: Callable[[dict], object]) -> None:
+        record = json.loads(path.read_text())
+        change(record)
+        path.write_text(json.dumps(record))
+
+    return edit
+
+
+@pytest.fixture
+def blender_folder(tmp_path: Path, picture, pose) -> Path:
+    """Three training and two test pictures of 8 x 6."""
+    root = tmp_path / "chair"
+    for split, count, seed in (("train", 3, 0), ("test", 2, 50)):
+        (root / split).mkdir(parents=True)
+        frames = []
+        for k in range(count):
+            Image.fromarray(picture(seed + k)).save(root / split / f"r_{k}.png")
+            frames.append({"file_path": f"./{split}/r_{k}", "transform_matrix": pose(k)})
+        record = {"camera_angle_x": 0.7, "frames": frames}
+        (root / f"transforms_{split}.json").write_text(json.dumps(record))
+    return root

@@ -1,0 +1,145 @@
+"""NSVF's layout: both forms of intrinsics, the split prefixes, and what is refused by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from bench.cameras import move_camera
+from bench.scenes import nsvf
+from bench.types import SteerbenchError
+
+MATRIX = "9 0 4.5 0\n0 8 2.5 0\n0 0 1 0\n0 0 0 1\n"
+FIRST_LINE = "9. 4.5 2.5 0.\n0. 0. 0.\n0.\n1.\n6 8\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, picture) -> Path:
+    """Two training, one validation and one test picture of 8 x 6."""
+    root = tmp_path / "Truck"
+    (root / "rgb").mkdir(parents=True)
+    (root / "pose").mkdir()
+    (root / "bbox.txt").write_text("-1 -2 -1 1 2 1 0.4\n")
+    (root / "intrinsics.txt").write_text(MATRIX)
+    for k, name in enumerate(("0_000", "0_001", "1_002", "2_003")):
+        Image.fromarray(picture(k, channels=3)).save(root / "rgb" / f"{name}.png")
+        pose = np.eye(4)
+        pose[:3, 3] = (k, 0, -5)
+        np.savetxt(root / "pose" / f"{name}.txt", pose)
+    return root
+
+
+def test_prefixes_are_splits(folder, picture, log) -> None:
+    scene = nsvf.load(folder, log=log)
+    names = {split: list(views.names) for split, views in scene.splits.items()}
+    assert names == {
+        "train": ["rgb/0_000.png", "rgb/0_001.png"],
+        "val": ["rgb/1_002.png"],
+        "test": ["rgb/2_003.png"],
+    }
+    assert np.array_equal(scene.splits["test"].images[0].numpy(), picture(3, channels=3))
+
+
+def test_without_2_the_1_are_the_test_split(folder, log) -> None:
+    (folder / "rgb" / "2_003.png").unlink()
+    scene = nsvf.load(folder, log=log)
+    assert {split: len(views) for split, views in scene.splits.items()} == {"train": 2, "test": 1}
+    assert "1_* are the test split" in log.messages[0]
+
+
+def test_the_box_with_its_margin_fills_the_unit_cube(folder, log) -> None:
+    scene = nsvf.load(folder, log=log)
+    assert scene.unit_length == pytest.approx(4 * 1.05)
+    # Sides 2.2, 4.2, 2.2: every side is longer by 5 % of the longest.
+    expected = torch.tensor(
+        [[0.5 - 1.1 / 4.2, 0, 0.5 - 1.1 / 4.2], [0.5 + 1.1 / 4.2, 1, 0.5 + 1.1 / 4.2]]
+    )
+    torch.testing.assert_close(scene.bounds, expected)
+
+
+def test_poses_are_taken_as_opencv(folder, log) -> None:
+    scene = nsvf.load(folder, log=log)
+    camera = move_camera(scene.splits["val"].cameras[0], scene.unit_length, scene.origin)
+    expected = torch.tensor([[1.0, 0, 0, 2], [0, 1, 0, 0], [0, 0, 1, -5]])
+    torch.testing.assert_close(camera.c2w, expected, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (MATRIX, (9, 8, 4.5, 2.5)),
+        ("9 0 4.5\n0 8 2.5\n0 0 1\n", (9, 8, 4.5, 2.5)),
+        (FIRST_LINE, (9, 9, 4.5, 2.5)),
+    ],
+)
+def test_every_form_of_intrinsics(folder, log, text, expected) -> None:
+    (folder / "intrinsics.txt").write_text(text)
+    camera = nsvf.load(folder, log=log).splits["train"].cameras[0]
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == expected
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "message"),
+    [
+        ("bbox.txt", "-1 -1 -1 1 1", r"bbox.txt: expected x0 y0 z0 x1 y1 z1 .* got 5 numbers"),
+        ("bbox.txt", "-1 -1 -1 1 -2 1 .4", r"bbox.txt: expected each upper bound above"),
+        ("bbox.txt", "-1 -1 nan 1 1 1 .4", r"bbox.txt: number 3: expected a finite number"),
+        ("bbox.txt", "a b c", r"bbox.txt: expected numbers, got"),
+        ("intrinsics.txt", "", r"intrinsics.txt: expected a 4x4 or 3x3 matrix"),
+        ("intrinsics.txt", "9 9\n1 1\n", r"intrinsics.txt: expected a 4x4 or 3x3 matrix"),
+        ("intrinsics.txt", MATRIX.replace("9", "-9"), r"intrinsics.txt: fx: .* above 0, got -9"),
+        ("intrinsics.txt", MATRIX.replace("8", "0"), r"intrinsics.txt: fy: .* above 0, got 0"),
+        ("pose/0_001.txt", "1 0 0 0\n0 1 0 0\n", r"0_001.txt: expected a 4x4 matrix"),
+        ("pose/0_001.txt", "2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1", r"0_001.txt: .* orthonormal"),
+        ("pose/0_001.txt", "1 0 0 inf\n0 1 0 0\n0 0 1 0\n0 0 0 1", r"0_001.txt\[0\]\[3\]: .* inf"),
+    ],
+)
+def test_bad_text_names_file_and_field(folder, log, file, text, message) -> None:
+    (folder / file).write_text(text)
+    with pytest.raises(SteerbenchError, match=message):
+        nsvf.load(folder, log=log)
+
+
+@pytest.mark.parametrize(
+    ("missing", "message"),
+    [
+        (["bbox.txt"], r"bbox.txt: expected a file, got nothing there"),
+        (["pose/2_003.txt"], r"pose/2_003.txt: expected a file, got nothing there"),
+        (["rgb/0_000.png", "rgb/0_001.png"], r"rgb: expected pictures 0_\*, got none"),
+        (["rgb/1_002.png", "rgb/2_003.png"], r"rgb: expected pictures 2_\* or 1_\*, got none"),
+    ],
+)
+def test_missing_files_are_named(folder, log, missing, message) -> None:
+    for name in missing:
+        (folder / name).unlink()
+    with pytest.raises(SteerbenchError, match=message):
+        nsvf.load(folder, log=log)
+
+
+def test_empty_picture_folder(folder, log) -> None:
+    for file in (folder / "rgb").iterdir():
+        file.unlink()
+    with pytest.raises(SteerbenchError, match=r"rgb: expected pictures named 0_\*"):
+        nsvf.load(folder, log=log)
+
+
+@pytest.mark.parametrize("what", ["rgb/0_000.png", "pose/0_000.txt", "bbox.txt"])
+def test_link_out_of_the_folder_is_refused(folder, tmp_path, log, what) -> None:
+    outside = tmp_path / "outside"
+    (folder / what).rename(outside)
+    (folder / what).symlink_to(outside)
+    with pytest.raises(SteerbenchError, match=r"expected a path inside"):
+        nsvf.load(folder, log=log)
+
+
+def test_wrong_size_and_truncation_are_named(folder, picture, log) -> None:
+    Image.fromarray(picture(0, width=9, channels=3)).save(folder / "rgb" / "2_003.png")
+    with pytest.raises(SteerbenchError, match=r"2_003.png: expected 8 x 6 pixels, got 9 x 6"):
+        nsvf.load(folder, log=log)
+    (folder / "rgb" / "2_003.png").write_bytes(b"")
+    with pytest.raises(SteerbenchError, match=r"2_003.png: expected a whole picture"):
+        nsvf.load(folder, log=log)

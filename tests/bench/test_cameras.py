@@ -1,0 +1,122 @@
+"""Cameras: projection undoes casting, and every change of grid or of units keeps the view."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bench.cameras import (
+    cast,
+    crop_camera,
+    look_at,
+    move_camera,
+    pixel_grid,
+    project,
+    scale_camera,
+    unproject,
+)
+from bench.types import Camera
+
+FLOAT32 = torch.finfo(torch.float32).eps
+
+
+def camera_at(eye: tuple[float, float, float], device: str = "cpu") -> Camera:
+    """52 x 36 pixels, off-centre, looking at the middle of the unit cube."""
+    up = torch.tensor((0.1, 0.2, 1.0))
+    c2w = look_at(torch.tensor(eye), torch.full((3,), 0.5), up).to(device)
+    return Camera(c2w, fx=60.0, fy=55.0, cx=27.5, cy=16.25, width=52, height=36)
+
+
+def test_pixel_grid_holds_centres_row_by_row() -> None:
+    expected = [[0.5, 0.5], [1.5, 0.5], [2.5, 0.5], [0.5, 1.5], [1.5, 1.5], [2.5, 1.5]]
+    assert pixel_grid(3, 2).tolist() == expected
+
+
+def test_ray_parameter_is_z_depth(device: str) -> None:
+    camera = camera_at((2.0, -1.0, 1.5), device)
+    rays = cast(camera)
+    assert rays.directions.shape == (52 * 36, 3)
+    along_axis = rays.directions @ camera.c2w[:, 2]
+    torch.testing.assert_close(along_axis, torch.ones_like(along_axis), rtol=0, atol=8 * FLOAT32)
+
+
+def test_principal_point_looks_along_the_axis() -> None:
+    camera = camera_at((2.0, -1.0, 1.5))
+    rays = cast(camera, torch.tensor([[camera.cx, camera.cy]]))
+    torch.testing.assert_close(rays.directions[0], camera.c2w[:, 2], rtol=0, atol=FLOAT32)
+
+
+@given(
+    st.tuples(*[st.floats(1.2, 3.0)] * 3),
+    st.tuples(st.floats(0, 52), st.floats(0, 36)),
+    st.floats(0.05, 8.0),
+)
+def test_project_undoes_unproject(eye, pixel, depth) -> None:
+    camera = camera_at(eye)
+    point = unproject(camera, torch.tensor([pixel]), torch.tensor([depth]))
+    pixels, depths = project(camera, point)
+    # Coordinates up to 16 are rounded a dozen times; a pixel is focal / depth of that.
+    error = 12 * 16 * FLOAT32
+    assert abs(depths.item() - depth) <= error
+    assert (pixels[0] - torch.tensor(pixel)).abs().max() <= 60 * 2 * error / depth
+
+
+def test_points_behind_the_camera_have_negative_depth_and_finite_pixels() -> None:
+    camera = camera_at((2.0, 2.0, 2.0))
+    pixels, depth = project(camera, torch.tensor([[3.0, 3.0, 3.0], [2.0, 2.0, 2.0]]))
+    assert depth[0] < 0
+    assert pixels.isfinite().all()
+
+
+def test_unproject_rejects_pixels_of_another_shape() -> None:
+    with pytest.raises(ValueError, match=r"pixels: expected shape \[any, 2\], got \[4, 3\]"):
+        unproject(camera_at((2.0, 2.0, 2.0)), torch.zeros(4, 3), torch.ones(4))
+
+
+def test_scaling_to_a_quarter_and_back_is_exact() -> None:
+    camera = camera_at((2.0, 2.0, 2.0))
+    there_and_back = scale_camera(scale_camera(camera, 13, 9), 52, 36)
+    assert there_and_back == camera
+
+
+def test_a_low_resolution_pixel_looks_through_the_middle_of_its_block() -> None:
+    camera = camera_at((2.0, 2.0, 2.0))
+    low = cast(scale_camera(camera, 13, 9)).directions.reshape(9, 13, 3)
+    high = cast(camera).directions.reshape(9, 4, 13, 4, 3).mean((1, 3))
+    torch.testing.assert_close(low, high, rtol=0, atol=16 * FLOAT32)
+
+
+def test_a_cropped_pixel_keeps_its_ray() -> None:
+    camera = camera_at((2.0, 2.0, 2.0))
+    whole = cast(camera).directions.reshape(36, 52, 3)
+    part = cast(crop_camera(camera, left=5, top=7, width=20, height=11)).directions
+    torch.testing.assert_close(part.reshape(11, 20, 3), whole[7:18, 5:25], rtol=0, atol=4 * FLOAT32)
+
+
+def test_moving_camera_and_points_alike_keeps_pixels_and_scales_depth() -> None:
+    camera, offset = camera_at((2.0, 2.0, 2.0)), torch.tensor((0.5, -3.0, 1.0))
+    points = torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
+    before, depth = project(camera, points)
+    after, moved_depth = project(move_camera(camera, 2.5, offset), 2.5 * points + offset)
+    torch.testing.assert_close(after, before, rtol=0, atol=60 * 32 * FLOAT32)
+    torch.testing.assert_close(moved_depth, 2.5 * depth, rtol=0, atol=32 * FLOAT32)
+
+
+def test_moving_there_and_back_returns_the_camera() -> None:
+    camera, offset = camera_at((2.0, 2.0, 2.0)), torch.tensor((0.5, -3.0, 1.0))
+    back = move_camera(move_camera(camera, 2.5, offset), 1 / 2.5, -offset / 2.5)
+    torch.testing.assert_close(back.c2w, camera.c2w, rtol=0, atol=4 * FLOAT32)
+
+
+def test_look_at_centres_the_target_with_up_upward() -> None:
+    camera = camera_at((3.0, -2.0, 1.0))
+    pixels, depth = project(camera, torch.tensor([[0.5, 0.5, 0.5], [0.5, 0.5, 0.7]]))
+    assert pixels[0].tolist() == pytest.approx([camera.cx, camera.cy], abs=1e-4)
+    assert depth[0].item() == pytest.approx(math.dist((3, -2, 1), (0.5, 0.5, 0.5)), rel=1e-6)
+    assert pixels[1, 1] < pixels[0, 1]
+    rotation = camera.c2w[:, :3]
+    assert torch.linalg.det(rotation).item() == pytest.approx(1, abs=1e-6)
