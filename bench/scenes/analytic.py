@@ -25,7 +25,7 @@ from bench.types import Camera, Frame, Log, Scene, SteerbenchError, Unavailable
 ANGLE_X = 0.69
 """Horizontal field of view in radians."""
 
-DISTANCE = 4.0
+DISTANCE = 4.3
 """Of all cameras from the middle of the scene, in the model's units."""
 
 

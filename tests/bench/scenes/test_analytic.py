@@ -1,0 +1,184 @@
+"""Embedded scenes: written once and whole, read back as they were rendered."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from bench.cameras import move_camera, unproject
+from bench.scenes import analytic
+from bench.scenes.analytic import exact_frame, orbit_poses, render_exact, train_poses
+from bench.scenes.models import MODELS
+from bench.types import Camera, SteerbenchError, Unavailable
+
+SMALL = {"width": 32, "height": 24, "train": 6, "test": 3}
+
+
+@pytest.fixture(params=MODELS)
+def name(request: pytest.FixtureRequest) -> str:
+    """Every embedded scene in turn."""
+    return request.param
+
+
+def test_the_layout_is_that_of_nerf_synthetic(tmp_path, log) -> None:
+    analytic.load("void", **SMALL, root=tmp_path, log=log)
+    (folder,) = tmp_path.iterdir()
+    assert folder.name.startswith("void-")
+    files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*"))
+    assert files == sorted(
+        ["transforms_train.json", "transforms_test.json"]
+        + [f"train/r_{k}.png" for k in range(6)]
+        + [f"test/r_{k}.png" for k in range(3)]
+    )
+    record = json.loads((folder / "transforms_train.json").read_text())
+    assert record["scene"] == {"name": "void", "seed": 0, **SMALL}
+
+
+def test_a_scene_is_written_once(tmp_path, log) -> None:
+    first = analytic.load("void", **SMALL, root=tmp_path, log=log)
+    written = log.done
+    assert written == 2 * 9  # nine rendered, nine decoded
+    second = analytic.load("void", **SMALL, root=tmp_path, log=log)
+    assert log.done == written + 9
+    assert second.digest == first.digest
+
+
+@pytest.mark.parametrize(
+    "change", [{"width": 33}, {"height": 25}, {"train": 7}, {"test": 4}, {"seed": 1}]
+)
+def test_every_parameter_has_its_own_folder(tmp_path, log, change) -> None:
+    analytic.load("void", **SMALL, root=tmp_path, log=log)
+    analytic.load("void", **{**SMALL, **change}, root=tmp_path, log=log)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_two_writes_are_equal_byte_for_byte(tmp_path, log) -> None:
+    digests = {
+        analytic.load("totem", **SMALL, root=tmp_path / place, log=log).digest for place in "ab"
+    }
+    assert len(digests) == 1
+
+
+def test_cameras_come_back_as_they_were_made(tmp_path, log) -> None:
+    scene = analytic.load("totem", **SMALL, root=tmp_path, log=log)
+    for split, poses in (("train", train_poses(6, 0)), ("test", orbit_poses(3))):
+        for camera, pose in zip(scene.splits[split].cameras, poses, strict=True):
+            in_model = move_camera(camera, scene.unit_length, scene.origin)
+            torch.testing.assert_close(in_model.c2w, pose.float(), rtol=0, atol=2e-6)
+            assert camera.fx == camera.fy == 16 / math.tan(0.345)
+            assert (camera.width, camera.height) == (32, 24)
+
+
+def test_pictures_are_the_exact_frames(tmp_path, log, name) -> None:
+    scene = analytic.load(name, **SMALL, root=tmp_path, bounds="full", log=log)
+    split = scene.splits["test"]
+    frame = exact_frame(scene, split.cameras[1])
+    image = split.images[1].float() / 255
+    shown = image[..., :3] * image[..., 3:] + 1 - image[..., 3:]
+    # Colour and opacity are rounded to 8 bits, half a level each; a sample that grazes an edge may
+    # turn with the rounding of the pose.
+    differing = ((shown - frame.rgb).abs().amax(-1) > 1.01 / 255).sum().item()
+    assert differing <= 3
+
+
+def test_exact_frames_are_in_scene_units(tmp_path, log) -> None:
+    scene = analytic.load("totem", **SMALL, root=tmp_path, log=log)
+    camera = scene.splits["test"].cameras[1]
+    frame = exact_frame(scene, camera, samples=1)
+    model = render_exact("totem", move_camera(camera, scene.unit_length, scene.origin), samples=1)
+    seen = frame.depth.isfinite()
+    torch.testing.assert_close(
+        scene.unit_length * frame.depth[seen], model.depth[seen], rtol=1e-5, atol=0
+    )
+
+
+def test_no_surface_point_is_outside_the_bounds(tmp_path, log, name) -> None:
+    options = {"width": 48, "train": 16, "test": 4}
+    scene = analytic.load(name, **options, root=tmp_path, log=log)
+    for camera in scene.splits["test"].cameras:
+        frame = exact_frame(scene, camera, samples=1)
+        seen = (frame.alpha > 0).nonzero()
+        pixels = seen.flip(1) + 0.5
+        points = unproject(camera, pixels, frame.depth[seen[:, 0], seen[:, 1]])
+        assert (points >= scene.bounds[0]).all()
+        assert (points <= scene.bounds[1]).all()
+
+
+def test_models_lie_in_their_cube(name) -> None:
+    assert MODELS[name]().boxes().abs().max() <= 1.2
+
+
+def test_the_totem_fills_but_does_not_leave_its_pictures() -> None:
+    for pose in orbit_poses(24)[::6]:
+        camera = Camera(pose.float(), 139.0, 139.0, 50, 50, 100, 100)
+        alpha = render_exact("totem", camera, samples=4).alpha
+        border = torch.cat((alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]))
+        assert (border == 0).all()
+        assert alpha.mean() > 0.2
+
+
+def test_the_orbit_is_smooth_and_closes() -> None:
+    eyes = torch.stack([pose[:, 3] for pose in orbit_poses(360)])
+    steps = (eyes - eyes.roll(1, 0)).norm(dim=1)  # the last step joins the ends
+    one_degree = 2 * analytic.DISTANCE * math.sin(math.radians(0.5))
+    # Azimuth moves cos(elevation) of a degree, elevation at most 8 * 2 / 57.3 of one.
+    assert steps.min() >= one_degree * math.cos(math.radians(33)) * 0.999
+    assert steps.max() <= one_degree * math.hypot(math.cos(math.radians(17)), 16 / 57.3) * 1.001
+
+
+def test_training_poses_look_at_the_middle_from_one_distance() -> None:
+    poses = torch.stack(train_poses(50, seed=3))
+    eyes = poses[:, :, 3]
+    assert eyes.norm(dim=1).tolist() == pytest.approx([analytic.DISTANCE] * 50)
+    height = eyes[:, 2] / analytic.DISTANCE
+    assert math.sin(math.radians(-10)) <= height.min() < 0
+    assert 0.9 < height.max() <= math.sin(math.radians(80))
+    torch.testing.assert_close(poses[:, :, 2], -eyes / analytic.DISTANCE)
+
+
+def test_seeds_change_the_training_poses() -> None:
+    first, again, other = train_poses(5, 0), train_poses(5, 0), train_poses(5, 1)
+    assert all(map(torch.equal, first, again))
+    assert not any(map(torch.equal, first, other))
+
+
+@pytest.mark.parametrize("fault", [KeyboardInterrupt, OSError("no space left on device")])
+def test_a_broken_write_leaves_nothing(tmp_path, monkeypatch, log, fault) -> None:
+    def fail(*args: object, **kwargs: object) -> None:
+        raise fault
+
+    monkeypatch.setattr(analytic, "to_rgba", fail)
+    with pytest.raises((KeyboardInterrupt, SteerbenchError)):
+        analytic.load("void", **SMALL, root=tmp_path, log=log)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_root_that_cannot_be_written_is_named(tmp_path: Path, log) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SteerbenchError, match=r"file/void-\w+: the scene cannot be written"):
+        analytic.load("void", **SMALL, root=tmp_path / "file", log=log)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"width": 0}, "width: expected a whole number from 1 on, got 0"),
+        ({"height": 2.5}, "height: .* got 2.5"),
+        ({"train": 0}, "train: expected a whole number from 1"),
+        ({"test": True}, "test: expected a whole number from 1"),
+        ({"seed": -1}, "seed: expected a whole number from 0"),
+    ],
+)
+def test_bad_options(tmp_path, log, options, message) -> None:
+    with pytest.raises(SteerbenchError, match=message):
+        analytic.load("void", **options, root=tmp_path, log=log)
+
+
+def test_unknown_names_are_refused(tmp_path, log) -> None:
+    with pytest.raises(Unavailable, match="expected one of totem, wires, cloud, void, got 'tower'"):
+        analytic.load("tower", root=tmp_path, log=log)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,181 @@
+"""Exact pictures: closed forms of a sphere, culling that changes nothing, shadows."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from bench.cameras import cast, look_at, scale_camera
+from bench.scenes import raytrace
+from bench.scenes.models import totem, wires
+from bench.scenes.opaque import LIGHT, Part, Solids
+from bench.scenes.raytrace import ProjectedBoxes, render, sample_offsets
+from bench.scenes.solids import Capsule, Ellipsoid
+from bench.scenes.textures import plain
+from bench.types import EMPTY_ALPHA, Camera, SteerbenchError
+
+RED = plain((1.0, 0.0, 0.0))
+CELL = math.sqrt(2) / 4
+"""Diagonal of the quarter-pixel cell that each of 16 samples stands for."""
+
+
+def camera_at(eye: tuple[float, float, float], size: int = 96, device: str = "cpu") -> Camera:
+    c2w = look_at(torch.tensor(eye), torch.zeros(3), torch.tensor((0.0, 0.0, 1.0)))
+    return Camera(c2w.to(device), 1.3 * size, 1.3 * size, size / 2, size / 2, size, size)
+
+
+def sphere(radius: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Part:
+    return Part(Ellipsoid((radius, radius, radius)), RED, centre)
+
+
+def test_16_samples_stand_for_the_16_quarter_pixel_cells() -> None:
+    offsets = sample_offsets(16)
+    cells = (offsets * 4).floor().tolist()
+    assert sorted(cells) == [[a, b] for a in range(4) for b in range(4)]
+    assert len(set(offsets[:, 0].tolist())) == len(set(offsets[:, 1].tolist())) == 16
+    assert offsets.mean(0).tolist() == [0.5, 0.5]
+
+
+def test_one_sample_is_the_centre() -> None:
+    assert sample_offsets(1).tolist() == [[0.5, 0.5]]
+
+
+@pytest.mark.parametrize("samples", [0, -4, 3, 12])
+def test_other_sample_counts_are_refused(samples) -> None:
+    with pytest.raises(SteerbenchError, match="samples: expected a power of two"):
+        sample_offsets(samples)
+
+
+def test_depth_of_a_sphere_is_the_closed_form(device) -> None:
+    camera = camera_at((3.0, 1.0, 2.0), device=device)
+    frame = render(Solids([sphere(0.7)]), camera, torch.ones(3), samples=1)
+    rays = cast(camera)
+    # |o + t d|^2 = r^2, the textbook's way, in double precision.
+    o, d = rays.origins.double(), rays.directions.double()
+    a, b, c = (d * d).sum(1), (o * d).sum(1), (o * o).sum(1) - 0.49
+    root = b * b - a * c
+    expected = torch.where(root > 0, (-b - root.clamp(min=0).sqrt()) / a, math.inf)
+    certain = root.abs() > 1e-4
+    torch.testing.assert_close(
+        frame.depth.flatten().double()[certain], expected[certain], rtol=0, atol=2e-4
+    )
+    assert torch.equal(frame.alpha.flatten()[certain] > 0, (root > 0)[certain])
+
+
+def test_silhouette_of_a_sphere_has_its_closed_form_area() -> None:
+    camera = camera_at((0.0, -4.0, 0.0))
+    alpha = render(Solids([sphere(0.8)]), camera, torch.ones(3), samples=16).alpha
+    radius = camera.fx * math.tan(math.asin(0.8 / 4))
+    # Only cells that the outline crosses can be counted wrongly, half of them either way.
+    assert abs(alpha.sum().item() - math.pi * radius**2) <= 2 * math.pi * radius * CELL
+
+
+def test_a_thin_wire_covers_its_width() -> None:
+    camera = camera_at((0.0, -4.0, 0.0), size=400)
+    alpha = render(Solids([Part(Capsule(0.006, 1.0), RED)]), camera, torch.ones(3), 16).alpha
+    width = 2 * camera.fx * math.tan(math.asin(0.006 / 4))
+    rows = alpha[150:250].sum(1)
+    # Sixteen columns of samples a pixel: each border is off by 1/16 at most.
+    assert (rows - width).abs().max() <= 2 / 16
+
+
+def test_nothing_seen_is_the_background_at_infinity() -> None:
+    background = torch.tensor((0.2, 0.4, 0.6))
+    frame = render(
+        Solids([sphere(0.1, (9.0, 9.0, 0.0))]), camera_at((0.0, -4.0, 0.0)), background, 4
+    )
+    assert (frame.rgb == background).all()
+    assert frame.depth.isinf().all()
+    assert (frame.alpha == 0).all()
+
+
+def test_depth_is_finite_exactly_where_there_is_opacity() -> None:
+    frame = render(totem(), camera_at((1.0, -3.5, 1.5), size=64), torch.ones(3), 16)
+    assert torch.equal(frame.depth.isfinite(), frame.alpha >= EMPTY_ALPHA)
+    assert ((frame.rgb >= 0) & (frame.rgb <= 1 + 1e-6)).all()
+
+
+class EverywhereBoxes(ProjectedBoxes):
+    """Knows nothing about where parts are."""
+
+    def spans(self, top: int, bottom: int) -> list[tuple[int, int, int]]:
+        return [(part, 0, self.width) for part in range(len(self.in_front))]
+
+
+@pytest.mark.parametrize("model", [totem, wires], ids=["totem", "wires"])
+@pytest.mark.parametrize("eye", [(1.0, -3.5, 1.5), (0.3, 0.2, 0.3), (0.0, 0.1, 4.0)])
+def test_culling_by_boxes_changes_nothing(monkeypatch, model, eye) -> None:
+    camera = camera_at(eye, size=24)
+    monkeypatch.setattr(raytrace, "BAND_RAYS", 24 * 4 * 5)  # bands of five rows, the last of four
+    culled = render(model(), camera, torch.ones(3), 4)
+    monkeypatch.setattr(raytrace, "ProjectedBoxes", EverywhereBoxes)
+    whole = render(model(), camera, torch.ones(3), 4)
+    # Only rounding may differ, and it can turn a sample that grazes an edge.
+    differing = ((culled.rgb - whole.rgb).abs().amax(-1) > 1e-4).sum()
+    assert differing <= 1
+    assert (culled.alpha > 0).any()
+
+
+def test_shadow_of_a_sphere_is_the_closed_form() -> None:
+    caster, ground = sphere(0.3, (0.2, -0.1, 0.8)), sphere(0.01, (0.0, 0.0, -0.5))
+    model = Solids([ground, caster])
+    generator = torch.Generator().manual_seed(0)
+    points = torch.cat(
+        (3 * torch.rand(4000, 2, generator=generator) - 1.5, torch.zeros(4000, 1)), 1
+    )
+    offset = torch.tensor(caster.centre) - points
+    light = torch.tensor(LIGHT)
+    ahead = offset @ light
+    gap = (offset - ahead[:, None] * light).norm(dim=1) - 0.3
+    certain = gap.abs() > 1e-4
+    assert torch.equal(model.shadowed(0, points)[certain], ((gap < 0) & (ahead > 0))[certain])
+    assert 50 < (gap < 0).sum() < 3950
+
+
+def test_culling_of_shadow_casters_changes_nothing(monkeypatch) -> None:
+    model, camera = totem(), camera_at((1.0, -3.5, 1.5), size=32)
+    culled = render(model, camera, torch.ones(3), 4).rgb
+    everybody = list(range(len(model.parts)))
+
+    def all_but_convex_itself(number: int, points: Tensor) -> list[int]:
+        return [k for k in everybody if k != number or number in carved]
+
+    carved = [k for k in everybody if k in model.casters(k, torch.tensor([[0.0, 0, -0.76]]))]
+    monkeypatch.setattr(model, "casters", all_but_convex_itself)
+    assert torch.equal(render(model, camera, torch.ones(3), 4).rgb, culled)
+
+
+def test_the_light_is_a_unit_vector() -> None:
+    assert math.hypot(*LIGHT) == pytest.approx(1, abs=1e-6)
+
+
+def test_highlights_move_with_the_viewer() -> None:
+    glossy = Solids([Part(Ellipsoid((0.7, 0.7, 0.7)), RED, gloss=0.9)])
+    top = Solids([sphere(0.7)])
+    places = []
+    for eye in ((0.0, -4.0, 0.0), (1.5, -3.7, 0.0)):
+        camera = camera_at(eye)
+        extra = (
+            render(glossy, camera, torch.zeros(3), 4).rgb
+            - render(top, camera, torch.zeros(3), 4).rgb
+        )[..., 1]
+        place = extra.argmax().item()
+        row, column = divmod(place, camera.width)
+        depth = render(top, camera, torch.zeros(3), 4).depth[row, column]
+        ray = cast(camera, torch.tensor([[column + 0.5, row + 0.5]]))
+        places.append(ray.origins[0] + depth * ray.directions[0])
+    assert (places[0] - places[1]).norm() > 0.05
+
+
+def test_resolutions_agree() -> None:
+    camera = camera_at((1.0, -3.5, 1.5), size=32)
+    low = render(totem(), camera, torch.ones(3), samples=16)
+    high = render(totem(), scale_camera(camera, 128, 128), torch.ones(3), samples=16)
+    mean = high.rgb.reshape(32, 4, 32, 4, 3).mean((1, 3))
+    # 16 and 256 samples of one footprint: the error of 16 is at most that of a random draw on
+    # average, 1 / (2 sqrt 16), where two colours meet.
+    assert (mean - low.rgb).abs().mean() <= 1 / 8
+    assert (mean - low.rgb).abs().mean() <= 0.25 * (low.rgb[1:] - low.rgb[:-1]).abs().mean()

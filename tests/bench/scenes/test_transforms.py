@@ -1,0 +1,251 @@
+"""Captures: intrinsics by frame, missing pictures, lens distortion, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from kornia.geometry.calibration import undistort_points
+from PIL import Image
+
+from bench.cameras import pixel_grid
+from bench.scenes import transforms
+from bench.scenes.distortion import undistort
+from bench.types import Camera, SteerbenchError
+
+HERE = Path("picture.png")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, picture, pose) -> Path:
+    """Ten pictures of 8 x 6, listed out of order, without a lens."""
+    root = tmp_path / "desk"
+    (root / "images").mkdir(parents=True)
+    frames = []
+    for k in reversed(range(10)):
+        Image.fromarray(picture(k, channels=3)).save(root / "images" / f"{k:03}.png")
+        frames.append({"file_path": f"images/{k:03}.png", "transform_matrix": pose(k)})
+    record = {"fl_x": 9.0, "fl_y": 8.0, "cx": 4.5, "cy": 2.5, "w": 8, "h": 6, "aabb_scale": 2}
+    (root / "transforms.json").write_text(json.dumps({**record, "frames": frames}))
+    return root
+
+
+def test_every_nth_picture_by_name_is_a_test(folder, picture, log) -> None:
+    scene = transforms.load(folder, split_every=4, log=log)
+    assert list(scene.splits["test"].names) == [f"images/{k:03}.png" for k in (0, 4, 8)]
+    assert len(scene.splits["train"]) == 7
+    assert np.array_equal(scene.splits["test"].images[1].numpy(), picture(4, channels=3))
+
+
+def test_intrinsics_of_a_frame_go_first(folder, edit_json, log) -> None:
+    edit_json(
+        folder / "transforms.json",
+        lambda r: next(f for f in r["frames"] if "008" in f["file_path"]).update(fl_x=7.0, cx=4.0),
+    )
+    first, second = transforms.load(folder, log=log).splits["test"].cameras
+    assert (first.fx, first.fy, first.cx, first.cy) == (9, 8, 4.5, 2.5)
+    assert (second.fx, second.fy, second.cx, second.cy) == (7, 8, 4, 2.5)
+
+
+def test_pictures_of_several_sizes(folder, picture, edit_json, log) -> None:
+    Image.fromarray(picture(0, 12, 10, 3)).save(folder / "images" / "000.png")
+    edit_json(
+        folder / "transforms.json",
+        lambda r: next(f for f in r["frames"] if "000" in f["file_path"]).update(w=12, h=10),
+    )
+    first, second = transforms.load(folder, log=log).splits["test"].images
+    assert (tuple(first.shape), tuple(second.shape)) == ((10, 12, 3), (6, 8, 3))
+
+
+def test_focal_from_the_angle_and_the_rest_from_the_picture(folder, edit_json, log) -> None:
+    def change(record: dict) -> None:
+        for name in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+            del record[name]
+        record["camera_angle_x"] = 2 * np.arctan(0.5)
+
+    edit_json(folder / "transforms.json", change)
+    camera = transforms.load(folder, log=log).splits["test"].cameras[0]
+    assert camera.fx == camera.fy == pytest.approx(8)
+    assert (camera.cx, camera.cy, camera.width, camera.height) == (4, 3, 8, 6)
+
+
+def test_missing_pictures_are_named_once_and_left_out(folder, log) -> None:
+    for k in (3, 7):
+        (folder / "images" / f"{k:03}.png").unlink()
+    scene = transforms.load(folder, log=log)
+    assert sum(map(len, scene.splits.values())) == 8
+    (message,) = log.messages
+    assert message.endswith(
+        "2 of 10 pictures are not there, left out: images/007.png, images/003.png"
+    )
+
+
+@pytest.mark.parametrize(("override", "sides"), [(None, 2), (4, 4)])
+def test_the_cube_is_that_of_instant_ngp(folder, log, override, sides) -> None:
+    scene = transforms.load(folder, aabb_scale=override, log=log)
+    assert scene.unit_length == pytest.approx(sides / 0.33)
+    assert scene.bounds.tolist() == [[0, 0, 0], [1, 1, 1]]
+    # Picture 0 was taken from (0, -4, 0): 0.33 x + 0.5 in instant-ngp's cube of side 1.
+    expected = torch.tensor([0.5, 0.5 - 4 * 0.33 / sides, 0.5])
+    torch.testing.assert_close(scene.splits["test"].cameras[0].c2w[:, 3], expected)
+
+
+def test_scale_and_offset_of_the_file_are_heeded(folder, edit_json, log) -> None:
+    edit_json(folder / "transforms.json", lambda r: r.update(scale=0.1, offset=[0.5, 0.7, 0.5]))
+    scene = transforms.load(folder, aabb_scale=1, log=log)
+    expected = torch.tensor([0.5, 0.7 - 0.4, 0.5])
+    torch.testing.assert_close(scene.splits["test"].cameras[0].c2w[:, 3], expected)
+
+
+def every(name: str, value: object) -> Callable[[dict], object]:
+    return lambda record: record.update({name: value})
+
+
+def first(name: str, value: object) -> Callable[[dict], object]:
+    return lambda record: record["frames"][0].update({name: value})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (every("frames", []), r"frames: expected a list with at least one frame"),
+        (every("fl_x", 0), r"frames\[0\].fl_x: expected a finite number above 0, got 0"),
+        (first("fl_x", -3), r"frames\[0\].fl_x: .* above 0, got -3"),
+        (first("fl_y", "9"), r"frames\[0\].fl_y: .* got '9'"),
+        (first("cx", 9), r"frames\[0\].cx: .* below 8, got 9"),
+        (first("w", 0), r"frames\[0\].w: .* above 0"),
+        (first("k1", None), r"frames\[0\].k1: expected a finite number, got nothing"),
+        (every("k4", 0.1), r"frames\[0\].k4: expected a lens of k1 k2 p1 p2 k3"),
+        (every("is_fisheye", True), r"frames\[0\].is_fisheye: expected a lens"),
+        (
+            every("camera_model", "OPENCV_FISHEYE"),
+            r"frames\[0\].camera_model: expected one of OPENCV",
+        ),
+        (every("aabb_scale", 0), r"aabb_scale: .* above 0"),
+        (every("scale", -1), r"scale: .* above 0"),
+        (every("offset", [1, 2]), r"offset: expected three numbers"),
+        (first("transform_matrix", [[1]]), r"frames\[0\].transform_matrix: expected a 4x4 matrix"),
+        (first("file_path", "../desk2/a.png"), r"frames\[0\].file_path: expected a path inside"),
+    ],
+)
+def test_bad_field_is_named(folder, edit_json, log, change, message) -> None:
+    edit_json(folder / "transforms.json", change)
+    with pytest.raises(SteerbenchError, match=r"transforms\.json: " + message):
+        transforms.load(folder, log=log)
+
+
+def test_no_focal_length(folder, edit_json, log) -> None:
+    edit_json(folder / "transforms.json", lambda r: r.pop("fl_x"))
+    with pytest.raises(SteerbenchError, match=r"fl_x: expected a focal length, or camera_angle_x"):
+        transforms.load(folder, log=log)
+
+
+def test_no_picture_at_all(folder, log) -> None:
+    for file in (folder / "images").iterdir():
+        file.unlink()
+    with pytest.raises(SteerbenchError, match=r"frames: expected pictures, got none of 10 files"):
+        transforms.load(folder, log=log)
+
+
+def test_nothing_left_to_train_on(folder, log) -> None:
+    for k in range(1, 10):
+        (folder / "images" / f"{k:03}.png").unlink()
+    with pytest.raises(SteerbenchError, match=r"expected a picture to train on"):
+        transforms.load(folder, log=log)
+
+
+@pytest.mark.parametrize("value", [0, 1, 2.5, "8"])
+def test_bad_split_every(folder, log, value) -> None:
+    with pytest.raises(SteerbenchError, match=r"split_every: expected a whole number from 2 on"):
+        transforms.load(folder, split_every=value, log=log)
+
+
+def test_wrong_size_is_named(folder, picture, log) -> None:
+    Image.fromarray(picture(5, 9, 6, 3)).save(folder / "images" / "005.png")
+    with pytest.raises(SteerbenchError, match=r"005.png: expected 8 x 6 pixels, got 9 x 6"):
+        transforms.load(folder, log=log)
+
+
+LENSES = {
+    "pincushion": (0.06, 0.02, 0.0, 0.0, 0.0),
+    "barrel": (-0.12, 0.02, 0.0, 0.0, 0.0),
+    "phone": (0.058, -0.081, -0.001, 0.0002, 0.01),
+    "tangential": (0.0, 0.0, 0.01, -0.008, 0.0),
+}
+
+
+def pinhole() -> Camera:
+    return Camera(torch.eye(4)[:3], 90.0, 84.0, 52.3, 37.1, 100, 76)
+
+
+def wave(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    """A smooth picture of the image plane, [..., 3] in [0, 255]."""
+    return 127.5 + 100 * torch.stack(
+        (torch.sin(6 * x), torch.cos(5 * y), torch.sin(4 * (x + y))), -1
+    )
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_undistortion_recovers_the_pinhole_picture(name) -> None:
+    camera, lens = pinhole(), LENSES[name]
+    matrix = torch.tensor(
+        [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float64
+    )
+    grid = pixel_grid(camera.width, camera.height).double()
+    seen = undistort_points(grid, matrix, torch.tensor(lens, dtype=torch.float64), num_iters=60)
+    x, y = (seen[:, 0] - camera.cx) / camera.fx, (seen[:, 1] - camera.cy) / camera.fy
+    distorted = wave(x, y).reshape(camera.height, camera.width, 3).round().to(torch.uint8)
+    straight, cropped = undistort(distorted, camera, lens, HERE)
+    assert straight.shape == (cropped.height, cropped.width, 3)
+    # The crop loses a border only: most of the picture stays.
+    assert cropped.width * cropped.height > 0.85 * camera.width * camera.height
+    grid = pixel_grid(cropped.width, cropped.height).double()
+    expected = wave((grid[:, 0] - cropped.cx) / cropped.fx, (grid[:, 1] - cropped.cy) / cropped.fy)
+    # Bilinear: h^2 / 8 of the second derivatives along u and v, at most 100 * 36 / 84^2 a pixel
+    # squared each, 1.5 for the lens' own stretch; and half a level for each rounding.
+    bilinear = 2 * 1.5 * 100 * 36 / 84**2 / 8
+    error = (straight.reshape(-1, 3).double() - expected).abs().max().item()
+    assert error <= bilinear + 1
+
+
+def test_a_lens_that_does_nothing_returns_the_inner_picture(picture) -> None:
+    image = torch.from_numpy(picture(1, 100, 76, 3))
+    straight, cropped = undistort(image, pinhole(), (1e-12, 0.0, 0.0, 0.0, 0.0), HERE)
+    left, top = round(52.3 - cropped.cx), round(37.1 - cropped.cy)
+    assert cropped.width >= 98
+    inner = image[top : top + cropped.height, left : left + cropped.width]
+    assert torch.equal(straight, inner)
+
+
+def test_colours_between_pixels_weigh_by_their_alpha() -> None:
+    image = torch.zeros(76, 100, 4, dtype=torch.uint8)
+    image[..., 0] = 200
+    image[:, 50:, 3] = 255
+    image[:, :50, :3] = 90  # not seen: alpha is 0
+    straight, _ = undistort(image, pinhole(), LENSES["pincushion"], HERE)
+    colours = straight[straight[..., 3] > 0][:, :3]
+    assert (colours.float() - torch.tensor([200.0, 0, 0])).abs().max() <= 1
+
+
+def test_a_lens_that_folds_the_picture_is_refused() -> None:
+    image = torch.zeros(76, 100, 3, dtype=torch.uint8)
+    with pytest.raises(SteerbenchError, match=r"picture.png: .* it folds the picture"):
+        undistort(image, pinhole(), (-2.0, 0.0, 0.0, 0.0, 0.0), HERE)
+
+
+def test_a_capture_with_a_lens_is_cropped_alike_everywhere(folder, edit_json, picture, log) -> None:
+    for k in range(10):
+        Image.fromarray(picture(k, 100, 76, 3)).save(folder / "images" / f"{k:03}.png")
+    record = {"w": 100, "h": 76, "fl_x": 90, "fl_y": 84, "cx": 52.3, "cy": 37.1, "k1": 0.06}
+    edit_json(folder / "transforms.json", lambda r: r.update(record))
+    scene = transforms.load(folder, downscale=2, log=log)
+    shapes = {tuple(i.shape) for split in scene.splits.values() for i in split.images}
+    assert len(shapes) == 1
+    camera = scene.splits["train"].cameras[0]
+    assert shapes == {(camera.height, camera.width, 3)}
+    assert camera.width < 50
+    assert camera.fx == 45
