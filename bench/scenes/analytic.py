@@ -19,7 +19,7 @@ from bench.cameras import look_at, move_camera
 from bench.scenes import blender
 from bench.scenes.files import opengl_to_opencv, whole_number
 from bench.scenes.models import MODELS
-from bench.scenes.raytrace import render
+from bench.scenes.raytrace import Model, render
 from bench.types import Camera, Frame, Log, Scene, SteerbenchError, Unavailable
 
 ANGLE_X = 0.69
@@ -73,7 +73,7 @@ def load(
     )
 
 
-def find(name: str):
+def find(name: str) -> Model:
     """The model of that name; Unavailable when there is none."""
     if name not in MODELS:
         raise Unavailable(f"scene: expected one of {', '.join(MODELS)}, got {name!r}")

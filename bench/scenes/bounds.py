@@ -73,13 +73,15 @@ def hull_box(cameras: Sequence[Camera], images: Sequence[Tensor], space: Box) ->
     """
     if any(image.shape[2] < 4 for image in images):
         return None
+    if all((image[..., 3] == 255).all() for image in images):
+        return None
     size = (space.upper - space.lower) / CELLS
     cells = torch.cartesian_prod(*(torch.arange(CELLS, dtype=torch.float32),) * 3)
     steps = torch.cartesian_prod(*(torch.tensor((0.0, 1.0)),) * 3)
     for camera, image in zip(cameras, images, strict=True):
         corners = space.lower + size * (cells[:, None] + steps)  # [M, 8, 3]
         cells = cells[maybe_seen(camera, image[..., 3] > 0, corners.float())]
-    if not len(cells) or all((image[..., 3] == 255).all() for image in images):
+    if not len(cells):
         return None
     lower = space.lower + size * cells.amin(0)
     upper = space.lower + size * (cells.amax(0) + 1)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 
 from bench.scenes.media import Ball, Cloud
 from bench.scenes.opaque import Part, Solids
+from bench.scenes.raytrace import Model
 from bench.scenes.solids import Box, Capsule, Carved, Common, Cylinder, Ellipsoid, Shifted
 from bench.scenes.textures import (
     checker,
@@ -208,4 +210,9 @@ def void() -> Solids:
     return Solids([Part(ball(0.06), plain(CORAL), (0.35, -0.2, 0.15), gloss=0.5)])
 
 
-MODELS = {"totem": totem, "wires": wires, "cloud": cloud, "void": void}
+MODELS: dict[str, Callable[[], Model]] = {
+    "totem": totem,
+    "wires": wires,
+    "cloud": cloud,
+    "void": void,
+}

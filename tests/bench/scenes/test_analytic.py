@@ -97,7 +97,7 @@ def test_exact_frames_are_in_scene_units(tmp_path, log) -> None:
 
 
 def test_no_surface_point_is_outside_the_bounds(tmp_path, log, name) -> None:
-    options = {"width": 48, "train": 16, "test": 4}
+    options = {"width": 40, "train": 10, "test": 2}
     scene = analytic.load(name, **options, root=tmp_path, log=log)
     for camera in scene.splits["test"].cameras:
         frame = exact_frame(scene, camera, samples=1)

@@ -38,25 +38,20 @@ def test_one_ball_through_its_middle(device, density) -> None:
 def quadrature(model: Cloud, camera: Camera, steps: int) -> tuple[torch.Tensor, ...]:
     """rgb, alpha, and depth times alpha of the pixel centres, by the midpoint rule on [0, 6]."""
     rays = cast(camera)
-    o, d = rays.origins.double(), rays.directions.double()
     width = 6 / steps
-    rgb = torch.zeros(len(o), 3, dtype=torch.float64)
-    thickness, depth = torch.zeros(len(o), dtype=torch.float64), torch.zeros(len(o)).double()
-    for step in range(steps):
-        t = (step + 0.5) * width
-        points = o + t * d
-        sigma = torch.zeros_like(thickness)
-        glow = torch.zeros_like(rgb)
-        for ball in model.balls:
-            inside = (points - torch.tensor(ball.centre)).norm(dim=1) < ball.radius
-            sigma += ball.density * inside
-            glow += ball.density * inside[:, None] * torch.tensor(ball.colour)
-        passed = torch.exp(-thickness)
-        thickness = thickness + sigma * width * d.norm(dim=1)
-        weight = passed - torch.exp(-thickness)
-        rgb += weight[:, None] * glow / sigma.clamp(min=1e-12)[:, None]
-        depth += weight * t
-    return rgb, 1 - torch.exp(-thickness), depth
+    t = (torch.arange(steps, dtype=torch.float64) + 0.5) * width
+    points = rays.origins.double()[:, None] + t[:, None] * rays.directions.double()[:, None]
+    sigma = torch.zeros(points.shape[:2], dtype=torch.float64)
+    glow = torch.zeros_like(points)
+    for ball in model.balls:
+        inside = (points - torch.tensor(ball.centre)).norm(dim=-1) < ball.radius
+        sigma += ball.density * inside
+        glow += ball.density * inside[..., None] * torch.tensor(ball.colour)
+    thickness = sigma * width * rays.directions.double().norm(dim=1, keepdim=True)
+    passed = torch.exp(-thickness.cumsum(1))  # after each step
+    weight = passed * torch.expm1(thickness)
+    colour = glow / sigma.clamp(min=1e-12)[..., None]
+    return (weight[..., None] * colour).sum(1), 1 - passed[:, -1], (weight * t).sum(1)
 
 
 @pytest.mark.parametrize("eye", [(0.5, -3.0, 1.0), (0.1, 0.0, -0.4)], ids=["outside", "inside"])
