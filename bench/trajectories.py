@@ -40,7 +40,7 @@ class Trajectory:
 
 def spread(total: int, count: int) -> list[int]:
     """At most `count` different indices of `total`, evenly spread, first and last among them."""
-    return np.unique(np.linspace(0, total - 1, min(total, count)).round().astype(int)).tolist()
+    return np.linspace(0, total - 1, min(total, count)).round().astype(int).tolist()
 
 
 def from_split(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import threading
 
 import pytest
 
@@ -78,16 +79,25 @@ def test_a_quiet_log_says_nothing(tmp_path, clock, capsys):
     assert capsys.readouterr() == ("", "")
 
 
-def test_on_a_terminal_nested_bars_show_percentage_time_left_and_note(
-    monkeypatch, tmp_path, clock, capsys
-):
+@pytest.fixture
+def terminal(monkeypatch, tmp_path, clock) -> ConsoleLog:
+    """A log on a terminal of 120 columns."""
     monkeypatch.setenv("TTY_COMPATIBLE", "1")
     monkeypatch.setenv("TTY_INTERACTIVE", "1")
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "120")
-    log = ConsoleLog(tmp_path, clock=clock)
-    with log.progress("outer [1]", 2) as outer:
-        with log.progress("inner", 4) as inner:
+    return ConsoleLog(tmp_path, clock=clock)
+
+
+def test_a_bar_runs_no_thread_beside_what_is_measured(terminal):
+    before = threading.active_count()
+    with terminal.progress("rendering", 2):
+        assert threading.active_count() == before
+
+
+def test_on_a_terminal_nested_bars_show_percentage_time_left_and_note(terminal, clock, capsys):
+    with terminal.progress("outer [1]", 2) as outer:
+        with terminal.progress("inner", 4) as inner:
             for _ in range(3):
                 clock.now += 2.0
                 inner.advance(1, note="[x] 9 dB")
