@@ -1,0 +1,1 @@
+"""Data sets and embedded scenes, each loader a module with `load(...) -> Scene`."""

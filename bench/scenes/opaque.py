@@ -123,10 +123,11 @@ class Solids:
     def shadowed(self, number: int, points: Tensor) -> Tensor:
         """[N] bool: is another part between these points of part `number` and the light?"""
         dark = torch.zeros(len(points), dtype=torch.bool, device=points.device)
-        light = points.new_tensor(LIGHT)
+        light, columns = points.new_tensor(LIGHT), points.T.contiguous()
         for caster in (self.parts[k] for k in self.casters(number, points)):
             frame = caster.frame.to(points)
-            x, y, z = ((points - points.new_tensor(caster.centre)) @ frame).unbind(1)
+            centre = points.new_tensor(caster.centre)[:, None]
+            x, y, z = (frame.T @ (columns - centre)).unbind(0)
             u, v, w = (light @ frame).unbind(0)
             dark |= caster.shape.hit((x, y, z), (u, v, w)) < math.inf
         return dark
