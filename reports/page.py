@@ -93,10 +93,10 @@ def _copy_pictures(source: Path, target: Path, prefix: str) -> dict[int, str]:
 
 def _pictures(frames: pd.DataFrame, shown: Mapping[int, str]) -> tables.Table:
     """One line per shown frame: name and PSNR, ground truth, rendering, error map."""
-    by_frame = frames.set_index("frame")
+    by_frame = frames.set_index("frame").to_dict("index")
     lines = tuple(
         (
-            f"{by_frame.at[frame, 'name']!s}, {by_frame.loc[frame, 'psnr']:.2f} dB",
+            f"{by_frame[frame]['name']}, {by_frame[frame]['psnr']:.2f} dB",
             *(f"![{caption}](pictures/{stem}-{panel}.png)" for panel, caption in PANELS.items()),
         )
         for frame, stem in shown.items()

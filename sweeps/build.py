@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
 from types import UnionType
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from hydra.errors import InstantiationException
-from hydra.utils import instantiate
+from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import SteerbenchError
@@ -21,47 +21,61 @@ STANDS_FOR = {"Path": str, "tuple": list, "Sequence": list, "Mapping": dict, "fl
 def build(config: DictConfig, group: str, *args: Any, **extra: Any) -> Any:
     """Call the `_target_` of `config[group]` with its settings, `args` and `extra`.
 
-    What the target itself raises passes through unchanged.
+    Nodes below it that have a `_target_` are built first. What a target raises passes through.
 
     Raises:
-        SteerbenchError: a setting is missing, unknown to the target, or of another type.
+        SteerbenchError: a setting is missing, unknown to its target, or of another type.
     """
     missing = sorted(OmegaConf.missing_keys(config[group]))  # full keys: "scene.path"
     if missing:
         raise SteerbenchError(f"{missing[0]} is not set: give {missing[0]}=...")
+    node: Any = OmegaConf.to_container(config[group], resolve=True)
+    target = get_object(node["_target_"])
+    given = [*list(inspect.signature(target).parameters)[: len(args)], *extra]
+    check_settings(target, node, f"{group}.", given)
     try:
-        target = instantiate(config[group], _partial_=True, _convert_="all")
+        prepared = instantiate(config[group], _partial_=True, _convert_="all")
     except InstantiationException as error:
-        raise SteerbenchError(f"{group}: {' '.join(str(error).split())}") from error
-    taken = [*list(inspect.signature(target.func).parameters)[: len(args)], *extra]
-    check_types(target.func, target.keywords, f"{group}.", taken)
-    return target(*args, **extra)
+        raise error.__cause__ or error from error
+    return prepared(*args, **extra)
 
 
-def check_types(
-    target: Any, settings: Mapping[str, Any], prefix: str = "", taken: Sequence[str] = ()
+def check_settings(
+    target: Any, settings: Mapping[str, Any], prefix: str = "", given: Collection[str] = ()
 ) -> None:
     """Raise `SteerbenchError` unless `target` takes these settings, by name and by type.
 
-    `prefix` stands before their names in the error; the parameters in `taken` cannot be set.
+    `prefix` stands before their names in the error; parameters `given` by the caller are no
+    settings. Settings that are nodes with a `_target_` are checked against that.
     """
-    parameters = inspect.signature(target).parameters
     hints = get_type_hints(target.__init__ if inspect.isclass(target) else target)
-    free = [name for name in parameters if name not in taken]
+    parameters = inspect.signature(target).parameters
+    names = [name for name in parameters if name not in given]
     for name, value in settings.items():
-        if name not in free:
-            raise unknown("setting", f"{prefix}{name}", [f"{prefix}{other}" for other in free])
-        if not _fits(value, hints.get(name, Any)):
-            wanted = parameters[name].annotation
+        if name.startswith("_"):  # of Hydra: _target_, _convert_
+            continue
+        if name not in names:
+            raise unknown("setting", f"{prefix}{name}", [f"{prefix}{other}" for other in names])
+        if isinstance(value, dict) and "_target_" in value:
+            check_settings(get_object(value["_target_"]), value, f"{prefix}{name}.")
+        elif not _fits(value, hints.get(name, Any)):
+            wanted = " or ".join(map(str, _choices(hints[name]))) or parameters[name].annotation
             raise SteerbenchError(f"{prefix}{name}: expected {wanted}, got {value!r}")
+
+
+def _choices(hint: Any) -> tuple[object, ...]:
+    """The values a `Literal` allows; none for other types."""
+    return get_args(hint) if get_origin(hint) is Literal else ()
 
 
 def _fits(value: object, hint: Any) -> bool:
     """Whether a plain YAML `value` can stand where `hint` is asked for; if in doubt, it can."""
     if get_origin(hint) is UnionType:
         return any(_fits(value, option) for option in get_args(hint))
+    if choices := _choices(hint):
+        return value in choices
     kind = get_origin(hint) or hint
     kind = STANDS_FOR.get(getattr(kind, "__name__", ""), kind)
-    if isinstance(value, bool) and kind is not bool:
-        return not isinstance(kind, type | UnionType)
-    return not isinstance(kind, type | UnionType) or isinstance(value, kind)
+    if not isinstance(kind, type | UnionType):
+        return True
+    return isinstance(value, kind) and (kind is bool or not isinstance(value, bool))

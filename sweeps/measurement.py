@@ -21,7 +21,7 @@ from bench.run import measure
 from bench.types import Method, Scene
 from reports.page import write_page
 from reports.tables import blocks
-from sweeps.build import build, check_types
+from sweeps.build import build, check_settings
 from sweeps.terminal import console, rich_table
 
 PLACES = ("outputs", "report", "weights_dir")
@@ -86,7 +86,7 @@ def execute(config: DictConfig, command: Sequence[str]) -> None:
 
 def _settings(config: DictConfig) -> Settings:
     values = {field.name: config[field.name] for field in fields(Settings)}
-    check_types(Settings, values)
+    check_settings(Settings, values)
     settings = Settings(**values)
     if settings.seed < 0:
         raise SteerbenchError(f"seed: expected 0 or more, got {settings.seed}")

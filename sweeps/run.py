@@ -13,7 +13,6 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from bench.errors import SteerbenchError
 from sweeps.overrides import CONFIGS, explain
 
 

@@ -1,0 +1,51 @@
+"""`steerbench kernels`: a table, then JSON; a kernel that is wrong fails the command."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+RIGHT = {
+    "kernel": "encode", "case": "view", "backend": "cpu", "dtype": "float32", "error": 1e-7,
+    "tolerance": 1e-6, "status": "ok", "ms": 12.5, "mitems_s": 10.4, "ratio": 31.0,
+}  # fmt: skip
+WRONG = {
+    "kernel": "march", "case": "empty", "backend": "cpu", "dtype": "float32", "error": 0.5,
+    "tolerance": 1e-6, "status": "wrong",
+}  # fmt: skip
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
+    """What the benchmark was asked for; it finds `RIGHT` and `WRONG`, by their names."""
+    calls = []
+
+    def main_rows(name_filter: str, repeats: int) -> list[dict]:
+        calls.append((name_filter, repeats))
+        return [row for row in (RIGHT, WRONG) if name_filter in row["kernel"]]
+
+    monkeypatch.setattr("methods.kernels.benchmark.main_rows", main_rows)
+    return calls
+
+
+def test_the_last_line_is_json_of_what_the_table_shows(steerbench, asked):
+    outcome = steerbench("kernels", "--filter", "enc", "--repeats", "3")
+    assert asked == [("enc", 3)]
+    assert outcome.status == 0
+    for text in ("encode", "1.0e-07", "1.0e-06", "12.50", "10.40", "31.0x"):
+        assert text in outcome.out
+    assert json.loads(outcome.out.splitlines()[-1]) == [RIGHT]
+
+
+def test_a_wrong_kernel_shows_its_status_instead_of_a_time_and_fails(steerbench, asked):
+    outcome = steerbench("kernels")
+    assert outcome.status == 1
+    assert "wrong" in outcome.out
+    assert json.loads(outcome.out.splitlines()[-1]) == [RIGHT, WRONG]
+
+
+def test_a_filter_that_fits_nothing_is_an_error(steerbench, asked):
+    outcome = steerbench("kernels", "--filter", "splat")
+    assert outcome.status == 2
+    assert "no kernel has 'splat' in its name" in outcome.err
