@@ -105,9 +105,7 @@ class HashField(nn.Module):
         return functional.linear(inputs, self.layers[layer].to(self._compute_dtype))
 
 
-def _xavier_uniform(
-    outputs: int, inputs: int, generator: torch.Generator | None
-) -> nn.Parameter:
+def _xavier_uniform(outputs: int, inputs: int, generator: torch.Generator | None) -> nn.Parameter:
     bound = math.sqrt(6 / (outputs + inputs))
     weights = torch.empty(outputs, inputs).uniform_(-bound, bound, generator=generator)
     return nn.Parameter(weights)

@@ -1,8 +1,10 @@
 """Learning where a field is empty: a decaying maximum of its density on a grid of cells.
 
-As in Instant-NGP (appendix E.2) and ngp_pl: every `EVERY` steps the density is sampled at random
-points of some cells, cell <- max(DECAY * cell, density), and a cell counts as occupied when it
-exceeds min(mean of the cells, the density that is opaque to 1 % over one step).
+After Instant-NGP (appendix E.2): every `EVERY` steps the density is sampled at random points of
+some cells, and a cell counts as occupied when its running maximum exceeds min(mean of the cells,
+the density that is opaque to 1 % over one step). Two things differ. A cell's value changes only
+when the cell is visited, so that a cell that was not looked at is not forgotten. And all cells
+start out occupied, one visit away from being empty, so that no step ever samples the whole grid.
 """
 
 from __future__ import annotations
@@ -18,11 +20,16 @@ from methods.kernels.march import MAX_SAMPLES, Occupancy
 RESOLUTION = 128
 STEP = math.sqrt(3) / MAX_SAMPLES
 """World length of a ray-marching step: the cube's diagonal in 1024 steps."""
+
 EVERY = 16
-WARMUP_STEPS = 256
-DECAY = 0.95
+"""Training steps between two updates."""
+
+DECAY = 0.8
+"""What a visit that finds nothing leaves of a cell's value."""
+
 MIN_ALPHA = 0.01
 THRESHOLD = MIN_ALPHA / STEP
+INITIAL = 1.2 * THRESHOLD
 CHUNK = 1 << 18
 
 
@@ -33,14 +40,14 @@ class DensityGrid:
     """
 
     def __init__(self, bounds: Tensor, device: torch.device | str = "cpu") -> None:
-        self.density = torch.zeros(RESOLUTION, RESOLUTION, RESOLUTION, device=device)
         edge = torch.arange(RESOLUTION, device=device) / RESOLUTION
         lower, upper = bounds.to(device)
         inside = (edge[:, None] + 1 / RESOLUTION > lower) & (edge[:, None] < upper)  # [G, 3]
         x, y, z = inside.unbind(dim=1)
-        self._inside = x[:, None, None] & y[:, None] & z
-        self._candidates = self._inside.flatten().nonzero().squeeze(1)
-        self.occupancy = Occupancy(self._inside)
+        cells = x[:, None, None] & y[:, None] & z
+        self.density = INITIAL * cells.float()
+        self._candidates = cells.flatten().nonzero().squeeze(1)
+        self.occupancy = Occupancy(cells)
 
     def restore(self, density: Tensor) -> None:
         """Take over the density of a checkpoint."""
@@ -48,20 +55,18 @@ class DensityGrid:
         self._threshold()
 
     @torch.no_grad()
-    def update(self, field: HashField, generator: torch.Generator, samples: int | None) -> None:
-        """Sample every candidate cell once (`samples` None) or `samples` of them.
-
-        Half of the samples go to cells drawn from all candidates, half to occupied ones.
-        """
-        cells = self._candidates if samples is None else self._draw(samples, generator)
-        found = torch.zeros_like(self.density).view(-1)
+    def update(self, field: HashField, generator: torch.Generator, samples: int) -> None:
+        """Visit `samples` random cells, half of them among all, half among the occupied ones."""
+        cells = self._draw(samples, generator)
+        found = torch.full_like(self.density.view(-1), -1.0)
         for part in cells.split(CHUNK):
             corner = torch.stack(torch.unravel_index(part, self.density.shape), dim=-1)
             jitter = torch.rand(len(part), 3, generator=generator, device=part.device)
             sigma, _ = field.density((corner + jitter) / RESOLUTION)
             found.scatter_reduce_(0, part, sigma, "amax")
-        self.density.mul_(DECAY)
-        torch.maximum(self.density, found.view_as(self.density), out=self.density)
+        found = found.view_as(self.density)
+        visited = torch.maximum(DECAY * self.density, found)
+        self.density = torch.where(found >= 0, visited, self.density)
         self._threshold()
 
     def _draw(self, samples: int, generator: torch.Generator) -> Tensor:
@@ -77,4 +82,4 @@ class DensityGrid:
 
     def _threshold(self) -> None:
         mean = self.density.view(-1)[self._candidates].mean().item()
-        self.occupancy = Occupancy((self.density > min(mean, THRESHOLD)) & self._inside)
+        self.occupancy = Occupancy(self.density > min(mean, THRESHOLD))

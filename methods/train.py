@@ -20,11 +20,14 @@ from torch import Tensor
 from bench.types import Budget, Log, Rays, Scene, Split, SteerbenchError
 from methods.fields import HashField
 from methods.kernels.adam import AdamState, sparse_adam_
-from methods.occupancy import EVERY, WARMUP_STEPS, DensityGrid
+from methods.occupancy import EVERY, DensityGrid
 from methods.volume import render_batch
 
 CHECKPOINT_S = 20.0
 """Seconds between checkpoints: what a killed training loses at most."""
+
+GRID_YOUTH_STEPS = 256
+"""Until this step the density grid is visited four times as much: most of it is still unknown."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,7 @@ class TrainingOptions:
         opacity_entropy: weight of -o ln o, which drives the opacity of a ray to 0 or 1.
         random_background: train RGBA pictures on a random colour a ray instead of the scene's
             background, so that no density can pass for background.
-        grid_samples: density samples of an update of the density grid after the warm-up.
+        grid_samples: visits of an update of the density grid.
         max_rays: most rays of a step.
     """
 
@@ -114,10 +117,9 @@ class FieldTraining:
             SteerbenchError: the loss is not finite.
         """
         if self.step % EVERY == 0:
-            warming = self.step < WARMUP_STEPS
-            self.grid.update(
-                self.field, self.generator, None if warming else self.options.grid_samples
-            )
+            young = self.step < GRID_YOUTH_STEPS
+            samples = self.options.grid_samples * (4 if young else 1)
+            self.grid.update(self.field, self.generator, samples)
         rays, colours = self.batches.draw(self.rays, self.generator)
         target, background = self._target(colours)
         jitter = torch.rand(
@@ -226,14 +228,18 @@ def _run(training: FieldTraining, folder: Path, log: Log) -> None:
     mean = math.nan
     with log.progress("training", steps) as progress:
         progress.advance(training.step)
-        while training.step < steps:
-            loss = training.advance()
-            mean = loss if math.isnan(mean) else 0.99 * mean + 0.01 * loss
-            progress.advance(note=f"{-10 * math.log10(max(mean, 1e-10)):.1f} dB")
-            training.seconds = time.monotonic() - began
-            if time.monotonic() - saved > CHECKPOINT_S:
-                _save(training, checkpoint)
-                saved = time.monotonic()
+        try:
+            while training.step < steps:
+                loss = training.advance()
+                mean = loss if math.isnan(mean) else 0.99 * mean + 0.01 * loss
+                progress.advance(note=f"{-10 * math.log10(max(mean, 1e-10)):.1f} dB")
+                training.seconds = time.monotonic() - began
+                if time.monotonic() - saved > CHECKPOINT_S:
+                    _save(training, checkpoint)
+                    saved = time.monotonic()
+        except KeyboardInterrupt:
+            _save(training, checkpoint)
+            raise
     _save(training, folder / "field.safetensors", finished=True)
     checkpoint.unlink(missing_ok=True)
 

@@ -10,7 +10,7 @@ from types import ModuleType
 
 import torch
 
-from bench.types import Unavailable
+from bench.errors import Unavailable
 
 BACKENDS = ("reference", "cpu", "gpu")
 

@@ -1,7 +1,7 @@
 """Volume rendering of samples into pixels (Max 1995; SteerNeRF Eq. 2 and 3).
 
-    alpha_i = 1 - exp(-sigma_i delta_i),  T_i = prod_{j<i} (1 - alpha_j),  w_i = T_i alpha_i
-    values = sum w_i f_i + (1 - sum w_i) background,  depth_sum = sum w_i t_i,  alpha = sum w_i
+alpha_i = 1 - exp(-sigma_i delta_i),  T_i = prod_{j<i} (1 - alpha_j),  w_i = T_i alpha_i
+values = sum w_i f_i + (1 - sum w_i) background,  depth_sum = sum w_i t_i,  alpha = sum w_i
 """
 
 from __future__ import annotations

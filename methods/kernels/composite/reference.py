@@ -28,9 +28,9 @@ def composite(
         return torch.where(mask, samples[index], 0) if len(samples) else samples[index]
 
     # A sample without length is without matter, however dense: 0, not inf * 0.
-    tau = torch.where(delta > 0, sigma * delta, 0)
-    tau = padded(tau)  # [R, N]
-    before = tau.cumsum(dim=1) - tau
+    tau = padded(torch.where(delta > 0, sigma * delta, 0))  # [R, N]
+    # Shifted rather than subtracted: behind an infinite thickness, inf - inf would be no number.
+    before = torch.nn.functional.pad(tau, (1, 0)).cumsum(dim=1)[:, :-1]
     front = 1 if carry is None else (1 - carry.alpha)[:, None]
     transmittance = front * torch.exp(-before)
     weight = torch.where(transmittance > stop, transmittance * -torch.expm1(-tau), 0)

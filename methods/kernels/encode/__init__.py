@@ -67,9 +67,7 @@ class HashGrid:
     @cached_property
     def dense(self) -> tuple[bool, ...]:
         """Whether a level stores every vertex."""
-        return tuple(
-            res**3 <= size for res, size in zip(self.resolutions, self.sizes, strict=True)
-        )
+        return tuple(res**3 <= size for res, size in zip(self.resolutions, self.sizes, strict=True))
 
     @cached_property
     def offsets(self) -> tuple[int, ...]:

@@ -58,9 +58,7 @@ class _Encode(torch.autograd.Function):
             _encode_float(positions.numpy(), table.detach().numpy(), *levels, features.numpy())
             return features
         words = torch.empty(len(positions), grid.levels, dtype=torch.int32)
-        _encode_packed(
-            positions.numpy(), _unsigned(packed), *levels, _unsigned(words)
-        )
+        _encode_packed(positions.numpy(), _unsigned(packed), *levels, _unsigned(words))
         return words.view(torch.bfloat16)
 
     @staticmethod

@@ -34,20 +34,23 @@ def _unpack(packed: Tensor, table: Tensor) -> Tensor:
 
 
 def _encode_level(positions: Tensor, table: Tensor, grid: HashGrid, level: int) -> Tensor:
+    entries, weights = corners(positions, grid, level)
+    return (weights.to(table.dtype)[..., None] * table[entries]).sum(dim=1)
+
+
+def corners(positions: Tensor, grid: HashGrid, level: int) -> tuple[Tensor, Tensor]:
+    """Table entries [N, 8] of the corners around `positions` in [0, 1]^3, and their weights."""
     scaled = positions * grid.scales[level] + 0.5  # [N, 3]
     cell = scaled.detach().floor()
-    fraction = scaled - cell
-    features = torch.zeros(len(positions), grid.features, dtype=table.dtype, device=table.device)
-    for corner in range(8):
-        bits = torch.tensor([corner >> axis & 1 for axis in range(3)], device=positions.device)
-        index = grid.offsets[level] + _entry(cell.long() + bits, grid, level)
-        weight = torch.where(bits.bool(), fraction, 1 - fraction).prod(dim=-1, keepdim=True)
-        features = features + weight.to(table.dtype) * table[index]
-    return features
+    fraction = (scaled - cell)[:, None]  # [N, 1, 3]
+    corner = torch.arange(8, device=positions.device)
+    bits = corner[:, None] >> torch.arange(3, device=positions.device) & 1  # [8, 3]
+    weights = torch.where(bits.bool(), fraction, 1 - fraction).prod(dim=-1)
+    return grid.offsets[level] + _entry(cell.long()[:, None] + bits, grid, level), weights
 
 
 def _entry(vertex: Tensor, grid: HashGrid, level: int) -> Tensor:
-    """Table entry, within its level, of integer grid vertices [N, 3]."""
+    """Table entry, within its level, of integer grid vertices [..., 3]."""
     x, y, z = vertex.unbind(dim=-1)
     if grid.dense[level]:
         res = grid.resolutions[level]

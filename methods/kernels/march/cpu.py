@@ -123,7 +123,8 @@ def _march_ray(origin, direction, words, blocks, bounds, step, near, far, phase,
     length = f32(math.sqrt(f64(dx) ** 2 + f64(dy) ** 2 + f64(dz) ** 2))
     enter, leave = _cross(origin, direction, UNIT_CUBE)
     near, far = max(enter, near), min(leave, far)
-    if not (near < far and length > 0 and near > -np.inf):
+    finite = abs(ox) + abs(oy) + abs(oz) < np.inf and 0 < length < np.inf
+    if not (finite and near < far):
         return 0, -1
     step_t, steps_per_t = step / length, length / step
     size = words.shape[0] * 4
@@ -212,6 +213,4 @@ def _place(origins, directions, scratch, most, offsets, t, positions, ray_of):  
                 t[sample] = scratch[sample + shift]
                 ray_of[sample] = ray
                 for axis in range(3):
-                    positions[sample, axis] = (
-                        origins[ray, axis] + t[sample] * directions[ray, axis]
-                    )
+                    positions[sample, axis] = origins[ray, axis] + t[sample] * directions[ray, axis]

@@ -1,0 +1,65 @@
+"""A case: inputs on which every backend of a kernel must agree with the reference.
+
+The cases of a kernel stand in its `cases.py`, once, and serve the tests, the benchmark and, where
+they are numerically hard, the stress table. Tolerances are derived from the arithmetic, in terms of
+the unit roundoff u of the type that the result is computed in, and stated beside the case.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+U32 = 2.0**-24
+"""Unit roundoff of float32."""
+
+U16 = 2.0**-8
+"""Unit roundoff of bfloat16, doubled: two nearly equal numbers may round to neighbours."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Inputs in place: `call(backend)` runs the kernel on them, each result within `tolerance`.
+
+    `tolerance` bounds |result - reference| in absolute terms, for all outputs of `call`.
+    """
+
+    call: Callable[[str], tuple[Tensor, ...]]
+    tolerance: float
+
+
+@dataclass(frozen=True)
+class Case:
+    """One case of a kernel.
+
+    Attributes:
+        kernel: what is computed, with its direction ("encode", "encode backward").
+        name: what is special about the inputs.
+        dtype: what the kernel reads.
+        items: how many samples, rays or entries one call handles.
+        prepare: makes the inputs on a device.
+        timed: large enough that its throughput says something.
+    """
+
+    kernel: str
+    name: str
+    dtype: str
+    items: int
+    prepare: Callable[[str], Prepared]
+    timed: bool = False
+
+
+def largest_error(results: tuple[Tensor, ...], reference: tuple[Tensor, ...]) -> float:
+    """Largest |result - reference| over all outputs; inf where shapes or non-finite values differ."""
+    worst = 0.0
+    for got, want in zip(results, reference, strict=True):
+        if got.shape != want.shape:
+            return torch.inf
+        got, want = got.detach().double(), want.detach().double()
+        same = (got == want) | (got.isnan() & want.isnan())
+        error = torch.where(same, 0, (got - want).abs()).nan_to_num(nan=torch.inf)
+        worst = max(worst, error.max().item() if error.numel() else 0.0)
+    return worst

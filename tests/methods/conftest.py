@@ -1,0 +1,56 @@
+"""A scene that a field can learn in seconds."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from bench.cameras import cast
+from bench.types import Camera, Scene, Split
+
+SIZE = 32
+
+
+def ball(camera: Camera) -> Tensor:
+    """A ball of radius 0.3 in the middle of the cube, coloured by its normal: uint8 [H, W, 4]."""
+    rays = cast(camera)
+    towards = torch.nn.functional.normalize(rays.directions, dim=-1)
+    offset = torch.full((3,), 0.5) - rays.origins
+    along = (offset * towards).sum(dim=-1)
+    inside = 0.3**2 - (offset - along[:, None] * towards).square().sum(dim=-1)
+    surface = rays.origins + (along - inside.clamp(min=0).sqrt())[:, None] * towards
+    colour = 255 * (0.5 + (surface - 0.5) / 0.6)
+    opaque = torch.full((len(colour), 1), 255.0)
+    picture = torch.where(inside[:, None] > 0, torch.cat((colour, opaque), dim=1), 0)
+    return picture.view(camera.height, camera.width, 4).byte()
+
+
+def look_at_the_middle(turn: float, lift: float) -> Camera:
+    """A camera at a distance of 1.6 from the middle of the unit cube."""
+    angle = 2 * math.pi * turn
+    away = torch.tensor(
+        [math.cos(angle) * math.cos(lift), math.sin(angle) * math.cos(lift), math.sin(lift)]
+    )
+    right = torch.nn.functional.normalize(
+        torch.linalg.cross(-away, torch.tensor([0.0, 0.0, 1.0])), dim=0
+    )
+    down = torch.linalg.cross(-away, right)
+    c2w = torch.stack((right, down, -away, 0.5 + 1.6 * away), dim=1)
+    return Camera(c2w, 40.0, 40.0, SIZE / 2, SIZE / 2, SIZE, SIZE)
+
+
+@pytest.fixture(scope="session")
+def ball_scene() -> Scene:
+    """24 training and 3 test pictures of a coloured ball on white."""
+    splits = {}
+    for name, count, shift in (("train", 24, 0.0), ("test", 3, 0.017)):
+        cameras = [
+            look_at_the_middle(i / count + shift, 0.9 * math.sin(5.0 * i)) for i in range(count)
+        ]
+        names = [f"{name}/{i}" for i in range(count)]
+        splits[name] = Split(cameras, [ball(camera) for camera in cameras], names)
+    bounds = torch.tensor([[0.1, 0.1, 0.1], [0.9, 0.9, 0.9]])
+    return Scene("ball", splits, torch.ones(3), bounds, unit_length=1.0, digest="ball")

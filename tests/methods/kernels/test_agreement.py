@@ -1,0 +1,63 @@
+"""Every backend against the reference, on the cases that stand beside the kernels."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from pathlib import Path
+
+import pytest
+import torch
+
+import methods.kernels
+from methods.kernels import BACKENDS, availability, resolve
+from methods.kernels.benchmark import all_cases
+from methods.kernels.case import Case, largest_error
+
+CASES = [case for case in all_cases() if not case.timed]
+KERNELS = ("adam", "composite", "encode", "march", "spherical")
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.kernel}: {case.name}")
+def test_backends_agree_with_the_reference(case: Case, device: str) -> None:
+    prepared = case.prepare(device)
+    fast = resolve("auto", device)
+    error = largest_error(prepared.call(fast), prepared.call("reference"))
+    assert error <= prepared.tolerance
+
+
+def test_a_wrong_result_exceeds_the_tolerance() -> None:
+    for case in CASES:
+        prepared = case.prepare("cpu")
+        right = prepared.call("reference")
+        wrong = tuple(result + 2 * prepared.tolerance + 1 for result in right)
+        assert largest_error(wrong, right) > prepared.tolerance or not right[0].numel()
+
+
+def test_a_nan_is_an_infinite_error() -> None:
+    assert largest_error((torch.tensor([torch.nan]),), (torch.ones(1),)) == torch.inf
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_backends_have_the_same_signature(kernel: str) -> None:
+    folder = Path(methods.kernels.__file__).parent / kernel
+    names = [path.stem for path in folder.glob("*.py") if path.stem in BACKENDS]
+    assert {"reference", "cpu"} <= set(names)
+    public = {"adam": "sparse_adam_", "spherical": "spherical_harmonics"}.get(kernel, kernel)
+    signatures = {
+        inspect.signature(
+            getattr(importlib.import_module(f"methods.kernels.{kernel}.{name}"), public)
+        )
+        for name in names
+    }
+    assert len(signatures) == 1
+
+
+def test_every_kernel_folder_has_cases() -> None:
+    folders = {path.parent.name for path in Path(methods.kernels.__file__).parent.glob("*/cpu.py")}
+    assert folders == set(KERNELS)
+    assert {case.kernel.split()[0] for case in CASES} == set(KERNELS)
+
+
+def test_reference_and_cpu_are_usable_everywhere() -> None:
+    assert availability()["reference"] == availability()["cpu"] == ""

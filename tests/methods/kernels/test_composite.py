@@ -1,0 +1,160 @@
+"""The reference of the compositing against a plain loop, closed forms and finite differences."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from methods.kernels.composite import Pixels, composite
+
+BACKENDS = ["reference", "cpu"]
+
+
+def samples(counts: list[int], channels: int = 3, dtype: torch.dtype = torch.float32) -> dict:
+    generator = torch.Generator().manual_seed(len(counts))
+    total = sum(counts)
+
+    def draw(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=dtype)
+
+    return {
+        "sigma": 30 * draw(total),
+        "values": draw(total, channels),
+        "t": draw(total).cumsum(0),
+        "delta": 0.1 * draw(total),
+        "offsets": torch.tensor([0, *counts]).cumsum(0),
+    }
+
+
+def plain_composite(inputs: dict, stop: float) -> list[tuple[list[float], float, float]]:
+    """The definition (Eq. 2, 3), a ray and a sample at a time, in Python numbers."""
+    rays = []
+    for begin, end in zip(inputs["offsets"][:-1], inputs["offsets"][1:], strict=True):
+        colour, depth, alpha = [0.0] * inputs["values"].shape[1], 0.0, 0.0
+        transmittance = 1.0
+        for i in range(int(begin), int(end)):
+            if transmittance <= stop:
+                break
+            opacity = 1 - math.exp(-inputs["sigma"][i].item() * inputs["delta"][i].item())
+            weight = transmittance * opacity
+            colour = [
+                c + weight * v for c, v in zip(colour, inputs["values"][i].tolist(), strict=True)
+            ]
+            depth += weight * inputs["t"][i].item()
+            alpha += weight
+            transmittance *= 1 - opacity
+        rays.append((colour, depth, alpha))
+    return rays
+
+
+@pytest.mark.parametrize("stop", [0.0, 0.3])
+def test_reference_is_the_definition(stop: float) -> None:
+    inputs = samples([4, 0, 1, 9], dtype=torch.float64)
+    pixels = composite(**inputs, stop=stop, backend="reference")
+    want = plain_composite(inputs, stop)
+    for ray, (colour, depth, alpha) in enumerate(want):
+        assert pixels.values[ray].tolist() == pytest.approx(colour, abs=1e-12)
+        assert pixels.depth_sum[ray].item() == pytest.approx(depth, abs=1e-12)
+        assert pixels.alpha[ray].item() == pytest.approx(alpha, abs=1e-12)
+
+
+def test_gradients_in_float64() -> None:
+    inputs = samples([3, 0, 5, 1], channels=4, dtype=torch.float64)
+    sigma, values = inputs["sigma"].requires_grad_(), inputs["values"].requires_grad_()
+    background = torch.rand(4, dtype=torch.float64)
+
+    def outputs(sigma: Tensor, values: Tensor) -> tuple[Tensor, ...]:
+        changed = inputs | {"sigma": sigma, "values": values}
+        pixels = composite(**changed, background=background, stop=0.0, backend="reference")
+        return pixels.values, pixels.depth_sum, pixels.alpha
+
+    assert torch.autograd.gradcheck(outputs, (sigma, values))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_homogeneous_medium_has_the_opacity_of_beer_lambert(backend: str) -> None:
+    count, sigma = 100, 3.0
+    inputs = {
+        "sigma": torch.full((count,), sigma),
+        "values": torch.full((count, 1), 0.25),
+        "t": (torch.arange(count) + 0.5) / count,
+        "delta": torch.full((count,), 1 / count),
+        "offsets": torch.tensor([0, count]),
+    }
+    pixels = composite(**inputs, background=torch.ones(1), stop=0.0, backend=backend)
+    opacity = 1 - math.exp(-sigma)
+    assert pixels.alpha.item() == pytest.approx(opacity, abs=1e-5)
+    assert pixels.values.item() == pytest.approx(0.25 * opacity + 1 - opacity, abs=1e-5)
+    # integral of t sigma exp(-sigma t) over [0, 1], by the midpoint rule: error below h^2 sigma^2.
+    depth = (1 - math.exp(-sigma) * (1 + sigma)) / sigma
+    assert pixels.depth_sum.item() == pytest.approx(depth, abs=sigma**2 / count**2)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_two_halves_of_a_ray_are_the_whole(backend: str) -> None:
+    inputs = samples([8])
+    whole = composite(**inputs, stop=0.0, backend=backend)
+    halves = [
+        {name: inputs[name][part] for name in ("sigma", "values", "t", "delta")}
+        | {"offsets": torch.tensor([0, len(inputs["sigma"][part])])}
+        for part in (slice(0, 3), slice(3, 8))
+    ]
+    front = composite(**halves[0], stop=0.0, backend=backend)
+    both = composite(**halves[1], stop=0.0, carry=front, backend=backend)
+    torch.testing.assert_close(both.values, whole.values, rtol=0, atol=1e-6)
+    torch.testing.assert_close(both.depth_sum, whole.depth_sum, rtol=0, atol=4e-6)
+    torch.testing.assert_close(both.alpha, whole.alpha, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("stop", [1e-4, 1e-2, 0.3])
+def test_the_early_stop_changes_a_pixel_by_less_than_its_threshold(
+    backend: str, stop: float
+) -> None:
+    inputs = samples([40] * 50)
+    exact = composite(**inputs, stop=0.0, backend=backend)
+    stopped = composite(**inputs, stop=stop, backend=backend)
+    difference = (exact.alpha - stopped.alpha).abs().max().item()
+    assert 0 < difference <= stop + 1e-6
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_infinite_density_is_opaque_and_without_length_nothing(backend: str) -> None:
+    inputs = {
+        "sigma": torch.tensor([torch.inf, torch.inf]),
+        "values": torch.tensor([[0.5], [0.25]]),
+        "t": torch.tensor([1.0, 2.0]),
+        "delta": torch.tensor([0.0, 0.1]),
+        "offsets": torch.tensor([0, 2]),
+    }
+    pixels = composite(**inputs, stop=0.0, backend=backend)
+    assert pixels.values.tolist() == [[0.25]]
+    assert pixels.alpha.tolist() == [1.0]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_channels_do_not_mix(backend: str) -> None:
+    inputs = samples([5, 7], channels=3)
+    together = composite(**inputs, backend=backend).values
+    alone = [
+        composite(**inputs | {"values": inputs["values"][:, [c]]}, backend=backend).values
+        for c in range(3)
+    ]
+    assert torch.equal(together, torch.cat(alone, dim=1))
+
+
+def test_wrong_arguments_are_named() -> None:
+    inputs = samples([5])
+    with pytest.raises(ValueError, match="values: expected shape"):
+        composite(**inputs | {"values": torch.zeros(4, 3)})
+    with pytest.raises(ValueError, match="float32"):
+        composite(**samples([5], dtype=torch.float64), backend="cpu")
+
+
+def test_pixels_in_front_stay_as_they_were() -> None:
+    carry = Pixels(torch.zeros(1, 3), torch.zeros(1), torch.zeros(1))
+    composite(**samples([5]), carry=carry, backend="cpu")
+    assert carry.alpha.tolist() == [0.0]

@@ -1,0 +1,169 @@
+"""The ray march against a plain loop over steps, and closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from methods.kernels.march import Occupancy, march
+
+STEP = math.sqrt(3) / 1024
+BACKENDS = ["reference", "cpu"]
+
+
+def full(size: int = 16) -> Occupancy:
+    return Occupancy(torch.ones(size, size, size, dtype=torch.bool))
+
+
+def dust(seed: int) -> Occupancy:
+    generator = torch.Generator().manual_seed(seed)
+    return Occupancy(torch.rand(32, 32, 32, generator=generator) < 0.05)
+
+
+def rays_through_the_cube(count: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(5)
+    origins = torch.rand(count, 3, generator=generator) * 3 - 1
+    return origins, torch.rand(count, 3, generator=generator) - origins
+
+
+def plain_march(origin: list[float], direction: list[float], grid: Occupancy) -> list[float]:
+    """All midpoints t_k inside the cube and an occupied cell, in Python numbers."""
+    near, far = 0.0, math.inf
+    for o, d in zip(origin, direction, strict=True):
+        ends = sorted(((0 - o) / d, (1 - o) / d))
+        near, far = max(near, ends[0]), min(far, ends[1])
+    step = STEP / math.hypot(*direction)
+    found, k, size = [], 0, grid.resolution
+    while (t := near + (k + 0.5) * step) < far:
+        cell = [int((o + t * d) * size) for o, d in zip(origin, direction, strict=True)]
+        if grid.cells[tuple(min(max(c, 0), size - 1) for c in cell)]:
+            found.append(t)
+        k += 1
+    return found
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_samples_are_the_steps_in_occupied_cells(backend: str) -> None:
+    grid = dust(0)
+    origins, directions = rays_through_the_cube(40)
+    samples = march(origins, directions, grid, STEP, backend=backend)
+    differing = 0
+    for ray in range(40):
+        got = samples.t[samples.offsets[ray] : samples.offsets[ray + 1]].tolist()
+        want = plain_march(origins[ray].tolist(), directions[ray].tolist(), grid)
+        common = [t for t in got if any(abs(t - w) < 1e-5 for w in want)]
+        differing += len(got) + len(want) - 2 * len(common)
+    # float32 puts a point that is within 1e-6 of a cell's face on either side of it; a step is
+    # 1.7e-3, so a sample has such a face with a chance below 3 * 1e-6 * 32 / 1.
+    assert len(samples) > 400
+    assert differing <= 2
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_full_grid_is_sampled_along_the_whole_chord(backend: str) -> None:
+    origins, directions = rays_through_the_cube(200)
+    samples = march(origins, directions, full(), STEP, backend=backend)
+    inverse = 1 / directions
+    first, second = -origins * inverse, (1 - origins) * inverse
+    near = torch.minimum(first, second).amax(dim=1).clamp(min=0)
+    far = torch.maximum(first, second).amin(dim=1)
+    chord = (far - near).clamp(min=0) * directions.norm(dim=1)
+    lengths = torch.zeros(200).index_add(0, samples.ray.long(), samples.delta)
+    # A midpoint rule covers the chord up to half a step, a sample more or less at its far end.
+    assert ((lengths - chord).abs() <= 0.5 * STEP + 1e-5).all()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_positions_lie_on_their_ray_in_an_occupied_cell(backend: str) -> None:
+    grid = dust(1)
+    origins, directions = rays_through_the_cube(100)
+    samples = march(origins, directions, grid, STEP, backend=backend)
+    ray = samples.ray.long()
+    assert torch.equal(samples.positions, origins[ray] + samples.t[:, None] * directions[ray])
+    cell = (samples.positions * 32).long().clamp(0, 31)
+    assert grid.cells[cell[:, 0], cell[:, 1], cell[:, 2]].all()
+    assert torch.equal(ray, torch.arange(100).repeat_interleave(samples.offsets.diff()))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("limit", [1, 3, 50])
+def test_rounds_give_the_samples_of_one_go(backend: str, limit: int) -> None:
+    grid = dust(2)
+    origins, directions = rays_through_the_cube(60)
+    whole = march(origins, directions, grid, STEP, backend=backend)
+    start: Tensor | None = None
+    parts: list[list[float]] = [[] for _ in range(60)]
+    while start is None or (start >= 0).any():
+        part = march(origins, directions, grid, STEP, start=start, limit=limit, backend=backend)
+        assert (part.offsets.diff() <= limit).all()
+        for ray, t in zip(part.ray.tolist(), part.t.tolist(), strict=True):
+            parts[ray].append(t)
+        start = part.resume
+    assert sum(parts, []) == whole.t.tolist()  # noqa: RUF017
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_window_narrows_the_range(backend: str) -> None:
+    origins = torch.tensor([[0.5, 0.5, -1.0]]).expand(2, 3)
+    directions = torch.tensor([[0.0, 0.0, 2.0]]).expand(2, 3)
+    window = torch.tensor([[0.6, 0.7], [0.9, 5.0]])
+    samples = march(origins, directions, full(), STEP, window=window, backend=backend)
+    first, second = samples.t.split(samples.offsets.diff().tolist())
+    assert 0.6 < first.min() < first.max() < 0.7
+    assert 0.9 < second.min() < second.max() < 1.0
+    assert len(first) == round(0.2 / STEP)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_jitter_shifts_the_samples_by_its_share_of_a_step(backend: str) -> None:
+    origins, directions = torch.tensor([[0.5, 0.5, -1.0]]), torch.tensor([[0.0, 0.0, 1.0]])
+    for phase in (0.0, 0.25, 0.875):
+        jitter = torch.tensor([phase])
+        samples = march(origins, directions, full(), STEP, jitter=jitter, backend=backend)
+        assert samples.t[0].item() == pytest.approx(1 + phase * STEP, abs=1e-6)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_rays_that_miss_or_make_no_sense_have_no_samples(backend: str) -> None:
+    nan, inf = math.nan, math.inf
+    origins = torch.tensor([[2.0, 2, 2], [0.5, 0.5, 0.5], [nan, 0, 0], [0.5, 0.5, 0.5], [0.5] * 3])
+    directions = torch.tensor([[1.0, 0, 0], [0, 0, 0], [1, 0, 0], [nan, 1, 0], [inf, 1, 0]])
+    samples = march(origins, directions, full(), STEP, backend=backend)
+    assert len(samples) == 0
+    assert samples.resume.tolist() == [-1] * 5
+
+
+def test_pyramid_bounds_and_share_describe_the_cells() -> None:
+    cells = torch.zeros(32, 32, 32, dtype=torch.bool)
+    cells[3, 17, 30] = cells[5, 20, 31] = True
+    grid = Occupancy(cells)
+    words = grid.words
+    assert words.count_nonzero() == 2
+    assert words[0, 4, 7] == 1 << (3 + 4 * 1 + 16 * 2)
+    assert words[1, 5, 7] == -(1 << 63) >> 63 << (1 + 4 * 0 + 16 * 3) & 1 << 49
+    assert grid.blocks[0, 1, 1] == (1 << (0 + 4 * 0 + 16 * 3)) + (1 << (1 + 4 * 1 + 16 * 3))
+    assert torch.equal(
+        grid.bounds, torch.tensor([[3 / 32, 17 / 32, 30 / 32], [6 / 32, 21 / 32, 1.0]])
+    )
+    assert grid.fraction == 2 / 32**3
+
+
+def test_the_last_bit_of_a_word_is_a_cell_too() -> None:
+    cells = torch.zeros(16, 16, 16, dtype=torch.bool)
+    cells[3, 3, 3] = True  # bit 63, the sign
+    origins, directions = torch.tensor([[-1.0, 3.5 / 16, 3.5 / 16]]), torch.tensor([[1.0, 0, 0]])
+    samples = march(origins, directions, Occupancy(cells), STEP, backend="cpu")
+    assert len(samples) == pytest.approx(1 / 16 / STEP, abs=1)
+
+
+def test_wrong_arguments_are_named() -> None:
+    origins = torch.zeros(2, 3)
+    with pytest.raises(ValueError, match="directions: expected shape"):
+        march(origins, torch.zeros(3, 3), full(), STEP)
+    with pytest.raises(ValueError, match="step: expected a positive length, got 0"):
+        march(origins, origins, full(), 0.0)
+    with pytest.raises(ValueError, match="multiple of 16, got 24"):
+        Occupancy(torch.zeros(24, 24, 24))

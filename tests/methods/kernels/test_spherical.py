@@ -1,0 +1,66 @@
+"""Spherical harmonics by what defines them: orthonormal, of their degree, in their order."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from methods.kernels.spherical import CHANNELS, spherical_harmonics
+
+BACKENDS = ["reference", "cpu"]
+
+
+def sphere_quadrature() -> tuple[Tensor, Tensor]:
+    """Directions and weights that integrate polynomials up to degree 6 over the sphere exactly."""
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    z = torch.tensor(nodes).repeat_interleave(16)
+    angle = torch.arange(16, dtype=torch.float64).repeat(8) * (2 * math.pi / 16)
+    radius = (1 - z * z).sqrt()
+    directions = torch.stack((radius * angle.cos(), radius * angle.sin(), z), dim=1)
+    return directions, torch.tensor(weights).repeat_interleave(16) * (2 * math.pi / 16)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_they_are_orthonormal(backend: str) -> None:
+    directions, weights = sphere_quadrature()
+    values = spherical_harmonics(directions.float(), backend=backend).double()
+    gram = (values * weights[:, None]).T @ values
+    torch.testing.assert_close(gram, torch.eye(CHANNELS).double(), rtol=0, atol=1e-5)
+
+
+def test_degree_by_parity_and_order_by_rotation() -> None:
+    directions, _ = sphere_quadrature()
+    values = spherical_harmonics(directions, backend="reference")
+    degree = torch.tensor([0] + [1] * 3 + [2] * 5 + [3] * 7)
+    mirrored = spherical_harmonics(-directions, backend="reference")
+    torch.testing.assert_close(mirrored, values * (-1.0) ** degree)
+    # About z, the pair (l, -m), (l, m) turns by m times the angle.
+    angle = 0.7
+    x, y, z = directions.unbind(dim=1)
+    turned = torch.stack(
+        (math.cos(angle) * x - math.sin(angle) * y, math.sin(angle) * x + math.cos(angle) * y, z), 1
+    )
+    rotated = spherical_harmonics(turned, backend="reference")
+    for first, orders in ((0, 0), (1, 1), (4, 2), (9, 3)):
+        for m in range(orders + 1):
+            sine, cosine = values[:, first + orders - m], values[:, first + orders + m]
+            want = math.cos(m * angle) * cosine - math.sin(m * angle) * sine
+            torch.testing.assert_close(rotated[:, first + orders + m], want)
+
+
+def test_first_degree_is_the_direction() -> None:
+    direction = torch.tensor([[0.36, 0.48, 0.8]])
+    values = spherical_harmonics(direction, backend="reference")[0]
+    scale = math.sqrt(3 / (4 * math.pi))
+    assert values[1:4].tolist() == pytest.approx([scale * 0.48, scale * 0.8, scale * 0.36])
+
+
+def test_gradients_in_float64() -> None:
+    directions = sphere_quadrature()[0][::20].requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda d: spherical_harmonics(d, backend="reference"), (directions,)
+    )

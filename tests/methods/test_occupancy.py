@@ -1,0 +1,73 @@
+"""The density grid that tells where a field is empty."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from methods.occupancy import DECAY, INITIAL, RESOLUTION, STEP, THRESHOLD, DensityGrid
+
+WHOLE = torch.tensor([[0.0] * 3, [1.0] * 3])
+
+
+class Slab:
+    """A field of density `sigma` where x < 1/4, nothing elsewhere."""
+
+    def __init__(self, sigma: float) -> None:
+        self.sigma = sigma
+
+    def density(self, positions: Tensor) -> tuple[Tensor, None]:
+        return self.sigma * (positions[:, 0] < 0.25).float(), None
+
+
+GENERATOR = torch.Generator().manual_seed(0)
+
+
+def test_the_threshold_is_an_opacity_of_one_percent_a_step() -> None:
+    assert abs(THRESHOLD * STEP - 0.01) < 1e-12
+
+
+def swept(grid: DensityGrid, field: Slab) -> DensityGrid:
+    """Visit cells until hardly one in e^8 was left out."""
+    for _ in range(8):
+        grid.update(field, GENERATOR, samples=2 * grid.density.numel())
+    return grid
+
+
+def test_visits_find_the_matter_and_nothing_else() -> None:
+    cells = swept(DensityGrid(WHOLE), Slab(100.0)).occupancy.cells
+    assert cells[: RESOLUTION // 4].all()
+    assert cells[RESOLUTION // 4 :].float().mean() < 10 * math.exp(-8)
+
+
+def test_cells_outside_the_bounds_stay_empty() -> None:
+    grid = DensityGrid(torch.tensor([[0.125, 0.0, 0.0], [1.0, 0.5, 1.0]]))
+    assert not grid.occupancy.cells[: RESOLUTION // 8].any()
+    cells = swept(grid, Slab(100.0)).occupancy.cells
+    assert not cells[: RESOLUTION // 8].any()
+    assert not cells[:, RESOLUTION // 2 :].any()
+    assert cells[RESOLUTION // 8 : RESOLUTION // 4, : RESOLUTION // 2].all()
+
+
+def test_a_cell_is_occupied_until_it_was_visited_and_keeps_its_value_in_between() -> None:
+    grid = DensityGrid(WHOLE)
+    grid.update(Slab(0.0), GENERATOR, samples=4096)
+    visited = grid.density < INITIAL
+    assert 0 < visited.sum() <= 4096
+    torch.testing.assert_close(
+        grid.density[visited], torch.full((int(visited.sum()),), DECAY * INITIAL)
+    )
+    assert torch.equal(grid.occupancy.cells, ~visited)
+
+
+def test_no_matter_at_all_is_an_empty_grid() -> None:
+    assert swept(DensityGrid(WHOLE), Slab(0.0)).occupancy.fraction < 10 * math.exp(-8)
+
+
+def test_a_restored_grid_is_the_same_grid() -> None:
+    grid, restored = DensityGrid(WHOLE), DensityGrid(WHOLE)
+    grid.update(Slab(100.0), GENERATOR, samples=1 << 16)
+    restored.restore(grid.density)
+    assert torch.equal(restored.occupancy.cells, grid.occupancy.cells)

@@ -1,0 +1,167 @@
+"""The training loop: what it learns, that it repeats, goes on after a kill, and stops on NaN."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import methods.train
+from bench.types import Budget, Log, Scene, SteerbenchError
+from methods.fields import HashField
+from methods.kernels.encode import HashGrid
+from methods.train import FieldTraining, PixelBatches, TrainingOptions, train_field
+
+GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
+BUDGET = Budget("test", steps=40, samples=4096)
+
+
+def new_field() -> HashField:
+    return HashField(GRID, generator=torch.Generator().manual_seed(0))
+
+
+def trained(scene: Scene, folder: Path, log: Log) -> HashField:
+    field = new_field()
+    folder.mkdir(parents=True, exist_ok=True)
+    train_field(field, scene, BUDGET, TrainingOptions(), 0, folder, log)
+    return field
+
+
+def test_rays_go_through_the_pixels_whose_colours_they_carry(ball_scene: Scene) -> None:
+    batches = PixelBatches(ball_scene.splits["train"], torch.device("cpu"))
+    rays, colours = batches.draw(500, torch.Generator().manual_seed(0))
+    towards = torch.nn.functional.normalize(rays.directions, dim=-1)
+    offset = 0.5 - rays.origins
+    along = (offset * towards).sum(dim=-1, keepdim=True)
+    hit = (offset - along * towards).norm(dim=-1) < 0.3
+    assert torch.equal(colours[:, 3] == 1, hit)
+    assert 0.1 < hit.float().mean() < 0.6
+
+
+def test_the_loss_falls(ball_scene: Scene) -> None:
+    training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
+    losses = [training.advance() for _ in range(BUDGET.steps)]
+    assert sum(losses[-5:]) < 0.3 * sum(losses[:5])
+
+
+def test_the_batch_grows_to_the_samples_of_the_budget(ball_scene: Scene) -> None:
+    training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
+    training.rays = 100
+    for wanted in (50, 50, 50):  # each ray brought half a sample: the batch may grow by a quarter
+        training._fit_batch(wanted)
+    assert training.rays == int(int(125 * 1.25) * 1.25)
+    training._fit_batch(2 * BUDGET.samples)
+    assert training.rays == 195 // 2
+
+
+def test_the_learning_rate_falls_from_the_first_to_the_last_step(ball_scene: Scene) -> None:
+    training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
+    rates = []
+    for training.step in range(BUDGET.steps + 1):
+        rates.append(training.learning_rate())
+    assert rates == sorted(rates, reverse=True)
+    assert rates[0] == pytest.approx(1e-2)
+    assert rates[-1] == pytest.approx(1e-2 / 30)
+
+
+def test_the_same_seed_gives_the_same_bits(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log
+) -> None:
+    first = trained(ball_scene, tmp_path / "first", quiet_log)
+    second = trained(ball_scene, tmp_path / "second", quiet_log)
+    assert torch.equal(first.table, second.table)
+    assert all(torch.equal(first.layers[n], second.layers[n]) for n in first.layers)
+
+
+def test_a_killed_training_ends_as_if_it_had_never_stopped(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = trained(ball_scene, tmp_path / "whole", quiet_log)
+
+    monkeypatch.setattr(methods.train, "CHECKPOINT_S", -1.0)  # after every step
+    advance = FieldTraining.advance
+
+    def killed_at_23(training: FieldTraining) -> float:
+        if training.step == 23:
+            raise KeyboardInterrupt
+        return advance(training)
+
+    monkeypatch.setattr(FieldTraining, "advance", killed_at_23)
+    folder = tmp_path / "killed"
+    with pytest.raises(KeyboardInterrupt):
+        trained(ball_scene, folder, quiet_log)
+    assert [path.name for path in folder.iterdir()] == ["checkpoint.safetensors"]
+
+    monkeypatch.setattr(FieldTraining, "advance", advance)
+    resumed = trained(ball_scene, folder, quiet_log)
+    assert torch.equal(resumed.table, whole.table)
+    assert [path.name for path in folder.iterdir()] == ["field.safetensors"]
+
+
+def test_an_interrupt_keeps_the_step_it_came_at(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    advance = FieldTraining.advance
+
+    def interrupted_at_7(training: FieldTraining) -> float:
+        if training.step == 7:
+            raise KeyboardInterrupt
+        return advance(training)
+
+    monkeypatch.setattr(FieldTraining, "advance", interrupted_at_7)
+    with pytest.raises(KeyboardInterrupt):
+        trained(ball_scene, tmp_path, quiet_log)
+    training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
+    methods.train._load(training, tmp_path / "checkpoint.safetensors")
+    assert training.step == 7
+
+
+def test_a_finished_training_is_loaded(ball_scene: Scene, tmp_path: Path, quiet_log: Log) -> None:
+    first = trained(ball_scene, tmp_path, quiet_log)
+    written = (tmp_path / "field.safetensors").stat().st_mtime_ns
+    second = trained(ball_scene, tmp_path, quiet_log)
+    assert torch.equal(first.table, second.table)
+    assert torch.equal(first.packed, second.packed)
+    assert (tmp_path / "field.safetensors").stat().st_mtime_ns == written
+
+
+def test_a_loss_that_is_no_number_stops_and_keeps_the_last_good_checkpoint(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(methods.train, "CHECKPOINT_S", -1.0)
+    advance = FieldTraining.advance
+
+    def spoiled_at_10(training: FieldTraining) -> float:
+        if training.step == 10:
+            with torch.no_grad():
+                training.field.layers["feature_mid"][0, 0] = torch.nan
+        return advance(training)
+
+    monkeypatch.setattr(FieldTraining, "advance", spoiled_at_10)
+    with pytest.raises(SteerbenchError, match=r"step 10.*feature_mid.*last good checkpoint"):
+        trained(ball_scene, tmp_path, quiet_log)
+    training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
+    methods.train._load(training, tmp_path / "checkpoint.safetensors")
+    assert training.step == 10
+    assert all(layer.isfinite().all() for layer in training.field.layers.values())
+
+
+def test_a_checkpoint_that_cannot_be_written_says_so(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log
+) -> None:
+    with pytest.raises(SteerbenchError, match=r"gone.*cannot write the checkpoint"):
+        train_field(
+            new_field(), ball_scene, BUDGET, TrainingOptions(), 0, tmp_path / "gone", quiet_log
+        )
+
+
+def test_pictures_without_alpha_are_trained_on_as_they_are(ball_scene: Scene) -> None:
+    from dataclasses import replace
+
+    split = ball_scene.splits["train"]
+    opaque = replace(split, images=[image[..., :3] for image in split.images])
+    scene = replace(ball_scene, splits={"train": opaque, "test": opaque})
+    training = FieldTraining(new_field(), scene, BUDGET, TrainingOptions(), seed=0)
+    losses = [training.advance() for _ in range(5)]
+    assert all(loss < 1 for loss in losses)
