@@ -19,6 +19,7 @@ from bench.cameras import look_at, move_camera
 from bench.scenes import blender
 from bench.scenes.files import opengl_to_opencv, whole_number
 from bench.scenes.models import MODELS
+from bench.scenes.parallel import in_parallel
 from bench.scenes.raytrace import Model, render
 from bench.types import Camera, Frame, Log, Scene, SteerbenchError, Unavailable
 
@@ -133,19 +134,24 @@ def write_pictures(folder: Path, settings: dict, log: Log) -> None:
         "train": train_poses(settings["train"], settings["seed"]),
         "test": orbit_poses(settings["test"]),
     }
-    with log.progress(f"render {settings['name']}", settings["train"] + settings["test"]) as bar:
-        for split, split_poses in poses.items():
-            (folder / split).mkdir(parents=True)
-            frames = []
-            for number, pose in enumerate(split_poses):
-                camera = Camera(pose.float(), focal, focal, width / 2, height / 2, width, height)
-                picture = to_rgba(render(model, camera, torch.zeros(3), samples=16))
-                Image.fromarray(picture.numpy()).save(folder / split / f"r_{number}.png")
-                matrix = [*opengl_to_opencv(pose).tolist(), [0.0, 0.0, 0.0, 1.0]]
-                frames.append({"file_path": f"./{split}/r_{number}", "transform_matrix": matrix})
-                bar.advance()
-            record = {"camera_angle_x": ANGLE_X, "scene": settings, "frames": frames}
-            (folder / blender.camera_file(split)).write_text(json.dumps(record, indent=1))
+    jobs = []
+    for split, split_poses in poses.items():
+        (folder / split).mkdir(parents=True)
+        frames = []
+        for number, pose in enumerate(split_poses):
+            camera = Camera(pose.float(), focal, focal, width / 2, height / 2, width, height)
+            jobs.append((camera, folder / split / f"r_{number}.png"))
+            matrix = [*opengl_to_opencv(pose).tolist(), [0.0, 0.0, 0.0, 1.0]]
+            frames.append({"file_path": f"./{split}/r_{number}", "transform_matrix": matrix})
+        record = {"camera_angle_x": ANGLE_X, "scene": settings, "frames": frames}
+        (folder / blender.camera_file(split)).write_text(json.dumps(record, indent=1))
+
+    def draw(job: tuple[Camera, Path]) -> None:
+        camera, path = job
+        picture = to_rgba(render(model, camera, torch.zeros(3), samples=16))
+        Image.fromarray(picture.numpy()).save(path)
+
+    in_parallel(draw, jobs, f"render {settings['name']}", log)
 
 
 def to_rgba(frame: Frame) -> Tensor:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +16,7 @@ from torch import Tensor
 from bench.cameras import crop_camera, scale_camera
 from bench.scenes.distortion import undistort
 from bench.scenes.files import unexpected
+from bench.scenes.parallel import in_parallel
 from bench.types import Camera, Log
 
 
@@ -54,19 +53,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 def decode_all(views: Sequence[View], downscale: int, log: Log) -> list[Picture]:
     """Read, undistort and downscale every view, in parallel; the order stays."""
-    with (
-        log.progress("decode pictures", len(views)) as bar,
-        ThreadPoolExecutor(max_workers=os.cpu_count()) as pool,
-    ):
-        futures = [pool.submit(decode, view, downscale) for view in views]
-        pictures = []
-        try:
-            for future in futures:
-                pictures.append(future.result())
-                bar.advance()
-        finally:  # the first fault ends the load: what still waits is not decoded
-            pool.shutdown(wait=False, cancel_futures=True)
-    return pictures
+    return in_parallel(lambda view: decode(view, downscale), views, "decode pictures", log)
 
 
 def decode(view: View, downscale: int) -> Picture:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 from bench.scenes.files import data_folder, unexpected
+from bench.scenes.parallel import in_parallel
 from bench.types import Log
 
 LIST = Path(__file__).with_name("nerf_synthetic.sha256.txt")
@@ -64,11 +63,8 @@ def verify(path: str | Path, log: Log) -> VerifyReport:
         if file.is_file() and file.resolve().is_relative_to(root)
     }
     known = sorted(present & expected.keys())
-    with log.progress("verify", len(known)) as bar, ThreadPoolExecutor(os.cpu_count()) as pool:
-        right = {}
-        for name, digest in zip(known, pool.map(sha256, (base / k for k in known)), strict=True):
-            right[name] = digest == expected[name]
-            bar.advance()
+    digests = in_parallel(sha256, [base / name for name in known], "verify", log)
+    right = {name: found == expected[name] for name, found in zip(known, digests, strict=True)}
     return VerifyReport(
         ok=[name for name in known if right[name]],
         wrong=[name for name in known if not right[name]],
