@@ -56,9 +56,9 @@ class HashField(nn.Module):
         self.layers = nn.ParameterDict(
             {name: _xavier_uniform(*size, generator) for name, size in sizes.items()}
         )
-        self.register_buffer(
-            "packed", pack(table) if precision == "bf16" else None, persistent=False
-        )
+        packed = pack(table) if precision == "bf16" else None
+        self.packed: Tensor | None
+        self.register_buffer("packed", packed, persistent=False)
         self.grad_buffer: Tensor | None = None  # set by a training that updates the table sparsely
 
     def repack(self) -> None:
@@ -115,11 +115,11 @@ class _ClampedExp(torch.autograd.Function):
     """exp, whose gradient neither vanishes nor overflows far from 0."""
 
     @staticmethod
-    def forward(ctx, log_density):  # type: ignore[no-untyped-def]
+    def forward(ctx, log_density):
         ctx.save_for_backward(log_density)
         return log_density.exp()
 
     @staticmethod
-    def backward(ctx, grad):  # type: ignore[no-untyped-def]
+    def backward(ctx, grad):
         (log_density,) = ctx.saved_tensors
         return grad * log_density.clamp(-LOG_DENSITY_CLAMP, LOG_DENSITY_CLAMP).exp()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -84,7 +83,7 @@ class PixelBatches:
 
 
 class FieldTraining:
-    """The state of a training: everything that a checkpoint must hold to go on as if never stopped."""
+    """The state of a training: what a checkpoint must hold to go on as if it had never stopped."""
 
     def __init__(
         self, field: HashField, scene: Scene, budget: Budget, options: TrainingOptions, seed: int
@@ -263,7 +262,7 @@ def _save(training: FieldTraining, path: Path, finished: bool = False) -> None:
     temporary = path.with_suffix(".tmp")
     try:
         save_file(_tensors(training, finished), temporary, {"training": json.dumps(meta)})
-        os.replace(temporary, path)
+        temporary.replace(path)
     except (OSError, SafetensorError) as error:
         temporary.unlink(missing_ok=True)
         raise SteerbenchError(f"{path}: cannot write the checkpoint: {error}") from error

@@ -35,7 +35,8 @@ def rays_at_matter(camera: Camera, occupancy: Occupancy) -> tuple[Tensor, Rays]:
     if (depth > 0).all():
         low = torch.minimum(corner_pixels.amin(dim=0).floor().clamp(min=0), size).long()
         high = torch.minimum(corner_pixels.amax(dim=0).ceil().clamp(min=0), size).long()
-    grid = pixel_grid(*(high - low).tolist(), device=device) + low
+    width, height = (high - low).tolist()
+    grid = pixel_grid(width, height, device) + low
     column, row = grid.long().unbind(dim=-1)
     return row * camera.width + column, cast(camera, grid)
 

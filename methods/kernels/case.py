@@ -53,7 +53,7 @@ class Case:
 
 
 def largest_error(results: tuple[Tensor, ...], reference: tuple[Tensor, ...]) -> float:
-    """Largest |result - reference| over all outputs; inf where shapes or non-finite values differ."""
+    """Largest |result - reference| of all outputs; inf where shapes or non-finite values differ."""
     worst = 0.0
     for got, want in zip(results, reference, strict=True):
         if got.shape != want.shape:

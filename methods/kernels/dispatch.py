@@ -1,4 +1,4 @@
-"""Which backend serves a call: by name, or by the device of the tensors. Never a silent fallback."""
+"""Which backend serves a call: by name or by the device of the tensors, never a silent fallback."""
 
 from __future__ import annotations
 

@@ -49,14 +49,14 @@ def sparse_adam_(
 
 @cache
 def _corrections(beta: float) -> np.ndarray:
-    """1 / (1 - beta^n) for n = 0, 1, ... until float32 cannot tell it from 1 (n = 0 is not used)."""
+    """1 / (1 - beta^n) for n = 0, 1, ... until float32 cannot tell it from 1; n = 0 is not used."""
     last = math.ceil(math.log(2.0**-25) / math.log(beta))
     powers = np.power(beta, np.arange(1, last + 1))
     return np.concatenate(([np.inf], 1 / (1 - powers))).astype(np.float32)
 
 
 @njit(cache=True, parallel=True)
-def _update(  # type: ignore[no-untyped-def]
+def _update(
     table,
     grad,
     first,

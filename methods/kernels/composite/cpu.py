@@ -34,7 +34,7 @@ def composite(
 
 class _Composite(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, sigma, values, t, delta, offsets, stop, carry):  # type: ignore[no-untyped-def]
+    def forward(ctx, sigma, values, t, delta, offsets, stop, carry):
         rays, channels = len(offsets) - 1, values.shape[1]
         if carry is None:
             pixels = Pixels(torch.zeros(rays, channels), torch.zeros(rays), torch.zeros(rays))
@@ -55,7 +55,7 @@ class _Composite(torch.autograd.Function):
         return pixels.values, pixels.depth_sum, pixels.alpha
 
     @staticmethod
-    def backward(ctx, grad_values, grad_depth, grad_alpha):  # type: ignore[no-untyped-def]
+    def backward(ctx, grad_values, grad_depth, grad_alpha):
         *samples, front = ctx.saved_tensors
         grad_sigma, grad_samples = torch.zeros_like(samples[0]), torch.zeros_like(samples[1])
         _backward(
@@ -72,13 +72,13 @@ class _Composite(torch.autograd.Function):
 
 
 @njit(cache=True)
-def _thickness(sigma, delta):  # type: ignore[no-untyped-def]
+def _thickness(sigma, delta):
     # A sample without length is without matter, however dense: 0, not inf * 0.
     return sigma * delta if delta > 0 else f32(0)
 
 
 @njit(cache=True, parallel=True)
-def _forward(sigma, values, t, delta, offsets, stop, front, out, depth_sum, alpha):  # type: ignore[no-untyped-def]
+def _forward(sigma, values, t, delta, offsets, stop, front, out, depth_sum, alpha):
     channels = values.shape[1]
     for ray in prange(len(offsets) - 1):
         transmittance = front[ray]
@@ -95,7 +95,7 @@ def _forward(sigma, values, t, delta, offsets, stop, front, out, depth_sum, alph
 
 
 @njit(cache=True, parallel=True)
-def _backward(  # type: ignore[no-untyped-def]
+def _backward(
     sigma,
     values,
     t,

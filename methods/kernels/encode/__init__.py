@@ -123,6 +123,6 @@ def encode(
 
 
 def pack(table: Tensor) -> Tensor:
-    """Two bfloat16 features in one int32 word, the first in the low half: [entries, 2] -> [entries]."""
+    """Two bfloat16 features in an int32 word, the first low: [entries, 2] -> [entries]."""
     check_shape("table", table, None, 2)
     return table.detach().to(torch.bfloat16).contiguous().view(torch.int32).squeeze(-1)

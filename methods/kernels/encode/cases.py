@@ -73,7 +73,7 @@ def _view(count: int) -> Tensor:
 
 
 def _fraction_error(grid: HashGrid) -> float:
-    """Of a trilinear fraction: p = scale x + 1/2 is rounded once or twice, at a size up to N_max."""
+    """Of a trilinear fraction: p = scale x + 1/2 is rounded once or twice, at sizes up to N_max."""
     return 2 * U32 * grid.n_max
 
 

@@ -49,7 +49,7 @@ def encode(
 
 class _Encode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, positions, table, grid, packed, grad_buffer):  # type: ignore[no-untyped-def]
+    def forward(ctx, positions, table, grid, packed, grad_buffer):
         ctx.save_for_backward(positions)
         ctx.grid, ctx.grad_buffer = grid, grad_buffer
         levels = _level_arrays(grid)
@@ -62,7 +62,7 @@ class _Encode(torch.autograd.Function):
         return words.view(torch.bfloat16)
 
     @staticmethod
-    def backward(ctx, grad):  # type: ignore[no-untyped-def]
+    def backward(ctx, grad):
         (positions,) = ctx.saved_tensors
         grid, buffer = ctx.grid, ctx.grad_buffer
         target = torch.zeros(grid.entries, grid.features) if buffer is None else buffer
@@ -91,7 +91,7 @@ def _level_arrays(grid: HashGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @njit(cache=True, fastmath=FAST)
-def _load(positions, first, count, xyz):  # type: ignore[no-untyped-def]
+def _load(positions, first, count, xyz):
     """Positions [first, first + count) clamped to [0, 1], NaN as 0, axis by axis."""
     for axis in range(3):
         for i in range(count):
@@ -101,7 +101,7 @@ def _load(positions, first, count, xyz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=FAST)
-def _weights(x, y, z, scale):  # type: ignore[no-untyped-def]
+def _weights(x, y, z, scale):
     """Cell and trilinear weights of a position: weights along y and z come multiplied."""
     px, py, pz = x * scale + f32(0.5), y * scale + f32(0.5), z * scale + f32(0.5)
     ix, iy, iz = i32(px), i32(py), i32(pz)
@@ -111,7 +111,7 @@ def _weights(x, y, z, scale):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=FAST)
-def _corners_hashed(xyz, count, scale, mask, index, weight):  # type: ignore[no-untyped-def]
+def _corners_hashed(xyz, count, scale, mask, index, weight):
     for i in range(count):
         ix, iy, iz, gx, fx, w00, w10, w01, w11 = _weights(
             xyz[i], xyz[CHUNK + i], xyz[2 * CHUNK + i], scale
@@ -135,13 +135,13 @@ def _corners_hashed(xyz, count, scale, mask, index, weight):  # type: ignore[no-
 
 
 @njit(cache=True, fastmath=FAST)
-def _wrap(entry, size):  # type: ignore[no-untyped-def]
+def _wrap(entry, size):
     """entry mod size, for entry < 2 size."""
     return u32(entry - size) if entry >= size else entry
 
 
 @njit(cache=True, fastmath=FAST)
-def _corners_dense(xyz, count, scale, stride, size, index, weight):  # type: ignore[no-untyped-def]
+def _corners_dense(xyz, count, scale, stride, size, index, weight):
     slice_ = u32(stride * stride)
     for i in range(count):
         ix, iy, iz, gx, fx, w00, w10, w01, w11 = _weights(
@@ -165,7 +165,7 @@ def _corners_dense(xyz, count, scale, stride, size, index, weight):  # type: ign
 
 
 @njit(cache=True)
-def _corners(xyz, count, scale, stride, size, index, weight):  # type: ignore[no-untyped-def]
+def _corners(xyz, count, scale, stride, size, index, weight):
     if stride:
         _corners_dense(xyz, count, scale, stride, size, index, weight)
     else:
@@ -173,14 +173,14 @@ def _corners(xyz, count, scale, stride, size, index, weight):  # type: ignore[no
 
 
 @njit(cache=True)
-def _gather(level_table, index, count, value):  # type: ignore[no-untyped-def]
+def _gather(level_table, index, count, value):
     for corner in range(8):
         for i in range(count):
             value[corner * CHUNK + i] = level_table[index[corner * CHUNK + i]]
 
 
 @njit(cache=True, fastmath=FAST)
-def _blend(value, weight, count, blended):  # type: ignore[no-untyped-def]
+def _blend(value, weight, count, blended):
     for i in range(count):
         total = f32(0)
         for corner in range(8):
@@ -189,7 +189,7 @@ def _blend(value, weight, count, blended):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def round_to_bf16(value):  # type: ignore[no-untyped-def]
+def round_to_bf16(value):
     """Bits of a float32 rounded to nearest even bfloat16, in the high half."""
     bits = f32(value).view(np.uint32)
     tie_to_even = u32(u32(bits >> u32(16)) & u32(1))
@@ -197,7 +197,7 @@ def round_to_bf16(value):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=FAST)
-def _blend_packed(word, weight, count, blended):  # type: ignore[no-untyped-def]
+def _blend_packed(word, weight, count, blended):
     for i in range(count):
         low, high = f32(0), f32(0)
         for corner in range(8):
@@ -211,7 +211,7 @@ def _blend_packed(word, weight, count, blended):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def _encode_packed(positions, table, scales, strides, offsets, out):  # type: ignore[no-untyped-def]
+def _encode_packed(positions, table, scales, strides, offsets, out):
     total, levels = out.shape
     for chunk in prange((total + CHUNK - 1) // CHUNK):
         first = chunk * CHUNK
@@ -232,7 +232,7 @@ def _encode_packed(positions, table, scales, strides, offsets, out):  # type: ig
 
 
 @njit(cache=True, parallel=True)
-def _encode_float(positions, table, scales, strides, offsets, out):  # type: ignore[no-untyped-def]
+def _encode_float(positions, table, scales, strides, offsets, out):
     total, channels = out.shape
     levels, features = len(scales), table.shape[1]
     for chunk in prange((total + CHUNK - 1) // CHUNK):
@@ -255,7 +255,7 @@ def _encode_float(positions, table, scales, strides, offsets, out):  # type: ign
 
 
 @njit(cache=True)
-def _scatter_pairs(index, weight, count, first, second, target):  # type: ignore[no-untyped-def]
+def _scatter_pairs(index, weight, count, first, second, target):
     for i in range(count):
         for corner in range(8):
             entry, w = index[corner * CHUNK + i], weight[corner * CHUNK + i]
@@ -264,14 +264,14 @@ def _scatter_pairs(index, weight, count, first, second, target):  # type: ignore
 
 
 @njit(cache=True)
-def _scatter_one(index, weight, count, grad, target):  # type: ignore[no-untyped-def]
+def _scatter_one(index, weight, count, grad, target):
     for i in range(count):
         for corner in range(8):
             target[index[corner * CHUNK + i]] += weight[corner * CHUNK + i] * grad[i]
 
 
 @njit(cache=True, parallel=True)
-def _scatter(positions, grad, scales, strides, offsets, target, workers):  # type: ignore[no-untyped-def]
+def _scatter(positions, grad, scales, strides, offsets, target, workers):
     """Adjoint of `_encode_float`: target[corner] += weight * grad; grad is [channels, N]."""
     total, features = len(positions), target.shape[1]
     for worker in prange(workers):

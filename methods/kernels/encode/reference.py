@@ -1,4 +1,4 @@
-"""Hash-grid encoding in plain torch: any dtype, any device, differentiable in table and positions."""
+"""Hash-grid encoding in plain torch, differentiable in the table and in the positions."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ STEP = math.sqrt(3) / MAX_SAMPLES
 
 def cases() -> list[Case]:
     """Every kind of ray, grid, window, phase and limit; and rays around a hollow sphere, timed."""
-    kinds = [
+    kinds: list[tuple[str, int, dict]] = [
         ("no ray", 0, {}),
         ("one ray", 1, {}),
         ("inside and outside", 129, {}),
@@ -65,7 +65,7 @@ def _rays(count: int) -> tuple[Tensor, Tensor]:
 
 
 def _special_rays() -> tuple[Tensor, Tensor]:
-    """Rays along axes, diagonals and grid planes, through corners, without direction, not finite."""
+    """Rays along axes, diagonals, grid planes, through corners, without direction, not finite."""
     directions = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * 3)  # [27, 3], one is 0
     targets = torch.tensor([[0.5, 0.5, 0.5], [0.0, 0.0, 0.0], [1.0, 1.0, 0.5], [0.25, 0.3, 0.75]])
     far = targets[:, None] - 2 * directions

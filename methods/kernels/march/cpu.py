@@ -74,7 +74,7 @@ def march(
 
 
 @njit(cache=True)
-def _cross(origin, direction, box):  # type: ignore[no-untyped-def]
+def _cross(origin, direction, box):
     """Where a ray enters and leaves a box; enter > leave where it misses (slab test)."""
     enter, leave = f32(-np.inf), f32(np.inf)
     for axis in range(3):
@@ -90,7 +90,7 @@ def _cross(origin, direction, box):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _empty_side(words, blocks, x, y, z):  # type: ignore[no-untyped-def]
+def _empty_side(words, blocks, x, y, z):
     """Cells along the side of the largest empty cube of the pyramid around a cell; 0: occupied."""
     if blocks[x >> 4, y >> 4, z >> 4] == 0:
         return 16
@@ -102,12 +102,12 @@ def _empty_side(words, blocks, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _cell(coordinate, size):  # type: ignore[no-untyped-def]
+def _cell(coordinate, size):
     return min(max(int(coordinate * f32(size)), 0), size - 1)
 
 
 @njit(cache=True)
-def _leave_slab(origin, slope, cell, side, width):  # type: ignore[no-untyped-def]
+def _leave_slab(origin, slope, cell, side, width):
     """t at which a ray leaves, along one axis, the aligned `side` cells that contain `cell`."""
     corner = cell & ~(side - 1)
     if slope > 0:
@@ -116,7 +116,7 @@ def _leave_slab(origin, slope, cell, side, width):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def _march_ray(origin, direction, words, blocks, bounds, step, near, far, phase, k, limit, out):  # type: ignore[no-untyped-def]
+def _march_ray(origin, direction, words, blocks, bounds, step, near, far, phase, k, limit, out):
     """Write the t of a ray's samples to `out`; return their number and the step to resume from."""
     ox, oy, oz = origin
     dx, dy, dz = direction
@@ -164,7 +164,7 @@ def _march_ray(origin, direction, words, blocks, bounds, step, near, far, phase,
 
 
 @njit(cache=True, parallel=True)
-def _find(  # type: ignore[no-untyped-def]
+def _find(
     origins,
     directions,
     words,
@@ -204,7 +204,7 @@ def _find(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, parallel=True)
-def _place(origins, directions, scratch, most, offsets, t, positions, ray_of):  # type: ignore[no-untyped-def]
+def _place(origins, directions, scratch, most, offsets, t, positions, ray_of):
     rays = len(origins)
     for chunk in prange((rays + CHUNK - 1) // CHUNK):
         shift = chunk * CHUNK * most - offsets[chunk * CHUNK]

@@ -34,7 +34,7 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
 
 
 @njit(cache=True, parallel=True)
-def _evaluate(directions, out):  # type: ignore[no-untyped-def]
+def _evaluate(directions, out):
     for i in prange(len(directions)):
         x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
         xx, yy, zz = x * x, y * y, z * z
