@@ -227,18 +227,14 @@ def _run(training: FieldTraining, folder: Path, log: Log) -> None:
     mean = math.nan
     with log.progress("training", steps) as progress:
         progress.advance(training.step)
-        try:
-            while training.step < steps:
-                loss = training.advance()
-                mean = loss if math.isnan(mean) else 0.99 * mean + 0.01 * loss
-                progress.advance(note=f"{-10 * math.log10(max(mean, 1e-10)):.1f} dB")
-                training.seconds = time.monotonic() - began
-                if time.monotonic() - saved > CHECKPOINT_S:
-                    _save(training, checkpoint)
-                    saved = time.monotonic()
-        except KeyboardInterrupt:
-            _save(training, checkpoint)
-            raise
+        while training.step < steps:
+            loss = training.advance()
+            mean = loss if math.isnan(mean) else 0.99 * mean + 0.01 * loss
+            progress.advance(note=f"{-10 * math.log10(max(mean, 1e-10)):.1f} dB")
+            training.seconds = time.monotonic() - began
+            if time.monotonic() - saved > CHECKPOINT_S:
+                _save(training, checkpoint)
+                saved = time.monotonic()
     _save(training, folder / "field.safetensors", finished=True)
     checkpoint.unlink(missing_ok=True)
 

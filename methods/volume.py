@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from bench.cameras import cast, pixel_grid, project
 from bench.types import Camera, Probe, Rays
 from methods.fields import HashField
 from methods.kernels.composite import STOP, Pixels, composite
-from methods.kernels.march import Occupancy, march
+from methods.kernels.march import Occupancy, Samples, march
 from methods.occupancy import STEP
 
 CHUNK_RAYS = 1 << 14
@@ -19,6 +20,9 @@ CHUNK_RAYS = 1 << 14
 
 ROUND_SAMPLES = (4, 8, 16, 32)
 """Samples a ray may take in a round; the last number repeats."""
+
+BATCH_QUANTUM = 1 << 11
+"""Samples are handed to the field in multiples of this."""
 
 
 def rays_at_matter(camera: Camera, occupancy: Occupancy) -> tuple[Tensor, Rays]:
@@ -53,9 +57,7 @@ def render_batch(
     samples = march(
         rays.origins, rays.directions, occupancy, STEP, jitter=jitter, backend=field.backend
     )
-    sigma, geometry = field.density(samples.positions)
-    directions = field.encode_directions(rays.directions)[samples.ray]
-    values = field.features(geometry, directions)
+    sigma, values = _query(field, samples, rays.directions)
     pixels = composite(
         sigma,
         values,
@@ -66,6 +68,21 @@ def render_batch(
         backend=field.backend,
     )
     return pixels, len(samples)
+
+
+def _query(field: HashField, samples: Samples, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Density [S] and features [S, K] of `samples` of rays along `directions` [R, 3].
+
+    The field sees batches of a few round sizes only: the library behind the matrix products
+    prepares code for every new size, which takes longer than the product itself.
+    """
+    count = len(samples)
+    padding = -count % BATCH_QUANTUM
+    positions = functional.pad(samples.positions, (0, 0, 0, padding))
+    ray = functional.pad(samples.ray, (0, padding))
+    sigma, geometry = field.density(positions)
+    values = field.features(geometry, field.encode_directions(directions)[ray])
+    return sigma[:count], values[:count]
 
 
 @dataclass
@@ -138,8 +155,7 @@ def _render_round(
     if len(samples) == 0:
         return alive[:0], start[:0]
     with probe.stage("field"):
-        sigma, geometry = field.density(samples.positions)
-        values = field.features(geometry, field.encode_directions(directions)[samples.ray])
+        sigma, values = _query(field, samples, directions)
     with probe.stage("composite"):
         pixels = composite(
             sigma,

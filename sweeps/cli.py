@@ -21,6 +21,10 @@ from typing import NoReturn
 from bench.errors import SteerbenchError
 from sweeps.names import unknown
 
+# Two thread pools take turns here, torch's and numba's. A pool that spins while it waits keeps the
+# other from its cores: where another program runs too, a training step takes three times as long.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 EXAMPLES = """\
 examples
   steerbench run +experiment=demo              train on an embedded scene, write a page about it

@@ -99,24 +99,6 @@ def test_a_killed_training_ends_as_if_it_had_never_stopped(
     assert [path.name for path in folder.iterdir()] == ["field.safetensors"]
 
 
-def test_an_interrupt_keeps_the_step_it_came_at(
-    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    advance = FieldTraining.advance
-
-    def interrupted_at_7(training: FieldTraining) -> float:
-        if training.step == 7:
-            raise KeyboardInterrupt
-        return advance(training)
-
-    monkeypatch.setattr(FieldTraining, "advance", interrupted_at_7)
-    with pytest.raises(KeyboardInterrupt):
-        trained(ball_scene, tmp_path, quiet_log)
-    training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
-    methods.train._load(training, tmp_path / "checkpoint.safetensors")
-    assert training.step == 7
-
-
 def test_a_finished_training_is_loaded(ball_scene: Scene, tmp_path: Path, quiet_log: Log) -> None:
     first = trained(ball_scene, tmp_path, quiet_log)
     written = (tmp_path / "field.safetensors").stat().st_mtime_ns
