@@ -8,6 +8,7 @@ import os
 import platform
 import re
 import subprocess
+from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
 
@@ -19,13 +20,17 @@ VERSIONS_OF = ("torch", "numpy", "numba", "scikit-image", "lpips")
 @functools.cache
 def code_digest() -> str:
     """SHA-256 of every source file that can change a row: paths and bytes of bench and methods."""
-    digest = hashlib.sha256()
-    for package in MEASURING_PACKAGES:
-        for path in sorted((ROOT / package).rglob("*.py")):
-            content = path.read_bytes()
-            digest.update(f"{path.relative_to(ROOT).as_posix()} {len(content)}\n".encode())
-            digest.update(content)
-    return digest.hexdigest()
+    return digest(path for name in MEASURING_PACKAGES for path in (ROOT / name).rglob("*.py"))
+
+
+def digest(sources: Iterable[Path]) -> str:
+    """SHA-256 of the paths and bytes of source files of this project, whatever their order."""
+    total = hashlib.sha256()
+    for path in sorted(sources):
+        content = path.read_bytes()
+        total.update(f"{path.relative_to(ROOT).as_posix()} {len(content)}\n".encode())
+        total.update(content)
+    return total.hexdigest()
 
 
 @functools.cache

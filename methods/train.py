@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import time
@@ -16,6 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from bench.provenance import digest
 from bench.types import Budget, Log, Rays, Scene, Split, SteerbenchError
 from methods.fields import HashField
 from methods.kernels.adam import AdamState, sparse_adam_
@@ -24,6 +24,9 @@ from methods.volume import render_batch
 
 CHECKPOINT_S = 20.0
 """Seconds between checkpoints: what a killed training loses at most."""
+
+UNTRAINED_SOURCES = ("case", "cases", "benchmark")
+"""Modules of the kernels that no training runs through."""
 
 GRID_YOUTH_STEPS = 256
 """Until this step the density grid is visited four times as much: most of it is still unknown."""
@@ -187,10 +190,8 @@ def training_digest() -> str:
     """SHA-256 of the sources that decide what a training results in."""
     folder = Path(__file__).parent
     sources = [folder / f"{name}.py" for name in ("train", "fields", "occupancy", "volume")]
-    digest = hashlib.sha256()
-    for source in [*sources, *sorted((folder / "kernels").rglob("*.py"))]:
-        digest.update(source.read_bytes())
-    return digest.hexdigest()
+    kernels = [p for p in (folder / "kernels").rglob("*.py") if p.stem not in UNTRAINED_SOURCES]
+    return digest(sources + kernels)
 
 
 def train_field(

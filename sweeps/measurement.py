@@ -61,7 +61,8 @@ def execute(config: DictConfig, command: Sequence[str]) -> None:
     method, budget, protocol = (build(config, group) for group in ("method", "budget", "protocol"))
     scene = build(config, "scene", log=log)
     trajectory = build(config, "trajectory", scene)
-    parts = _identity(config, scene, method)
+    weights = Path(settings.weights_dir) if settings.weights_dir else None
+    parts = _identity(config, scene, method) | {"lpips": protocol.find_lpips(weights, log)}
     run = store.key(parts)
     known = store.find(run) is not None
     if known:
@@ -75,7 +76,7 @@ def execute(config: DictConfig, command: Sequence[str]) -> None:
             budget,
             log,
             seed=settings.seed,
-            weights_dir=Path(settings.weights_dir) if settings.weights_dir else None,
+            weights_dir=weights,
         )
         record = {**measurement.record, "command": shlex.join(command)}
         store.save(parts, replace(measurement, record=record))
@@ -100,10 +101,9 @@ def _settings(config: DictConfig) -> Settings:
 
 
 def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any]:
-    """Everything that can change the rows, and nothing else: what the run's key is made of.
+    """Everything that can change the rows but for the weights at hand: what makes a run's key.
 
-    Whether weights were given is part of it, because without them LPIPS may be missing; where
-    they and the scene lie is not.
+    Where scene and weights lie is not part of it.
     """
     plain = OmegaConf.to_container(config, resolve=True)
     assert isinstance(plain, dict)
@@ -115,7 +115,6 @@ def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any
         "scene": scene.digest,
         "resolved": method.settings(),
         "threads": torch.get_num_threads(),
-        "weights_given": config.weights_dir is not None,
     }
 
 

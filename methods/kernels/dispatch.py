@@ -55,9 +55,11 @@ def resolve(backend: str, device: torch.device | str) -> str:
 
 def implementation(kernel: str, backend: str, device: torch.device) -> ModuleType:
     """The module that implements `kernel` (a folder beside this file) for tensors on `device`."""
-    return _load(kernel, resolve(backend, device))
+    name = resolve(backend, device)
+    if name == "cpu":
+        _load("methods.kernels.cpu").follow_torch_threads()
+    return _load(f"methods.kernels.{kernel}.{name}")
 
 
-@cache
-def _load(kernel: str, backend: str) -> ModuleType:
-    return importlib.import_module(f"methods.kernels.{kernel}.{backend}")
+# Imported when first used: numba and Triton are heavy, and not every machine has both.
+_load = cache(importlib.import_module)

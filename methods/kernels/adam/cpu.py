@@ -11,10 +11,9 @@ from numba import njit, prange
 from torch import Tensor
 
 from methods.kernels.adam import AdamState
-from methods.kernels.encode.cpu import round_to_bf16
+from methods.kernels.cpu import f32, pack_bf16
 
 CHUNK = 4096  # entries
-f32, u32 = np.float32, np.uint32
 
 
 @torch.no_grad()
@@ -90,5 +89,4 @@ def _update(
                 scale = math.sqrt(v * correction2) + eps
                 table[entry, feature] -= rate * m * correction1 / scale
             if len(packed):
-                low, high = round_to_bf16(table[entry, 0]), round_to_bf16(table[entry, 1])
-                packed[entry] = u32(u32(low >> u32(16)) | u32(high & u32(0xFFFF0000)))
+                packed[entry] = pack_bf16(table[entry, 0], table[entry, 1])

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import torch
 from numba import njit, prange
 from torch import Tensor
 
 from methods.kernels.composite import Pixels
-
-f32 = np.float32
+from methods.kernels.cpu import f32
 
 
 def composite(

@@ -16,11 +16,11 @@ import torch
 from numba import get_num_threads, njit, prange
 from torch import Tensor
 
+from methods.kernels.cpu import f32, i32, pack_bf16, u32
 from methods.kernels.encode import PRIMES, HashGrid
 
 CHUNK = 256  # samples; 256 * (8 indices + 8 weights + 8 values) * 4 bytes = 24 KiB
 
-u32, i32, f32 = np.uint32, np.int32, np.float32
 PRIME_Y, PRIME_Z = u32(PRIMES[1]), u32(PRIMES[2])
 
 # Reordering and fused multiply-adds are allowed; assuming that no NaN comes is not: `_load`
@@ -188,14 +188,6 @@ def _blend(value, weight, count, blended):
         blended[i] = total
 
 
-@njit(cache=True)
-def round_to_bf16(value):
-    """Bits of a float32 rounded to nearest even bfloat16, in the high half."""
-    bits = f32(value).view(np.uint32)
-    tie_to_even = u32(u32(bits >> u32(16)) & u32(1))
-    return u32(u32(bits + u32(0x7FFF)) + tie_to_even)
-
-
 @njit(cache=True, fastmath=FAST)
 def _blend_packed(word, weight, count, blended):
     for i in range(count):
@@ -205,9 +197,7 @@ def _blend_packed(word, weight, count, blended):
             w = weight[corner * CHUNK + i]
             low += w * u32(pair << u32(16)).view(np.float32)
             high += w * u32(pair & u32(0xFFFF0000)).view(np.float32)
-        blended[i] = u32(
-            u32(round_to_bf16(low) >> u32(16)) | u32(round_to_bf16(high) & u32(0xFFFF0000))
-        )
+        blended[i] = pack_bf16(low, high)
 
 
 @njit(cache=True, parallel=True)

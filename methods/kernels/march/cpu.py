@@ -14,10 +14,11 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
+from methods.kernels.cpu import f32
 from methods.kernels.march import Occupancy, Samples
 
 CHUNK = 64  # rays
-f32, f64 = np.float32, np.float64
+f64 = np.float64
 UNIT_CUBE = np.array([[0, 0, 0], [1, 1, 1]], np.float32)
 
 

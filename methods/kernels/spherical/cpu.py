@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from math import pi, sqrt
 
-import numpy as np
 import torch
 from numba import njit, prange
 from torch import Tensor
 
-f32 = np.float32
+from methods.kernels.cpu import f32
+
 C00 = f32(sqrt(1 / (4 * pi)))
 C1 = f32(sqrt(3 / (4 * pi)))
 C2 = f32(sqrt(15 / (4 * pi)))

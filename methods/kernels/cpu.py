@@ -1,0 +1,29 @@
+"""What the numba backends share."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import torch
+from numba import njit
+
+f32, i32, u32 = np.float32, np.int32, np.uint32
+
+
+def follow_torch_threads() -> None:
+    """Let the kernels run on as many threads as torch does, as far as numba has started them."""
+    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
+
+
+@njit(cache=True)
+def pack_bf16(low, high):
+    """Two float32 rounded to nearest even bfloat16, in the low and high half of a word."""
+    return u32(u32(_round_bits(low) >> u32(16)) | u32(_round_bits(high) & u32(0xFFFF0000)))
+
+
+@njit(cache=True)
+def _round_bits(value):
+    """Bits of a float32 after rounding; the upper half is the bfloat16."""
+    bits = f32(value).view(np.uint32)
+    tie_to_even = u32(u32(bits >> u32(16)) & u32(1))
+    return u32(u32(bits + u32(0x7FFF)) + tie_to_even)
