@@ -1,0 +1,94 @@
+"""What a new user does first: the demo, made small, as a process of its own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from bench.results import Store
+
+SMALL = ["scene.width=64", "scene.train=6", "scene.test=3", "budget=tiny", "budget.frames=0"]
+MEASURED_ANEW = ("frame_ms", "fps", "stage_ms", "train_s", "peak_bytes")
+"""Metrics that differ from one run to the next on any machine."""
+
+
+def demo(folder: Path, weights: Path, *more: str) -> subprocess.CompletedProcess[str]:
+    steerbench = Path(sys.executable).with_name("steerbench")
+    command = [steerbench, "run", "+experiment=demo", *SMALL]
+    return subprocess.run(
+        [*command, f"weights_dir={weights}", *more],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def rows(folder: Path) -> pd.DataFrame:
+    return Store(folder / "outputs").rows()
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory, lpips_weights: Path) -> tuple[Path, str]:
+    """A folder in which the demo has run, and what it printed."""
+    folder = tmp_path_factory.mktemp("first")
+    done = demo(folder, lpips_weights)
+    assert done.returncode == 0, done.stderr
+    return folder, done.stdout
+
+
+def test_the_table_has_quality_time_by_stage_and_memory(first: tuple[Path, str]) -> None:
+    printed = first[1]
+    for word in ("PSNR", "SSIM", "LPIPS alex", "LPIPS vgg", "FPS", "march", "field", "composite"):
+        assert word in printed
+    for word in ("hash_table", "field_networks", "occupancy", "peak"):
+        assert word.replace("_", " ") in printed.replace("_", " ")
+
+
+def test_the_report_shows_truth_rendering_and_error(first: tuple[Path, str]) -> None:
+    folder = first[0] / "outputs" / "demo"
+    text = (folder / "report.md").read_text()
+    for kind in ("truth", "rendered", "error"):
+        assert len(list((folder / "pictures").glob(f"*-{kind}.png"))) == 3
+        assert f"-{kind}.png" in text
+
+
+def test_the_stages_add_up_to_the_frame(first: tuple[Path, str]) -> None:
+    values = rows(first[0]).set_index("metric")["value"]
+    stages = values[values.index.str.startswith("stage_ms.")]
+    assert stages.sum() == pytest.approx(values["frame_ms"], rel=1e-9)
+    assert set(stages.index) >= {"stage_ms.march", "stage_ms.field", "stage_ms.composite"}
+
+
+def test_the_same_seed_gives_the_same_rows(
+    first: tuple[Path, str], tmp_path: Path, lpips_weights: Path
+) -> None:
+    assert demo(tmp_path, lpips_weights).returncode == 0
+    kept = [
+        table[~table["metric"].str.startswith(MEASURED_ANEW)].reset_index(drop=True)
+        for table in (rows(first[0]), rows(tmp_path))
+    ]
+    assert {"psnr", "ssim", "lpips_alex", "lpips_vgg", "work.samples"} <= set(kept[0]["metric"])
+    pd.testing.assert_frame_equal(*kept, check_exact=True)
+
+
+def test_what_was_measured_is_not_measured_again(
+    first: tuple[Path, str], lpips_weights: Path
+) -> None:
+    before = rows(first[0])
+    again = demo(first[0], lpips_weights)
+    assert "already measured" in again.stderr
+    pd.testing.assert_frame_equal(rows(first[0]), before, check_exact=True)
+
+
+def test_training_is_shared_by_runs_that_differ_in_rendering_only(
+    first: tuple[Path, str], lpips_weights: Path
+) -> None:
+    done = demo(first[0], lpips_weights, "method.stop=1e-2")
+    assert "trained field found" in done.stderr
+    assert len(rows(first[0])["run"].unique()) == 2
+    assert len(list((first[0] / "outputs" / "stages").iterdir())) == 1
