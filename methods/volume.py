@@ -11,7 +11,7 @@ from torch.nn import functional
 from bench.cameras import cast, pixel_grid, project
 from bench.types import Camera, Probe, Rays
 from methods.fields import HashField
-from methods.kernels.composite import STOP, Pixels, composite
+from methods.kernels.composite import STOP, Pixels, composite, visible_counts
 from methods.kernels.march import Occupancy, Samples, march
 from methods.occupancy import STEP
 
@@ -48,7 +48,10 @@ def rays_at_matter(camera: Camera, occupancy: Occupancy) -> tuple[Tensor, Rays]:
 def render_batch(
     field: HashField, rays: Rays, occupancy: Occupancy, jitter: Tensor, background: Tensor
 ) -> tuple[Pixels, int]:
-    """Render `rays` differentiably with all their samples; also the number of samples.
+    """Render `rays` differentiably; also the number of samples that took part.
+
+    Samples behind the early stop, more than half of all once surfaces have formed, have neither
+    weight nor gradient: the density of all samples, without gradient, tells which they are.
 
     Args:
         jitter: [R] phase of the samples of each ray, in [0, 1).
@@ -57,6 +60,11 @@ def render_batch(
     samples = march(
         rays.origins, rays.directions, occupancy, STEP, jitter=jitter, backend=field.backend
     )
+    with torch.no_grad():
+        sigma, _ = field.density(_pad(samples.positions))
+        sigma = sigma[: len(samples)]
+        counts = visible_counts(sigma, samples.delta, samples.offsets, backend=field.backend)
+    samples = samples.front(counts)
     sigma, values = _query(field, samples, rays.directions)
     pixels = composite(
         sigma,
@@ -76,13 +84,15 @@ def _query(field: HashField, samples: Samples, directions: Tensor) -> tuple[Tens
     The field sees batches of a few round sizes only: the library behind the matrix products
     prepares code for every new size, which takes longer than the product itself.
     """
-    count = len(samples)
-    padding = -count % BATCH_QUANTUM
-    positions = functional.pad(samples.positions, (0, 0, 0, padding))
-    ray = functional.pad(samples.ray, (0, padding))
-    sigma, geometry = field.density(positions)
-    values = field.features(geometry, field.encode_directions(directions)[ray])
-    return sigma[:count], values[:count]
+    sigma, geometry = field.density(_pad(samples.positions))
+    values = field.features(geometry, field.encode_directions(directions)[_pad(samples.ray)])
+    return sigma[: len(samples)], values[: len(samples)]
+
+
+def _pad(samples: Tensor) -> Tensor:
+    """Zeros at the end of [S, ...], up to a multiple of `BATCH_QUANTUM`."""
+    padding = -len(samples) % BATCH_QUANTUM
+    return functional.pad(samples, (0, 0) * (samples.dim() - 1) + (0, padding))
 
 
 @dataclass

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from bench.cameras import cast
 from bench.types import NullProbe
 from methods.fields import HashField
+from methods.kernels.composite import composite
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy, march
 from methods.occupancy import STEP
@@ -31,7 +34,7 @@ def cloud(device: str) -> tuple[HashField, Occupancy]:
 def test_rounds_render_what_one_go_renders(cloud: tuple[HashField, Occupancy], device: str) -> None:
     field, occupancy = cloud
     camera = look_at_the_middle(0.1, 0.4)
-    rays = cast(type(camera)(**{**vars(camera), "c2w": camera.c2w.to(device)}))
+    rays = cast(replace(camera, c2w=camera.c2w.to(device)))
     half = torch.full((len(rays.origins),), 0.5, device=device)
     with torch.no_grad():
         whole, _ = render_batch(field, rays, occupancy, half, torch.zeros(3, device=device))
@@ -41,6 +44,36 @@ def test_rounds_render_what_one_go_renders(cloud: tuple[HashField, Occupancy], d
     torch.testing.assert_close(rounds.values, whole.values, rtol=0, atol=1e-4)
     torch.testing.assert_close(rounds.depth_sum, whole.depth_sum, rtol=0, atol=3e-4)
     torch.testing.assert_close(rounds.alpha, whole.alpha, rtol=0, atol=1e-4)
+
+
+def test_leaving_out_hidden_samples_changes_no_gradient(
+    cloud: tuple[HashField, Occupancy], device: str
+) -> None:
+    field, occupancy = cloud
+    thin = field.density
+    field.density = lambda x: (100 * thin(x)[0], thin(x)[1])  # type: ignore[method-assign]
+    camera = look_at_the_middle(0.1, 0.4)
+    rays = cast(replace(camera, c2w=camera.c2w.to(device)))
+    jitter = torch.rand(len(rays.origins), generator=torch.Generator().manual_seed(0)).to(device)
+    white = torch.ones(3, device=device)
+
+    pixels, used = render_batch(field, rays, occupancy, jitter, white)
+    pixels.values.square().sum().backward()
+    grads = [p.grad.clone() for p in field.parameters() if p.grad is not None]
+    field.zero_grad()
+
+    samples = march(rays.origins, rays.directions, occupancy, STEP, jitter=jitter)
+    sigma, geometry = field.density(samples.positions)
+    values = field.features(geometry, field.encode_directions(rays.directions)[samples.ray])
+    whole = composite(sigma, values, samples.t, samples.delta, samples.offsets, background=white)
+    whole.values.square().sum().backward()
+
+    assert used < 0.9 * len(samples)
+    assert len(grads) == 6
+    for got, want in zip(grads, (p.grad for p in field.parameters()), strict=True):
+        assert want is not None
+        # Sums over up to 10^5 samples, in another grouping.
+        torch.testing.assert_close(got, want, rtol=1e-3, atol=1e-4 * want.abs().max().item())
 
 
 def test_samples_behind_the_early_stop_are_hardly_evaluated() -> None:
@@ -82,7 +115,7 @@ def test_no_ray_that_has_samples_is_left_out(
 
 def test_a_camera_inside_the_matter_sees_it_in_all_pixels() -> None:
     camera = look_at_the_middle(0.0, 0.0)
-    inside = type(camera)(**{**vars(camera), "c2w": camera.c2w.clone()})
+    inside = replace(camera, c2w=camera.c2w.clone())
     inside.c2w[:, 3] = 0.5
     pixels, _ = rays_at_matter(inside, Occupancy(torch.ones(16, 16, 16, dtype=torch.bool)))
     assert len(pixels) == camera.width * camera.height

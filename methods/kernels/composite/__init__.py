@@ -63,3 +63,21 @@ def composite(
         return pixels
     shine = (1 - pixels.alpha)[:, None] * background
     return Pixels(pixels.values + shine, pixels.depth_sum, pixels.alpha)
+
+
+def visible_counts(
+    sigma: Tensor,
+    delta: Tensor,
+    offsets: Tensor,
+    *,
+    stop: float = STOP,
+    backend: str = "auto",
+) -> Tensor:
+    """How many samples of each ray `composite` would give a weight: [R] int64. No gradient.
+
+    They are the first ones of the ray; what lies behind has neither weight nor gradient.
+    """
+    check_shape("delta", delta, len(sigma))
+    return implementation("composite", backend, sigma.device).visible_counts(
+        sigma.detach(), delta, offsets, stop
+    )

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from methods.kernels.case import U32, Case, Prepared
-from methods.kernels.composite import Pixels, composite
+from methods.kernels.composite import Pixels, composite, visible_counts
 
 DEPTH = 2.0
 """Largest t of the samples: the size of what is summed, values being at most 1."""
@@ -31,7 +31,7 @@ def cases() -> list[Case]:
     found = [
         Case(f"composite{direction}", name, "fp32", rays * most, partial(make, rays, most, options))
         for name, rays, most, options in kinds
-        for direction, make in (("", _forward), (" backward", _backward))
+        for direction, make in (("", _forward), (" backward", _backward), (" visible", _visible))
     ]
     return [
         *found,
@@ -113,3 +113,17 @@ def _backward(rays: int, most: int, options: dict, device: str) -> Prepared:
     # The gain of a weight is a product with K + 2 gradients of at most 1; delta is at most 2 / n.
     channels = grad.shape[1]
     return Prepared(call, channels * _tolerance(most))
+
+
+def _visible(rays: int, most: int, options: dict, device: str) -> Prepared:
+    inputs, _ = _inputs(rays, most, options, device)
+
+    def call(backend: str) -> tuple[Tensor, ...]:
+        return (
+            visible_counts(
+                inputs["sigma"], inputs["delta"], inputs["offsets"], stop=0.3, backend=backend
+            ),
+        )
+
+    # A transmittance within rounding of the threshold may end a ray one sample earlier.
+    return Prepared(call, 1.0)

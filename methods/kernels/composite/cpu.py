@@ -30,6 +30,13 @@ def composite(
     return Pixels(*_Composite.apply(sigma, values, t, delta, offsets, stop, carry))
 
 
+def visible_counts(sigma: Tensor, delta: Tensor, offsets: Tensor, stop: float) -> Tensor:
+    """See `methods.kernels.composite.visible_counts`."""
+    counts = torch.empty(len(offsets) - 1, dtype=torch.int64)
+    _visible(sigma.contiguous().numpy(), delta.numpy(), offsets.numpy(), f32(stop), counts.numpy())
+    return counts
+
+
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx, sigma, values, t, delta, offsets, stop, carry):
@@ -90,6 +97,17 @@ def _forward(sigma, values, t, delta, offsets, stop, front, out, depth_sum, alph
             depth_sum[ray] += weight * t[i]
             alpha[ray] += weight
             transmittance *= f32(math.exp(-tau))
+
+
+@njit(cache=True, parallel=True)
+def _visible(sigma, delta, offsets, stop, counts):
+    for ray in prange(len(offsets) - 1):
+        transmittance = f32(1)
+        i = offsets[ray]
+        while i < offsets[ray + 1] and transmittance > stop:
+            transmittance *= f32(math.exp(-_thickness(sigma[i], delta[i])))
+            i += 1
+        counts[ray] = i - offsets[ray]
 
 
 @njit(cache=True, parallel=True)

@@ -18,21 +18,15 @@ def composite(
     carry: Pixels | None,
 ) -> Pixels:
     """See `methods.kernels.composite.composite`."""
-    counts = offsets.diff()
-    slot = torch.arange(int(counts.max()) if len(counts) else 0, device=sigma.device)
-    present = slot < counts[:, None]  # [R, N]
-    index = torch.where(present, offsets[:-1, None] + slot, 0)
+    present, index = _padded_rays(offsets)
 
     def padded(samples: Tensor) -> Tensor:
         mask = present.reshape(*present.shape, *(1,) * (samples.dim() - 1))
         return torch.where(mask, samples[index], 0) if len(samples) else samples[index]
 
-    # A sample without length is without matter, however dense: 0, not inf * 0.
-    tau = padded(torch.where(delta > 0, sigma * delta, 0))  # [R, N]
-    # Shifted rather than subtracted: behind an infinite thickness, inf - inf would be no number.
-    before = torch.nn.functional.pad(tau, (1, 0)).cumsum(dim=1)[:, :-1]
+    tau = padded(_thickness(sigma, delta))  # [R, N]
     front = 1 if carry is None else (1 - carry.alpha)[:, None]
-    transmittance = front * torch.exp(-before)
+    transmittance = front * _transmittance(tau)
     weight = torch.where(transmittance > stop, transmittance * -torch.expm1(-tau), 0)
 
     rays = Pixels(
@@ -45,3 +39,31 @@ def composite(
     return Pixels(
         carry.values + rays.values, carry.depth_sum + rays.depth_sum, carry.alpha + rays.alpha
     )
+
+
+def visible_counts(sigma: Tensor, delta: Tensor, offsets: Tensor, stop: float) -> Tensor:
+    """See `methods.kernels.composite.visible_counts`."""
+    present, index = _padded_rays(offsets)
+    if not len(sigma):
+        return offsets.diff()
+    tau = torch.where(present, _thickness(sigma, delta)[index], 0)
+    return ((_transmittance(tau) > stop) & present).sum(dim=1)
+
+
+def _padded_rays(offsets: Tensor) -> tuple[Tensor, Tensor]:
+    """Which of [R, N] slots hold a sample, N of the longest ray, and which sample (0 elsewhere)."""
+    counts = offsets.diff()
+    slot = torch.arange(int(counts.max()) if len(counts) else 0, device=offsets.device)
+    present = slot < counts[:, None]
+    return present, torch.where(present, offsets[:-1, None] + slot, 0)
+
+
+def _thickness(sigma: Tensor, delta: Tensor) -> Tensor:
+    # A sample without length is without matter, however dense: 0, not inf * 0.
+    return torch.where(delta > 0, sigma * delta, 0)
+
+
+def _transmittance(tau: Tensor) -> Tensor:
+    """In front of each sample, of optical thicknesses [R, N]."""
+    # Shifted rather than subtracted: behind an infinite thickness, inf - inf would be no number.
+    return torch.exp(-torch.nn.functional.pad(tau, (1, 0)).cumsum(dim=1)[:, :-1])

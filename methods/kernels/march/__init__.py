@@ -104,6 +104,20 @@ class Samples:
     def __len__(self) -> int:
         return len(self.t)
 
+    def front(self, counts: Tensor) -> Samples:
+        """Only the first `counts` [R] samples of each ray."""
+        offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
+        shift = (self.offsets - offsets)[:-1].repeat_interleave(counts)
+        kept = torch.arange(len(shift), device=shift.device) + shift
+        return Samples(
+            offsets,
+            self.ray[kept],
+            self.t[kept],
+            self.delta[kept],
+            self.positions[kept],
+            self.resume,
+        )
+
 
 def march(
     origins: Tensor,

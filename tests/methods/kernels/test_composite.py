@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from methods.kernels.composite import Pixels, composite
+from methods.kernels.composite import Pixels, composite, visible_counts
 
 BACKENDS = ["reference", "cpu"]
 
@@ -119,6 +119,24 @@ def test_the_early_stop_changes_a_pixel_by_less_than_its_threshold(
     stopped = composite(**inputs, stop=stop, backend=backend)
     difference = (exact.alpha - stopped.alpha).abs().max().item()
     assert 0 < difference <= stop + 1e-6
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_visible_samples_are_those_with_a_gradient(backend: str) -> None:
+    inputs = samples([40, 0, 1, 25])
+    stop = 0.05
+    counts = visible_counts(
+        inputs["sigma"], inputs["delta"], inputs["offsets"], stop=stop, backend=backend
+    )
+    values = inputs["values"].requires_grad_()
+    pixels = composite(**inputs | {"values": values}, stop=stop, backend=backend)
+    (grad,) = torch.autograd.grad(pixels.values.sum(), values)
+    seen = (grad != 0).any(dim=1)
+    for ray, count in enumerate(counts.tolist()):
+        begin, end = inputs["offsets"][ray], inputs["offsets"][ray + 1]
+        assert seen[begin : begin + count].all()
+        assert not seen[begin + count : end].any()
+    assert 0 < counts[0] < 40
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

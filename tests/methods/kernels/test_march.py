@@ -136,6 +136,19 @@ def test_rays_that_miss_or_make_no_sense_have_no_samples(backend: str) -> None:
     assert samples.resume.tolist() == [-1] * 5
 
 
+def test_the_front_of_a_ray_is_its_first_samples() -> None:
+    origins, directions = rays_through_the_cube(30)
+    samples = march(origins, directions, dust(3), STEP)
+    counts = torch.minimum(samples.offsets.diff(), torch.arange(30) % 5)
+    front = samples.front(counts)
+    assert torch.equal(front.offsets.diff(), counts)
+    for ray in range(30):
+        kept = slice(int(front.offsets[ray]), int(front.offsets[ray + 1]))
+        whole = slice(int(samples.offsets[ray]), int(samples.offsets[ray]) + int(counts[ray]))
+        for name in ("ray", "t", "delta", "positions"):
+            assert torch.equal(getattr(front, name)[kept], getattr(samples, name)[whole])
+
+
 def test_pyramid_bounds_and_share_describe_the_cells() -> None:
     cells = torch.zeros(32, 32, 32, dtype=torch.bool)
     cells[3, 17, 30] = cells[5, 20, 31] = True
