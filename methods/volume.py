@@ -8,17 +8,17 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.cameras import cast, pixel_grid, project
+from bench.cameras import cast, project
 from bench.types import Camera, Probe, Rays
 from methods.fields import HashField
 from methods.kernels.composite import STOP, Pixels, composite, visible_counts
-from methods.kernels.march import Occupancy, Samples, march
+from methods.kernels.march import BRICK, Occupancy, Samples, march
 from methods.occupancy import STEP
 
-CHUNK_RAYS = 1 << 14
-"""Rays rendered together: their samples of a round should stay in the last-level cache."""
+CHUNK_RAYS = 1 << 16
+"""Rays rendered together: enough to keep all threads busy, few enough to stay in the cache."""
 
-ROUND_SAMPLES = (4, 8, 16, 32)
+ROUND_SAMPLES = (4, 8, 16)
 """Samples a ray may take in a round; the last number repeats."""
 
 BATCH_QUANTUM = 1 << 11
@@ -28,21 +28,36 @@ BATCH_QUANTUM = 1 << 11
 def rays_at_matter(camera: Camera, occupancy: Occupancy) -> tuple[Tensor, Rays]:
     """The pixels that may see an occupied cell, as indices [P] row by row, and their rays.
 
-    They are the pixels in the box around the projected corners of the occupied box; all of them
-    when one of its corners is not in front of the camera.
+    A pixel may see an occupied brick if it lies in the box around the projected corners of the
+    brick; every pixel may, if one of them is not in front of the camera.
     """
     device = camera.c2w.device
-    corners = torch.cartesian_prod(*occupancy.bounds.to(device).T)
-    corner_pixels, depth = project(camera, corners)
+    bricks = occupancy.words.nonzero().to(device)  # [B, 3]
+    unit = torch.arange(2, device=device)
+    corners = (bricks[:, None] + torch.cartesian_prod(unit, unit, unit)) * BRICK
+    projected, depth = project(camera, corners.reshape(-1, 3) / occupancy.resolution)
+    projected = projected.view(-1, 8, 2)
+    behind = (depth.view(-1, 8) <= 0).any(dim=1)[:, None]  # [B, 1]
+
     size = torch.tensor((camera.width, camera.height), device=device)
-    low, high = torch.zeros_like(size), size
-    if (depth > 0).all():
-        low = torch.minimum(corner_pixels.amin(dim=0).floor().clamp(min=0), size).long()
-        high = torch.minimum(corner_pixels.amax(dim=0).ceil().clamp(min=0), size).long()
-    width, height = (high - low).tolist()
-    grid = pixel_grid(width, height, device) + low
-    column, row = grid.long().unbind(dim=-1)
-    return row * camera.width + column, cast(camera, grid)
+    low = torch.where(behind, 0, projected.amin(dim=1)).floor().clamp(min=0)
+    high = torch.where(behind, size, projected.amax(dim=1)).ceil().clamp(min=0)
+    left, top = torch.minimum(low, size).long().unbind(dim=1)
+    right, bottom = torch.minimum(high, size).long().unbind(dim=1)
+
+    # How many boxes cover a pixel: the sum, over all pixels above and to the left, of +1 and -1 at
+    # the boxes' corners.
+    edges = torch.zeros(camera.height + 1, camera.width + 1, dtype=torch.int32, device=device)
+    for row, column, sign in (
+        (top, left, 1),
+        (top, right, -1),
+        (bottom, left, -1),
+        (bottom, right, 1),
+    ):
+        edges.index_put_((row, column), torch.tensor(sign, dtype=torch.int32, device=device), True)
+    covers = edges.cumsum(dim=0).cumsum(dim=1)[:-1, :-1]
+    row, column = covers.nonzero().unbind(dim=1)
+    return row * camera.width + column, cast(camera, torch.stack((column, row), dim=1) + 0.5)
 
 
 def render_batch(
