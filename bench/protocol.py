@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -92,9 +93,9 @@ class EvaluationProtocol:
             for net in self.lpips:
                 metrics.check_size(f"lpips_{net}", camera.width, camera.height)
 
-    def find_lpips(self, weights_dir: Path | None, log: Log) -> dict[str, bool]:
-        """For which backbones weights can be had: part of what a run's rows depend on."""
-        return {net: _is_available(net, weights_dir, log) for net in self.lpips}
+    def find_lpips(self, weights_dir: Path | None, log: Log) -> dict[str, str | None]:
+        """SHA-256 of each backbone's weight file, None where there is none: rows depend on it."""
+        return {net: _weights_digest(net, weights_dir, log) for net in self.lpips}
 
     def load_lpips(
         self, weights_dir: Path | None, log: Log
@@ -132,12 +133,12 @@ class EvaluationProtocol:
         return scores
 
 
-def _is_available(net: str, weights_dir: Path | None, log: Log) -> bool:
+def _weights_digest(net: str, weights_dir: Path | None, log: Log) -> str | None:
     try:
-        locate(net, weights_dir, log)
+        with locate(net, weights_dir, log).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
     except Unavailable:
-        return False
-    return True
+        return None
 
 
 def composite(picture: Tensor, background: Tensor) -> Tensor:

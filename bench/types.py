@@ -23,7 +23,7 @@ Scene units: every scene is normalised so that what is to be rendered lies in th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -120,7 +120,7 @@ class Budget:
     Attributes:
         name: as it stands in result rows.
         steps: optimiser steps of the (pre-)training of a field.
-        samples: field samples a step aims at; the number of rays follows from it.
+        samples: field samples with a gradient that a step aims at; the rays follow from it.
         frames: at most this many test frames are rendered and scored (0: all).
     """
 
@@ -128,6 +128,10 @@ class Budget:
     steps: int
     samples: int
     frames: int = 0
+
+    def __post_init__(self) -> None:
+        if not (self.steps >= 1 and self.samples >= 1 and self.frames >= 0):
+            raise ValueError(f"expected steps >= 1, samples >= 1 and frames >= 0: {self}")
 
 
 class Log(Protocol):
@@ -188,15 +192,12 @@ class Method(Protocol):
         """The resolved `device`, `backend`, `engine` and `precision`, for the result rows."""
 
 
-@dataclass
 class NullProbe:
-    """A probe that measures nothing, for training and for pictures."""
-
-    counts: dict[str, int] = field(default_factory=dict)
+    """A probe that measures nothing: for pictures alone."""
 
     def stage(self, name: str) -> AbstractContextManager[None]:
         """Do not time."""
-        return torch.autograd.profiler.record_function(name)
+        return nullcontext()
 
     def count(self, name: str, done: int, dense: int | None = None) -> None:
         """Do not count."""

@@ -40,6 +40,11 @@ class InstantNgp:
     ) -> None:
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
+        if precision == "bf16" and grid.features != 2:
+            raise ValueError(
+                f"precision bf16 packs 2 features an entry, grid.features is {grid.features}: "
+                "use precision=fp32"
+            )
         self.device = torch.device(device)
         self.backend = resolve(backend, self.device)
         self.grid, self.training, self.precision = grid, training, precision
@@ -106,6 +111,7 @@ class InstantNgp:
             "precision": self.precision,
             "backend": self.backend,
             "device": self.device.type,
+            "threads": torch.get_num_threads(),
             "seed": self.seed,
             "code": training_digest(),
         }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,8 +15,9 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
+from torch.nn import functional
 
-from bench.provenance import digest
+from bench.provenance import ROOT, digest
 from bench.types import Budget, Log, Rays, Scene, Split, SteerbenchError
 from methods.fields import HashField
 from methods.kernels.adam import AdamState, sparse_adam_
@@ -27,6 +29,9 @@ CHECKPOINT_S = 20.0
 
 UNTRAINED_SOURCES = ("case", "cases", "benchmark")
 """Modules of the kernels that no training runs through."""
+
+MIN_RAYS = 64
+"""Fewest rays of a step."""
 
 GRID_YOUTH_STEPS = 256
 """Until this step the density grid is visited four times as much: most of it is still unknown."""
@@ -53,16 +58,29 @@ class TrainingOptions:
     grid_samples: int = 1 << 17
     max_rays: int = 1 << 15
 
+    def __post_init__(self) -> None:
+        if not (self.rate > 0 and 0 < self.final_rate <= 1 and self.opacity_entropy >= 0):
+            raise ValueError(
+                f"expected rate > 0, final_rate in (0, 1], opacity_entropy >= 0: {self}"
+            )
+        if not (self.grid_samples >= 2 and self.max_rays >= MIN_RAYS):
+            raise ValueError(f"expected grid_samples >= 2, max_rays >= {MIN_RAYS}: {self}")
+
 
 class PixelBatches:
     """Random pixels of the pictures of a split, with their rays."""
 
     def __init__(self, split: Split, device: torch.device) -> None:
         self._device = device
-        self._pictures = [picture.reshape(-1, picture.shape[-1]) for picture in split.images]
-        sizes = torch.tensor([len(picture) for picture in self._pictures])
-        self._ends = sizes.cumsum(0).to(device)
-        self._pixels = torch.cat([p.to(device) for p in self._pictures])  # [P, 3 or 4] uint8
+        channels = max(picture.shape[-1] for picture in split.images)
+        pictures = [
+            # An opaque picture among transparent ones gets an alpha of 255.
+            functional.pad(picture, (0, channels - picture.shape[-1]), value=255).flatten(0, 1)
+            for picture in split.images
+        ]
+        sizes = torch.tensor([len(picture) for picture in pictures])
+        self._ends = sizes.cumsum(0).to(device)  # of each picture in `_pixels`
+        self._pixels = torch.cat([p.to(device) for p in pictures])  # [P, 3 or 4] uint8
         cameras = split.cameras
         self._widths = torch.tensor([c.width for c in cameras], device=device)
         self._poses = torch.stack([c.c2w for c in cameras]).to(device)  # [N, 3, 4]
@@ -124,17 +142,15 @@ class FieldTraining:
             self.grid.update(self.field, self.generator, samples)
         rays, colours = self.batches.draw(self.rays, self.generator)
         target, background = self._target(colours)
-        jitter = torch.rand(
-            len(target), generator=self.generator, device=target.device, dtype=target.dtype
-        )
+        jitter = torch.rand(len(target), generator=self.generator, device=target.device)
         pixels, samples = render_batch(self.field, rays, self.grid.occupancy, jitter, background)
-        loss = torch.nn.functional.mse_loss(pixels.values, target)
+        loss = functional.mse_loss(pixels.values, target)
         opacity = pixels.alpha.clamp(1e-5, 1 - 1e-5)
         entropy = -(opacity * opacity.log()).mean()
         (loss + self.options.opacity_entropy * entropy).backward()
         value = loss.item()
         if not math.isfinite(value):
-            raise self._not_finite(pixels.values)
+            self.check_finite({"loss": loss, "rendered pixels": pixels.values})
         self._update()
         self._fit_batch(samples)
         self.step += 1
@@ -170,28 +186,32 @@ class FieldTraining:
 
     def _fit_batch(self, samples: int) -> None:
         """Choose the next number of rays so that it brings about `budget.samples` samples."""
-        wanted = self.rays * self.budget.samples / max(samples, 1)
-        change = min(max(wanted / self.rays, 0.5), 1.25)
-        self.rays = min(max(int(self.rays * change), 64), self.options.max_rays)
+        change = min(max(self.budget.samples / max(samples, 1), 0.5), 1.25)
+        self.rays = min(max(int(self.rays * change), MIN_RAYS), self.options.max_rays)
 
-    def _not_finite(self, rendered: Tensor) -> SteerbenchError:
-        tensors = {"rendered pixels": rendered, "table": self.field.table}
-        tensors |= dict(self.field.layers.items())
+    def check_finite(self, more: Mapping[str, Tensor] | None = None) -> None:
+        """Raise `SteerbenchError` naming the step and the tensors that are not finite, if any are.
+
+        Looked at are the table and its moments, the networks and `more`.
+        """
+        tensors = {"table": self.field.table, **dict(self.field.layers.items()), **(more or {})}
+        tensors |= {"table moments": self.table_state.first + self.table_state.second}
         bad = [name for name, tensor in tensors.items() if not tensor.isfinite().all()]
-        return SteerbenchError(
-            f"training stopped at step {self.step}: the loss is not finite "
-            f"(not finite: {', '.join(bad) or 'only the loss'}); the last good checkpoint was "
-            "kept. Try a smaller learning rate (method.training.rate)."
-        )
+        if bad:
+            raise SteerbenchError(
+                f"training stopped at step {self.step}: not finite: {', '.join(bad)}. The last "
+                "good checkpoint was kept. Try a smaller learning rate (method.training.rate)."
+            )
 
 
 @cache
 def training_digest() -> str:
     """SHA-256 of the sources that decide what a training results in."""
-    folder = Path(__file__).parent
-    sources = [folder / f"{name}.py" for name in ("train", "fields", "occupancy", "volume")]
-    kernels = [p for p in (folder / "kernels").rglob("*.py") if p.stem not in UNTRAINED_SOURCES]
-    return digest(sources + kernels)
+    methods, bench = ROOT / "methods", ROOT / "bench"
+    sources = [methods / f"{name}.py" for name in ("train", "fields", "occupancy", "volume")]
+    sources += [p for p in (methods / "kernels").rglob("*.py") if p.stem not in UNTRAINED_SOURCES]
+    sources += [bench / "cameras.py", *(bench / "scenes").glob("*.py")]  # pixels and rays
+    return digest(sources)
 
 
 def train_field(
@@ -208,12 +228,15 @@ def train_field(
     The result stands in `folder` as `field.safetensors`; a training that is found there is loaded,
     one that was killed goes on from its last checkpoint.
     """
-    training = FieldTraining(field, scene, budget, options, seed)
-    if (finished := folder / "field.safetensors").exists():
-        _load(training, finished)
+    finished = folder / "field.safetensors"
+    if finished.exists():
+        tensors, meta = _read(finished)
+        grid = DensityGrid(scene.bounds, field.table.device)
+        _restore(field, grid, tensors)
         log.info(f"trained field found: {finished}")
-    else:
-        _run(training, folder, log)
+        return grid, meta["seconds"]
+    training = FieldTraining(field, scene, budget, options, seed)
+    _run(training, folder, log)
     field.grad_buffer = None
     return training.grid, training.seconds
 
@@ -221,13 +244,13 @@ def train_field(
 def _run(training: FieldTraining, folder: Path, log: Log) -> None:
     checkpoint = folder / "checkpoint.safetensors"
     if checkpoint.exists():
-        _load(training, checkpoint)
+        resume(training, checkpoint)
         log.info(f"going on from step {training.step} of {checkpoint}")
     steps = training.budget.steps
     began, saved = time.monotonic() - training.seconds, time.monotonic()
     mean = math.nan
     with log.progress("training", steps) as progress:
-        progress.advance(training.step)
+        progress.advance(training.step, note="compiling kernels")  # on their first use ever
         while training.step < steps:
             loss = training.advance()
             mean = loss if math.isnan(mean) else 0.99 * mean + 0.01 * loss
@@ -254,32 +277,33 @@ def _tensors(training: FieldTraining, finished: bool) -> dict[str, Tensor]:
 
 
 def _save(training: FieldTraining, path: Path, finished: bool = False) -> None:
-    """Write a checkpoint under a temporary name and rename it: never half a file."""
+    """Write a good checkpoint whole or not at all, also when another process writes the same."""
+    training.check_finite()
     meta = {"step": training.step, "rays": training.rays, "seconds": training.seconds}
-    temporary = path.with_suffix(".tmp")
+    temporary = path.with_suffix(f".{os.getpid()}.tmp")
     try:
         save_file(_tensors(training, finished), temporary, {"training": json.dumps(meta)})
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
         temporary.replace(path)
     except (OSError, SafetensorError) as error:
         temporary.unlink(missing_ok=True)
         raise SteerbenchError(f"{path}: cannot write the checkpoint: {error}") from error
 
 
-def _load(training: FieldTraining, path: Path) -> None:
-    with safe_open(path, "pt") as file:
-        meta: Mapping[str, float] = json.loads(file.metadata()["training"])
-    tensors = load_file(path, device=str(training.field.table.device))
+def resume(training: FieldTraining, path: Path) -> None:
+    """Put `training` back into the state of a checkpoint.
+
+    Raises:
+        SteerbenchError: the file is damaged, or of another training.
+    """
+    tensors, meta = _read(path)
+    _restore(training.field, training.grid, tensors)
     training.step, training.rays = int(meta["step"]), int(meta["rays"])
-    training.seconds = float(meta["seconds"])
-    training.field.load_state_dict(
-        {name[6:]: value for name, value in tensors.items() if name.startswith("field.")}
-    )
-    training.field.repack()
-    training.grid.restore(tensors["grid.density"])
-    if "generator" not in tensors:
-        return
+    training.seconds = meta["seconds"]
+    device = training.field.table.device
     training.table_state = AdamState(
-        tensors["adam.first"], tensors["adam.second"], tensors["adam.steps"]
+        *(tensors[f"adam.{name}"].to(device) for name in ("first", "second", "steps"))
     )
     training.generator.set_state(tensors["generator"].cpu())
     state = training.network_optimiser.state_dict()
@@ -288,3 +312,25 @@ def _load(training: FieldTraining, path: Path) -> None:
             _, index, slot = name.split(".")
             state["state"].setdefault(int(index), {})[slot] = value
     training.network_optimiser.load_state_dict(state)
+
+
+def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, float]]:
+    """Tensors and figures of a file written by `_save`."""
+    try:
+        with safe_open(path, "pt") as file:
+            meta = json.loads(file.metadata()["training"])
+        return load_file(path), meta
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise SteerbenchError(
+            f"{path}: expected a field written by a training, could not read one ({error}); "
+            "remove it to train again"
+        ) from error
+
+
+def _restore(field: HashField, grid: DensityGrid, tensors: Mapping[str, Tensor]) -> None:
+    prefix = "field."
+    field.load_state_dict(
+        {name.removeprefix(prefix): x for name, x in tensors.items() if name.startswith(prefix)}
+    )
+    field.repack()
+    grid.restore(tensors["grid.density"])

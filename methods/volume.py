@@ -21,6 +21,9 @@ CHUNK_RAYS = 1 << 16
 ROUND_SAMPLES = (4, 8, 16)
 """Samples a ray may take in a round; the last number repeats."""
 
+CHUNK_SAMPLES = 1 << 18
+"""Samples whose density is evaluated together, without gradient: bounds the memory of a step."""
+
 BATCH_QUANTUM = 1 << 11
 """Samples are handed to the field in multiples of this."""
 
@@ -76,8 +79,8 @@ def render_batch(
         rays.origins, rays.directions, occupancy, STEP, jitter=jitter, backend=field.backend
     )
     with torch.no_grad():
-        sigma, _ = field.density(_pad(samples.positions))
-        sigma = sigma[: len(samples)]
+        parts = _pad(samples.positions).split(CHUNK_SAMPLES)
+        sigma = torch.cat([field.density(part)[0] for part in parts])[: len(samples)]
         counts = visible_counts(sigma, samples.delta, samples.offsets, backend=field.backend)
     samples = samples.front(counts)
     sigma, values = _query(field, samples, rays.directions)

@@ -35,9 +35,17 @@ def build(config: DictConfig, group: str, *args: Any, **extra: Any) -> Any:
     check_settings(target, node, f"{group}.", given)
     try:
         prepared = instantiate(config[group], _partial_=True, _convert_="all")
+        return prepared(*args, **extra)
     except InstantiationException as error:
-        raise error.__cause__ or error from error
-    return prepared(*args, **extra)
+        cause = error.__cause__ or error
+        raise (_refused(group, cause) if isinstance(cause, ValueError) else cause) from error
+    except ValueError as error:
+        raise _refused(group, error) from error
+
+
+def _refused(group: str, error: BaseException) -> SteerbenchError:
+    """A value that the thing itself refuses: the message names it, the group says where."""
+    return SteerbenchError(f"{group}: {error}")
 
 
 def check_settings(

@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
+from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from reports.tables import Table
 from sweeps.terminal import console, rich_table
@@ -21,7 +23,7 @@ def main(options: argparse.Namespace) -> int:
         raise SteerbenchError(f"--repeats: expected 1 or more, got {options.repeats}")
     from methods.kernels.benchmark import main_rows
 
-    rows = main_rows(options.filter, options.repeats)
+    rows = main_rows(options.filter, options.repeats, ConsoleLog(Path()))
     if not rows:
         raise SteerbenchError(f"--filter: no kernel has {options.filter!r} in its name")
     console().print(rich_table(Table("Kernels", COLUMNS, tuple(_line(row) for row in rows))))
@@ -31,7 +33,8 @@ def main(options: argparse.Namespace) -> int:
 
 def _line(row: Mapping[str, Any]) -> tuple[str, ...]:
     labels = (row["kernel"], row["case"], row["backend"], row["dtype"])
-    errors = (f"{row['error']:.1e}", f"{row['tolerance']:.1e}")
+    error = "not finite" if row["error"] is None else f"{row['error']:.1e}"
+    errors = (error, f"{row['tolerance']:.1e}")
     if row["status"] != "ok":
         return (*labels, *errors, row["status"], "", "")
     return (*labels, *errors, f"{row['ms']:.2f}", f"{row['mitems_s']:.2f}", f"{row['ratio']:.1f}x")

@@ -15,7 +15,7 @@ from rich.columns import Columns
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
-from bench.provenance import code_digest
+from bench.provenance import code_digest, machine
 from bench.results import Store
 from bench.run import measure
 from bench.types import Method, Scene
@@ -115,6 +115,7 @@ def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any
         "scene": scene.digest,
         "resolved": method.settings(),
         "threads": torch.get_num_threads(),
+        "machine": {k: v for k, v in machine().items() if k in ("cpu", "gpus", "versions")},
     }
 
 

@@ -35,7 +35,11 @@ def data_folder(path: str | Path) -> Path:
 
 def inside(root: Path, relative: str, where: str | Path) -> Path:
     """`root / relative`, refused when it lies outside `root` (.., an absolute path, a link)."""
-    path = (root / relative).resolve()
+    try:
+        path = (root / relative).resolve()
+        path.exists()  # refuses names that are too long
+    except (ValueError, RuntimeError, OSError) as error:  # a NUL, a circle of links, a long name
+        raise unexpected(where, "the name of a file", f"{relative!r} ({error})") from error
     if not path.is_relative_to(root):
         raise unexpected(where, f"a path inside {root}", repr(relative))
     return path

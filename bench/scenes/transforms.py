@@ -113,7 +113,7 @@ def read_views(root: Path, record: dict, log: Log) -> list[View]:
     return views
 
 
-def read_camera(settings: Mapping, pose: torch.Tensor, file: Path, where: str) -> Camera:
+def read_camera(settings: ChainMap, pose: torch.Tensor, file: Path, where: str) -> Camera:
     """The pinhole of a frame; what is not said about its size the picture's header tells.
 
     Focal lengths come from fl_x and fl_y or from camera_angle_x and camera_angle_y; the vertical
@@ -130,13 +130,17 @@ def read_camera(settings: Mapping, pose: torch.Tensor, file: Path, where: str) -
     return Camera(pose.float(), fx, fy, cx, cy, int(width), int(height))
 
 
-def focal(settings: Mapping, axis: str, size: float, where: str) -> float | None:
-    """Focal length in pixels along an axis of `size` pixels; None when nothing is said."""
-    if f"fl_{axis}" in settings:
-        return number(settings[f"fl_{axis}"], f"{where}.fl_{axis}", 0)
-    if f"camera_angle_{axis}" in settings:
-        angle = number(settings[f"camera_angle_{axis}"], f"{where}.camera_angle_{axis}", 0, math.pi)
-        return size / 2 / math.tan(angle / 2)
+def focal(settings: ChainMap, axis: str, size: float, where: str) -> float | None:
+    """Focal length in pixels along an axis of `size` pixels; None when nothing is said.
+
+    A frame's angle of view goes before the file's focal length: they say the same thing.
+    """
+    length, angle = f"fl_{axis}", f"camera_angle_{axis}"
+    for level in settings.maps:
+        if length in level:
+            return number(level[length], f"{where}.{length}", 0)
+        if angle in level:
+            return size / 2 / math.tan(number(level[angle], f"{where}.{angle}", 0, math.pi) / 2)
     return None
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import importlib
+import math
 import statistics
 import time
 from typing import Any
 
 import torch
 
-from bench.errors import Unavailable
+from bench.types import Log, Unavailable
 from methods.kernels.case import Case, Prepared, largest_error
 from methods.kernels.dispatch import BACKENDS, resolve
 
@@ -28,39 +29,65 @@ def all_cases() -> list[Case]:
     return [case for name in CASE_MODULES for case in importlib.import_module(name).cases()]
 
 
-def main_rows(name_filter: str, repeats: int) -> list[dict[str, Any]]:
+def main_rows(name_filter: str, repeats: int, log: Log) -> list[dict[str, Any]]:
     """One row for each timed case and backend of the kernels with `name_filter` in their name.
 
     A row holds kernel, case, backend, dtype, error and tolerance (absolute, against the
-    reference), status ("ok" or what is wrong), ms (median of `repeats`), mitems_s (million items a
+    reference; error None where it is not finite), status ("ok", or on which cases of the kernel
+    the backend is wrong, timed or not), ms (median of `repeats`), mitems_s (million items a
     second) and ratio (time of the reference over that of this backend, the two timed in turn).
     """
     device = "cuda" if torch.cuda.is_available() else "cpu"
+    others = [name for name in BACKENDS if name != "reference" and _serves(name, device)]
+    cases = [case for case in all_cases() if name_filter in case.kernel]
+    wrong: dict[tuple[str, str], list[str]] = {}
     rows = []
-    for case in all_cases():
-        if case.timed and name_filter in case.kernel:
-            rows += _case_rows(case, device, repeats)
+    with log.progress("kernels", len(cases)) as progress:
+        for case in sorted(cases, key=lambda case: case.timed):  # what is small comes first
+            prepared = case.prepare(device)
+            errors = _errors(prepared, others)
+            for backend, error in errors.items():
+                if not error <= prepared.tolerance:
+                    wrong.setdefault((case.kernel, backend), []).append(case.name)
+            if case.timed:
+                statuses = {name: _status(wrong.get((case.kernel, name))) for name in errors}
+                rows += _timed_rows(case, prepared, errors, statuses, repeats, device)
+            progress.advance(note=f"{case.kernel}, {case.name}")
     return rows
 
 
-def _case_rows(case: Case, device: str, repeats: int) -> list[dict[str, Any]]:
-    prepared = case.prepare(device)
+def _errors(prepared: Prepared, others: list[str]) -> dict[str, float]:
+    """Largest error of each backend; the reference is right by definition."""
     reference = prepared.call("reference")
-    others = [name for name in BACKENDS if name != "reference" and _serves(name, device)]
-    errors = {name: largest_error(prepared.call(name), reference) for name in others}
-    errors["reference"] = 0.0
-    correct = [name for name, error in errors.items() if error <= prepared.tolerance]
+    return {"reference": 0.0} | {
+        name: largest_error(prepared.call(name), reference) for name in others
+    }
+
+
+def _status(wrong_cases: list[str] | None) -> str:
+    return f"wrong: {', '.join(wrong_cases)}" if wrong_cases else "ok"
+
+
+def _timed_rows(
+    case: Case,
+    prepared: Prepared,
+    errors: dict[str, float],
+    statuses: dict[str, str],
+    repeats: int,
+    device: str,
+) -> list[dict[str, Any]]:
+    correct = [name for name, status in statuses.items() if status == "ok"]
     times = _times_ms(prepared, correct, repeats, device)
     rows = []
-    for name in ("reference", *others):
+    for name, error in errors.items():
         row: dict[str, Any] = {
             "kernel": case.kernel,
             "case": case.name,
             "backend": name,
             "dtype": case.dtype,
-            "error": errors[name],
+            "error": error if math.isfinite(error) else None,
             "tolerance": prepared.tolerance,
-            "status": "ok" if name in correct else "wrong",
+            "status": statuses[name],
         }
         if name in correct:
             row["ms"] = times[name]

@@ -1,4 +1,8 @@
-"""What the numba backends share."""
+"""What the numba backends share.
+
+numba caches compiled code by the file of the calling function alone: after a change of
+`pack_bf16`, remove the `__pycache__` of its callers.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -86,7 +87,9 @@ def test_backbones_that_cannot_be_had_are_named_with_the_reason(
     monkeypatch.delenv("STEERBENCH_WEIGHTS", raising=False)
     (tmp_path / "alexnet_features.pth").symlink_to(lpips_weights / "alexnet_features.pth")
     protocol = EvaluationProtocol()
-    assert protocol.find_lpips(tmp_path, quiet_log) == {"alex": True, "vgg": False}
+    weights = (tmp_path / "alexnet_features.pth").read_bytes()
+    found = protocol.find_lpips(tmp_path, quiet_log)
+    assert found == {"alex": hashlib.sha256(weights).hexdigest(), "vgg": None}
     loaded, missing = protocol.load_lpips(tmp_path, quiet_log)
     assert list(loaded) == ["alex"]
     assert list(missing) == ["lpips_vgg"]

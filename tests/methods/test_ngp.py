@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from bench.metrics import psnr
@@ -61,3 +62,8 @@ def test_frames_do_not_depend_on_one_another(ball_scene: Scene, quiet_log: Log) 
     alone = method.render(first, NullProbe()).rgb
     method.render(second, NullProbe())
     assert torch.equal(method.render(first, NullProbe()).rgb, alone)
+
+
+def test_a_packed_table_needs_two_features() -> None:
+    with pytest.raises(ValueError, match=r"grid\.features is 4: use precision=fp32"):
+        InstantNgp(grid=HashGrid(features=4), training=TrainingOptions(), device="cpu")

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import methods.train
-from bench.types import Budget, Log, Scene, SteerbenchError
+from bench.types import Budget, Log, Scene, Split, SteerbenchError
 from methods.fields import HashField
 from methods.kernels.encode import HashGrid
 from methods.train import FieldTraining, PixelBatches, TrainingOptions, train_field
@@ -124,9 +124,51 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_last_good_checkpoint(
     with pytest.raises(SteerbenchError, match=r"step 10.*feature_mid.*last good checkpoint"):
         trained(ball_scene, tmp_path, quiet_log)
     training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
-    methods.train._load(training, tmp_path / "checkpoint.safetensors")
+    methods.train.resume(training, tmp_path / "checkpoint.safetensors")
     assert training.step == 10
     assert all(layer.isfinite().all() for layer in training.field.layers.values())
+
+
+def test_a_training_that_went_bad_in_its_last_step_is_not_finished(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    update = FieldTraining._update
+
+    def spoiled(training: FieldTraining) -> None:
+        update(training)
+        if training.step == BUDGET.steps - 1:
+            with torch.no_grad():
+                training.field.table[0, 0] = torch.inf
+
+    monkeypatch.setattr(FieldTraining, "_update", spoiled)
+    with pytest.raises(SteerbenchError, match=r"step 40: not finite: table"):
+        trained(ball_scene, tmp_path, quiet_log)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_damaged_field_is_named_with_what_to_do(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log
+) -> None:
+    (tmp_path / "field.safetensors").write_bytes(b"half a file")
+    with pytest.raises(SteerbenchError, match=r"field\.safetensors.*remove it to train again"):
+        trained(ball_scene, tmp_path, quiet_log)
+
+
+def test_an_opaque_picture_among_transparent_ones_is_opaque(ball_scene: Scene) -> None:
+    split = ball_scene.splits["train"]
+    images = [split.images[0][..., :3], split.images[1]]
+    mixed = Split(split.cameras[:2], images, split.names[:2])
+    _, colours = PixelBatches(mixed, torch.device("cpu")).draw(
+        4000, torch.Generator().manual_seed(0)
+    )
+    transparent = (split.images[1][..., 3] == 0).float().mean().item() / 2
+    assert (colours[:, 3] == 0).float().mean().item() == pytest.approx(transparent, abs=0.05)
+
+
+@pytest.mark.parametrize("setting", [{"rate": 0.0}, {"final_rate": 2.0}, {"max_rays": 1}])
+def test_options_that_make_no_sense_are_refused(setting: dict) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(setting))}"):
+        TrainingOptions(**setting)
 
 
 def test_a_checkpoint_that_cannot_be_written_says_so(

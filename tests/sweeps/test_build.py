@@ -39,6 +39,10 @@ class Outer:
     limits: tuple[float, ...] = ()
     log: object = None
 
+    def __post_init__(self) -> None:
+        if self.rate < 0:
+            raise ValueError("rate: expected 0 or more")
+
 
 @pytest.fixture(autouse=True)
 def targets(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -97,6 +101,7 @@ def test_a_fitting_setting_is_taken(override, expected):
         ("thing.first=mine", r"unknown setting 'thing\.first'"),
         ("thing.path=???", r"thing\.path is not set: give thing\.path="),
         ("thing.inner.size=-1", "size: expected 0 or more"),
+        ("thing.rate=-0.5", "thing: rate: expected 0 or more"),
     ],
 )
 def test_a_setting_that_does_not_fit_is_named_in_full(override, message):

@@ -6,6 +6,8 @@ import json
 
 import pytest
 
+from bench.types import Log
+
 RIGHT = {
     "kernel": "encode", "case": "view", "backend": "cpu", "dtype": "float32", "error": 1e-7,
     "tolerance": 1e-6, "status": "ok", "ms": 12.5, "mitems_s": 10.4, "ratio": 31.0,
@@ -21,7 +23,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
     """What the benchmark was asked for; it finds `RIGHT` and `WRONG`, by their names."""
     calls = []
 
-    def main_rows(name_filter: str, repeats: int) -> list[dict]:
+    def main_rows(name_filter: str, repeats: int, log: Log) -> list[dict]:
         calls.append((name_filter, repeats))
         return [row for row in (RIGHT, WRONG) if name_filter in row["kernel"]]
 

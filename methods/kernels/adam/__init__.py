@@ -49,7 +49,13 @@ def sparse_adam_(
     The bias correction goes by the entry's own number of steps. `packed`, the bfloat16 copy of
     the table (`encode.pack`), is brought up to date when given.
     """
-    check_shape("grad", grad, *table.shape)
+    entries, features = table.shape
+    for name, tensor in (("grad", grad), ("first", state.first), ("second", state.second)):
+        check_shape(name, tensor, entries, features)
+    check_shape("steps", state.steps, entries)
+    if packed is not None:
+        check_shape("packed", packed, entries)
+        check_shape("table, to be packed,", table, None, 2)
     implementation("adam", backend, table.device).sparse_adam_(
         table, grad, state, rate, betas, eps, packed
     )

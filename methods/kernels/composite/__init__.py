@@ -52,10 +52,14 @@ def composite(
         carry: what lies in front of these samples, composited without a background. Constant:
             no gradient flows into it.
     """
-    count = len(sigma)
-    check_shape("values", values, count, None)
-    check_shape("t", t, count)
-    check_shape("delta", delta, count)
+    _check_samples(sigma, delta, offsets)
+    check_shape("values", values, len(sigma), None)
+    check_shape("t", t, len(sigma))
+    if carry is not None:
+        rays, channels = len(offsets) - 1, values.shape[1]
+        check_shape("carry.values", carry.values, rays, channels)
+        check_shape("carry.depth_sum", carry.depth_sum, rays)
+        check_shape("carry.alpha", carry.alpha, rays)
     pixels = implementation("composite", backend, sigma.device).composite(
         sigma, values, t, delta, offsets, stop, carry
     )
@@ -77,7 +81,15 @@ def visible_counts(
 
     They are the first ones of the ray; what lies behind has neither weight nor gradient.
     """
-    check_shape("delta", delta, len(sigma))
+    _check_samples(sigma, delta, offsets)
     return implementation("composite", backend, sigma.device).visible_counts(
         sigma.detach(), delta, offsets, stop
     )
+
+
+def _check_samples(sigma: Tensor, delta: Tensor, offsets: Tensor) -> None:
+    check_shape("sigma", sigma, None)
+    check_shape("delta", delta, len(sigma))
+    check_shape("offsets", offsets, None)
+    if len(offsets) < 1 or int(offsets[-1]) != len(sigma):
+        raise ValueError(f"offsets: expected to end at the {len(sigma)} samples, got {offsets}")

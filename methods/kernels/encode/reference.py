@@ -20,22 +20,18 @@ def encode(
     if grad_buffer is not None:
         table = table.detach().requires_grad_()
         table.register_hook(grad_buffer.add_)
-    source = table if packed is None else _unpack(packed, table)
     inside = torch.where(positions > 0, positions, 0).clamp(max=1)
-    levels = [_encode_level(inside, source, grid, level) for level in range(grid.levels)]
+    levels = []
+    for level in range(grid.levels):
+        entries, weights = corners(inside, grid, level)
+        values = table[entries]  # [N, 8, F]
+        if packed is not None:
+            # The rounded values, with the gradient passed straight through to the table.
+            rounded = packed[entries, None].view(torch.bfloat16).to(table.dtype)
+            values = values + (rounded - values).detach()
+        levels.append((weights.to(table.dtype)[..., None] * values).sum(dim=1))
     features = torch.cat(levels, dim=-1)
     return features if packed is None else features.to(torch.bfloat16)
-
-
-def _unpack(packed: Tensor, table: Tensor) -> Tensor:
-    """The rounded entries as values, with the gradient passed straight through to `table`."""
-    rounded = packed[:, None].view(torch.bfloat16).to(table.dtype)
-    return table + (rounded - table).detach()
-
-
-def _encode_level(positions: Tensor, table: Tensor, grid: HashGrid, level: int) -> Tensor:
-    entries, weights = corners(positions, grid, level)
-    return (weights.to(table.dtype)[..., None] * table[entries]).sum(dim=1)
 
 
 def corners(positions: Tensor, grid: HashGrid, level: int) -> tuple[Tensor, Tensor]:

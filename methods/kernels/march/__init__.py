@@ -105,7 +105,7 @@ class Samples:
         return len(self.t)
 
     def front(self, counts: Tensor) -> Samples:
-        """Only the first `counts` [R] samples of each ray."""
+        """Only the first `counts` [R] samples of each ray, which then has no more."""
         offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
         shift = (self.offsets - offsets)[:-1].repeat_interleave(counts)
         kept = torch.arange(len(shift), device=shift.device) + shift
@@ -115,7 +115,7 @@ class Samples:
             self.t[kept],
             self.delta[kept],
             self.positions[kept],
-            self.resume,
+            torch.full_like(self.resume, -1),
         )
 
 
@@ -157,6 +157,8 @@ def march(
     check_shape("start", start, rays)
     if not step > 0:
         raise ValueError(f"step: expected a positive length, got {step}")
+    if limit < 1:
+        raise ValueError(f"limit: expected 1 or more, got {limit}")
     return implementation("march", backend, origins.device).march(
         origins, directions, occupancy, step, window, jitter, start, limit
     )

@@ -7,6 +7,9 @@ from torch import Tensor
 
 from methods.kernels.march import Occupancy, Samples
 
+BLOCK = 1 << 12
+"""Rays whose steps are tested at once: [BLOCK, 1024, 3] positions are 50 MB."""
+
 
 def march(
     origins: Tensor,
@@ -19,6 +22,36 @@ def march(
     limit: int,
 ) -> Samples:
     """See `methods.kernels.march.march`."""
+    rays = len(origins)
+    parts = []
+    for first in range(0, max(rays, 1), BLOCK):
+        o, d, near_far, phase, begin = (
+            x[first : first + BLOCK] for x in (origins, directions, window, jitter, start)
+        )
+        parts.append(_march_block(o, d, occupancy, step, near_far, phase, begin, limit))
+    t, positions, per_ray, resume = (torch.cat(column) for column in zip(*parts, strict=True))
+    ray = torch.arange(rays, device=origins.device).repeat_interleave(per_ray)
+    return Samples(
+        offsets=torch.cat((per_ray.new_zeros(1), per_ray.cumsum(dim=0))),
+        ray=ray.int(),
+        t=t,
+        delta=torch.full_like(t, step),
+        positions=positions,
+        resume=resume,
+    )
+
+
+def _march_block(
+    origins: Tensor,
+    directions: Tensor,
+    occupancy: Occupancy,
+    step: float,
+    window: Tensor,
+    jitter: Tensor,
+    start: Tensor,
+    limit: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """t [S] and positions [S, 3] of the samples, how many a ray has [R], where to resume [R]."""
     entry, leave = _cross_unit_cube(origins, directions)
     near, far = torch.maximum(entry, window[:, 0]), torch.minimum(leave, window[:, 1])
     # In float64, where every backend rounds to the same float32.
@@ -39,15 +72,7 @@ def march(
     per_ray = kept.sum(dim=1)
     full = (per_ray == limit) & (per_ray > 0)
     last = (kept * (k + 1)).amax(dim=1) if len(k) else per_ray
-    ray = kept.nonzero()[:, 0]
-    return Samples(
-        offsets=torch.cat((per_ray.new_zeros(1), per_ray.cumsum(dim=0))),
-        ray=ray.int(),
-        t=t[kept],
-        delta=torch.full_like(t[kept], step),
-        positions=positions[kept],
-        resume=torch.where(full, last, -1).int(),
-    )
+    return t[kept], positions[kept], per_ray, torch.where(full, last, -1).int()
 
 
 def _cross_unit_cube(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:

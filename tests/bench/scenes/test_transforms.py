@@ -51,6 +51,27 @@ def test_intrinsics_of_a_frame_go_first(folder, edit_json, log) -> None:
     assert (second.fx, second.fy, second.cx, second.cy) == (7, 8, 4, 2.5)
 
 
+def test_the_angle_of_a_frame_goes_before_the_focal_length_of_the_file(
+    folder, edit_json, log
+) -> None:
+    edit_json(
+        folder / "transforms.json",
+        lambda r: next(f for f in r["frames"] if "008" in f["file_path"]).update(
+            camera_angle_x=2 * np.arctan(0.25)
+        ),
+    )
+    first, second = transforms.load(folder, log=log).splits["test"].cameras
+    assert first.fx == 9
+    assert second.fx == pytest.approx(8 / 2 / 0.25)
+
+
+@pytest.mark.parametrize("name", ["images/\0.png", "images/" + "x" * 5000])
+def test_a_name_that_no_file_can_have(folder, edit_json, log, name) -> None:
+    edit_json(folder / "transforms.json", lambda r: r["frames"][3].update(file_path=name))
+    with pytest.raises(SteerbenchError, match=r"frames\[3\].file_path: expected the name of a"):
+        transforms.load(folder, log=log)
+
+
 def test_pictures_of_several_sizes(folder, picture, edit_json, log) -> None:
     Image.fromarray(picture(0, 12, 10, 3)).save(folder / "images" / "000.png")
     edit_json(

@@ -54,3 +54,12 @@ def test_bias_correction_goes_by_the_steps_of_the_entry(backend: str) -> None:
     # Equal gradients make every step of Adam one of length `rate`.
     assert table[0].tolist() == pytest.approx([-0.3, -0.3], rel=1e-5)
     assert table[1].tolist() == pytest.approx([-0.1, -0.1], rel=1e-5)
+
+
+def test_wrong_arguments_are_named() -> None:
+    table, short = torch.zeros(3, 2), torch.zeros(2, dtype=torch.int32)
+    state = AdamState.like(table)
+    with pytest.raises(ValueError, match="steps: expected shape"):
+        sparse_adam_(table, table.clone(), AdamState(state.first, state.second, short), 0.1)
+    with pytest.raises(ValueError, match="packed: expected shape"):
+        sparse_adam_(table, table.clone(), state, 0.1, packed=short)

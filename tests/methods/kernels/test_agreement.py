@@ -10,9 +10,10 @@ import pytest
 import torch
 
 import methods.kernels
-from methods.kernels import BACKENDS, availability, resolve
+from bench.types import Log
+from methods.kernels import BACKENDS, availability, benchmark, resolve
 from methods.kernels.benchmark import all_cases
-from methods.kernels.case import Case, largest_error
+from methods.kernels.case import Case, Prepared, largest_error
 
 CASES = [case for case in all_cases() if not case.timed]
 KERNELS = ("adam", "composite", "encode", "march", "spherical")
@@ -36,6 +37,27 @@ def test_a_wrong_result_exceeds_the_tolerance() -> None:
 
 def test_a_nan_is_an_infinite_error() -> None:
     assert largest_error((torch.tensor([torch.nan]),), (torch.ones(1),)) == torch.inf
+
+
+def test_a_kernel_that_is_wrong_on_a_small_case_gets_no_time(
+    monkeypatch: pytest.MonkeyPatch, quiet_log: Log
+) -> None:
+    def wrong_at_zero(device: str) -> Prepared:
+        return Prepared(lambda backend: (torch.tensor([float(backend == "cpu")]),), 0.5)
+
+    def right(device: str) -> Prepared:
+        return Prepared(lambda backend: (torch.zeros(1),), 0.5)
+
+    cases = [
+        Case("fake", "large", "fp32", 1000, right, timed=True),
+        Case("fake", "no sample", "fp32", 0, wrong_at_zero),
+    ]
+    monkeypatch.setattr(benchmark, "all_cases", lambda: cases)
+    rows = {row["backend"]: row for row in benchmark.main_rows("fake", 2, quiet_log)}
+    assert rows["reference"]["status"] == "ok"
+    assert rows["reference"]["ratio"] == 1
+    assert rows["cpu"]["status"] == "wrong: no sample"
+    assert "ms" not in rows["cpu"]
 
 
 @pytest.mark.parametrize("kernel", KERNELS)

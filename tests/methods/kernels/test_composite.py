@@ -168,6 +168,8 @@ def test_wrong_arguments_are_named() -> None:
     inputs = samples([5])
     with pytest.raises(ValueError, match="values: expected shape"):
         composite(**inputs | {"values": torch.zeros(4, 3)})
+    with pytest.raises(ValueError, match="offsets: expected to end at the 5 samples"):
+        composite(**inputs | {"offsets": torch.tensor([0, 6])})
     with pytest.raises(ValueError, match="float32"):
         composite(**samples([5], dtype=torch.float64), backend="cpu")
 

@@ -142,6 +142,7 @@ def test_the_front_of_a_ray_is_its_first_samples() -> None:
     counts = torch.minimum(samples.offsets.diff(), torch.arange(30) % 5)
     front = samples.front(counts)
     assert torch.equal(front.offsets.diff(), counts)
+    assert (front.resume == -1).all()
     for ray in range(30):
         kept = slice(int(front.offsets[ray]), int(front.offsets[ray + 1]))
         whole = slice(int(samples.offsets[ray]), int(samples.offsets[ray]) + int(counts[ray]))
@@ -178,5 +179,7 @@ def test_wrong_arguments_are_named() -> None:
         march(origins, torch.zeros(3, 3), full(), STEP)
     with pytest.raises(ValueError, match="step: expected a positive length, got 0"):
         march(origins, origins, full(), 0.0)
+    with pytest.raises(ValueError, match="limit: expected 1 or more, got 0"):
+        march(origins, origins, full(), STEP, limit=0)
     with pytest.raises(ValueError, match="multiple of 16, got 24"):
         Occupancy(torch.zeros(24, 24, 24))
