@@ -53,7 +53,7 @@ def store(tmp_path: Path, offset_method, tiny_scene, quiet_log) -> Store:
         tiny_scene,
         from_split(tiny_scene),
         EvaluationProtocol(name="quick", lpips=()),
-        Budget("none", steps=0, samples=1),
+        Budget("none", steps=1, samples=1),
         quiet_log,
         seed=5,
     )
