@@ -10,12 +10,16 @@ start out occupied, one visit away from being empty, so that no step ever sample
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from bench.cameras import project
+from bench.types import Camera
 from methods.fields import HashField
-from methods.kernels.march import MAX_SAMPLES, Occupancy
+from methods.kernels.march import BRICK, MAX_SAMPLES, Occupancy
 
 RESOLUTION = 128
 STEP = math.sqrt(3) / MAX_SAMPLES
@@ -30,21 +34,49 @@ DECAY = 0.8
 MIN_ALPHA = 0.01
 THRESHOLD = MIN_ALPHA / STEP
 INITIAL = 1.2 * THRESHOLD
+
+MIN_VIEWS = 2
+"""Training cameras that must see a place before anything is believed to be there."""
 CHUNK = 1 << 18
+
+
+def learnable_cells(bounds: Tensor, cameras: Sequence[Camera]) -> Tensor:
+    """Cells [G, G, G] of which the pictures of `cameras` can tell whether they are empty.
+
+    They lie inside `bounds` [2, 3] and in a brick of 4^3 cells that at least `MIN_VIEWS` cameras
+    have in their picture: what a single one sees could be anywhere along its rays, and training
+    would put it right before the camera. Bricks that touch a camera are left out as well.
+    """
+    device = bounds.device
+    edge = torch.arange(RESOLUTION, device=device) / RESOLUTION
+    lower, upper = bounds
+    x, y, z = ((edge[:, None] + 1 / RESOLUTION > lower) & (edge[:, None] < upper)).unbind(dim=1)
+    inside = x[:, None, None] & y[:, None] & z
+
+    side = RESOLUTION // BRICK
+    axis = (torch.arange(side, device=device) + 0.5) / side
+    centres = torch.cartesian_prod(axis, axis, axis)
+    views = torch.zeros(len(centres), dtype=torch.int32, device=device)
+    free = torch.ones(len(centres), dtype=torch.bool, device=device)
+    for camera in cameras:
+        camera = replace(camera, c2w=camera.c2w.to(device))
+        pixels, depth = project(camera, centres)
+        size = pixels.new_tensor((camera.width, camera.height))
+        views += (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
+        free &= (centres - camera.c2w[:, 3]).abs().amax(dim=1) > 1.5 / side
+    bricks = ((views >= MIN_VIEWS) & free).view(side, side, side)
+    for dim in range(3):
+        bricks = bricks.repeat_interleave(BRICK, dim=dim)
+    return inside & bricks
 
 
 class DensityGrid:
     """Running density of [G, G, G] cells of the unit cube and the occupancy that follows from it.
 
-    Cells outside `bounds` [2, 3] stay empty for ever.
+    Only `cells` [G, G, G] bool may ever be occupied.
     """
 
-    def __init__(self, bounds: Tensor, device: torch.device | str = "cpu") -> None:
-        edge = torch.arange(RESOLUTION, device=device) / RESOLUTION
-        lower, upper = bounds.to(device)
-        inside = (edge[:, None] + 1 / RESOLUTION > lower) & (edge[:, None] < upper)  # [G, 3]
-        x, y, z = inside.unbind(dim=1)
-        cells = x[:, None, None] & y[:, None] & z
+    def __init__(self, cells: Tensor) -> None:
         self.density = INITIAL * cells.float()
         self._candidates = cells.flatten().nonzero().squeeze(1)
         self.occupancy = Occupancy(cells)

@@ -21,7 +21,7 @@ from bench.provenance import ROOT, digest
 from bench.types import Budget, Log, Rays, Scene, Split, SteerbenchError
 from methods.fields import HashField
 from methods.kernels.adam import AdamState, sparse_adam_
-from methods.occupancy import EVERY, DensityGrid
+from methods.occupancy import EVERY, MIN_VIEWS, DensityGrid, learnable_cells
 from methods.volume import render_batch
 
 CHECKPOINT_S = 20.0
@@ -103,6 +103,17 @@ class PixelBatches:
         return Rays(pose[:, :, 3].contiguous(), directions), self._pixels[pixel].float() / 255
 
 
+def new_grid(scene: Scene, device: torch.device) -> DensityGrid:
+    """The density grid of a training of `scene` before its first step."""
+    cells = learnable_cells(scene.bounds.to(device), scene.splits["train"].cameras)
+    if not cells.any():
+        raise SteerbenchError(
+            f"scene {scene.name}: no part of the unit cube is seen by {MIN_VIEWS} training "
+            "cameras: expected pictures that overlap there; look at the poses and the scale"
+        )
+    return DensityGrid(cells)
+
+
 class FieldTraining:
     """The state of a training: what a checkpoint must hold to go on as if it had never stopped."""
 
@@ -111,7 +122,7 @@ class FieldTraining:
     ) -> None:
         device = field.table.device
         self.field, self.budget, self.options = field, budget, options
-        self.grid = DensityGrid(scene.bounds, device)
+        self.grid = new_grid(scene, device)
         self.batches = PixelBatches(scene.splits["train"], device)
         self.background = scene.background.to(device)
         self.step = 0
@@ -231,7 +242,7 @@ def train_field(
     finished = folder / "field.safetensors"
     if finished.exists():
         tensors, meta = _read(finished)
-        grid = DensityGrid(scene.bounds, field.table.device)
+        grid = new_grid(scene, field.table.device)
         _restore(field, grid, tensors)
         log.info(f"trained field found: {finished}")
         return grid, meta["seconds"]

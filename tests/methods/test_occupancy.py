@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from methods.occupancy import DECAY, INITIAL, RESOLUTION, STEP, THRESHOLD, DensityGrid
+from methods.occupancy import (
+    DECAY,
+    INITIAL,
+    RESOLUTION,
+    STEP,
+    THRESHOLD,
+    DensityGrid,
+    learnable_cells,
+)
+from tests.methods.conftest import look_at_the_middle
 
-WHOLE = torch.tensor([[0.0] * 3, [1.0] * 3])
+UNIT_CUBE = torch.tensor([[0.0] * 3, [1.0] * 3])
+WHOLE = torch.ones(RESOLUTION, RESOLUTION, RESOLUTION, dtype=torch.bool)
+AROUND = [look_at_the_middle(turn / 4, lift) for turn in range(4) for lift in (-0.5, 0.5)]
 
 
 class Slab:
@@ -42,13 +54,39 @@ def test_visits_find_the_matter_and_nothing_else() -> None:
     assert cells[RESOLUTION // 4 :].float().mean() < 10 * math.exp(-8)
 
 
-def test_cells_outside_the_bounds_stay_empty() -> None:
-    grid = DensityGrid(torch.tensor([[0.125, 0.0, 0.0], [1.0, 0.5, 1.0]]))
-    assert not grid.occupancy.cells[: RESOLUTION // 8].any()
-    cells = swept(grid, Slab(100.0)).occupancy.cells
-    assert not cells[: RESOLUTION // 8].any()
+def test_cells_that_may_not_be_occupied_stay_empty() -> None:
+    allowed = WHOLE.clone()
+    allowed[:, RESOLUTION // 2 :] = False
+    cells = swept(DensityGrid(allowed), Slab(100.0)).occupancy.cells
+    assert cells[: RESOLUTION // 4, : RESOLUTION // 2].all()
     assert not cells[:, RESOLUTION // 2 :].any()
-    assert cells[RESOLUTION // 8 : RESOLUTION // 4, : RESOLUTION // 2].all()
+
+
+def test_cells_outside_the_bounds_cannot_be_learnt() -> None:
+    cells = learnable_cells(torch.tensor([[0.375, 0.375, 0.375], [0.625, 0.5, 0.625]]), AROUND)
+    inside = torch.zeros_like(WHOLE)
+    inside[48:80, 48:64, 48:80] = True
+    assert torch.equal(cells, inside)  # in the middle, where every camera looks
+
+
+def test_what_one_camera_sees_cannot_be_learnt() -> None:
+    one, other = AROUND[:2]
+    assert not learnable_cells(UNIT_CUBE, [one]).any()
+    assert learnable_cells(UNIT_CUBE, [one, other]).any()
+    behind = replace(other, c2w=other.c2w * torch.tensor([[-1.0, 1.0, -1.0, 1.0]]))  # turned away
+    assert not learnable_cells(UNIT_CUBE, [one, behind]).any()
+
+
+def test_cells_at_a_camera_cannot_be_learnt() -> None:
+    inside = replace(AROUND[0], c2w=AROUND[0].c2w.clone())
+    inside.c2w[:, 3] = torch.tensor([0.51, 0.51, 0.51])
+    without, with_it = (
+        learnable_cells(UNIT_CUBE, AROUND),
+        learnable_cells(UNIT_CUBE, [*AROUND, inside]),
+    )
+    lost = (without & ~with_it).nonzero()
+    assert len(lost) == (3 * 4) ** 3  # the camera's brick and those that touch it
+    assert ((lost + 0.5) / RESOLUTION - 0.51).abs().max() < 2 / 32
 
 
 def test_a_cell_is_occupied_until_it_was_visited_and_keeps_its_value_in_between() -> None:

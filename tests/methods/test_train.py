@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -165,6 +166,15 @@ def test_an_opaque_picture_among_transparent_ones_is_opaque(ball_scene: Scene) -
     assert (colours[:, 3] == 0).float().mean().item() == pytest.approx(transparent, abs=0.05)
 
 
+def test_pictures_that_do_not_overlap_are_refused(ball_scene: Scene) -> None:
+    train = ball_scene.splits["train"]
+    alone = Split(train.cameras[:1], train.images[:1], train.names[:1])
+    with pytest.raises(SteerbenchError, match="no part of the unit cube is seen by 2 training"):
+        FieldTraining(
+            new_field(), replace(ball_scene, splits={"train": alone}), BUDGET, TrainingOptions(), 0
+        )
+
+
 @pytest.mark.parametrize("setting", [{"rate": 0.0}, {"final_rate": 2.0}, {"max_rays": 1}])
 def test_options_that_make_no_sense_are_refused(setting: dict) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(setting))}"):
@@ -181,8 +191,6 @@ def test_a_checkpoint_that_cannot_be_written_says_so(
 
 
 def test_pictures_without_alpha_are_trained_on_as_they_are(ball_scene: Scene) -> None:
-    from dataclasses import replace
-
     split = ball_scene.splits["train"]
     opaque = replace(split, images=[image[..., :3] for image in split.images])
     scene = replace(ball_scene, splits={"train": opaque, "test": opaque})
