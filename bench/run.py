@@ -113,7 +113,9 @@ def _render(
     """Warm up, then render the sequence in its order; each frame is scored and let go."""
     steps, split = trajectory.steps, scene.splits[trajectory.split]
     clock = StageClock(method.settings()["device"])
-    warmup, shown = spread(len(steps), protocol.warmup), spread(len(steps), pictures)
+    warmup = spread(len(steps), protocol.warmup)
+    scored = [index for index, step in enumerate(steps) if step.truth is not None]
+    shown = {scored[i] for i in spread(len(scored), pictures)}
     table: list[dict[str, Any]] = []
     images: dict[str, np.ndarray] = {}
     with torch.no_grad(), log.progress("rendering", len(warmup) + len(steps)) as progress:
