@@ -30,6 +30,8 @@ def write_page(store: Store, runs: Sequence[str], folder: Path) -> Path:
     pictures = folder / "pictures"
     with explained(folder):
         pictures.mkdir(parents=True, exist_ok=True)
+        for stale in pictures.glob("run*-*-*.png"):  # of an earlier page
+            stale.unlink()
         figures.stage_bars(rows, pictures / "stages.png")
         parts = [_heading(rows, records)]
         for number, run in enumerate(runs, 1):

@@ -59,6 +59,7 @@ def test_every_row_of_every_table_has_as_many_cells_as_its_heading(page):
 
 def test_a_page_is_written_over_an_earlier_one_and_leaves_nothing_else(page, store, stored_run):
     before = {path: path.read_bytes() for path in page.parent.rglob("*") if path.is_file()}
+    (page.parent / "pictures" / "run7-0042-truth.png").write_bytes(b"of an earlier page")
     write_page(store, [stored_run], page.parent)
     after = {path: path.read_bytes() for path in page.parent.rglob("*") if path.is_file()}
     assert after == before
