@@ -86,7 +86,7 @@ def test_results_can_be_narrowed_down(steerbench, run):
 @pytest.mark.parametrize(
     ("line", "completed"),
     [
-        ("steerbench run trajectory=", ["trajectory=test"]),
+        ("steerbench run trajectory=sm", ["trajectory=smooth"]),
         ("steerbench run +experiment=", ["+experiment=demo"]),
         ("steerbench run thre", ["threads="]),
     ],
