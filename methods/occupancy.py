@@ -37,7 +37,9 @@ INITIAL = 1.2 * THRESHOLD
 
 MIN_VIEWS = 2
 """Training cameras that must see a place before anything is believed to be there."""
+
 CHUNK = 1 << 18
+"""Visits whose density is evaluated together: bounds the memory of an update."""
 
 
 def learnable_cells(bounds: Tensor, cameras: Sequence[Camera]) -> Tensor:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -113,31 +111,6 @@ def _pad(samples: Tensor) -> Tensor:
     return functional.pad(samples, (0, 0) * (samples.dim() - 1) + (0, padding))
 
 
-@dataclass
-class _Canvas:
-    """Pixels under construction, without background."""
-
-    values: Tensor
-    depth_sum: Tensor
-    alpha: Tensor
-
-    @classmethod
-    def blank(cls, rays: int, channels: int, device: torch.device) -> _Canvas:
-        return cls(
-            torch.zeros(rays, channels, device=device),
-            torch.zeros(rays, device=device),
-            torch.zeros(rays, device=device),
-        )
-
-    def take(self, index: Tensor) -> Pixels:
-        return Pixels(self.values[index], self.depth_sum[index], self.alpha[index])
-
-    def put(self, index: Tensor, pixels: Pixels) -> None:
-        self.values[index] = pixels.values
-        self.depth_sum[index] = pixels.depth_sum
-        self.alpha[index] = pixels.alpha
-
-
 @torch.no_grad()
 def render_rays(
     field: HashField, rays: Rays, occupancy: Occupancy, probe: Probe, *, stop: float = STOP
@@ -148,7 +121,7 @@ def render_rays(
     that are still open, evaluates and composites them, and drops the rays that are done.
     """
     device = rays.origins.device
-    canvas = _Canvas.blank(len(rays.origins), field.channels, device)
+    canvas = Pixels.blank(len(rays.origins), field.channels, device)
     for first in range(0, len(rays.origins), CHUNK_RAYS):
         alive = torch.arange(first, min(first + CHUNK_RAYS, len(rays.origins)), device=device)
         start = torch.zeros(len(alive), dtype=torch.int32, device=device)
@@ -159,7 +132,7 @@ def render_rays(
                 field, rays, occupancy, probe, canvas, alive, start, limit, stop
             )
             turn += 1
-    return Pixels(canvas.values, canvas.depth_sum, canvas.alpha)
+    return canvas
 
 
 def _render_round(
@@ -167,7 +140,7 @@ def _render_round(
     rays: Rays,
     occupancy: Occupancy,
     probe: Probe,
-    canvas: _Canvas,
+    canvas: Pixels,
     alive: Tensor,
     start: Tensor,
     limit: int,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from bench.types import check_shape
@@ -24,6 +25,25 @@ class Pixels:
     values: Tensor
     depth_sum: Tensor
     alpha: Tensor
+
+    @classmethod
+    def blank(cls, rays: int, channels: int, device: torch.device | str = "cpu") -> Pixels:
+        """Rays in front of which nothing lies yet."""
+        return cls(
+            torch.zeros(rays, channels, device=device),
+            torch.zeros(rays, device=device),
+            torch.zeros(rays, device=device),
+        )
+
+    def take(self, index: Tensor) -> Pixels:
+        """The rays at `index`."""
+        return Pixels(self.values[index], self.depth_sum[index], self.alpha[index])
+
+    def put(self, index: Tensor, pixels: Pixels) -> None:
+        """Replace, in place, the rays at `index`."""
+        self.values[index] = pixels.values
+        self.depth_sum[index] = pixels.depth_sum
+        self.alpha[index] = pixels.alpha
 
 
 def composite(

@@ -42,7 +42,7 @@ class _Composite(torch.autograd.Function):
     def forward(ctx, sigma, values, t, delta, offsets, stop, carry):
         rays, channels = len(offsets) - 1, values.shape[1]
         if carry is None:
-            pixels = Pixels(torch.zeros(rays, channels), torch.zeros(rays), torch.zeros(rays))
+            pixels = Pixels.blank(rays, channels)
         else:
             pixels = Pixels(carry.values.clone(), carry.depth_sum.clone(), carry.alpha.clone())
         front = 1 - pixels.alpha

@@ -111,6 +111,15 @@ def _weights(x, y, z, scale):
 
 
 @njit(cache=True, fastmath=FAST)
+def _put_weights(weight, i, gx, fx, w00, w10, w01, w11):
+    """Weights of the eight corners of sample i, x varying fastest."""
+    weight[i], weight[CHUNK + i] = gx * w00, fx * w00
+    weight[2 * CHUNK + i], weight[3 * CHUNK + i] = gx * w10, fx * w10
+    weight[4 * CHUNK + i], weight[5 * CHUNK + i] = gx * w01, fx * w01
+    weight[6 * CHUNK + i], weight[7 * CHUNK + i] = gx * w11, fx * w11
+
+
+@njit(cache=True, fastmath=FAST)
 def _corners_hashed(xyz, count, scale, mask, index, weight):
     for i in range(count):
         ix, iy, iz, gx, fx, w00, w10, w01, w11 = _weights(
@@ -128,10 +137,7 @@ def _corners_hashed(xyz, count, scale, mask, index, weight):
         index[5 * CHUNK + i] = u32(x1 ^ h01) & mask
         index[6 * CHUNK + i] = u32(ix ^ h11) & mask
         index[7 * CHUNK + i] = u32(x1 ^ h11) & mask
-        weight[i], weight[CHUNK + i] = gx * w00, fx * w00
-        weight[2 * CHUNK + i], weight[3 * CHUNK + i] = gx * w10, fx * w10
-        weight[4 * CHUNK + i], weight[5 * CHUNK + i] = gx * w01, fx * w01
-        weight[6 * CHUNK + i], weight[7 * CHUNK + i] = gx * w11, fx * w11
+        _put_weights(weight, i, gx, fx, w00, w10, w01, w11)
 
 
 @njit(cache=True, fastmath=FAST)
@@ -158,10 +164,7 @@ def _corners_dense(xyz, count, scale, stride, size, index, weight):
         index[5 * CHUNK + i] = _wrap(u32(b01 + u32(1)), size)
         index[6 * CHUNK + i] = _wrap(b11, size)
         index[7 * CHUNK + i] = _wrap(u32(b11 + u32(1)), size)
-        weight[i], weight[CHUNK + i] = gx * w00, fx * w00
-        weight[2 * CHUNK + i], weight[3 * CHUNK + i] = gx * w10, fx * w10
-        weight[4 * CHUNK + i], weight[5 * CHUNK + i] = gx * w01, fx * w01
-        weight[6 * CHUNK + i], weight[7 * CHUNK + i] = gx * w11, fx * w11
+        _put_weights(weight, i, gx, fx, w00, w10, w01, w11)
 
 
 @njit(cache=True)
