@@ -66,6 +66,16 @@ class HashField(nn.Module):
         if self.packed is not None:
             self.packed.copy_(pack(self.table))
 
+    def widen(self, channels: int) -> None:
+        """Append features up to `channels`; they are 1/2 everywhere until they are trained."""
+        old = self.layers["feature_out"].detach()
+        if channels < len(old):
+            raise ValueError(f"channels: expected at least {len(old)}, got {channels}")
+        self.channels = channels
+        self.layers["feature_out"] = nn.Parameter(
+            functional.pad(old, (0, 0, 0, channels - len(old)))
+        )
+
     def encode_directions(self, directions: Tensor) -> Tensor:
         """Spherical harmonics [R, 16] of ray `directions` [R, 3] of any length."""
         unit = functional.normalize(directions, dim=-1)
@@ -83,13 +93,13 @@ class HashField(nn.Module):
         )
         hidden = self._linear(features, "density_in").relu_()
         geometry = self._linear(hidden, "density_out")
-        return _ClampedExp.apply(geometry[:, 0].float()), geometry
+        return _ClampedExp.apply(geometry[:, 0].to(self.table.dtype)), geometry
 
     def features(self, geometry: Tensor, directions: Tensor) -> Tensor:
         """Features [S, K] float32 of samples with encoded view `directions` [S, 16]."""
         hidden = self._linear(torch.cat((directions, geometry), dim=-1), "feature_in").relu_()
         hidden = self._linear(hidden, "feature_mid").relu_()
-        return self._linear(hidden, "feature_out").float().sigmoid()
+        return self._linear(hidden, "feature_out").to(self.table.dtype).sigmoid()
 
     def sizes(self) -> dict[str, int]:
         """Bytes of table and networks at the precision in which they are read."""

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 
 import torch
 
-from bench.types import EMPTY_ALPHA, Budget, Camera, Frame, Log, Probe, Scene
+from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.fields import HashField, Precision
 from methods.kernels import resolve
 from methods.kernels.composite import STOP
 from methods.kernels.encode import HashGrid
 from methods.train import TrainingOptions, train_field, training_digest
-from methods.volume import rays_at_matter, render_rays
+from methods.volume import render_frame
 
 
 class InstantNgp:
@@ -70,23 +70,10 @@ class InstantNgp:
     @torch.no_grad()
     def render(self, camera: Camera, probe: Probe) -> Frame:
         """One frame at the camera's full resolution."""
-        size = camera.height * camera.width
-        with probe.stage("rays"):
-            camera = replace(camera, c2w=camera.c2w.to(self.device))
-            pixels, rays = rays_at_matter(camera, self.occupancy)
-        probe.count("rays", len(pixels), size)
-        rendered = render_rays(self.field, rays, self.occupancy, probe, stop=self.stop)
-        with probe.stage("finish"):
-            shine = (1 - rendered.alpha)[:, None] * self.background
-            rgb = self.background.repeat(size, 1)
-            rgb[pixels] = rendered.values + shine
-            alpha = torch.zeros(size, device=self.device)
-            alpha[pixels] = rendered.alpha
-            depth = torch.full((size,), torch.inf, device=self.device)
-            seen = rendered.alpha > EMPTY_ALPHA
-            depth[pixels] = torch.where(seen, rendered.depth_sum / rendered.alpha, torch.inf)
-        shape = (camera.height, camera.width)
-        return Frame(rgb.view(*shape, 3), depth.view(shape), alpha.view(shape))
+        frame = render_frame(
+            self.field, camera, self.occupancy, self.background, probe, stop=self.stop
+        )
+        return Frame(frame.values, frame.depth, frame.alpha)
 
     def sizes(self) -> dict[str, int]:
         """Bytes of table, networks and occupancy bits."""

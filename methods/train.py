@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,13 +10,12 @@ from functools import cache
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.nn import functional
 
 from bench.provenance import ROOT, digest
 from bench.types import Budget, Log, Rays, Scene, Split, SteerbenchError
+from methods import checkpoint
 from methods.fields import HashField
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.occupancy import EVERY, MIN_VIEWS, DensityGrid, learnable_cells
@@ -27,8 +24,8 @@ from methods.volume import render_batch
 CHECKPOINT_S = 20.0
 """Seconds between checkpoints: what a killed training loses at most."""
 
-UNTRAINED_SOURCES = ("case", "cases", "benchmark")
-"""Modules of the kernels that no training runs through."""
+KERNELS = ("adam", "composite", "encode", "march", "spherical")
+"""Kernels that a training of a field runs through."""
 
 MIN_RAYS = 64
 """Fewest rays of a step."""
@@ -220,7 +217,9 @@ def training_digest() -> str:
     """SHA-256 of the sources that decide what a training results in."""
     methods, bench = ROOT / "methods", ROOT / "bench"
     sources = [methods / f"{name}.py" for name in ("train", "fields", "occupancy", "volume")]
-    sources += [p for p in (methods / "kernels").rglob("*.py") if p.stem not in UNTRAINED_SOURCES]
+    kernels = methods / "kernels"
+    sources += [kernels / "dispatch.py", kernels / "cpu.py"]
+    sources += [p for k in KERNELS for p in (kernels / k).glob("*.py") if p.stem != "cases"]
     sources += [bench / "cameras.py", *(bench / "scenes").glob("*.py")]  # pixels and rays
     return digest(sources)
 
@@ -241,11 +240,11 @@ def train_field(
     """
     finished = folder / "field.safetensors"
     if finished.exists():
-        tensors, meta = _read(finished)
+        tensors, figures = checkpoint.read(finished)
         grid = new_grid(scene, field.table.device)
         _restore(field, grid, tensors)
         log.info(f"trained field found: {finished}")
-        return grid, meta["seconds"]
+        return grid, figures["seconds"]
     training = FieldTraining(field, scene, budget, options, seed)
     _run(training, folder, log)
     field.grad_buffer = None
@@ -253,10 +252,10 @@ def train_field(
 
 
 def _run(training: FieldTraining, folder: Path, log: Log) -> None:
-    checkpoint = folder / "checkpoint.safetensors"
-    if checkpoint.exists():
-        resume(training, checkpoint)
-        log.info(f"going on from step {training.step} of {checkpoint}")
+    unfinished = folder / "checkpoint.safetensors"
+    if unfinished.exists():
+        resume(training, unfinished)
+        log.info(f"going on from step {training.step} of {unfinished}")
     steps = training.budget.steps
     began, saved = time.monotonic() - training.seconds, time.monotonic()
     mean = math.nan
@@ -268,10 +267,10 @@ def _run(training: FieldTraining, folder: Path, log: Log) -> None:
             progress.advance(note=f"{-10 * math.log10(max(mean, 1e-10)):.1f} dB")
             training.seconds = time.monotonic() - began
             if time.monotonic() - saved > CHECKPOINT_S:
-                _save(training, checkpoint)
+                _save(training, unfinished)
                 saved = time.monotonic()
     _save(training, folder / "field.safetensors", finished=True)
-    checkpoint.unlink(missing_ok=True)
+    unfinished.unlink(missing_ok=True)
 
 
 def _tensors(training: FieldTraining, finished: bool) -> dict[str, Tensor]:
@@ -288,18 +287,10 @@ def _tensors(training: FieldTraining, finished: bool) -> dict[str, Tensor]:
 
 
 def _save(training: FieldTraining, path: Path, finished: bool = False) -> None:
-    """Write a good checkpoint whole or not at all, also when another process writes the same."""
+    """Write a good state; a bad one raises and leaves the last good file alone."""
     training.check_finite()
-    meta = {"step": training.step, "rays": training.rays, "seconds": training.seconds}
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    try:
-        save_file(_tensors(training, finished), temporary, {"training": json.dumps(meta)})
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except (OSError, SafetensorError) as error:
-        temporary.unlink(missing_ok=True)
-        raise SteerbenchError(f"{path}: cannot write the checkpoint: {error}") from error
+    figures = {"step": training.step, "rays": training.rays, "seconds": training.seconds}
+    checkpoint.write(path, _tensors(training, finished), figures)
 
 
 def resume(training: FieldTraining, path: Path) -> None:
@@ -308,10 +299,10 @@ def resume(training: FieldTraining, path: Path) -> None:
     Raises:
         SteerbenchError: the file is damaged, or of another training.
     """
-    tensors, meta = _read(path)
+    tensors, figures = checkpoint.read(path)
     _restore(training.field, training.grid, tensors)
-    training.step, training.rays = int(meta["step"]), int(meta["rays"])
-    training.seconds = meta["seconds"]
+    training.step, training.rays = int(figures["step"]), int(figures["rays"])
+    training.seconds = figures["seconds"]
     device = training.field.table.device
     training.table_state = AdamState(
         *(tensors[f"adam.{name}"].to(device) for name in ("first", "second", "steps"))
@@ -325,23 +316,7 @@ def resume(training: FieldTraining, path: Path) -> None:
     training.network_optimiser.load_state_dict(state)
 
 
-def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, float]]:
-    """Tensors and figures of a file written by `_save`."""
-    try:
-        with safe_open(path, "pt") as file:
-            meta = json.loads(file.metadata()["training"])
-        return load_file(path), meta
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise SteerbenchError(
-            f"{path}: expected a field written by a training, could not read one ({error}); "
-            "remove it to train again"
-        ) from error
-
-
 def _restore(field: HashField, grid: DensityGrid, tensors: Mapping[str, Tensor]) -> None:
-    prefix = "field."
-    field.load_state_dict(
-        {name.removeprefix(prefix): x for name, x in tensors.items() if name.startswith(prefix)}
-    )
+    field.load_state_dict(checkpoint.part(tensors, "field."))
     field.repack()
     grid.restore(tensors["grid.density"])

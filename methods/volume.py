@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from bench.cameras import cast, project
-from bench.types import Camera, Probe, Rays
+from bench.types import EMPTY_ALPHA, Camera, Probe, Rays
 from methods.fields import HashField
 from methods.kernels.composite import STOP, Pixels, composite, visible_counts
 from methods.kernels.march import BRICK, Occupancy, Samples, march
@@ -62,7 +64,13 @@ def rays_at_matter(camera: Camera, occupancy: Occupancy) -> tuple[Tensor, Rays]:
 
 
 def render_batch(
-    field: HashField, rays: Rays, occupancy: Occupancy, jitter: Tensor, background: Tensor
+    field: HashField,
+    rays: Rays,
+    occupancy: Occupancy,
+    jitter: Tensor | None,
+    background: Tensor,
+    *,
+    stop: float = STOP,
 ) -> tuple[Pixels, int]:
     """Render `rays` differentiably; also the number of samples that took part.
 
@@ -70,8 +78,9 @@ def render_batch(
     weight nor gradient: the density of all samples, without gradient, tells which they are.
 
     Args:
-        jitter: [R] phase of the samples of each ray, in [0, 1).
+        jitter: [R] phase of the samples of each ray, in [0, 1); None: as `render_rays`.
         background: [K] or [R, K].
+        stop: transmittance at which a ray ends.
     """
     samples = march(
         rays.origins, rays.directions, occupancy, STEP, jitter=jitter, backend=field.backend
@@ -79,7 +88,9 @@ def render_batch(
     with torch.no_grad():
         parts = _pad(samples.positions).split(CHUNK_SAMPLES)
         sigma = torch.cat([field.density(part)[0] for part in parts])[: len(samples)]
-        counts = visible_counts(sigma, samples.delta, samples.offsets, backend=field.backend)
+        counts = visible_counts(
+            sigma, samples.delta, samples.offsets, stop=stop, backend=field.backend
+        )
     samples = samples.front(counts)
     sigma, values = _query(field, samples, rays.directions)
     pixels = composite(
@@ -89,6 +100,7 @@ def render_batch(
         samples.delta,
         samples.offsets,
         background=background,
+        stop=stop,
         backend=field.backend,
     )
     return pixels, len(samples)
@@ -111,14 +123,75 @@ def _pad(samples: Tensor) -> Tensor:
     return functional.pad(samples, (0, 0) * (samples.dim() - 1) + (0, padding))
 
 
+@dataclass(frozen=True)
+class FeatureFrame:
+    """What a field shows to a camera (SteerNeRF Eq. 3 to 5).
+
+    Attributes:
+        camera: of `width` x `height` pixels, w x h below.
+        values: [h, w, K] features on the background, the first three are RGB.
+        depth: [h, w] z-depth, +inf where nothing is.
+        alpha: [h, w] opacity.
+    """
+
+    camera: Camera
+    values: Tensor
+    depth: Tensor
+    alpha: Tensor
+
+
+@torch.no_grad()
+def render_frame(
+    field: HashField,
+    camera: Camera,
+    occupancy: Occupancy,
+    background: Tensor,
+    probe: Probe,
+    *,
+    stop: float = STOP,
+    window: Tensor | None = None,
+) -> FeatureFrame:
+    """Render the picture of `camera` over `background` [K].
+
+    Args:
+        window: [h, w, 2] nearest and farthest z-depth to look at; None: all.
+    """
+    device, size = field.table.device, camera.height * camera.width
+    with probe.stage("rays"):
+        camera = replace(camera, c2w=camera.c2w.to(device))
+        pixels, rays = rays_at_matter(camera, occupancy)
+        canvas = Pixels.blank(size, field.channels, device)
+        limits = None if window is None else window.view(-1, 2)[pixels]
+    probe.count("rays", len(pixels), size)
+    rendered = render_rays(field, rays, occupancy, probe, stop=stop, window=limits)
+    with probe.stage("finish"):
+        canvas.put(pixels, rendered)
+        values = canvas.values + (1 - canvas.alpha)[:, None] * background
+        seen = canvas.alpha > EMPTY_ALPHA
+        depth = torch.where(seen, canvas.depth_sum / canvas.alpha, torch.inf)
+    shape = (camera.height, camera.width)
+    return FeatureFrame(
+        camera, values.view(*shape, -1), depth.view(shape), canvas.alpha.view(shape)
+    )
+
+
 @torch.no_grad()
 def render_rays(
-    field: HashField, rays: Rays, occupancy: Occupancy, probe: Probe, *, stop: float = STOP
+    field: HashField,
+    rays: Rays,
+    occupancy: Occupancy,
+    probe: Probe,
+    *,
+    stop: float = STOP,
+    window: Tensor | None = None,
 ) -> Pixels:
     """Render `rays` in rounds, so that samples behind the early stop are hardly ever evaluated.
 
     Values are not composited onto a background. A round takes the next few samples of the rays
     that are still open, evaluates and composites them, and drops the rays that are done.
+
+    Args:
+        window: [R, 2] nearest and farthest t of each ray; None: all.
     """
     device = rays.origins.device
     canvas = Pixels.blank(len(rays.origins), field.channels, device)
@@ -129,7 +202,7 @@ def render_rays(
         while len(alive):
             limit = ROUND_SAMPLES[min(turn, len(ROUND_SAMPLES) - 1)]
             alive, start = _render_round(
-                field, rays, occupancy, probe, canvas, alive, start, limit, stop
+                field, rays, window, occupancy, probe, canvas, alive, start, limit, stop
             )
             turn += 1
     return canvas
@@ -138,6 +211,7 @@ def render_rays(
 def _render_round(
     field: HashField,
     rays: Rays,
+    window: Tensor | None,
     occupancy: Occupancy,
     probe: Probe,
     canvas: Pixels,
@@ -150,7 +224,14 @@ def _render_round(
     with probe.stage("march"):
         origins, directions = rays.origins[alive], rays.directions[alive]
         samples = march(
-            origins, directions, occupancy, STEP, start=start, limit=limit, backend=field.backend
+            origins,
+            directions,
+            occupancy,
+            STEP,
+            window=None if window is None else window[alive],
+            start=start,
+            limit=limit,
+            backend=field.backend,
         )
     probe.count("samples", len(samples))
     if len(samples) == 0:

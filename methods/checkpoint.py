@@ -1,0 +1,57 @@
+"""Files of trained and half-trained stages: tensors and figures, whole or not there at all."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from bench.types import SteerbenchError
+
+
+def write(path: Path, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
+    """Write a file whole or not at all, also when another process writes the same.
+
+    Raises:
+        SteerbenchError: the disk refuses.
+    """
+    temporary = path.with_suffix(f".{os.getpid()}.tmp")
+    try:
+        save_file(dict(tensors), temporary, {"training": json.dumps(figures)})
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except (OSError, SafetensorError) as error:
+        temporary.unlink(missing_ok=True)
+        raise SteerbenchError(f"{path}: cannot write the checkpoint: {error}") from error
+
+
+def read(path: Path) -> tuple[dict[str, Tensor], dict[str, float]]:
+    """Tensors and figures of a file written by `write`.
+
+    Raises:
+        SteerbenchError: the file is damaged, or something else.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            figures = json.loads(file.metadata()["training"])
+        return load_file(path), figures
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise SteerbenchError(
+            f"{path}: expected the file of a training, could not read one ({error}); "
+            "remove it to train again"
+        ) from error
+
+
+def part(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """The tensors whose names begin with `prefix`, without it."""
+    return {
+        name.removeprefix(prefix): value
+        for name, value in tensors.items()
+        if name.startswith(prefix)
+    }
