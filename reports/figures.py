@@ -2,30 +2,48 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
-import pandas as pd
+import matplotlib
 from matplotlib.figure import Figure
 
+from reports.runs import Run
+
 STAGE = "stage_ms."
+LEGEND_COLUMNS = 6
+COLOURS = [matplotlib.colormaps["tab20"](index) for index in (*range(0, 20, 2), *range(1, 20, 2))]
+COLOURS = [colour for colour in COLOURS if len(set(colour[:3])) > 1]  # grey is for "other"
 
 
-def stage_bars(rows: pd.DataFrame, path: Path) -> None:
-    """Write a PNG: one bar per run, its mean frame time in ms divided into stages."""
-    stages = rows[rows["metric"].str.startswith(STAGE)]
-    runs = list(dict.fromkeys(stages["run"]))
-    figure = Figure(figsize=(8, 0.9 + 0.5 * len(runs)), layout="constrained")
+def stage_bars(runs: Sequence[Run], path: Path) -> None:
+    """Write a PNG: one bar per run, its mean frame time in ms divided into stages.
+
+    A stage has one colour in all bars; what lies in no stage is grey and comes last.
+    """
+    stages = list(dict.fromkeys(name for run in runs for name in run.values if _is_stage(name)))
+    stages.sort(key=lambda name: name == f"{STAGE}other")
+    legend_lines = -(-len(stages) // LEGEND_COLUMNS)
+    height = 0.7 + 0.25 * legend_lines + 0.5 * len(runs)
+    figure = Figure(figsize=(8, height), layout="constrained")
     axes = figure.subplots()
-    left = pd.Series(0.0, index=runs)
-    for metric, of_stage in stages.groupby("metric", sort=False):
-        widths = of_stage.set_index("run")["value"].reindex(runs, fill_value=0.0)
-        label = str(metric).removeprefix(STAGE)
-        axes.barh(range(len(runs)), widths, left=left, height=0.6, label=label)
-        left += widths
-    names = stages.drop_duplicates("run").set_index("run")["method"]
-    axes.set_yticks(range(len(runs)), [f"{names[run]} ({run[:8]})" for run in runs])
+    ends = [0.0] * len(runs)
+    for number, stage in enumerate(stages):
+        widths = [run.values.get(stage, 0.0) for run in runs]
+        name = stage.removeprefix(STAGE)
+        colour = "lightgrey" if name == "other" else COLOURS[number % len(COLOURS)]
+        axes.barh(range(len(runs)), widths, left=ends, height=0.6, label=name, color=colour)
+        ends = [end + width for end, width in zip(ends, widths, strict=True)]
+    for line, end in enumerate(ends):
+        axes.text(end, line, f" {end:.1f}", va="center")
+    axes.set_xlim(0, 1.12 * max(ends))
+    axes.set_yticks(range(len(runs)), [run.label for run in runs])
     axes.invert_yaxis()
     axes.set_xlabel("mean ms of a frame")
     axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="outside upper center", ncols=6, frameon=False)
+    figure.legend(loc="outside upper center", ncols=LEGEND_COLUMNS, frameon=False)
     figure.savefig(path, dpi=150)
+
+
+def _is_stage(metric: str) -> bool:
+    return metric.startswith(STAGE)

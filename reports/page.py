@@ -1,54 +1,160 @@
-"""A page about measured runs: tables, pictures, and where every figure comes from."""
+"""A page about measured runs: one table of all, pictures, and where every figure comes from."""
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
+import numpy as np
+from PIL import Image
 
 from bench.results import Store, explained
 from reports import figures, tables
+from reports.comparison import comparison
+from reports.runs import Run, load
+from reports.sheets import View, write_sheet
 
-PANELS = {"truth": "ground truth", "rendered": "rendering", "error": "error"}
-"""Caption of each picture of a frame, by the end of its file name."""
+BESIDE = 4
+"""Renderings in one picture, beside the ground truth; more runs get further pictures."""
 
 
-def write_page(store: Store, runs: Sequence[str], folder: Path) -> Path:
-    """Write `folder/report.md` about `runs`, with its pictures beside it, and return its path.
+def write_page(
+    store: Store,
+    labels: Mapping[str, str],
+    folder: Path,
+    failures: Mapping[str, str] | None = None,
+) -> Path:
+    """Write `folder/report.md` with its pictures beside it, and return its path.
 
     The page replaces an earlier one only when it is whole.
+
+    Args:
+        store: where the runs are.
+        labels: what each run is called, by its key, in the order of the page.
+        folder: made if missing.
+        failures: why a run is missing, by its label.
 
     Raises:
         SteerbenchError: a run is not in the store, or `folder` cannot be written to.
     """
-    records: dict[str, Any] = {run: store.record(run) for run in runs}
-    rows = store.rows(report=lambda unreadable: None)  # others, which are not asked for
-    rows = rows[rows["run"].isin(runs)]
+    runs = load(store, labels)
     pictures = folder / "pictures"
     with explained(folder):
         pictures.mkdir(parents=True, exist_ok=True)
-        for stale in pictures.glob("run*-*-*.png"):  # of an earlier page
+        for stale in pictures.glob("frames-*.png"):  # of an earlier page
             stale.unlink()
-        figures.stage_bars(rows, pictures / "stages.png")
-        parts = [_heading(rows, records)]
-        for number, run in enumerate(runs, 1):
-            shown = _copy_pictures(store.folder / run / "pictures", pictures, f"run{number}-")
-            of_run = rows[rows["run"] == run]
-            parts.append(_section(of_run, records[run], store.frames(run), shown))
+        figures.stage_bars(runs, pictures / "stages.png")
+        parts = [
+            _heading(runs, failures or {}),
+            TIME,
+            _pictures(runs, pictures),
+            *map(_figures, runs),
+            _provenance(runs),
+        ]
         partial = folder / ".report.md.partial"
         partial.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
         return partial.replace(folder / "report.md")
 
 
-def _heading(rows: pd.DataFrame, records: Mapping[str, Any]) -> str:
-    commands = "\n".join(dict.fromkeys(record["command"] for record in records.values()))
-    scenes = ", ".join(dict.fromkeys(rows["scene"]))
-    methods = ", ".join(dict.fromkeys(rows["method"]))
+TIME = """\
+## Where the time goes
+
+![Mean time of a frame in ms, one bar per run, divided into stages](pictures/stages.png)
+
+One bar per run: the mean time of a frame, divided into the stages of the method. What was spent
+between the stages is `other`."""
+
+
+def _heading(runs: Sequence[Run], failures: Mapping[str, str]) -> str:
+    """Title, the table of all runs and how to read it."""
+    labels = ", ".join(run.label for run in runs)
+    scenes = ", ".join(dict.fromkeys(run.facts["scene"] for run in runs))
+    table = comparison(runs, failures)
+    reading = "Arrows point to better; means over all frames of the trajectory."
+    if table.bold:
+        reading += (
+            " The best figure of each column is **bold**, among runs with the same frames, protocol"
+            " and machine."
+        )
+    notes = dict.fromkeys(
+        f"{name}: n/a. {why}" for run in runs for name, why in run.record["missing"].items()
+    )
+    texts = (f"# {labels} on {scenes}", f"{table.title}.", table.markdown(), reading, *notes)
+    return "\n\n".join(texts)
+
+
+def _pictures(runs: Sequence[Run], folder: Path) -> str:
+    """Pictures of the shown frames; runs that rendered the same frames share them."""
+    groups: dict[tuple[object, ...], list[Run]] = {}
+    for run in runs:
+        groups.setdefault(run.views, []).append(run)
+    parts = [
+        text
+        for number, group in enumerate(groups.values(), 1)
+        for first in range(0, len(group), BESIDE)
+        for text in _sheets(group[first : first + BESIDE], f"frames-{number}-{first}", folder)
+    ]
+    return "\n\n".join(("## Pictures", *(parts or ["No frame has a ground truth."])))
+
+
+def _sheets(runs: Sequence[Run], stem: str, folder: Path) -> Iterator[str]:
+    """Write a picture of every shown frame; what stands on the page of each."""
+    several = len(runs) > 1
+    for truth in sorted(runs[0].pictures.glob("*-truth.png")):
+        frame = truth.name.split("-")[0]
+        views = [_view(run, frame) for run in runs]
+        name = f"{stem}-{frame}.png"
+        write_sheet(_read(truth), views, runs[0].record["error_map"], folder / name)
+        of_frame = runs[0].frames.set_index("frame").loc[int(frame)]
+        where = "in which the renderings differ most" if several else "with the largest error"
+        beside = "renderings" if several else "rendering"
+        yield f"""\
+### {runs[0].facts["scene"]}, {of_frame["name"]}
+
+![{of_frame["name"]}: ground truth, {beside}, detail and error maps](pictures/{name})
+
+Frame {int(frame)} of {len(runs[0].frames)}: ground truth and {beside}, above a detail of each (the
+framed part, {where}). Error maps show the {runs[0].record["error_map"]}."""
+
+
+def _view(run: Run, frame: str) -> View:
+    """A shown frame of a run, titled with its own PSNR and time."""
+    figures_of = run.frames.set_index("frame").loc[int(frame)]
+    titles = (run.label, f"{figures_of['psnr']:.2f} dB, {figures_of['frame_ms']:.1f} ms")
+    kinds = ("rendered", "error")
+    return View(titles, *(_read(run.pictures / f"{frame}-{kind}.png") for kind in kinds))
+
+
+def _read(path: Path) -> np.ndarray:
+    with Image.open(path) as picture:
+        return np.asarray(picture.convert("RGB"))
+
+
+def _figures(run: Run) -> str:
+    """All figures of one run."""
+    blocks = "\n\n".join(
+        f"### {table.title}\n\n{table.markdown()}" for table in tables.blocks(run.rows)
+    )
+    return f"## {run.label}, run {run.key}\n\n{blocks}"
+
+
+def _provenance(runs: Sequence[Run]) -> str:
+    """Commands, then where the figures come from: a line for what all have in common."""
+    commands = "\n".join(dict.fromkeys(run.record["command"] for run in runs))
+    facts = [_facts(run) for run in runs]
+    lines = []
+    for name in facts[0]:
+        values = [of_run[name] for of_run in facts]
+        if len(set(values)) == 1:
+            lines.append((name, values[0]))
+        else:
+            lines += [
+                (f"{name}, {run.label}", value) for run, value in zip(runs, values, strict=True)
+            ]
+    table = tables.Table("Provenance", ("", ""), tuple(lines), figures=False)
     return f"""\
-# {methods} on {scenes}
+## Provenance
 
 Every figure and picture on this page was made by
 
@@ -56,78 +162,29 @@ Every figure and picture on this page was made by
 {commands}
 ```
 
-{tables.overview(rows).markdown()}
-
-![Mean time of a frame, divided into stages](pictures/stages.png)"""
+{table.markdown()}"""
 
 
-def _section(
-    rows: pd.DataFrame, record: Mapping[str, Any], frames: pd.DataFrame, shown: Mapping[int, str]
-) -> str:
-    """Tables, pictures and provenance of one run."""
-    blocks = "\n\n".join(
-        f"### {table.title}\n\n{table.markdown()}" for table in tables.blocks(rows)
-    )
-    missing = "".join(f"\n\n{name}: n/a. {why}" for name, why in record["missing"].items())
-    return f"""\
-## Run {record["run"]}
-
-{blocks}{missing}
-
-### Pictures
-
-Error maps show the {record["error_map"]}.
-
-{_pictures(frames, shown).markdown()}
-
-### Provenance
-
-{_provenance(rows.iloc[0], record).markdown()}"""
-
-
-def _copy_pictures(source: Path, target: Path, prefix: str) -> dict[int, str]:
-    """Copy the pictures of a run; for each frame, how their names begin in `target`."""
-    for picture in source.glob("*.png"):
-        shutil.copyfile(picture, target / f"{prefix}{picture.name}")
-    frames = sorted(picture.name.split("-")[0] for picture in source.glob("*-truth.png"))
-    return {int(frame): f"{prefix}{frame}" for frame in frames}
-
-
-def _pictures(frames: pd.DataFrame, shown: Mapping[int, str]) -> tables.Table:
-    """One line per shown frame: name and PSNR, ground truth, rendering, error map."""
-    by_frame = frames.set_index("frame").to_dict("index")
-    lines = tuple(
-        (
-            f"{by_frame[frame]['name']}, {by_frame[frame]['psnr']:.2f} dB",
-            *(f"![{caption}](pictures/{stem}-{panel}.png)" for panel, caption in PANELS.items()),
-        )
-        for frame, stem in shown.items()
-    )
-    return tables.Table("Pictures", ("frame", *PANELS.values()), lines, figures=False)
-
-
-def _provenance(row: pd.Series, record: Mapping[str, Any]) -> tables.Table:
-    """Where the figures come from, line by line."""
-    machine = record["machine"]
+def _facts(run: Run) -> dict[str, str]:
+    """Where the figures of a run come from, by name."""
+    machine, record, row = run.record["machine"], run.record, run.facts
     memory = f"{machine['memory_bytes'] / 2**30:.0f} GiB"
-    lines = (
-        ("scene", f"{row['scene']}, digest {record['scene']['digest'][:16]}"),
-        ("frames", f"{row['trajectory']} at {row['resolution']}"),
-        ("protocol", _listed(record["protocol"])),
-        ("budget", _listed(record["budget"])),
-        ("seed", str(row["seed"])),
-        ("commit", row["commit"]),
-        (
-            "computed on",
-            _listed({name: row[name] for name in ("device", "backend", "engine", "precision")}),
-        ),
-        ("peak memory", record["peak_bytes"]),
-        ("machine", f"{machine['cpu']}, {machine['threads']} threads, {memory}"),
-        ("GPU", ", ".join(machine["gpus"]) or "none"),
-        ("system", f"{machine['system']}, Python {machine['python']}"),
-        ("versions", _listed(machine["versions"])),
-    )
-    return tables.Table("Provenance", ("", ""), lines, figures=False)
+    computed = {name: row[name] for name in ("device", "backend", "engine", "precision")}
+    return {
+        "run": run.key,
+        "scene": f"{row['scene']}, digest {record['scene']['digest'][:16]}",
+        "frames": f"{row['trajectory']} at {row['resolution']}",
+        "protocol": _listed(record["protocol"]),
+        "budget": _listed(record["budget"]),
+        "seed": str(row["seed"]),
+        "commit": row["commit"],
+        "computed on": _listed(computed),
+        "peak memory": record["peak_bytes"],
+        "machine": f"{machine['cpu']}, {machine['threads']} threads, {memory}",
+        "GPU": ", ".join(machine["gpus"]) or "none",
+        "system": f"{machine['system']}, Python {machine['python']}",
+        "versions": _listed(machine["versions"]),
+    }
 
 
 def _listed(values: Mapping[str, Any]) -> str:

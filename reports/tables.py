@@ -27,41 +27,28 @@ QUALITY = {
 class Table:
     """`lines` of text under `columns`.
 
-    The first column is a label; the others are figures, or text when `figures` is False.
+    The first column is a label; the others are figures, or text when `figures` is False. `bold`
+    holds the line and the column, from 0, of every cell that stands out.
     """
 
     title: str
     columns: tuple[str, ...]
     lines: tuple[tuple[str, ...], ...]
     figures: bool = True
+    bold: frozenset[tuple[int, int]] = frozenset()
 
     def markdown(self) -> str:
         """The table in GitHub's Markdown, without its title."""
         rule = ("---", *("---:" if self.figures else "---" for _ in self.columns[1:]))
-        return "\n".join(f"| {' | '.join(line)} |" for line in (self.columns, rule, *self.lines))
+        lines = [
+            [self._cell(text, (row, column)) for column, text in enumerate(line)]
+            for row, line in enumerate(self.lines)
+        ]
+        return "\n".join(f"| {' | '.join(line)} |" for line in (self.columns, rule, *lines))
 
-
-def overview(rows: pd.DataFrame) -> Table:
-    """One line per run: quality, speed, size."""
-    shown = [metric for metric in QUALITY if (rows["metric"] == metric).any()]
-    lines = []
-    for run, of_run in rows.groupby("run", sort=False):
-        value = _values(of_run)
-        first = of_run.iloc[0]
-        lines.append(
-            (
-                f"{first['method']} ({str(run)[:8]})",
-                f"{first['scene']}, {first['resolution']}",
-                *(number(value.get(metric), QUALITY[metric][1]) for metric in shown),
-                number(value.get("frame_ms"), 1),
-                number(value.get("fps"), 2),
-                megabytes(value.get("size_bytes.total")),
-                number(value.get("train_s"), 0),
-            )
-        )
-    labels = (QUALITY[metric][0] for metric in shown)
-    columns = ("method (run)", "scene", *labels, "ms / frame ↓", "FPS ↑", "MB ↓", "trained, s")
-    return Table("Overview", columns, tuple(lines))
+    def _cell(self, text: str, place: tuple[int, int]) -> str:
+        escaped = text.replace("|", "\\|")
+        return f"**{escaped}**" if place in self.bold else escaped
 
 
 def blocks(rows: pd.DataFrame) -> list[Table]:

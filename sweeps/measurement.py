@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.columns import Columns
 
@@ -20,6 +21,7 @@ from bench.results import Store
 from bench.run import measure
 from bench.types import Method, Scene
 from reports.page import write_page
+from reports.runs import Run, load
 from reports.tables import blocks
 from sweeps.build import build, check_settings
 from sweeps.terminal import console, rich_table
@@ -41,8 +43,31 @@ class Settings:
     report: str | None
 
 
+@dataclass(frozen=True)
+class Obtained:
+    """A run that is in the store; `measured` tells whether it had to be measured for that."""
+
+    store: Store
+    run: str
+    measured: bool
+
+
 def execute(config: DictConfig, command: Sequence[str]) -> None:
-    """Measure what `config` describes unless the store has it, print it, write its page.
+    """Obtain the run that `config` describes, print its tables, write its page.
+
+    Raises as `obtain` does, and where the page cannot be written.
+    """
+    obtained = obtain(config, command)
+    label = {obtained.run: HydraConfig.get().runtime.choices["method"]}
+    (run,) = load(obtained.store, label)
+    _show(run, explain=not obtained.measured)
+    if config.report:
+        page = write_page(obtained.store, label, Path(config.report))
+        ConsoleLog(Path(config.outputs)).info(f"report: {page}")
+
+
+def obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
+    """Measure what `config` describes, unless the store has it.
 
     Args:
         config: the composed run.yaml.
@@ -64,25 +89,22 @@ def execute(config: DictConfig, command: Sequence[str]) -> None:
     weights = Path(settings.weights_dir) if settings.weights_dir else None
     parts = _identity(config, scene, method) | {"lpips": protocol.find_lpips(weights, log)}
     run = store.key(parts)
-    known = store.find(run) is not None
-    if known:
+    if store.find(run) is not None:
         log.info(f"already measured; to measure again, remove {store.folder / run}")
-    else:
-        measurement = measure(
-            method,
-            scene,
-            trajectory,
-            protocol,
-            budget,
-            log,
-            seed=settings.seed,
-            weights_dir=weights,
-        )
-        record = {**measurement.record, "command": shlex.join(command)}
-        store.save(parts, replace(measurement, record=record))
-    _show(store, run, explain=known)
-    if settings.report:
-        log.info(f"report: {write_page(store, [run], Path(settings.report))}")
+        return Obtained(store, run, measured=False)
+    measurement = measure(
+        method,
+        scene,
+        trajectory,
+        protocol,
+        budget,
+        log,
+        seed=settings.seed,
+        weights_dir=weights,
+    )
+    record = {**measurement.record, "command": shlex.join(command)}
+    store.save(parts, replace(measurement, record=record))
+    return Obtained(store, run, measured=True)
 
 
 def _settings(config: DictConfig) -> Settings:
@@ -119,14 +141,11 @@ def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any
     }
 
 
-def _show(store: Store, run: str, explain: bool) -> None:
+def _show(run: Run, explain: bool) -> None:
     """Print the tables of one run and, unless the log just said so, why a figure is missing."""
-    rows = store.rows(report=lambda unreadable: None)  # `steerbench results` tells of those
-    rows = rows[rows["run"] == run]
-    what = rows.iloc[0][["method", "scene", "trajectory", "resolution", "budget", "protocol"]]
+    what = run.facts[["method", "scene", "trajectory", "resolution", "budget", "protocol"]]
     out = console()
-    out.print(f"{', '.join(what)}, seed {rows.iloc[0]['seed']}: run {run}", style="bold")
-    out.print(Columns([rich_table(table) for table in blocks(rows)]))
-    missing: Any = store.record(run)["missing"] if explain else {}
-    for metric, reason in missing.items():
+    out.print(f"{', '.join(what)}, seed {run.facts['seed']}: run {run.key}", style="bold")
+    out.print(Columns([rich_table(table) for table in blocks(run.rows)]))
+    for metric, reason in run.record["missing"].items() if explain else ():
         out.print(f"{metric}: n/a. {reason}", markup=False, soft_wrap=True)

@@ -13,42 +13,61 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from sweeps.announced import Announced
 from sweeps.overrides import CONFIGS, explain
 
 
 def main(argv: Sequence[str]) -> int:
     """Run what the overrides and flags in `argv` ask for: one job, a sweep, or Hydra's own help.
 
-    In a sweep a job that fails is named at once and the others still run.
+    In a sweep a job that fails is named at once and the others still run; at the end all stand in
+    one table.
 
     Raises:
         SteerbenchError: a setting or a choice does not exist, or a job failed.
     """
-    failures: list[Exception] = []
-
-    def job(config: DictConfig) -> None:
-        from sweeps.measurement import execute  # loads torch: not for --help or completion
-
-        overrides = HydraConfig.get().overrides.task
-        try:
-            execute(config, ["steerbench", "run", *overrides])
-        except Exception as error:
-            if HydraConfig.get().mode == RunMode.MULTIRUN:
-                print(f"steerbench: failed: {' '.join(overrides)}: {error}", file=sys.stderr)
-                raise
-            failures.append(error)  # past Hydra, which would announce it in its own way
-
     # Hydra's parser takes the overrides in one piece only: flags first, whatever was typed.
     sys.argv = [sys.argv[0], *sorted(argv, key=_is_override)]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors instead of printing them
     _hide_subcommand_from_completion()
+    Announced.folder = None
+    error = _launch(argv)
+    if Announced.folder is not None:
+        from sweeps.sweep import finish
+
+        finish(Announced.folder)
+    if error is not None:
+        raise error
+    return 0
+
+
+def _launch(argv: Sequence[str]) -> Exception | None:
+    """Have Hydra run every job; the error that a job or a setting ended with."""
+    failures: list[Exception] = []
+
+    def job(config: DictConfig) -> None:
+        # These load torch: not for --help or completion.
+        from sweeps.measurement import execute
+        from sweeps.sweep import run_job
+
+        command = ["steerbench", "run", *HydraConfig.get().overrides.task]
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            run_job(config, command)
+            return
+        try:
+            execute(config, command)
+        except Exception as error:
+            failures.append(error)  # past Hydra, which would announce it in its own way
+
     try:
         hydra.main(str(CONFIGS), "run", version_base="1.3")(job)()
-        if failures:
-            raise failures[0]
     except (HydraException, OmegaConfBaseException) as error:
-        raise explain(error, argv) from error
-    return 0
+        explained = explain(error, argv)
+        explained.__cause__ = error
+        return explained
+    except Exception as error:
+        return error
+    return failures[0] if failures else None
 
 
 def _is_override(argument: str) -> bool:

@@ -30,6 +30,10 @@ def rich_table(table: Table) -> RichTable:
     grid = RichTable(title=table.title, title_justify="left")
     for index, column in enumerate(table.columns):
         grid.add_column(column, justify="right" if index and table.figures else "left")
-    for line in table.lines:
-        grid.add_row(*map(escape, line))
+    for row, line in enumerate(table.lines):
+        cells = (
+            f"[bold]{escape(text)}[/bold]" if (row, column) in table.bold else escape(text)
+            for column, text in enumerate(line)
+        )
+        grid.add_row(*cells)
     return grid

@@ -1,0 +1,78 @@
+"""Runs as a page or a table needs them: all that the store knows of each, and what it is called."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from bench.results import Store
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of the store.
+
+    Attributes:
+        key: in the store.
+        label: what it is called beside the others.
+        rows: one metric per row.
+        frames: one frame per row.
+        record: what the figures mean, and where they come from.
+        pictures: folder of ground truths, renderings and error maps.
+    """
+
+    key: str
+    label: str
+    rows: pd.DataFrame
+    frames: pd.DataFrame
+    record: Mapping[str, Any]
+    pictures: Path
+
+    @cached_property
+    def values(self) -> dict[str, float]:
+        """Figures by metric."""
+        return dict(zip(self.rows["metric"], self.rows["value"], strict=True))
+
+    @property
+    def facts(self) -> pd.Series:
+        """What all rows of the run have in common: method, scene, protocol, device and so on."""
+        return self.rows.iloc[0]
+
+    @property
+    def views(self) -> tuple[object, ...]:
+        """The same for runs that rendered the same frames of the same scene."""
+        where = (self.facts["split"], self.facts["trajectory"], self.facts["resolution"])
+        return (self.record["scene"]["digest"], *where, len(self.frames))
+
+    @property
+    def conditions(self) -> tuple[object, ...]:
+        """The same for runs whose figures may be held against each other."""
+        machine = self.record["machine"]
+        computer = (machine["cpu"], machine["threads"], *machine["gpus"])
+        return (*self.views, self.facts["protocol"], self.facts["device"], *computer)
+
+
+def load(store: Store, labels: Mapping[str, str]) -> list[Run]:
+    """The runs whose keys `labels` has, in its order.
+
+    Raises:
+        SteerbenchError: one of them is not in the store.
+    """
+    records = {key: store.record(key) for key in labels}
+    rows = store.rows(report=lambda unreadable: None)  # others, which are not asked for
+    return [
+        Run(
+            key,
+            label,
+            rows[rows["run"] == key],
+            store.frames(key),
+            records[key],
+            store.folder / key / "pictures",
+        )
+        for key, label in labels.items()
+    ]

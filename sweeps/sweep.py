@@ -1,0 +1,104 @@
+"""A sweep: its jobs one by one, and at its end one table and one page about all of them.
+
+Jobs may run in other processes, so they meet in the folder of the sweep and in the store alone.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import timedelta
+from math import prod
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from bench.results import Store
+from reports.comparison import comparison
+from reports.page import write_page
+from reports.runs import load
+from reports.tables import number
+from sweeps.announced import Announced
+from sweeps.jobs import Job, read, varying
+from sweeps.measurement import obtain
+from sweeps.terminal import console, rich_table
+
+
+def run_job(config: DictConfig, command: Sequence[str]) -> None:
+    """Run the present job of a sweep, leave behind how it ended, say so in a line.
+
+    `command` runs this job alone. Raises what the measurement raises.
+    """
+    present = HydraConfig.get()
+    folder = Path(present.runtime.output_dir)
+    job = Job(
+        present.job.num,
+        present.runtime.choices["method"],
+        tuple(present.overrides.task),
+        str(config.outputs),
+        config.report,
+        begun=time.time(),
+    )
+    try:
+        obtained = obtain(config, command)
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        replace(job, failure=reason).write(folder)
+        print(f"steerbench: failed: {' '.join(job.overrides)}: {error}", file=sys.stderr)
+        raise
+    replace(job, run=obtained.run, measured=obtained.measured).write(folder)
+    swept = [name for name, size in Announced.sizes.items() if size > 1 and name != "method"]
+    (run,) = load(obtained.store, {obtained.run: job.label(swept)})
+    psnr, ms = number(run.values.get("psnr"), 2), number(run.values["frame_ms"], 1)
+    print(f"{run.label}: {psnr} dB, {ms} ms a frame{_progress(read(folder))}", file=sys.stderr)
+
+
+def finish(folder: Path) -> None:
+    """Print one table of all jobs that ended, and write the pages that they asked for.
+
+    Raises:
+        SteerbenchError: a page cannot be written.
+    """
+    jobs = read(folder)
+    for outputs in dict.fromkeys(job.outputs for job in jobs):
+        there = [job for job in jobs if job.outputs == outputs]
+        names, store = varying(there), Store(Path(outputs))
+        _show(store, *_labels(there, names))
+        for report in dict.fromkeys(job.report for job in there if job.report):
+            runs, failures = _labels([job for job in there if job.report == report], names)
+            if runs:
+                page = write_page(store, runs, Path(report), failures)
+                print(f"report: {page}", file=sys.stderr)
+
+
+def _progress(ended: Sequence[Job]) -> str:
+    """How far the sweep is and, from what had to be measured so far, how long the rest takes."""
+    total, measured = prod(Announced.sizes.values()), sum(job.measured for job in ended)
+    if Announced.folder is None or len(ended) > total:
+        return ""
+    text = f"; {len(ended)} of {total} jobs done"
+    if measured and len(ended) < total:
+        each = (time.time() - min(job.begun for job in ended)) / measured
+        left = timedelta(seconds=round(each * (total - len(ended))))
+        text += f", about {left} left"
+    return text
+
+
+def _labels(jobs: Sequence[Job], names: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
+    """What runs are called, by their keys; why others failed, by what they are called."""
+    runs = {job.run: job.label(names) for job in jobs if job.run}
+    return runs, {job.label(names): job.failure for job in jobs if job.failure}
+
+
+def _show(store: Store, labels: dict[str, str], failures: dict[str, str]) -> None:
+    """Print the table of all jobs, and why a figure is missing."""
+    runs = load(store, labels)
+    out = console()
+    out.print(rich_table(comparison(runs, failures)))
+    for note in dict.fromkeys(
+        f"{metric}: n/a. {why}" for run in runs for metric, why in run.record["missing"].items()
+    ):
+        out.print(note, markup=False, soft_wrap=True)
