@@ -45,7 +45,8 @@ def comparison(runs: Sequence[Run], failures: Mapping[str, str]) -> Table:
     blank = ("",) * len(columns)
     lines += [(f"{label}: failed: {reason}", *blank) for label, reason in failures.items()]
     labels = (label for _, label, _ in columns)
-    return Table(_title(runs), ("run", *labels), tuple(lines), bold=bold)
+    title = f"Comparison: {setting(runs)}" if runs else "Comparison"
+    return Table(title, ("run", *labels), tuple(lines), bold=bold)
 
 
 def _columns(runs: Sequence[Run]) -> list[tuple[str, str, Write]]:
@@ -70,7 +71,7 @@ def _best(runs: Sequence[Run], metric: str, write: Write, highest: bool) -> Iter
             yield from (row for row, value in figures.items() if write(value) == write(best))
 
 
-def _title(runs: Sequence[Run]) -> str:
-    """What the runs have in common, or the several there are of it."""
-    several = [" / ".join(dict.fromkeys(str(run.facts[name]) for run in runs)) for name in COMMON]
-    return ", ".join(filter(None, ("Comparison", *several)))
+def setting(runs: Sequence[Run]) -> str:
+    """Under what the runs were made: what they have in common, or the several there are of it."""
+    several = {name: dict.fromkeys(str(run.facts[name]) for run in runs) for name in COMMON}
+    return ", ".join(f"{name} {' / '.join(values)}" for name, values in several.items())

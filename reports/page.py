@@ -11,9 +11,9 @@ from PIL import Image
 
 from bench.results import Store, explained
 from reports import figures, tables
-from reports.comparison import comparison
+from reports.comparison import comparison, setting
 from reports.runs import Run, load
-from reports.sheets import View, write_sheet
+from reports.sheets import ZOOM, View, find_detail, write_sheet
 
 BESIDE = 4
 """Renderings in one picture, beside the ground truth; more runs get further pictures."""
@@ -68,7 +68,7 @@ between the stages is `other`."""
 
 def _heading(runs: Sequence[Run], failures: Mapping[str, str]) -> str:
     """Title, the table of all runs and how to read it."""
-    labels = ", ".join(run.label for run in runs)
+    labels = ", ".join(run.label for run in runs) if len(runs) <= BESIDE else f"{len(runs)} runs"
     scenes = ", ".join(dict.fromkeys(run.facts["scene"] for run in runs))
     table = comparison(runs, failures)
     reading = "Arrows point to better; means over all frames of the trajectory."
@@ -80,7 +80,13 @@ def _heading(runs: Sequence[Run], failures: Mapping[str, str]) -> str:
     notes = dict.fromkeys(
         f"{name}: n/a. {why}" for run in runs for name, why in run.record["missing"].items()
     )
-    texts = (f"# {labels} on {scenes}", f"{table.title}.", table.markdown(), reading, *notes)
+    texts = (
+        f"# {labels} on {scenes}",
+        f"Measured: {setting(runs)}.",
+        table.markdown(),
+        reading,
+        *notes,
+    )
     return "\n\n".join(texts)
 
 
@@ -92,38 +98,39 @@ def _pictures(runs: Sequence[Run], folder: Path) -> str:
     parts = [
         text
         for number, group in enumerate(groups.values(), 1)
-        for first in range(0, len(group), BESIDE)
-        for text in _sheets(group[first : first + BESIDE], f"frames-{number}-{first}", folder)
+        for text in _frames(group, f"frames-{number}", folder)
     ]
     return "\n\n".join(("## Pictures", *(parts or ["No frame has a ground truth."])))
 
 
-def _sheets(runs: Sequence[Run], stem: str, folder: Path) -> Iterator[str]:
-    """Write a picture of every shown frame; what stands on the page of each."""
-    several = len(runs) > 1
-    for truth in sorted(runs[0].pictures.glob("*-truth.png")):
-        frame = truth.name.split("-")[0]
+def _frames(runs: Sequence[Run], stem: str, folder: Path) -> Iterator[str]:
+    """Write the pictures of every shown frame of `runs`; yield what the page has about it."""
+    for path in sorted(runs[0].pictures.glob("*-truth.png")):
+        frame, truth = path.name.split("-")[0], _read(path)
         views = [_view(run, frame) for run in runs]
-        name = f"{stem}-{frame}.png"
-        write_sheet(_read(truth), views, runs[0].record["error_map"], folder / name)
-        of_frame = runs[0].frames.set_index("frame").loc[int(frame)]
-        where = "in which the renderings differ most" if several else "with the largest error"
-        beside = "renderings" if several else "rendering"
-        yield f"""\
-### {runs[0].facts["scene"]}, {of_frame["name"]}
-
-![{of_frame["name"]}: ground truth, {beside}, detail and error maps](pictures/{name})
-
-Frame {int(frame)} of {len(runs[0].frames)}: ground truth and {beside}, above a detail of each (the
-framed part, {where}). Error maps show the {runs[0].record["error_map"]}."""
+        detail = find_detail(truth, [view.rendering for view in views])
+        name = runs[0].frames.set_index("frame")["name"][int(frame)]
+        yield f"### {runs[0].facts['scene']}, {name}, frame {int(frame)} of {len(runs[0].frames)}"
+        for first in range(0, len(views), BESIDE):
+            file = f"{stem}-{frame}-{first}.png"
+            beside = views[first : first + BESIDE]
+            write_sheet(truth, beside, detail, runs[0].record["error_map"], folder / file)
+            shown = ", ".join(view.titles[0] for view in beside)
+            yield f"![Ground truth, {shown}; a detail of each; error maps](pictures/{file})"
+        yield (
+            "PSNR and time above a picture are of this frame alone. The framed part, where"
+            f" {detail.where}, is enlarged {ZOOM} times."
+            f" Error maps show the {runs[0].record['error_map']}."
+        )
 
 
 def _view(run: Run, frame: str) -> View:
     """A shown frame of a run, titled with its own PSNR and time."""
-    figures_of = run.frames.set_index("frame").loc[int(frame)]
-    titles = (run.label, f"{figures_of['psnr']:.2f} dB, {figures_of['frame_ms']:.1f} ms")
+    of_frame = run.frames.set_index("frame").loc[int(frame)]
+    figures_shown = f"PSNR {of_frame['psnr']:.2f} dB, {of_frame['frame_ms']:.1f} ms"
     kinds = ("rendered", "error")
-    return View(titles, *(_read(run.pictures / f"{frame}-{kind}.png") for kind in kinds))
+    pictures = [_read(run.pictures / f"{frame}-{kind}.png") for kind in kinds]
+    return View((run.label, figures_shown), *pictures)
 
 
 def _read(path: Path) -> np.ndarray:

@@ -53,8 +53,8 @@ class Run:
     def conditions(self) -> tuple[object, ...]:
         """The same for runs whose figures may be held against each other."""
         machine = self.record["machine"]
-        computer = (machine["cpu"], machine["threads"], *machine["gpus"])
-        return (*self.views, self.facts["protocol"], self.facts["device"], *computer)
+        computer = (self.facts["device"], machine["cpu"], *machine["gpus"])
+        return (*self.views, self.facts["protocol"], *computer)
 
 
 def load(store: Store, labels: Mapping[str, str]) -> list[Run]:

@@ -38,44 +38,57 @@ class Band:
     panels: Sequence[Image.Image | None]
 
 
-def write_sheet(truth: np.ndarray, views: Sequence[View], errors: str, path: Path) -> None:
-    """Write the PNG that shows the ground truth, the `views` and what `errors` says of errors."""
-    top, left, height, width = region(truth, [view.rendering for view in views])
-    box = (left, top, left + width, top + height)
-    pictures = [truth, *(view.rendering for view in views)]
-    maps = [view.error for view in views]
-    titles: list[tuple[str, ...]] = [("ground truth",), *(view.titles for view in views)]
-    if len(views) == 1:  # one line is enough
-        pictures, maps, titles = [*pictures, *maps], [], [*titles, ("error", errors)]
-    what = "the error is largest" if len(views) == 1 else "the renderings differ most"
-    bands = [
-        Band("", [_whole(picture, box) for picture in pictures]),
-        Band(f"detail, where {what}", [_detail(picture, box) for picture in pictures]),
-    ]
-    if maps:
-        bands.append(Band(f"error: {errors}", [None, *(_whole(error, box) for error in maps)]))
-    _compose(titles, bands).save(path)
+@dataclass(frozen=True)
+class Detail:
+    """The part of a frame that is shown enlarged: left, top, right, bottom, and why this one."""
+
+    box: tuple[int, int, int, int]
+    where: str
 
 
-def region(truth: np.ndarray, renderings: Sequence[np.ndarray]) -> tuple[int, int, int, int]:
-    """Top, left, height, width of the part in which pictures differ most, in the mean over it.
+def find_detail(truth: np.ndarray, renderings: Sequence[np.ndarray]) -> Detail:
+    """The part of a frame in which its pictures differ most, in the mean over that part.
 
     Of several renderings, from each other; of a single one, from the ground truth. Where nothing
     differs, it is the middle.
     """
-    stack = np.stack([*renderings, truth] if len(renderings) == 1 else renderings).astype(float)
+    alone = len(renderings) == 1
+    stack = np.stack([*renderings, truth] if alone else renderings).astype(float)
     spread = (stack.max(axis=0) - stack.min(axis=0)).mean(axis=-1)  # [H, W]
-    size = tuple(max(1, side // ZOOM) for side in spread.shape)
-    centre = tuple(side // 2 for side in spread.shape)
+    height, width = spread.shape
+    high, wide = max(1, height // ZOOM), max(1, width // ZOOM)
+    middle = (height // 2, width // 2)
     if spread.any():
-        mean = uniform_filter(spread, size, mode="constant")
-        centre = tuple(map(int, np.unravel_index(mean.argmax(), mean.shape)))
-    corner = (
-        min(max(0, middle - part // 2), side - part)
-        for middle, part, side in zip(centre, size, spread.shape, strict=True)
-    )
-    top, left = corner
-    return top, left, size[0], size[1]
+        mean = uniform_filter(spread, (high, wide), mode="constant")
+        middle = divmod(int(mean.argmax()), width)
+    top = min(max(0, middle[0] - high // 2), height - high)
+    left = min(max(0, middle[1] - wide // 2), width - wide)
+    where = "the error is largest" if alone else "the renderings differ most"
+    return Detail((left, top, left + wide, top + high), where)
+
+
+def write_sheet(
+    truth: np.ndarray, views: Sequence[View], detail: Detail, errors: str, path: Path
+) -> None:
+    """Write the PNG that shows the ground truth and the `views`, each with the `detail`.
+
+    `errors` says what the error maps show. A single view takes two lines, several take three.
+    """
+    pictures = [truth, *(view.rendering for view in views)]
+    maps = [view.error for view in views]
+    titles: list[tuple[str, ...]] = [("ground truth",), *(view.titles for view in views)]
+    if len(views) == 1:
+        pictures, maps, titles = [*pictures, *maps], [], [*titles, ("error map", errors)]
+    bands = [
+        Band("", [_whole(picture, detail) for picture in pictures]),
+        Band(
+            f"detail, {ZOOM} times enlarged, where {detail.where}",
+            [_part(picture, detail) for picture in pictures],
+        ),
+    ]
+    if maps:
+        bands.append(Band(f"error maps: {errors}", [None, *(_whole(m, detail) for m in maps)]))
+    _compose(titles, bands).save(path)
 
 
 def _shown(height: int, width: int) -> tuple[int, int]:
@@ -84,7 +97,7 @@ def _shown(height: int, width: int) -> tuple[int, int]:
     return round(width * scale), round(height * scale)
 
 
-def _whole(picture: np.ndarray, box: tuple[int, int, int, int]) -> Image.Image:
+def _whole(picture: np.ndarray, detail: Detail) -> Image.Image:
     """The picture with the detail outlined."""
     size = _shown(*picture.shape[:2])
     enlarged = size[0] > picture.shape[1]
@@ -92,13 +105,15 @@ def _whole(picture: np.ndarray, box: tuple[int, int, int, int]) -> Image.Image:
         size, Image.Resampling.NEAREST if enlarged else Image.Resampling.BOX
     )
     scale = size[0] / picture.shape[1]
-    ImageDraw.Draw(panel).rectangle([round(edge * scale) for edge in box], outline=MARK, width=2)
+    ImageDraw.Draw(panel).rectangle(
+        [round(edge * scale) for edge in detail.box], outline=MARK, width=2
+    )
     return panel
 
 
-def _detail(picture: np.ndarray, box: tuple[int, int, int, int]) -> Image.Image:
+def _part(picture: np.ndarray, detail: Detail) -> Image.Image:
     """The outlined part, as large as the picture is shown, its pixels kept apart."""
-    part = Image.fromarray(picture).crop(box)
+    part = Image.fromarray(picture).crop(detail.box)
     panel = part.resize(_shown(*picture.shape[:2]), Image.Resampling.NEAREST)
     ImageDraw.Draw(panel).rectangle(
         (0, 0, panel.width - 1, panel.height - 1), outline=MARK, width=2

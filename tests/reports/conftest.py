@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -65,6 +67,26 @@ def store(tmp_path: Path, offset_method, tiny_scene, quiet_log) -> Store:
     store = Store(tmp_path)
     store.save({"what": "offset"}, replace(measurement, record=record))
     return store
+
+
+@pytest.fixture
+def several(store: Store, stored_run: str) -> tuple[Store, dict[str, str]]:
+    """A store with six runs of the same frames, and what each is called.
+
+    The last was made on another machine; all else is the same.
+    """
+    labels = {stored_run: "first"}
+    for number in range(5):
+        key = f"{number}{stored_run[1:]}"
+        folder = shutil.copytree(store.folder / stored_run, store.folder / key)
+        for file in ("rows.csv", "record.json"):
+            text = (folder / file).read_text().replace(stored_run, key)
+            (folder / file).write_text(text)
+        labels[key] = f"copy {number}"
+    record = json.loads((folder / "record.json").read_text())
+    record["machine"]["cpu"] = "another"
+    (folder / "record.json").write_text(json.dumps(record))
+    return store, labels
 
 
 @pytest.fixture

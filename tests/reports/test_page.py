@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -11,12 +12,13 @@ from PIL import Image
 from bench.types import SteerbenchError
 from reports import figures
 from reports.page import write_page
+from reports.runs import Run
 
 
 @pytest.fixture
 def page(store, stored_run, tmp_path) -> Path:
     """The page of the one stored run."""
-    return write_page(store, [stored_run], tmp_path / "page")
+    return write_page(store, {stored_run: "offset"}, tmp_path / "page")
 
 
 def linked(page: Path) -> list[Path]:
@@ -26,7 +28,7 @@ def linked(page: Path) -> list[Path]:
 
 def test_every_picture_on_the_page_lies_beside_it_and_can_be_read(page):
     pictures = linked(page)
-    assert len(pictures) == 1 + 3 * 3  # the bar, then truth, rendering, error of three frames
+    assert len(pictures) == 1 + 3  # the bar, then three frames
     for path in pictures:
         Image.open(path).load()
     assert {path.resolve() for path in (page.parent / "pictures").iterdir()} == {
@@ -39,7 +41,7 @@ def test_the_page_says_how_it_was_made_and_where_its_figures_come_from(page, sto
     for fact in (
         "# offset on tiny",
         "```sh\nsteerbench run method=offset\n```",
-        f"## Run {stored_run}",
+        f"## offset, run {stored_run}",
         "| scene | tiny, digest 0123456789abcdef |",
         "| frames | test at 40x32 |",
         "| seed | 5 |",
@@ -52,35 +54,74 @@ def test_the_page_says_how_it_was_made_and_where_its_figures_come_from(page, sto
 
 def test_every_row_of_every_table_has_as_many_cells_as_its_heading(page):
     tables = re.findall(r"(?:^\|.*\|\n)+", page.read_text(), re.MULTILINE)
-    assert len(tables) == 6
+    assert len(tables) == 5
     for table in tables:
         assert len({line.count("|") for line in table.splitlines()}) == 1
 
 
 def test_a_page_is_written_over_an_earlier_one_and_leaves_nothing_else(page, store, stored_run):
     before = {path: path.read_bytes() for path in page.parent.rglob("*") if path.is_file()}
-    (page.parent / "pictures" / "run7-0042-truth.png").write_bytes(b"of an earlier page")
-    write_page(store, [stored_run], page.parent)
+    (page.parent / "pictures" / "frames-7-0042-0.png").write_bytes(b"of an earlier page")
+    write_page(store, {stored_run: "offset"}, page.parent)
     after = {path: path.read_bytes() for path in page.parent.rglob("*") if path.is_file()}
     assert after == before
 
 
 def test_a_run_that_is_not_there_is_named(store, tmp_path):
     with pytest.raises(SteerbenchError, match="no run 'nonesuch'"):
-        write_page(store, ["nonesuch"], tmp_path / "page")
+        write_page(store, {"nonesuch": "none"}, tmp_path / "page")
     assert not (tmp_path / "page").exists()
 
 
 def test_a_folder_that_cannot_be_written_is_named(store, stored_run, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(SteerbenchError, match="file"):
-        write_page(store, [stored_run], tmp_path / "file" / "page")
+        write_page(store, {stored_run: "offset"}, tmp_path / "file" / "page")
+
+
+def test_a_page_of_several_runs_has_all_of_them_beside_each_other(several, tmp_path):
+    store, labels = several
+    page = write_page(store, labels, tmp_path / "page", {"gone": "no memory"})
+    text = page.read_text()
+    assert text.startswith("# 6 runs on tiny\n")
+    assert len(linked(page)) == 1 + 3 * 2  # the bars, then three frames, at most four runs in each
+    assert {path.resolve() for path in (page.parent / "pictures").iterdir()} == {
+        path.resolve() for path in linked(page)
+    }
+    assert "gone: failed: no memory" in text
+    for key, label in labels.items():
+        assert f"\n| {label} |" in text
+        assert f"## {label}, run {key}" in text
+        assert f"| run, {label} | {key} |" in text
+
+
+def test_provenance_tells_once_what_all_runs_have_in_common(several, tmp_path):
+    text = write_page(*several, tmp_path / "page").read_text()
+    assert text.count("steerbench run method=offset") == 1
+    assert text.count("| seed | 5 |") == 1
+    assert "| machine, copy 4 | another," in text
+
+
+def test_runs_of_different_frames_are_not_put_into_one_picture(several, tmp_path):
+    store, labels = several
+    key, other = list(labels)[:2]
+    record = json.loads((store.folder / other / "record.json").read_text())
+    record["scene"]["digest"] = "of another scene"
+    (store.folder / other / "record.json").write_text(json.dumps(record))
+    page = write_page(store, {key: "one", other: "two"}, tmp_path / "page")
+    assert len(linked(page)) == 1 + 2 * 3
+    assert "**" not in page.read_text()
 
 
 def test_a_bar_per_run_is_as_long_as_its_stages_together(rows, tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(figures.Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
-    figures.stage_bars(rows, tmp_path / "bars.png")
+    other = rows[rows["metric"] != "stage_ms.other"]
+    runs = [Run(str(i), f"run {i}", r, r, {}, tmp_path) for i, r in enumerate((rows, other))]
+    figures.stage_bars(runs, tmp_path / "bars.png")
     (axes,) = drawn[0].axes
-    assert sum(bar.get_width() for bar in axes.patches) == 200.0
-    assert axes.patches[1].get_x() == axes.patches[0].get_width() == 150.0
+    field, rest = axes.containers
+    assert [bar.get_width() for bar in field] == [150.0, 150.0]
+    assert [bar.get_width() for bar in rest] == [50.0, 0.0]
+    assert [bar.get_x() for bar in rest] == [150.0, 150.0]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["run 0", "run 1"]

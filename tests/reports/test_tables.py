@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import pandas as pd
 import pytest
 
 from reports import tables
@@ -52,19 +51,15 @@ def test_memory_is_in_decimal_megabytes(rows):
     }
 
 
-def test_overview_has_one_line_per_run_in_their_order(rows):
-    other = rows.assign(run="another-run-of-it", method="nerf")
-    other.loc[other["metric"] == "ssim", "value"] = math.nan
-    table = tables.overview(pd.concat([rows, other]))
-    assert [line[0] for line in table.lines] == ["ngp (01234567)", "nerf (another-)"]
-    assert [line[table.columns.index("SSIM ↑")] for line in table.lines] == ["0.9877", "n/a"]
-    assert table.lines[0][-4:] == ("200.0", "5.00", "25.20", "61")
-
-
 @pytest.mark.parametrize(("figures", "rule"), [(True, "| --- | ---: |"), (False, "| --- | --- |")])
 def test_markdown_sets_figures_to_the_right_and_text_to_the_left(figures, rule):
     table = tables.Table("A title", ("name", "what"), (("a", "1"), ("b", "2")), figures)
     assert table.markdown().splitlines() == ["| name | what |", rule, "| a | 1 |", "| b | 2 |"]
+
+
+def test_markdown_sets_what_stands_out_in_bold_and_keeps_bars_in_their_cells():
+    table = tables.Table("", ("name", "what"), (("a|b", "1"), ("c", "2")), bold=frozenset({(1, 1)}))
+    assert table.markdown().splitlines()[2:] == ["| a\\|b | 1 |", "| c | **2** |"]
 
 
 @pytest.mark.parametrize(

@@ -82,6 +82,86 @@ def test_a_job_that_fails_does_not_take_the_sweep_along(run, tmp_path):
     assert len(stored(tmp_path)) == 2
 
 
+def test_a_sweep_ends_with_one_table_of_all_its_jobs(run):
+    outcome = run("-m", "method=grey,dark", "seed=0,1")
+    assert outcome.out.count("Comparison") == 1
+    lines = outcome.out.splitlines()
+    for label in ("grey (seed=0)", "grey (seed=1)", "dark (seed=0)", "dark (seed=1)"):
+        assert len([line for line in lines if label in line]) == 1
+    assert "Time of a frame" not in outcome.out
+
+
+def test_every_job_says_how_good_it_is_and_how_far_the_sweep(run):
+    told = run("-m", "method=grey,dark").err.splitlines()
+    assert told[0].startswith("grey: 6.05 dB, ")
+    assert "; 1 of 2 jobs done, about 0:00:0" in told[0]
+    # Grey 0.25 rounds to 64/255: PSNR = -20 log10(191 / 255) = 2.51 dB.
+    assert told[1].startswith("dark: 2.51 dB, ")
+    assert told[1].endswith("; 2 of 2 jobs done")
+
+
+def test_a_failed_job_stands_in_the_table_and_on_the_page(run, tmp_path):
+    outcome = run("-m", "method.level=0.5,7", "report=page")
+    assert outcome.status == 2
+    for text in (outcome.out, (tmp_path / "page/report.md").read_text()):
+        assert "grey (level=7): failed: method.level: expected 0 to 1, got 7" in text
+        assert "6.05" in text
+
+
+def test_a_sweep_whose_jobs_all_fail_has_a_table_and_no_page(run, tmp_path):
+    outcome = run("-m", "method.level=7,8", "report=page")
+    assert outcome.status == 2
+    assert outcome.out.count("failed: method.level") == 2
+    assert not (tmp_path / "page").exists()
+
+
+def test_a_sweep_writes_one_page_about_all_its_jobs(run, tmp_path):
+    outcome = run("-m", "method=grey,dark", "report=page")
+    assert outcome.status == 0
+    assert outcome.err.count("report: ") == 1
+    text = (tmp_path / "page/report.md").read_text()
+    assert text.startswith("# grey, dark on white")
+    assert len(list((tmp_path / "page/pictures").iterdir())) == 1 + 2  # the bars, two frames
+
+
+def test_a_folder_named_after_what_is_swept_gets_a_page_of_its_own(run, tmp_path):
+    run("-m", "scene.frames=2,3", "seed=0,1", "report=pages/${scene.frames}")
+    for frames in (2, 3):
+        text = (tmp_path / f"pages/{frames}/report.md").read_text()
+        assert text.startswith(f"# grey (frames={frames}, seed=0), grey (frames={frames}, seed=1)")
+
+
+def test_a_second_sweep_is_read_from_the_store_and_knows_nothing_of_the_first(run, tmp_path):
+    run("-m", "seed=0,1,2")
+    again = run("-m", "seed=0,1")
+    assert "seed=2" not in again.out
+    assert "about" not in again.err
+    assert len(stored(tmp_path)) == 3
+    assert len(list((tmp_path / "outputs/sweeps").iterdir())) == 2
+
+
+@pytest.mark.parametrize(
+    ("overrides", "methods"), [([], ["grey", "dark"]), (["method=dark"], ["dark"])]
+)
+def test_an_experiment_may_be_a_sweep_that_what_is_typed_narrows_down(
+    steerbench, tmp_path, overrides, methods
+):
+    configs = ["--config-dir", str(Path(__file__).parent / "configs")]
+    outcome = steerbench("run", *configs, "+experiment=greys", *overrides)
+    assert outcome.status == 0
+    assert f"{len(methods)} of {len(methods)} jobs done" in outcome.err
+    text = (tmp_path / "outputs/greys/report.md").read_text()
+    assert text.startswith(f"# {', '.join(methods)} on white")
+
+
+def test_a_sweep_that_cannot_begin_is_one_line(run, tmp_path):
+    outcome = run("-m", "seed=0,1", "sed=1")
+    assert outcome.status == 2
+    assert outcome.out == ""
+    assert "Did you mean seed" in outcome.err
+    assert stored(tmp_path) == []
+
+
 def test_an_error_is_one_line_and_stores_nothing(run, tmp_path):
     outcome = run("method.level=7")
     assert outcome.status == 2

@@ -1,0 +1,72 @@
+"""Several runs in one table: a line each, the best in bold, and only among what is comparable."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from reports.comparison import comparison
+from reports.runs import Run
+
+FACTS = dict.fromkeys(("split", "trajectory", "budget", "protocol", "device"), "same")
+MACHINE = {"cpu": "EPYC", "gpus": []}
+
+
+@pytest.fixture
+def make(rows):
+    """Makes a run with the figures of `rows`, some of them changed."""
+
+    def make_run(label: str, *, cpu: str = "EPYC", digest: str = "d", **changed: float) -> Run:
+        kept = rows["value"].where(~rows["metric"].isin(list(changed)), rows["metric"].map(changed))
+        own = rows.assign(value=kept, **FACTS)
+        record = {"machine": {**MACHINE, "cpu": cpu}, "scene": {"digest": digest}}
+        return Run(label, label, own, pd.DataFrame({"frame": [0]}), record, Path())
+
+    return make_run
+
+
+def bold(table) -> set[tuple[str, str]]:
+    """Label and column of every bold cell."""
+    return {(table.lines[row][0], table.columns[column]) for row, column in table.bold}
+
+
+def test_every_run_has_a_line_with_quality_speed_size_and_training(make):
+    table = comparison([make("ngp"), make("nerf", ssim=math.nan)], {})
+    assert table.columns[1:4] == ("PSNR, dB ↑", "SSIM ↑", "LPIPS alex ↓")
+    assert table.columns[4:] == ("ms / frame ↓", "FPS ↑", "model, MB ↓", "training, s ↓")
+    assert table.lines[0] == ("ngp", "30.46", "0.9877", "n/a", "200.0", "5.00", "25.20", "61")
+    assert table.lines[1][:3] == ("nerf", "30.46", "n/a")
+
+
+def test_the_best_is_the_highest_or_the_lowest_as_the_arrow_says(make):
+    table = comparison([make("slow", psnr=31.0, frame_ms=300.0), make("fast", psnr=29.0)], {})
+    assert ("slow", "PSNR, dB ↑") in bold(table)
+    assert ("fast", "ms / frame ↓") in bold(table)
+    assert not {("fast", "PSNR, dB ↑"), ("slow", "ms / frame ↓")} & bold(table)
+
+
+def test_figures_that_read_alike_are_equally_good(make):
+    table = comparison([make("a", psnr=31.001), make("b", psnr=31.002)], {})
+    assert {("a", "PSNR, dB ↑"), ("b", "PSNR, dB ↑")} <= bold(table)
+
+
+def test_what_could_not_be_had_is_never_the_best(make):
+    table = comparison([make("a"), make("b")], {})
+    assert "LPIPS alex ↓" not in {column for _, column in bold(table)}
+
+
+def test_one_run_or_runs_of_different_kinds_have_no_best(make):
+    other_protocol = make("c")
+    other_protocol = replace(other_protocol, rows=other_protocol.rows.assign(protocol="quick"))
+    runs = [make("a"), make("b", cpu="Xeon"), other_protocol, make("d", digest="other")]
+    assert bold(comparison(runs, {})) == set()
+
+
+def test_a_failure_is_a_line_that_tells_its_reason(make):
+    table = comparison([make("a")], {"b (level=7)": "expected 0 to 1"})
+    assert table.lines[1][0] == "b (level=7): failed: expected 0 to 1"
+    assert {len(line) for line in table.lines} == {len(table.columns)}

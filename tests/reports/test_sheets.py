@@ -1,0 +1,57 @@
+"""The picture of a frame: the right part enlarged, every run in it, nothing cut off."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from reports.sheets import View, find_detail, write_sheet
+
+HEIGHT, WIDTH = 64, 96
+
+
+def flat(level: int) -> np.ndarray:
+    return np.full((HEIGHT, WIDTH, 3), level, dtype=np.uint8)
+
+
+def with_spot(level: int, top: int, left: int) -> np.ndarray:
+    """A flat picture with 4 x 4 pixels of another level."""
+    picture = flat(level)
+    picture[top : top + 4, left : left + 4] = 255 - level
+    return picture
+
+
+@pytest.mark.parametrize(("top", "left"), [(30, 50), (0, 0), (60, 92)])
+def test_the_detail_holds_what_differs_and_stays_within_the_picture(top, left):
+    detail = find_detail(flat(255), [flat(0), with_spot(0, top, left)])
+    x0, y0, x1, y1 = detail.box
+    assert 0 <= x0 <= left < left + 4 <= x1 <= WIDTH
+    assert 0 <= y0 <= top < top + 4 <= y1 <= HEIGHT
+    assert (x1 - x0, y1 - y0) == (WIDTH // 4, HEIGHT // 4)
+    assert "renderings differ" in detail.where
+
+
+def test_of_a_single_rendering_the_detail_is_where_it_is_wrong():
+    detail = find_detail(flat(0), [with_spot(0, 30, 50)])
+    assert detail.box[0] <= 50 < detail.box[2]
+    assert "error" in detail.where
+
+
+def test_where_nothing_differs_the_detail_is_the_middle():
+    box = find_detail(flat(9), [flat(0), flat(0)]).box
+    assert (box[0] + box[2], box[1] + box[3]) == (WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize(("runs", "columns", "lines"), [(1, 3, 2), (2, 3, 3), (4, 5, 3)])
+def test_a_sheet_has_a_place_for_every_picture(tmp_path, runs, columns, lines):
+    views = [View(("a", "b"), flat(50 * number), flat(7)) for number in range(runs)]
+    detail = find_detail(flat(255), [view.rendering for view in views])
+    write_sheet(flat(255), views, detail, "absolute error", tmp_path / "sheet.png")
+    with Image.open(tmp_path / "sheet.png") as sheet:
+        pixels = np.asarray(sheet)
+    panel = (3 * HEIGHT, 3 * WIDTH)  # small pictures are enlarged by a whole number
+    assert columns * panel[1] < pixels.shape[1] < (columns + 1) * panel[1]
+    assert lines * panel[0] < pixels.shape[0] < (lines + 1) * panel[0]
+    for number in range(runs):
+        assert np.count_nonzero((pixels == 50 * number).all(axis=-1)) > panel[0] * panel[1]
