@@ -71,7 +71,8 @@ def _heading(runs: Sequence[Run], failures: Mapping[str, str]) -> str:
     labels = ", ".join(run.label for run in runs) if len(runs) <= BESIDE else f"{len(runs)} runs"
     scenes = ", ".join(dict.fromkeys(run.facts["scene"] for run in runs))
     table = comparison(runs, failures)
-    reading = "Arrows point to better; means over all frames of the trajectory."
+    frames = " / ".join(dict.fromkeys(str(len(run.frames)) for run in runs))
+    reading = f"Arrows point to better. Quality and time are means over {frames} frames."
     if table.bold:
         reading += (
             " The best figure of each column is **bold**, among runs with the same frames, protocol"

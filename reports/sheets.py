@@ -77,14 +77,13 @@ def write_sheet(
     pictures = [truth, *(view.rendering for view in views)]
     maps = [view.error for view in views]
     titles: list[tuple[str, ...]] = [("ground truth",), *(view.titles for view in views)]
+    enlarged = f"detail, {ZOOM} times enlarged, where {detail.where}"
     if len(views) == 1:
-        pictures, maps, titles = [*pictures, *maps], [], [*titles, ("error map", errors)]
+        pictures, maps, titles = [*pictures, *maps], [], [*titles, ("error map",)]
+        enlarged += f"; error map: {errors}"
     bands = [
         Band("", [_whole(picture, detail) for picture in pictures]),
-        Band(
-            f"detail, {ZOOM} times enlarged, where {detail.where}",
-            [_part(picture, detail) for picture in pictures],
-        ),
+        Band(enlarged, [_part(picture, detail) for picture in pictures]),
     ]
     if maps:
         bands.append(Band(f"error maps: {errors}", [None, *(_whole(m, detail) for m in maps)]))
