@@ -71,8 +71,11 @@ def _heading(runs: Sequence[Run], failures: Mapping[str, str]) -> str:
     labels = ", ".join(run.label for run in runs) if len(runs) <= BESIDE else f"{len(runs)} runs"
     scenes = ", ".join(dict.fromkeys(run.facts["scene"] for run in runs))
     table = comparison(runs, failures)
-    frames = " / ".join(dict.fromkeys(str(len(run.frames)) for run in runs))
-    reading = f"Arrows point to better. Quality and time are means over {frames} frames."
+    scored, timed = (
+        " / ".join(dict.fromkeys(str(run.frames[column].count()) for run in runs))
+        for column in ("psnr", "frame_ms")
+    )
+    reading = f"Arrows point to better. Quality is a mean over {scored} frames, time over {timed}."
     if table.bold:
         reading += (
             " The best figure of each column is **bold**, among runs with the same frames, protocol"
@@ -111,7 +114,8 @@ def _frames(runs: Sequence[Run], stem: str, folder: Path) -> Iterator[str]:
         views = [_view(run, frame) for run in runs]
         detail = find_detail(truth, [view.rendering for view in views])
         name = runs[0].frames.set_index("frame")["name"][int(frame)]
-        yield f"### {runs[0].facts['scene']}, {name}, frame {int(frame)} of {len(runs[0].frames)}"
+        place = f"frame {int(frame) + 1} of {len(runs[0].frames)}"
+        yield f"### {runs[0].facts['scene']}, {name}, {place}"
         for first in range(0, len(views), BESIDE):
             file = f"{stem}-{frame}-{first}.png"
             beside = views[first : first + BESIDE]
