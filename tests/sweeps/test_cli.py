@@ -25,7 +25,13 @@ def test_without_a_command_the_help_shows_every_command_and_examples(steerbench)
 def test_help_of_run_lists_choices_settings_and_examples(run):
     outcome = run("--help")
     assert outcome.status == 0
-    for text in ("steerbench run -m seed=0,1,2", "method: grey", "totem", "seed: 0", "-sc install"):
+    for text in (
+        "steerbench run -m seed=0,1,2",
+        "method: dark, grey",
+        "totem",
+        "seed: 0",
+        "-sc install",
+    ):
         assert text in outcome.out
 
 
