@@ -26,6 +26,7 @@ class InstantNgp:
     """
 
     name = "ngp"
+    memory = 0
 
     def __init__(
         self,
