@@ -7,11 +7,17 @@ from pathlib import Path
 import pandas as pd
 from matplotlib.figure import Figure
 
+from reports.tables import headline
+
 STAGE = "stage_ms."
 
 
 def stage_bars(rows: pd.DataFrame, path: Path) -> None:
-    """Write a PNG: one bar per run, its mean frame time in ms divided into stages."""
+    """Write a PNG: one bar per run, its mean frame time in ms divided into stages.
+
+    The frames are those of the headline: steady ones, where a run has any.
+    """
+    rows = headline(rows)
     stages = rows[rows["metric"].str.startswith(STAGE)]
     runs = list(dict.fromkeys(stages["run"]))
     figure = Figure(figsize=(8, 0.9 + 0.5 * len(runs)), layout="constrained")

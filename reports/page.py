@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from bench.results import Store, explained
+from bench.results import COLD, Store, explained
 from reports import figures, tables
 
 PANELS = {"truth": "ground truth", "rendered": "rendering", "error": "error"}
@@ -95,11 +95,15 @@ def _copy_pictures(source: Path, target: Path, prefix: str) -> dict[int, str]:
 
 def _pictures(frames: pd.DataFrame, shown: Mapping[int, str]) -> tables.Table:
     """One line per shown frame: name and PSNR, ground truth, rendering, error map."""
+
+    def caption(row: Mapping[str, Any]) -> str:
+        return f"{row['name']}, {row['psnr']:.2f} dB{', cold' if row['phase'] == COLD else ''}"
+
     by_frame = frames.set_index("frame").to_dict("index")
     lines = tuple(
         (
-            f"{by_frame[frame]['name']}, {by_frame[frame]['psnr']:.2f} dB",
-            *(f"![{caption}](pictures/{stem}-{panel}.png)" for panel, caption in PANELS.items()),
+            caption(by_frame[frame]),
+            *(f"![{what}](pictures/{stem}-{panel}.png)" for panel, what in PANELS.items()),
         )
         for frame, stem in shown.items()
     )

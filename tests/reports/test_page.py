@@ -50,6 +50,16 @@ def test_the_page_says_how_it_was_made_and_where_its_figures_come_from(page, sto
         assert fact in text
 
 
+def test_a_picture_of_a_cold_frame_says_so(store, stored_run, tmp_path):
+    frames = store.frames(stored_run)
+    frames.loc[0, "phase"] = "cold"
+    frames.to_csv(store.folder / stored_run / "frames.csv", index=False)
+    captions = re.findall(
+        r"^\| (r_\d.*?) \|", write_page(store, [stored_run], tmp_path).read_text(), re.M
+    )
+    assert [caption.endswith(" dB, cold") for caption in captions] == [True, False, False]
+
+
 def test_every_row_of_every_table_has_as_many_cells_as_its_heading(page):
     tables = re.findall(r"(?:^\|.*\|\n)+", page.read_text(), re.MULTILINE)
     assert len(tables) == 6
@@ -77,10 +87,11 @@ def test_a_folder_that_cannot_be_written_is_named(store, stored_run, tmp_path):
         write_page(store, [stored_run], tmp_path / "file" / "page")
 
 
-def test_a_bar_per_run_is_as_long_as_its_stages_together(rows, tmp_path, monkeypatch):
+@pytest.mark.parametrize("of", ["rows", "rows_with_cold"])
+def test_a_bar_per_run_is_as_long_as_its_stages_together(of, request, tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(figures.Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
-    figures.stage_bars(rows, tmp_path / "bars.png")
+    figures.stage_bars(request.getfixturevalue(of), tmp_path / "bars.png")
     (axes,) = drawn[0].axes
     assert sum(bar.get_width() for bar in axes.patches) == 200.0
     assert axes.patches[1].get_x() == axes.patches[0].get_width() == 150.0

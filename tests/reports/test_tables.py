@@ -61,6 +61,42 @@ def test_overview_has_one_line_per_run_in_their_order(rows):
     assert table.lines[0][-4:] == ("200.0", "5.00", "25.20", "61")
 
 
+def test_cold_frames_stand_apart_and_are_called_so(rows, rows_with_cold):
+    quality, time, cold_quality, cold_time, memory = tables.blocks(rows_with_cold)
+    assert [quality, time, memory] == tables.blocks(rows)
+    assert cold_quality.title == "Quality, cold, mean of 2 frames"
+    assert cells(cold_quality)["PSNR, dB ↑"] == ("27.46", "26.50 – 28.50")
+    assert cold_time.title == "Time of a frame, cold"
+    assert cells(cold_time)["field"] == ("300.00", "75.0 %")
+
+
+def test_overview_gives_cold_frames_a_line_below_the_headline(rows, rows_with_cold):
+    steady, cold = tables.overview(rows_with_cold).lines
+    assert (steady,) == tables.overview(rows).lines
+    assert cold[0] == "ngp (01234567), cold"
+    assert cold[2] == "27.46"
+    assert cold[-4:] == ("400.0", "2.50", "25.20", "61")
+
+
+def test_a_run_of_cold_frames_alone_says_so(rows_with_cold):
+    cold = rows_with_cold[rows_with_cold["phase"] != "steady"]
+    titles = [table.title for table in tables.blocks(cold)]
+    assert titles == ["Quality, cold, mean of 2 frames", "Time of a frame, cold", "Memory"]
+    assert [line[0] for line in tables.overview(cold).lines] == ["ngp (01234567), cold"]
+
+
+def test_the_headline_is_steady_where_a_run_has_steady_frames(rows, rows_with_cold):
+    pd.testing.assert_frame_equal(tables.headline(rows_with_cold), rows)
+    cold = rows_with_cold[rows_with_cold["phase"] != "steady"]
+    pd.testing.assert_frame_equal(tables.headline(cold), cold)
+
+
+def test_flicker_is_shown_where_there_is_any(rows):
+    flicker = rows[rows["metric"] == "psnr"].assign(metric="flicker", value=0.01234)
+    shown = tables.blocks(pd.concat([rows, flicker]))[0]
+    assert cells(shown)["flicker ↓"][0] == "0.0123"
+
+
 @pytest.mark.parametrize(("figures", "rule"), [(True, "| --- | ---: |"), (False, "| --- | --- |")])
 def test_markdown_sets_figures_to_the_right_and_text_to_the_left(figures, rule):
     table = tables.Table("A title", ("name", "what"), (("a", "1"), ("b", "2")), figures)
