@@ -68,7 +68,7 @@ def render_batch(
     rays: Rays,
     occupancy: Occupancy,
     jitter: Tensor | None,
-    background: Tensor,
+    background: Tensor | None,
     *,
     stop: float = STOP,
 ) -> tuple[Pixels, int]:
@@ -79,7 +79,7 @@ def render_batch(
 
     Args:
         jitter: [R] phase of the samples of each ray, in [0, 1); None: as `render_rays`.
-        background: [K] or [R, K].
+        background: [K] or [R, K]; None: not composited on any.
         stop: transmittance at which a ray ends.
     """
     samples = march(
@@ -139,19 +139,27 @@ class FeatureFrame:
     depth: Tensor
     alpha: Tensor
 
+    @classmethod
+    def of(cls, camera: Camera, pixels: Pixels, background: Tensor) -> FeatureFrame:
+        """From all pixels of `camera`, not yet composited on `background` [K]."""
+        values = pixels.values + (1 - pixels.alpha)[:, None] * background
+        seen = pixels.alpha > EMPTY_ALPHA
+        depth = torch.where(seen, pixels.depth_sum / pixels.alpha, torch.inf)
+        shape = (camera.height, camera.width)
+        return cls(camera, values.view(*shape, -1), depth.view(shape), pixels.alpha.view(shape))
+
 
 @torch.no_grad()
-def render_frame(
+def render_pixels(
     field: HashField,
     camera: Camera,
     occupancy: Occupancy,
-    background: Tensor,
     probe: Probe,
     *,
     stop: float = STOP,
     window: Tensor | None = None,
-) -> FeatureFrame:
-    """Render the picture of `camera` over `background` [K].
+) -> Pixels:
+    """All pixels of `camera`, row by row, not composited on a background.
 
     Args:
         window: [h, w, 2] nearest and farthest z-depth to look at; None: all.
@@ -159,20 +167,14 @@ def render_frame(
     device, size = field.table.device, camera.height * camera.width
     with probe.stage("rays"):
         camera = replace(camera, c2w=camera.c2w.to(device))
-        pixels, rays = rays_at_matter(camera, occupancy)
+        seen, rays = rays_at_matter(camera, occupancy)
         canvas = Pixels.blank(size, field.channels, device)
-        limits = None if window is None else window.view(-1, 2)[pixels]
-    probe.count("rays", len(pixels), size)
+        limits = None if window is None else window.view(-1, 2)[seen]
+    probe.count("rays", len(seen), size)
     rendered = render_rays(field, rays, occupancy, probe, stop=stop, window=limits)
     with probe.stage("finish"):
-        canvas.put(pixels, rendered)
-        values = canvas.values + (1 - canvas.alpha)[:, None] * background
-        seen = canvas.alpha > EMPTY_ALPHA
-        depth = torch.where(seen, canvas.depth_sum / canvas.alpha, torch.inf)
-    shape = (camera.height, camera.width)
-    return FeatureFrame(
-        camera, values.view(*shape, -1), depth.view(shape), canvas.alpha.view(shape)
-    )
+        canvas.put(seen, rendered)
+        return canvas
 
 
 @torch.no_grad()
