@@ -95,19 +95,20 @@ def _copy_pictures(source: Path, target: Path, prefix: str) -> dict[int, str]:
 
 def _pictures(frames: pd.DataFrame, shown: Mapping[int, str]) -> tables.Table:
     """One line per shown frame: name and PSNR, ground truth, rendering, error map."""
-
-    def caption(row: Mapping[str, Any]) -> str:
-        return f"{row['name']}, {row['psnr']:.2f} dB{', cold' if row['phase'] == COLD else ''}"
-
     by_frame = frames.set_index("frame").to_dict("index")
     lines = tuple(
         (
-            caption(by_frame[frame]),
-            *(f"![{what}](pictures/{stem}-{panel}.png)" for panel, what in PANELS.items()),
+            _caption(by_frame[frame]),
+            *(f"![{caption}](pictures/{stem}-{panel}.png)" for panel, caption in PANELS.items()),
         )
         for frame, stem in shown.items()
     )
     return tables.Table("Pictures", ("frame", *PANELS.values()), lines, figures=False)
+
+
+def _caption(frame: Mapping[Any, Any]) -> str:
+    cold = ", cold" if frame["phase"] == COLD else ""
+    return f"{frame['name']}, {frame['psnr']:.2f} dB{cold}"
 
 
 def _provenance(row: pd.Series, record: Mapping[str, Any]) -> tables.Table:

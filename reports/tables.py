@@ -3,8 +3,8 @@
 Units are those of the field: dB, milliseconds, MB = 10^6 bytes. Every LPIPS column names its
 network. A figure that could not be had reads `n/a`.
 
-The headline of a run are its steady frames. Where a method also rendered frames with less to look
-back on than it can use, these stand apart and are called cold.
+The headline figures of a run are those of its steady frames. Where a method also rendered frames
+with less to look back on than it can use, these stand apart and are called cold.
 """
 
 from __future__ import annotations
