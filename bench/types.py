@@ -125,16 +125,20 @@ class Budget:
         steps: optimiser steps of the (pre-)training of a field.
         samples: field samples with a gradient that a step aims at; the rays follow from it.
         frames: at most this many test frames are rendered and scored (0: all).
+        renderer_steps: optimiser steps of the second stage, for methods with a 2D renderer.
     """
 
     name: str
     steps: int
     samples: int
     frames: int = 0
+    renderer_steps: int = 1
 
     def __post_init__(self) -> None:
-        if not (self.steps >= 1 and self.samples >= 1 and self.frames >= 0):
-            raise ValueError(f"expected steps >= 1, samples >= 1 and frames >= 0: {self}")
+        if min(self.steps, self.samples, self.renderer_steps) < 1 or self.frames < 0:
+            raise ValueError(
+                f"expected steps, samples and renderer_steps >= 1, frames >= 0: {self}"
+            )
 
 
 class Log(Protocol):

@@ -21,9 +21,10 @@ def write(path: Path, tensors: Mapping[str, Tensor], figures: Mapping[str, float
     Raises:
         SteerbenchError: the disk refuses.
     """
+    packed = {name: tensor.contiguous() for name, tensor in tensors.items()}
     temporary = path.with_suffix(f".{os.getpid()}.tmp")
     try:
-        save_file(dict(tensors), temporary, {"training": json.dumps(figures)})
+        save_file(packed, temporary, {"training": json.dumps(figures)})
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
         temporary.replace(path)

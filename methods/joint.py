@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -23,6 +23,9 @@ from methods.pipeline import Pipeline, View
 from methods.renderer2d import Observation, Reprojected
 from methods.sequences import MotionOptions, Sequence, SequencePool
 from methods.volume import FeatureFrame, rays_at_matter, render_batch
+
+
+Tensors = tuple[Tensor, ...] | list[Tensor]
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ class JointOptions:
     average: float = 0.999
     distilled_views: int = 100
     distilled_share: float = 0.3
-    motion: MotionOptions = field(default_factory=MotionOptions)
+    motion: MotionOptions = MotionOptions()
 
     def __post_init__(self) -> None:
         if not (self.rate > 0 and self.field_rate > 0 and 0 < self.final_rate <= 1):
@@ -255,7 +258,7 @@ class JointTraining:
             )
 
     @torch.no_grad()
-    def _average(self, mean: list[Tensor], new: list[Tensor], count: Tensor | int) -> None:
+    def _average(self, mean: Tensors, new: Tensors, count: Tensor | int) -> None:
         # In the beginning, over fewer steps: the first weights are not worth remembering.
         keep = min(self.options.average, (1 + int(count)) / (10 + int(count)))
         torch._foreach_lerp_(mean, new, 1 - keep)

@@ -1,4 +1,4 @@
-"""The loop of every training: progress, checkpoints, going on after a kill, the guard against NaN."""
+"""The loop of every training: progress, checkpoints, going on after a kill, guards."""
 
 from __future__ import annotations
 

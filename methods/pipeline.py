@@ -8,7 +8,7 @@ renderer2d            the 2D neural renderer                                 Eq.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 
 import torch
@@ -48,8 +48,8 @@ class PipelineOptions:
     channels: int = 6
     frames: int = 2
     scale: int = 4
-    range: RangeReduction = field(default_factory=RangeReduction)
-    reprojection: Reprojection = field(default_factory=Reprojection)
+    range: RangeReduction = RangeReduction()
+    reprojection: Reprojection = Reprojection()
     history: bool = True
     jitter: bool = False
     feature_background: float = 0.5

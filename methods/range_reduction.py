@@ -1,4 +1,4 @@
-"""Range reduction: a preceding frame's depth says where along a ray to look (SteerNeRF, Eq. 6 to 8)."""
+"""Range reduction: where a preceding depth says that a ray should look (SteerNeRF Eq. 6 to 8)."""
 
 from __future__ import annotations
 

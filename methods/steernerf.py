@@ -1,4 +1,4 @@
-"""SteerNeRF (Li et al. 2022) as a `bench.types.Method`: trained in two stages, rendered in sequence."""
+"""SteerNeRF (Li et al. 2022), as a `bench.types.Method`."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class SteerNerf:
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Train both stages, or load what the same trainings left behind."""
-        device, seed, options = self.setup.device, self.setup.seed, self.options
+        seed, options = self.setup.seed, self.options
         trained = pretrain(self.setup, scene, budget, log)
         key = self.setup.key(scene, budget)
         target = scene.bounds.mean(dim=0)
@@ -125,7 +125,7 @@ class SteerNerf:
         device, options = self.setup.device, self.options
         torch.manual_seed(self.setup.seed)  # of the renderer's weights
         renderer = self.make_renderer(options.channels, options.frames, options.scale)
-        renderer = renderer.to(device, memory_format=torch.channels_last)
+        renderer = renderer.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         pipeline = Pipeline(
             trained.field, trained.occupancy, scene.background.to(device), renderer, options
         )
