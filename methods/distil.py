@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -12,8 +13,8 @@ from bench.motion import novel_view
 from bench.types import Camera, Log, NullProbe, Scene
 from methods import checkpoint
 from methods.pretrained import Pretrained
+from methods.range_reduction import render_guided
 from methods.sequences import TrueView
-from methods.volume import FeatureFrame, render_pixels
 
 INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height")
 
@@ -50,9 +51,11 @@ def distilled_views(
 
 def _picture(trained: Pretrained, camera: Camera, background: Tensor) -> Tensor:
     """uint8 [H, W, 3]."""
-    background = background.to(trained.field.table.device)
-    pixels = render_pixels(trained.field, camera, trained.occupancy, NullProbe())
-    rgb = FeatureFrame.of(camera, pixels, background).values
+    device = trained.field.table.device
+    camera = replace(camera, c2w=camera.c2w.to(device))
+    rgb = render_guided(
+        trained.field, camera, trained.occupancy, background.to(device), NullProbe(), None
+    ).values
     return (rgb.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
 
 

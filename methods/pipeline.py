@@ -143,7 +143,6 @@ class Pipeline:
                 self.background,
                 probe,
                 found,
-                repair=options.range.mode == "window",
                 stop=options.stop,
             )
 

@@ -9,16 +9,18 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.cameras import cast, pixel_grid
-from bench.types import Camera, Probe
+from bench.types import Camera, Probe, Rays
 from methods.buffer import Cloud, Reprojection
 from methods.fields import HashField
-from methods.kernels.composite import STOP
+from methods.kernels.composite import STOP, Pixels
 from methods.kernels.march import Occupancy
-from methods.volume import FeatureFrame, render_pixels, render_rays
+from methods.volume import FeatureFrame, rays_at_matter, render_rays
 
 KEPT_ALPHA = 0.95
-"""A ray whose window leaves less than this share of the opacity it had is marched in full."""
+"""Share of the expected opacity at which a ray has found what was to be expected."""
+
+EDGE = 2.0
+"""Depths within a neighbourhood that differ by more than this many epsilons are those of an edge."""
 
 
 @dataclass(frozen=True)
@@ -26,10 +28,10 @@ class RangeReduction:
     """Where along a ray to look for a surface, given the newest preceding frame.
 
     Attributes:
-        mode: "off": everywhere. "paper": within `epsilon` of the depth reprojected onto the pixel
-            (Eq. 8). "window": within `epsilon` of the depths reprojected onto its 3 x 3
-            neighbourhood; in full at depth edges, and again in full where the window turns out to
-            have missed what was there.
+        mode: "off": everywhere. "paper": within `epsilon` of the depth reprojected onto the pixel,
+            whatever is found there (Eq. 8). "window": within `epsilon` of the depths reprojected
+            onto its 3 x 3 neighbourhood, until the ray has the opacity they had; a ray that does
+            not reach it looks behind the window as well, and one at a depth edge everywhere.
         epsilon: scene units along z.
     """
 
@@ -48,15 +50,12 @@ class Evidence:
     Attributes:
         window: [h, w, 2] nearest and farthest z-depth worth looking at; [0, inf) if unknown.
         alpha: [h, w] the opacity to expect; 0 if unknown.
+        binding: nothing else is looked at, even if there is less in the windows than expected.
     """
 
     window: Tensor
     alpha: Tensor
-
-    def missed(self, alpha: Tensor) -> Tensor:
-        """Where `alpha` [h w], found inside a narrowed window, is less than was to be expected."""
-        narrowed = self.window[..., 1].isfinite()
-        return (narrowed & (alpha.view_as(self.alpha) < KEPT_ALPHA * self.alpha)).flatten()
+    binding: bool
 
 
 def evidence(
@@ -65,11 +64,11 @@ def evidence(
     """What `cloud` tells of the depths that `camera`, a low-resolution one, will see."""
     index, depth = cloud.land(camera, reprojection, backend)
     known = index >= 0
-    near = _at(depth, index, torch.inf)
-    far = _at(depth, index, -torch.inf)
+    near, far = _at(depth, index, torch.inf), _at(depth, index, -torch.inf)
+    alpha = _at(cloud.alpha, index, 0.0)
     if options.mode == "window":
-        near, far = -_highest(-near), _highest(far)
-        known = near.isfinite() & (far - near < 2 * options.epsilon)  # else a depth edge
+        near, far, alpha = -_highest(-near), _highest(far), _highest(alpha)
+        known = near.isfinite() & (far - near < EDGE * options.epsilon)
     window = torch.stack(
         (
             torch.where(known, near - options.epsilon, 0),
@@ -77,7 +76,7 @@ def evidence(
         ),
         dim=-1,
     )
-    return Evidence(window, _at(cloud.alpha, index, 0.0))
+    return Evidence(window, alpha, binding=options.mode == "paper")
 
 
 def _at(values: Tensor, index: Tensor, otherwise: float) -> Tensor:
@@ -99,20 +98,72 @@ def render_guided(
     probe: Probe,
     found: Evidence | None,
     *,
-    repair: bool = True,
     stop: float = STOP,
 ) -> FeatureFrame:
-    """Render a frame, looking only where a preceding one says that something is.
+    """Render a frame, looking only where `found` says that something is; None: everywhere."""
+    device, size = field.table.device, camera.height * camera.width
+    with probe.stage("rays"):
+        seen, rays = rays_at_matter(camera, occupancy)
+        canvas = Pixels.blank(size, field.channels, device)
+    probe.count("rays", len(seen), size)
+    if found is None:
+        rendered = render_rays(field, rays, occupancy, probe, stop=stop)
+    elif found.binding:
+        window = found.window.view(-1, 2)[seen]
+        rendered = render_rays(field, rays, occupancy, probe, stop=stop, window=window)
+    else:
+        window, alpha = found.window.view(-1, 2)[seen], found.alpha.flatten()[seen]
+        rendered = _render_within(field, rays, window, alpha, occupancy, probe, stop)
+    with probe.stage("finish"):
+        canvas.put(seen, rendered)
+        return FeatureFrame.of(camera, canvas, background)
 
-    Args:
-        found: what the preceding frame says; None: look everywhere.
-        repair: march rays in full where the window turns out to have missed what was there.
-    """
-    window = None if found is None else found.window
-    canvas = render_pixels(field, camera, occupancy, probe, stop=stop, window=window)
-    if found is not None and repair:
-        missed = found.missed(canvas.alpha).nonzero().squeeze(1)
-        probe.count("repaired", len(missed), len(canvas.alpha))
-        centres = pixel_grid(camera.width, camera.height, missed.device)[missed]
-        canvas.put(missed, render_rays(field, cast(camera, centres), occupancy, probe, stop=stop))
-    return FeatureFrame.of(camera, canvas, background)
+
+def _render_within(
+    field: HashField,
+    rays: Rays,
+    window: Tensor,
+    alpha: Tensor,
+    occupancy: Occupancy,
+    probe: Probe,
+    stop: float,
+) -> Pixels:
+    """Render `rays` within `window` [R, 2] where those have an end and the ray reaches `alpha` [R]
+    there; in full elsewhere."""
+    canvas = Pixels.blank(len(rays.origins), field.channels, window.device)
+    narrow = window[:, 1].isfinite().nonzero().squeeze(1)
+    expected = alpha[narrow]
+    first = render_rays(
+        field,
+        _take(rays, narrow),
+        occupancy,
+        probe,
+        stop=max(stop, 1 - KEPT_ALPHA),
+        window=window[narrow],
+    )
+    enough = first.alpha >= KEPT_ALPHA * expected
+    # What is left of the opacity looks like what was found.
+    more = torch.where(enough & (first.alpha < expected), expected / first.alpha, 1)
+    canvas.put(
+        narrow,
+        Pixels(first.values * more[:, None], first.depth_sum * more, first.alpha * more),
+    )
+    probe.count("continued", len(narrow) - int(enough.sum()), len(narrow))
+
+    open_end = torch.ones(len(window), dtype=torch.bool, device=window.device)
+    open_end[narrow[enough]] = False
+    rest = open_end.nonzero().squeeze(1)
+    far = window[rest, 1]
+    behind = torch.stack((torch.where(far.isfinite(), far, 0), far + torch.inf), dim=1)
+    carry = canvas.take(rest)
+    canvas.put(
+        rest,
+        render_rays(
+            field, _take(rays, rest), occupancy, probe, stop=stop, window=behind, carry=carry
+        ),
+    )
+    return canvas
+
+
+def _take(rays: Rays, index: Tensor) -> Rays:
+    return Rays(rays.origins[index], rays.directions[index])
