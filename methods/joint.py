@@ -20,10 +20,9 @@ from methods.buffer import Cloud
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import Pixels
 from methods.pipeline import Pipeline, View
-from methods.renderer2d import Observation, Reprojected
+from methods.renderer2d import Observation, Renderer2d, Reprojected
 from methods.sequences import MotionOptions, Sequence, SequencePool
 from methods.volume import FeatureFrame, rays_at_matter, render_batch
-
 
 Tensors = tuple[Tensor, ...] | list[Tensor]
 
@@ -109,7 +108,7 @@ class JointTraining:
     def __init__(
         self,
         pipeline: Pipeline,
-        renderer: nn.Module,
+        renderer: Renderer2d,
         pool: SequencePool,
         options: JointOptions,
         steps: int,

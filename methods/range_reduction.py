@@ -20,7 +20,7 @@ KEPT_ALPHA = 0.95
 """Share of the expected opacity at which a ray has found what was to be expected."""
 
 EDGE = 2.0
-"""Depths within a neighbourhood that differ by more than this many epsilons are those of an edge."""
+"""Depths of a neighbourhood that differ by more than this many epsilons are those of an edge."""
 
 
 @dataclass(frozen=True)

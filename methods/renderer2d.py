@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -58,14 +58,15 @@ class Observation:
     phase: tuple[float, float] = (0.0, 0.0)
 
 
-class Renderer2d(Protocol):
-    """A network that turns observations into pictures; also an `nn.Module`."""
+class Renderer2d(nn.Module, ABC):
+    """A network that turns observations into pictures."""
 
-    def __call__(self, observations: Sequence[Observation]) -> tuple[Tensor, Tensor]:
-        """Pictures [B, H, W, 3], and the [B, H, W, 3] base that the network corrected."""
+    @abstractmethod
+    def forward(self, observations: Sequence[Observation]) -> tuple[Tensor, Tensor]:
+        """Pictures [B, H, W, 3], and the base [B, H, W, 3] that the network corrected."""
 
 
-class UnetRelease(nn.Module):
+class UnetRelease(Renderer2d):
     """The U-Net of the released code (`ReconstructionNet_v4`), at full resolution.
 
     Its input are the features of all frames, zero where nothing is: those of the present one at
@@ -85,9 +86,9 @@ class UnetRelease(nn.Module):
         self.channels, self.frames, self.scale, self.aligned = channels, frames, scale, aligned
         self.first = _conv(channels * (frames + 1), 64)
         self.enter = _conv(64, 64)
-        self.half = _Residual(64)
+        self.at_half = _Residual(64)
         self.narrow = _conv(64, 128)
-        self.quarter = nn.Sequential(*(_Residual(128) for _ in range(3)))
+        self.at_quarter = nn.Sequential(*(_Residual(128) for _ in range(3)))
         self.widen_quarter = _conv(128, 512)
         self.merge_half = _conv(192, 64)
         self.half_again = _Residual(64)
@@ -123,9 +124,9 @@ class UnetRelease(nn.Module):
         # Two halvings: sizes that are no multiple of 4 are padded, and the padding cut off.
         padded = functional.pad(inputs, (0, -width % 4, 0, -height % 4))
         full = self.enter(self.first(padded)).relu()
-        half = self.half(functional.max_pool2d(full, 2)).relu()
+        half = self.at_half(functional.max_pool2d(full, 2)).relu()
         quarter = self.narrow(functional.max_pool2d(half, 2)).relu()
-        quarter = self.widen_quarter(self.quarter(quarter).relu()).relu()
+        quarter = self.widen_quarter(self.at_quarter(quarter).relu()).relu()
         quarter = functional.pixel_shuffle(quarter, 2)
         merged = self.merge_half(torch.cat((quarter, half), dim=1)).relu()
         merged = self.widen_half(self.half_again(merged)).relu()
@@ -134,7 +135,7 @@ class UnetRelease(nn.Module):
         return self.last(merged)[..., :height, :width]
 
 
-class SpaceToDepth(nn.Module):
+class SpaceToDepth(Renderer2d):
     """A network that works at low resolution throughout: s x s pixels are channels of one.
 
     A picture is the aligned bilinear enlargement of the present RGB, blended pixel by pixel with
@@ -173,9 +174,8 @@ class SpaceToDepth(nn.Module):
         )
         self.recent = nn.Conv2d(cell * 4, width, 1, bias=False) if self.history else None
         self.trunk = nn.ModuleList(_LeakyResidual(width) for _ in range(blocks))
-        self.last = nn.Conv2d(width, cell * (4 if self.history else 3), 3, padding=1)
-        nn.init.zeros_(self.last.weight)
-        nn.init.zeros_(self.last.bias)
+        self.last = _conv(width, cell * (4 if self.history else 3))
+        nn.init.zeros_(self.last.weight)  # in the beginning, the base
 
     def forward(self, observations: Sequence[Observation]) -> tuple[Tensor, Tensor]:
         """See `Renderer2d`."""
@@ -297,8 +297,9 @@ class _LeakyResidual(nn.Module):
 
 def _conv(inputs: int, outputs: int) -> nn.Conv2d:
     layer = nn.Conv2d(inputs, outputs, 3, padding=1)
-    nn.init.kaiming_normal_(layer.weight, a=0, mode="fan_in")
-    nn.init.zeros_(layer.bias)
+    nn.init.kaiming_normal_(layer.weight)
+    with torch.no_grad():
+        layer.bias.zero_()
     return layer
 
 
@@ -340,8 +341,3 @@ def _bounding_box(active: Tensor) -> tuple[slice, slice]:
 def _channels_last(images: Tensor) -> Tensor:
     """[B, 3, H, W] to [B, H, W, 3]."""
     return images.permute(0, 2, 3, 1)
-
-
-def parameter_count(module: nn.Module) -> int:
-    """Numbers a module has learned."""
-    return sum(p.numel() for p in module.parameters())

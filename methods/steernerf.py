@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from functools import cache, partial
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from bench.provenance import ROOT, digest
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
@@ -19,6 +19,7 @@ from methods.joint import JointOptions, JointTraining
 from methods.kernels.encode import HashGrid
 from methods.pipeline import Pipeline, PipelineOptions
 from methods.pretrained import Pretrained, Setup, pretrain
+from methods.renderer2d import Renderer2d
 from methods.sequences import SequencePool, TrueView
 from methods.train import TrainingOptions
 
@@ -55,7 +56,7 @@ class SteerNerf:
         grid: HashGrid,
         training: TrainingOptions,
         pipeline: PipelineOptions,
-        renderer: Callable[..., nn.Module],
+        renderer: Callable[..., Renderer2d],
         joint: JointOptions,
         precision: Precision = "bf16",
         name: str = "steernerf",
