@@ -1,7 +1,7 @@
-"""Picture quality: PSNR, SSIM and LPIPS of one picture against its reference.
+"""Picture quality: PSNR, SSIM and LPIPS of one picture against its reference, flicker of two.
 
-Every function takes two float pictures [H, W, 3] in [0, 1] and returns a Python float. None of
-them clips or rounds: that is the protocol's choice, made with `quantise`.
+Every function takes float pictures [H, W, 3] in [0, 1] and returns a Python float. None of them
+clips or rounds: that is the protocol's choice, made with `quantise`.
 """
 
 from __future__ import annotations
@@ -43,6 +43,22 @@ def psnr(image: Tensor, reference: Tensor) -> float:
     _check_pair(image, reference)
     mse = (image.double() - reference.double()).square().mean().item()
     return -10.0 * math.log10(mse) if mse > 0.0 else math.inf
+
+
+def flicker(
+    image: Tensor, reference: Tensor, previous_image: Tensor, previous_reference: Tensor
+) -> float:
+    """Change of the error from one frame to the next, root mean square over pixels and channels.
+
+    0 for an error that stays the same, as also for none: a wrong colour is the business of the
+    other metrics, this one sees what blinks, swims or shimmers.
+    """
+    _check_pair(image, reference)
+    _check_pair(previous_image, previous_reference)
+    check_shape("previous_image", previous_image, *image.shape)
+    error = image.double() - reference.double()
+    previous_error = previous_image.double() - previous_reference.double()
+    return (error - previous_error).square().mean().sqrt().item()
 
 
 def ssim(image: Tensor, reference: Tensor, window: str = "gaussian") -> float:

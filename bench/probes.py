@@ -111,13 +111,14 @@ class MemoryMeter:
 
     Attributes:
         peak_bytes: the highest peak so far.
+        last_bytes: the peak of the last region.
         source: in words, what was read; it belongs beside the figure, because the memory of a
             device, of a process while it renders, and of a process since it began are three
             different things.
     """
 
     def __init__(self, device: str) -> None:
-        self.peak_bytes = 0
+        self.peak_bytes = self.last_bytes = 0
         self._device = torch.device(device)
         if self._device.type == "cuda":
             self.source = "peak allocated on the device while rendering"
@@ -134,10 +135,10 @@ class MemoryMeter:
 
     def __exit__(self, *exception: object) -> None:
         if self._device.type == "cuda":
-            peak = torch.cuda.max_memory_allocated(self._device)
+            self.last_bytes = torch.cuda.max_memory_allocated(self._device)
         else:
-            peak = _process_peak_bytes()
-        self.peak_bytes = max(self.peak_bytes, peak)
+            self.last_bytes = _process_peak_bytes()
+        self.peak_bytes = max(self.peak_bytes, self.last_bytes)
 
 
 def _reset_high_water_mark() -> bool:

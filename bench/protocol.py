@@ -35,6 +35,9 @@ class EvaluationProtocol:
         warmup: frames rendered before the timed sequence, spread over the trajectory.
         memory: "steady": a method keeps its preceding frames along the trajectory; "cold": it is
             reset before every frame.
+        flicker: where the true pictures of two consecutive frames come from: "split": frames with
+            ground truth alone; "exact": at the others from the scene, where it knows its picture
+            at any camera, which takes it about half a second at 400 x 400.
     """
 
     name: str = "steerbench-1"
@@ -44,6 +47,7 @@ class EvaluationProtocol:
     background: str = "white"
     warmup: int = 3
     memory: str = "steady"
+    flicker: str = "split"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lpips", tuple(self.lpips))  # a list, when read from YAML
@@ -52,6 +56,7 @@ class EvaluationProtocol:
             "ssim": ("gaussian", "uniform"),
             "background": tuple(BACKGROUNDS),
             "memory": ("steady", "cold"),
+            "flicker": ("split", "exact"),
         }
         for option, allowed in choices.items():
             if getattr(self, option) not in allowed:
@@ -110,6 +115,10 @@ class EvaluationProtocol:
                 log.info(f"lpips_{net}: n/a. {error}")
         return loaded, missing
 
+    def rounded(self, rgb: Tensor) -> Tensor:
+        """A prediction [H, W, 3] as it is scored."""
+        return metrics.quantise(rgb.float()) if self.rounding == "8bit" else rgb.float()
+
     def score(
         self,
         rgb: Tensor,
@@ -122,7 +131,7 @@ class EvaluationProtocol:
         `reference` is uint8 [H, W, 3 or 4]; straight alpha is composited on `background` [3].
         NaN stands for a backbone missing from `lpips`.
         """
-        image = metrics.quantise(rgb.float()) if self.rounding == "8bit" else rgb.float()
+        image = self.rounded(rgb)
         truth = composite(reference.to(rgb.device), background)
         scores = {
             "psnr": metrics.psnr(image, truth),

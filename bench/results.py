@@ -27,16 +27,21 @@ from PIL import Image
 from bench.errors import SteerbenchError
 from bench.provenance import commit, machine
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Of record.json and rows.csv; a folder of another version is reported and left alone."""
 
 COLUMNS = [
     *("run", "method", "scene", "split", "trajectory", "resolution", "protocol", "budget"),
-    *("metric", "unit", "value", "n", "lo", "hi"),
+    *("phase", "metric", "unit", "value", "n", "lo", "hi"),
     *("device", "backend", "engine", "precision", "seed", "commit"),
 ]
 """`value` is a mean over `n` frames with its 95 % interval [lo, hi], or a single figure (n = 1,
-no interval); NaN with n = 0 is a figure that could not be had."""
+no interval); NaN with n = 0 is a figure that could not be had. `phase` says which frames: "steady",
+"cold" (a method that looks back had fewer frames to look back on than it can), or "all" for a
+figure of the whole run."""
+
+STEADY, COLD, WHOLE = "steady", "cold", "all"
+"""The values of the column `phase`."""
 
 FIGURES = {"value": "float64", "lo": "float64", "hi": "float64", "n": "int64", "seed": "int64"}
 RECORD = "record.json"

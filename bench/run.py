@@ -6,29 +6,25 @@ Quality, time and memory of a run come from the same rendering of the same frame
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 import pandas as pd
 import torch
 from scipy import stats
-from torch import Tensor
 
-from bench.metrics import Lpips, quantise
 from bench.probes import FrameRecord, MemoryMeter, StageClock
-from bench.protocol import EvaluationProtocol, composite
-from bench.results import Measurement
-from bench.trajectories import Trajectory, spread
+from bench.protocol import EvaluationProtocol
+from bench.results import COLD, STEADY, WHOLE, Measurement
+from bench.scoring import ERROR_RANGE, Scoring
+from bench.trajectories import Step, Trajectory, spread
 from bench.types import Budget, Frame, Log, Method, Scene, SteerbenchError, check_shape
 
 CONFIDENCE = 0.95
 QUANTILES = (50, 95, 99)
-ERROR_RANGE = 0.1
-"""Absolute error, mean over the channels, that the brightest colour of an error map stands for."""
-
 UNITS = {
     "psnr": "dB",
     "frame_ms": "ms",
@@ -69,7 +65,8 @@ def measure(
     protocol.check(scene, trajectory)
     method.fit(scene, budget, log)
     meter = MemoryMeter(method.settings()["device"])
-    frames, images = _render(method, scene, trajectory, protocol, lpips, meter, log, pictures)
+    scoring = Scoring(scene, trajectory, protocol, lpips, pictures)
+    frames = _render(method, trajectory, protocol, scoring, meter, log)
     summary = [
         *_frame_rows(frames, protocol),
         *(_single(f"size_bytes.{part}", size) for part, size in method.sizes().items()),
@@ -97,27 +94,23 @@ def measure(
         "peak_bytes": meter.source,
         "error_map": f"absolute error, mean over the channels, black 0 to yellow {ERROR_RANGE}",
     }
-    return Measurement(rows, frames, images, record)
+    return Measurement(rows, frames, scoring.images, record)
 
 
 def _render(
     method: Method,
-    scene: Scene,
     trajectory: Trajectory,
     protocol: EvaluationProtocol,
-    lpips: dict[str, Lpips],
+    scoring: Scoring,
     meter: MemoryMeter,
     log: Log,
-    pictures: int,
-) -> tuple[pd.DataFrame, dict[str, np.ndarray]]:
+) -> pd.DataFrame:
     """Warm up, then render the sequence in its order; each frame is scored and let go."""
-    steps, split = trajectory.steps, scene.splits[trajectory.split]
+    steps = trajectory.steps
+    phases = _phases(steps, method.memory, protocol)
     clock = StageClock(method.settings()["device"])
     warmup = spread(len(steps), protocol.warmup)
-    scored = [index for index, step in enumerate(steps) if step.truth is not None]
-    shown = {scored[i] for i in spread(len(scored), pictures)}
     table: list[dict[str, Any]] = []
-    images: dict[str, np.ndarray] = {}
     with torch.no_grad(), log.progress("rendering", len(warmup) + len(steps)) as progress:
         method.reset()
         for index in warmup:
@@ -125,22 +118,31 @@ def _render(
                 method.render(steps[index].camera, clock)
             progress.advance(note="warming up")
         method.reset()
-        for index, step in enumerate(steps):
+        for index, (step, phase) in enumerate(zip(steps, phases, strict=True)):
             if protocol.memory == "cold":
                 method.reset()
             with meter, clock.frame():
                 frame = method.render(step.camera, clock)
             _check_frame(frame, step.camera.height, step.camera.width, method.name, index)
-            figures = {"frame": index, **_times_and_work(clock.frames[-1])}
-            if step.truth is not None:
-                truth = split.images[step.truth]
-                figures["name"] = split.names[step.truth]
-                figures |= protocol.score(frame.rgb, truth, scene.background, lpips)
-                if index in shown:
-                    images |= _pictures(index, frame.rgb, composite(truth, scene.background))
-            table.append(figures)
+            figures = {"frame": index, "phase": phase, "peak_bytes": meter.last_bytes}
+            figures |= _times_and_work(clock.frames[-1])
+            table.append(figures | scoring.score(index, step, frame.rgb))
             progress.advance(note=_mean_psnr(table))
-    return _frame_table(table, protocol), images
+    return _frame_table(table, protocol)
+
+
+def _phases(steps: Sequence[Step], memory: int, protocol: EvaluationProtocol) -> list[str]:
+    """Of each frame: cold while fewer than `memory` were rendered since the last reset or cut.
+
+    The method is not told of a cut: whoever steers a camera does not announce a jump either.
+    """
+    phases, preceding = [], 0
+    for step in steps:
+        if step.cut or protocol.memory == "cold":
+            preceding = 0
+        phases.append(COLD if preceding < memory else STEADY)
+        preceding += 1
+    return phases
 
 
 def _check_frame(frame: Frame, height: int, width: int, method: str, index: int) -> None:
@@ -170,21 +172,35 @@ def _frame_table(table: list[dict[str, Any]], protocol: EvaluationProtocol) -> p
     frames = pd.DataFrame(table)
     touched = [name for name in map(str, frames) if name.startswith(("stage_ms.", "work."))]
     touched.sort(key=lambda name: (name.startswith("work."), name == "stage_ms.other"))
-    columns = ["frame", "name", *protocol.metric_names, "frame_ms", *touched]
+    scores = (*protocol.metric_names, "flicker")
+    columns = ["frame", "name", "phase", *scores, "frame_ms", *touched, "peak_bytes"]
     return frames.reindex(columns=columns).fillna(dict.fromkeys(touched, 0))
 
 
 def _frame_rows(frames: pd.DataFrame, protocol: EvaluationProtocol) -> list[dict[str, Any]]:
+    """The rows of the steady frames, then those of the cold ones, of whichever there are."""
+    return [
+        row | {"phase": phase}
+        for phase in (STEADY, COLD)
+        if (frames["phase"] == phase).any()
+        for row in _rows_of_phase(frames[frames["phase"] == phase], protocol)
+    ]
+
+
+def _rows_of_phase(frames: pd.DataFrame, protocol: EvaluationProtocol) -> list[dict[str, Any]]:
     """Mean and interval of every column, quantiles of the frame time, frames a second."""
-    rows = [_mean(name, frames[name]) for name in (*protocol.metric_names, "frame_ms")]
-    ms = rows[-1]
-    rows += [
+    scores = [*protocol.metric_names, *(["flicker"] if frames["flicker"].notna().any() else [])]
+    ms = _mean("frame_ms", frames["frame_ms"])
+    quantiles = [
         _single(f"frame_ms.p{percent}", np.percentile(frames["frame_ms"], percent))
         for percent in QUANTILES
     ]
-    rows.append({"metric": "fps", "n": ms["n"]} | _rate(ms))
-    done = {"frame", "name", *(row["metric"] for row in rows)}
-    return rows + [_mean(name, frames[name]) for name in map(str, frames) if name not in done]
+    parts = [name for name in map(str, frames) if name.startswith(("stage_ms.", "work."))]
+    return [
+        *(_mean(name, frames[name]) for name in scores),
+        *(ms, *quantiles, {"metric": "fps", "n": ms["n"]} | _rate(ms)),
+        *(_mean(name, frames[name]) for name in parts),
+    ]
 
 
 def _mean(metric: str, values: pd.Series) -> dict[str, Any]:
@@ -215,25 +231,11 @@ def _rate(ms: dict) -> dict[str, float]:
 
 
 def _single(metric: str, value: float) -> dict[str, Any]:
-    """A figure of the whole run."""
-    return {"metric": metric, "value": float(value), "n": 1, "lo": math.nan, "hi": math.nan}
+    """A single figure, of the whole run unless it is given another phase."""
+    row = {"metric": metric, "value": float(value), "n": 1, "lo": math.nan, "hi": math.nan}
+    return row | {"phase": WHOLE}
 
 
 def _mean_psnr(table: list[dict[str, Any]]) -> str:
     scores = [row["psnr"] for row in table if "psnr" in row]
     return f"{np.mean(scores):.2f} dB" if scores else ""
-
-
-def _pictures(index: int, rgb: Tensor, truth: Tensor) -> dict[str, np.ndarray]:
-    """Ground truth, rendering and error map of a frame, as 8-bit pictures by file name."""
-    rendering, truth = quantise(rgb).cpu(), truth.cpu()
-    error = (rendering - truth).abs().mean(dim=-1) / ERROR_RANGE
-    return {
-        f"{index:04d}-truth": _bytes(truth),
-        f"{index:04d}-rendered": _bytes(rendering),
-        f"{index:04d}-error": matplotlib.colormaps["inferno"](error.numpy(), bytes=True)[..., :3],
-    }
-
-
-def _bytes(image: Tensor) -> np.ndarray:
-    return image.mul(255.0).round().to(torch.uint8).numpy()

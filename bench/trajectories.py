@@ -1,4 +1,7 @@
-"""Trajectories: the ordered cameras of a measurement, and which of them have ground truth."""
+"""Trajectories: the ordered cameras of a measurement, and which of them have ground truth.
+
+How a camera comes from one pose to the next is in `bench.motion`.
+"""
 
 from __future__ import annotations
 
@@ -8,22 +11,25 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-import torch
-from kornia.geometry.conversions import (
-    axis_angle_to_rotation_matrix,
-    rotation_matrix_to_axis_angle,
-)
-from torch import Tensor
 
+from bench.motion import between, rotation_between
 from bench.types import Camera, Scene, SteerbenchError
 
 
 @dataclass(frozen=True)
 class Step:
-    """One frame: its camera, and the index of its ground truth in the split (None: unscored)."""
+    """One frame of a trajectory.
+
+    Attributes:
+        camera: from where it is rendered.
+        truth: the index of its ground truth in the split; None: unscored.
+        cut: the camera did not come here from the step before. The first step of a trajectory
+            has no step before it and counts as a cut whether it is marked or not.
+    """
 
     camera: Camera
     truth: int | None
+    cut: bool = False
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,19 @@ def from_split(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:
     return Trajectory(name, split, tuple(Step(cameras[index], index) for index in kept))
 
 
+def orbit(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:
+    """The cameras of a split in their order, without gaps; `limit` > 0 keeps the first that many.
+
+    Where the split was taken along a path, the frames before a frame are those of that path.
+
+    Raises:
+        SteerbenchError: as `from_split`.
+    """
+    kept, part = _first(scene, split, limit)
+    steps = tuple(Step(camera, index) for index, camera in enumerate(kept))
+    return Trajectory(f"{split}-orbit{part}", split, steps)
+
+
 def smooth(scene: Scene, split: str = "test", degrees: float = 1.0, limit: int = 0) -> Trajectory:
     """A path through the cameras of a split that turns by at most `degrees` from frame to frame.
 
@@ -73,19 +92,51 @@ def smooth(scene: Scene, split: str = "test", degrees: float = 1.0, limit: int =
     Raises:
         SteerbenchError: as `from_split`; `degrees` is not positive, or picture sizes differ.
     """
-    if not degrees > 0:
-        raise SteerbenchError(f"trajectory.degrees: expected more than 0, got {degrees}")
-    cameras = _cameras(scene, split, limit)
-    kept = cameras[: limit or len(cameras)]
-    steps = [Step(kept[0], 0)]
-    for index, (first, second) in enumerate(pairwise(kept), 1):
-        turn = _rotation_between(first, second)
-        # Cameras that are `degrees` apart are neighbours, whatever the rounding of their poses.
-        count = max(math.ceil(math.degrees(turn.norm().item()) / degrees - 1e-3), 1)
-        steps += [Step(_between(first, second, turn, k / count), None) for k in range(1, count)]
-        steps.append(Step(second, index))
-    part = "" if len(kept) == len(cameras) else f"-{len(kept)}of{len(cameras)}"
+    steps, part = _smooth_steps(scene, split, degrees, limit)
     return Trajectory(f"{split}-smooth{degrees:g}deg{part}", split, tuple(steps))
+
+
+def jump(
+    scene: Scene, split: str = "test", degrees: float = 1.0, every: int = 10, limit: int = 0
+) -> Trajectory:
+    """The smooth path in pieces of `every` frames, shuffled: a teleport after each of them.
+
+    The order is the same every time, and no piece follows the one it followed on the path.
+
+    Raises:
+        SteerbenchError: as `smooth`; `every` is less than 1, or the path has no second piece.
+    """
+    steps, part = _smooth_steps(scene, split, degrees, limit)
+    if not 1 <= every < len(steps):
+        raise SteerbenchError(
+            f"trajectory.every: expected 1 to {len(steps) - 1}, fewer than the {len(steps)} "
+            f"frames of the path, got {every}; trajectory.limit=0 takes all cameras"
+        )
+    pieces = [steps[start : start + every] for start in range(0, len(steps), every)]
+    jumps = [
+        replace(step, cut=position == 0)
+        for piece in _shuffled(len(pieces))
+        for position, step in enumerate(pieces[piece])
+    ]
+    return Trajectory(f"{split}-jump{every}-{degrees:g}deg{part}", split, tuple(jumps))
+
+
+def loop(
+    scene: Scene, split: str = "test", degrees: float = 1.0, frames: int = 1000, limit: int = 0
+) -> Trajectory:
+    """The smooth path there and back, again and again, until `frames` frames are rendered.
+
+    Every round comes back to exactly the same cameras, so what drifts or grows over a long
+    sequence shows in the scores of the same pictures.
+
+    Raises:
+        SteerbenchError: as `smooth`; `frames` is less than 1.
+    """
+    _at_least_one("frames", frames)
+    there, part = _smooth_steps(scene, split, degrees, limit)
+    round_trip = there + there[-2:0:-1]
+    steps = tuple(round_trip[index % len(round_trip)] for index in range(frames))
+    return Trajectory(f"{split}-loop{frames}-{degrees:g}deg{part}", split, steps)
 
 
 def static(scene: Scene, split: str = "test", view: int = 0, frames: int = 60) -> Trajectory:
@@ -100,8 +151,7 @@ def static(scene: Scene, split: str = "test", view: int = 0, frames: int = 60) -
             f"trajectory.view: expected 0 to {len(cameras) - 1}, the cameras of {split!r}, "
             f"got {view}"
         )
-    if frames < 1:
-        raise SteerbenchError(f"trajectory.frames: expected 1 or more, got {frames}")
+    _at_least_one("frames", frames)
     return Trajectory(f"{split}-static{view}", split, (Step(cameras[view], view),) * frames)
 
 
@@ -116,27 +166,37 @@ def _cameras(scene: Scene, split: str, limit: int) -> Sequence[Camera]:
     return scene.splits[split].cameras
 
 
-def _rotation_between(first: Camera, second: Camera) -> Tensor:
-    """The rotation [3] from one camera to the other, axis times angle, in the first one's axes."""
-    relative = first.c2w[:, :3].double().T @ second.c2w[:, :3].double()
-    return rotation_matrix_to_axis_angle(relative[None])[0]
+def _first(scene: Scene, split: str, limit: int) -> tuple[Sequence[Camera], str]:
+    """The first `limit` cameras of a split (0: all), and how the name says that some are left."""
+    cameras = _cameras(scene, split, limit)
+    kept = cameras[: limit or len(cameras)]
+    return kept, "" if len(kept) == len(cameras) else f"-{len(kept)}of{len(cameras)}"
 
 
-def _between(first: Camera, second: Camera, turn: Tensor, share: float) -> Camera:
-    """The camera at `share` of the way: rotated evenly, everything else interpolated linearly.
+def _smooth_steps(scene: Scene, split: str, degrees: float, limit: int) -> tuple[list[Step], str]:
+    """The steps of the smooth path through the first `limit` cameras, and the end of its name."""
+    if not degrees > 0:
+        raise SteerbenchError(f"trajectory.degrees: expected more than 0, got {degrees}")
+    kept, part = _first(scene, split, limit)
+    steps = [Step(kept[0], 0)]
+    for index, (first, second) in enumerate(pairwise(kept), 1):
+        turn = rotation_between(first, second)
+        # Cameras that are `degrees` apart are neighbours, whatever the rounding of their poses.
+        count = max(math.ceil(math.degrees(turn.norm().item()) / degrees - 1e-3), 1)
+        steps += [Step(between(first, second, turn, k / count), None) for k in range(1, count)]
+        steps.append(Step(second, index))
+    return steps, part
 
-    On an orbit the centre takes the chord: at 4 degrees it is off by 0.06 % of the distance.
-    """
-    if (first.width, first.height) != (second.width, second.height):
-        raise SteerbenchError(
-            "trajectory: expected pictures of one size to interpolate between, got "
-            f"{first.width}x{first.height} and {second.width}x{second.height}"
-        )
-    rotation = first.c2w[:, :3].double() @ axis_angle_to_rotation_matrix(share * turn[None])[0]
-    centre = torch.lerp(first.c2w[:, 3].double(), second.c2w[:, 3].double(), share)
-    inner = {
-        name: (1 - share) * getattr(first, name) + share * getattr(second, name)
-        for name in ("fx", "fy", "cx", "cy")
-    }
-    c2w = torch.cat((rotation, centre[:, None]), dim=1).to(first.c2w)
-    return replace(first, c2w=c2w, **inner)
+
+def _shuffled(count: int) -> list[int]:
+    """0 to count - 1 in a repeatable random order in which k + 1 never follows k; count >= 2."""
+    random = np.random.default_rng(0)
+    while True:  # about one order in three is free of neighbours
+        order = random.permutation(count).tolist()
+        if all(after != before + 1 for before, after in pairwise(order)):
+            return order
+
+
+def _at_least_one(option: str, value: int) -> None:
+    if value < 1:
+        raise SteerbenchError(f"trajectory.{option}: expected 1 or more, got {value}")

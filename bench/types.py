@@ -22,7 +22,7 @@ Scene units: every scene is normalised so that what is to be rendered lies in th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -102,6 +102,8 @@ class Scene:
         digest: content hash of cameras, pictures and normalisation.
         origin: [3] the corner (0, 0, 0) of the unit cube in the data set's own coordinates:
             data set point = origin + unit_length * scene point; the axes stay.
+        exact: the exact picture at any camera, uint8 [H, W, 3 or 4] as in a split, for scenes
+            that know it.
     """
 
     name: str
@@ -111,6 +113,7 @@ class Scene:
     unit_length: float
     digest: str
     origin: Tensor = field(default_factory=lambda: torch.zeros(3))
+    exact: Callable[[Camera], Tensor] | None = None
 
 
 @dataclass(frozen=True)
@@ -122,16 +125,20 @@ class Budget:
         steps: optimiser steps of the (pre-)training of a field.
         samples: field samples with a gradient that a step aims at; the rays follow from it.
         frames: at most this many test frames are rendered and scored (0: all).
+        renderer_steps: optimiser steps of the second stage, for methods with a 2D renderer.
     """
 
     name: str
     steps: int
     samples: int
     frames: int = 0
+    renderer_steps: int = 1
 
     def __post_init__(self) -> None:
-        if not (self.steps >= 1 and self.samples >= 1 and self.frames >= 0):
-            raise ValueError(f"expected steps >= 1, samples >= 1 and frames >= 0: {self}")
+        if min(self.steps, self.samples, self.renderer_steps) < 1 or self.frames < 0:
+            raise ValueError(
+                f"expected steps, samples and renderer_steps >= 1, frames >= 0: {self}"
+            )
 
 
 class Log(Protocol):
@@ -171,10 +178,12 @@ class Method(Protocol):
         name: as it stands in result rows.
         train_s: seconds the training took, over all the processes it was continued in; `fit`
             knows it also when it only loads.
+        memory: preceding frames it looks back on; 0: every frame stands alone.
     """
 
     name: str
     train_s: float
+    memory: int
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Train, or load the stages that a training with the same content hash left behind."""

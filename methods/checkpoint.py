@@ -7,6 +7,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
@@ -20,9 +21,10 @@ def write(path: Path, tensors: Mapping[str, Tensor], figures: Mapping[str, float
     Raises:
         SteerbenchError: the disk refuses.
     """
+    packed = {name: tensor.contiguous() for name, tensor in tensors.items()}
     temporary = path.with_suffix(f".{os.getpid()}.tmp")
     try:
-        save_file(dict(tensors), temporary, {"training": json.dumps(figures)})
+        save_file(packed, temporary, {"training": json.dumps(figures)})
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
         temporary.replace(path)
@@ -55,3 +57,20 @@ def part(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
         for name, value in tensors.items()
         if name.startswith(prefix)
     }
+
+
+def optimiser_tensors(optimiser: torch.optim.Optimizer, prefix: str) -> dict[str, Tensor]:
+    """The state of an optimiser, as `<prefix><parameter>.<slot>`."""
+    state = optimiser.state_dict()["state"]
+    return {f"{prefix}{n}.{slot}": x for n, slots in state.items() for slot, x in slots.items()}
+
+
+def restore_optimiser(
+    optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor], prefix: str
+) -> None:
+    """Put back what `optimiser_tensors` gave."""
+    state = optimiser.state_dict()
+    for name, value in part(tensors, prefix).items():
+        parameter, slot = name.split(".")
+        state["state"].setdefault(int(parameter), {})[slot] = value
+    optimiser.load_state_dict(state)

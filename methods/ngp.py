@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import replace
 
 import torch
 
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
-from methods.fields import HashField, Precision
-from methods.kernels import resolve
+from methods.buffer import Cloud, Reprojection
+from methods.fields import Precision
 from methods.kernels.composite import STOP
 from methods.kernels.encode import HashGrid
-from methods.train import TrainingOptions, train_field, training_digest
-from methods.volume import render_frame
+from methods.pretrained import Setup, pretrain
+from methods.range_reduction import RangeReduction, evidence, render_guided
+from methods.train import TrainingOptions
 
 
 class InstantNgp:
@@ -23,9 +24,10 @@ class InstantNgp:
         training: how the field is trained.
         precision: "bf16" (packed table, bfloat16 networks) or "fp32".
         stop: transmittance at which a ray ends when rendering.
+        range: where rays look, given the depth of the preceding frame; null: every frame stands
+            alone.
+        name: as it stands in result rows.
     """
-
-    name = "ngp"
 
     def __init__(
         self,
@@ -34,71 +36,52 @@ class InstantNgp:
         training: TrainingOptions,
         precision: Precision = "bf16",
         stop: float = STOP,
+        range: RangeReduction | None = None,
+        name: str = "ngp",
         backend: str = "auto",
         device: str = "auto",
         seed: int = 0,
     ) -> None:
-        if device == "auto":
-            device = "cuda" if torch.cuda.is_available() else "cpu"
-        if precision == "bf16" and grid.features != 2:
-            raise ValueError(
-                f"precision bf16 packs 2 features an entry, grid.features is {grid.features}: "
-                "use precision=fp32"
-            )
-        self.device = torch.device(device)
-        self.backend = resolve(backend, self.device)
-        self.grid, self.training, self.precision = grid, training, precision
-        self.stop, self.seed = stop, seed
+        self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
+        self.stop, self.range, self.name = stop, range, name
+        self.memory = 0 if range is None else 1
+        self.reprojection = Reprojection()
+        self.preceding: Cloud | None = None
         self.train_s = 0.0
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Train the field, or load the one that the same training left behind."""
-        generator = torch.Generator().manual_seed(self.seed)
-        self.field = HashField(
-            self.grid, precision=self.precision, backend=self.backend, generator=generator
-        ).to(self.device)
-        folder = log.stage_dir("field", self._training_key(scene, budget))
-        density, self.train_s = train_field(
-            self.field, scene, budget, self.training, self.seed, folder, log
-        )
-        self.occupancy = density.occupancy
-        self.background = scene.background.to(self.device)
+        self.trained = pretrain(self.setup, scene, budget, log)
+        self.train_s = self.trained.train_s
+        self.background = scene.background.to(self.setup.device)
 
     def reset(self) -> None:
-        """Nothing to forget: every frame stands alone."""
+        """Forget the preceding frame."""
+        self.preceding = None
 
     @torch.no_grad()
     def render(self, camera: Camera, probe: Probe) -> Frame:
         """One frame at the camera's full resolution."""
-        frame = render_frame(
-            self.field, camera, self.occupancy, self.background, probe, stop=self.stop
+        field, occupancy = self.trained.field, self.trained.occupancy
+        camera = replace(camera, c2w=camera.c2w.to(self.setup.device))
+        found = None
+        if self.range is not None and self.preceding is not None:
+            with probe.stage("depth_reprojection"):
+                found = evidence(
+                    self.preceding, camera, self.range, self.reprojection, field.backend
+                )
+        frame = render_guided(
+            field, camera, occupancy, self.background, probe, found, stop=self.stop
         )
+        if self.range is not None:
+            with probe.stage("depth_reprojection"):
+                self.preceding = Cloud.of(frame, self.reprojection)
         return Frame(frame.values, frame.depth, frame.alpha)
 
     def sizes(self) -> dict[str, int]:
         """Bytes of table, networks and occupancy bits."""
-        return self.field.sizes() | {"occupancy": self.occupancy.cells.numel() // 8}
+        return self.trained.sizes()
 
     def settings(self) -> dict[str, str]:
         """See `bench.types.Method.settings`."""
-        return {
-            "device": str(self.device),
-            "backend": self.backend,
-            "engine": "torch",
-            "precision": self.precision,
-        }
-
-    def _training_key(self, scene: Scene, budget: Budget) -> dict[str, object]:
-        return {
-            "scene": scene.digest,
-            "steps": budget.steps,
-            "samples": budget.samples,
-            "grid": asdict(self.grid),
-            "training": asdict(self.training),
-            "precision": self.precision,
-            "backend": self.backend,
-            "device": self.device.type,
-            "threads": torch.get_num_threads(),
-            "seed": self.seed,
-            "code": training_digest(),
-        }
+        return self.setup.settings()

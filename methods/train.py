@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -15,17 +14,17 @@ from torch.nn import functional
 
 from bench.provenance import ROOT, digest
 from bench.types import Budget, Log, Rays, Scene, Split, SteerbenchError
-from methods import checkpoint
+from methods import checkpoint, loop
 from methods.fields import HashField
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.occupancy import EVERY, MIN_VIEWS, DensityGrid, learnable_cells
 from methods.volume import render_batch
 
-CHECKPOINT_S = 20.0
-"""Seconds between checkpoints: what a killed training loses at most."""
-
 KERNELS = ("adam", "composite", "encode", "march", "spherical")
 """Kernels that a training of a field runs through."""
+
+SOURCES = ("checkpoint", "fields", "loop", "occupancy", "train", "volume")
+"""Modules beside this one that decide what a training of a field results in."""
 
 MIN_RAYS = 64
 """Fewest rays of a step."""
@@ -112,7 +111,9 @@ def new_grid(scene: Scene, device: torch.device) -> DensityGrid:
 
 
 class FieldTraining:
-    """The state of a training: what a checkpoint must hold to go on as if it had never stopped."""
+    """Stage 1 as a `loop.Training`."""
+
+    advice = "Try a smaller learning rate (method.training.rate)."
 
     def __init__(
         self, field: HashField, scene: Scene, budget: Budget, options: TrainingOptions, seed: int
@@ -122,7 +123,7 @@ class FieldTraining:
         self.grid = new_grid(scene, device)
         self.batches = PixelBatches(scene.splits["train"], device)
         self.background = scene.background.to(device)
-        self.step = 0
+        self.step, self.steps = 0, budget.steps
         self.rays = 1024
         self.seconds = 0.0
         self.generator = torch.Generator(device).manual_seed(seed)
@@ -135,11 +136,11 @@ class FieldTraining:
     def learning_rate(self) -> float:
         """Cosine from `rate` to `rate * final_rate`: monotone."""
         low = self.options.final_rate
-        done = self.step / self.budget.steps
+        done = self.step / self.steps
         return self.options.rate * (low + (1 - low) * 0.5 * (1 + math.cos(math.pi * done)))
 
-    def advance(self) -> float:
-        """One step; returns the loss.
+    def advance(self) -> dict[str, float]:
+        """One step; its mean squared error.
 
         Raises:
             SteerbenchError: the loss is not finite.
@@ -158,11 +159,11 @@ class FieldTraining:
         (loss + self.options.opacity_entropy * entropy).backward()
         value = loss.item()
         if not math.isfinite(value):
-            self.check_finite({"loss": loss, "rendered pixels": pixels.values})
+            loop.check_finite(self, {"loss": loss, "rendered pixels": pixels.values})
         self._update()
         self._fit_batch(samples)
         self.step += 1
-        return value
+        return {"": value}
 
     def _target(self, colours: Tensor) -> tuple[Tensor, Tensor]:
         """Colours composited on the background, and that background ([3] or a ray's own [R, 3])."""
@@ -197,26 +198,40 @@ class FieldTraining:
         change = min(max(self.budget.samples / max(samples, 1), 0.5), 1.25)
         self.rays = min(max(int(self.rays * change), MIN_RAYS), self.options.max_rays)
 
-    def check_finite(self, more: Mapping[str, Tensor] | None = None) -> None:
-        """Raise `SteerbenchError` naming the step and the tensors that are not finite, if any are.
+    def watched(self) -> dict[str, Tensor]:
+        """Table and its moments, networks."""
+        moments = self.table_state.first + self.table_state.second
+        return {"table": self.field.table, "table moments": moments, **self.field.layers}
 
-        Looked at are the table and its moments, the networks and `more`.
-        """
-        tensors = {"table": self.field.table, **dict(self.field.layers.items()), **(more or {})}
-        tensors |= {"table moments": self.table_state.first + self.table_state.second}
-        bad = [name for name, tensor in tensors.items() if not tensor.isfinite().all()]
-        if bad:
-            raise SteerbenchError(
-                f"training stopped at step {self.step}: not finite: {', '.join(bad)}. The last "
-                "good checkpoint was kept. Try a smaller learning rate (method.training.rate)."
-            )
+    def result(self) -> dict[str, Tensor]:
+        """Field and density grid."""
+        tensors = {f"field.{name}": value for name, value in self.field.state_dict().items()}
+        return tensors | {"grid.density": self.grid.density}
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+        """Optimisers, random numbers, size of the batch."""
+        adam = self.table_state
+        tensors = {"adam.first": adam.first, "adam.second": adam.second, "adam.steps": adam.steps}
+        tensors |= checkpoint.optimiser_tensors(self.network_optimiser, "network.")
+        return tensors | {"generator": self.generator.get_state()}, {"rays": self.rays}
+
+    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
+        """See `loop.Training`."""
+        restore_field(self.field, self.grid, tensors)
+        self.rays = int(figures["rays"])
+        device = self.field.table.device
+        self.table_state = AdamState(
+            *(tensors[f"adam.{name}"].to(device) for name in ("first", "second", "steps"))
+        )
+        self.generator.set_state(tensors["generator"].cpu())
+        checkpoint.restore_optimiser(self.network_optimiser, tensors, "network.")
 
 
 @cache
 def training_digest() -> str:
     """SHA-256 of the sources that decide what a training results in."""
     methods, bench = ROOT / "methods", ROOT / "bench"
-    sources = [methods / f"{name}.py" for name in ("train", "fields", "occupancy", "volume")]
+    sources = [methods / f"{name}.py" for name in SOURCES]
     kernels = methods / "kernels"
     sources += [kernels / "dispatch.py", kernels / "cpu.py"]
     sources += [p for k in KERNELS for p in (kernels / k).glob("*.py") if p.stem != "cases"]
@@ -242,81 +257,17 @@ def train_field(
     if finished.exists():
         tensors, figures = checkpoint.read(finished)
         grid = new_grid(scene, field.table.device)
-        _restore(field, grid, tensors)
+        restore_field(field, grid, tensors)
         log.info(f"trained field found: {finished}")
         return grid, figures["seconds"]
     training = FieldTraining(field, scene, budget, options, seed)
-    _run(training, folder, log)
+    loop.train(training, finished, "training", log)
     field.grad_buffer = None
     return training.grid, training.seconds
 
 
-def _run(training: FieldTraining, folder: Path, log: Log) -> None:
-    unfinished = folder / "checkpoint.safetensors"
-    if unfinished.exists():
-        resume(training, unfinished)
-        log.info(f"going on from step {training.step} of {unfinished}")
-    steps = training.budget.steps
-    began, saved = time.monotonic() - training.seconds, time.monotonic()
-    mean = math.nan
-    with log.progress("training", steps) as progress:
-        progress.advance(training.step, note="compiling kernels")  # on their first use ever
-        while training.step < steps:
-            loss = training.advance()
-            mean = loss if math.isnan(mean) else 0.99 * mean + 0.01 * loss
-            progress.advance(note=f"{-10 * math.log10(max(mean, 1e-10)):.1f} dB")
-            training.seconds = time.monotonic() - began
-            if time.monotonic() - saved > CHECKPOINT_S:
-                _save(training, unfinished)
-                saved = time.monotonic()
-    _save(training, folder / "field.safetensors", finished=True)
-    unfinished.unlink(missing_ok=True)
-
-
-def _tensors(training: FieldTraining, finished: bool) -> dict[str, Tensor]:
-    tensors = {"field." + name: value for name, value in training.field.state_dict().items()}
-    tensors["grid.density"] = training.grid.density
-    if finished:
-        return tensors
-    state = training.table_state
-    tensors |= {"adam.first": state.first, "adam.second": state.second, "adam.steps": state.steps}
-    tensors["generator"] = training.generator.get_state()
-    for index, slots in training.network_optimiser.state_dict()["state"].items():
-        tensors |= {f"network.{index}.{name}": value for name, value in slots.items()}
-    return tensors
-
-
-def _save(training: FieldTraining, path: Path, finished: bool = False) -> None:
-    """Write a good state; a bad one raises and leaves the last good file alone."""
-    training.check_finite()
-    figures = {"step": training.step, "rays": training.rays, "seconds": training.seconds}
-    checkpoint.write(path, _tensors(training, finished), figures)
-
-
-def resume(training: FieldTraining, path: Path) -> None:
-    """Put `training` back into the state of a checkpoint.
-
-    Raises:
-        SteerbenchError: the file is damaged, or of another training.
-    """
-    tensors, figures = checkpoint.read(path)
-    _restore(training.field, training.grid, tensors)
-    training.step, training.rays = int(figures["step"]), int(figures["rays"])
-    training.seconds = figures["seconds"]
-    device = training.field.table.device
-    training.table_state = AdamState(
-        *(tensors[f"adam.{name}"].to(device) for name in ("first", "second", "steps"))
-    )
-    training.generator.set_state(tensors["generator"].cpu())
-    state = training.network_optimiser.state_dict()
-    for name, value in tensors.items():
-        if name.startswith("network."):
-            _, index, slot = name.split(".")
-            state["state"].setdefault(int(index), {})[slot] = value
-    training.network_optimiser.load_state_dict(state)
-
-
-def _restore(field: HashField, grid: DensityGrid, tensors: Mapping[str, Tensor]) -> None:
+def restore_field(field: HashField, grid: DensityGrid, tensors: Mapping[str, Tensor]) -> None:
+    """Put back what `FieldTraining.result` gave."""
     field.load_state_dict(checkpoint.part(tensors, "field."))
     field.repack()
     grid.restore(tensors["grid.density"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -18,8 +18,8 @@ from methods.occupancy import STEP
 CHUNK_RAYS = 1 << 16
 """Rays rendered together: enough to keep all threads busy, few enough to stay in the cache."""
 
-ROUND_SAMPLES = (4, 8, 16)
-"""Samples a ray may take in a round; the last number repeats."""
+ROUND_SAMPLES = 8
+"""Samples a ray may take in a round: more are evaluated in vain, fewer take more rounds."""
 
 CHUNK_SAMPLES = 1 << 18
 """Samples whose density is evaluated together, without gradient: bounds the memory of a step."""
@@ -68,7 +68,7 @@ def render_batch(
     rays: Rays,
     occupancy: Occupancy,
     jitter: Tensor | None,
-    background: Tensor,
+    background: Tensor | None,
     *,
     stop: float = STOP,
 ) -> tuple[Pixels, int]:
@@ -79,7 +79,7 @@ def render_batch(
 
     Args:
         jitter: [R] phase of the samples of each ray, in [0, 1); None: as `render_rays`.
-        background: [K] or [R, K].
+        background: [K] or [R, K]; None: not composited on any.
         stop: transmittance at which a ray ends.
     """
     samples = march(
@@ -139,40 +139,14 @@ class FeatureFrame:
     depth: Tensor
     alpha: Tensor
 
-
-@torch.no_grad()
-def render_frame(
-    field: HashField,
-    camera: Camera,
-    occupancy: Occupancy,
-    background: Tensor,
-    probe: Probe,
-    *,
-    stop: float = STOP,
-    window: Tensor | None = None,
-) -> FeatureFrame:
-    """Render the picture of `camera` over `background` [K].
-
-    Args:
-        window: [h, w, 2] nearest and farthest z-depth to look at; None: all.
-    """
-    device, size = field.table.device, camera.height * camera.width
-    with probe.stage("rays"):
-        camera = replace(camera, c2w=camera.c2w.to(device))
-        pixels, rays = rays_at_matter(camera, occupancy)
-        canvas = Pixels.blank(size, field.channels, device)
-        limits = None if window is None else window.view(-1, 2)[pixels]
-    probe.count("rays", len(pixels), size)
-    rendered = render_rays(field, rays, occupancy, probe, stop=stop, window=limits)
-    with probe.stage("finish"):
-        canvas.put(pixels, rendered)
-        values = canvas.values + (1 - canvas.alpha)[:, None] * background
-        seen = canvas.alpha > EMPTY_ALPHA
-        depth = torch.where(seen, canvas.depth_sum / canvas.alpha, torch.inf)
-    shape = (camera.height, camera.width)
-    return FeatureFrame(
-        camera, values.view(*shape, -1), depth.view(shape), canvas.alpha.view(shape)
-    )
+    @classmethod
+    def of(cls, camera: Camera, pixels: Pixels, background: Tensor) -> FeatureFrame:
+        """From all pixels of `camera`, not yet composited on `background` [K]."""
+        values = pixels.values + (1 - pixels.alpha)[:, None] * background
+        seen = pixels.alpha > EMPTY_ALPHA
+        depth = torch.where(seen, pixels.depth_sum / pixels.alpha, torch.inf)
+        shape = (camera.height, camera.width)
+        return cls(camera, values.view(*shape, -1), depth.view(shape), pixels.alpha.view(shape))
 
 
 @torch.no_grad()
@@ -184,6 +158,7 @@ def render_rays(
     *,
     stop: float = STOP,
     window: Tensor | None = None,
+    carry: Pixels | None = None,
 ) -> Pixels:
     """Render `rays` in rounds, so that samples behind the early stop are hardly ever evaluated.
 
@@ -192,19 +167,17 @@ def render_rays(
 
     Args:
         window: [R, 2] nearest and farthest t of each ray; None: all.
+        carry: what lies in front of the windows; taken over and changed in place.
     """
     device = rays.origins.device
-    canvas = Pixels.blank(len(rays.origins), field.channels, device)
+    canvas = carry or Pixels.blank(len(rays.origins), field.channels, device)
     for first in range(0, len(rays.origins), CHUNK_RAYS):
         alive = torch.arange(first, min(first + CHUNK_RAYS, len(rays.origins)), device=device)
         start = torch.zeros(len(alive), dtype=torch.int32, device=device)
-        turn = 0
         while len(alive):
-            limit = ROUND_SAMPLES[min(turn, len(ROUND_SAMPLES) - 1)]
             alive, start = _render_round(
-                field, rays, window, occupancy, probe, canvas, alive, start, limit, stop
+                field, rays, window, occupancy, probe, canvas, alive, start, stop
             )
-            turn += 1
     return canvas
 
 
@@ -217,7 +190,6 @@ def _render_round(
     canvas: Pixels,
     alive: Tensor,
     start: Tensor,
-    limit: int,
     stop: float,
 ) -> tuple[Tensor, Tensor]:
     """One round of the rays `alive` from their steps `start`; those left and where they go on."""
@@ -230,7 +202,7 @@ def _render_round(
             STEP,
             window=None if window is None else window[alive],
             start=start,
-            limit=limit,
+            limit=ROUND_SAMPLES,
             backend=field.backend,
         )
     probe.count("samples", len(samples))

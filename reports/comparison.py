@@ -23,7 +23,7 @@ COMMON = ("scene", "resolution", "trajectory", "budget", "protocol", "device")
 
 
 def comparison(runs: Sequence[Run], failures: Mapping[str, str]) -> Table:
-    """One line per run, then one per failure; the best figure of each column is bold.
+    """One line per run, or per phase of it, then one per failure; the best figures are bold.
 
     A figure is the best only among runs made under the same conditions, and only where there are
     at least two of them.
@@ -33,14 +33,15 @@ def comparison(runs: Sequence[Run], failures: Mapping[str, str]) -> Table:
         failures: why a run is missing, by its label.
     """
     columns = _columns(runs)
+    parts = [part for run in runs for part in run.phases()]
     lines = [
-        (run.label, *(write(run.values.get(metric)) for metric, _, write in columns))
-        for run in runs
+        (part.label, *(write(part.values.get(metric)) for metric, _, write in columns))
+        for part in parts
     ]
     bold = frozenset(
         (row, column)
         for column, (metric, label, write) in enumerate(columns, 1)
-        for row in _best(runs, metric, write, highest=label.endswith("↑"))
+        for row in _best(parts, metric, write, highest=label.endswith("↑"))
     )
     blank = ("",) * len(columns)
     lines += [(f"{label}: failed: {reason}", *blank) for label, reason in failures.items()]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from bench.results import Store, explained
+from bench.results import COLD, Store, explained
 from reports import figures, tables
 from reports.comparison import comparison, setting
 from reports.runs import Run, load
@@ -72,8 +72,8 @@ def _heading(runs: Sequence[Run], failures: Mapping[str, str]) -> str:
     scenes = ", ".join(dict.fromkeys(run.facts["scene"] for run in runs))
     table = comparison(runs, failures)
     scored, timed = (
-        " / ".join(dict.fromkeys(str(run.frames[column].count()) for run in runs))
-        for column in ("psnr", "frame_ms")
+        " / ".join(dict.fromkeys(str(run.headline["n"][metric]) for run in runs))
+        for metric in ("psnr", "frame_ms")
     )
     reading = f"Arrows point to better. Quality is a mean over {scored} frames, time over {timed}."
     if table.bold:
@@ -133,6 +133,8 @@ def _view(run: Run, frame: str) -> View:
     """A shown frame of a run, titled with its own PSNR and time."""
     of_frame = run.frames.set_index("frame").loc[int(frame)]
     figures_shown = f"PSNR {of_frame['psnr']:.2f} dB, {of_frame['frame_ms']:.1f} ms"
+    if of_frame["phase"] == COLD:
+        figures_shown += ", cold"
     kinds = ("rendered", "error")
     pictures = [_read(run.pictures / f"{frame}-{kind}.png") for kind in kinds]
     return View((run.label, figures_shown), *pictures)

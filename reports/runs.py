@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from bench.results import Store
+from bench.results import WHOLE, Store
+from reports.tables import headline, phases, suffix
 
 
 @dataclass(frozen=True)
@@ -34,9 +35,22 @@ class Run:
     pictures: Path
 
     @cached_property
+    def headline(self) -> pd.DataFrame:
+        """The rows that speak for the run, one per metric: of steady frames, where it has any."""
+        return headline(self.rows).set_index("metric")
+
+    @cached_property
     def values(self) -> dict[str, float]:
-        """Figures by metric."""
-        return dict(zip(self.rows["metric"], self.rows["value"], strict=True))
+        """Figures of the headline by metric."""
+        return {str(metric): value for metric, value in self.headline["value"].items()}
+
+    def phases(self) -> list[Run]:
+        """The run once for each of its phases, each with the figures of that phase alone."""
+        whole = self.rows[self.rows["phase"] == WHOLE]
+        return [
+            replace(self, label=self.label + suffix(phase), rows=pd.concat([of_phase, whole]))
+            for phase, of_phase in phases(self.rows)
+        ]
 
     @property
     def facts(self) -> pd.Series:
@@ -54,7 +68,7 @@ class Run:
         """The same for runs whose figures may be held against each other."""
         machine = self.record["machine"]
         computer = (self.facts["device"], machine["cpu"], *machine["gpus"])
-        return (*self.views, self.facts["protocol"], *computer)
+        return (*self.views, self.headline["phase"].iloc[0], self.facts["protocol"], *computer)
 
 
 def load(store: Store, labels: Mapping[str, str]) -> list[Run]:

@@ -2,6 +2,9 @@
 
 Units are those of the field: dB, milliseconds, MB = 10^6 bytes. Every LPIPS column names its
 network. A figure that could not be had reads `n/a`.
+
+The headline figures of a run are those of its steady frames. Where a method also rendered frames
+with less to look back on than it can use, these stand apart and are called cold.
 """
 
 from __future__ import annotations
@@ -11,6 +14,8 @@ from dataclasses import dataclass
 
 import pandas as pd
 
+from bench.results import COLD, STEADY
+
 NOT_AVAILABLE = "n/a"
 
 QUALITY = {
@@ -19,6 +24,7 @@ QUALITY = {
     "lpips_alex": ("LPIPS alex ↓", 4),
     "lpips_vgg": ("LPIPS vgg ↓", 4),
     "lpips_squeeze": ("LPIPS squeeze ↓", 4),
+    "flicker": ("flicker ↓", 4),
 }
 """Label and decimals of each metric of a picture; the arrow points to better."""
 
@@ -51,9 +57,31 @@ class Table:
         return f"**{escaped}**" if place in self.bold else escaped
 
 
+def headline(rows: pd.DataFrame) -> pd.DataFrame:
+    """Of every run the rows of its first phase, steady where it has one, and of the whole run."""
+    steady = set(rows.loc[rows["phase"] == STEADY, "run"])
+    return rows[(rows["phase"] != COLD) | ~rows["run"].isin(steady)]
+
+
 def blocks(rows: pd.DataFrame) -> list[Table]:
-    """The tables of one run: quality, time by stage, memory."""
-    return [_quality(rows), _time(rows), _memory(rows)]
+    """The tables of one run: quality and time by stage of each phase, memory."""
+    tables = [
+        table(of_phase, suffix(phase))
+        for phase, of_phase in phases(rows)
+        for table in (_quality, _time)
+    ]
+    return [*tables, _memory(rows)]
+
+
+def phases(rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+    """The rows of one run by phase, steady ones first, without those of the whole run."""
+    by_phase = [(phase, rows[rows["phase"] == phase]) for phase in (STEADY, COLD)]
+    return [(phase, of_phase) for phase, of_phase in by_phase if len(of_phase)]
+
+
+def suffix(phase: str) -> str:
+    """What a label says of its frames: nothing when they are steady."""
+    return "" if phase == STEADY else f", {phase}"
 
 
 def _values(rows: pd.DataFrame, prefix: str = "", column: str = "value") -> dict[str, float]:
@@ -65,7 +93,7 @@ def _values(rows: pd.DataFrame, prefix: str = "", column: str = "value") -> dict
     }
 
 
-def _quality(rows: pd.DataFrame) -> Table:
+def _quality(rows: pd.DataFrame, suffix: str) -> Table:
     value, low, high, frames = (_values(rows, column=name) for name in ("value", "lo", "hi", "n"))
     lines = []
     for metric, (label, decimals) in QUALITY.items():
@@ -75,11 +103,11 @@ def _quality(rows: pd.DataFrame) -> Table:
             lines.append(
                 (label, number(value[metric], decimals), " – ".join(ends) if known else "")
             )
-    title = f"Quality, mean of {frames['psnr']} frames"
+    title = f"Quality{suffix}, mean of {frames['psnr']} frames"
     return Table(title, ("metric", "mean", "95 % interval"), tuple(lines))
 
 
-def _time(rows: pd.DataFrame) -> Table:
+def _time(rows: pd.DataFrame, suffix: str) -> Table:
     value, stages = _values(rows), _values(rows, "stage_ms.")
     total = value["frame_ms"]
     lines = [(name, number(ms, 2), share(ms, total)) for name, ms in stages.items()]
@@ -89,7 +117,7 @@ def _time(rows: pd.DataFrame) -> Table:
         for quantile in ("p50", "p95", "p99")
     ]
     lines.append(("FPS", number(value["fps"], 2), ""))
-    return Table("Time of a frame", ("stage", "mean ms", "share"), tuple(lines))
+    return Table(f"Time of a frame{suffix}", ("stage", "mean ms", "share"), tuple(lines))
 
 
 def _memory(rows: pd.DataFrame) -> Table:

@@ -20,6 +20,7 @@ SHOWN = (
     "scene",
     "trajectory",
     "seed",
+    "phase",
     "metric",
     "value",
     "lo",

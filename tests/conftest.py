@@ -96,6 +96,7 @@ class OffsetMethod:
 
     name = "offset"
     train_s = 0.0
+    memory = 0
 
     def __init__(self, device: str, offset: float) -> None:
         self.calls: list[str] = []

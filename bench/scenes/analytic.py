@@ -9,6 +9,7 @@ import hashlib
 import json
 import math
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -69,9 +70,10 @@ def load(
     folder = Path(root) / f"{name}-{settings_hash(settings)}"
     if not folder.is_dir():
         write(folder, settings, log)
-    return blender.load(
+    scene = blender.load(
         folder, downscale=downscale, background=background, bounds=bounds, name=name, log=log
     )
+    return replace(scene, exact=lambda camera: exact_picture(scene, camera))
 
 
 def find(name: str) -> Model:
@@ -101,6 +103,12 @@ def exact_frame(scene: Scene, camera: Camera, *, samples: int = 16) -> Frame:
     in_model = move_camera(camera, scene.unit_length, scene.origin)
     frame = render(find(scene.name), in_model, scene.background, samples)
     return Frame(frame.rgb, frame.depth / scene.unit_length, frame.alpha)
+
+
+def exact_picture(scene: Scene, camera: Camera) -> Tensor:
+    """The picture uint8 [H, W, 4] that a split of the scene would have at `camera`."""
+    in_model = move_camera(camera, scene.unit_length, scene.origin)
+    return to_rgba(render(find(scene.name), in_model, torch.zeros(3), samples=16))
 
 
 def settings_hash(settings: dict) -> str:

@@ -20,6 +20,7 @@ CASE_MODULES = (
     "methods.kernels.composite.cases",
     "methods.kernels.spherical.cases",
     "methods.kernels.adam.cases",
+    "methods.kernels.splat.cases",
     "methods.step_cases",
 )
 

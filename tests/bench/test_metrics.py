@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from bench.metrics import SMALLEST_SIDE, Lpips, psnr, quantise, ssim
+from bench.metrics import SMALLEST_SIDE, Lpips, flicker, psnr, quantise, ssim
 from bench.types import SteerbenchError, Unavailable
 
 UNIT = st.floats(0.0, 1.0)
@@ -53,6 +53,25 @@ def test_psnr_is_symmetric_and_infinite_for_equal_pictures(device):
     a, b = noise(9, 8, 1, device), noise(9, 8, 2, device)
     assert psnr(a, b) == psnr(b, a)
     assert psnr(a, a) == math.inf
+
+
+def test_flicker_is_the_change_of_the_error_alone(device):
+    before, after, wrong = (noise(9, 8, seed, device).double() for seed in range(3))
+    assert flicker(after, after, before, before) == 0
+    assert flicker(after + wrong, after, before + wrong, before) == pytest.approx(0, abs=1e-15)
+    # Half of the pixels become 0.3 brighter, the others as much darker: 0.3 each.
+    blink = torch.where(torch.arange(8, device=device)[None, :, None] % 2 == 0, 0.3, -0.3).double()
+    assert flicker(after + blink, after, before, before) == pytest.approx(0.3, rel=1e-7)
+    shown = after + wrong, after, before, before
+    expected = F.mse_loss(wrong, torch.zeros_like(wrong)).sqrt().item()
+    assert flicker(*shown) == pytest.approx(expected, rel=1e-12)
+    assert flicker(*shown[2:], *shown[:2]) == flicker(*shown)
+
+
+def test_flicker_refuses_pictures_of_different_size():
+    small, large = noise(4, 5), noise(5, 4)
+    with pytest.raises(ValueError, match=r"previous_image: expected shape \[4, 5, 3\]"):
+        flicker(small, small, large, large)
 
 
 def test_psnr_refuses_pictures_of_different_size():

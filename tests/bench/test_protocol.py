@@ -36,7 +36,13 @@ def test_a_changed_protocol_may_not_keep_the_name():
 
 @pytest.mark.parametrize(
     ("option", "value"),
-    [("rounding", "floor"), ("ssim", "ms"), ("background", "grey"), ("memory", "warm")],
+    [
+        ("rounding", "floor"),
+        ("ssim", "ms"),
+        ("background", "grey"),
+        ("memory", "warm"),
+        ("flicker", "no"),
+    ],
 )
 def test_an_unknown_choice_names_the_option_and_what_is_allowed(option, value):
     with pytest.raises(SteerbenchError, match=f"protocol.{option}: expected .* got '{value}'"):

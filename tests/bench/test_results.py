@@ -32,7 +32,7 @@ PARTS = st.dictionaries(st.text(), JSON, max_size=4)
 def measurement(values: list[float], text: str = "plain") -> Measurement:
     """One row per value; `text` stands in the columns of text."""
     words = ("method", "scene", "split", "trajectory", "resolution", "protocol", "budget")
-    kind = ("unit", "device", "backend", "engine", "precision")
+    kind = ("phase", "unit", "device", "backend", "engine", "precision")
     rows = pd.DataFrame(
         {
             **dict.fromkeys((*words, *kind), text),
@@ -167,7 +167,7 @@ def test_what_a_killed_process_left_is_ignored_and_deleted_after_a_day(store):
 def test_a_run_of_another_schema_is_reported_and_left_out(store):
     kept, foreign, damaged = (store.save({"seed": i}, measurement([1.0])) for i in range(3))
     record = store.folder / foreign / "record.json"
-    record.write_text(record.read_text().replace('"schema_version": 1', '"schema_version": 99'))
+    record.write_text(record.read_text().replace('"schema_version": 2', '"schema_version": 99'))
     (store.folder / damaged / "record.json").write_text("{")
     reports: list[str] = []
     assert set(store.rows(report=reports.append)["run"]) == {kept}

@@ -147,6 +147,70 @@ def test_cold_means_that_every_frame_is_the_first_of_its_sequence(run, offset_me
     assert offset_method.calls == ["fit", "reset", "reset", *frames]
 
 
+def with_cuts(trajectory, *cuts: int):
+    steps = tuple(replace(s, cut=i in cuts) for i, s in enumerate(trajectory.steps))
+    return replace(trajectory, steps=steps)
+
+
+def test_frames_with_too_little_to_look_back_on_are_cold(run, offset_method, tiny_scene):
+    offset_method.memory = 2
+    measured = run(offset_method, trajectory=with_cuts(from_split(tiny_scene), 3))
+    frames, rows = measured.frames, measured.rows
+    assert frames["phase"].tolist() == ["cold", "cold", "steady", "cold", "cold", "steady"]
+    for phase, of_phase in frames.groupby("phase"):
+        of_rows = rows[rows["phase"] == phase]
+        for metric in ("psnr", "frame_ms", "work.pixels", "stage_ms.look-up"):
+            found = row(of_rows, metric)
+            assert (found["value"], found["n"]) == (of_phase[metric].mean(), len(of_phase))
+        assert value(of_rows, "frame_ms.p50") == pytest.approx(of_phase["frame_ms"].median())
+        assert value(of_rows, "fps") == pytest.approx(1000 / of_phase["frame_ms"].mean())
+    whole = rows.loc[rows["phase"] == "all", "metric"]
+    assert set(whole) == {
+        *("size_bytes.offset", "size_bytes.table", "size_bytes.total", "peak_bytes", "train_s")
+    }
+    assert not rows.duplicated(["phase", "metric"]).any()
+
+
+def test_a_cut_is_not_announced_to_the_method(run, offset_method, tiny_scene):
+    run(offset_method, trajectory=with_cuts(from_split(tiny_scene), 2, 4))
+    assert offset_method.calls.count("reset") == 2
+
+
+@pytest.mark.parametrize(
+    ("memory", "protocol", "phases"),
+    [
+        (0, "steady", {"steady"}),
+        (0, "cold", {"steady"}),
+        (2, "cold", {"cold"}),
+        (6, "steady", {"cold"}),
+    ],
+)
+def test_phases_there_are_none_of_have_no_rows(run, offset_method, memory, protocol, phases):
+    offset_method.memory = memory
+    measured = run(offset_method, protocol=replace(QUICK, memory=protocol))
+    assert set(measured.frames["phase"]) == phases
+    assert set(measured.rows["phase"]) == {*phases, "all"}
+
+
+def test_every_frame_says_how_much_memory_it_needed(run, offset_method):
+    measured = run(offset_method)
+    assert measured.frames["peak_bytes"].max() == value(measured.rows, "peak_bytes")
+    assert measured.frames["peak_bytes"].min() > 0
+
+
+def test_flicker_has_a_row_in_the_phases_that_have_a_pair(run, offset_method, tiny_scene):
+    offset_method.memory = 1
+    measured = run(offset_method)
+    found = row(measured.rows, "flicker")
+    assert (found["phase"], found["n"], found["unit"]) == ("steady", 5, "1")
+    known = measured.frames["flicker"]
+    assert math.isnan(known[0])
+    assert found["value"] == pytest.approx(known[1:].mean())
+    alone = run(offset_method, trajectory=from_split(tiny_scene, limit=1))
+    assert "flicker" not in set(alone.rows["metric"])
+    assert alone.frames["flicker"].isna().all()
+
+
 def test_a_backbone_that_cannot_be_had_leaves_nan_and_its_reason(
     run, offset_method, monkeypatch, tmp_path, lpips_weights
 ):

@@ -1,4 +1,4 @@
-"""Trajectories keep the order of their split and thin it out evenly."""
+"""Trajectories go through the cameras of their split in the order that they promise."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from bench.cameras import look_at, scale_camera
-from bench.trajectories import Step, from_split, smooth, spread, static
+from bench.trajectories import Step, from_split, jump, loop, orbit, smooth, spread, static
 from bench.types import Camera, Scene, Split, SteerbenchError
 
 CONFIGS = Path(__file__).parents[2] / "sweeps" / "configs" / "trajectory"
@@ -143,3 +143,70 @@ def test_a_static_path_stays_where_it_is():
         static(scene, view=2)
     with pytest.raises(SteerbenchError, match=r"trajectory\.frames: expected 1 or more"):
         static(scene, frames=0)
+
+
+def test_an_orbit_takes_the_first_cameras_without_gaps():
+    scene = orbit_of([0, 4, 8, 12])
+    path = orbit(scene, limit=3)
+    assert path.steps == tuple(Step(scene.splits["test"].cameras[i], i) for i in range(3))
+    assert (path.name, orbit(scene).name) == ("test-orbit-3of4", "test-orbit")
+    assert not any(step.cut for step in path.steps)
+
+
+def test_a_jumping_path_has_every_frame_once_and_a_cut_before_every_piece():
+    scene = orbit_of(list(range(23)))
+    there, jumping = smooth(scene), jump(scene, every=5)
+    places = {id(step.camera): i for i, step in enumerate(there.steps)}
+    order = [places[id(step.camera)] for step in jumping.steps]
+    assert sorted(order) == list(range(23))
+    assert [replace(step, cut=False) for step in jumping.steps] == [there.steps[i] for i in order]
+    assert [step.cut for step in jumping.steps] == [i % 5 == 0 for i in order]
+    for (before, after), step in zip(pairwise(order), jumping.steps[1:], strict=True):
+        assert step.cut == (after != before + 1)
+    assert jumping == jump(scene, every=5)
+    assert jumping.name == "test-jump5-1deg"
+
+
+@pytest.mark.parametrize("pieces", range(2, 12))
+def test_no_number_of_pieces_is_too_small_to_shuffle(pieces):
+    path = jump(orbit_of(list(range(pieces))), every=1, limit=pieces)
+    assert all(step.cut for step in path.steps)
+    assert all(after.truth != before.truth + 1 for before, after in pairwise(path.steps))
+
+
+def test_a_jumping_path_needs_somewhere_to_jump():
+    with pytest.raises(SteerbenchError, match=r"trajectory\.every: expected 1 to 2, .* got 3"):
+        jump(orbit_of([0, 1, 2]), every=3)
+    with pytest.raises(SteerbenchError, match=r"trajectory\.every"):
+        jump(orbit_of([0, 1, 2]), every=0)
+
+
+def test_a_loop_goes_there_and_back_until_its_frames_are_used_up():
+    scene = orbit_of([0, 2, 4])
+    path = loop(scene, frames=11)
+    there = smooth(scene).steps
+    for step, place in zip(path.steps, (0, 1, 2, 3, 4, 3, 2, 1, 0, 1, 2), strict=True):
+        assert step.truth == there[place].truth
+        assert torch.equal(step.camera.c2w, there[place].camera.c2w)
+    assert [step.truth for step in path.steps[::8]] == [0, 0]
+    assert not any(step.cut for step in path.steps)
+    turns = [turn_deg(a.camera, b.camera) for a, b in pairwise(path.steps)]
+    assert turns == pytest.approx([1.0] * 10, abs=0.05)
+    assert path.name == "test-loop11-1deg"
+
+
+def test_a_loop_of_two_cameras_and_of_one():
+    scene = orbit_of([0, 1, 2])
+    assert [step.truth for step in loop(scene, frames=5, limit=2).steps] == [0, 1, 0, 1, 0]
+    assert [step.truth for step in loop(scene, frames=3, limit=1).steps] == [0, 0, 0]
+    with pytest.raises(SteerbenchError, match=r"trajectory\.frames: expected 1 or more, got 0"):
+        loop(scene, frames=0)
+
+
+@pytest.mark.parametrize(("choice", "made"), [("orbit", orbit), ("jump", jump), ("loop", loop)])
+def test_the_configurations_are_the_defaults(choice, made):
+    scene = orbit_of(list(range(15)))
+    config = OmegaConf.create(
+        {"trajectory": OmegaConf.load(CONFIGS / f"{choice}.yaml"), "budget": {"frames": 12}}
+    )
+    assert hydra.utils.instantiate(config.trajectory, scene) == made(scene, limit=12)

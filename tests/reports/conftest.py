@@ -7,6 +7,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -44,7 +45,20 @@ def rows() -> pd.DataFrame:
     table = pd.DataFrame(lines).assign(
         run="0123456789abcdef", method="ngp", scene="totem", resolution="64x48", n=7
     )
+    whole = table["metric"].str.match("size_bytes|peak_bytes|train_s")
+    table["phase"] = np.where(whole, "all", "steady")
     return table.reindex(columns=COLUMNS)
+
+
+@pytest.fixture
+def rows_with_cold(rows: pd.DataFrame) -> pd.DataFrame:
+    """The same of a method that looks back: two cold frames, 3 dB worse and half as fast."""
+    cold = rows[rows["phase"] == "steady"].assign(phase="cold", n=2)
+    figures = ["value", "lo", "hi"]
+    cold.loc[cold["metric"] == "psnr", figures] -= 3
+    cold.loc[cold["metric"].str.match("frame_ms|stage_ms"), figures] *= 2
+    cold.loc[cold["metric"] == "fps", figures] /= 2
+    return pd.concat([rows, cold], ignore_index=True)
 
 
 @pytest.fixture

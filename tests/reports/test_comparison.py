@@ -70,3 +70,13 @@ def test_a_failure_is_a_line_that_tells_its_reason(make):
     table = comparison([make("a")], {"b (level=7)": "expected 0 to 1"})
     assert table.lines[1][0] == "b (level=7): failed: expected 0 to 1"
     assert {len(line) for line in table.lines} == {len(table.columns)}
+
+
+def test_cold_frames_have_a_line_of_their_own_and_compete_among_themselves(make, rows_with_cold):
+    runs = [make("a"), make("b"), make("c")]
+    runs[1:] = [replace(run, rows=rows_with_cold.assign(**FACTS)) for run in runs[1:]]
+    table = comparison(runs, {})
+    assert [line[0] for line in table.lines] == ["a", "b", "b, cold", "c", "c, cold"]
+    assert [line[1] for line in table.lines] == ["30.46", "30.46", "27.46", "30.46", "27.46"]
+    assert table.lines[2][-4:] == ("400.0", "2.50", "25.20", "61")
+    assert ("b, cold", "PSNR, dB ↑") in bold(table)

@@ -52,6 +52,18 @@ def test_the_page_says_how_it_was_made_and_where_its_figures_come_from(page, sto
         assert fact in text
 
 
+def test_a_picture_of_a_cold_frame_says_so(store, stored_run, tmp_path, monkeypatch):
+    frames = store.frames(stored_run)
+    frames.loc[0, "phase"] = "cold"
+    frames.to_csv(store.folder / stored_run / "frames.csv", index=False)
+    titles = []
+    monkeypatch.setattr(
+        "reports.page.write_sheet", lambda truth, views, *_: titles.extend(views[0].titles[1:])
+    )
+    write_page(store, {stored_run: "offset"}, tmp_path)
+    assert [title.endswith(" ms, cold") for title in titles] == [True, False, False]
+
+
 def test_every_row_of_every_table_has_as_many_cells_as_its_heading(page):
     tables = re.findall(r"(?:^\|.*\|\n)+", page.read_text(), re.MULTILINE)
     assert len(tables) == 5
@@ -113,9 +125,11 @@ def test_runs_of_different_frames_are_not_put_into_one_picture(several, tmp_path
     assert "**" not in page.read_text()
 
 
-def test_a_bar_per_run_is_as_long_as_its_stages_together(rows, tmp_path, monkeypatch):
+@pytest.mark.parametrize("of", ["rows", "rows_with_cold"])
+def test_a_bar_per_run_is_as_long_as_its_stages_together(of, request, tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(figures.Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    rows = request.getfixturevalue(of)
     other = rows[rows["metric"] != "stage_ms.other"]
     runs = [Run(str(i), f"run {i}", r, r, {}, tmp_path) for i, r in enumerate((rows, other))]
     figures.stage_bars(runs, tmp_path / "bars.png")

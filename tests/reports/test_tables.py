@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import pandas as pd
 import pytest
 
 from reports import tables
@@ -49,6 +50,33 @@ def test_memory_is_in_decimal_megabytes(rows):
         "model": ("25.20",),
         "peak, rendering": ("1,000.00",),
     }
+
+
+def test_cold_frames_stand_apart_and_are_called_so(rows, rows_with_cold):
+    quality, time, cold_quality, cold_time, memory = tables.blocks(rows_with_cold)
+    assert [quality, time, memory] == tables.blocks(rows)
+    assert cold_quality.title == "Quality, cold, mean of 2 frames"
+    assert cells(cold_quality)["PSNR, dB ↑"] == ("27.46", "26.50 – 28.50")
+    assert cold_time.title == "Time of a frame, cold"
+    assert cells(cold_time)["field"] == ("300.00", "75.0 %")
+
+
+def test_a_run_of_cold_frames_alone_says_so(rows_with_cold):
+    cold = rows_with_cold[rows_with_cold["phase"] != "steady"]
+    titles = [table.title for table in tables.blocks(cold)]
+    assert titles == ["Quality, cold, mean of 2 frames", "Time of a frame, cold", "Memory"]
+
+
+def test_the_headline_is_steady_where_a_run_has_steady_frames(rows, rows_with_cold):
+    pd.testing.assert_frame_equal(tables.headline(rows_with_cold), rows)
+    cold = rows_with_cold[rows_with_cold["phase"] != "steady"]
+    pd.testing.assert_frame_equal(tables.headline(cold), cold)
+
+
+def test_flicker_is_shown_where_there_is_any(rows):
+    flicker = rows[rows["metric"] == "psnr"].assign(metric="flicker", value=0.01234)
+    shown = tables.blocks(pd.concat([rows, flicker]))[0]
+    assert cells(shown)["flicker ↓"][0] == "0.0123"
 
 
 @pytest.mark.parametrize(("figures", "rule"), [(True, "| --- | ---: |"), (False, "| --- | --- |")])

@@ -1,9 +1,10 @@
 """Ray marching through an occupancy grid: samples where something may be, nothing elsewhere.
 
-A ray enters the unit cube, or its window, at t_0 and is divided into steps of one world length:
+A ray enters the unit cube at t_0 and is divided into steps of one world length:
 t_k = t_0 + (k + phase) step / norm(d), phase 1/2 (midpoint rule) or a jitter in [0, 1). Sample k
-exists where the cell at o + t_k d is occupied. The set of samples does not depend on how empty
-space is skipped, so every backend returns the same ones.
+exists where the cell at o + t_k d is occupied and t_k lies in the ray's window. The set of samples
+does not depend on how empty space is skipped, so every backend returns the same ones, and a window
+leaves samples out but moves none.
 """
 
 from __future__ import annotations
@@ -137,7 +138,7 @@ def march(
 
     Args:
         step: world length of a step, scene units.
-        window: [R, 2] nearest and farthest t; None: [0, inf).
+        window: [R, 2] nearest and farthest t, the latter excluded; None: [0, inf).
         jitter: [R] phase of a ray's samples in [0, 1); None: 1/2.
         start: [R] int32 step to begin with, `Samples.resume` of an earlier call with the same rays;
             a negative one ends the ray; None: 0.

@@ -117,13 +117,13 @@ def _leave_slab(origin, slope, cell, side, width):
 
 
 @njit(cache=True)
-def _march_ray(origin, direction, words, blocks, bounds, step, near, far, phase, k, limit, out):
+def _march_ray(origin, direction, words, blocks, bounds, step, window, phase, k, limit, out):
     """Write the t of a ray's samples to `out`; return their number and the step to resume from."""
     ox, oy, oz = origin
     dx, dy, dz = direction
     length = f32(math.sqrt(f64(dx) ** 2 + f64(dy) ** 2 + f64(dz) ** 2))
     enter, leave = _cross(origin, direction, UNIT_CUBE)
-    near, far = max(enter, near), min(leave, far)
+    near, far = max(enter, f32(0)), min(leave, window[1])
     finite = abs(ox) + abs(oy) + abs(oz) < np.inf and 0 < length < np.inf
     if not (finite and near < far):
         return 0, -1
@@ -134,11 +134,12 @@ def _march_ray(origin, direction, words, blocks, bounds, step, near, far, phase,
     sy = f32(1) / dy if dy != 0 else f32(0)
     sz = f32(1) / dz if dz != 0 else f32(0)
 
-    # Skip what lies before the box of occupied cells, with a step to spare for rounding.
+    # Skip what lies before the window and the box of occupied cells, with a step to spare for
+    # rounding.
     enter, leave = _cross(origin, direction, bounds)
     if not enter <= leave:
         return 0, -1
-    k = max(k, int((enter - near) * steps_per_t) - 1)
+    k = max(k, int((min(max(enter, window[0]), far) - near) * steps_per_t) - 1)
     far = min(far, leave + step_t)
 
     count = 0
@@ -148,7 +149,9 @@ def _march_ray(origin, direction, words, blocks, bounds, step, near, far, phase,
             return count, -1
         x, y, z = _cell(ox + t * dx, size), _cell(oy + t * dy, size), _cell(oz + t * dz, size)
         side = _empty_side(words, blocks, x, y, z)
-        if side == 0:
+        if t < window[0]:
+            k += 1
+        elif side == 0:
             out[count] = t
             count += 1
             k += 1
@@ -193,8 +196,7 @@ def _find(
                     blocks,
                     bounds,
                     step,
-                    window[ray, 0],
-                    window[ray, 1],
+                    window[ray],
                     jitter[ray],
                     np.int64(start[ray]),
                     most,

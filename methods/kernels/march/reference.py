@@ -53,7 +53,7 @@ def _march_block(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """t [S] and positions [S, 3] of the samples, how many a ray has [R], where to resume [R]."""
     entry, leave = _cross_unit_cube(origins, directions)
-    near, far = torch.maximum(entry, window[:, 0]), torch.minimum(leave, window[:, 1])
+    near, far = entry.clamp(min=0), torch.minimum(leave, window[:, 1])
     # In float64, where every backend rounds to the same float32.
     length = directions.double().norm(dim=-1).to(directions.dtype)
     # A true division: `step / length` would multiply by the reciprocal, an ulp away.
@@ -64,7 +64,7 @@ def _march_block(
     k = torch.arange(int(count.max()) if len(count) else 0, device=origins.device)
     t = near[:, None] + (k + jitter[:, None]) * step_t[:, None]  # [R, K]
     positions = origins[:, None] + t[..., None] * directions[:, None]  # [R, K, 3]
-    candidate = alive[:, None] & (t < far[:, None]) & (k >= start[:, None])
+    candidate = alive[:, None] & (t >= window[:, :1]) & (t < far[:, None]) & (k >= start[:, None])
     candidate &= _occupied(torch.where(candidate[..., None], positions, 0), occupancy)
 
     rank = candidate.cumsum(dim=1)

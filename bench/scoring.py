@@ -1,0 +1,87 @@
+"""Scores of a sequence of frames, taken one after another so that none has to be kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib
+import numpy as np
+import torch
+from torch import Tensor
+
+from bench.metrics import Lpips, flicker, quantise
+from bench.protocol import EvaluationProtocol, composite
+from bench.trajectories import Step, Trajectory, spread
+from bench.types import Scene
+
+ERROR_RANGE = 0.1
+"""Absolute error, mean over the channels, that the brightest colour of an error map stands for."""
+
+
+class Scoring:
+    """Scores the frames of a trajectory in their order; remembers the last one for its flicker.
+
+    Attributes:
+        images: of `pictures` scored frames, evenly spread: ground truth, rendering and error map
+            as 8-bit pictures by file name; filled as the frames come.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        trajectory: Trajectory,
+        protocol: EvaluationProtocol,
+        lpips: Mapping[str, Lpips],
+        pictures: int,
+    ) -> None:
+        self.images: dict[str, np.ndarray] = {}
+        self._scene, self._protocol, self._lpips = scene, protocol, lpips
+        self._split = scene.splits[trajectory.split]
+        scored = [index for index, step in enumerate(trajectory.steps) if step.truth is not None]
+        self._shown = {scored[i] for i in spread(len(scored), pictures)}
+        self._last: tuple[Tensor, Tensor] | None = None
+
+    def score(self, index: int, step: Step, rgb: Tensor) -> dict[str, Any]:
+        """Name and metrics of frame `index`, rendered as `rgb` [H, W, 3]; none without a truth."""
+        figures: dict[str, Any] = {}
+        if step.truth is not None:
+            truth, background = self._split.images[step.truth], self._scene.background
+            figures["name"] = self._split.names[step.truth]
+            figures |= self._protocol.score(rgb, truth, background, self._lpips)
+            if index in self._shown:
+                self.images |= _pictures(index, rgb, composite(truth, background))
+        return figures | self._flicker(step, rgb)
+
+    def _flicker(self, step: Step, rgb: Tensor) -> dict[str, float]:
+        """The flicker since the frame before, where both have a true picture of the same size."""
+        last, self._last = self._last, self._with_truth(step, rgb)
+        if step.cut or last is None or self._last is None or last[0].shape != rgb.shape:
+            return {}
+        return {"flicker": flicker(*self._last, *last)}
+
+    def _with_truth(self, step: Step, rgb: Tensor) -> tuple[Tensor, Tensor] | None:
+        """The frame as it is scored and its true picture, both [H, W, 3]."""
+        if step.truth is not None:
+            truth = self._split.images[step.truth]
+        elif self._protocol.flicker == "exact" and self._scene.exact is not None:
+            truth = self._scene.exact(step.camera)
+        else:
+            return None
+        background = self._scene.background
+        return self._protocol.rounded(rgb), composite(truth.to(rgb.device), background)
+
+
+def _pictures(index: int, rgb: Tensor, truth: Tensor) -> dict[str, np.ndarray]:
+    """Ground truth, rendering and error map of a frame, as 8-bit pictures by file name."""
+    rendering, truth = quantise(rgb).cpu(), truth.cpu()
+    error = (rendering - truth).abs().mean(dim=-1) / ERROR_RANGE
+    return {
+        f"{index:04d}-truth": _bytes(truth),
+        f"{index:04d}-rendered": _bytes(rendering),
+        f"{index:04d}-error": matplotlib.colormaps["inferno"](error.numpy(), bytes=True)[..., :3],
+    }
+
+
+def _bytes(image: Tensor) -> np.ndarray:
+    return image.mul(255.0).round().to(torch.uint8).numpy()

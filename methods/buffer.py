@@ -1,0 +1,120 @@
+"""Preceding frames, kept as points and brought into the present view (SteerNeRF Eq. 6, 9, 10)."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from bench.cameras import pixel_grid, project, unproject
+from bench.types import Camera
+from methods.kernels.splat import splat
+from methods.volume import FeatureFrame
+
+SPLAT_ALPHA = 0.1
+"""Least opacity of a pixel that becomes a point: the depth of a fainter one means little."""
+
+
+@dataclass(frozen=True)
+class Reprojection:
+    """How a frame is brought into another view; each `paper` value is what the release does.
+
+    Attributes:
+        rule: which point a pixel shows, the "nearest", or the "last" written (paper).
+        centres: "exact", or "paper": unprojected through the corner of a pixel, which is constant
+            offset of s / 2 - 1/2 pixels that the 2D renderer has to learn.
+        depth: "expected" termination, or the "sum" of w t (paper): too near where alpha < 1; empty
+            pixels become points at the camera.
+    """
+
+    rule: Literal["nearest", "last"] = "nearest"
+    centres: Literal["exact", "paper"] = "exact"
+    depth: Literal["expected", "sum"] = "expected"
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """The pixels of a low-resolution frame that show something, as points in the scene.
+
+    Attributes:
+        camera: of the frame.
+        source: [N] index of each point's pixel, row by row.
+        points: [N, 3].
+        values: [N, K] features.
+        alpha: [N] opacity.
+    """
+
+    camera: Camera
+    source: Tensor
+    points: Tensor
+    values: Tensor
+    alpha: Tensor
+
+    @classmethod
+    def of(cls, frame: FeatureFrame, options: Reprojection) -> Cloud:
+        """Unproject `frame` (Eq. 6)."""
+        alpha, depth = frame.alpha.flatten(), frame.depth.flatten()
+        if options.depth == "sum":
+            source = torch.arange(len(alpha), device=alpha.device)
+            depth = torch.where(alpha > 0, depth.nan_to_num(posinf=0) * alpha, 0) + 1e-12
+        else:
+            source = ((alpha > SPLAT_ALPHA) & depth.isfinite()).nonzero().squeeze(1)
+            depth = depth[source]
+        camera = frame.camera
+        centres = pixel_grid(camera.width, camera.height, alpha.device)[source]
+        if options.centres == "paper":
+            centres = centres - 0.5
+        values = frame.values.reshape(len(alpha), -1)[source]
+        return cls(camera, source, unproject(camera, centres, depth), values, alpha[source])
+
+    def land(self, camera: Camera, options: Reprojection, backend: str) -> tuple[Tensor, Tensor]:
+        """Which point each pixel of `camera` shows (Eq. 9, 10).
+
+        Returns:
+            [H, W] int32, the index of the point, -1 for none; and [N] the z-depth of the points.
+        """
+        pixels, depth = project(camera, self.points)
+        if options.centres == "paper":
+            pixels = pixels + 0.5  # pixel i is at i there, and shows what rounds to it
+        size = camera.width, camera.height
+        return splat(pixels, depth, *size, rule=options.rule, backend=backend), depth
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """What is kept of a frame: its `cloud`, and its `picture` [H, W, 3] as `camera` saw it."""
+
+    cloud: Cloud
+    camera: Camera
+    picture: Tensor
+
+
+class RenderingBuffer:
+    """The last `length` frames of a sequence; more are forgotten.
+
+    Attributes:
+        turn: frames since the sequence began.
+    """
+
+    def __init__(self, length: int, turn: int = 0) -> None:
+        self._frames: deque[Remembered] = deque(maxlen=length)
+        self.turn = turn
+
+    @property
+    def frames(self) -> Sequence[Remembered]:
+        """Newest first; fewer than `length` after a cold start."""
+        return tuple(self._frames)
+
+    def push(self, frame: Remembered) -> None:
+        """Remember `frame`, forget the oldest one if there are too many."""
+        self._frames.appendleft(frame)
+        self.turn += 1
+
+    def reset(self) -> None:
+        """Forget all: a new sequence starts."""
+        self._frames.clear()
+        self.turn = 0

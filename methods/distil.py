@@ -1,0 +1,75 @@
+"""Pictures that a trained field shows at views nobody photographed, to learn from as if true."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from bench.motion import novel_view
+from bench.types import Camera, Log, NullProbe, Scene
+from methods import checkpoint
+from methods.pretrained import Pretrained
+from methods.range_reduction import render_guided
+from methods.sequences import TrueView
+
+INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height")
+
+
+def distilled_views(
+    trained: Pretrained,
+    scene: Scene,
+    target: Tensor,
+    count: int,
+    seed: int,
+    folder: Path,
+    log: Log,
+) -> list[TrueView]:
+    """`count` views among the training cameras as `trained` shows them at full resolution.
+
+    Args:
+        target: [3] the point that the cameras look at, more or less.
+        folder: where they are kept, and found again.
+    """
+    path = folder / "views.safetensors"
+    if not path.exists():
+        generator = torch.Generator().manual_seed(seed)
+        cameras = scene.splits["train"].cameras
+        views = [novel_view(cameras, target, generator) for _ in range(count)]
+        tensors: dict[str, Tensor] = {}
+        with log.progress("distilling", count) as progress:
+            for number, camera in enumerate(views):
+                tensors |= _packed(number, camera, _picture(trained, camera, scene.background))
+                progress.advance()
+        checkpoint.write(path, tensors, {"views": count})
+    tensors, figures = checkpoint.read(path)
+    return [_unpacked(tensors, number) for number in range(int(figures["views"]))]
+
+
+def _picture(trained: Pretrained, camera: Camera, background: Tensor) -> Tensor:
+    """uint8 [H, W, 3]."""
+    device = trained.field.table.device
+    camera = replace(camera, c2w=camera.c2w.to(device))
+    rgb = render_guided(
+        trained.field, camera, trained.occupancy, background.to(device), NullProbe(), None
+    ).values
+    return (rgb.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
+
+
+def _packed(number: int, camera: Camera, picture: Tensor) -> dict[str, Tensor]:
+    inside = torch.tensor([getattr(camera, name) for name in INTRINSICS], dtype=torch.float64)
+    return {
+        f"{number}.picture": picture,
+        f"{number}.c2w": camera.c2w.contiguous(),
+        f"{number}.intrinsics": inside,
+    }
+
+
+def _unpacked(tensors: Mapping[str, Tensor], number: int) -> TrueView:
+    inside = dict(zip(INTRINSICS, tensors[f"{number}.intrinsics"].tolist(), strict=True))
+    inside |= {side: int(inside[side]) for side in ("width", "height")}
+    camera = Camera(tensors[f"{number}.c2w"], **inside)
+    return TrueView(camera, tensors[f"{number}.picture"])

@@ -1,0 +1,327 @@
+"""Stage 2: the 2D renderer, and with it the field, trained on patches of pictures (Section 3.5)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.optim.swa_utils import AveragedModel
+
+from bench.cameras import cast, crop_camera, pixel_grid
+from bench.protocol import composite
+from bench.types import Camera, Rays
+from methods import checkpoint, loop
+from methods.buffer import Cloud
+from methods.kernels.adam import AdamState, sparse_adam_
+from methods.kernels.composite import Pixels
+from methods.pipeline import Pipeline, View
+from methods.renderer2d import Observation, Renderer2d, Reprojected
+from methods.sequences import MotionOptions, Sequence, SequencePool
+from methods.volume import FeatureFrame, rays_at_matter, render_batch
+
+Tensors = tuple[Tensor, ...] | list[Tensor]
+
+
+@dataclass(frozen=True)
+class JointOptions:
+    """How stage 2 is trained.
+
+    Attributes:
+        field: "joint", or "frozen" as stage 1 left it (the ablation of the paper's Table 5).
+        through: which frames the field learns from: "all", also the preceding ones, or only the
+            "present" one.
+        rate: learning rate of the 2D renderer at the beginning.
+        field_rate: of the field.
+        final_rate: share of both left at the end of the cosine schedule.
+        patch: side of a patch, low-resolution pixels.
+        batch: patches of a step.
+        opacity_entropy: weight of -o ln o of the rays.
+        clip: largest norm of the 2D renderer's gradient.
+        average: decay of the running mean of the 2D renderer's weights that is used in the end.
+        distilled_views: pictures of the stage 1 field at random views, to learn from as well.
+        distilled_share: of the patches that are taken from those.
+        motion: what precedes a training view.
+    """
+
+    field: Literal["joint", "frozen"] = "joint"
+    through: Literal["all", "present"] = "all"
+    rate: float = 1e-3
+    field_rate: float = 1e-3
+    final_rate: float = 0.01
+    patch: int = 32
+    batch: int = 2
+    opacity_entropy: float = 1e-3
+    clip: float = 1.0
+    average: float = 0.999
+    distilled_views: int = 100
+    distilled_share: float = 0.3
+    motion: MotionOptions = MotionOptions()
+
+    def __post_init__(self) -> None:
+        if not (self.rate > 0 and self.field_rate > 0 and 0 < self.final_rate <= 1):
+            raise ValueError(f"expected rates > 0, final_rate in (0, 1]: {self}")
+        if not (self.patch >= 1 and self.batch >= 1 and self.clip > 0 and 0 <= self.average < 1):
+            raise ValueError(f"expected patch, batch >= 1, clip > 0, average in [0, 1): {self}")
+        if not (self.distilled_views >= 0 and 0 <= self.distilled_share <= 1):
+            raise ValueError(f"expected distilled_views >= 0 and distilled_share in [0, 1]: {self}")
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A patch of a training view, and the rays of the field that it is drawn from.
+
+    Attributes:
+        sequence: what it was cut from.
+        view: its cameras.
+        truth: [H, W, 3].
+        seen: [P] pixels of `view.low` whose rays are rendered.
+        indices: what each preceding frame shows at its pixels, [H, W].
+        shown: the points of each preceding frame that are seen.
+        rays: of `seen`, then of each of `shown`.
+    """
+
+    sequence: Sequence
+    view: View
+    truth: Tensor
+    seen: Tensor
+    indices: list[Tensor]
+    shown: list[Tensor]
+    rays: list[Rays]
+
+
+class JointTraining:
+    """Stage 2 as a `loop.Training`.
+
+    Args:
+        pipeline: trained in place; its renderer is replaced by the running mean of its weights.
+        pool: training sequences, rendered by `pipeline`.
+        steps: optimiser steps.
+    """
+
+    advice = "Try smaller learning rates (method.joint.rate, method.joint.field_rate)."
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        renderer: Renderer2d,
+        pool: SequencePool,
+        options: JointOptions,
+        steps: int,
+        generator: torch.Generator,
+    ) -> None:
+        self.pipeline, self.renderer, self.pool, self.options = pipeline, renderer, pool, options
+        self.generator = generator
+        self.step, self.steps, self.seconds = 0, steps, 0.0
+        self.optimiser = torch.optim.Adam(renderer.parameters(), lr=options.rate)
+        self.mean = AveragedModel(renderer, multi_avg_fn=self._average)
+        pipeline.renderer = self.mean.module
+        self.joint = options.field == "joint"
+        self.field = pipeline.field.requires_grad_(self.joint)
+        if self.joint:
+            self.table_state = AdamState.like(self.field.table.detach())
+            self.networks = torch.optim.Adam(
+                list(self.field.layers.values()),
+                lr=options.field_rate,
+                betas=(0.9, 0.99),
+                eps=1e-15,
+            )
+            self.field.grad_buffer = torch.zeros_like(self.field.table)
+
+    def advance(self) -> dict[str, float]:
+        """One step; mean squared error of the picture and of the base that it corrects.
+
+        Raises:
+            SteerbenchError: the loss is not finite.
+        """
+        patches = [self._cut(self.pool.draw()) for _ in range(self.options.batch)]
+        observations, opacity = self._observe(patches)
+        drawn, base = self.renderer(observations)
+        truth = torch.stack([patch.truth for patch in patches])
+        loss = functional.mse_loss(drawn, truth)
+        entropy = -(opacity * opacity.log()).mean() if self.joint and len(opacity) else 0.0
+        (loss + self.options.opacity_entropy * entropy).backward()
+        value = loss.item()
+        if not math.isfinite(value):
+            loop.check_finite(self, {"loss": loss, "picture": drawn})
+        self._update()
+        self.step += 1
+        return {"": value, "base": functional.mse_loss(base.detach(), truth).item()}
+
+    def _cut(self, sequence: Sequence) -> Patch:
+        """A random patch of `sequence` in which there is more than background."""
+        scale, view = self.pipeline.options.scale, sequence.view
+        place = sequence.cells[self._random(len(sequence.cells))].tolist()
+        size = view.low.height, view.low.width
+        height, width = (min(self.options.patch, side) for side in size)
+        top, left = (
+            min(max(centre - self._random(extent), 0), side - extent)
+            for centre, extent, side in zip(place, (height, width), size, strict=True)
+        )
+        low = crop_camera(view.low, left, top, width, height)
+        full = crop_camera(view.full, left * scale, top * scale, width * scale, height * scale)
+        cut = View(full, low, view.phase)
+        seen, rays = rays_at_matter(low, self.pipeline.occupancy)
+        patch = Patch(sequence, cut, self._truth(sequence, top, left, full), seen, [], [], [rays])
+        for frame in sequence.buffer.frames:
+            index, _ = frame.cloud.land(
+                full, self.pipeline.options.reprojection, self.field.backend
+            )
+            shown = index[index >= 0].unique().long()
+            patch.indices.append(index)
+            patch.shown.append(shown)
+            if self.joint and self.options.through == "all":
+                patch.rays.append(_rays_of(frame.cloud, shown))
+        return patch
+
+    def _truth(self, sequence: Sequence, top: int, left: int, full: Camera) -> Tensor:
+        """The true picture [H, W, 3] of the patch; the background where it ends."""
+        scale = self.pipeline.options.scale
+        background = self.pipeline.background[:3]
+        rows = slice(top * scale, top * scale + full.height)
+        columns = slice(left * scale, left * scale + full.width)
+        part = composite(sequence.truth.picture[rows, columns].to(background.device), background)
+        truth = background.expand(full.height, full.width, 3).clone()
+        truth[: part.shape[0], : part.shape[1]] = part
+        return truth
+
+    def _observe(self, patches: list[Patch]) -> tuple[list[Observation], Tensor]:
+        """What the renderer is given of `patches`, with the gradient it is to have; opacities."""
+        rays = [rays for patch in patches for rays in patch.rays]
+        together = Rays(
+            torch.cat([r.origins for r in rays]), torch.cat([r.directions for r in rays])
+        )
+        pipeline = self.pipeline
+        with torch.set_grad_enabled(self.joint):
+            pixels, _ = render_batch(
+                self.field,
+                together,
+                pipeline.occupancy,
+                jitter=None,
+                background=None,
+                stop=pipeline.options.stop,
+            )
+            parts = iter(_split(pixels, [len(r.origins) for r in rays]))
+            observations = [self._observation(p, [next(parts) for _ in p.rays]) for p in patches]
+        return observations, pixels.alpha.clamp(1e-5, 1 - 1e-5)
+
+    def _observation(self, patch: Patch, rendered: list[Pixels]) -> Observation:
+        present, *preceding = rendered
+        frame = self._spread(patch, present)
+        frames = patch.sequence.buffer.frames
+        values = [frame.cloud.values for frame in frames]
+        for age, pixels in enumerate(preceding):
+            shine = (1 - pixels.alpha)[:, None] * self.pipeline.background
+            values[age] = values[age].index_copy(0, patch.shown[age], pixels.values + shine)
+        newest = frames[0] if frames else None
+        return Observation(
+            frame,
+            self.pipeline.background,
+            [Reprojected(v, i) for v, i in zip(values, patch.indices, strict=True)],
+            self.pipeline.history(newest, frame.depth, patch.view),
+            patch.view.phase,
+        )
+
+    def _spread(self, patch: Patch, pixels: Pixels) -> FeatureFrame:
+        """All pixels of the patch, from those that were rendered."""
+        low = patch.view.low
+        blank = Pixels.blank(low.height * low.width, self.field.channels, pixels.alpha.device)
+        canvas = Pixels(
+            blank.values.index_copy(0, patch.seen, pixels.values),
+            blank.depth_sum.index_copy(0, patch.seen, pixels.depth_sum),
+            blank.alpha.index_copy(0, patch.seen, pixels.alpha),
+        )
+        frame = FeatureFrame.of(low, canvas, self.pipeline.background)
+        return replace(frame, depth=frame.depth.detach())
+
+    def _update(self) -> None:
+        low, done = self.options.final_rate, self.step / self.steps
+        share = low + (1 - low) * 0.5 * (1 + math.cos(math.pi * done))
+        nn.utils.clip_grad_norm_(self.renderer.parameters(), self.options.clip)
+        _step(self.optimiser, share * self.options.rate)
+        self.mean.update_parameters(self.renderer)
+        if self.joint:
+            _step(self.networks, share * self.options.field_rate)
+            assert self.field.grad_buffer is not None
+            sparse_adam_(
+                self.field.table.detach(),
+                self.field.grad_buffer,
+                self.table_state,
+                share * self.options.field_rate,
+                packed=self.field.packed,
+                backend=self.field.backend,
+            )
+
+    @torch.no_grad()
+    def _average(self, mean: Tensors, new: Tensors, count: Tensor | int) -> None:
+        # In the beginning, over fewer steps: the first weights are not worth remembering.
+        keep = min(self.options.average, (1 + int(count)) / (10 + int(count)))
+        torch._foreach_lerp_(mean, new, 1 - keep)
+
+    def _random(self, below: int) -> int:
+        return int(torch.randint(below, (), generator=self.generator))
+
+    def watched(self) -> dict[str, Tensor]:
+        """Table, networks, 2D renderer."""
+        renderer = {f"renderer.{name}": x for name, x in self.renderer.named_parameters()}
+        return {"table": self.field.table, **self.field.layers, **renderer}
+
+    def result(self) -> dict[str, Tensor]:
+        """Field and running mean of the renderer."""
+        field = {f"field.{name}": x for name, x in self.field.state_dict().items()}
+        mean = self.mean.module.state_dict()
+        return field | {f"mean.{name}": x for name, x in mean.items()}
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+        """Renderer, optimisers, random numbers. The sequences are not in it: going on, they are
+        rendered anew."""
+        tensors = {f"renderer.{name}": x for name, x in self.renderer.state_dict().items()}
+        tensors |= checkpoint.optimiser_tensors(self.optimiser, "adam.renderer.")
+        tensors |= {"generator": self.generator.get_state(), "mean_count": self.mean.n_averaged}
+        if self.joint:
+            adam = self.table_state
+            tensors |= checkpoint.optimiser_tensors(self.networks, "adam.networks.")
+            tensors |= {"first": adam.first, "second": adam.second, "steps": adam.steps}
+        return tensors, {}
+
+    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
+        """See `loop.Training`."""
+        self.restore_result(tensors)
+        self.renderer.load_state_dict(checkpoint.part(tensors, "renderer."))
+        checkpoint.restore_optimiser(self.optimiser, tensors, "adam.renderer.")
+        self.generator.set_state(tensors["generator"].cpu())
+        self.mean.n_averaged.copy_(tensors["mean_count"])
+        if self.joint:
+            checkpoint.restore_optimiser(self.networks, tensors, "adam.networks.")
+            device = self.field.table.device
+            self.table_state = AdamState(
+                *(tensors[name].to(device) for name in ("first", "second", "steps"))
+            )
+
+    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+        """Put back what `result` gave."""
+        self.field.load_state_dict(checkpoint.part(tensors, "field."))
+        self.field.repack()
+        self.mean.module.load_state_dict(checkpoint.part(tensors, "mean."))
+
+
+def _rays_of(cloud: Cloud, points: Tensor) -> Rays:
+    camera = cloud.camera
+    centres = pixel_grid(camera.width, camera.height, points.device)
+    return cast(camera, centres[cloud.source[points]])
+
+
+def _split(pixels: Pixels, sizes: list[int]) -> list[Pixels]:
+    parts = (x.split(sizes) for x in (pixels.values, pixels.depth_sum, pixels.alpha))
+    return [Pixels(*part) for part in zip(*parts, strict=True)]
+
+
+def _step(optimiser: torch.optim.Optimizer, rate: float) -> None:
+    for group in optimiser.param_groups:
+        group["lr"] = rate
+    optimiser.step()
+    optimiser.zero_grad(set_to_none=True)

@@ -1,0 +1,77 @@
+"""Points into pixels, and what the points carry with them: the reprojection of earlier frames.
+
+`splat` says which point each pixel shows, `gather` brings the features of those points. Pixel
+(i, j) covers [i, i+1) x [j, j+1), so a point at (u, v) lands in (floor u, floor v) alone.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from bench.types import check_shape
+from methods.kernels.dispatch import implementation
+
+Rule = Literal["nearest", "last"]
+"""Which of the points in a pixel is shown."""
+
+
+def splat(
+    pixels: Tensor,
+    depth: Tensor,
+    width: int,
+    height: int,
+    *,
+    rule: Rule = "nearest",
+    backend: str = "auto",
+) -> Tensor:
+    """Which of N points each pixel of a width x height picture shows: [height, width] int32.
+
+    An entry is the index of a point, -1 where none lands. A point takes part if it lies inside the
+    picture and its depth is finite and positive; one that is not finite takes no part. Not
+    differentiable: what the points carry is brought by `gather`.
+
+    Args:
+        pixels: [N, 2] continuous coordinates (u, v), in pixels.
+        depth: [N] z-depth.
+        width, height: pixels of the picture, 1 or more.
+        rule: "nearest": the point of smallest depth, among equals that of smaller u, then of
+            smaller v, so that the order of the points decides only between exact duplicates (the
+            first). "last": the point of highest index, whatever its depth; SteerNeRF's release
+            lets points overwrite each other.
+
+    Raises:
+        ValueError: a shape, size or rule other than these; backend "cpu": not float32.
+    """
+    check_shape("pixels", pixels, None, 2)
+    check_shape("depth", depth, len(pixels))
+    if width < 1 or height < 1:
+        raise ValueError(f"width, height: expected 1 or more, got {width} x {height}")
+    if rule not in get_args(Rule):
+        raise ValueError(f"rule: expected one of {', '.join(get_args(Rule))}, got {rule!r}")
+    return implementation("splat", backend, pixels.device).splat(
+        pixels.detach(), depth.detach(), width, height, rule
+    )
+
+
+def gather(values: Tensor, index: Tensor, *, backend: str = "auto") -> Tensor:
+    """Rows of `values` [N, C] at `index` [...] int32, zeros where it is -1: [..., C].
+
+    Differentiable in `values`; the gradient of a row is the sum over all places that show it.
+
+    Raises:
+        ValueError: `index` is not int32 or names no row; backend "cpu": `values` is not float32.
+    """
+    check_shape("values", values, None, None)
+    if index.dtype != torch.int32:
+        raise ValueError(f"index: expected int32, got {index.dtype}")
+    if index.numel():
+        least, most = (int(bound) for bound in index.aminmax())
+        if least < -1 or most >= len(values):
+            raise ValueError(
+                f"index: expected -1 to {len(values) - 1} for {len(values)} rows of values, "
+                f"got {least} to {most}"
+            )
+    return implementation("splat", backend, values.device).gather(values, index)

@@ -1,0 +1,75 @@
+"""Backward warping: the preceding picture, looked up where the present surface was in it.
+
+A pixel of the present picture takes its depth from the low-resolution depth around it, becomes a
+point, and shows what the preceding picture shows at that point, interpolated bilinearly. Depths are
+averaged bilinearly over those of the four nearest low-resolution pixels that have one and lie no
+deeper than `TOLERANCE` behind the nearest of the four: what moves with the front surface hides what
+is behind it.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from bench.types import Camera, check_shape
+from methods.kernels.dispatch import implementation
+
+TOLERANCE = 0.02
+"""Scene units along z by which a depth may lie behind the nearest one and still be averaged."""
+
+
+def warp(
+    picture: Tensor,
+    source: Camera,
+    depth: Tensor,
+    camera: Camera,
+    scale: int,
+    phase: tuple[float, float] = (0.0, 0.0),
+    *,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor]:
+    """Warp `picture` [H', W', C] of `source` into the view of `camera`. Not differentiable.
+
+    The result is laid out for a network at low resolution: the s x s pixels of a low-resolution
+    pixel, row by row, beside each other.
+
+    Args:
+        depth: [h, w] z-depth at low resolution, not finite where there is none. Pixel (i, j) of it
+            is sampled at (s (i + 1/2), s (j + 1/2)) + `phase` in the full-resolution picture.
+        camera: the view, of `w s` x `h s` pixels.
+        scale: s.
+
+    Returns:
+        values [h, w, s^2, C], zero where nothing is known, and valid [h, w, s^2] in {0, 1}.
+
+    Raises:
+        ValueError: a size is wrong.
+    """
+    check_shape("picture", picture, source.height, source.width, None)
+    check_shape("depth", depth, None, None)
+    height, width = depth.shape
+    if (camera.width, camera.height) != (width * scale, height * scale):
+        raise ValueError(
+            f"camera: expected {width * scale} x {height * scale} pixels, {scale} times those of "
+            f"depth, got {camera.width} x {camera.height}"
+        )
+    matrix, offset = _source_from_camera(source, camera)
+    return implementation("warp", backend, picture.device).warp(
+        picture, depth, matrix, offset, scale, phase
+    )
+
+
+def _source_from_camera(source: Camera, camera: Camera) -> tuple[Tensor, Tensor]:
+    """M [3, 3] and m [3]: homogeneous source pixel = z M (u, v, 1) + m, in float64 on the CPU."""
+    to, of = source.c2w.double().cpu(), camera.c2w.double().cpu()
+    rotation = to[:, :3].T @ of[:, :3]
+    offset = to[:, :3].T @ (of[:, 3] - to[:, 3])
+    inside = _intrinsics(source)
+    return inside @ rotation @ _intrinsics(camera).inverse(), inside @ offset
+
+
+def _intrinsics(camera: Camera) -> Tensor:
+    return torch.tensor(
+        [(camera.fx, 0, camera.cx), (0, camera.fy, camera.cy), (0, 0, 1)], dtype=torch.float64
+    )

@@ -1,0 +1,127 @@
+"""Backward warping with numba: a low-resolution pixel at a time, nothing where no depth is near."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from numba import njit, prange
+from torch import Tensor
+
+from methods.kernels.cpu import f32
+from methods.kernels.warp import TOLERANCE
+
+
+def warp(
+    picture: Tensor,
+    depth: Tensor,
+    matrix: Tensor,
+    offset: Tensor,
+    scale: int,
+    phase: tuple[float, float],
+) -> tuple[Tensor, Tensor]:
+    """See `methods.kernels.warp.warp`."""
+    if not picture.dtype == depth.dtype == torch.float32:
+        raise ValueError(
+            f"backend 'cpu' warps float32, got picture {picture.dtype}, depth {depth.dtype}: "
+            "use backend='reference'"
+        )
+    height, width = depth.shape
+    values = torch.zeros(height, width, scale**2, picture.shape[2])
+    valid = torch.zeros(height, width, scale**2)
+    _warp(
+        picture.contiguous().numpy(),
+        depth.contiguous().numpy(),
+        matrix.float().numpy(),
+        offset.float().numpy(),
+        scale,
+        f32(phase[0]),
+        f32(phase[1]),
+        f32(TOLERANCE),
+        values.numpy(),
+        valid.numpy(),
+    )
+    return values, valid
+
+
+@njit(cache=True, parallel=True)
+def _warp(picture, depth, matrix, offset, scale, phase_u, phase_v, tolerance, values, valid):
+    height, width = depth.shape
+    for row in prange(height):
+        for column in range(width):
+            if not _anything_near(depth, row, column):
+                continue
+            for sub in range(scale * scale):
+                v = f32(row * scale + sub // scale) + f32(0.5)
+                u = f32(column * scale + sub % scale) + f32(0.5)
+                z = _depth_at(
+                    depth,
+                    (v - phase_v) / f32(scale) - f32(0.5),
+                    (u - phase_u) / f32(scale) - f32(0.5),
+                    tolerance,
+                )
+                if not z < math.inf:
+                    continue
+                w = z * (matrix[2, 0] * u + matrix[2, 1] * v + matrix[2, 2]) + offset[2]
+                if not w > 0:
+                    continue
+                x = (z * (matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 2]) + offset[0]) / w
+                y = (z * (matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2]) + offset[1]) / w
+                if 0 <= x < picture.shape[1] and 0 <= y < picture.shape[0]:
+                    valid[row, column, sub] = f32(1)
+                    _look_up(picture, y - f32(0.5), x - f32(0.5), values[row, column, sub])
+
+
+@njit(cache=True)
+def _anything_near(depth, row, column):
+    # With a phase of up to a whole pixel a block reaches into its 8 neighbours.
+    for y in range(max(row - 1, 0), min(row + 2, depth.shape[0])):
+        for x in range(max(column - 1, 0), min(column + 2, depth.shape[1])):
+            if -math.inf < depth[y, x] < math.inf:
+                return True
+    return False
+
+
+@njit(cache=True)
+def _clamp(value, size):
+    return min(max(value, 0), size - 1)
+
+
+@njit(cache=True)
+def _depth_at(depth, y, x, tolerance):
+    """Depth at a continuous place, counted from the centre of pixel (0, 0); inf if none."""
+    row, column = math.floor(y), math.floor(x)
+    down, right = f32(y - row), f32(x - column)
+    top, bottom = _clamp(int(row), depth.shape[0]), _clamp(int(row) + 1, depth.shape[0])
+    left, other = _clamp(int(column), depth.shape[1]), _clamp(int(column) + 1, depth.shape[1])
+    z0, z1 = _known(depth[top, left]), _known(depth[top, other])
+    z2, z3 = _known(depth[bottom, left]), _known(depth[bottom, other])
+    limit = min(min(z0, z1), min(z2, z3)) + tolerance
+    total, weights = f32(0), f32(0)
+    for z, weight in (
+        (z0, (f32(1) - down) * (f32(1) - right)),
+        (z1, (f32(1) - down) * right),
+        (z2, down * (f32(1) - right)),
+        (z3, down * right),
+    ):
+        if z <= limit and z < math.inf:
+            total += weight * z
+            weights += weight
+    return total / weights if weights > 0 else f32(math.inf)
+
+
+@njit(cache=True)
+def _known(z):
+    return z if -math.inf < z < math.inf else f32(math.inf)
+
+
+@njit(cache=True)
+def _look_up(picture, y, x, out):
+    row, column = math.floor(y), math.floor(x)
+    down, right = f32(y - row), f32(x - column)
+    top, bottom = _clamp(int(row), picture.shape[0]), _clamp(int(row) + 1, picture.shape[0])
+    left, other = _clamp(int(column), picture.shape[1]), _clamp(int(column) + 1, picture.shape[1])
+    for c in range(picture.shape[2]):
+        above = (f32(1) - right) * picture[top, left, c] + right * picture[top, other, c]
+        below = (f32(1) - right) * picture[bottom, left, c] + right * picture[bottom, other, c]
+        out[c] = (f32(1) - down) * above + down * below

@@ -1,0 +1,199 @@
+"""SteerNeRF's rendering of one frame, top-down beside Section 3 of the paper.
+
+depth_reprojection    the newest preceding depth narrows where rays look     Eq. 6 to 8
+field                 features, depth and opacity at h x w = H/s x W/s       Eq. 3 to 5
+feature_reprojection  preceding features, and the preceding picture, at H x W   Eq. 9, 10
+renderer2d            the 2D neural renderer                                 Eq. 11
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from bench.cameras import scale_camera
+from bench.types import Camera, Frame, Probe
+from methods.buffer import Cloud, Remembered, RenderingBuffer, Reprojection
+from methods.fields import HashField
+from methods.kernels.composite import STOP
+from methods.kernels.march import Occupancy
+from methods.kernels.warp import warp
+from methods.range_reduction import RangeReduction, evidence, render_guided
+from methods.renderer2d import History, Observation, Renderer2d, Reprojected
+from methods.volume import FeatureFrame
+
+
+@dataclass(frozen=True)
+class PipelineOptions:
+    """What a frame is made of.
+
+    Attributes:
+        channels: K, features of the field; the first three are RGB.
+        frames: L, preceding frames.
+        scale: s, the field is rendered at 1/s of the resolution.
+        range: where rays look for a surface.
+        reprojection: how preceding frames are brought into the present view.
+        history: the preceding picture is reprojected, too.
+        jitter: the samples of the low-resolution grid move from frame to frame, so that
+            preceding frames carry samples of other places.
+        feature_background: what the features beyond RGB are composited on. 1/2 is what an
+            untrained feature is everywhere.
+        stop: transmittance at which a ray ends.
+    """
+
+    channels: int = 6
+    frames: int = 2
+    scale: int = 4
+    range: RangeReduction = RangeReduction()
+    reprojection: Reprojection = Reprojection()
+    history: bool = True
+    jitter: bool = False
+    feature_background: float = 0.5
+    stop: float = STOP
+
+    def __post_init__(self) -> None:
+        if not (self.channels >= 3 and self.frames >= 0 and self.scale >= 1):
+            raise ValueError(
+                f"expected channels (K) >= 3, frames (L) >= 0, scale (s) >= 1, got "
+                f"{self.channels}, {self.frames}, {self.scale}"
+            )
+
+
+class Pipeline:
+    """A field and a 2D renderer that together render frames, one after the other.
+
+    Args:
+        field: with `options.channels` features.
+        background: [3] of the scene.
+    """
+
+    def __init__(
+        self,
+        field: HashField,
+        occupancy: Occupancy,
+        background: Tensor,
+        renderer: Renderer2d,
+        options: PipelineOptions,
+    ) -> None:
+        self.field, self.occupancy, self.renderer = field, occupancy, renderer
+        self.options, self.backend = options, field.backend
+        self.background = functional.pad(
+            background, (0, options.channels - 3), value=options.feature_background
+        )  # [K]
+
+    @torch.no_grad()
+    def render(self, camera: Camera, buffer: RenderingBuffer, probe: Probe) -> Frame:
+        """Render one frame that follows those in `buffer`, and remember it there."""
+        view = View.of(camera, self.options, buffer.turn)
+        newest = buffer.frames[0] if buffer.frames else None
+        features = self._features(view, newest, probe)
+        with probe.stage("feature_reprojection"):
+            observation = Observation(
+                features,
+                self.background,
+                [self.reproject(frame.cloud, view) for frame in buffer.frames],
+                self.history(newest, features.depth, view),
+                view.phase,
+            )
+        with probe.stage("renderer2d"):
+            pictures, _ = self.renderer([observation])
+            picture = pictures[0].clamp(0, 1)
+        with probe.stage("finish"):
+            cloud = Cloud.of(features, self.options.reprojection)
+            buffer.push(Remembered(cloud, view.full, picture))
+            return _finish(camera, picture, features, self.options.scale)
+
+    def reproject(self, cloud: Cloud, view: View) -> Reprojected:
+        """The features of a preceding frame where the present picture sees them."""
+        index, _ = cloud.land(view.full, self.options.reprojection, self.backend)
+        return Reprojected(cloud.values, index)
+
+    def history(self, newest: Remembered | None, depth: Tensor, view: View) -> History | None:
+        """The preceding picture where the present one, of low-resolution `depth`, sees it."""
+        if newest is None or not self.options.history:
+            return None
+        values, valid = warp(
+            newest.picture,
+            newest.camera,
+            depth,
+            view.full,
+            self.options.scale,
+            view.phase,
+            backend=self.backend,
+        )
+        return History(values, valid)
+
+    def _features(self, view: View, newest: Remembered | None, probe: Probe) -> FeatureFrame:
+        """The field at low resolution, looked at where the newest preceding frame says."""
+        options, found = self.options, None
+        if newest is not None and options.range.mode != "off":
+            with probe.stage("depth_reprojection"):
+                found = evidence(
+                    newest.cloud, view.low, options.range, options.reprojection, self.backend
+                )
+        with probe.stage("field"):
+            return render_guided(
+                self.field,
+                view.low,
+                self.occupancy,
+                self.background,
+                probe,
+                found,
+                stop=options.stop,
+            )
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera as the pipeline sees it.
+
+    Attributes:
+        full: the camera, its picture enlarged to the right and below to multiples of s.
+        low: its low-resolution camera, whose pixel centres lie `phase` beside those of s x s
+            pixels.
+        phase: (u, v) in full-resolution pixels.
+    """
+
+    full: Camera
+    low: Camera
+    phase: tuple[float, float]
+
+    @classmethod
+    def of(cls, camera: Camera, options: PipelineOptions, turn: int) -> View:
+        """The view of the `turn`-th frame of a sequence."""
+        scale = options.scale
+        width, height = -(-camera.width // scale), -(-camera.height // scale)
+        full = replace(camera, width=width * scale, height=height * scale)
+        low = scale_camera(full, width, height)
+        phase = sample_phase(turn, scale) if options.jitter else (0.0, 0.0)
+        low = replace(low, cx=low.cx - phase[0] / scale, cy=low.cy - phase[1] / scale)
+        return cls(full, low, phase)
+
+
+def sample_phase(turn: int, scale: int) -> tuple[float, float]:
+    """Where the low-resolution samples of the `turn`-th frame lie beside the middle of their cell.
+
+    On the centre of one of its s x s pixels; s^2 frames visit all of them where s is a power of 2,
+    and any few that follow each other lie apart.
+    """
+    u, v = (_phases(scale)[turn % scale**2] * scale).floor().tolist()
+    return u - (scale - 1) / 2, v - (scale - 1) / 2
+
+
+@cache
+def _phases(scale: int) -> Tensor:
+    return torch.quasirandom.SobolEngine(2).draw(scale**2)
+
+
+def _finish(camera: Camera, picture: Tensor, features: FeatureFrame, scale: int) -> Frame:
+    """What the harness asks for: depth and opacity of the nearest low-resolution pixel."""
+    size = slice(0, camera.height), slice(0, camera.width)
+    depth, alpha = (
+        image.repeat_interleave(scale, 0).repeat_interleave(scale, 1)[size]
+        for image in (features.depth, features.alpha)
+    )
+    return Frame(picture[size], depth, alpha)

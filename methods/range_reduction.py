@@ -1,0 +1,169 @@
+"""Range reduction: where a preceding depth says that a ray should look (SteerNeRF Eq. 6 to 8)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from bench.types import Camera, Probe, Rays
+from methods.buffer import Cloud, Reprojection
+from methods.fields import HashField
+from methods.kernels.composite import STOP, Pixels
+from methods.kernels.march import Occupancy
+from methods.volume import FeatureFrame, rays_at_matter, render_rays
+
+KEPT_ALPHA = 0.95
+"""Share of the expected opacity at which a ray has found what was to be expected."""
+
+EDGE = 2.0
+"""Depths of a neighbourhood that differ by more than this many epsilons are those of an edge."""
+
+
+@dataclass(frozen=True)
+class RangeReduction:
+    """Where along a ray to look for a surface, given the newest preceding frame.
+
+    Attributes:
+        mode: "off": everywhere. "paper": within `epsilon` of the depth reprojected onto the pixel,
+            whatever is found there (Eq. 8). "window": within `epsilon` of the depths reprojected
+            onto its 3 x 3 neighbourhood, until the ray has the opacity they had; a ray that does
+            not reach it looks behind the window as well, and one at a depth edge everywhere.
+        epsilon: scene units along z.
+    """
+
+    mode: Literal["off", "paper", "window"] = "window"
+    epsilon: float = 0.03
+
+    def __post_init__(self) -> None:
+        if not self.epsilon > 0:
+            raise ValueError(f"range.epsilon: expected more than 0, got {self.epsilon}")
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a preceding frame says of a view of h x w pixels.
+
+    Attributes:
+        window: [h, w, 2] nearest and farthest z-depth worth looking at; [0, inf) if unknown.
+        alpha: [h, w] the opacity to expect; 0 if unknown.
+        binding: nothing else is looked at, even if there is less in the windows than expected.
+    """
+
+    window: Tensor
+    alpha: Tensor
+    binding: bool
+
+
+def evidence(
+    cloud: Cloud, camera: Camera, options: RangeReduction, reprojection: Reprojection, backend: str
+) -> Evidence:
+    """What `cloud` tells of the depths that `camera`, a low-resolution one, will see."""
+    index, depth = cloud.land(camera, reprojection, backend)
+    known = index >= 0
+    near, far = _at(depth, index, torch.inf), _at(depth, index, -torch.inf)
+    alpha = _at(cloud.alpha, index, 0.0)
+    if options.mode == "window":
+        near, far, alpha = -_highest(-near), _highest(far), _highest(alpha)
+        known = near.isfinite() & (far - near < EDGE * options.epsilon)
+    window = torch.stack(
+        (
+            torch.where(known, near - options.epsilon, 0),
+            torch.where(known, far + options.epsilon, torch.inf),
+        ),
+        dim=-1,
+    )
+    return Evidence(window, alpha, binding=options.mode == "paper")
+
+
+def _at(values: Tensor, index: Tensor, otherwise: float) -> Tensor:
+    """`values` [N] at `index` [h, w], `otherwise` where that is -1."""
+    return functional.pad(values, (0, 1), value=otherwise)[index.long()]  # -1 is the last one
+
+
+def _highest(image: Tensor) -> Tensor:
+    """Largest value of each pixel's 3 x 3 neighbourhood."""
+    return functional.max_pool2d(image[None], 3, stride=1, padding=1)[0]
+
+
+@torch.no_grad()
+def render_guided(
+    field: HashField,
+    camera: Camera,
+    occupancy: Occupancy,
+    background: Tensor,
+    probe: Probe,
+    found: Evidence | None,
+    *,
+    stop: float = STOP,
+) -> FeatureFrame:
+    """Render a frame, looking only where `found` says that something is; None: everywhere."""
+    device, size = field.table.device, camera.height * camera.width
+    with probe.stage("rays"):
+        seen, rays = rays_at_matter(camera, occupancy)
+        canvas = Pixels.blank(size, field.channels, device)
+    probe.count("rays", len(seen), size)
+    if found is None:
+        rendered = render_rays(field, rays, occupancy, probe, stop=stop)
+    elif found.binding:
+        window = found.window.view(-1, 2)[seen]
+        rendered = render_rays(field, rays, occupancy, probe, stop=stop, window=window)
+    else:
+        window, alpha = found.window.view(-1, 2)[seen], found.alpha.flatten()[seen]
+        rendered = _render_within(field, rays, window, alpha, occupancy, probe, stop)
+    with probe.stage("finish"):
+        canvas.put(seen, rendered)
+        return FeatureFrame.of(camera, canvas, background)
+
+
+def _render_within(
+    field: HashField,
+    rays: Rays,
+    window: Tensor,
+    alpha: Tensor,
+    occupancy: Occupancy,
+    probe: Probe,
+    stop: float,
+) -> Pixels:
+    """Render `rays` within `window` [R, 2] where those have an end and the ray reaches `alpha` [R]
+    there; in full elsewhere."""
+    canvas = Pixels.blank(len(rays.origins), field.channels, window.device)
+    narrow = window[:, 1].isfinite().nonzero().squeeze(1)
+    expected = alpha[narrow]
+    first = render_rays(
+        field,
+        _take(rays, narrow),
+        occupancy,
+        probe,
+        stop=max(stop, 1 - KEPT_ALPHA),
+        window=window[narrow],
+    )
+    enough = first.alpha >= KEPT_ALPHA * expected
+    # What is left of the opacity looks like what was found.
+    more = torch.where(enough & (first.alpha < expected), expected / first.alpha, 1)
+    canvas.put(
+        narrow,
+        Pixels(first.values * more[:, None], first.depth_sum * more, first.alpha * more),
+    )
+    probe.count("continued", len(narrow) - int(enough.sum()), len(narrow))
+
+    open_end = torch.ones(len(window), dtype=torch.bool, device=window.device)
+    open_end[narrow[enough]] = False
+    rest = open_end.nonzero().squeeze(1)
+    far = window[rest, 1]
+    behind = torch.stack((torch.where(far.isfinite(), far, 0), far + torch.inf), dim=1)
+    carry = canvas.take(rest)
+    canvas.put(
+        rest,
+        render_rays(
+            field, _take(rays, rest), occupancy, probe, stop=stop, window=behind, carry=carry
+        ),
+    )
+    return canvas
+
+
+def _take(rays: Rays, index: Tensor) -> Rays:
+    return Rays(rays.origins[index], rays.directions[index])

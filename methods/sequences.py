@@ -1,0 +1,142 @@
+"""Training sequences: a true picture, and the frames that came before it.
+
+Training views are scattered, so the cameras before each are made up: a random smooth motion that
+ends there. The frames before it are rendered as they will be when the method is used, by the same
+pipeline as it stands, and rendered anew, along another motion, when they have served for a while.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as Seq
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bench.motion import preceding
+from bench.types import Camera, NullProbe
+from methods.buffer import RenderingBuffer
+from methods.pipeline import Pipeline, View
+
+
+@dataclass(frozen=True)
+class TrueView:
+    """A `camera` and its `picture`, uint8 [H, W, 3 or 4]."""
+
+    camera: Camera
+    picture: Tensor
+
+
+@dataclass
+class Sequence:
+    """A view to be drawn and what precedes it; good for `uses` more patches.
+
+    Attributes:
+        truth: the view and its picture.
+        view: the view as the pipeline sees it.
+        buffer: the preceding frames.
+        cells: [N, 2] row and column of the low-resolution pixels in which the picture is not just
+            background, or of all if it is.
+    """
+
+    truth: TrueView
+    view: View
+    buffer: RenderingBuffer
+    cells: Tensor
+    uses: int
+
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """The made-up motions before a training view.
+
+    Attributes:
+        degrees: range of the angular speed, degrees a frame.
+        length: most frames that precede a view; fewer, and none at times, teach the cold start.
+        pool: sequences kept at a time.
+        uses: patches cut out of a sequence before it is rendered anew.
+    """
+
+    degrees: tuple[float, float] = (0.0, 2.5)
+    length: int = 4
+    pool: int = 32
+    uses: int = 64
+
+    def __post_init__(self) -> None:
+        low, high = self.degrees
+        if not (0 <= low <= high and self.length >= 0 and self.pool >= 1 and self.uses >= 1):
+            raise ValueError(
+                f"expected 0 <= degrees[0] <= degrees[1], length >= 0, pool and uses >= 1: {self}"
+            )
+
+
+class SequencePool:
+    """Sequences that end in randomly chosen views, always as fresh as `MotionOptions` says.
+
+    Args:
+        real: training views.
+        distilled: views whose picture a trained field has rendered.
+        share: of the sequences that end in a distilled view.
+        target: [3] the point that motions turn about.
+    """
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        real: Seq[TrueView],
+        distilled: Seq[TrueView],
+        share: float,
+        target: Tensor,
+        options: MotionOptions,
+        generator: torch.Generator,
+    ) -> None:
+        self._pipeline, self._target, self._options = pipeline, target, options
+        self._real, self._distilled = real, distilled
+        self._share = share if distilled else 0.0
+        self._generator = generator
+        self._pool: list[Sequence] = []
+
+    def draw(self) -> Sequence:
+        """A sequence of the pool; counts as one use."""
+        place = self._random(self._options.pool)
+        if place >= len(self._pool):
+            self._pool.append(self._make())
+            place = len(self._pool) - 1
+        elif self._pool[place].uses <= 0:
+            self._pool[place] = self._make()
+        sequence = self._pool[place]
+        sequence.uses -= 1
+        return sequence
+
+    def _make(self) -> Sequence:
+        distilled = torch.rand((), generator=self._generator).item() < self._share
+        views = self._distilled if distilled else self._real
+        truth = views[self._random(len(views))]
+        pipeline, options = self._pipeline, self._options
+        frames = pipeline.options.frames
+        buffer = RenderingBuffer(frames, turn=self._random(pipeline.options.scale**2))
+        if frames:
+            count = self._random(options.length + 1)
+            motion = preceding(truth.camera, self._target, count, options.degrees, self._generator)
+            for camera in motion:
+                pipeline.render(camera, buffer, NullProbe())
+        view = View.of(truth.camera, pipeline.options, buffer.turn)
+        cells = _cells_with_content(truth.picture, pipeline)
+        return Sequence(truth, view, buffer, cells, options.uses)
+
+    def _random(self, below: int) -> int:
+        return int(torch.randint(below, (), generator=self._generator))
+
+
+def _cells_with_content(picture: Tensor, pipeline: Pipeline) -> Tensor:
+    scale = pipeline.options.scale
+    if picture.shape[-1] == 4:
+        content = picture[..., 3] > 0
+    else:
+        background = (pipeline.background[:3].cpu() * 255).round().to(torch.uint8)
+        content = (picture != background).any(dim=-1)
+    height, width = (-(-side // scale) for side in content.shape)
+    cells = torch.zeros(height, width, dtype=torch.bool)
+    rows, columns = content.nonzero().unbind(dim=1)
+    cells[rows // scale, columns // scale] = True
+    return cells.nonzero() if cells.any() else (~cells).nonzero()

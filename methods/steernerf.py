@@ -1,0 +1,172 @@
+"""SteerNeRF (Li et al. 2022), as a `bench.types.Method`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from functools import cache, partial
+
+import torch
+from torch import Tensor
+
+from bench.provenance import ROOT, digest
+from bench.types import Budget, Camera, Frame, Log, Probe, Scene
+from methods import checkpoint, loop
+from methods.buffer import RenderingBuffer
+from methods.distil import distilled_views
+from methods.fields import Precision
+from methods.joint import JointOptions, JointTraining
+from methods.kernels.encode import HashGrid
+from methods.pipeline import Pipeline, PipelineOptions
+from methods.pretrained import Pretrained, Setup, pretrain
+from methods.renderer2d import Renderer2d
+from methods.sequences import SequencePool, TrueView
+from methods.train import TrainingOptions
+
+SOURCES = (
+    "buffer",
+    "distil",
+    "joint",
+    "pipeline",
+    "range_reduction",
+    "renderer2d",
+    "sequences",
+    "steernerf",
+)
+"""Modules beside this one that decide what stage 2 results in, with those of stage 1."""
+
+
+class SteerNerf:
+    """Low-resolution features of a field, preceding frames and a 2D renderer.
+
+    Args:
+        grid: shape of the hash table.
+        training: stage 1, the field alone at full resolution; shared with every other method that
+            trains it in the same way.
+        pipeline: what a frame is made of.
+        renderer: makes the 2D renderer, called with K, L and s.
+        joint: stage 2, on patches, of `budget.renderer_steps` steps.
+        precision: of the field, "bf16" (packed table, bfloat16 networks) or "fp32".
+        name: as it stands in result rows.
+    """
+
+    def __init__(
+        self,
+        *,
+        grid: HashGrid,
+        training: TrainingOptions,
+        pipeline: PipelineOptions,
+        renderer: Callable[..., Renderer2d],
+        joint: JointOptions,
+        precision: Precision = "bf16",
+        name: str = "steernerf",
+        backend: str = "auto",
+        device: str = "auto",
+        seed: int = 0,
+    ) -> None:
+        self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
+        self.options, self.make_renderer, self.joint, self.name = pipeline, renderer, joint, name
+        self.memory = pipeline.frames
+        self.buffer = RenderingBuffer(pipeline.frames)
+        self.train_s = 0.0
+
+    def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
+        """Train both stages, or load what the same trainings left behind."""
+        seed, options = self.setup.seed, self.options
+        trained = pretrain(self.setup, scene, budget, log)
+        key = self.setup.key(scene, budget)
+        target = scene.bounds.mean(dim=0)
+        distilled: list[TrueView] = []
+        if self.joint.distilled_views and self.joint.distilled_share:
+            folder = log.stage_dir("distilled", {**key, "views": self.joint.distilled_views})
+            distilled = distilled_views(
+                trained, scene, target, self.joint.distilled_views, seed, folder, log
+            )
+        trained.field.widen(options.channels)
+        self.pipeline, training = self._stage2(trained, scene, distilled, target, budget)
+        folder = log.stage_dir("steernerf", {**key, **self._key(budget)})
+        finished = folder / "steernerf.safetensors"
+        if finished.exists():
+            tensors, figures = checkpoint.read(finished)
+            training.restore_result(tensors)
+            training.seconds = figures["seconds"]
+            log.info(f"trained renderer found: {finished}")
+        else:
+            loop.train(training, finished, f"training {self.name}", log)
+        trained.field.requires_grad_(False).grad_buffer = None
+        self.trained, self.train_s = trained, trained.train_s + training.seconds
+        self.pipeline.renderer.requires_grad_(False)
+
+    def reset(self) -> None:
+        """Forget preceding frames."""
+        self.buffer.reset()
+
+    def render(self, camera: Camera, probe: Probe) -> Frame:
+        """The next frame of the sequence."""
+        camera = replace(camera, c2w=camera.c2w.to(self.setup.device))
+        return self.pipeline.render(camera, self.buffer, probe)
+
+    def sizes(self) -> dict[str, int]:
+        """Bytes of table, networks, occupancy bits and 2D renderer."""
+        weights = self.pipeline.renderer.parameters()
+        return self.trained.sizes() | {"renderer2d": sum(w.numel() * 4 for w in weights)}
+
+    def settings(self) -> dict[str, str]:
+        """See `bench.types.Method.settings`."""
+        return self.setup.settings()
+
+    def _stage2(
+        self,
+        trained: Pretrained,
+        scene: Scene,
+        distilled: list[TrueView],
+        target: Tensor,
+        budget: Budget,
+    ) -> tuple[Pipeline, JointTraining]:
+        device, options = self.setup.device, self.options
+        torch.manual_seed(self.setup.seed)  # of the renderer's weights
+        renderer = self.make_renderer(options.channels, options.frames, options.scale)
+        renderer = renderer.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        pipeline = Pipeline(
+            trained.field, trained.occupancy, scene.background.to(device), renderer, options
+        )
+        split = scene.splits["train"]
+        real = [TrueView(c, p) for c, p in zip(split.cameras, split.images, strict=True)]
+        generator = torch.Generator().manual_seed(self.setup.seed)
+        pool = SequencePool(
+            pipeline,
+            real,
+            distilled,
+            self.joint.distilled_share,
+            target,
+            self.joint.motion,
+            generator,
+        )
+        training = JointTraining(
+            pipeline, renderer, pool, self.joint, budget.renderer_steps, generator
+        )
+        return pipeline, training
+
+    def _key(self, budget: Budget) -> dict[str, object]:
+        """What the second stage depends on, beside the first."""
+        make = self.make_renderer
+        kind, settings = make, {}
+        if isinstance(make, partial):
+            kind, settings = make.func, make.keywords
+        return {
+            "renderer_steps": budget.renderer_steps,
+            "pipeline": asdict(self.options),
+            "renderer": {"kind": kind.__qualname__, **settings},
+            "joint": asdict(self.joint),
+            "stage2": stage2_digest(),
+        }
+
+
+@cache
+def stage2_digest() -> str:
+    """SHA-256 of the sources that decide what stage 2 results in, beside those of stage 1."""
+    sources = [ROOT / "methods" / f"{name}.py" for name in SOURCES]
+    for kernel in ("splat", "warp"):
+        folder = ROOT / "methods" / "kernels" / kernel
+        sources += [path for path in folder.glob("*.py") if path.stem != "cases"]
+    return digest([*sources, ROOT / "bench" / "motion.py"])
