@@ -19,6 +19,7 @@ from methods import checkpoint, loop
 from methods.buffer import Cloud
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import Pixels
+from methods.occupancy import STEP
 from methods.pipeline import Pipeline, View
 from methods.renderer2d import Observation, Renderer2d, Reprojected
 from methods.sequences import MotionOptions, Sequence, SequencePool
@@ -40,6 +41,7 @@ class JointOptions:
         final_rate: share of both left at the end of the cosine schedule.
         patch: side of a patch, low-resolution pixels.
         batch: patches of a step.
+        precision: of the 2D renderer's convolutions while it is trained.
         opacity_entropy: weight of -o ln o of the rays.
         clip: largest norm of the 2D renderer's gradient.
         average: decay of the running mean of the 2D renderer's weights that is used in the end.
@@ -55,6 +57,7 @@ class JointOptions:
     final_rate: float = 0.01
     patch: int = 32
     batch: int = 2
+    precision: Literal["bf16", "fp32"] = "bf16"
     opacity_entropy: float = 1e-3
     clip: float = 1.0
     average: float = 0.999
@@ -119,7 +122,7 @@ class JointTraining:
         self.step, self.steps, self.seconds = 0, steps, 0.0
         self.optimiser = torch.optim.Adam(renderer.parameters(), lr=options.rate)
         self.mean = AveragedModel(renderer, multi_avg_fn=self._average)
-        pipeline.renderer = self.mean.module
+        pipeline.renderer = self.mean.module  # type: ignore[assignment]
         self.joint = options.field == "joint"
         self.field = pipeline.field.requires_grad_(self.joint)
         if self.joint:
@@ -140,7 +143,9 @@ class JointTraining:
         """
         patches = [self._cut(self.pool.draw()) for _ in range(self.options.batch)]
         observations, opacity = self._observe(patches)
-        drawn, base = self.renderer(observations)
+        half = self.options.precision == "bf16"
+        with torch.autocast(opacity.device.type, torch.bfloat16, enabled=half):
+            drawn, base = self.renderer(observations)
         truth = torch.stack([patch.truth for patch in patches])
         loss = functional.mse_loss(drawn, truth)
         entropy = -(opacity * opacity.log()).mean() if self.joint and len(opacity) else 0.0
@@ -204,6 +209,7 @@ class JointTraining:
                 jitter=None,
                 background=None,
                 stop=pipeline.options.stop,
+                step=pipeline.options.steps * STEP,
             )
             parts = iter(_split(pixels, [len(r.origins) for r in rays]))
             observations = [self._observation(p, [next(parts) for _ in p.rays]) for p in patches]

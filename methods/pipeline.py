@@ -22,6 +22,7 @@ from methods.fields import HashField
 from methods.kernels.composite import STOP
 from methods.kernels.march import Occupancy
 from methods.kernels.warp import warp
+from methods.occupancy import STEP
 from methods.range_reduction import RangeReduction, evidence, render_guided
 from methods.renderer2d import History, Observation, Renderer2d, Reprojected
 from methods.volume import FeatureFrame
@@ -43,6 +44,8 @@ class PipelineOptions:
         feature_background: what the features beyond RGB are composited on. 1/2 is what an
             untrained feature is everywhere.
         stop: transmittance at which a ray ends.
+        steps: length of a ray-marching step, in those of stage 1: stage 2 teaches the field to do
+            with longer ones.
     """
 
     channels: int = 6
@@ -54,12 +57,13 @@ class PipelineOptions:
     jitter: bool = False
     feature_background: float = 0.5
     stop: float = STOP
+    steps: float = 1.0
 
     def __post_init__(self) -> None:
-        if not (self.channels >= 3 and self.frames >= 0 and self.scale >= 1):
+        if not (self.channels >= 3 and self.frames >= 0 and self.scale >= 1 and self.steps > 0):
             raise ValueError(
-                f"expected channels (K) >= 3, frames (L) >= 0, scale (s) >= 1, got "
-                f"{self.channels}, {self.frames}, {self.scale}"
+                f"expected channels (K) >= 3, frames (L) >= 0, scale (s) >= 1, steps > 0, "
+                f"got {self.channels}, {self.frames}, {self.scale}, {self.steps}"
             )
 
 
@@ -144,6 +148,7 @@ class Pipeline:
                 probe,
                 found,
                 stop=options.stop,
+                step=options.steps * STEP,
             )
 
 

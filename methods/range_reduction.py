@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import torch
@@ -14,6 +16,7 @@ from methods.buffer import Cloud, Reprojection
 from methods.fields import HashField
 from methods.kernels.composite import STOP, Pixels
 from methods.kernels.march import Occupancy
+from methods.occupancy import STEP
 from methods.volume import FeatureFrame, rays_at_matter, render_rays
 
 KEPT_ALPHA = 0.95
@@ -99,69 +102,57 @@ def render_guided(
     found: Evidence | None,
     *,
     stop: float = STOP,
+    step: float = STEP,
 ) -> FeatureFrame:
-    """Render a frame, looking only where `found` says that something is; None: everywhere."""
+    """Render a frame, looking only where `found` says that something is; None: everywhere.
+
+    Args:
+        background: [K].
+        stop: transmittance at which a ray ends.
+        step: world length of a ray-marching step.
+    """
+    march = partial(render_rays, field, occupancy=occupancy, probe=probe, step=step)
     device, size = field.table.device, camera.height * camera.width
     with probe.stage("rays"):
         seen, rays = rays_at_matter(camera, occupancy)
         canvas = Pixels.blank(size, field.channels, device)
     probe.count("rays", len(seen), size)
     if found is None:
-        rendered = render_rays(field, rays, occupancy, probe, stop=stop)
+        rendered = march(rays, stop=stop)
     elif found.binding:
         window = found.window.view(-1, 2)[seen]
-        rendered = render_rays(field, rays, occupancy, probe, stop=stop, window=window)
+        rendered = march(rays, stop=stop, window=window)
     else:
         window, alpha = found.window.view(-1, 2)[seen], found.alpha.flatten()[seen]
-        rendered = _render_within(field, rays, window, alpha, occupancy, probe, stop)
+        rendered = _march_within(march, rays, window, alpha, stop)
     with probe.stage("finish"):
         canvas.put(seen, rendered)
         return FeatureFrame.of(camera, canvas, background)
 
 
-def _render_within(
-    field: HashField,
-    rays: Rays,
-    window: Tensor,
-    alpha: Tensor,
-    occupancy: Occupancy,
-    probe: Probe,
-    stop: float,
+def _march_within(
+    march: Callable[..., Pixels], rays: Rays, window: Tensor, alpha: Tensor, stop: float
 ) -> Pixels:
-    """Render `rays` within `window` [R, 2] where those have an end and the ray reaches `alpha` [R]
-    there; in full elsewhere."""
-    canvas = Pixels.blank(len(rays.origins), field.channels, window.device)
-    narrow = window[:, 1].isfinite().nonzero().squeeze(1)
-    expected = alpha[narrow]
-    first = render_rays(
-        field,
-        _take(rays, narrow),
-        occupancy,
-        probe,
-        stop=max(stop, 1 - KEPT_ALPHA),
-        window=window[narrow],
-    )
+    """Render `rays` within `window` [R, 2] where that has an end and the ray reaches `alpha` [R]
+    there; behind it, too, where the ray does not."""
+    narrow = window[:, 1].isfinite()
+    inside = narrow.nonzero().squeeze(1)
+    expected = alpha[inside]
+    loose = max(stop, 1 - KEPT_ALPHA)
+    first = march(_take(rays, inside), stop=loose, window=window[inside])
     enough = first.alpha >= KEPT_ALPHA * expected
     # What is left of the opacity looks like what was found.
     more = torch.where(enough & (first.alpha < expected), expected / first.alpha, 1)
+    canvas = Pixels.blank(len(alpha), first.values.shape[1], alpha.device)
     canvas.put(
-        narrow,
-        Pixels(first.values * more[:, None], first.depth_sum * more, first.alpha * more),
+        inside, Pixels(first.values * more[:, None], first.depth_sum * more, first.alpha * more)
     )
-    probe.count("continued", len(narrow) - int(enough.sum()), len(narrow))
-
-    open_end = torch.ones(len(window), dtype=torch.bool, device=window.device)
-    open_end[narrow[enough]] = False
-    rest = open_end.nonzero().squeeze(1)
-    far = window[rest, 1]
-    behind = torch.stack((torch.where(far.isfinite(), far, 0), far + torch.inf), dim=1)
-    carry = canvas.take(rest)
-    canvas.put(
-        rest,
-        render_rays(
-            field, _take(rays, rest), occupancy, probe, stop=stop, window=behind, carry=carry
-        ),
-    )
+    unfinished = torch.ones_like(narrow)
+    unfinished[inside[enough]] = False
+    rest = unfinished.nonzero().squeeze(1)
+    begin = torch.where(narrow, window[:, 1], 0)[rest]
+    behind = torch.stack((begin, torch.full_like(begin, torch.inf)), dim=1)
+    canvas.put(rest, march(_take(rays, rest), stop=stop, window=behind, carry=canvas.take(rest)))
     return canvas
 
 

@@ -298,8 +298,6 @@ class _LeakyResidual(nn.Module):
 def _conv(inputs: int, outputs: int) -> nn.Conv2d:
     layer = nn.Conv2d(inputs, outputs, 3, padding=1)
     nn.init.kaiming_normal_(layer.weight)
-    with torch.no_grad():
-        layer.bias.zero_()
     return layer
 
 
@@ -313,7 +311,8 @@ def _enlarge(image: Tensor, scale: int, phase: tuple[float, float]) -> Tensor:
     across, down = (_tent_weights(scale, shift).to(image) for shift in phase)
     kernel = (down[:, None, :, None] * across[None, :, None, :]).reshape(scale**2, 1, 3, 3)
     padded = functional.pad(image, (1, 1, 1, 1), mode="replicate")
-    return functional.conv2d(padded, kernel.repeat(channels, 1, 1, 1), groups=channels)
+    with torch.autocast(image.device.type, enabled=False):
+        return functional.conv2d(padded, kernel.repeat(channels, 1, 1, 1), groups=channels)
 
 
 def _tent_weights(scale: int, shift: float) -> Tensor:

@@ -71,6 +71,7 @@ def render_batch(
     background: Tensor | None,
     *,
     stop: float = STOP,
+    step: float = STEP,
 ) -> tuple[Pixels, int]:
     """Render `rays` differentiably; also the number of samples that took part.
 
@@ -81,9 +82,10 @@ def render_batch(
         jitter: [R] phase of the samples of each ray, in [0, 1); None: as `render_rays`.
         background: [K] or [R, K]; None: not composited on any.
         stop: transmittance at which a ray ends.
+        step: world length of a ray-marching step.
     """
     samples = march(
-        rays.origins, rays.directions, occupancy, STEP, jitter=jitter, backend=field.backend
+        rays.origins, rays.directions, occupancy, step, jitter=jitter, backend=field.backend
     )
     with torch.no_grad():
         parts = _pad(samples.positions).split(CHUNK_SAMPLES)
@@ -157,6 +159,7 @@ def render_rays(
     probe: Probe,
     *,
     stop: float = STOP,
+    step: float = STEP,
     window: Tensor | None = None,
     carry: Pixels | None = None,
 ) -> Pixels:
@@ -176,7 +179,7 @@ def render_rays(
         start = torch.zeros(len(alive), dtype=torch.int32, device=device)
         while len(alive):
             alive, start = _render_round(
-                field, rays, window, occupancy, probe, canvas, alive, start, stop
+                field, rays, window, occupancy, probe, canvas, alive, start, stop, step
             )
     return canvas
 
@@ -191,6 +194,7 @@ def _render_round(
     alive: Tensor,
     start: Tensor,
     stop: float,
+    step: float,
 ) -> tuple[Tensor, Tensor]:
     """One round of the rays `alive` from their steps `start`; those left and where they go on."""
     with probe.stage("march"):
@@ -199,7 +203,7 @@ def _render_round(
             origins,
             directions,
             occupancy,
-            STEP,
+            step,
             window=None if window is None else window[alive],
             start=start,
             limit=ROUND_SAMPLES,
