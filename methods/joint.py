@@ -120,7 +120,7 @@ class JointTraining:
         self.pipeline, self.renderer, self.pool, self.options = pipeline, renderer, pool, options
         self.generator = generator
         self.step, self.steps, self.seconds = 0, steps, 0.0
-        self.optimiser = torch.optim.Adam(renderer.parameters(), lr=options.rate)
+        self.optimiser = torch.optim.Adam(renderer.parameters(), lr=options.rate, fused=True)
         self.mean = AveragedModel(renderer, multi_avg_fn=self._average)
         pipeline.renderer = self.mean.module  # type: ignore[assignment]
         self.joint = options.field == "joint"
@@ -132,6 +132,7 @@ class JointTraining:
                 lr=options.field_rate,
                 betas=(0.9, 0.99),
                 eps=1e-15,
+                fused=True,
             )
             self.field.grad_buffer = torch.zeros_like(self.field.table)
 
