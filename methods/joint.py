@@ -228,7 +228,10 @@ class JointTraining:
         return Observation(
             frame,
             self.pipeline.background,
-            [Reprojected(v, i) for v, i in zip(values, patch.indices, strict=True)],
+            [
+                Reprojected(v, i, self.field.backend)
+                for v, i in zip(values, patch.indices, strict=True)
+            ],
             self.pipeline.history(newest, frame.depth, patch.view),
             patch.view.phase,
         )
@@ -236,12 +239,12 @@ class JointTraining:
     def _spread(self, patch: Patch, pixels: Pixels) -> FeatureFrame:
         """All pixels of the patch, from those that were rendered."""
         low = patch.view.low
-        blank = Pixels.blank(low.height * low.width, self.field.channels, pixels.alpha.device)
-        canvas = Pixels(
-            blank.values.index_copy(0, patch.seen, pixels.values),
-            blank.depth_sum.index_copy(0, patch.seen, pixels.depth_sum),
-            blank.alpha.index_copy(0, patch.seen, pixels.alpha),
-        )
+
+        def spread(part: Tensor) -> Tensor:
+            blank = part.new_zeros(low.height * low.width, *part.shape[1:])
+            return blank.index_copy(0, patch.seen, part)
+
+        canvas = Pixels(spread(pixels.values), spread(pixels.depth_sum), spread(pixels.alpha))
         frame = FeatureFrame.of(low, canvas, self.pipeline.background)
         return replace(frame, depth=frame.depth.detach())
 

@@ -114,7 +114,7 @@ class Pipeline:
     def reproject(self, cloud: Cloud, view: View) -> Reprojected:
         """The features of a preceding frame where the present picture sees them."""
         index, _ = cloud.land(view.full, self.options.reprojection, self.backend)
-        return Reprojected(cloud.values, index)
+        return Reprojected(cloud.values, index, self.backend)
 
     def history(self, newest: Remembered | None, depth: Tensor, view: View) -> History | None:
         """The preceding picture where the present one, of low-resolution `depth`, sees it."""

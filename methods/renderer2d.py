@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -28,6 +28,11 @@ class Reprojected:
 
     values: Tensor
     index: Tensor
+    backend: str = "auto"
+
+    def at(self, index: Tensor) -> Tensor:
+        """Values [..., K] of the points at `index` [...], zeros where it is -1."""
+        return gather(self.values, index, backend=self.backend)
 
 
 @dataclass(frozen=True)
@@ -114,7 +119,7 @@ class UnetRelease(Renderer2d):
         height, width = values.shape[0] * self.scale, values.shape[1] * self.scale
         present = values.new_zeros(height, width, self.channels)
         present[:: self.scale, :: self.scale] = values
-        frames = [present] + [gather(p.values, p.index) for p in observation.preceding]
+        frames = [present] + [p.at(p.index) for p in observation.preceding]
         frames += [torch.zeros_like(present)] * (self.frames + 1 - len(frames))
         rgb, rest = ([f[..., part] for f in frames] for part in (slice(0, 3), slice(3, None)))
         return torch.cat((*rgb, *rest), dim=-1).permute(2, 0, 1)
@@ -250,7 +255,7 @@ class SpaceToDepth(Renderer2d):
         if self.validity:
             values = functional.pad(values, (0, 1), value=1.0)
         index = _blocks(frame.index, self.scale)[box].contiguous()
-        return gather(values, index).flatten(start_dim=2)
+        return replace(frame, values=values).at(index).flatten(start_dim=2)
 
     def _recent(
         self, observations: Sequence[Observation], base: Tensor, box: tuple[slice, slice]

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-import methods.train
 from bench.types import Budget, Log, Scene, Split, SteerbenchError
+from methods import loop
 from methods.fields import HashField
 from methods.kernels.encode import HashGrid
 from methods.train import FieldTraining, PixelBatches, TrainingOptions, train_field
@@ -42,7 +42,7 @@ def test_rays_go_through_the_pixels_whose_colours_they_carry(ball_scene: Scene) 
 
 def test_the_loss_falls(ball_scene: Scene) -> None:
     training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
-    losses = [training.advance() for _ in range(BUDGET.steps)]
+    losses = [training.advance()[""] for _ in range(BUDGET.steps)]
     assert sum(losses[-10:]) < 0.5 * sum(losses[:10])
 
 
@@ -80,10 +80,10 @@ def test_a_killed_training_ends_as_if_it_had_never_stopped(
 ) -> None:
     whole = trained(ball_scene, tmp_path / "whole", quiet_log)
 
-    monkeypatch.setattr(methods.train, "CHECKPOINT_S", -1.0)  # after every step
+    monkeypatch.setattr(loop, "CHECKPOINT_S", -1.0)  # after every step
     advance = FieldTraining.advance
 
-    def killed_at_23(training: FieldTraining) -> float:
+    def killed_at_23(training: FieldTraining) -> dict[str, float]:
         if training.step == 23:
             raise KeyboardInterrupt
         return advance(training)
@@ -112,10 +112,10 @@ def test_a_finished_training_is_loaded(ball_scene: Scene, tmp_path: Path, quiet_
 def test_a_loss_that_is_no_number_stops_and_keeps_the_last_good_checkpoint(
     ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(methods.train, "CHECKPOINT_S", -1.0)
+    monkeypatch.setattr(loop, "CHECKPOINT_S", -1.0)
     advance = FieldTraining.advance
 
-    def spoiled_at_10(training: FieldTraining) -> float:
+    def spoiled_at_10(training: FieldTraining) -> dict[str, float]:
         if training.step == 10:
             with torch.no_grad():
                 training.field.layers["feature_mid"][0, 0] = torch.nan
@@ -125,7 +125,7 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_last_good_checkpoint(
     with pytest.raises(SteerbenchError, match=r"step 10.*feature_mid.*last good checkpoint"):
         trained(ball_scene, tmp_path, quiet_log)
     training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
-    methods.train.resume(training, tmp_path / "checkpoint.safetensors")
+    loop.resume(training, tmp_path / "checkpoint.safetensors")
     assert training.step == 10
     assert all(layer.isfinite().all() for layer in training.field.layers.values())
 
@@ -195,5 +195,5 @@ def test_pictures_without_alpha_are_trained_on_as_they_are(ball_scene: Scene) ->
     opaque = replace(split, images=[image[..., :3] for image in split.images])
     scene = replace(ball_scene, splits={"train": opaque, "test": opaque})
     training = FieldTraining(new_field(), scene, BUDGET, TrainingOptions(), seed=0)
-    losses = [training.advance() for _ in range(5)]
+    losses = [training.advance()[""] for _ in range(5)]
     assert all(loss < 1 for loss in losses)

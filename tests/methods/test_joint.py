@@ -1,0 +1,252 @@
+"""Stage 2: the gradient of the whole chain, what is trained, killed trainings, the guard."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from bench.types import Camera, Log, Scene, SteerbenchError
+from methods import loop
+from methods.fields import HashField
+from methods.joint import JointOptions, JointTraining
+from methods.kernels.encode import HashGrid
+from methods.kernels.march import Occupancy
+from methods.pipeline import Pipeline, PipelineOptions
+from methods.renderer2d import Renderer2d, SpaceToDepth, UnetRelease
+from methods.sequences import MotionOptions, SequencePool, TrueView
+
+GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)
+MOTION = MotionOptions(pool=3, uses=4, length=2)
+OPTIONS = JointOptions(patch=4, batch=2, motion=MOTION, precision="fp32")
+PIPELINE = PipelineOptions(channels=4, frames=2, steps=8)
+TARGET = torch.full((3,), 0.5)
+
+
+def shell() -> Occupancy:
+    """Where the surface of the ball is, and a little more."""
+    axis = (torch.arange(32) + 0.5) / 32 - 0.5
+    radius = torch.cartesian_prod(axis, axis, axis).norm(dim=1).view(32, 32, 32)
+    return Occupancy((radius - 0.3).abs() < 0.06)
+
+
+def misty_field(precision: str = "bf16", backend: str = "auto", channels: int = 4) -> HashField:
+    """A field in which every sample matters: density of about 10, features all different."""
+    generator = torch.Generator().manual_seed(3)
+    field = HashField(GRID, channels, precision=precision, backend=backend, generator=generator)
+    with torch.no_grad():
+        field.table.uniform_(-1, 1, generator=generator)
+        field.layers["density_out"][0] = 0.3
+    field.repack()
+    return field
+
+
+def new_training(
+    scene: Scene,
+    options: JointOptions = OPTIONS,
+    pipeline: PipelineOptions = PIPELINE,
+    field: HashField | None = None,
+    renderer: Renderer2d | None = None,
+    steps: int = 12,
+) -> JointTraining:
+    torch.manual_seed(0)
+    field = field or misty_field(channels=pipeline.channels)
+    renderer = renderer or SpaceToDepth(
+        pipeline.channels,
+        pipeline.frames,
+        pipeline.scale,
+        width=8,
+        blocks=1,
+        history=pipeline.history,
+    )
+    split = scene.splits["train"]
+    views = [TrueView(c, p) for c, p in zip(split.cameras, split.images, strict=True)]
+    generator = torch.Generator().manual_seed(1)
+    whole = Pipeline(field, shell(), scene.background, renderer, pipeline)
+    pool = SequencePool(whole, views, [], 0.0, TARGET, options.motion, generator)
+    return JointTraining(whole, renderer, pool, options, steps, generator)
+
+
+@pytest.mark.parametrize("through", ["all", "present"])
+def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
+    ball_scene: Scene, through: str
+) -> None:
+    """In float64, along a random direction of all parameters, against a central difference.
+
+    Table, networks and renderer are differentiated through compositing, the splatted features of
+    two preceding frames, and the 2D renderer; depths, and so places, are constants.
+    """
+    field = misty_field("fp32", "reference").double()
+    pipeline = replace(PIPELINE, history=False)
+    renderer = SpaceToDepth(4, 2, 4, width=6, blocks=1, history=False).double()
+    options = replace(OPTIONS, through=through)
+    with torch.no_grad():
+        renderer.last.weight.normal_(0, 0.1)
+    training = new_training(ball_scene, options, pipeline, field.float(), renderer.float())
+    patches = [training._cut(training.pool.draw()) for _ in range(16)]
+    after_two = [patch for patch in patches if len(patch.shown) == 2]
+    patches = [patch for patch in after_two if all(len(shown) for shown in patch.shown)][:2]
+    assert len(patches) == 2
+    field.double(), renderer.double()
+    training.pipeline.background = training.pipeline.background.double()
+    field.grad_buffer = None
+    clouds = [f.cloud for patch in patches for f in patch.sequence.buffer.frames]
+    frozen = [cloud.values.double() for cloud in clouds]
+    for cloud, values in zip(clouds, frozen, strict=True):
+        object.__setattr__(cloud, "values", values)
+
+    def loss() -> Tensor:
+        observations, opacity = training._observe(patches)
+        drawn, _ = renderer(observations)
+        truth = torch.stack([patch.truth for patch in patches])
+        return (drawn - truth).square().mean() + 1e-2 * (-opacity * opacity.log()).mean()
+
+    parameters = [field.table, *field.layers.values(), *renderer.parameters()]
+    gradient = torch.autograd.grad(loss(), parameters)
+    assert all(g.abs().max() > 0 for g in gradient)
+    generator = torch.Generator().manual_seed(0)
+    for group in (parameters[:1], parameters[1:6], parameters[6:]):
+        slope, step = 0.0, 1e-6
+        directions = [torch.randn(p.shape, generator=generator).double() for p in group]
+        for p, d in zip(group, directions, strict=True):
+            place = next(i for i, q in enumerate(parameters) if q is p)
+            slope += (gradient[place] * d).sum().item()
+        values = []
+        with torch.no_grad():
+            for sign in (1, -2):
+                for p, d in zip(group, directions, strict=True):
+                    p += sign * step * d
+                values.append(loss().item())
+            for p, d in zip(group, directions, strict=True):
+                p += step * d
+        assert (values[0] - values[1]) / (2 * step) == pytest.approx(slope, rel=1e-4)
+
+
+def state_of(training: JointTraining) -> dict[str, Tensor]:
+    return {name: tensor.clone() for name, tensor in training.result().items()}
+
+
+def test_frozen_leaves_the_field_alone_and_trains_the_renderer(ball_scene: Scene) -> None:
+    training = new_training(ball_scene, replace(OPTIONS, field="frozen"))
+    before = state_of(training)
+    for _ in range(3):
+        training.advance()
+    after = training.result()
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert changed
+    assert all(name.startswith("mean.") for name in changed)
+
+
+def test_joint_trains_table_networks_and_renderer(ball_scene: Scene) -> None:
+    training = new_training(ball_scene)
+    before = state_of(training)
+    for _ in range(3):
+        training.advance()
+    after = training.result()
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert {"field.table", "field.layers.density_out", "field.layers.feature_out"} <= changed
+    assert {"mean.last.weight", "mean.last.bias"} <= changed
+
+
+@pytest.mark.parametrize("frames", [0, 2])
+def test_the_error_falls(ball_scene: Scene, frames: int) -> None:
+    pipeline = replace(PIPELINE, frames=frames)
+    options = replace(OPTIONS, rate=1e-2, field_rate=1e-2)
+    training = new_training(ball_scene, options, pipeline, steps=30)
+    errors = [training.advance()[""] for _ in range(30)]
+    assert sum(errors[-5:]) < 0.5 * sum(errors[:5])
+
+
+def test_the_renderer_of_the_release_can_be_trained(ball_scene: Scene) -> None:
+    pipeline = replace(PIPELINE, frames=1, history=False)
+    options = replace(OPTIONS, batch=1)
+    training = new_training(ball_scene, options, pipeline, renderer=UnetRelease(4, 1, 4))
+    before = state_of(training)
+    training.advance()
+    after = training.result()
+    assert all(
+        not torch.equal(before[name], after[name]) for name in before if name.endswith("weight")
+    )
+
+
+def test_the_learning_rate_only_falls(ball_scene: Scene) -> None:
+    training = new_training(ball_scene)
+    rates = []
+    for _ in range(12):
+        training.advance()
+        rates.append(training.optimiser.param_groups[0]["lr"])
+    assert rates == sorted(rates, reverse=True)
+    assert rates[0] == OPTIONS.rate
+
+
+def test_a_patch_shows_what_the_picture_shows_there(ball_scene: Scene) -> None:
+    """The true colour of a pixel of the ball is its normal: also that of the patch's own camera."""
+    training = new_training(ball_scene)
+    patch = training._cut(training.pool.draw())
+    cut: Camera = patch.view.full
+    assert patch.truth.shape == (cut.height, cut.width, 3)
+    from tests.methods.conftest import ball
+
+    expected = ball(cut).float() / 255
+    expected = expected[..., :3] * expected[..., 3:] + 1 - expected[..., 3:]
+    assert (patch.truth - expected).abs().max() <= 1 / 255  # the colour of a ray, rounded twice
+
+
+def test_a_killed_training_goes_on_with_the_same_state(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "CHECKPOINT_S", -1.0)  # after every step
+    training = new_training(ball_scene)
+    advance = JointTraining.advance
+
+    def killed_at_5(training: JointTraining) -> dict[str, float]:
+        if training.step == 5:
+            raise KeyboardInterrupt
+        return advance(training)
+
+    finished = tmp_path / "steernerf.safetensors"
+    monkeypatch.setattr(JointTraining, "advance", killed_at_5)
+    with pytest.raises(KeyboardInterrupt):
+        loop.train(training, finished, "training", quiet_log)
+    again = new_training(ball_scene)
+    loop.resume(again, tmp_path / "checkpoint.safetensors")
+    assert again.step == 5
+    for name, tensor in training.result().items():
+        assert torch.equal(tensor, again.result()[name])
+    for name, tensor in training.state()[0].items():
+        assert torch.equal(tensor, again.state()[0][name])
+
+    monkeypatch.setattr(JointTraining, "advance", advance)
+    loop.train(again, finished, "training", quiet_log)
+    assert [path.name for path in tmp_path.iterdir()] == ["steernerf.safetensors"]
+
+
+def test_without_preceding_frames_a_killed_training_ends_as_if_it_had_never_stopped(
+    ball_scene: Scene, tmp_path: Path
+) -> None:
+    """With a pool that is always drawn anew, the random numbers are all there is to go on from."""
+    pipeline = replace(PIPELINE, frames=0)
+    options = replace(OPTIONS, motion=MotionOptions(pool=1, uses=1))
+    whole = new_training(ball_scene, options, pipeline)
+    for _ in range(3):
+        whole.advance()
+    loop.save(whole, tmp_path / "checkpoint.safetensors")
+    for _ in range(3):
+        whole.advance()
+    again = new_training(ball_scene, options, pipeline)
+    loop.resume(again, tmp_path / "checkpoint.safetensors")
+    for _ in range(3):
+        again.advance()
+    for name, tensor in whole.result().items():
+        assert torch.equal(tensor, again.result()[name]), name
+
+
+def test_a_loss_that_is_no_number_stops_and_names_what_is_not_finite(ball_scene: Scene) -> None:
+    training = new_training(ball_scene)
+    with torch.no_grad():
+        training.renderer.last.bias[0] = torch.nan
+    with pytest.raises(SteerbenchError, match=r"step 0: not finite: .*renderer\.last\.bias.*rate"):
+        training.advance()
