@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from torch import Tensor
 from bench.cameras import look_at, move_camera
 from bench.scenes import blender
 from bench.scenes.files import opengl_to_opencv, whole_number
+from bench.scenes.medley import medley
 from bench.scenes.models import MODELS
 from bench.scenes.parallel import in_parallel
 from bench.scenes.raytrace import Model, render
@@ -29,6 +31,9 @@ ANGLE_X = 0.69
 
 DISTANCE = 4.3
 """Of all cameras from the middle of the scene, in the model's units."""
+
+MEDLEY = re.compile("medley-(0|[1-9][0-9]*)")
+"""Names of the variants of `medley`."""
 
 
 def load(
@@ -48,7 +53,7 @@ def load(
     """Read an embedded scene, after writing it if it is not there yet.
 
     Args:
-        name: one of `MODELS`.
+        name: one of `MODELS`, or `medley-N` for variant N of the random heap.
         width, height: of its pictures; square when no height is given.
         train: pictures from all around, 10 degrees below to 80 above the horizon.
         test: pictures of a smooth orbit, 1 degree of azimuth apart: 360 of them close it.
@@ -76,10 +81,43 @@ def load(
     return replace(scene, exact=lambda camera: exact_picture(scene, camera))
 
 
+def load_medley(
+    *,
+    variant: int = 0,
+    width: int = 400,
+    height: int | None = None,
+    train: int = 60,
+    test: int = 24,
+    seed: int = 0,
+    downscale: int = 1,
+    background: str = "white",
+    bounds: str | list = "auto",
+    root: str | Path = "outputs/scenes",
+    log: Log,
+) -> Scene:
+    """Read a variant of the random heap; the other options are those of `load`."""
+    return load(
+        f"medley-{whole_number(variant, 'variant', 0)}",
+        width=width,
+        height=height,
+        train=train,
+        test=test,
+        seed=seed,
+        downscale=downscale,
+        background=background,
+        bounds=bounds,
+        root=root,
+        log=log,
+    )
+
+
 def find(name: str) -> Model:
     """The model of that name; Unavailable when there is none."""
+    if match := MEDLEY.fullmatch(name):
+        return medley(int(match[1]))
     if name not in MODELS:
-        raise Unavailable(f"scene: expected one of {', '.join(MODELS)}, got {name!r}")
+        names = ", ".join((*MODELS, "medley-0, medley-1 and so on"))
+        raise Unavailable(f"scene: expected one of {names}, got {name!r}")
     return MODELS[name]()
 
 
@@ -87,7 +125,7 @@ def render_exact(name: str, camera: Camera, *, background: float = 1.0, samples:
     """The exact picture of a model.
 
     Args:
-        name: one of `MODELS`.
+        name: as of `load`.
         camera: in the model's units, which are those of the written data set.
         background: the grey behind it, 1 for white.
         samples: rays a pixel, a power of two; 1 asks for the pixel centre's ray alone.
@@ -115,7 +153,8 @@ def settings_hash(settings: dict) -> str:
     """Of the settings and of the sources that the pictures come from."""
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     here = Path(__file__).parent
-    for module in ("analytic", "models", "raytrace", "solids", "opaque", "media", "textures"):
+    own = "medley" if MEDLEY.fullmatch(settings["name"]) else "models"
+    for module in ("analytic", own, "raytrace", "solids", "opaque", "media", "textures"):
         digest.update((here / f"{module}.py").read_bytes())
     return digest.hexdigest()[:12]
 

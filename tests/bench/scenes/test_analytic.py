@@ -11,14 +11,14 @@ import torch
 
 from bench.cameras import move_camera, unproject
 from bench.scenes import analytic
-from bench.scenes.analytic import exact_frame, orbit_poses, render_exact, train_poses
+from bench.scenes.analytic import exact_frame, find, orbit_poses, render_exact, train_poses
 from bench.scenes.models import MODELS
 from bench.types import Camera, SteerbenchError, Unavailable
 
 SMALL = {"width": 32, "height": 24, "train": 6, "test": 3}
 
 
-@pytest.fixture(params=MODELS)
+@pytest.fixture(params=[*MODELS, "medley-0"])
 def name(request: pytest.FixtureRequest) -> str:
     """Every embedded scene in turn."""
     return request.param
@@ -123,7 +123,7 @@ def test_no_surface_point_is_outside_the_bounds(tmp_path, log, name) -> None:
 
 
 def test_models_lie_in_their_cube(name) -> None:
-    assert MODELS[name]().boxes().abs().max() <= 1.2
+    assert find(name).boxes().abs().max() <= 1.2
 
 
 def test_the_totem_fills_but_does_not_leave_its_pictures() -> None:
@@ -193,6 +193,43 @@ def test_bad_options(tmp_path, log, options, message) -> None:
 
 
 def test_unknown_names_are_refused(tmp_path, log) -> None:
-    with pytest.raises(Unavailable, match="expected one of totem, wires, cloud, void, got 'tower'"):
-        analytic.load("tower", root=tmp_path, log=log)
+    for name in ("tower", "medley", "medley-", "medley--1", "medley-07", "medley-1.5"):
+        with pytest.raises(
+            Unavailable,
+            match=f"one of totem, wires, cloud, void, medley-0, medley-1 and so on, got '{name}'",
+        ):
+            analytic.load(name, root=tmp_path, log=log)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_variants_of_medley_are_scenes_of_their_own(tmp_path, log) -> None:
+    scenes = [
+        analytic.load_medley(variant=variant, **SMALL, root=tmp_path, log=log)
+        for variant in (7, 8, 7)
+    ]
+    assert [scene.name for scene in scenes] == ["medley-7", "medley-8", "medley-7"]
+    names = sorted(folder.name.rsplit("-", 1)[0] for folder in tmp_path.iterdir())
+    assert names == ["medley-7", "medley-8"]
+    assert scenes[0].digest == scenes[2].digest != scenes[1].digest
+
+
+def test_medley_hands_every_option_on(tmp_path, log, monkeypatch) -> None:
+    given = {
+        **SMALL,
+        "seed": 3,
+        "downscale": 2,
+        "background": "black",
+        "bounds": "full",
+        "root": tmp_path,
+        "log": log,
+    }
+    seen = {}
+    monkeypatch.setattr(analytic, "load", lambda name, **options: seen.update(options, name=name))
+    analytic.load_medley(variant=5, **given)
+    assert seen == {"name": "medley-5", **given}
+
+
+@pytest.mark.parametrize("variant", [-1, 1.5, True, "7"])
+def test_a_variant_is_a_whole_number(tmp_path, log, variant) -> None:
+    with pytest.raises(SteerbenchError, match="variant: expected a whole number from 0 on"):
+        analytic.load_medley(variant=variant, root=tmp_path, log=log)

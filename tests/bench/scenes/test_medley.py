@@ -1,0 +1,122 @@
+"""The random heap: fixed by its variant, inside its ball, connected, and varied."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from bench.scenes import textures
+from bench.scenes.analytic import orbit_poses, train_poses
+from bench.scenes.medley import BULKY, CORE, REACH, SMALLER, Draw, medley
+from bench.scenes.opaque import Solids
+from bench.scenes.raytrace import render
+from bench.scenes.solids import Box, Capsule, Carved, Common, Cylinder, Ellipsoid, Shifted
+from bench.types import Camera
+
+FIRST = range(12)
+
+
+def picture(model: Solids, pose: torch.Tensor) -> torch.Tensor:
+    focal = 32 / math.tan(0.345)
+    camera = Camera(pose.float(), focal, focal, 32, 32, 64, 64)
+    frame = render(model, camera, torch.ones(3), 4)
+    return torch.cat((frame.rgb, frame.alpha[..., None]), -1)
+
+
+def test_a_variant_is_always_the_same_bits() -> None:
+    for variant in FIRST:
+        first, again = (medley(variant) for _ in range(2))
+        for a, b in zip(first.parts, again.parts, strict=True):
+            assert (a.shape, a.centre, a.turn, a.gloss) == (b.shape, b.centre, b.turn, b.gloss)
+        pose = orbit_poses(1)[0]
+        assert torch.equal(picture(first, pose), picture(again, pose))
+
+
+def test_the_stream_is_the_one_that_python_promises() -> None:
+    # The sequence of the Mersenne twister from an integer seed is part of Python's interface.
+    assert Draw(7).share() == pytest.approx(0.32383276483316237, abs=1e-15)
+
+
+def test_variants_differ() -> None:
+    pose = orbit_poses(1)[0]
+    pictures = [picture(medley(variant), pose) for variant in FIRST]
+    for k, first in enumerate(pictures):
+        for second in pictures[k + 1 :]:
+            assert (first - second).abs().mean() > 0.02
+
+
+def test_parts_are_few_and_lie_in_their_ball() -> None:
+    for variant in range(60):
+        model = medley(variant)
+        assert 8 <= len(model.parts) <= 16
+        assert model.boxes().norm(dim=-1).max() <= REACH * (1 + 1e-5)
+
+
+def test_pictures_are_filled_and_not_cut() -> None:
+    for variant in FIRST:
+        shown = picture(medley(variant), train_poses(12, variant)[variant])[..., 3]
+        border = torch.cat((shown[0], shown[-1], shown[:, 0], shown[:, -1]))
+        assert (border == 0).all()
+        assert 0.06 < shown.mean() < 0.4
+
+
+def test_the_core_touches_its_first_part() -> None:
+    for variant in FIRST:
+        first, *others = medley(variant).parts[:CORE]
+        for part in others:
+            # The centre lies on an ellipsoid inside the first part, unless moved to the middle.
+            local = (torch.tensor(part.centre) - torch.tensor(first.centre)) @ first.frame
+            assert first.shape.distance(local[None]) <= 1e-5
+
+
+def test_every_solid_and_every_texture_occurs() -> None:
+    parts = [part for variant in FIRST for part in medley(variant).parts]
+    shapes = {type(part.shape) for part in parts}
+    assert shapes == {Box, Capsule, Carved, Common, Cylinder, Ellipsoid}
+    makers = {  # of all functions of that module, those that return a texture
+        name
+        for name, value in vars(textures).items()
+        if getattr(value, "__annotations__", {}).get("return") == "Texture"
+    }
+    assert {part.texture.__qualname__.split(".")[0] for part in parts} == makers
+    assert len(makers) == 10
+    assert {part.gloss > 0 for part in parts} == {True, False}
+
+
+def test_there_is_fine_and_coarse() -> None:
+    parts = [part for variant in FIRST for part in medley(variant).parts]
+    thickness = [min(part.shape.extent()) for part in parts]
+    assert min(thickness) < 0.01
+    assert max(thickness) > 0.3
+
+
+@pytest.mark.parametrize("make", sorted({*BULKY, *SMALLER}, key=lambda make: make.__name__))
+def test_makers_keep_about_the_size_they_are_asked_for(make) -> None:
+    for seed in range(20):
+        shape = make(Draw(seed), 0.3)
+        assert math.hypot(*shape.extent()) < REACH
+        if isinstance(shape, Carved):
+            assert all(isinstance(bite, Shifted) for bite in shape.bites)
+        if make in BULKY:  # holds the ellipsoid of its box, on which others are put
+            directions = torch.nn.functional.normalize(
+                torch.randn(500, 3, generator=torch.Generator().manual_seed(seed)), dim=1
+            )
+            assert shape.distance(directions * torch.tensor(shape.extent())).max() <= 1e-5
+
+
+def test_a_deck_repeats_nothing_before_all_have_come() -> None:
+    cards = Draw(1).deck("abcde", 12)
+    assert len(cards) == 12
+    assert sorted(cards[:5]) == sorted(cards[5:10]) == list("abcde")
+    assert len(set(cards[10:])) == 2
+
+
+def test_draws_keep_their_range() -> None:
+    draw = Draw(3)
+    assert {draw.whole(2, 4) for _ in range(200)} == {2, 3, 4}
+    assert all(1 <= draw.between(1, 2) <= 2 and 1 <= draw.small(1, 2) <= 2 for _ in range(200))
+    assert all(
+        sum(x * x for x in draw.direction()) == pytest.approx(1, rel=1e-12) for _ in range(200)
+    )
