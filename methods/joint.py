@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -12,18 +12,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel
 
-from bench.cameras import cast, crop_camera, pixel_grid
-from bench.protocol import composite
-from bench.types import Camera, Rays
 from methods import checkpoint, loop
-from methods.buffer import Cloud
 from methods.kernels.adam import AdamState, sparse_adam_
-from methods.kernels.composite import Pixels
-from methods.occupancy import STEP
-from methods.pipeline import Pipeline, View
-from methods.renderer2d import Observation, Renderer2d, Reprojected
-from methods.sequences import MotionOptions, Sequence, SequencePool
-from methods.volume import FeatureFrame, rays_at_matter, render_batch
+from methods.patches import PatchSource, Through
+from methods.pipeline import Pipeline
+from methods.renderer2d import Renderer2d
+from methods.sequences import MotionOptions, SequencePool
 
 Tensors = tuple[Tensor, ...] | list[Tensor]
 
@@ -51,7 +45,7 @@ class JointOptions:
     """
 
     field: Literal["joint", "frozen"] = "joint"
-    through: Literal["all", "present"] = "all"
+    through: Through = "all"
     rate: float = 1e-3
     field_rate: float = 1e-3
     final_rate: float = 0.01
@@ -74,29 +68,6 @@ class JointOptions:
             raise ValueError(f"expected distilled_views >= 0 and distilled_share in [0, 1]: {self}")
 
 
-@dataclass(frozen=True)
-class Patch:
-    """A patch of a training view, and the rays of the field that it is drawn from.
-
-    Attributes:
-        sequence: what it was cut from.
-        view: its cameras.
-        truth: [H, W, 3].
-        seen: [P] pixels of `view.low` whose rays are rendered.
-        indices: what each preceding frame shows at its pixels, [H, W].
-        shown: the points of each preceding frame that are seen.
-        rays: of `seen`, then of each of `shown`.
-    """
-
-    sequence: Sequence
-    view: View
-    truth: Tensor
-    seen: Tensor
-    indices: list[Tensor]
-    shown: list[Tensor]
-    rays: list[Rays]
-
-
 class JointTraining:
     """Stage 2 as a `loop.Training`.
 
@@ -117,13 +88,15 @@ class JointTraining:
         steps: int,
         generator: torch.Generator,
     ) -> None:
-        self.pipeline, self.renderer, self.pool, self.options = pipeline, renderer, pool, options
-        self.generator = generator
+        self.pipeline, self.renderer, self.options = pipeline, renderer, options
+        self.joint, self.generator = options.field == "joint", generator
+        self.patches = PatchSource(
+            pipeline, pool, options.patch, self.joint, options.through, generator
+        )
         self.step, self.steps, self.seconds = 0, steps, 0.0
         self.optimiser = torch.optim.Adam(renderer.parameters(), lr=options.rate, fused=True)
         self.mean = AveragedModel(renderer, multi_avg_fn=self._average)
         pipeline.renderer = self.mean.module  # type: ignore[assignment]
-        self.joint = options.field == "joint"
         self.field = pipeline.field.requires_grad_(self.joint)
         if self.joint:
             self.table_state = AdamState.like(self.field.table.detach())
@@ -142,12 +115,10 @@ class JointTraining:
         Raises:
             SteerbenchError: the loss is not finite.
         """
-        patches = [self._cut(self.pool.draw()) for _ in range(self.options.batch)]
-        observations, opacity = self._observe(patches)
+        observations, truth, opacity = self.patches.draw(self.options.batch)
         half = self.options.precision == "bf16"
         with torch.autocast(opacity.device.type, torch.bfloat16, enabled=half):
             drawn, base = self.renderer(observations)
-        truth = torch.stack([patch.truth for patch in patches])
         loss = functional.mse_loss(drawn, truth)
         entropy = -(opacity * opacity.log()).mean() if self.joint and len(opacity) else 0.0
         (loss + self.options.opacity_entropy * entropy).backward()
@@ -157,96 +128,6 @@ class JointTraining:
         self._update()
         self.step += 1
         return {"": value, "base": functional.mse_loss(base.detach(), truth).item()}
-
-    def _cut(self, sequence: Sequence) -> Patch:
-        """A random patch of `sequence` in which there is more than background."""
-        scale, view = self.pipeline.options.scale, sequence.view
-        place = sequence.cells[self._random(len(sequence.cells))].tolist()
-        size = view.low.height, view.low.width
-        height, width = (min(self.options.patch, side) for side in size)
-        top, left = (
-            min(max(centre - self._random(extent), 0), side - extent)
-            for centre, extent, side in zip(place, (height, width), size, strict=True)
-        )
-        low = crop_camera(view.low, left, top, width, height)
-        full = crop_camera(view.full, left * scale, top * scale, width * scale, height * scale)
-        cut = View(full, low, view.phase)
-        seen, rays = rays_at_matter(low, self.pipeline.occupancy)
-        patch = Patch(sequence, cut, self._truth(sequence, top, left, full), seen, [], [], [rays])
-        for frame in sequence.buffer.frames:
-            index, _ = frame.cloud.land(
-                full, self.pipeline.options.reprojection, self.field.backend
-            )
-            shown = index[index >= 0].unique().long()
-            patch.indices.append(index)
-            patch.shown.append(shown)
-            if self.joint and self.options.through == "all":
-                patch.rays.append(_rays_of(frame.cloud, shown))
-        return patch
-
-    def _truth(self, sequence: Sequence, top: int, left: int, full: Camera) -> Tensor:
-        """The true picture [H, W, 3] of the patch; the background where it ends."""
-        scale = self.pipeline.options.scale
-        background = self.pipeline.background[:3]
-        rows = slice(top * scale, top * scale + full.height)
-        columns = slice(left * scale, left * scale + full.width)
-        part = composite(sequence.truth.picture[rows, columns].to(background.device), background)
-        truth = background.expand(full.height, full.width, 3).clone()
-        truth[: part.shape[0], : part.shape[1]] = part
-        return truth
-
-    def _observe(self, patches: list[Patch]) -> tuple[list[Observation], Tensor]:
-        """What the renderer is given of `patches`, with the gradient it is to have; opacities."""
-        rays = [rays for patch in patches for rays in patch.rays]
-        together = Rays(
-            torch.cat([r.origins for r in rays]), torch.cat([r.directions for r in rays])
-        )
-        pipeline = self.pipeline
-        with torch.set_grad_enabled(self.joint):
-            pixels, _ = render_batch(
-                self.field,
-                together,
-                pipeline.occupancy,
-                jitter=None,
-                background=None,
-                stop=pipeline.options.stop,
-                step=pipeline.options.steps * STEP,
-            )
-            parts = iter(_split(pixels, [len(r.origins) for r in rays]))
-            observations = [self._observation(p, [next(parts) for _ in p.rays]) for p in patches]
-        return observations, pixels.alpha.clamp(1e-5, 1 - 1e-5)
-
-    def _observation(self, patch: Patch, rendered: list[Pixels]) -> Observation:
-        present, *preceding = rendered
-        frame = self._spread(patch, present)
-        frames = patch.sequence.buffer.frames
-        values = [frame.cloud.values for frame in frames]
-        for age, pixels in enumerate(preceding):
-            shine = (1 - pixels.alpha)[:, None] * self.pipeline.background
-            values[age] = values[age].index_copy(0, patch.shown[age], pixels.values + shine)
-        newest = frames[0] if frames else None
-        return Observation(
-            frame,
-            self.pipeline.background,
-            [
-                Reprojected(v, i, self.field.backend)
-                for v, i in zip(values, patch.indices, strict=True)
-            ],
-            self.pipeline.history(newest, frame.depth, patch.view),
-            patch.view.phase,
-        )
-
-    def _spread(self, patch: Patch, pixels: Pixels) -> FeatureFrame:
-        """All pixels of the patch, from those that were rendered."""
-        low = patch.view.low
-
-        def spread(part: Tensor) -> Tensor:
-            blank = part.new_zeros(low.height * low.width, *part.shape[1:])
-            return blank.index_copy(0, patch.seen, part)
-
-        canvas = Pixels(spread(pixels.values), spread(pixels.depth_sum), spread(pixels.alpha))
-        frame = FeatureFrame.of(low, canvas, self.pipeline.background)
-        return replace(frame, depth=frame.depth.detach())
 
     def _update(self) -> None:
         low, done = self.options.final_rate, self.step / self.steps
@@ -271,9 +152,6 @@ class JointTraining:
         # In the beginning, over fewer steps: the first weights are not worth remembering.
         keep = min(self.options.average, (1 + int(count)) / (10 + int(count)))
         torch._foreach_lerp_(mean, new, 1 - keep)
-
-    def _random(self, below: int) -> int:
-        return int(torch.randint(below, (), generator=self.generator))
 
     def watched(self) -> dict[str, Tensor]:
         """Table, networks, 2D renderer."""
@@ -317,17 +195,6 @@ class JointTraining:
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
         self.field.repack()
         self.mean.module.load_state_dict(checkpoint.part(tensors, "mean."))
-
-
-def _rays_of(cloud: Cloud, points: Tensor) -> Rays:
-    camera = cloud.camera
-    centres = pixel_grid(camera.width, camera.height, points.device)
-    return cast(camera, centres[cloud.source[points]])
-
-
-def _split(pixels: Pixels, sizes: list[int]) -> list[Pixels]:
-    parts = (x.split(sizes) for x in (pixels.values, pixels.depth_sum, pixels.alpha))
-    return [Pixels(*part) for part in zip(*parts, strict=True)]
 
 
 def _step(optimiser: torch.optim.Optimizer, rate: float) -> None:

@@ -27,6 +27,7 @@ SOURCES = (
     "buffer",
     "distil",
     "joint",
+    "patches",
     "pipeline",
     "range_reduction",
     "renderer2d",

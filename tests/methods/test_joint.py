@@ -86,7 +86,7 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
     with torch.no_grad():
         renderer.last.weight.normal_(0, 0.1)
     training = new_training(ball_scene, options, pipeline, field.float(), renderer.float())
-    patches = [training._cut(training.pool.draw()) for _ in range(16)]
+    patches = [training.patches.cut(training.patches.pool.draw()) for _ in range(16)]
     after_two = [patch for patch in patches if len(patch.shown) == 2]
     patches = [patch for patch in after_two if all(len(shown) for shown in patch.shown)][:2]
     assert len(patches) == 2
@@ -99,7 +99,7 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
         object.__setattr__(cloud, "values", values)
 
     def loss() -> Tensor:
-        observations, opacity = training._observe(patches)
+        observations, opacity = training.patches.observe(patches)
         drawn, _ = renderer(observations)
         truth = torch.stack([patch.truth for patch in patches])
         return (drawn - truth).square().mean() + 1e-2 * (-opacity * opacity.log()).mean()
@@ -185,7 +185,7 @@ def test_the_learning_rate_only_falls(ball_scene: Scene) -> None:
 def test_a_patch_shows_what_the_picture_shows_there(ball_scene: Scene) -> None:
     """The true colour of a pixel of the ball is its normal: also that of the patch's own camera."""
     training = new_training(ball_scene)
-    patch = training._cut(training.pool.draw())
+    patch = training.patches.cut(training.patches.pool.draw())
     cut: Camera = patch.view.full
     assert patch.truth.shape == (cut.height, cut.width, 3)
     from tests.methods.conftest import ball
