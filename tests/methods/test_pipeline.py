@@ -1,0 +1,100 @@
+"""A frame of the pipeline: views, phases, cold start, what follows what."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bench.cameras import cast, project
+from bench.types import NullProbe
+from methods.buffer import RenderingBuffer
+from methods.pipeline import Pipeline, PipelineOptions, View, sample_phase
+from methods.renderer2d import SpaceToDepth
+from tests.methods.conftest import look_at_the_middle
+from tests.methods.test_joint import misty_field, shell
+
+OPTIONS = PipelineOptions(channels=4, frames=2, steps=8)
+CAMERA = look_at_the_middle(0.1, 0.3)
+
+
+def new_pipeline(options: PipelineOptions = OPTIONS) -> Pipeline:
+    torch.manual_seed(0)
+    renderer = SpaceToDepth(
+        options.channels, options.frames, options.scale, width=8, blocks=1, history=options.history
+    )
+    field = misty_field(channels=options.channels)
+    return Pipeline(field, shell(), torch.ones(3), renderer, options)
+
+
+@pytest.mark.parametrize("scale", [1, 2, 4, 8])
+def test_the_phases_of_a_round_visit_every_pixel_of_a_cell_once(scale: int) -> None:
+    phases = {sample_phase(turn, scale) for turn in range(scale**2)}
+    middle = (scale - 1) / 2
+    assert phases == {(u - middle, v - middle) for u in range(scale) for v in range(scale)}
+    assert sample_phase(scale**2, scale) == sample_phase(0, scale)
+
+
+@pytest.mark.parametrize("size", [(32, 32), (33, 30)])
+def test_a_ray_of_the_low_resolution_goes_through_the_middle_of_its_cell_and_the_phase(
+    size: tuple[int, int],
+) -> None:
+    camera = replace(CAMERA, width=size[0], height=size[1])
+    for turn in range(16):
+        view = View.of(camera, replace(OPTIONS, jitter=True), turn)
+        assert (view.full.width, view.full.height) == (4 * view.low.width, 4 * view.low.height)
+        rays = cast(view.low)
+        pixels, _ = project(view.full, rays.origins + 2 * rays.directions)
+        first = torch.tensor((2.0, 2.0)) + torch.tensor(view.phase)
+        assert torch.allclose(pixels[0], first, atol=1e-4)  # float32 at 32 pixels
+        assert torch.allclose(pixels[1] - pixels[0], torch.tensor((4.0, 0.0)), atol=1e-4)
+
+
+@pytest.mark.parametrize("frames", [0, 1, 3])
+@pytest.mark.parametrize("size", [(32, 32), (33, 30), (5, 3)])
+def test_frames_have_the_size_of_the_camera_whatever_is_remembered(
+    frames: int, size: tuple[int, int]
+) -> None:
+    pipeline = new_pipeline(replace(OPTIONS, frames=frames))
+    camera = replace(CAMERA, width=size[0], height=size[1])
+    buffer = RenderingBuffer(frames)
+    for remembered in range(frames + 2):
+        assert len(buffer.frames) == min(remembered, frames)
+        frame = pipeline.render(camera, buffer, NullProbe())
+        assert frame.rgb.shape == (size[1], size[0], 3)
+        assert frame.depth.shape == frame.alpha.shape == (size[1], size[0])
+        assert frame.rgb.isfinite().all()
+
+
+def test_after_a_reset_a_sequence_repeats_bit_for_bit() -> None:
+    pipeline = new_pipeline(replace(OPTIONS, jitter=True))
+    cameras = [look_at_the_middle(0.1 + 0.003 * i, 0.3) for i in range(4)]
+    buffer = RenderingBuffer(2)
+    first = [pipeline.render(camera, buffer, NullProbe()).rgb for camera in cameras]
+    buffer.reset()
+    second = [pipeline.render(camera, buffer, NullProbe()).rgb for camera in cameras]
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+    third = pipeline.render(cameras[0], buffer, NullProbe()).rgb
+    assert not torch.equal(third, first[0])  # it remembers
+
+
+def test_the_preceding_picture_of_a_still_camera_is_where_it_was() -> None:
+    pipeline = new_pipeline()
+    buffer = RenderingBuffer(2)
+    frame = pipeline.render(CAMERA, buffer, NullProbe())
+    view = View.of(CAMERA, OPTIONS, 1)
+    low_depth = frame.depth[::4, ::4]
+    history = pipeline.history(buffer.frames[0], low_depth, view)
+    assert history is not None
+    blocks = frame.rgb.view(8, 4, 8, 4, 3).transpose(1, 2).reshape(8, 8, 16, 3)
+    known = history.valid > 0
+    assert known.float().mean() > 0.2
+    # Positions are off by some ulps of 32 pixels, and neighbours differ by at most 1.
+    assert (history.values - blocks)[known].abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("wrong", [{"channels": 2}, {"frames": -1}, {"scale": 0}, {"steps": 0.0}])
+def test_options_that_make_no_frame_are_refused(wrong: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match="expected channels"):
+        replace(OPTIONS, **wrong)

@@ -1,0 +1,71 @@
+"""Training sequences: what precedes a view, and how long it is used."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bench.types import Scene
+from methods.sequences import MotionOptions, SequencePool, TrueView
+from tests.methods.test_pipeline import OPTIONS, new_pipeline
+
+TARGET = torch.full((3,), 0.5)
+
+
+def views(scene: Scene) -> list[TrueView]:
+    split = scene.splits["train"]
+    return [TrueView(c, p) for c, p in zip(split.cameras, split.images, strict=True)]
+
+
+def new_pool(scene: Scene, motion: MotionOptions, share: float = 0.0, frames: int = 2):
+    real = views(scene)
+    pipeline = new_pipeline(replace(OPTIONS, frames=frames))
+    generator = torch.Generator().manual_seed(0)
+    return SequencePool(pipeline, real[:12], real[12:], share, TARGET, motion, generator)
+
+
+def test_a_sequence_is_made_anew_after_its_uses(ball_scene: Scene) -> None:
+    pool = new_pool(ball_scene, MotionOptions(pool=1, uses=3))
+    drawn = [pool.draw() for _ in range(7)]
+    assert [sequence is drawn[0] for sequence in drawn] == [True] * 3 + [False] * 4
+    assert drawn[3] is drawn[5]
+    assert drawn[3] is not drawn[6]
+
+
+def test_the_pool_holds_no_more_than_it_is_to(ball_scene: Scene) -> None:
+    pool = new_pool(ball_scene, MotionOptions(pool=3, uses=100, length=1))
+    assert len({id(pool.draw()) for _ in range(40)}) == 3
+
+
+@pytest.mark.parametrize(("share", "distilled"), [(0.0, 0), (1.0, 20)])
+def test_the_share_of_distilled_views_is_kept(
+    ball_scene: Scene, share: float, distilled: int
+) -> None:
+    pool = new_pool(ball_scene, MotionOptions(pool=1, uses=1, length=0), share)
+    of_field = {id(view.camera) for view in views(ball_scene)[12:]}
+    drawn = [pool.draw() for _ in range(20)]
+    assert sum(id(sequence.truth.camera) in of_field for sequence in drawn) == distilled
+
+
+def test_cold_and_steady_starts_both_occur(ball_scene: Scene) -> None:
+    pool = new_pool(ball_scene, MotionOptions(pool=1, uses=1, length=3))
+    lengths = {len(pool.draw().buffer.frames) for _ in range(24)}
+    assert lengths == {0, 1, 2}  # L = 2 of the 0 to 3 that were rendered
+
+
+def test_the_newest_preceding_frame_is_a_step_away(ball_scene: Scene) -> None:
+    pool = new_pool(ball_scene, MotionOptions(degrees=(2.0, 2.0), pool=1, uses=1, length=3))
+    for sequence in (pool.draw() for _ in range(12)):
+        away = sequence.truth.camera.c2w[:, 3] - TARGET
+        for age, frame in enumerate(sequence.buffer.frames, 1):
+            then = frame.camera.c2w[:, 3] - TARGET
+            turn = torch.rad2deg(torch.acos(torch.cosine_similarity(away, then, dim=0)))
+            assert turn.item() == pytest.approx(2.0 * age, rel=0.05)  # the bend makes it shorter
+
+
+def test_cells_are_those_in_which_something_is(ball_scene: Scene) -> None:
+    sequence = new_pool(ball_scene, MotionOptions(pool=1, uses=1), frames=0).draw()
+    alpha = sequence.truth.picture[..., 3].float().view(8, 4, 8, 4).amax(dim=(1, 3))
+    assert torch.equal(sequence.cells, (alpha > 0).nonzero())

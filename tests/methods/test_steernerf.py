@@ -1,0 +1,89 @@
+"""The method as the harness uses it: trained, loaded again, rendered in sequence."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+
+from bench.console import ConsoleLog
+from bench.types import Budget, NullProbe, Scene
+from methods.joint import JointOptions
+from methods.kernels.encode import HashGrid
+from methods.pipeline import PipelineOptions
+from methods.renderer2d import SpaceToDepth
+from methods.sequences import MotionOptions
+from methods.steernerf import SteerNerf
+from methods.train import TrainingOptions
+
+BUDGET = Budget("test", steps=40, samples=4096, renderer_steps=4)
+
+
+def new_method(frames: int = 2, rate: float = 1e-3) -> SteerNerf:
+    return SteerNerf(
+        grid=HashGrid(levels=8, log2_table=12, n_min=8, n_max=64),
+        training=TrainingOptions(),
+        pipeline=PipelineOptions(channels=5, frames=frames, steps=4),
+        renderer=partial(SpaceToDepth, width=8, blocks=1),
+        joint=JointOptions(
+            patch=4,
+            rate=rate,
+            distilled_views=2,
+            motion=MotionOptions(pool=2, length=2),
+        ),
+    )
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> ConsoleLog:
+    return ConsoleLog(tmp_path)
+
+
+def stages(folder: Path) -> list[str]:
+    return sorted(path.name.split("-")[0] for path in (folder / "stages").iterdir())
+
+
+def test_what_was_trained_is_found_again_and_renders_the_same(
+    ball_scene: Scene, log: ConsoleLog, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = new_method(), new_method()
+    first.fit(ball_scene, BUDGET, log)
+    capsys.readouterr()
+    second.fit(ball_scene, BUDGET, log)
+    assert "trained renderer found" in capsys.readouterr().err
+    assert stages(tmp_path) == ["distilled", "field", "steernerf"]
+    assert second.train_s == first.train_s > 0
+    for camera in ball_scene.splits["test"].cameras:
+        frames = [method.render(camera, NullProbe()).rgb for method in (first, second)]
+        assert torch.equal(*frames)
+
+
+def test_every_number_of_frames_shares_one_field(
+    ball_scene: Scene, log: ConsoleLog, tmp_path: Path
+) -> None:
+    for frames in (0, 1):
+        new_method(frames).fit(ball_scene, BUDGET, log)
+    assert stages(tmp_path) == ["distilled", "field", "steernerf", "steernerf"]
+
+
+def test_reset_forgets(ball_scene: Scene, log: ConsoleLog) -> None:
+    method = new_method(rate=1e-2)
+    method.fit(ball_scene, BUDGET, log)
+    camera = ball_scene.splits["test"].cameras[0]
+    cold = method.render(camera, NullProbe()).rgb
+    steady = method.render(camera, NullProbe()).rgb
+    method.reset()
+    assert torch.equal(method.render(camera, NullProbe()).rgb, cold)
+    assert not torch.equal(steady, cold)
+    assert method.memory == 2
+
+
+def test_sizes_are_those_of_all_that_a_frame_needs(ball_scene: Scene, log: ConsoleLog) -> None:
+    method = new_method()
+    method.fit(ball_scene, BUDGET, log)
+    renderer = SpaceToDepth(5, 2, 4, width=8, blocks=1)
+    numbers = sum(p.numel() for p in renderer.parameters())
+    assert method.sizes()["renderer2d"] == 4 * numbers
+    assert set(method.sizes()) == {"hash_table", "field_networks", "occupancy", "renderer2d"}
