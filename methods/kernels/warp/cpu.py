@@ -94,16 +94,13 @@ def _depth_at(depth, y, x, tolerance):
     down, right = f32(y - row), f32(x - column)
     top, bottom = _clamp(int(row), depth.shape[0]), _clamp(int(row) + 1, depth.shape[0])
     left, other = _clamp(int(column), depth.shape[1]), _clamp(int(column) + 1, depth.shape[1])
-    z0, z1 = _known(depth[top, left]), _known(depth[top, other])
-    z2, z3 = _known(depth[bottom, left]), _known(depth[bottom, other])
+    w0, w1 = (f32(1) - down) * (f32(1) - right), (f32(1) - down) * right
+    w2, w3 = down * (f32(1) - right), down * right
+    z0, z1 = _known(depth[top, left], w0), _known(depth[top, other], w1)
+    z2, z3 = _known(depth[bottom, left], w2), _known(depth[bottom, other], w3)
     limit = min(min(z0, z1), min(z2, z3)) + tolerance
     total, weights = f32(0), f32(0)
-    for z, weight in (
-        (z0, (f32(1) - down) * (f32(1) - right)),
-        (z1, (f32(1) - down) * right),
-        (z2, down * (f32(1) - right)),
-        (z3, down * right),
-    ):
+    for z, weight in ((z0, w0), (z1, w1), (z2, w2), (z3, w3)):
         if z <= limit and z < math.inf:
             total += weight * z
             weights += weight
@@ -111,8 +108,9 @@ def _depth_at(depth, y, x, tolerance):
 
 
 @njit(cache=True)
-def _known(z):
-    return z if -math.inf < z < math.inf else f32(math.inf)
+def _known(z, weight):
+    """The depth; inf where it is not finite or has no weight."""
+    return z if weight > 0 and -math.inf < z < math.inf else f32(math.inf)
 
 
 @njit(cache=True)
