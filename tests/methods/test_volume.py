@@ -14,7 +14,7 @@ from methods.kernels.composite import composite
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy, march
 from methods.occupancy import STEP
-from methods.volume import rays_at_matter, render_batch, render_rays
+from methods.volume import ROUND_SAMPLES, rays_at_matter, render_batch, render_rays
 from tests.methods.conftest import look_at_the_middle
 
 GRID = HashGrid(levels=4, log2_table=10, n_min=4, n_max=32)
@@ -94,7 +94,7 @@ def test_samples_behind_the_early_stop_are_hardly_evaluated() -> None:
     pixels = render_rays(field, rays, occupancy, Counter())
     hit = int((pixels.alpha > 0).sum())
     assert hit > 0
-    assert evaluated <= 4 * hit  # one round of four samples for each ray that hits
+    assert evaluated <= ROUND_SAMPLES * hit  # one round for each ray that hits
 
 
 @pytest.mark.parametrize(("turn", "lift"), [(0.0, 0.0), (0.13, 0.7), (0.6, -1.2)])
