@@ -21,6 +21,7 @@ CASE_MODULES = (
     "methods.kernels.spherical.cases",
     "methods.kernels.adam.cases",
     "methods.kernels.splat.cases",
+    "methods.kernels.warp.cases",
     "methods.step_cases",
 )
 

@@ -118,6 +118,45 @@ def test_a_window_narrows_the_range(backend: str) -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("limit", [40, 1024])
+def test_a_window_leaves_samples_out_and_moves_none(backend: str, limit: int) -> None:
+    grid = dust(4)
+    origins, directions = rays_through_the_cube(80)
+    generator = torch.Generator().manual_seed(6)
+    jitter = torch.rand(80, generator=generator)
+    near = torch.rand(80, generator=generator) * 2 - 0.5
+    far = near + torch.rand(80, generator=generator) * 1.5 - 0.1  # some are empty
+    far[::7], near[::5] = torch.inf, 0.0
+    whole = march(origins, directions, grid, STEP, jitter=jitter, backend=backend)
+    near[3], far[4] = whole.t[whole.ray == 3][2], whole.t[whole.ray == 4][-1]  # the latter excluded
+    window, start = torch.stack((near, far), dim=1), None
+    parts = []
+    while start is None or (start >= 0).any():
+        parts.append(
+            march(
+                origins,
+                directions,
+                grid,
+                STEP,
+                window=window,
+                jitter=jitter,
+                start=start,
+                limit=limit,
+                backend=backend,
+            )
+        )
+        start = parts[-1].resume
+    ray = torch.cat([part.ray for part in parts])
+    order = ray.argsort(stable=True)
+    inside = (whole.t >= near[whole.ray.long()]) & (whole.t < far[whole.ray.long()])
+    assert 0.1 < inside.float().mean() < 0.9
+    assert torch.equal(ray[order], whole.ray[inside])
+    assert torch.equal(torch.cat([part.t for part in parts])[order], whole.t[inside])
+    positions = torch.cat([part.positions for part in parts])[order]
+    assert torch.equal(positions, whole.positions[inside])
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_the_jitter_shifts_the_samples_by_its_share_of_a_step(backend: str) -> None:
     origins, directions = torch.tensor([[0.5, 0.5, -1.0]]), torch.tensor([[0.0, 0.0, 1.0]])
     for phase in (0.0, 0.25, 0.875):
