@@ -71,7 +71,7 @@ def evidence(
     alpha = _at(cloud.alpha, index, 0.0)
     if options.mode == "window":
         near, far, alpha = -_highest(-near), _highest(far), _highest(alpha)
-        known = near.isfinite() & (far - near < EDGE * options.epsilon)
+        known = (alpha > 0) & (far - near < EDGE * options.epsilon)
     window = torch.stack(
         (
             torch.where(known, near - options.epsilon, 0),
