@@ -180,7 +180,8 @@ class SpaceToDepth(Renderer2d):
         self.recent = nn.Conv2d(cell * 4, width, 1, bias=False) if self.history else None
         self.trunk = nn.ModuleList(_LeakyResidual(width) for _ in range(blocks))
         self.last = _conv(width, cell * (4 if self.history else 3))
-        nn.init.zeros_(self.last.weight)  # in the beginning, the base
+        for parameter in self.last.parameters():
+            nn.init.zeros_(parameter)  # in the beginning, the base
 
     def forward(self, observations: Sequence[Observation]) -> tuple[Tensor, Tensor]:
         """See `Renderer2d`."""
