@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
-from bench.types import Camera, NullProbe
+from bench.types import Camera
 from methods.buffer import Cloud, Reprojection
 from methods.kernels.march import Occupancy
 from methods.occupancy import STEP
@@ -18,61 +17,15 @@ from methods.range_reduction import EDGE, KEPT_ALPHA, Evidence, RangeReduction, 
 from methods.range_reduction import render_guided as render_guided_by
 from methods.volume import ROUND_SAMPLES, FeatureFrame
 from tests.methods.conftest import look_at_the_middle
+from tests.methods.solids import Counter, Solid, ball, slab, wall
 
 EXACT = Reprojection()
 EVERYWHERE = Occupancy(torch.ones(32, 32, 32, dtype=torch.bool))
 WHITE = torch.ones(4)
 EPSILON = 0.03
 LONG = 4 * STEP
-DENSITY = 1000.0
-"""Of what is solid: a step in it lets exp(-6.8) through."""
-
 SIZE = 16
 FOCAL = 40.0
-
-Shape = Callable[[Tensor], Tensor]
-
-
-class Solid:
-    """A field of four features in [0, 1] that vary with the place, dense where `shape` is > 0."""
-
-    backend, channels = "cpu", 4
-
-    def __init__(self, *shapes: Shape, density: float = DENSITY) -> None:
-        self.shapes, self.solid, self.table = shapes, density, torch.zeros(1)
-
-    def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        inside = torch.stack([shape(positions) > 0 for shape in self.shapes]).any(dim=0)
-        return self.solid * inside, positions
-
-    def features(self, geometry: Tensor, directions: Tensor) -> Tensor:
-        return torch.cat((geometry.clamp(0, 1), directions[:, :1] * 0 + 0.25), dim=1)
-
-    def encode_directions(self, directions: Tensor) -> Tensor:
-        return directions
-
-
-class Counter(NullProbe):
-    """Counts the samples of a frame."""
-
-    samples = 0
-
-    def count(self, name: str, done: int, dense: int | None = None) -> None:
-        self.samples += done if name == "samples" else 0
-
-
-def ball(radius: float = 0.3) -> Shape:
-    return lambda x: radius - (x - 0.5).norm(dim=-1)
-
-
-def slab(begin: float, end: float, until_y: float = 1.0) -> Shape:
-    """From x = `begin` to `end`, as far as y = `until_y`."""
-    return lambda p: torch.stack((p[:, 0] - begin, end - p[:, 0], until_y - p[:, 1])).amin(dim=0)
-
-
-def wall(begin: float) -> Shape:
-    """Everything from x = `begin` on."""
-    return slab(begin, 2.0)
 
 
 def at_ball(turn: float) -> Camera:
