@@ -42,7 +42,7 @@ def _prepare(device: str) -> Prepared:
         training.step, training.rays = 1, RAYS
         training.generator.manual_seed(0)
         training.grid.occupancy = occupancy
-        return (torch.tensor(training.advance()),)
+        return (torch.tensor(training.advance()[""]),)
 
     # The loss, below 1, of pixels behind five bfloat16 layers.
     return Prepared(call, 5 * U16)
