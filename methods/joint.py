@@ -13,11 +13,11 @@ from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel
 
 from methods import checkpoint, loop
+from methods.fields import HashField
 from methods.kernels.adam import AdamState, sparse_adam_
-from methods.patches import PatchSource, Through
-from methods.pipeline import Pipeline
+from methods.patches import Patches, Through
 from methods.renderer2d import Renderer2d
-from methods.sequences import MotionOptions, SequencePool
+from methods.sequences import MotionOptions
 
 Tensors = tuple[Tensor, ...] | list[Tensor]
 
@@ -68,46 +68,35 @@ class JointOptions:
             raise ValueError(f"expected distilled_views >= 0 and distilled_share in [0, 1]: {self}")
 
 
-class JointTraining:
-    """Stage 2 as a `loop.Training`.
+class RendererTraining:
+    """Stage 2 of the 2D renderer alone, as a `loop.Training`: the field stays as it is.
 
     Args:
-        pipeline: trained in place; its renderer is replaced by the running mean of its weights.
-        pool: training sequences, rendered by `pipeline`.
+        renderer: trained in place.
+        patches: what it is shown.
         steps: optimiser steps.
+        generator: of all random numbers, also those of `patches`.
+
+    Attributes:
+        mean: the running mean of the renderer's weights, which is what is used in the end.
     """
 
     advice = "Try smaller learning rates (method.joint.rate, method.joint.field_rate)."
 
     def __init__(
         self,
-        pipeline: Pipeline,
         renderer: Renderer2d,
-        pool: SequencePool,
+        patches: Patches,
         options: JointOptions,
         steps: int,
         generator: torch.Generator,
     ) -> None:
-        self.pipeline, self.renderer, self.options = pipeline, renderer, options
-        self.joint, self.generator = options.field == "joint", generator
-        self.patches = PatchSource(
-            pipeline, pool, options.patch, self.joint, options.through, generator
-        )
+        self.renderer, self.patches, self.options = renderer, patches, options
+        self.generator = generator
         self.step, self.steps, self.seconds = 0, steps, 0.0
         self.optimiser = torch.optim.Adam(renderer.parameters(), lr=options.rate, fused=True)
-        self.mean = AveragedModel(renderer, multi_avg_fn=self._average)
-        pipeline.renderer = self.mean.module  # type: ignore[assignment]
-        self.field = pipeline.field.requires_grad_(self.joint)
-        if self.joint:
-            self.table_state = AdamState.like(self.field.table.detach())
-            self.networks = torch.optim.Adam(
-                list(self.field.layers.values()),
-                lr=options.field_rate,
-                betas=(0.9, 0.99),
-                eps=1e-15,
-                fused=True,
-            )
-            self.field.grad_buffer = torch.zeros_like(self.field.table)
+        self._averaged = AveragedModel(renderer, multi_avg_fn=self._average)
+        self.mean: Renderer2d = self._averaged.module  # type: ignore[assignment]
 
     def advance(self) -> dict[str, float]:
         """One step; mean squared error of the picture and of the base that it corrects.
@@ -117,35 +106,26 @@ class JointTraining:
         """
         observations, truth, opacity = self.patches.draw(self.options.batch)
         half = self.options.precision == "bf16"
-        with torch.autocast(opacity.device.type, torch.bfloat16, enabled=half):
+        with torch.autocast(truth.device.type, torch.bfloat16, enabled=half):
             drawn, base = self.renderer(observations)
         loss = functional.mse_loss(drawn, truth)
-        entropy = -(opacity * opacity.log()).mean() if self.joint and len(opacity) else 0.0
-        (loss + self.options.opacity_entropy * entropy).backward()
+        (loss + self._regularisation(opacity)).backward()
         value = loss.item()
         if not math.isfinite(value):
             loop.check_finite(self, {"loss": loss, "picture": drawn})
-        self._update()
+        nn.utils.clip_grad_norm_(self.renderer.parameters(), self.options.clip)
+        low = self.options.final_rate
+        self._update(low + (1 - low) * 0.5 * (1 + math.cos(math.pi * self.step / self.steps)))
         self.step += 1
         return {"": value, "base": functional.mse_loss(base.detach(), truth).item()}
 
-    def _update(self) -> None:
-        low, done = self.options.final_rate, self.step / self.steps
-        share = low + (1 - low) * 0.5 * (1 + math.cos(math.pi * done))
-        nn.utils.clip_grad_norm_(self.renderer.parameters(), self.options.clip)
+    def _regularisation(self, opacity: Tensor) -> Tensor | float:
+        return 0.0
+
+    def _update(self, share: float) -> None:
+        """Change the weights, at `share` of the learning rates of the beginning."""
         _step(self.optimiser, share * self.options.rate)
-        self.mean.update_parameters(self.renderer)
-        if self.joint:
-            _step(self.networks, share * self.options.field_rate)
-            assert self.field.grad_buffer is not None
-            sparse_adam_(
-                self.field.table.detach(),
-                self.field.grad_buffer,
-                self.table_state,
-                share * self.options.field_rate,
-                packed=self.field.packed,
-                backend=self.field.backend,
-            )
+        self._averaged.update_parameters(self.renderer)
 
     @torch.no_grad()
     def _average(self, mean: Tensors, new: Tensors, count: Tensor | int) -> None:
@@ -154,27 +134,26 @@ class JointTraining:
         torch._foreach_lerp_(mean, new, 1 - keep)
 
     def watched(self) -> dict[str, Tensor]:
-        """Table, networks, 2D renderer."""
-        renderer = {f"renderer.{name}": x for name, x in self.renderer.named_parameters()}
-        return {"table": self.field.table, **self.field.layers, **renderer}
+        """The renderer."""
+        return {f"renderer.{name}": x for name, x in self.renderer.named_parameters()}
 
     def result(self) -> dict[str, Tensor]:
-        """Field and running mean of the renderer."""
-        field = {f"field.{name}": x for name, x in self.field.state_dict().items()}
-        mean = self.mean.module.state_dict()
-        return field | {f"mean.{name}": x for name, x in mean.items()}
+        """The running mean of the renderer."""
+        return {f"mean.{name}": x for name, x in self.mean.state_dict().items()}
+
+    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+        """Put back what `result` gave."""
+        self.mean.load_state_dict(checkpoint.part(tensors, "mean."))
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Renderer, optimisers, random numbers. The sequences are not in it: going on, they are
+        """Renderer, optimiser, random numbers. The sequences are not in it: going on, they are
         rendered anew."""
         tensors = {f"renderer.{name}": x for name, x in self.renderer.state_dict().items()}
         tensors |= checkpoint.optimiser_tensors(self.optimiser, "adam.renderer.")
-        tensors |= {"generator": self.generator.get_state(), "mean_count": self.mean.n_averaged}
-        if self.joint:
-            adam = self.table_state
-            tensors |= checkpoint.optimiser_tensors(self.networks, "adam.networks.")
-            tensors |= {"first": adam.first, "second": adam.second, "steps": adam.steps}
-        return tensors, {}
+        return tensors | {
+            "generator": self.generator.get_state(),
+            "averaged": self._averaged.n_averaged,
+        }, {}
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
         """See `loop.Training`."""
@@ -182,19 +161,88 @@ class JointTraining:
         self.renderer.load_state_dict(checkpoint.part(tensors, "renderer."))
         checkpoint.restore_optimiser(self.optimiser, tensors, "adam.renderer.")
         self.generator.set_state(tensors["generator"].cpu())
-        self.mean.n_averaged.copy_(tensors["mean_count"])
-        if self.joint:
-            checkpoint.restore_optimiser(self.networks, tensors, "adam.networks.")
-            device = self.field.table.device
-            self.table_state = AdamState(
-                *(tensors[name].to(device) for name in ("first", "second", "steps"))
-            )
+        self._averaged.n_averaged.copy_(tensors["averaged"])
+
+
+class JointTraining(RendererTraining):
+    """Stage 2 end to end: the field learns through the 2D renderer.
+
+    Args:
+        field: that `patches` are rendered from; trained in place.
+    """
+
+    def __init__(
+        self,
+        field: HashField,
+        renderer: Renderer2d,
+        patches: Patches,
+        options: JointOptions,
+        steps: int,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__(renderer, patches, options, steps, generator)
+        self.field = field
+        self.table_state = AdamState.like(field.table.detach())
+        self.networks = torch.optim.Adam(
+            list(field.layers.values()),
+            lr=options.field_rate,
+            betas=(0.9, 0.99),
+            eps=1e-15,
+            fused=True,
+        )
+        field.grad_buffer = torch.zeros_like(field.table)
+
+    def _regularisation(self, opacity: Tensor) -> Tensor | float:
+        if not len(opacity):
+            return 0.0
+        opacity = opacity.clamp(1e-5, 1 - 1e-5)
+        return -self.options.opacity_entropy * (opacity * opacity.log()).mean()
+
+    def _update(self, share: float) -> None:
+        super()._update(share)
+        rate = share * self.options.field_rate
+        _step(self.networks, rate)
+        assert self.field.grad_buffer is not None
+        sparse_adam_(
+            self.field.table.detach(),
+            self.field.grad_buffer,
+            self.table_state,
+            rate,
+            packed=self.field.packed,
+            backend=self.field.backend,
+        )
+
+    def watched(self) -> dict[str, Tensor]:
+        """Table, networks, 2D renderer."""
+        return {"table": self.field.table, **self.field.layers, **super().watched()}
+
+    def result(self) -> dict[str, Tensor]:
+        """Field and running mean of the renderer."""
+        field = {f"field.{name}": x for name, x in self.field.state_dict().items()}
+        return field | super().result()
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
         """Put back what `result` gave."""
+        super().restore_result(tensors)
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
         self.field.repack()
-        self.mean.module.load_state_dict(checkpoint.part(tensors, "mean."))
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+        """The optimisers of the field, too."""
+        tensors, figures = super().state()
+        adam = self.table_state
+        tensors |= checkpoint.optimiser_tensors(self.networks, "adam.networks.")
+        tensors |= {"first": adam.first, "second": adam.second, "steps": adam.steps}
+        return tensors, figures
+
+    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
+        """See `loop.Training`."""
+        super().restore(tensors, figures)
+        checkpoint.restore_optimiser(self.networks, tensors, "adam.networks.")
+        device = self.field.table.device
+        self.table_state = AdamState(
+            *(tensors[name].to(device) for name in ("first", "second", "steps"))
+        )
 
 
 def _step(optimiser: torch.optim.Optimizer, rate: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -45,6 +45,14 @@ class Patch:
     rays: list[Rays]
 
 
+class Patches(Protocol):
+    """Where a training gets its patches from."""
+
+    def draw(self, count: int) -> tuple[list[Observation], Tensor, Tensor]:
+        """`count` patches: what is known of them, with a gradient if the field is to learn; their
+        true pictures [count, H, W, 3]; and the opacity of the rays that were rendered."""
+
+
 class PatchSource:
     """Batches of random patches of the sequences of a pool.
 
@@ -67,8 +75,7 @@ class PatchSource:
         self.learning, self.through, self.generator = learning, through, generator
 
     def draw(self, count: int) -> tuple[list[Observation], Tensor, Tensor]:
-        """`count` patches: what is known of them, with a gradient if the field is to learn; their
-        true pictures [count, H, W, 3]; and the opacity of the rays that were rendered."""
+        """See `Patches`."""
         patches = [self.cut(self.pool.draw()) for _ in range(count)]
         observations, opacity = self.observe(patches)
         return observations, torch.stack([patch.truth for patch in patches]), opacity
@@ -129,7 +136,7 @@ class PatchSource:
             )
             parts = iter(_split(pixels, [len(r.origins) for r in rays]))
             observations = [self._observation(p, [next(parts) for _ in p.rays]) for p in patches]
-        return observations, pixels.alpha.clamp(1e-5, 1 - 1e-5)
+        return observations, pixels.alpha
 
     def _observation(self, patch: Patch, rendered: list[Pixels]) -> Observation:
         present, *preceding = rendered

@@ -15,8 +15,9 @@ from methods import checkpoint, loop
 from methods.buffer import RenderingBuffer
 from methods.distil import distilled_views
 from methods.fields import Precision
-from methods.joint import JointOptions, JointTraining
+from methods.joint import JointOptions, JointTraining, RendererTraining
 from methods.kernels.encode import HashGrid
+from methods.patches import PatchSource
 from methods.pipeline import Pipeline, PipelineOptions
 from methods.pretrained import Pretrained, Setup, pretrain
 from methods.renderer2d import Renderer2d
@@ -123,29 +124,26 @@ class SteerNerf:
         distilled: list[TrueView],
         target: Tensor,
         budget: Budget,
-    ) -> tuple[Pipeline, JointTraining]:
-        device, options = self.setup.device, self.options
+    ) -> tuple[Pipeline, RendererTraining]:
+        device, shape = self.setup.device, self.options
         torch.manual_seed(self.setup.seed)  # of the renderer's weights
-        renderer = self.make_renderer(options.channels, options.frames, options.scale)
+        renderer = self.make_renderer(shape.channels, shape.frames, shape.scale)
         renderer = renderer.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         pipeline = Pipeline(
-            trained.field, trained.occupancy, scene.background.to(device), renderer, options
+            trained.field, trained.occupancy, scene.background.to(device), renderer, shape
         )
         split = scene.splits["train"]
         real = [TrueView(c, p) for c, p in zip(split.cameras, split.images, strict=True)]
         generator = torch.Generator().manual_seed(self.setup.seed)
+        options = self.joint
         pool = SequencePool(
-            pipeline,
-            real,
-            distilled,
-            self.joint.distilled_share,
-            target,
-            self.joint.motion,
-            generator,
+            pipeline, real, distilled, options.distilled_share, target, options.motion, generator
         )
-        training = JointTraining(
-            pipeline, renderer, pool, self.joint, budget.renderer_steps, generator
-        )
+        learning = options.field == "joint"
+        patches = PatchSource(pipeline, pool, options.patch, learning, options.through, generator)
+        rest = (renderer, patches, options, budget.renderer_steps, generator)
+        training = JointTraining(trained.field, *rest) if learning else RendererTraining(*rest)
+        pipeline.renderer = training.mean
         return pipeline, training
 
     def _key(self, budget: Budget) -> dict[str, object]:
