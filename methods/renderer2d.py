@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
 
 import torch
+from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -16,6 +19,9 @@ from methods.volume import FeatureFrame
 REACH = 2
 """Low-resolution pixels around matter that are still given to the network: what is further from
 anything that was seen is background."""
+
+GENERIC = Path(__file__).parent / "weights" / "generic.safetensors"
+"""Weights trained on other scenes by `steerbench generic`; see its help."""
 
 LEAK = 0.1
 """Slope of the activations below 0. With a slope of 0 the sparse inputs kill a trunk for good."""
@@ -154,6 +160,8 @@ class SpaceToDepth(Renderer2d):
         scale: s.
         width: channels of the trunk.
         blocks: residual blocks of two 3 x 3 convolutions.
+        init: "generic": start from the weights that come with the package, trained on other
+            scenes; "scratch": from random ones.
         history: use the preceding picture.
         validity: tell the network at which pixels preceding features land.
     """
@@ -166,6 +174,7 @@ class SpaceToDepth(Renderer2d):
         *,
         width: int = 64,
         blocks: int = 5,
+        init: Literal["generic", "scratch"] = "generic",
         history: bool = True,
         validity: bool = True,
     ) -> None:
@@ -182,6 +191,39 @@ class SpaceToDepth(Renderer2d):
         self.last = _conv(width, cell * (4 if self.history else 3))
         for parameter in self.last.parameters():
             nn.init.zeros_(parameter)  # in the beginning, the base
+
+    @torch.no_grad()
+    def _start_from(self, generic: Mapping[str, Tensor]) -> None:
+        """Take over the weights of a renderer of the same trunk that was trained at K = 3.
+
+        Weights of features beyond RGB, and of frames it did not have, stay as they are.
+        """
+        kept = [0, 1, 2, self.channels] if self.validity else [0, 1, 2]
+        each = self.channels + self.validity
+        slots = [slot * each + channel for slot in range(self.scale**2) for channel in kept]
+        known = [slot * 4 + i for slot in range(self.scale**2) for i in range(len(kept))]
+        for name, weight in self.named_parameters():
+            if name not in generic:
+                continue
+            new, place = generic[name].float(), weight
+            if name == "present.weight":
+                place = weight[:, [0, 1, 2, self.channels]]
+            elif name.startswith("preceding"):
+                place, new = weight[:, slots], new[:, known]
+            elif name.startswith("last"):
+                new = new[: len(weight)]
+            if place.shape != new.shape:
+                raise ValueError(
+                    f"renderer.init=generic: {name} is {list(place.shape)}, the generic weights "
+                    f"have {list(new.shape)}: use renderer.init=scratch, or the width, blocks and "
+                    "scale of the default"
+                )
+            if name == "present.weight":
+                weight[:, [0, 1, 2, self.channels]] = new
+            elif name.startswith("preceding"):
+                weight[:, slots] = new
+            else:
+                weight.copy_(new)
 
     def forward(self, observations: Sequence[Observation]) -> tuple[Tensor, Tensor]:
         """See `Renderer2d`."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import cache, partial
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from methods import checkpoint, loop
 from methods.buffer import RenderingBuffer
 from methods.distil import distilled_views
 from methods.fields import Precision
+from methods.generic import train_generic
 from methods.joint import JointOptions, JointTraining, RendererTraining
 from methods.kernels.encode import HashGrid
 from methods.patches import PatchSource
@@ -98,6 +100,12 @@ class SteerNerf:
         trained.field.requires_grad_(False).grad_buffer = None
         self.trained, self.train_s = trained, trained.train_s + training.seconds
         self.pipeline.renderer.requires_grad_(False)
+
+    def fit_generic(self, scenes: Sequence[Scene], budget: Budget, output: Path, log: Log) -> None:
+        """Train a 2D renderer on many scenes, for others to start from; see `methods.generic`."""
+        train_generic(
+            self.setup, self.options, self.make_renderer, self.joint, scenes, budget, output, log
+        )
 
     def reset(self) -> None:
         """Forget preceding frames."""

@@ -1,0 +1,82 @@
+"""A 2D renderer for any scene: trained once, on the fields of many, to start every scene from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from bench.types import Budget, Log, Scene, SteerbenchError
+from methods import checkpoint, loop
+from methods.joint import JointOptions, RendererTraining
+from methods.patches import Patches, PatchSource
+from methods.pipeline import Pipeline, PipelineOptions
+from methods.pretrained import Setup, pretrain
+from methods.renderer2d import Observation, Renderer2d
+from methods.sequences import SequencePool, TrueView
+
+
+@dataclass(frozen=True)
+class AnyOf:
+    """The patches of a batch come from one of `sources`, drawn by `generator`."""
+
+    sources: Sequence[Patches]
+    generator: torch.Generator
+
+    def draw(self, count: int) -> tuple[list[Observation], Tensor, Tensor]:
+        """See `methods.patches.Patches`."""
+        place = int(torch.randint(len(self.sources), (), generator=self.generator))
+        return self.sources[place].draw(count)
+
+
+def train_generic(
+    setup: Setup,
+    options: PipelineOptions,
+    make_renderer: Callable[..., Renderer2d],
+    joint: JointOptions,
+    scenes: Sequence[Scene],
+    budget: Budget,
+    output: Path,
+    log: Log,
+) -> None:
+    """Fit a field to each of `scenes`, train one renderer on all of them, write it to `output`.
+
+    The fields are frozen: what a renderer learns from them must hold for fields it never saw.
+
+    Raises:
+        SteerbenchError: K is not 3. Other features mean something else in every scene.
+    """
+    if options.channels != 3:
+        raise SteerbenchError(
+            f"a generic renderer knows colours alone: expected channels (K) of 3, got "
+            f"{options.channels}"
+        )
+    torch.manual_seed(setup.seed)
+    generator = torch.Generator().manual_seed(setup.seed)
+    renderer = make_renderer(options.channels, options.frames, options.scale)
+    renderer = renderer.to(setup.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    sources, pipelines = [], []
+    for number, scene in enumerate(scenes, 1):
+        log.info(f"scene {number} of {len(scenes)}: {scene.name}")
+        trained = pretrain(setup, scene, budget, log)
+        background = scene.background.to(setup.device)
+        pipeline = Pipeline(trained.field, trained.occupancy, background, renderer, options)
+        split = scene.splits["train"]
+        views = [TrueView(c, p) for c, p in zip(split.cameras, split.images, strict=True)]
+        target = scene.bounds.mean(dim=0)
+        pool = SequencePool(pipeline, views, [], 0.0, target, joint.motion, generator)
+        sources.append(PatchSource(pipeline, pool, joint.patch, False, "present", generator))
+        pipelines.append(pipeline)
+    patches = AnyOf(sources, generator)
+    training = RendererTraining(renderer, patches, joint, budget.renderer_steps, generator)
+    for pipeline in pipelines:
+        pipeline.renderer = training.mean
+    output.parent.mkdir(parents=True, exist_ok=True)
+    loop.train(training, output, "training a generic renderer", log)
+    weights, figures = checkpoint.read(output)
+    halves = {name: x.half() for name, x in checkpoint.part(weights, "mean.").items()}
+    checkpoint.write(output, halves, figures)
+    log.info(f"written: {output}")
