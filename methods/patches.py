@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bench.cameras import cast, crop_camera, pixel_grid
 from bench.protocol import composite
-from bench.types import Camera, Rays
+from bench.types import Camera, NullProbe, Rays
 from methods.buffer import Cloud
 from methods.kernels.composite import Pixels
 from methods.occupancy import STEP
@@ -155,6 +155,7 @@ class PatchSource:
                 for v, i in zip(values, patch.indices, strict=True)
             ],
             self.pipeline.history(newest, frame.depth, patch.view),
+            self.pipeline.surface(frame.depth, patch.view, NullProbe()),
             patch.view.phase,
         )
 

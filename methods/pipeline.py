@@ -15,17 +15,17 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.cameras import scale_camera
+from bench.cameras import cast, scale_camera, unproject
 from bench.types import Camera, Frame, Probe
 from methods.buffer import Cloud, Remembered, RenderingBuffer, Reprojection
 from methods.fields import HashField
 from methods.kernels.composite import STOP
 from methods.kernels.march import Occupancy
-from methods.kernels.warp import warp
+from methods.kernels.warp import enlarge, warp
 from methods.occupancy import STEP
 from methods.range_reduction import RangeReduction, evidence, render_guided
-from methods.renderer2d import History, Observation, Renderer2d, Reprojected
-from methods.volume import FeatureFrame
+from methods.renderer2d import Detail, Observation, Renderer2d, Reprojected
+from methods.volume import FeatureFrame, query
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,8 @@ class PipelineOptions:
         range: where rays look for a surface.
         reprojection: how preceding frames are brought into the present view.
         history: the preceding picture is reprojected, too.
+        surface: the field is looked at once a pixel at full resolution, too, where the
+            low-resolution depth has the surface.
         jitter: the samples of the low-resolution grid move from frame to frame, so that
             preceding frames carry samples of other places.
         feature_background: what the features beyond RGB are composited on. 1/2 is what an
@@ -54,6 +56,7 @@ class PipelineOptions:
     range: RangeReduction = RangeReduction()
     reprojection: Reprojection = Reprojection()
     history: bool = True
+    surface: bool = True
     jitter: bool = False
     feature_background: float = 0.5
     stop: float = STOP
@@ -101,6 +104,7 @@ class Pipeline:
                 self.background,
                 [self.reproject(frame.cloud, view) for frame in buffer.frames],
                 self.history(newest, features.depth, view),
+                self.surface(features.depth, view, probe),
                 view.phase,
             )
         with probe.stage("renderer2d"):
@@ -116,7 +120,7 @@ class Pipeline:
         index, _ = cloud.land(view.full, self.options.reprojection, self.backend)
         return Reprojected(cloud.values, index, self.backend)
 
-    def history(self, newest: Remembered | None, depth: Tensor, view: View) -> History | None:
+    def history(self, newest: Remembered | None, depth: Tensor, view: View) -> Detail | None:
         """The preceding picture where the present one, of low-resolution `depth`, sees it."""
         if newest is None or not self.options.history:
             return None
@@ -129,7 +133,29 @@ class Pipeline:
             view.phase,
             backend=self.backend,
         )
-        return History(values, valid)
+        return Detail(values, valid)
+
+    def surface(self, depth: Tensor, view: View, probe: Probe) -> Detail | None:
+        """Features at full resolution, one sample a pixel, where `depth` [h, w] has the surface.
+
+        Differentiable in the field, not in its depth.
+        """
+        if not self.options.surface:
+            return None
+        with probe.stage("surface"):
+            scale = self.options.scale
+            fine = enlarge(depth.detach(), scale, view.phase, backend=self.backend)
+            valid = fine.isfinite()
+            cell, sub = valid.flatten(0, 1).nonzero().unbind(dim=1)
+            row, column = cell // view.low.width, cell % view.low.width
+            pixels = torch.stack((column * scale + sub % scale, row * scale + sub // scale), dim=1)
+            points = unproject(view.full, pixels + 0.5, fine.view(-1, scale**2)[cell, sub])
+            probe.count("surface_samples", len(points), valid.numel())
+            # The pixels of a cell share the view direction of its middle.
+            _, values = query(self.field, points, cell, cast(view.low).directions)
+            blank = values.new_zeros(valid.numel(), values.shape[1])
+            spread = blank.index_copy(0, cell * scale**2 + sub, values)
+        return Detail(spread.view(*valid.shape, -1), valid.to(values.dtype))
 
     def _features(self, view: View, newest: Remembered | None, probe: Probe) -> FeatureFrame:
         """The field at low resolution, looked at where the newest preceding frame says."""

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -42,8 +41,8 @@ class Reprojected:
 
 
 @dataclass(frozen=True)
-class History:
-    """The preceding picture in the present view: `values` [h, w, s^2, 3], `valid` [h, w, s^2]."""
+class Detail:
+    """What is known pixel by pixel, in blocks: `values` [h, w, s^2, C], `valid` [h, w, s^2]."""
 
     values: Tensor
     valid: Tensor
@@ -57,7 +56,9 @@ class Observation:
         frame: the present features, [h, w, K].
         background: [K] that they are composited on.
         preceding: newest first; fewer than L after a cold start.
-        history: of the newest preceding frame; None after a cold start, or where it is not used.
+        history: the newest preceding picture; None after a cold start, or where it is not used.
+        surface: features of the field where the low-resolution depth has the surface of a pixel;
+            None where they are not used.
         phase: of the samples of `frame` against the centres of its pixels, in pixels of the
             picture.
     """
@@ -65,7 +66,8 @@ class Observation:
     frame: FeatureFrame
     background: Tensor
     preceding: Sequence[Reprojected]
-    history: History | None
+    history: Detail | None
+    surface: Detail | None = None
     phase: tuple[float, float] = (0.0, 0.0)
 
 
@@ -163,6 +165,7 @@ class SpaceToDepth(Renderer2d):
         init: "generic": start from the weights that come with the package, trained on other
             scenes; "scratch": from random ones.
         history: use the preceding picture.
+        surface: use the features at the surface, pixel by pixel.
         validity: tell the network at which pixels preceding features land.
     """
 
@@ -176,6 +179,7 @@ class SpaceToDepth(Renderer2d):
         blocks: int = 5,
         init: Literal["generic", "scratch"] = "generic",
         history: bool = True,
+        surface: bool = True,
         validity: bool = True,
     ) -> None:
         super().__init__()
@@ -187,8 +191,11 @@ class SpaceToDepth(Renderer2d):
             nn.Conv2d(cell * (channels + validity), width, 1, bias=False) for _ in range(frames)
         )
         self.recent = nn.Conv2d(cell * 4, width, 1, bias=False) if self.history else None
+        self.on_surface = (
+            nn.Conv2d(cell * (channels + 1), width, 1, bias=False) if surface else None
+        )
         self.trunk = nn.ModuleList(_LeakyResidual(width) for _ in range(blocks))
-        self.last = _conv(width, cell * (4 if self.history else 3))
+        self.last = _conv(width, cell * (3 + self.history + surface))
         for parameter in self.last.parameters():
             nn.init.zeros_(parameter)  # in the beginning, the base
 
@@ -198,32 +205,35 @@ class SpaceToDepth(Renderer2d):
 
         Weights of features beyond RGB, and of frames it did not have, stay as they are.
         """
-        kept = [0, 1, 2, self.channels] if self.validity else [0, 1, 2]
-        each = self.channels + self.validity
-        slots = [slot * each + channel for slot in range(self.scale**2) for channel in kept]
-        known = [slot * 4 + i for slot in range(self.scale**2) for i in range(len(kept))]
         for name, weight in self.named_parameters():
             if name not in generic:
                 continue
-            new, place = generic[name].float(), weight
-            if name == "present.weight":
-                place = weight[:, [0, 1, 2, self.channels]]
-            elif name.startswith("preceding"):
-                place, new = weight[:, slots], new[:, known]
-            elif name.startswith("last"):
+            new = generic[name].float()
+            columns = self._columns_of_colour(name, weight)
+            if name.startswith("last"):
                 new = new[: len(weight)]
-            if place.shape != new.shape:
+            if (weight[:, columns] if columns else weight).shape != new.shape:
                 raise ValueError(
-                    f"renderer.init=generic: {name} is {list(place.shape)}, the generic weights "
-                    f"have {list(new.shape)}: use renderer.init=scratch, or the width, blocks and "
-                    "scale of the default"
+                    f"renderer.init=generic: {name} is {list(weight.shape)}, the generic weights "
+                    f"have {list(new.shape)}: use renderer.init=scratch, or the width, blocks, "
+                    "scale, history, surface and validity of the default"
                 )
-            if name == "present.weight":
-                weight[:, [0, 1, 2, self.channels]] = new
-            elif name.startswith("preceding"):
-                weight[:, slots] = new
+            if columns:
+                weight[:, columns] = new
             else:
                 weight.copy_(new)
+
+    def _columns_of_colour(self, name: str, weight: Tensor) -> list[int]:
+        """Inputs of a layer that a renderer of K = 3 has as well; [] for all."""
+        cell = self.scale**2
+        if name == "present.weight":
+            return [0, 1, 2, self.channels]
+        if name.startswith("preceding"):
+            each = self.channels + self.validity
+            return [slot * each + i for slot in range(cell) for i in (0, 1, 2, self.channels)]
+        if name == "on_surface.weight":
+            return [*range(3 * cell), *range(self.channels * cell, weight.shape[1])]
+        return []
 
     def forward(self, observations: Sequence[Observation]) -> tuple[Tensor, Tensor]:
         """See `Renderer2d`."""
@@ -269,18 +279,23 @@ class SpaceToDepth(Renderer2d):
         for age, layer in enumerate(self.preceding):
             seen = [self._preceding(o, age, box) for o in observations]
             hidden = hidden + layer(torch.stack(seen).permute(0, 3, 1, 2))
-        if self.recent is not None:
-            recent, valid = self._recent(observations, base, box)
-            hidden = hidden + self.recent(torch.cat((recent, valid), dim=1))
+        offers = []
+        for take, channels, details in (
+            (self.recent, 3, [o.history for o in observations]),
+            (self.on_surface, self.channels, [o.surface for o in observations]),
+        ):
+            if take is not None:
+                offer = self._offer(details, observations[0].background[:channels], base, box)
+                hidden = hidden + take(torch.cat(offer, dim=1))
+                offers.append(offer)
         hidden = functional.leaky_relu(hidden, LEAK) * active
         for block in self.trunk:
             hidden = block(hidden, active)
-        out = self.last(hidden)
-        count = 3 * self.scale**2
-        drawn = base + out[:, :count]
-        if self.recent is not None:
-            share = out[:, count:].sigmoid() * valid
-            drawn = drawn + recent * share.repeat(1, 3, 1, 1)
+        out, count = self.last(hidden), base.shape[1]
+        correction, *shares = out.split((count, *[self.scale**2] * len(offers)), dim=1)
+        drawn = base + correction
+        for share, (values, valid) in zip(shares, offers, strict=True):
+            drawn = drawn + values[:, :count] * (share.sigmoid() * valid).repeat(1, 3, 1, 1)
         return drawn * active, base * active
 
     def _present(self, observation: Observation) -> Tensor:
@@ -300,23 +315,32 @@ class SpaceToDepth(Renderer2d):
         index = _blocks(frame.index, self.scale)[box].contiguous()
         return replace(frame, values=values).at(index).flatten(start_dim=2)
 
-    def _recent(
-        self, observations: Sequence[Observation], base: Tensor, box: tuple[slice, slice]
+    def _offer(
+        self,
+        details: Sequence[Detail | None],
+        background: Tensor,
+        base: Tensor,
+        box: tuple[slice, slice],
     ) -> tuple[Tensor, Tensor]:
-        """The preceding picture less the base, [B, 3 s^2, ...], and where it is known."""
+        """Another picture, to be chosen instead of the base.
+
+        Returns:
+            [B, C s^2, ...] its RGB less the base, and its other channels less the background, 0
+            where not known; and [B, s^2, ...] where it is known.
+        """
         values, valid = [], []
-        for observation in observations:
-            history = observation.history
-            if history is None:
-                shape = base.shape[2], base.shape[3], self.scale**2
+        for detail in details:
+            if detail is None:
+                shape = *base.shape[2:], self.scale**2
+                values.append(base.new_zeros(*shape, len(background)))
                 valid.append(base.new_zeros(shape))
-                values.append(base.new_zeros(*shape, 3))
             else:
-                valid.append(history.valid[box])
-                values.append(history.values[box] - observation.background[:3])
+                values.append(detail.values[box] - background)
+                valid.append(detail.valid[box])
         known = torch.stack(valid).permute(0, 3, 1, 2)
-        recent = torch.stack(values).transpose(3, 4).flatten(start_dim=3).permute(0, 3, 1, 2)
-        return (recent - base) * known.repeat(1, 3, 1, 1), known
+        shown = torch.stack(values).transpose(3, 4).flatten(start_dim=3).permute(0, 3, 1, 2)
+        less = functional.pad(base, (0, 0, 0, 0, 0, shown.shape[1] - base.shape[1]))
+        return (shown - less) * known.repeat(1, len(background), 1, 1), known
 
 
 class _Residual(nn.Module):

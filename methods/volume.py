@@ -12,7 +12,7 @@ from bench.cameras import cast, project
 from bench.types import EMPTY_ALPHA, Camera, Probe, Rays
 from methods.fields import HashField
 from methods.kernels.composite import STOP, Pixels, composite, visible_counts
-from methods.kernels.march import BRICK, Occupancy, Samples, march
+from methods.kernels.march import BRICK, Occupancy, march
 from methods.occupancy import STEP
 
 CHUNK_RAYS = 1 << 16
@@ -94,7 +94,7 @@ def render_batch(
             sigma, samples.delta, samples.offsets, stop=stop, backend=field.backend
         )
     samples = samples.front(counts)
-    sigma, values = _query(field, samples, rays.directions)
+    sigma, values = query(field, samples.positions, samples.ray, rays.directions)
     pixels = composite(
         sigma,
         values,
@@ -108,15 +108,18 @@ def render_batch(
     return pixels, len(samples)
 
 
-def _query(field: HashField, samples: Samples, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Density [S] and features [S, K] of `samples` of rays along `directions` [R, 3].
+def query(
+    field: HashField, positions: Tensor, ray: Tensor, directions: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Density [S] and features [S, K] at `positions` [S, 3] on rays `ray` [S] along `directions`
+    [R, 3].
 
     The field sees batches of a few round sizes only: the library behind the matrix products
     prepares code for every new size, which takes longer than the product itself.
     """
-    sigma, geometry = field.density(_pad(samples.positions))
-    values = field.features(geometry, field.encode_directions(directions)[_pad(samples.ray)])
-    return sigma[: len(samples)], values[: len(samples)]
+    sigma, geometry = field.density(_pad(positions))
+    values = field.features(geometry, field.encode_directions(directions)[_pad(ray)])
+    return sigma[: len(positions)], values[: len(positions)]
 
 
 def _pad(samples: Tensor) -> Tensor:
@@ -213,7 +216,7 @@ def _render_round(
     if len(samples) == 0:
         return alive[:0], start[:0]
     with probe.stage("field"):
-        sigma, values = _query(field, samples, directions)
+        sigma, values = query(field, samples.positions, samples.ray, directions)
     with probe.stage("composite"):
         pixels = composite(
             sigma,

@@ -60,6 +60,22 @@ def warp(
     )
 
 
+def enlarge(
+    depth: Tensor,
+    scale: int,
+    phase: tuple[float, float] = (0.0, 0.0),
+    *,
+    backend: str = "auto",
+) -> Tensor:
+    """The depth that `warp` gives to the pixels of the picture: [h, w, s^2], inf for none.
+
+    Args:
+        depth, scale, phase: as of `warp`.
+    """
+    check_shape("depth", depth, None, None)
+    return implementation("warp", backend, depth.device).enlarge(depth, scale, phase)
+
+
 def _source_from_camera(source: Camera, camera: Camera) -> tuple[Tensor, Tensor]:
     """M [3, 3] and m [3]: homogeneous source pixel = z M (u, v, 1) + m, in float64 on the CPU."""
     to, of = source.c2w.double().cpu(), camera.c2w.double().cpu()

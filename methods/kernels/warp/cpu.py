@@ -44,6 +44,43 @@ def warp(
     return values, valid
 
 
+def enlarge(depth: Tensor, scale: int, phase: tuple[float, float]) -> Tensor:
+    """See `methods.kernels.warp.enlarge`."""
+    if depth.dtype != torch.float32:
+        raise ValueError(
+            f"backend 'cpu' enlarges float32, got depth {depth.dtype}: use backend='reference'"
+        )
+    height, width = depth.shape
+    out = torch.full((height, width, scale**2), torch.inf)
+    _enlarge(
+        depth.contiguous().numpy(),
+        scale,
+        f32(phase[0]),
+        f32(phase[1]),
+        f32(TOLERANCE),
+        out.numpy(),
+    )
+    return out
+
+
+@njit(cache=True, parallel=True)
+def _enlarge(depth, scale, phase_u, phase_v, tolerance, out):
+    height, width = depth.shape
+    for row in prange(height):
+        for column in range(width):
+            if not _anything_near(depth, row, column):
+                continue
+            for sub in range(scale * scale):
+                v = f32(row * scale + sub // scale) + f32(0.5)
+                u = f32(column * scale + sub % scale) + f32(0.5)
+                out[row, column, sub] = _depth_at(
+                    depth,
+                    (v - phase_v) / f32(scale) - f32(0.5),
+                    (u - phase_u) / f32(scale) - f32(0.5),
+                    tolerance,
+                )
+
+
 @njit(cache=True, parallel=True)
 def _warp(picture, depth, matrix, offset, scale, phase_u, phase_v, tolerance, values, valid):
     height, width = depth.shape

@@ -33,6 +33,14 @@ def warp(
     return _blocks(values, scale), _blocks(known[..., None].to(values), scale).squeeze(-1)
 
 
+def enlarge(depth: Tensor, scale: int, phase: tuple[float, float]) -> Tensor:
+    """See `methods.kernels.warp.enlarge`."""
+    height, width = depth.shape
+    v = torch.arange(height * scale, device=depth.device, dtype=depth.dtype) + 0.5
+    u = torch.arange(width * scale, device=depth.device, dtype=depth.dtype) + 0.5
+    return _blocks(_upsample(depth, v, u, scale, phase)[..., None], scale).squeeze(-1)
+
+
 def _upsample(
     depth: Tensor, v: Tensor, u: Tensor, scale: int, phase: tuple[float, float]
 ) -> Tensor:
