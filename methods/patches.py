@@ -150,13 +150,11 @@ class PatchSource:
         return Observation(
             frame,
             self.pipeline.background,
-            [
-                Reprojected(v, i, self.pipeline.backend)
-                for v, i in zip(values, patch.indices, strict=True)
-            ],
+            [Reprojected(v, i) for v, i in zip(values, patch.indices, strict=True)],
             self.pipeline.history(newest, frame.depth, patch.view),
             self.pipeline.surface(frame.depth, patch.view, NullProbe()),
             patch.view.phase,
+            self.pipeline.backend,
         )
 
     def _spread(self, patch: Patch, pixels: Pixels) -> FeatureFrame:

@@ -106,6 +106,7 @@ class Pipeline:
                 self.history(newest, features.depth, view),
                 self.surface(features.depth, view, probe),
                 view.phase,
+                self.backend,
             )
         with probe.stage("renderer2d"):
             pictures, _ = self.renderer([observation])
@@ -118,7 +119,7 @@ class Pipeline:
     def reproject(self, cloud: Cloud, view: View) -> Reprojected:
         """The features of a preceding frame where the present picture sees them."""
         index, _ = cloud.land(view.full, self.options.reprojection, self.backend)
-        return Reprojected(cloud.values, index, self.backend)
+        return Reprojected(cloud.values, index)
 
     def history(self, newest: Remembered | None, depth: Tensor, view: View) -> Detail | None:
         """The preceding picture where the present one, of low-resolution `depth`, sees it."""

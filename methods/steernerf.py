@@ -35,7 +35,9 @@ SOURCES = (
     "range_reduction",
     "renderer2d",
     "sequences",
+    "space_to_depth",
     "steernerf",
+    "unet_release",
 )
 """Modules beside this one that decide what stage 2 results in, with those of stage 1."""
 
@@ -173,7 +175,7 @@ class SteerNerf:
 def stage2_digest() -> str:
     """SHA-256 of the sources that decide what stage 2 results in, beside those of stage 1."""
     sources = [ROOT / "methods" / f"{name}.py" for name in SOURCES]
-    for kernel in ("splat", "warp"):
+    for kernel in ("depthwise", "splat", "warp"):
         folder = ROOT / "methods" / "kernels" / kernel
         sources += [path for path in folder.glob("*.py") if path.stem != "cases"]
     return digest([*sources, ROOT / "bench" / "motion.py"])

@@ -17,8 +17,10 @@ from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy
 from methods.patches import PatchSource
 from methods.pipeline import Pipeline, PipelineOptions
-from methods.renderer2d import Renderer2d, SpaceToDepth, UnetRelease
+from methods.renderer2d import Renderer2d
 from methods.sequences import MotionOptions, SequencePool, TrueView
+from methods.space_to_depth import SpaceToDepth
+from methods.unet_release import UnetRelease
 
 GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)
 MOTION = MotionOptions(pool=3, uses=4, length=2)

@@ -11,7 +11,7 @@ from bench.cameras import cast, project
 from bench.types import NullProbe
 from methods.buffer import RenderingBuffer
 from methods.pipeline import Pipeline, PipelineOptions, View, sample_phase
-from methods.renderer2d import SpaceToDepth
+from methods.space_to_depth import SpaceToDepth
 from tests.methods.conftest import look_at_the_middle
 from tests.methods.test_joint import misty_field, shell
 

@@ -13,8 +13,8 @@ from bench.types import Budget, NullProbe, Scene
 from methods.joint import JointOptions
 from methods.kernels.encode import HashGrid
 from methods.pipeline import PipelineOptions
-from methods.renderer2d import SpaceToDepth
 from methods.sequences import MotionOptions
+from methods.space_to_depth import SpaceToDepth
 from methods.steernerf import SteerNerf
 from methods.train import TrainingOptions
 

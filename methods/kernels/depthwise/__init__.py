@@ -1,0 +1,49 @@
+"""Depthwise 3 x 3 convolution of cells, of which most of a picture has none.
+
+y[n, c] = sum_k weight[k, c] x[neighbours[n, k], c], a neighbour of -1 counting as 0: what a dense
+convolution gives on a picture that is 0 where there is no cell, for the cells alone.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from bench.types import check_shape
+from methods.kernels.dispatch import implementation
+
+TAPS = 9
+"""Neighbours of a cell, itself in the middle, row by row."""
+
+
+def neighbours_of(cells: Tensor) -> Tensor:
+    """Which cells lie around each: [N, 9] int32, -1 for none.
+
+    Args:
+        cells: [B, h, w] bool, N of them True; cells count from 0, row by row, picture by picture.
+    """
+    check_shape("cells", cells, None, None, None)
+    batch, height, width = cells.shape
+    number = torch.full((batch, height + 2, width + 2), -1, dtype=torch.int32, device=cells.device)
+    where = cells.nonzero()
+    picture, row, column = where.unbind(dim=1)
+    number[picture, row + 1, column + 1] = torch.arange(
+        len(where), dtype=torch.int32, device=cells.device
+    )
+    middle = (picture * (height + 2) + row + 1) * (width + 2) + column + 1
+    around = torch.arange(-1, 2, device=cells.device)
+    offsets = (around[:, None] * (width + 2) + around).flatten()
+    return number.flatten()[middle[:, None] + offsets]
+
+
+def depthwise(x: Tensor, neighbours: Tensor, weight: Tensor, *, backend: str = "auto") -> Tensor:
+    """Convolve the cells `x` [N, C]; differentiable in `x` and `weight`.
+
+    Args:
+        neighbours: [N, 9] int32 of `neighbours_of`: what lies around what is mutual.
+        weight: [9, C].
+    """
+    check_shape("x", x, None, None)
+    check_shape("neighbours", neighbours, len(x), TAPS)
+    check_shape("weight", weight, TAPS, x.shape[1])
+    return implementation("depthwise", backend, x.device).depthwise(x, neighbours, weight)

@@ -1,0 +1,281 @@
+"""A lean 2D renderer that works at low resolution, where something is, and nowhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor, nn
+from torch.nn import functional
+
+from methods.kernels.depthwise import TAPS, depthwise, neighbours_of
+from methods.kernels.splat import gather
+from methods.renderer2d import Detail, Observation, Renderer2d
+
+REACH = 2
+"""Cells around matter that are still drawn: what is further from all that was seen is empty."""
+
+LEAK = 0.1
+"""Slope of the activations below 0. With a slope of 0 the sparse inputs kill a trunk for good."""
+
+GENERIC = Path(__file__).parent / "weights" / "generic.safetensors"
+"""Weights trained on other scenes, by `steerbench generic`."""
+
+GENERIC_GROUPS = (
+    ("present", 1, 4),
+    ("preceding 0", 16, 4),
+    ("preceding 1", 16, 4),
+    ("history", 16, 4),
+    ("surface", 16, 4),
+)
+"""What those weights expect: K = 3, L = 2, s = 4."""
+
+
+Groups = Sequence[tuple[str, int, int]]
+"""Inputs of a cell: name, slots, features a slot. A feature beyond the fourth is no colour."""
+
+
+class SpaceToDepth(Renderer2d):
+    """A network on cells: the s x s pixels of a low-resolution pixel are channels of its cell.
+
+    A picture is the aligned bilinear enlargement of the present RGB (the base), blended pixel by
+    pixel with the other pictures that offer themselves (the preceding one, the one of the surface)
+    where those are known, plus a correction. The shares and the correction come from a trunk of
+    depthwise 3 x 3 convolutions and matrix products, after ConvNeXt (Liu et al. 2022).
+
+    A cell within `REACH` of anything that was seen is active; all others are background, and 0 to
+    their neighbours. So nothing is computed for them, and a part of a frame is drawn exactly as in
+    the whole. All features enter less their background, so that nothing is 0.
+
+    Args:
+        channels: K.
+        frames: L.
+        scale: s.
+        width: channels of the trunk.
+        blocks: residual blocks of the trunk.
+        init: "generic": start from the weights that come with the package, trained on other
+            scenes; "scratch": from random ones.
+        history: use the preceding picture.
+        surface: use the features at the surface, pixel by pixel.
+    """
+
+    def __init__(
+        self,
+        channels: int,
+        frames: int,
+        scale: int,
+        *,
+        width: int = 64,
+        blocks: int = 6,
+        init: Literal["generic", "scratch"] = "generic",
+        history: bool = True,
+        surface: bool = True,
+    ) -> None:
+        super().__init__()
+        self.channels, self.frames, self.scale = channels, frames, scale
+        self.history, self.surface = history and frames > 0, surface
+        groups = self._input_groups()
+        self.enter = nn.Linear(sum(slots * features for _, slots, features in groups), width)
+        self.trunk = nn.ModuleList(_Block(width) for _ in range(blocks))
+        self.leave = nn.Linear(width, scale**2 * (3 + self.history + surface))
+        for parameter in self.leave.parameters():
+            nn.init.zeros_(parameter)
+        if init == "generic":
+            self._start_from(load_file(GENERIC))
+
+    def _input_groups(self) -> Groups:
+        """What a cell is given, in its order: colour, how far something is there, the rest."""
+        cell, features = self.scale**2, self.channels + 1
+        return [
+            ("present", 1, features),
+            *((f"preceding {age}", cell, features) for age in range(self.frames)),
+            *[("history", cell, 4)] * self.history,
+            *[("surface", cell, features)] * self.surface,
+        ]
+
+    def forward(self, observations: Sequence[Observation]) -> tuple[Tensor, Tensor]:
+        """See `Renderer2d`."""
+        active = torch.stack([self._active(o) for o in observations])  # [B, h, w]
+        backend = observations[0].backend
+        places = [cells.flatten().nonzero().squeeze(1) for cells in active]
+        base = torch.cat([self._base(o, p) for o, p in zip(observations, places, strict=True)])
+        inputs, offers = self._inputs(observations, places, base)
+        neighbours = neighbours_of(active)
+        hidden = self.enter(inputs).float()  # [N, width]
+        for block in self.trunk:
+            hidden = block(hidden, neighbours, backend)
+        out = self.leave(functional.leaky_relu(hidden, LEAK)).float()
+        out = out.view(len(out), self.scale**2, -1)
+        drawn = base + out[..., :3]
+        for (values, valid), share in zip(offers, out[..., 3:].unbind(dim=-1), strict=True):
+            drawn = drawn + (share.sigmoid() * valid)[..., None] * (values - base)
+        background = observations[0].background[:3]
+        return self._paint(active, drawn, background), self._paint(active, base, background)
+
+    def _active(self, observation: Observation) -> Tensor:
+        """[h, w] bool: where there is anything within `REACH`."""
+        some = observation.frame.alpha > 0
+        for frame in observation.preceding:
+            some = some | (self._blocks(frame.index) >= 0).any(dim=-1)
+        size = 2 * REACH + 1
+        return functional.max_pool2d(some[None].float(), size, stride=1, padding=REACH)[0] > 0
+
+    def _base(self, observation: Observation, places: Tensor) -> Tensor:
+        """RGB of the frame less the background, enlarged bilinearly: [n, s^2, 3].
+
+        A pixel lies between its 3 x 3 nearest samples, whatever the phase; beyond the frame its
+        border goes on.
+        """
+        height, width, _ = observation.frame.values.shape
+        around = torch.arange(-1, 2, device=places.device)
+        row = (places // width)[:, None] + around.repeat_interleave(3)
+        column = (places % width)[:, None] + around.repeat(3)
+        near = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)  # [n, 9]
+        colours = (observation.frame.values[..., :3] - observation.background[:3]).flatten(0, 1)
+        across, down = (_tent(self.scale, shift).to(colours) for shift in observation.phase)
+        weights = (down[:, None, :, None] * across[None, :, None, :]).reshape(-1, TAPS)  # [s^2, 9]
+        with torch.autocast(colours.device.type, enabled=False):
+            return weights @ colours[near]
+
+    def _inputs(
+        self, observations: Sequence[Observation], places: Sequence[Tensor], base: Tensor
+    ) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+        """What every cell is given, [N, inputs]; and the pictures that offer themselves instead of
+        the base, [N, s^2, 3] less the background, with where they are known, [N, s^2]."""
+        pairs = list(zip(observations, places, strict=True))
+        parts = [torch.cat([self._present(o, p) for o, p in pairs])]
+        parts += [
+            torch.cat([self._preceding(o, age, p) for o, p in pairs]) for age in range(self.frames)
+        ]
+        offers = []
+        for used, channels, details in (
+            (self.history, 3, [o.history for o in observations]),
+            (self.surface, self.channels, [o.surface for o in observations]),
+        ):
+            if used:
+                background = observations[0].background[:channels]
+                detail = [
+                    self._detail(d, p, background) for d, p in zip(details, places, strict=True)
+                ]
+                values = torch.cat([v for v, _ in detail])
+                valid = torch.cat([v for _, v in detail])
+                offers.append((values[..., :3], valid))
+                told = values - functional.pad(base, (0, channels - 3))
+                parts.append(_tell(told * valid[..., None], valid).flatten(start_dim=1))
+        return torch.cat(parts, dim=1), offers
+
+    def _present(self, observation: Observation, places: Tensor) -> Tensor:
+        frame = observation.frame
+        values = frame.values.flatten(0, 1)[places] - observation.background
+        return _tell(values, frame.alpha.flatten()[places])
+
+    def _preceding(self, observation: Observation, age: int, places: Tensor) -> Tensor:
+        """[n, s^2 (K + 1)] what the frame of this age left at the pixels of each cell."""
+        if age >= len(observation.preceding):
+            size = self.scale**2 * (self.channels + 1)
+            return observation.frame.values.new_zeros(len(places), size)
+        frame = observation.preceding[age]
+        values = frame.values - observation.background
+        values = _tell(values, torch.ones_like(values[:, 0]))
+        index = self._blocks(frame.index).flatten(0, 1)[places]
+        return gather(values, index, backend=observation.backend).flatten(start_dim=1)
+
+    def _detail(
+        self, detail: Detail | None, places: Tensor, background: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """[n, s^2, C] less the background and [n, s^2] of the cells; 0 where there is none."""
+        if detail is None:
+            blank = background.new_zeros(len(places), self.scale**2)
+            return blank[..., None].expand(-1, -1, len(background)), blank
+        return detail.values.flatten(0, 1)[places] - background, detail.valid.flatten(0, 1)[places]
+
+    def _blocks(self, index: Tensor) -> Tensor:
+        """[H, W] to [h, w, s^2]: the pixels of each cell, row by row."""
+        height, width = index.shape
+        blocks = index.view(height // self.scale, self.scale, width // self.scale, self.scale)
+        return blocks.transpose(1, 2).flatten(start_dim=2)
+
+    def _paint(self, active: Tensor, cells: Tensor, background: Tensor) -> Tensor:
+        """Pictures [B, H, W, 3] of `cells` [N, s^2, 3], less the background, on the background."""
+        batch, height, width = active.shape
+        side = self.scale
+        canvas = background.expand(batch, height, width, side**2, 3)
+        canvas = canvas.masked_scatter(active[..., None, None], cells + background)
+        blocks = canvas.view(batch, height, width, side, side, 3).transpose(2, 3)
+        return blocks.reshape(batch, height * side, width * side, 3)
+
+    @torch.no_grad()
+    def _start_from(self, generic: Mapping[str, Tensor]) -> None:
+        """Take over the weights of a renderer of the same trunk that was trained at K = 3, L = 2.
+
+        Weights of features beyond RGB, and of frames it did not have, stay as they are.
+
+        Raises:
+            ValueError: this renderer is of another shape.
+        """
+        cell = self.scale**2
+        outputs = [0, 1, 2] + [3] * self.history + [4] * self.surface
+        rows = [5 * slot + i for slot in range(cell) for i in outputs]
+        ours, theirs = _same_columns(self._input_groups(), GENERIC_GROUPS)
+        for name, weight in self.named_parameters():
+            new = generic[name].float() if name in generic else weight.new_empty(0)
+            if name.startswith("leave") and len(new) == 5 * cell:
+                new = new[rows]
+            into: Tensor = weight
+            if name == "enter.weight" and self.scale == 4:
+                into, new = weight[:, ours], new[:, theirs]
+            if into.shape != new.shape:
+                raise ValueError(
+                    f"renderer.init=generic: {name} is {list(into.shape)}, the generic weights "
+                    f"have {list(new.shape)}: use renderer.init=scratch, or the scale, width and "
+                    "blocks of the default"
+                )
+            if name == "enter.weight":
+                weight[:, ours] = new
+            else:
+                weight.copy_(new)
+
+
+def _same_columns(ours: Groups, theirs: Groups) -> tuple[list[int], list[int]]:
+    """Columns of colours and validity that two layouts of the inputs have in common."""
+    columns: tuple[dict[tuple[str, int, int], int], ...] = ({}, {})
+    for groups, place in zip((ours, theirs), columns, strict=True):
+        begin = 0
+        for name, slots, features in groups:
+            for slot in range(slots):
+                for feature in range(min(features, 4)):
+                    place[name, slot, feature] = begin + slot * features + feature
+            begin += slots * features
+    both = [key for key in columns[0] if key in columns[1]]
+    return [columns[0][key] for key in both], [columns[1][key] for key in both]
+
+
+class _Block(nn.Module):
+    """x + W2 act(W1 (x convolved channel by channel))."""
+
+    def __init__(self, width: int, growth: int = 2) -> None:
+        super().__init__()
+        self.spread = nn.Parameter(torch.randn(TAPS, width) / 3)
+        self.grow = nn.Linear(width, growth * width)
+        self.shrink = nn.Linear(growth * width, width)
+        with torch.no_grad():
+            self.shrink.weight.mul_(0.1)
+
+    def forward(self, x: Tensor, neighbours: Tensor, backend: str) -> Tensor:
+        """`x` [N, width] of cells with `neighbours` [N, 9]."""
+        mixed = depthwise(x, neighbours, self.spread, backend=backend)
+        return x + self.shrink(functional.leaky_relu(self.grow(mixed), LEAK))
+
+
+def _tell(values: Tensor, known: Tensor) -> Tensor:
+    """`known` [...] put behind the colours of `values` [..., K]."""
+    return torch.cat((values[..., :3], known[..., None], values[..., 3:]), dim=-1)
+
+
+def _tent(scale: int, shift: float) -> Tensor:
+    """[s, 3] weights of the samples at -1, 0, 1 for the s pixels between -1/2 and 1/2."""
+    place = (torch.arange(scale) + 0.5 - shift) / scale - 0.5
+    return (1 - (place[:, None] - torch.tensor((-1.0, 0.0, 1.0))).abs()).clamp(min=0)
