@@ -107,7 +107,7 @@ class RendererTraining:
         observations, truth, opacity = self.patches.draw(self.options.batch)
         half = self.options.precision == "bf16"
         with torch.autocast(truth.device.type, torch.bfloat16, enabled=half):
-            drawn, base = self.renderer(observations)
+            drawn = self.renderer(observations)
         loss = functional.mse_loss(drawn, truth)
         (loss + self._regularisation(opacity)).backward()
         value = loss.item()
@@ -117,7 +117,9 @@ class RendererTraining:
         low = self.options.final_rate
         self._update(low + (1 - low) * 0.5 * (1 + math.cos(math.pi * self.step / self.steps)))
         self.step += 1
-        return {"": value, "base": functional.mse_loss(base.detach(), truth).item()}
+        with torch.no_grad():
+            base = functional.mse_loss(self.renderer.base(observations), truth).item()
+        return {"": value, "base": base}
 
     def _regularisation(self, opacity: Tensor) -> Tensor | float:
         return 0.0

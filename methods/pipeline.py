@@ -109,8 +109,7 @@ class Pipeline:
                 self.backend,
             )
         with probe.stage("renderer2d"):
-            pictures, _ = self.renderer([observation])
-            picture = pictures[0].clamp(0, 1)
+            picture = self.renderer([observation])[0].clamp(0, 1)
         with probe.stage("finish"):
             cloud = Cloud.of(features, self.options.reprojection)
             buffer.push(Remembered(cloud, view.full, picture))

@@ -57,5 +57,9 @@ class Renderer2d(nn.Module, ABC):
     """A network that turns observations into pictures."""
 
     @abstractmethod
-    def forward(self, observations: Sequence[Observation]) -> tuple[Tensor, Tensor]:
-        """Pictures [B, H, W, 3], and the base [B, H, W, 3] that the network corrected."""
+    def forward(self, observations: Sequence[Observation]) -> Tensor:
+        """Pictures [B, H, W, 3]."""
+
+    @abstractmethod
+    def base(self, observations: Sequence[Observation]) -> Tensor:
+        """The pictures [B, H, W, 3] that the network corrects: RGB, enlarged."""

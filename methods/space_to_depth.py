@@ -96,14 +96,12 @@ class SpaceToDepth(Renderer2d):
             *[("surface", cell, features)] * self.surface,
         ]
 
-    def forward(self, observations: Sequence[Observation]) -> tuple[Tensor, Tensor]:
+    def forward(self, observations: Sequence[Observation]) -> Tensor:
         """See `Renderer2d`."""
-        active = torch.stack([self._active(o) for o in observations])  # [B, h, w]
-        backend = observations[0].backend
-        places = [cells.flatten().nonzero().squeeze(1) for cells in active]
-        base = torch.cat([self._base(o, p) for o, p in zip(observations, places, strict=True)])
+        active, places = self._cells(observations)
+        base = self._bases(observations, places)
         inputs, offers = self._inputs(observations, places, base)
-        neighbours = neighbours_of(active)
+        neighbours, backend = neighbours_of(active), observations[0].backend
         hidden = self.enter(inputs).float()  # [N, width]
         for block in self.trunk:
             hidden = block(hidden, neighbours, backend)
@@ -112,16 +110,30 @@ class SpaceToDepth(Renderer2d):
         drawn = base + out[..., :3]
         for (values, valid), share in zip(offers, out[..., 3:].unbind(dim=-1), strict=True):
             drawn = drawn + (share.sigmoid() * valid)[..., None] * (values - base)
-        background = observations[0].background[:3]
-        return self._paint(active, drawn, background), self._paint(active, base, background)
+        return self._paint(active, drawn, observations[0].background[:3])
+
+    def base(self, observations: Sequence[Observation]) -> Tensor:
+        """See `Renderer2d`."""
+        active, places = self._cells(observations)
+        base = self._bases(observations, places)
+        return self._paint(active, base, observations[0].background[:3])
+
+    def _cells(self, observations: Sequence[Observation]) -> tuple[Tensor, list[Tensor]]:
+        """Which cells are active, [B, h, w]; and for each picture where they are, row by row."""
+        active = torch.stack([self._active(o) for o in observations])
+        return active, [cells.flatten().nonzero().squeeze(1) for cells in active]
+
+    def _bases(self, observations: Sequence[Observation], places: Sequence[Tensor]) -> Tensor:
+        return torch.cat([self._base(o, p) for o, p in zip(observations, places, strict=True)])
 
     def _active(self, observation: Observation) -> Tensor:
         """[h, w] bool: where there is anything within `REACH`."""
-        some = observation.frame.alpha > 0
+        some = (observation.frame.alpha > 0).float()
         for frame in observation.preceding:
-            some = some | (self._blocks(frame.index) >= 0).any(dim=-1)
+            shown = (frame.index >= 0).float()
+            some = some + functional.max_pool2d(shown[None], self.scale)[0]
         size = 2 * REACH + 1
-        return functional.max_pool2d(some[None].float(), size, stride=1, padding=REACH)[0] > 0
+        return functional.max_pool2d(some[None], size, stride=1, padding=REACH)[0] > 0
 
     def _base(self, observation: Observation, places: Tensor) -> Tensor:
         """RGB of the frame less the background, enlarged bilinearly: [n, s^2, 3].
@@ -202,10 +214,12 @@ class SpaceToDepth(Renderer2d):
         """Pictures [B, H, W, 3] of `cells` [N, s^2, 3], less the background, on the background."""
         batch, height, width = active.shape
         side = self.scale
-        canvas = background.expand(batch, height, width, side**2, 3)
-        canvas = canvas.masked_scatter(active[..., None, None], cells + background)
-        blocks = canvas.view(batch, height, width, side, side, 3).transpose(2, 3)
-        return blocks.reshape(batch, height * side, width * side, 3)
+        canvas = background.repeat(batch, height, side, width, side, 1)
+        blocks = (cells + background).view(-1, side, side, 3)
+        picture, row, column = active.nonzero().unbind(dim=1)
+        # Advanced indices with a slice between them: the cells come first, as they do in `blocks`.
+        canvas[picture, row, :, column] = blocks
+        return canvas.view(batch, height * side, width * side, 3)
 
     @torch.no_grad()
     def _start_from(self, generic: Mapping[str, Tensor]) -> None:

@@ -42,17 +42,18 @@ class UnetRelease(Renderer2d):
         self.merge_full = _conv(128, 64)
         self.last = nn.Sequential(_conv(64, 64), nn.ReLU(), _conv(64, 3))
 
-    def forward(self, observations: Sequence[Observation]) -> tuple[Tensor, Tensor]:
+    def forward(self, observations: Sequence[Observation]) -> Tensor:
+        """See `Renderer2d`."""
+        inputs = torch.stack([self._inputs(o) for o in observations])
+        return self.base(observations) + self._network(inputs).permute(0, 2, 3, 1)
+
+    def base(self, observations: Sequence[Observation]) -> Tensor:
         """See `Renderer2d`."""
         rgb = torch.stack([o.frame.values[..., :3] for o in observations]).permute(0, 3, 1, 2)
-        base = functional.interpolate(
-            rgb,
-            scale_factor=self.scale,
-            mode="bilinear",
-            align_corners=not self.aligned,
+        enlarged = functional.interpolate(
+            rgb, scale_factor=self.scale, mode="bilinear", align_corners=not self.aligned
         )
-        inputs = torch.stack([self._inputs(o) for o in observations])
-        return _channels_last(base + self._network(inputs)), _channels_last(base)
+        return enlarged.permute(0, 2, 3, 1)
 
     def _inputs(self, observation: Observation) -> Tensor:
         """[K (L + 1), H, W]: the RGB of all frames, then their other features."""
@@ -99,8 +100,3 @@ def _conv(inputs: int, outputs: int) -> nn.Conv2d:
     layer = nn.Conv2d(inputs, outputs, 3, padding=1)
     nn.init.kaiming_normal_(layer.weight)
     return layer
-
-
-def _channels_last(images: Tensor) -> Tensor:
-    """[B, 3, H, W] to [B, H, W, 3]."""
-    return images.permute(0, 2, 3, 1)
