@@ -135,7 +135,7 @@ class Pipeline:
         )
         return Detail(values, valid)
 
-    def surface(self, depth: Tensor, view: View, probe: Probe) -> Detail | None:
+    def surface(self, depth: Tensor, view: View, probe: Probe) -> Reprojected | None:
         """Features at full resolution, one sample a pixel, where `depth` [h, w] has the surface.
 
         Differentiable in the field, not in its depth.
@@ -143,19 +143,21 @@ class Pipeline:
         if not self.options.surface:
             return None
         with probe.stage("surface"):
-            scale = self.options.scale
+            scale, width = self.options.scale, view.full.width
             fine = enlarge(depth.detach(), scale, view.phase, backend=self.backend)
-            valid = fine.isfinite()
-            cell, sub = valid.flatten(0, 1).nonzero().unbind(dim=1)
-            row, column = cell // view.low.width, cell % view.low.width
-            pixels = torch.stack((column * scale + sub % scale, row * scale + sub // scale), dim=1)
-            points = unproject(view.full, pixels + 0.5, fine.view(-1, scale**2)[cell, sub])
-            probe.count("surface_samples", len(points), valid.numel())
+            row, column, sub = fine.isfinite().nonzero().unbind(dim=1)
+            z = fine[row, column, sub]
+            cell = row * view.low.width + column
+            row, column = row * scale + sub // scale, column * scale + sub % scale
+            pixels = torch.stack((column, row), dim=1) + 0.5
+            points = unproject(view.full, pixels, z)
+            probe.count("surface_samples", len(points), fine.numel())
             # The pixels of a cell share the view direction of its middle.
             _, values = query(self.field, points, cell, cast(view.low).directions)
-            blank = values.new_zeros(valid.numel(), values.shape[1])
-            spread = blank.index_copy(0, cell * scale**2 + sub, values)
-        return Detail(spread.view(*valid.shape, -1), valid.to(values.dtype))
+            index = torch.full((view.full.height, width), -1, dtype=torch.int32, device=z.device)
+            number = torch.arange(len(points), dtype=torch.int32, device=z.device)
+            index.view(-1)[row * width + column] = number
+        return Reprojected(values, index)
 
     def _features(self, view: View, newest: Remembered | None, probe: Probe) -> FeatureFrame:
         """The field at low resolution, looked at where the newest preceding frame says."""

@@ -13,8 +13,8 @@ from methods.volume import FeatureFrame
 
 @dataclass(frozen=True)
 class Reprojected:
-    """A preceding frame in the present view: `values` [N, K] of points and the `index` [H, W] of
-    the point that each full-resolution pixel shows, -1 for none."""
+    """Points in the present view: their `values` [N, K], and the `index` [H, W] of the point that
+    each full-resolution pixel shows, -1 for none."""
 
     values: Tensor
     index: Tensor
@@ -48,7 +48,7 @@ class Observation:
     background: Tensor
     preceding: Sequence[Reprojected]
     history: Detail | None
-    surface: Detail | None = None
+    surface: Reprojected | None = None
     phase: tuple[float, float] = (0.0, 0.0)
     backend: str = "auto"
 

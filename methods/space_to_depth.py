@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from methods.kernels.depthwise import TAPS, depthwise, neighbours_of
 from methods.kernels.splat import gather
-from methods.renderer2d import Detail, Observation, Renderer2d
+from methods.renderer2d import Detail, Observation, Renderer2d, Reprojected
 
 REACH = 2
 """Cells around matter that are still drawn: what is further from all that was seen is empty."""
@@ -163,21 +163,25 @@ class SpaceToDepth(Renderer2d):
             torch.cat([self._preceding(o, age, p) for o, p in pairs]) for age in range(self.frames)
         ]
         offers = []
-        for used, channels, details in (
-            (self.history, 3, [o.history for o in observations]),
-            (self.surface, self.channels, [o.surface for o in observations]),
-        ):
-            if used:
-                background = observations[0].background[:channels]
-                detail = [
-                    self._detail(d, p, background) for d, p in zip(details, places, strict=True)
-                ]
-                values = torch.cat([v for v, _ in detail])
-                valid = torch.cat([v for _, v in detail])
-                offers.append((values[..., :3], valid))
-                told = values - functional.pad(base, (0, channels - 3))
-                parts.append(_tell(told * valid[..., None], valid).flatten(start_dim=1))
+        for offer in self._offers(pairs):
+            values = torch.cat([v for v, _ in offer])  # [N, s^2, 3 or K]
+            valid = torch.cat([v for _, v in offer])  # [N, s^2]
+            offers.append((values[..., :3], valid))
+            told = values - functional.pad(base, (0, values.shape[2] - 3))
+            parts.append(_tell(told * valid[..., None], valid).flatten(start_dim=1))
         return torch.cat(parts, dim=1), offers
+
+    def _offers(
+        self, pairs: Sequence[tuple[Observation, Tensor]]
+    ) -> list[list[tuple[Tensor, Tensor]]]:
+        """Of the preceding picture and of the surface, as far as they are used: for each frame
+        the values less the background, [n, s^2, C], and where they are known, [n, s^2]."""
+        offers = []
+        if self.history:
+            offers.append([self._detail(o.history, p, o.background[:3]) for o, p in pairs])
+        if self.surface:
+            offers.append([self._points(o.surface, p, o) for o, p in pairs])
+        return offers
 
     def _present(self, observation: Observation, places: Tensor) -> Tensor:
         frame = observation.frame
@@ -186,14 +190,20 @@ class SpaceToDepth(Renderer2d):
 
     def _preceding(self, observation: Observation, age: int, places: Tensor) -> Tensor:
         """[n, s^2 (K + 1)] what the frame of this age left at the pixels of each cell."""
-        if age >= len(observation.preceding):
-            size = self.scale**2 * (self.channels + 1)
-            return observation.frame.values.new_zeros(len(places), size)
-        frame = observation.preceding[age]
-        values = frame.values - observation.background
-        values = _tell(values, torch.ones_like(values[:, 0]))
-        index = self._blocks(frame.index).flatten(0, 1)[places]
-        return gather(values, index, backend=observation.backend).flatten(start_dim=1)
+        frames = observation.preceding
+        frame = frames[age] if age < len(frames) else None
+        return _tell(*self._points(frame, places, observation)).flatten(start_dim=1)
+
+    def _points(
+        self, points: Reprojected | None, places: Tensor, observation: Observation
+    ) -> tuple[Tensor, Tensor]:
+        """[n, s^2, K] less the background and [n, s^2] of the cells; 0 where there is none."""
+        if points is None:
+            return self._detail(None, places, observation.background)
+        values = points.values - observation.background
+        index = self._blocks(points.index).flatten(0, 1)[places]
+        shown = gather(values, index, backend=observation.backend)
+        return shown, (index >= 0).to(shown.dtype)
 
     def _detail(
         self, detail: Detail | None, places: Tensor, background: Tensor
