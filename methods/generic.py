@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
@@ -74,9 +74,15 @@ def train_generic(
     training = RendererTraining(renderer, patches, joint, budget.renderer_steps, generator)
     for pipeline in pipelines:
         pipeline.renderer = training.mean
+    key = {
+        "scenes": [setup.key(scene, budget) for scene in scenes],
+        "pipeline": asdict(options),
+        "joint": asdict(joint),
+        "steps": budget.renderer_steps,
+    }
+    finished = log.stage_dir("generic", key) / "generic.safetensors"
+    loop.train(training, finished, "training a generic renderer", log)
+    halves = {name: x.half() for name, x in training.mean.state_dict().items()}
     output.parent.mkdir(parents=True, exist_ok=True)
-    loop.train(training, output, "training a generic renderer", log)
-    weights, figures = checkpoint.read(output)
-    halves = {name: x.half() for name, x in checkpoint.part(weights, "mean.").items()}
-    checkpoint.write(output, halves, figures)
+    checkpoint.write(output, halves, {"scenes": len(scenes), "steps": training.steps})
     log.info(f"written: {output}")

@@ -35,7 +35,7 @@ examples
   steerbench results --format csv              every number measured so far
 """
 
-COMMANDS = ("run", "list", "results", "kernels", "scenes")
+COMMANDS = ("run", "list", "results", "kernels", "scenes", "generic")
 
 # What the disk refuses: worth a plain sentence, not a traceback.
 REFUSALS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR}
@@ -124,6 +124,14 @@ def _parser() -> Parser:
     verify = actions.add_parser("verify", help="compare with the official checksums")
     verify.add_argument("path", type=Path, help="folder of one scene or of all of NeRF-Synthetic")
     verify.set_defaults(module="verify", parser=verify)
+
+    generic = commands.add_parser("generic", help="train the 2D renderer that scenes start from")
+    generic.add_argument("--scenes", type=int, default=8, help="random scenes (default 8)")
+    generic.add_argument(
+        "--output", type=Path, required=True, metavar="FILE", help="the weights, safetensors"
+    )
+    generic.add_argument("overrides", nargs="*", help="settings as of `steerbench run`")
+    generic.set_defaults(module="generic", parser=generic)
     return parser
 
 

@@ -1,0 +1,36 @@
+"""`steerbench generic`: train the 2D renderer that every scene starts from."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+
+from bench.console import ConsoleLog
+from bench.errors import SteerbenchError
+from sweeps.build import build
+from sweeps.overrides import CONFIGS
+
+SETTINGS = (
+    "method=steernerf",
+    "scene=medley",
+    "budget=generic",
+    "method.pipeline.channels=3",  # features beyond colour mean something else in every scene
+    "method.renderer.init=scratch",
+)
+
+
+def main(options: argparse.Namespace) -> int:
+    """Fit a field to each of many random scenes, train one renderer on all, write its weights."""
+    if options.scenes < 1:
+        raise SteerbenchError(f"--scenes: expected 1 or more, got {options.scenes}")
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        config = compose("run", overrides=[*SETTINGS, *options.overrides])
+    log = ConsoleLog(Path(config.outputs))
+    method, budget = build(config, "method"), build(config, "budget")
+    scenes = []
+    for config.scene.variant in range(options.scenes):
+        scenes.append(build(config, "scene", log=log))
+    method.fit_generic(scenes, budget, options.output, log)
+    return 0
