@@ -22,6 +22,7 @@ CASE_MODULES = (
     "methods.kernels.adam.cases",
     "methods.kernels.splat.cases",
     "methods.kernels.warp.cases",
+    "methods.kernels.depthwise.cases",
     "methods.step_cases",
 )
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from bench.cameras import pixel_grid, project, scale_camera, unproject
 from bench.types import Camera
 from methods.kernels.case import U32, Case, Prepared
-from methods.kernels.warp import _source_from_camera, warp
+from methods.kernels.warp import _source_from_camera, enlarge, warp
 
 LOW, HIGH = 200, 800
 """Side of the depth and of the picture, in pixels."""
@@ -26,9 +26,13 @@ CHANNELS = 3
 MIDDLE = 2.0
 """Depth of the wall that most cases look at."""
 
-ROUNDINGS = 16
-"""Most operations, of relative error u each, from the inputs to a coordinate's numerator and
-denominator: two for a matrix entry, six for the sum of products, eight for the mean depth."""
+MEAN_ROUNDINGS = 8
+"""Most operations, of relative error u each, from the depths to their mean: a weight and its
+product, three sums, those of the weights and the quotient, as far as they do not cancel."""
+
+ROUNDINGS = 8 + MEAN_ROUNDINGS
+"""The same from the inputs to a coordinate's numerator and denominator: two for a matrix entry, six
+for the sum of products, and those of the mean depth."""
 
 
 def cases() -> list[Case]:
@@ -56,21 +60,37 @@ def cases() -> list[Case]:
         ("half of it empty", 24, 17, 4, {"edge": math.inf}),
         ("nothing known", 1, 17, 4, {"edge": math.inf}),
     ]
-    moved = {"turn": (0.02, -0.01, 0.0), "move": (0.02, 0.0, 0.0), "holes": True}
+    depth_kinds: list[tuple[str, int, int, int, dict]] = [
+        ("one pixel", 1, 1, 4, {}),
+        ("one of one", 9, 7, 1, {}),
+        ("three by three", 9, 7, 3, {}),
+        ("phase", 24, 17, 4, {"phase": (1.5, -0.5)}),
+        ("phase of a whole pixel", 24, 17, 3, {"phase": (-3.0, 3.0)}),
+        ("holes and a phase", 24, 17, 4, {"holes": True, "phase": (-1.5, 0)}),
+        ("edges and holes", 24, 17, 4, {"edge": 0.5, "holes": True}),
+        ("half of it empty", 24, 17, 4, {"edge": math.inf}),
+        ("nothing known", 1, 17, 4, {"edge": math.inf}),
+    ]
     found = [
         Case(
-            "warp",
+            kernel,
             name,
             "fp32",
             width * height * scale**2,
-            partial(_prepare, width, height, scale, options),
+            partial(prepare, width, height, scale, options),
         )
-        for name, width, height, scale, options in kinds
+        for kernel, prepare, some in (
+            ("warp", _prepare, kinds),
+            ("warp enlarge", _prepare_enlarge, depth_kinds),
+        )
+        for name, width, height, scale, options in some
     ]
     moved = {"turn": (0.02, -0.01, 0.0), "move": (0.02, 0.0, 0.0), "holes": True}
-    timed = partial(_prepare, LOW, LOW, HIGH // LOW, moved)
     frame = f"{LOW} x {LOW} to {HIGH} x {HIGH}"
-    return [*found, Case("warp", frame, "fp32", HIGH**2, timed, timed=True)]
+    for kernel, prepare in (("warp", _prepare), ("warp enlarge", _prepare_enlarge)):
+        timed = partial(prepare, LOW, LOW, HIGH // LOW, moved)
+        found.append(Case(kernel, frame, "fp32", HIGH**2, timed, timed=True))
+    return found
 
 
 def _camera(width: int, height: int) -> Camera:
@@ -119,6 +139,20 @@ def _prepare(width: int, height: int, scale: int, options: dict, device: str) ->
     # Neighbours differ by 1 at most, so a value by no more than its place along each axis; and it
     # is a sum of products, 8 roundings in either backend.
     return Prepared(call, 2 * shift + 16 * U32)
+
+
+def _prepare_enlarge(width: int, height: int, scale: int, options: dict, device: str) -> Prepared:
+    depth = _depth(width, height, options)
+    known = depth[depth.isfinite()]
+    farthest = known.max().item() if len(known) else 0.0
+    depth, phase = depth.to(device), options.get("phase", (0.0, 0.0))
+
+    def call(backend: str) -> tuple[Tensor, ...]:
+        # No depth is 0: a finite number in its place can be compared.
+        z = enlarge(depth, scale, phase, backend=backend)
+        return (z.nan_to_num(nan=-1.0, posinf=0.0),)
+
+    return Prepared(call, 2 * MEAN_ROUNDINGS * U32 * farthest)
 
 
 def _position_error(source: Camera, camera: Camera, depth: Tensor, scale: int) -> float:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bench.cameras import look_at
 from bench.types import Camera
-from methods.kernels.warp import TOLERANCE, warp
+from methods.kernels.warp import TOLERANCE, enlarge, warp
 
 BACKENDS = ["reference", "cpu"]
 ERROR = 1e-4
@@ -32,6 +32,15 @@ def elsewhere(camera: Camera) -> Camera:
 
 def noise(height: int, width: int, channels: int = 3) -> Tensor:
     return torch.rand(height, width, channels, generator=torch.Generator().manual_seed(height))
+
+
+def uneven_depth() -> Tensor:
+    """Two walls that are a little rough, with holes of every kind."""
+    depth = 2 + 0.01 * torch.rand(7, 9, generator=torch.Generator().manual_seed(1))
+    depth[:, 5:] += 1.0
+    depth[2, 2], depth[3, 6], depth[6, 0] = math.inf, math.nan, -math.inf
+    depth[4:, 7:] = math.inf
+    return depth
 
 
 def whole(blocks: Tensor, scale: int) -> Tensor:
@@ -107,11 +116,7 @@ def test_a_picture_is_the_definition(
     width, height = 9, 7
     camera = straight(width * scale, height * scale, focal=8.0 * scale)
     source = elsewhere(camera)
-    generator = torch.Generator().manual_seed(1)
-    depth = 2 + 0.01 * torch.rand(height, width, generator=generator)
-    depth[:, 5:] += 1.0
-    depth[2, 2], depth[3, 6], depth[6, 0] = math.inf, math.nan, -math.inf
-    depth[4:, 7:] = math.inf
+    depth = uneven_depth()
     picture = noise(source.height, source.width, channels)
     values, valid = warp(picture, source, depth, camera, scale, phase, backend=backend)
     assert values.shape == (height, width, scale**2, channels)
@@ -136,6 +141,60 @@ def test_a_picture_is_the_definition(
             compared += 1
     assert compared > 0.99 * camera.width * camera.height
     assert 0.3 < valid.mean() < 0.95
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    ("scale", "phase"), [(4, (0.0, 0.0)), (4, (1.5, -0.5)), (3, (-1.0, 1.0)), (1, (0.0, 0.0))]
+)
+def test_an_enlarged_depth_is_the_definition(
+    scale: int, phase: tuple[float, float], backend: str
+) -> None:
+    depth = uneven_depth()
+    enlarged = whole(enlarge(depth, scale, phase, backend=backend)[..., None], scale)[..., 0]
+    rows = depth.tolist()
+    for row in range(len(enlarged)):
+        for column in range(enlarged.shape[1]):
+            x, y = (
+                (at + 0.5 - p) / scale - 0.5 for at, p in zip((column, row), phase, strict=True)
+            )
+            # A mean of depths up to 4, after eight roundings.
+            want = pytest.approx(plain_depth(rows, x, y), rel=0, abs=8 * 4 * 2.0**-24)
+            assert enlarged[row, column].item() == want
+    assert 0.05 < enlarged.isinf().float().mean() < 0.5
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(("scale", "phase"), [(4, (0.0, 0.0)), (4, (1.5, -0.5)), (3, (-1.0, 1.0))])
+def test_a_picture_is_warped_with_the_enlarged_depth(
+    scale: int, phase: tuple[float, float], backend: str
+) -> None:
+    """With a depth for every pixel there is nothing left to average: the same bits."""
+    depth = uneven_depth()
+    camera = straight(9 * scale, 7 * scale, focal=8.0 * scale)
+    source = elsewhere(camera)
+    picture = noise(source.height, source.width)
+    fine = whole(enlarge(depth, scale, phase, backend=backend)[..., None], scale)[..., 0]
+    got = warp(picture, source, fine, camera, 1, backend=backend)
+    want = warp(picture, source, depth, camera, scale, phase, backend=backend)
+    assert want[1].any()
+    assert torch.equal(whole(got[0], 1), whole(want[0], scale))
+    assert torch.equal(whole(got[1][..., None], 1), whole(want[1][..., None], scale))
+
+
+def test_an_enlarged_depth_of_float64_keeps_its_digits() -> None:
+    depth = torch.full((2, 3), 2 + 1e-12, dtype=torch.float64)
+    enlarged = enlarge(depth, 4, backend="reference")
+    assert enlarged.dtype == torch.float64
+    # A sum of 4 products and a quotient.
+    torch.testing.assert_close(enlarged, depth[..., None].expand(2, 3, 16), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_strided_depth_is_enlarged_as_it_stands(backend: str) -> None:
+    depth = uneven_depth()
+    got = enlarge(depth.T.contiguous().T, 4, backend=backend)
+    assert torch.equal(got, enlarge(depth, 4, backend=backend))
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -294,3 +353,7 @@ def test_wrong_arguments_are_named() -> None:
         warp(picture, camera, depth, camera, 2)
     with pytest.raises(ValueError, match="warps float32"):
         warp(picture.double(), camera, depth, camera, 4, backend="cpu")
+    with pytest.raises(ValueError, match=r"depth: expected shape \[any, any\], got \[6\]"):
+        enlarge(depth.flatten(), 4)
+    with pytest.raises(ValueError, match="enlarges float32"):
+        enlarge(depth.double(), 4, backend="cpu")

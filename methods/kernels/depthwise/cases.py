@@ -1,0 +1,96 @@
+"""Cases of the depthwise convolution of cells.
+
+Forward, inputs are any numbers: what a backend may round is bounded. Backward, they are few digits
+long: nothing is rounded, in whatever order the gradient of the weights is added up.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from methods.kernels.case import U32, Case, Prepared
+from methods.kernels.depthwise import TAPS, depthwise, neighbours_of
+
+LOW = 200
+"""Side of the frame that is timed, in cells."""
+
+SHARE = 0.25
+"""Of the cells of the frame that are there: matter, and what surrounds it."""
+
+WIDTH = 64
+"""Channels of the trunk of the lean renderer."""
+
+STEPS = 16
+"""Backward, inputs are multiples of 1/16 from -1 to 1, products multiples of 1/256: a sum of up to
+2^15 of them has 23 bits or less."""
+
+
+def cases() -> list[Case]:
+    """No, one and all cells; lines; scattered ones; several pictures; a frame, timed."""
+    kinds: list[tuple[str, Tensor, int]] = [
+        ("no cell", torch.zeros(1, 4, 5, dtype=torch.bool), 8),
+        ("one pixel", torch.ones(1, 1, 1, dtype=torch.bool), 8),
+        ("one row", torch.ones(1, 1, 40, dtype=torch.bool), 8),
+        ("one column", torch.ones(1, 40, 1, dtype=torch.bool), 8),
+        ("all cells", torch.ones(1, 9, 7, dtype=torch.bool), 8),
+        ("scattered", _scattered(1, 30, 20), 8),
+        ("three pictures", _scattered(3, 11, 6), 8),
+        ("one channel", _scattered(1, 30, 20), 1),
+        ("thirteen channels", _scattered(1, 30, 20), 13),
+    ]
+    found = []
+    for kernel, make in (("depthwise", _forward), ("depthwise backward", _backward)):
+        for name, cells, channels in kinds:
+            count = int(cells.sum())
+            found.append(Case(kernel, name, "fp32", count, partial(make, cells, channels)))
+        frame = _disc(LOW)
+        timed = partial(make, frame, WIDTH)
+        name = f"a quarter of {LOW} x {LOW}, {WIDTH} channels"
+        found.append(Case(kernel, name, "fp32", int(frame.sum()), timed, timed=True))
+    return found
+
+
+def _scattered(batch: int, height: int, width: int) -> Tensor:
+    generator = torch.Generator().manual_seed(height)
+    return torch.rand(batch, height, width, generator=generator) < 0.5
+
+
+def _disc(side: int) -> Tensor:
+    """A round thing in the middle of a picture."""
+    away = (torch.arange(side) + 0.5) / side - 0.5
+    return (away[:, None] ** 2 + away**2 < SHARE / torch.pi)[None]
+
+
+def _forward(cells: Tensor, channels: int, device: str) -> Prepared:
+    generator = torch.Generator().manual_seed(channels)
+    neighbours = neighbours_of(cells.to(device))
+    x = 2 * torch.rand(len(neighbours), channels, generator=generator) - 1
+    weight = 2 * torch.rand(TAPS, channels, generator=generator) - 1
+    x, weight = x.to(device), weight.to(device)
+
+    def call(backend: str) -> tuple[Tensor, ...]:
+        return (depthwise(x, neighbours, weight, backend=backend),)
+
+    # Nine products of size 1 at most, each rounded once alone and in at most eight sums.
+    return Prepared(call, 2 * TAPS * TAPS * U32)
+
+
+def _backward(cells: Tensor, channels: int, device: str) -> Prepared:
+    generator = torch.Generator().manual_seed(channels)
+    neighbours = neighbours_of(cells.to(device))
+
+    def draw(rows: int) -> Tensor:
+        whole = torch.randint(-STEPS, STEPS + 1, (rows, channels), generator=generator)
+        return (whole / STEPS).to(device)
+
+    x, grad = draw(len(neighbours)).requires_grad_(), draw(len(neighbours))
+    weight = draw(TAPS).requires_grad_()
+
+    def call(backend: str) -> tuple[Tensor, ...]:
+        out = depthwise(x, neighbours, weight, backend=backend)
+        return torch.autograd.grad(out, (x, weight), grad)
+
+    return Prepared(call, 0.0)
