@@ -102,11 +102,11 @@ class SpaceToDepth(Renderer2d):
         base = self._bases(observations, places)
         inputs, offers = self._inputs(observations, places, base)
         neighbours, backend = neighbours_of(active), observations[0].backend
-        hidden = self.enter(inputs).float()  # [N, width]
+        hidden = self.enter(inputs).to(base)  # [N, width]; half precision stays inside the blocks
         for block in self.trunk:
             hidden = block(hidden, neighbours, backend)
-        out = self.leave(functional.leaky_relu(hidden, LEAK)).float()
-        out = out.view(len(out), self.scale**2, -1)
+        out = self.leave(functional.leaky_relu(hidden, LEAK)).to(base)
+        out = out.view(-1, self.scale**2, 3 + len(offers))
         drawn = base + out[..., :3]
         for (values, valid), share in zip(offers, out[..., 3:].unbind(dim=-1), strict=True):
             drawn = drawn + (share.sigmoid() * valid)[..., None] * (values - base)
@@ -244,8 +244,9 @@ class SpaceToDepth(Renderer2d):
         outputs = [0, 1, 2] + [3] * self.history + [4] * self.surface
         rows = [5 * slot + i for slot in range(cell) for i in outputs]
         ours, theirs = _same_columns(self._input_groups(), GENERIC_GROUPS)
-        for name, weight in self.named_parameters():
-            new = generic[name].float() if name in generic else weight.new_empty(0)
+        weights, missing = dict(self.named_parameters()), torch.empty(0)
+        for name in dict.fromkeys((*weights, *generic)):
+            weight, new = weights.get(name, missing), generic.get(name, missing).float()
             if name.startswith("leave") and len(new) == 5 * cell:
                 new = new[rows]
             into: Tensor = weight

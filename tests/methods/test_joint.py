@@ -9,15 +9,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.types import Camera, Log, Scene, SteerbenchError
+from bench.types import Camera, Log, Probe, Scene, SteerbenchError
 from methods import loop
 from methods.fields import HashField
 from methods.joint import JointOptions, JointTraining, RendererTraining
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy
-from methods.patches import PatchSource
-from methods.pipeline import Pipeline, PipelineOptions
-from methods.renderer2d import Renderer2d
+from methods.patches import PatchSource, Through
+from methods.pipeline import Pipeline, PipelineOptions, View
+from methods.renderer2d import Renderer2d, Reprojected
 from methods.sequences import MotionOptions, SequencePool, TrueView
 from methods.space_to_depth import SpaceToDepth
 from methods.unet_release import UnetRelease
@@ -63,7 +63,9 @@ def new_training(
         pipeline.scale,
         width=8,
         blocks=1,
+        init="scratch",
         history=pipeline.history,
+        surface=pipeline.surface,
     )
     split = scene.splits["train"]
     views = [TrueView(c, p) for c, p in zip(split.cameras, split.images, strict=True)]
@@ -78,22 +80,26 @@ def new_training(
     return training
 
 
+@pytest.mark.parametrize("surface", [False, True])
 @pytest.mark.parametrize("through", ["all", "present"])
 def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
-    ball_scene: Scene, through: str
+    ball_scene: Scene, through: Through, surface: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In float64, along a random direction of all parameters, against a central difference.
 
     Table, networks and renderer are differentiated through compositing, the splatted features of
-    two preceding frames, and the 2D renderer; depths, and so places, are constants.
+    two preceding frames, the features at the surface, and the 2D renderer; depths, and so places,
+    are constants.
     """
     field = misty_field("fp32", "reference").double()
-    pipeline = replace(PIPELINE, history=False)
-    renderer = SpaceToDepth(4, 2, 4, width=6, blocks=1, history=False).double()
+    pipeline = replace(PIPELINE, history=False, surface=surface)
+    renderer = SpaceToDepth(
+        4, 2, 4, width=6, blocks=1, init="scratch", history=False, surface=surface
+    )
     options = replace(OPTIONS, through=through)
     with torch.no_grad():
-        renderer.last.weight.normal_(0, 0.1)
-    training = new_training(ball_scene, options, pipeline, field.float(), renderer.float())
+        renderer.leave.weight.normal_(0, 0.1)
+    training = new_training(ball_scene, options, pipeline, field.float(), renderer)
     patches = [training.patches.cut(training.patches.pool.draw()) for _ in range(16)]
     after_two = [patch for patch in patches if len(patch.shown) == 2]
     patches = [patch for patch in after_two if all(len(shown) for shown in patch.shown)][:2]
@@ -105,10 +111,16 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
     frozen = [cloud.values.double() for cloud in clouds]
     for cloud, values in zip(clouds, frozen, strict=True):
         object.__setattr__(cloud, "values", values)
+    look, depths = training.patches.pipeline.surface, {}
+
+    def look_at_first_depth(depth: Tensor, view: View, probe: Probe) -> Reprojected | None:
+        return look(depths.setdefault(id(view), depth.detach()), view, probe)
+
+    monkeypatch.setattr(training.patches.pipeline, "surface", look_at_first_depth)
 
     def loss() -> Tensor:
         observations, opacity = training.patches.observe(patches)
-        drawn, _ = renderer(observations)
+        drawn = renderer(observations)
         truth = torch.stack([patch.truth for patch in patches])
         return (drawn - truth).square().mean() + 1e-2 * opacity.square().mean()
 
@@ -156,7 +168,7 @@ def test_joint_trains_table_networks_and_renderer(ball_scene: Scene) -> None:
     after = training.result()
     changed = {name for name in before if not torch.equal(before[name], after[name])}
     assert {"field.table", "field.layers.density_out", "field.layers.feature_out"} <= changed
-    assert {"mean.last.weight", "mean.last.bias"} <= changed
+    assert {"mean.leave.weight", "mean.leave.bias"} <= changed
 
 
 @pytest.mark.parametrize("frames", [0, 2])
@@ -255,6 +267,6 @@ def test_without_preceding_frames_a_killed_training_ends_as_if_it_had_never_stop
 def test_a_loss_that_is_no_number_stops_and_names_what_is_not_finite(ball_scene: Scene) -> None:
     training = new_training(ball_scene)
     with torch.no_grad():
-        training.renderer.last.bias[0] = torch.nan
-    with pytest.raises(SteerbenchError, match=r"step 0: not finite: .*renderer\.last\.bias.*rate"):
+        training.renderer.leave.bias[0] = torch.nan
+    with pytest.raises(SteerbenchError, match=r"step 0: not finite: .*renderer\.leave\.bias.*rate"):
         training.advance()

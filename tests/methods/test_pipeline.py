@@ -22,7 +22,14 @@ CAMERA = look_at_the_middle(0.1, 0.3)
 def new_pipeline(options: PipelineOptions = OPTIONS) -> Pipeline:
     torch.manual_seed(0)
     renderer = SpaceToDepth(
-        options.channels, options.frames, options.scale, width=8, blocks=1, history=options.history
+        options.channels,
+        options.frames,
+        options.scale,
+        width=8,
+        blocks=1,
+        init="scratch",
+        history=options.history,
+        surface=options.surface,
     )
     field = misty_field(channels=options.channels)
     return Pipeline(field, shell(), torch.ones(3), renderer, options)

@@ -26,7 +26,7 @@ def new_method(frames: int = 2, rate: float = 1e-3) -> SteerNerf:
         grid=HashGrid(levels=8, log2_table=12, n_min=8, n_max=64),
         training=TrainingOptions(),
         pipeline=PipelineOptions(channels=5, frames=frames, steps=4),
-        renderer=partial(SpaceToDepth, width=8, blocks=1),
+        renderer=partial(SpaceToDepth, width=8, blocks=1, init="scratch"),
         joint=JointOptions(
             patch=4,
             rate=rate,
@@ -83,7 +83,7 @@ def test_reset_forgets(ball_scene: Scene, log: ConsoleLog) -> None:
 def test_sizes_are_those_of_all_that_a_frame_needs(ball_scene: Scene, log: ConsoleLog) -> None:
     method = new_method()
     method.fit(ball_scene, BUDGET, log)
-    renderer = SpaceToDepth(5, 2, 4, width=8, blocks=1)
+    renderer = SpaceToDepth(5, 2, 4, width=8, blocks=1, init="scratch")
     numbers = sum(p.numel() for p in renderer.parameters())
     assert method.sizes()["renderer2d"] == 4 * numbers
     assert set(method.sizes()) == {"hash_table", "field_networks", "occupancy", "renderer2d"}

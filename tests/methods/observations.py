@@ -1,0 +1,133 @@
+"""What a 2D renderer is shown, made up at random, whole and cut."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from methods.renderer2d import Detail, Observation, Renderer2d, Reprojected
+from methods.volume import FeatureFrame
+from tests.methods.conftest import look_at_the_middle
+
+CAMERA = look_at_the_middle(0.0, 0.0)  # no renderer looks at it
+BACKGROUND = torch.tensor([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.5, 0.5])
+ROUNDING = 1e-12
+"""Error of a network in float64: activations of size 1 to 10, sums of up to 2,000 products in
+another order, a few tens of u = 1.1e-16 a layer, a few layers deep."""
+
+POINTS = 20
+
+AnyRenderer = TypeVar("AnyRenderer", bound=Renderer2d)
+
+
+def observe(
+    height: int = 5,
+    width: int = 7,
+    *,
+    channels: int = 6,
+    frames: int = 2,
+    scale: int = 4,
+    matter: Tensor | None = None,
+    history: bool = True,
+    surface: bool = True,
+    phase: tuple[float, float] = (0.0, 0.0),
+    seed: int = 0,
+) -> Observation:
+    """Random features in steps of 1/256 where there is `matter` [h, w], the background elsewhere.
+
+    Preceding points land on a third of the pixels of cells with matter; the preceding picture, and
+    the surface, are known in two thirds of them. Only the order of numbers drawn depends on L: what
+    is there of fewer frames is the same.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    if matter is None:
+        matter = torch.ones(height, width, dtype=torch.bool)
+    background = BACKGROUND[:channels]
+    values = torch.randint(257, (height, width, channels), generator=generator) / 256
+    values = torch.where(matter[..., None], values, background)
+    fine = matter.repeat_interleave(scale, 0).repeat_interleave(scale, 1)
+
+    def land(share: float) -> Reprojected:
+        points = torch.rand(POINTS, channels, generator=generator)
+        index = torch.randint(POINTS, fine.shape, generator=generator, dtype=torch.int32)
+        shown = fine & (torch.rand(fine.shape, generator=generator) < share)
+        return Reprojected(points, torch.where(shown, index, -1))
+
+    valid = torch.rand(height, width, scale**2, generator=generator) < 0.66
+    valid = (valid & matter[..., None]).float()
+    picture = torch.rand(height, width, scale**2, 3, generator=generator) * valid[..., None]
+    at_surface = land(0.66)
+    frame = FeatureFrame(CAMERA, values, torch.where(matter, 1.5, torch.inf), matter.float())
+    return Observation(
+        frame,
+        background,
+        [land(0.33) for _ in range(frames)],
+        Detail(picture, valid) if history else None,
+        at_surface if surface else None,
+        phase,
+    )
+
+
+def spot(height: int, width: int, row: int, column: int) -> Tensor:
+    """Matter of 2 x 3 cells."""
+    matter = torch.zeros(height, width, dtype=torch.bool)
+    matter[row : row + 2, column : column + 3] = True
+    return matter
+
+
+def doubled(observation: Observation) -> Observation:
+    """In float64, for the backend that takes it."""
+    frame, history, surface = observation.frame, observation.history, observation.surface
+    return replace(
+        observation,
+        frame=replace(
+            frame,
+            values=frame.values.double(),
+            depth=frame.depth.double(),
+            alpha=frame.alpha.double(),
+        ),
+        background=observation.background.double(),
+        preceding=[replace(p, values=p.values.double()) for p in observation.preceding],
+        history=history and Detail(history.values.double(), history.valid.double()),
+        surface=surface and replace(surface, values=surface.values.double()),
+        backend="reference",
+    )
+
+
+def cut(observation: Observation, scale: int, rows: slice, columns: slice) -> Observation:
+    """The low-resolution pixels `rows` x `columns` of an observation, and all that is in them."""
+    fine = tuple(slice(scale * part.start, scale * part.stop) for part in (rows, columns))
+    frame, history, surface = observation.frame, observation.history, observation.surface
+    return replace(
+        observation,
+        frame=replace(
+            frame,
+            values=frame.values[rows, columns],
+            depth=frame.depth[rows, columns],
+            alpha=frame.alpha[rows, columns],
+        ),
+        preceding=[replace(p, index=p.index[fine]) for p in observation.preceding],
+        history=history and Detail(history.values[rows, columns], history.valid[rows, columns]),
+        surface=surface and replace(surface, index=surface.index[fine]),
+    )
+
+
+def shaken(renderer: AnyRenderer, seed: int = 0) -> AnyRenderer:
+    """The renderer with no weight that is 0, as after some training."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in renderer.parameters():
+            parameter.add_(0.02 * torch.randn(parameter.shape, generator=generator))
+    return renderer
+
+
+def features_of(observation: Observation) -> Iterator[Tensor]:
+    """All that a field may learn from: of the present, of preceding frames, of the surface."""
+    yield observation.frame.values
+    yield from (frame.values for frame in observation.preceding)
+    if observation.surface is not None:
+        yield observation.surface.values

@@ -1,0 +1,464 @@
+"""The lean 2D renderer: against a dense network, its base, its offers, where it starts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+from torch.nn import functional
+
+from methods import space_to_depth
+from methods.renderer2d import Detail, Observation, Reprojected
+from methods.space_to_depth import LEAK, REACH, SpaceToDepth
+from tests.methods.observations import (
+    BACKGROUND,
+    ROUNDING,
+    cut,
+    doubled,
+    features_of,
+    observe,
+    shaken,
+    spot,
+)
+
+FLOAT32_ERROR = 1e-5
+"""What is 1e-12 in float64 is five hundred million times as much in float32, if all errors went
+the same way; activations of size 1 to 10, a few tens of u = 6e-8."""
+
+
+def new_renderer(
+    channels: int = 6, frames: int = 2, scale: int = 4, *, width: int = 16, blocks: int = 2, **rest
+) -> SpaceToDepth:
+    return SpaceToDepth(channels, frames, scale, width=width, blocks=blocks, init="scratch", **rest)
+
+
+def to_picture(blocks: Tensor, scale: int) -> Tensor:
+    """[h, w, s^2, C] to [h s, w s, C]."""
+    height, width, _, channels = blocks.shape
+    parts = blocks.view(height, width, scale, scale, channels).transpose(1, 2)
+    return parts.reshape(height * scale, width * scale, channels)
+
+
+def shown_by(points: Reprojected) -> tuple[Tensor, Tensor]:
+    """[H, W, K] and [H, W]: what each pixel shows, and whether."""
+    return points.values[points.index.clamp(min=0).long()], (points.index >= 0).to(points.values)
+
+
+def reached(observation: Observation, scale: int) -> Tensor:
+    """[h, w] bool: cells within REACH of something, a cell at a time."""
+    height, width = observation.frame.alpha.shape
+    seen = observation.frame.alpha > 0
+    for frame in observation.preceding:
+        for row, column in (frame.index >= 0).nonzero().tolist():
+            seen[row // scale, column // scale] = True
+    active = torch.zeros(height, width, dtype=torch.bool)
+    for row, column in seen.nonzero().tolist():
+        above, left = max(row - REACH, 0), max(column - REACH, 0)
+        active[above : row + REACH + 1, left : column + REACH + 1] = True
+    return active
+
+
+def enlarged(observation: Observation, scale: int) -> Tensor:
+    """[H, W, 3], at a phase of 0."""
+    rgb = observation.frame.values[..., :3].permute(2, 0, 1)[None]
+    large = functional.interpolate(rgb, scale_factor=scale, mode="bilinear", align_corners=False)
+    return large[0].permute(1, 2, 0)
+
+
+def dense(renderer: SpaceToDepth, observation: Observation) -> Tensor:
+    """The same network on all cells, with dense convolutions of pictures that are masked."""
+    scale, background = renderer.scale, observation.background
+    active = reached(observation, scale)
+    everywhere = active.repeat_interleave(scale, 0).repeat_interleave(scale, 1)[..., None]
+    base = enlarged(observation, scale) - background[:3]
+
+    def told(values: Tensor, known: Tensor) -> Tensor:
+        """[C + 1, H, W]: the colours, whether they are known, the rest."""
+        parts = (values[..., :3], known[..., None], values[..., 3:])
+        return torch.cat(parts, dim=-1).permute(2, 0, 1)
+
+    def in_cells(image: Tensor) -> Tensor:
+        """[s^2 C, h, w], the channels of a pixel beside each other."""
+        channels = functional.pixel_unshuffle(image[None], scale)[0]
+        parts = channels.view(len(image), scale**2, *channels.shape[1:])
+        return parts.transpose(0, 1).flatten(0, 1)
+
+    frame = observation.frame
+    planes = [told(frame.values - background, frame.alpha)]
+    for points in observation.preceding:
+        values, known = shown_by(points)
+        planes.append(in_cells(told((values - background) * known[..., None], known)))
+    offers = []
+    if renderer.history:
+        assert observation.history is not None
+        picture = to_picture(observation.history.values, scale) - background[:3]
+        offers.append((picture, to_picture(observation.history.valid[..., None], scale)[..., 0]))
+    if renderer.surface:
+        assert observation.surface is not None
+        values, known = shown_by(observation.surface)
+        offers.append((values - background, known))
+    for values, known in offers:
+        less = torch.cat((values[..., :3] - base, values[..., 3:]), dim=-1)
+        planes.append(in_cells(told(less * known[..., None], known)))
+
+    def pointwise(x: Tensor, layer: torch.nn.Linear) -> Tensor:
+        return functional.conv2d(x, layer.weight[:, :, None, None], layer.bias)
+
+    hidden = pointwise(torch.cat(planes)[None], renderer.enter) * active
+    for block in renderer.trunk:
+        kernel = block.spread.T.reshape(-1, 1, 3, 3)
+        mixed = functional.conv2d(hidden, kernel, padding=1, groups=len(kernel))
+        grown = functional.leaky_relu(pointwise(mixed, block.grow), LEAK)
+        hidden = (hidden + pointwise(grown, block.shrink)) * active
+    out = pointwise(functional.leaky_relu(hidden, LEAK), renderer.leave)[0]
+    slots = out.view(scale**2, -1, *active.shape).transpose(0, 1).flatten(0, 1)
+    fine = functional.pixel_shuffle(slots[None], scale)[0].permute(1, 2, 0)  # [H, W, 3 + offers]
+    drawn = base + fine[..., :3]
+    for number, (values, known) in enumerate(offers):
+        share = fine[..., 3 + number].sigmoid() * known
+        drawn = drawn + share[..., None] * (values[..., :3] - base)
+    return torch.where(everywhere, drawn, 0) + background[:3]
+
+
+@pytest.mark.parametrize("history", [False, True])
+@pytest.mark.parametrize("surface", [False, True])
+@pytest.mark.parametrize("share", [0.03, 1.0])
+def test_cells_are_drawn_as_by_a_dense_network(history: bool, surface: bool, share: float) -> None:
+    matter = torch.rand(12, 14, generator=torch.Generator().manual_seed(2)) < share
+    observation = observe(12, 14, matter=matter)
+    renderer = shaken(new_renderer(history=history, surface=surface))
+    active = reached(observation, 4)
+    assert (active.float().mean() < 0.9) == (share < 1)
+    want = dense(renderer.double(), doubled(observation))
+    assert (want != 1).any()
+    got = renderer([doubled(observation)])[0]
+    torch.testing.assert_close(got, want, rtol=0, atol=ROUNDING)
+    quick = renderer.float()([observation])[0]
+    torch.testing.assert_close(quick.double(), want, rtol=0, atol=FLOAT32_ERROR)
+
+
+@pytest.mark.parametrize(
+    ("channels", "frames", "scale", "height", "width"),
+    [(6, 2, 4, 5, 7), (3, 0, 4, 3, 4), (8, 1, 3, 5, 3), (6, 3, 2, 1, 5), (4, 1, 1, 9, 6)],
+)
+def test_any_features_frames_and_sizes_are_taken(
+    channels: int, frames: int, scale: int, height: int, width: int
+) -> None:
+    renderer = new_renderer(channels, frames, scale)
+    observations = [
+        observe(height, width, channels=channels, frames=frames, scale=scale, seed=seed)
+        for seed in range(2)
+    ]
+    for batch in (observations[:1], observations):
+        pictures, base = renderer(batch), renderer.base(batch)
+        assert pictures.shape == base.shape == (len(batch), height * scale, width * scale, 3)
+        assert pictures.isfinite().all()
+
+
+def test_frames_that_are_missing_after_a_cold_start_show_nothing() -> None:
+    renderer = shaken(new_renderer())
+    warm = observe()
+    assert warm.history is not None
+    assert warm.surface is not None
+    nothing = replace(
+        warm,
+        preceding=[
+            warm.preceding[0],
+            replace(warm.preceding[1], index=torch.full_like(warm.preceding[1].index, -1)),
+        ],
+        history=Detail(warm.history.values, torch.zeros_like(warm.history.valid)),
+        surface=replace(warm.surface, index=torch.full_like(warm.surface.index, -1)),
+    )
+    missing = replace(warm, preceding=warm.preceding[:1], history=None, surface=None)
+    assert torch.equal(renderer([nothing]), renderer([missing]))
+    cold = renderer([replace(missing, preceding=[])])
+    assert cold.isfinite().all()
+    assert (cold - renderer([missing])).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("history", [False, True])
+def test_gradients_reach_every_parameter_and_the_features_of_all_that_is_shown(
+    history: bool,
+) -> None:
+    renderer = shaken(new_renderer(history=history))
+    observation = observe(history=history)
+    features = [tensor.requires_grad_() for tensor in features_of(observation)]
+    assert len(features) == 4  # of the present, two preceding frames, the surface
+    renderer([observation]).square().sum().backward()
+    for name, parameter in renderer.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.any(), name
+    for tensor in features:
+        assert tensor.grad is not None
+        assert tensor.grad.any(dim=0).all()  # every channel, RGB and others
+
+
+@pytest.mark.parametrize("scale", [1, 2, 4])
+def test_an_untrained_network_without_offers_draws_the_aligned_bilinear_base(scale: int) -> None:
+    renderer = new_renderer(scale=scale)
+    observation = observe(6, 5, scale=scale, history=False, surface=False)
+    base = renderer.base([observation])
+    # Weights and values are multiples of 1/4096: nothing is rounded.
+    assert torch.equal(base[0], enlarged(observation, scale))
+    assert torch.equal(renderer([observation]), base)
+
+
+@pytest.mark.parametrize("phase", [(0.0, 0.0), (1.5, -0.5), (-1.5, 1.5), (2.0, -2.0)])
+def test_the_base_reproduces_a_ramp_at_any_phase(phase: tuple[float, float]) -> None:
+    height, width, scale = 5, 7, 4
+    observation = observe(height, width, phase=phase)
+    across = scale * (torch.arange(width) + 0.5) + phase[0]
+    down = scale * (torch.arange(height) + 0.5) + phase[1]
+    observation.frame.values[..., 0] = across / 64
+    observation.frame.values[..., 1] = down[:, None] / 64
+    observation.frame.values[..., 2] = (2 * down[:, None] - across) / 64
+    base = new_renderer().base([observation])
+    # Within the samples; beyond the outermost ones the border is repeated.
+    u, v = torch.arange(width * scale) + 0.5, torch.arange(height * scale) + 0.5
+    columns = ((u >= across[0]) & (u <= across[-1])).nonzero().squeeze(1)
+    rows = ((v >= down[0]) & (v <= down[-1])).nonzero().squeeze(1)
+    x, y = u[columns][None, :], v[rows][:, None]
+    want = torch.stack((x + 0 * y, y + 0 * x, 2 * y - x), dim=-1) / 64
+    assert torch.equal(base[0][rows][:, columns], want)
+    assert (base[0, :, 0, 0] <= across[1] / 64).all()
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+def test_far_from_anything_the_picture_is_the_background(batch: int) -> None:
+    height, width, scale = 14, 16, 4
+    observation = observe(height, width, matter=spot(height, width, 5, 6))
+    renderer = shaken(new_renderer())
+    pictures, base = renderer([observation] * batch), renderer.base([observation] * batch)
+    near = torch.zeros(height * scale, width * scale, dtype=torch.bool)
+    rows = slice(scale * (5 - REACH), scale * (7 + REACH))
+    columns = slice(scale * (6 - REACH), scale * (9 + REACH))
+    near[rows, columns] = True
+    for picture in (*pictures, *base):
+        assert (picture[~near] == BACKGROUND[:3]).all()
+    assert ((pictures[0] != BACKGROUND[:3]).any(dim=-1) == near).float().mean() > 0.99
+    assert torch.equal(base[0][near], enlarged(observation, scale)[near])
+
+
+def test_a_point_of_a_preceding_frame_alone_is_something() -> None:
+    nothing = torch.zeros(9, 9, dtype=torch.bool)
+    observation = observe(9, 9, frames=1, matter=nothing)
+    renderer = shaken(new_renderer(frames=1))
+    index = observation.preceding[0].index.clone()
+    index[18, 17] = 3  # in cell (4, 4)
+    seen = renderer(
+        [replace(observation, preceding=[replace(observation.preceding[0], index=index)])]
+    )
+    changed = (seen[0] != 1).any(dim=-1).nonzero()
+    assert changed.amin(dim=0).tolist() == [4 * (4 - REACH)] * 2
+    assert changed.amax(dim=0).tolist() == [4 * (5 + REACH) - 1] * 2
+
+
+def test_where_nothing_is_the_picture_is_the_background() -> None:
+    observation = observe(matter=torch.zeros(5, 7, dtype=torch.bool))
+    renderer = shaken(new_renderer())
+    assert (renderer([observation]) == 1).all()
+    assert (renderer.base([observation]) == 1).all()
+    for empty in (observation, replace(observation, preceding=[], history=None, surface=None)):
+        renderer([empty]).sum().backward()  # a patch without matter stops no training
+
+
+@pytest.mark.parametrize(("row", "column"), [(5, 6), (0, 0), (12, 13)])
+def test_a_batch_of_two_is_one_after_the_other(row: int, column: int) -> None:
+    observations = [
+        doubled(observe(14, 16, matter=spot(14, 16, row, column))),
+        doubled(observe(14, 16, matter=spot(14, 16, 3, 3), seed=1)),
+    ]
+    renderer = shaken(new_renderer()).double()
+    for draw in (renderer, renderer.base):
+        alone = torch.cat([draw([observation]) for observation in observations])
+        torch.testing.assert_close(draw(observations), alone, rtol=0, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("blocks", [1, 3])
+def test_a_patch_is_drawn_as_the_whole_frame(blocks: int) -> None:
+    """A cell sees as far as there are blocks, and whether the last one it sees is there depends on
+    what is within REACH of that."""
+    scale, size = 4, 24
+    halo = blocks + REACH
+    matter = torch.rand(size, size, generator=torch.Generator().manual_seed(5)) < 0.03
+    observation = doubled(observe(size, size, matter=matter))
+    renderer = shaken(new_renderer(blocks=blocks)).double()
+    begin, end = 9, 15
+    side = slice(begin - halo, end + halo)
+    patch = cut(observation, scale, side, side)
+    inside = slice(scale * halo, scale * (halo + end - begin))
+    there = slice(scale * begin, scale * end)
+    for draw in (renderer, renderer.base):
+        want = draw([observation])[0, there, there]
+        assert (want != 1).any()
+        got = draw([patch])[0, inside, inside]
+        torch.testing.assert_close(got, want, rtol=0, atol=ROUNDING)
+
+
+def test_a_cell_sees_as_far_as_a_patch_has_to_reach() -> None:
+    """Whether something is `blocks + REACH` away decides whether the cell `blocks` away is there.
+
+    The cells between are there in either case, because of what is one cell to the other side.
+    """
+    assert REACH == 2
+    blocks, size = 2, 12
+    observation = observe(size, size, frames=0, matter=spot(size, size, 6, 5))
+    renderer = shaken(new_renderer(frames=0, blocks=blocks)).double()
+    middle = 0, slice(20, 24), slice(20, 24)  # cell (5, 5)
+    without = renderer([doubled(observation)])[middle]
+    for away, seen in ((blocks + REACH, True), (blocks + REACH + 1, False)):
+        alpha = observation.frame.alpha.clone()
+        alpha[5 - away, 5] = 1e-6
+        changed = replace(observation, frame=replace(observation.frame, alpha=alpha))
+        difference = (renderer([doubled(changed)])[middle] - without).abs().max()
+        assert (difference > ROUNDING) == seen
+
+
+OFFERS = ["history", "surface"]
+
+
+@pytest.mark.parametrize("offer", OFFERS)
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_an_offer_is_blended_in_where_it_is_known(offer: str, share: float) -> None:
+    scale = 4
+    renderer = new_renderer()
+    with torch.no_grad():
+        bias = renderer.leave.bias.view(scale**2, 5)
+        bias[:, 3:] = -200.0
+        bias[:, 3 + OFFERS.index(offer)] = 40.0 if share else -200.0
+    observation = observe()
+    assert observation.history is not None
+    assert observation.surface is not None
+    if offer == "history":
+        picture = to_picture(observation.history.values, scale)
+        valid = to_picture(observation.history.valid[..., None], scale)
+    else:
+        values, known = shown_by(observation.surface)
+        picture, valid = values[..., :3], known[..., None]
+    base = enlarged(observation, scale)
+    want = torch.where(valid > 0, share * picture + (1 - share) * base, base)
+    assert 0.5 < valid.mean() < 0.8
+    # base + (offer - base), less the background and with it again, of size 1.
+    torch.testing.assert_close(renderer([observation])[0], want, rtol=0, atol=6 * 2.0**-24)
+
+
+@pytest.mark.parametrize("offer", OFFERS)
+def test_a_renderer_without_an_offer_ignores_it(offer: str) -> None:
+    renderer = shaken(new_renderer(**{offer: False}))
+    observation = observe()
+    without = replace(observation, **{offer: None})
+    assert torch.equal(renderer([observation]), renderer([without]))
+    other = shaken(new_renderer())
+    assert not torch.equal(other([observation]), other([without]))
+
+
+def test_without_preceding_frames_there_is_no_preceding_picture() -> None:
+    assert not new_renderer(frames=0).history
+    assert new_renderer(frames=0).surface
+
+
+def test_a_point_that_looks_like_the_background_is_not_nothing() -> None:
+    observation = observe(frames=1)
+    renderer = shaken(new_renderer(frames=1))
+    like_background = replace(observation.preceding[0], values=BACKGROUND[:6].expand(20, 6))
+    none = replace(like_background, index=torch.full_like(like_background.index, -1))
+    shown, hidden = (
+        renderer([replace(observation, preceding=[p])]) for p in (like_background, none)
+    )
+    assert (shown - hidden).abs().max() > FLOAT32_ERROR
+
+
+def test_half_precision_changes_little() -> None:
+    renderer = shaken(new_renderer())
+    observation = observe()
+    with torch.autocast("cpu", torch.bfloat16):
+        half = renderer([observation])
+        assert torch.equal(renderer.base([observation]), new_renderer().base([observation]))
+    assert half.dtype == torch.float32
+    # A correction below 1, of sums of which each term is off by 1/256.
+    assert 0 < (half - renderer([observation])).abs().max() < 0.1
+
+
+def generic_renderer() -> SpaceToDepth:
+    """What the weights that come with the package were trained as, but smaller."""
+    return shaken(new_renderer(3, 2, 4), seed=1)
+
+
+def widened(observation: Observation) -> Observation:
+    """Six features, of which the last three are everywhere what they are in the background."""
+
+    def wide(values: Tensor) -> Tensor:
+        return functional.pad(values, (0, 3), value=0.5)
+
+    surface = observation.surface
+    return replace(
+        observation,
+        frame=replace(observation.frame, values=wide(observation.frame.values)),
+        background=wide(observation.background),
+        preceding=[replace(p, values=wide(p.values)) for p in observation.preceding],
+        surface=surface and replace(surface, values=wide(surface.values)),
+    )
+
+
+@pytest.mark.parametrize("channels", [3, 6])
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"frames": 2},
+        {"frames": 0},
+        {"frames": 1},
+        {"frames": 3},
+        {"frames": 2, "history": False},
+        {"frames": 2, "surface": False},
+        {"frames": 0, "surface": False},
+    ],
+    ids=str,
+)
+def test_a_renderer_starts_as_the_generic_one_draws(channels: int, parts: dict) -> None:
+    """Of what both know: the same picture, whatever else it may be shown later."""
+    generic = generic_renderer()
+    renderer = new_renderer(channels, scale=4, **parts)
+    renderer._start_from(generic.state_dict())
+    known = doubled(
+        observe(
+            channels=3,
+            frames=min(parts["frames"], 2),
+            history=renderer.history,
+            surface=renderer.surface,
+        )
+    )
+    want = generic.double()([known])
+    got = renderer.double()([widened(known) if channels == 6 else known])
+    torch.testing.assert_close(got, want, rtol=0, atol=ROUNDING)
+
+
+def test_the_weights_of_what_the_generic_one_never_saw_stay() -> None:
+    renderer = new_renderer(4, 3)
+    before = renderer.enter.weight.detach().clone()
+    renderer._start_from(generic_renderer().state_dict())
+    stayed = (renderer.enter.weight == before).all(dim=0)
+    cell = [False, False, False, False, True]  # the colour, whether it is known, a feature
+    preceding = 2 * 16 * cell + 16 * [True] * 5
+    assert stayed.tolist() == cell + preceding + 16 * cell[:4] + 16 * cell
+
+
+def test_generic_weights_are_read_from_their_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    halves = {name: x.half() for name, x in generic_renderer().state_dict().items()}
+    save_file(halves, tmp_path / "generic.safetensors")
+    monkeypatch.setattr(space_to_depth, "GENERIC", tmp_path / "generic.safetensors")
+    renderer = SpaceToDepth(3, 2, 4, width=16, blocks=2)
+    for name, weight in renderer.state_dict().items():
+        assert torch.equal(weight, halves[name].float()), name
+
+
+@pytest.mark.parametrize("other", [{"width": 8}, {"blocks": 1}, {"blocks": 3}, {"scale": 2}])
+def test_generic_weights_of_another_shape_are_refused(other: dict[str, int]) -> None:
+    renderer = new_renderer(3, **other)
+    with pytest.raises(ValueError, match=r"renderer\.init=generic: .* use renderer\.init=scratch"):
+        renderer._start_from(generic_renderer().state_dict())
