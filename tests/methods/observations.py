@@ -40,8 +40,7 @@ def observe(
     """Random features in steps of 1/256 where there is `matter` [h, w], the background elsewhere.
 
     Preceding points land on a third of the pixels of cells with matter; the preceding picture, and
-    the surface, are known in two thirds of them. Only the order of numbers drawn depends on L: what
-    is there of fewer frames is the same.
+    the surface, are known in two thirds of them.
     """
     generator = torch.Generator().manual_seed(seed)
     if matter is None:

@@ -26,8 +26,8 @@ from tests.methods.observations import (
 )
 
 FLOAT32_ERROR = 1e-5
-"""What is 1e-12 in float64 is five hundred million times as much in float32, if all errors went
-the same way; activations of size 1 to 10, a few tens of u = 6e-8."""
+"""Activations of size 1 to 10, sums of up to 400 products in another order: a few tens of u = 6e-8,
+a few layers deep."""
 
 
 def new_renderer(
