@@ -27,6 +27,9 @@ from methods.range_reduction import RangeReduction, evidence, render_guided
 from methods.renderer2d import Detail, Observation, Renderer2d, Reprojected
 from methods.volume import FeatureFrame, query
 
+LAYER = 4 * STEP
+"""Thickness, in scene units, of what a single sample of the surface stands for."""
+
 
 @dataclass(frozen=True)
 class PipelineOptions:
@@ -136,7 +139,8 @@ class Pipeline:
         return Detail(values, valid)
 
     def surface(self, depth: Tensor, view: View, probe: Probe) -> Reprojected | None:
-        """Features at full resolution, one sample a pixel, where `depth` [h, w] has the surface.
+        """Features and, as the last of [N, K + 1], opacity at full resolution: one sample a pixel,
+        where `depth` [h, w] has the surface, standing for a layer of `LAYER`.
 
         Differentiable in the field, not in its depth.
         """
@@ -153,11 +157,12 @@ class Pipeline:
             points = unproject(view.full, pixels, z)
             probe.count("surface_samples", len(points), fine.numel())
             # The pixels of a cell share the view direction of its middle.
-            _, values = query(self.field, points, cell, cast(view.low).directions)
+            sigma, values = query(self.field, points, cell, cast(view.low).directions)
+            alpha = -torch.expm1(-LAYER * sigma)
             index = torch.full((view.full.height, width), -1, dtype=torch.int32, device=z.device)
             number = torch.arange(len(points), dtype=torch.int32, device=z.device)
             index.view(-1)[row * width + column] = number
-        return Reprojected(values, index)
+        return Reprojected(torch.cat((values, alpha[:, None]), dim=1), index)
 
     def _features(self, view: View, newest: Remembered | None, probe: Probe) -> FeatureFrame:
         """The field at low resolution, looked at where the newest preceding frame says."""

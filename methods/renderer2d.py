@@ -37,8 +37,8 @@ class Observation:
         background: [K] that they are composited on.
         preceding: newest first; fewer than L after a cold start.
         history: the newest preceding picture; None after a cold start, or where it is not used.
-        surface: features of the field where the low-resolution depth has the surface of a pixel;
-            None where they are not used.
+        surface: features of the field where the low-resolution depth has the surface of a pixel,
+            and their opacity as the last of K + 1; None where they are not used.
         phase: of the samples of `frame` against the centres of its pixels, in pixels of the
             picture.
         backend: of the kernels that a renderer calls.

@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from methods.kernels.depthwise import TAPS, depthwise, neighbours_of
 from methods.kernels.splat import gather
-from methods.renderer2d import Detail, Observation, Renderer2d, Reprojected
+from methods.renderer2d import Observation, Renderer2d, Reprojected
 
 REACH = 2
 """Cells around matter that are still drawn: what is further from all that was seen is empty."""
@@ -33,6 +33,8 @@ GENERIC_GROUPS = (
 )
 """What those weights expect: K = 3, L = 2, s = 4."""
 
+GENERIC_SCALE = 4
+
 
 Groups = Sequence[tuple[str, int, int]]
 """Inputs of a cell: name, slots, features a slot. A feature beyond the fourth is no colour."""
@@ -42,9 +44,10 @@ class SpaceToDepth(Renderer2d):
     """A network on cells: the s x s pixels of a low-resolution pixel are channels of its cell.
 
     A picture is the aligned bilinear enlargement of the present RGB (the base), blended pixel by
-    pixel with the other pictures that offer themselves (the preceding one, the one of the surface)
-    where those are known, plus a correction. The shares and the correction come from a trunk of
-    depthwise 3 x 3 convolutions and matrix products, after ConvNeXt (Liu et al. 2022).
+    pixel with the preceding picture where that is known, plus a correction, plus what the features
+    at the surface of each pixel say, read by a matrix that all pixels of a cell share. Shares,
+    corrections and matrices come from a trunk of depthwise 3 x 3 convolutions and matrix products,
+    after ConvNeXt (Liu et al. 2022).
 
     A cell within `REACH` of anything that was seen is active; all others are background, and 0 to
     their neighbours. So nothing is computed for them, and a part of a frame is drawn exactly as in
@@ -80,9 +83,11 @@ class SpaceToDepth(Renderer2d):
         groups = self._input_groups()
         self.enter = nn.Linear(sum(slots * features for _, slots, features in groups), width)
         self.trunk = nn.ModuleList(_Block(width) for _ in range(blocks))
-        self.leave = nn.Linear(width, scale**2 * (3 + self.history + surface))
-        for parameter in self.leave.parameters():
-            nn.init.zeros_(parameter)
+        self.leave = nn.Linear(width, scale**2 * (3 + self.history))
+        self.read = nn.Linear(width, 3 * (channels + 1)) if surface else None
+        for layer in filter(None, (self.leave, self.read)):
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
         if init == "generic":
             self._start_from(load_file(GENERIC))
 
@@ -100,16 +105,28 @@ class SpaceToDepth(Renderer2d):
         """See `Renderer2d`."""
         active, places = self._cells(observations)
         base = self._bases(observations, places)
-        inputs, offers = self._inputs(observations, places, base)
+        inputs = self._seen(observations, places)
+        if self.history:
+            recent, known = self._recent(observations, places, base)
+            inputs.append(_tell(recent, known))
+        if self.surface:
+            detail = self._detail(observations, places, base)  # [N, s^2, K + 1]
+            inputs.append(detail)
         neighbours, backend = neighbours_of(active), observations[0].backend
-        hidden = self.enter(inputs).to(base)  # [N, width]; half precision stays inside the blocks
+        hidden = self.enter(torch.cat([x.flatten(start_dim=1) for x in inputs], dim=1)).to(base)
         for block in self.trunk:
             hidden = block(hidden, neighbours, backend)
-        out = self.leave(functional.leaky_relu(hidden, LEAK)).to(base)
-        out = out.view(-1, self.scale**2, 3 + len(offers))
+        hidden = functional.leaky_relu(hidden, LEAK)
+        out = self.leave(hidden).to(base).view(-1, self.scale**2, 3 + self.history)
         drawn = base + out[..., :3]
-        for (values, valid), share in zip(offers, out[..., 3:].unbind(dim=-1), strict=True):
-            drawn = drawn + (share.sigmoid() * valid)[..., None] * (values - base)
+        if self.history:
+            drawn = drawn + (out[..., 3].sigmoid() * known)[..., None] * recent
+        if self.read is not None:
+            matrix = self.read(hidden).to(base).view(-1, 3, self.channels + 1)
+            # The colour of what is hardly there counts little.
+            weighed = torch.cat((detail[..., :3] * detail[..., 3:4], detail[..., 3:]), dim=-1)
+            with torch.autocast(base.device.type, enabled=False):
+                drawn = drawn + weighed @ matrix.transpose(1, 2)
         return self._paint(active, drawn, observations[0].background[:3])
 
     def base(self, observations: Sequence[Observation]) -> Tensor:
@@ -152,67 +169,61 @@ class SpaceToDepth(Renderer2d):
         with torch.autocast(colours.device.type, enabled=False):
             return weights @ colours[near]
 
-    def _inputs(
-        self, observations: Sequence[Observation], places: Sequence[Tensor], base: Tensor
-    ) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
-        """What every cell is given, [N, inputs]; and the pictures that offer themselves instead of
-        the base, [N, s^2, 3] less the background, with where they are known, [N, s^2]."""
+    def _seen(self, observations: Sequence[Observation], places: Sequence[Tensor]) -> list[Tensor]:
+        """What the present and the preceding frames have in every cell, [N, ...]."""
         pairs = list(zip(observations, places, strict=True))
-        parts = [torch.cat([self._present(o, p) for o, p in pairs])]
-        parts += [
-            torch.cat([self._preceding(o, age, p) for o, p in pairs]) for age in range(self.frames)
-        ]
-        offers = []
-        for offer in self._offers(pairs):
-            values = torch.cat([v for v, _ in offer])  # [N, s^2, 3 or K]
-            valid = torch.cat([v for _, v in offer])  # [N, s^2]
-            offers.append((values[..., :3], valid))
-            told = values - functional.pad(base, (0, values.shape[2] - 3))
-            parts.append(_tell(told * valid[..., None], valid).flatten(start_dim=1))
-        return torch.cat(parts, dim=1), offers
+        parts = []
+        for o, cells in pairs:
+            values = o.frame.values.flatten(0, 1)[cells] - o.background
+            parts.append(_tell(values, o.frame.alpha.flatten()[cells]))
+        seen = [torch.cat(parts)]
+        for age in range(self.frames):
+            parts = []
+            for o, cells in pairs:
+                frame = o.preceding[age] if age < len(o.preceding) else None
+                values, known = self._points(frame, cells, o.background, o.backend)
+                parts.append(_tell(values, known))
+            seen.append(torch.cat(parts))
+        return seen
 
-    def _offers(
-        self, pairs: Sequence[tuple[Observation, Tensor]]
-    ) -> list[list[tuple[Tensor, Tensor]]]:
-        """Of the preceding picture and of the surface, as far as they are used: for each frame
-        the values less the background, [n, s^2, C], and where they are known, [n, s^2]."""
-        offers = []
-        if self.history:
-            offers.append([self._detail(o.history, p, o.background[:3]) for o, p in pairs])
-        if self.surface:
-            offers.append([self._points(o.surface, p, o) for o, p in pairs])
-        return offers
-
-    def _present(self, observation: Observation, places: Tensor) -> Tensor:
-        frame = observation.frame
-        values = frame.values.flatten(0, 1)[places] - observation.background
-        return _tell(values, frame.alpha.flatten()[places])
-
-    def _preceding(self, observation: Observation, age: int, places: Tensor) -> Tensor:
-        """[n, s^2 (K + 1)] what the frame of this age left at the pixels of each cell."""
-        frames = observation.preceding
-        frame = frames[age] if age < len(frames) else None
-        return _tell(*self._points(frame, places, observation)).flatten(start_dim=1)
-
-    def _points(
-        self, points: Reprojected | None, places: Tensor, observation: Observation
+    def _recent(
+        self, observations: Sequence[Observation], places: Sequence[Tensor], base: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """[n, s^2, K] less the background and [n, s^2] of the cells; 0 where there is none."""
-        if points is None:
-            return self._detail(None, places, observation.background)
-        values = points.values - observation.background
-        index = self._blocks(points.index).flatten(0, 1)[places]
-        shown = gather(values, index, backend=observation.backend)
-        return shown, (index >= 0).to(shown.dtype)
+        """The preceding picture less the base, [N, s^2, 3], and where it is known, [N, s^2]."""
+        values, valid = [], []
+        for o, cells in zip(observations, places, strict=True):
+            if o.history is None:
+                valid.append(base.new_zeros(len(cells), self.scale**2))
+                values.append(base.new_zeros(len(cells), self.scale**2, 3))
+            else:
+                valid.append(o.history.valid.flatten(0, 1)[cells])
+                values.append(o.history.values.flatten(0, 1)[cells] - o.background[:3])
+        known = torch.cat(valid)
+        return (torch.cat(values) - base) * known[..., None], known
 
     def _detail(
-        self, detail: Detail | None, places: Tensor, background: Tensor
+        self, observations: Sequence[Observation], places: Sequence[Tensor], base: Tensor
+    ) -> Tensor:
+        """Of the surface of each pixel, [N, s^2, K + 1]: RGB less the base, opacity, the rest."""
+        parts, valid = [], []
+        for o, cells in zip(observations, places, strict=True):
+            background = functional.pad(o.background, (0, 1))
+            values, known = self._points(o.surface, cells, background, o.backend)
+            parts.append(_tell(values[..., :-1], values[..., -1]))
+            valid.append(known)
+        less = functional.pad(base, (0, self.channels - 2))
+        return (torch.cat(parts) - less) * torch.cat(valid)[..., None]
+
+    def _points(
+        self, points: Reprojected | None, cells: Tensor, background: Tensor, backend: str
     ) -> tuple[Tensor, Tensor]:
-        """[n, s^2, C] less the background and [n, s^2] of the cells; 0 where there is none."""
-        if detail is None:
-            blank = background.new_zeros(len(places), self.scale**2)
+        """[n, s^2, C] less the background and [n, s^2] in {0, 1}; 0 where there is no point."""
+        if points is None:
+            blank = background.new_zeros(len(cells), self.scale**2)
             return blank[..., None].expand(-1, -1, len(background)), blank
-        return detail.values.flatten(0, 1)[places] - background, detail.valid.flatten(0, 1)[places]
+        index = self._blocks(points.index).flatten(0, 1)[cells]
+        shown = gather(points.values - background, index, backend=backend)
+        return shown, (index >= 0).to(shown.dtype)
 
     def _blocks(self, index: Tensor) -> Tensor:
         """[H, W] to [h, w, s^2]: the pixels of each cell, row by row."""
@@ -240,28 +251,28 @@ class SpaceToDepth(Renderer2d):
         Raises:
             ValueError: this renderer is of another shape.
         """
-        cell = self.scale**2
-        outputs = [0, 1, 2] + [3] * self.history + [4] * self.surface
-        rows = [5 * slot + i for slot in range(cell) for i in outputs]
+        weights = dict(self.named_parameters())
+        unused = {name for name in generic if name.startswith("read") and not self.surface}
         ours, theirs = _same_columns(self._input_groups(), GENERIC_GROUPS)
-        weights, missing = dict(self.named_parameters()), torch.empty(0)
-        for name in dict.fromkeys((*weights, *generic)):
-            weight, new = weights.get(name, missing), generic.get(name, missing).float()
-            if name.startswith("leave") and len(new) == 5 * cell:
-                new = new[rows]
-            into: Tensor = weight
-            if name == "enter.weight" and self.scale == 4:
-                into, new = weight[:, ours], new[:, theirs]
-            if into.shape != new.shape:
-                raise ValueError(
-                    f"renderer.init=generic: {name} is {list(into.shape)}, the generic weights "
-                    f"have {list(new.shape)}: use renderer.init=scratch, or the scale, width and "
-                    "blocks of the default"
-                )
-            if name == "enter.weight":
-                weight[:, ours] = new
-            else:
-                weight.copy_(new)
+        slots = range(self.scale**2)
+        written = [4 * slot + i for slot in slots for i in range(3 + self.history)]
+        matrix = [(self.channels + 1) * row + column for row in range(3) for column in range(4)]
+        try:
+            if weights.keys() != generic.keys() - unused or self.scale != GENERIC_SCALE:
+                raise KeyError("of other layers")
+            for name, weight in weights.items():
+                new = generic[name].float()
+                if name == "enter.weight":
+                    weight[:, ours] = new[:, theirs]
+                elif name.startswith("read"):
+                    weight[matrix] = new
+                else:
+                    weight.copy_(new[written] if name.startswith("leave") else new)
+        except (KeyError, RuntimeError) as error:
+            raise ValueError(
+                f"renderer.init=generic: this renderer is {error}: use renderer.init=scratch, or "
+                "the scale, width and blocks of the default"
+            ) from error
 
 
 def _same_columns(ours: Groups, theirs: Groups) -> tuple[list[int], list[int]]:
