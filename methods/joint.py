@@ -45,9 +45,9 @@ class JointOptions:
     """
 
     field: Literal["joint", "frozen"] = "joint"
-    through: Through = "all"
+    through: Through = "present"
     rate: float = 1e-3
-    field_rate: float = 1e-3
+    field_rate: float = 3e-3
     final_rate: float = 0.01
     patch: int = 32
     batch: int = 2
@@ -56,7 +56,7 @@ class JointOptions:
     clip: float = 1.0
     average: float = 0.999
     distilled_views: int = 100
-    distilled_share: float = 0.3
+    distilled_share: float = 0.5
     motion: MotionOptions = MotionOptions()
 
     def __post_init__(self) -> None:
