@@ -39,7 +39,7 @@ class JointOptions:
         opacity_entropy: weight of -o ln o of the rays.
         clip: largest norm of the 2D renderer's gradient.
         average: decay of the running mean of the 2D renderer's weights that is used in the end.
-        distilled_views: pictures of the stage 1 field at random views, to learn from as well.
+        distilled_views: most pictures of the stage 1 field at random views, to learn from as well.
         distilled_share: of the patches that are taken from those.
         motion: what precedes a training view.
     """
@@ -66,6 +66,11 @@ class JointOptions:
             raise ValueError(f"expected patch, batch >= 1, clip > 0, average in [0, 1): {self}")
         if not (self.distilled_views >= 0 and 0 <= self.distilled_share <= 1):
             raise ValueError(f"expected distilled_views >= 0 and distilled_share in [0, 1]: {self}")
+
+    def distilled(self, steps: int) -> int:
+        """Distilled views of a training of so many steps: no more than it has a use for."""
+        sequences = self.motion.pool + steps * self.batch / self.motion.uses
+        return min(self.distilled_views, math.ceil(self.distilled_share * sequences))
 
 
 class RendererTraining:

@@ -83,11 +83,9 @@ class SteerNerf:
         key = self.setup.key(scene, budget)
         target = scene.bounds.mean(dim=0)
         distilled: list[TrueView] = []
-        if self.joint.distilled_views and self.joint.distilled_share:
-            folder = log.stage_dir("distilled", {**key, "views": self.joint.distilled_views})
-            distilled = distilled_views(
-                trained, scene, target, self.joint.distilled_views, seed, folder, log
-            )
+        if views := self.joint.distilled(budget.renderer_steps):
+            folder = log.stage_dir("distilled", {**key, "views": views})
+            distilled = distilled_views(trained, scene, target, views, seed, folder, log)
         trained.field.widen(options.channels)
         self.pipeline, training = self._stage2(trained, scene, distilled, target, budget)
         folder = log.stage_dir("steernerf", {**key, **self._key(budget)})

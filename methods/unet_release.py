@@ -97,6 +97,4 @@ class _Residual(nn.Module):
 
 
 def _conv(inputs: int, outputs: int) -> nn.Conv2d:
-    layer = nn.Conv2d(inputs, outputs, 3, padding=1)
-    nn.init.kaiming_normal_(layer.weight)
-    return layer
+    return nn.Conv2d(inputs, outputs, 3, padding=1)
