@@ -43,8 +43,9 @@ class InstantNgp:
         seed: int = 0,
     ) -> None:
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
-        self.stop, self.range, self.name = stop, range, name
-        self.memory = 0 if range is None else 1
+        self.stop, self.name = stop, name
+        self.range = range if range is not None and range.mode != "off" else None
+        self.memory = 0 if self.range is None else 1
         self.reprojection = Reprojection()
         self.preceding: Cloud | None = None
         self.train_s = 0.0

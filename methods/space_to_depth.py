@@ -113,7 +113,7 @@ class SpaceToDepth(Renderer2d):
             detail = self._detail(observations, places, base)  # [N, s^2, K + 1]
             inputs.append(detail)
         neighbours, backend = neighbours_of(active), observations[0].backend
-        hidden = self.enter(torch.cat([x.flatten(start_dim=1) for x in inputs], dim=1)).to(base)
+        hidden = self._enter([x.flatten(start_dim=1) for x in inputs]).to(base)  # [N, width]
         for block in self.trunk:
             hidden = block(hidden, neighbours, backend)
         hidden = functional.leaky_relu(hidden, LEAK)
@@ -128,6 +128,12 @@ class SpaceToDepth(Renderer2d):
             with torch.autocast(base.device.type, enabled=False):
                 drawn = drawn + weighed @ matrix.transpose(1, 2)
         return self._paint(active, drawn, observations[0].background[:3])
+
+    def _enter(self, inputs: Sequence[Tensor]) -> Tensor:
+        """`enter` of all inputs beside each other, without writing them there."""
+        weights = self.enter.weight.split([x.shape[1] for x in inputs], dim=1)
+        parts = [functional.linear(x, w) for x, w in zip(inputs, weights, strict=True)]
+        return sum(parts[1:], parts[0] + self.enter.bias)
 
     def base(self, observations: Sequence[Observation]) -> Tensor:
         """See `Renderer2d`."""
