@@ -125,7 +125,12 @@ def _parser() -> Parser:
     verify.add_argument("path", type=Path, help="folder of one scene or of all of NeRF-Synthetic")
     verify.set_defaults(module="verify", parser=verify)
 
-    generic = commands.add_parser("generic", help="train the 2D renderer that scenes start from")
+    generic = commands.add_parser(
+        "generic",
+        help="train the 2D renderer that scenes start from",
+        description="Fit a field to each of many random scenes, train one 2D renderer on all of "
+        "them, write its weights: what renderer.init=generic starts from.",
+    )
     generic.add_argument("--scenes", type=int, default=8, help="random scenes (default 8)")
     generic.add_argument(
         "--output", type=Path, required=True, metavar="FILE", help="the weights, safetensors"

@@ -40,7 +40,7 @@ def observe(
     """Random features in steps of 1/256 where there is `matter` [h, w], the background elsewhere.
 
     Preceding points land on a third of the pixels of cells with matter; the preceding picture, and
-    the surface, are known in two thirds of them.
+    the surface, are known in two thirds of them. Points of the surface have an opacity, too.
     """
     generator = torch.Generator().manual_seed(seed)
     if matter is None:
@@ -50,8 +50,8 @@ def observe(
     values = torch.where(matter[..., None], values, background)
     fine = matter.repeat_interleave(scale, 0).repeat_interleave(scale, 1)
 
-    def land(share: float) -> Reprojected:
-        points = torch.rand(POINTS, channels, generator=generator)
+    def land(share: float, features: int) -> Reprojected:
+        points = torch.rand(POINTS, features, generator=generator)
         index = torch.randint(POINTS, fine.shape, generator=generator, dtype=torch.int32)
         shown = fine & (torch.rand(fine.shape, generator=generator) < share)
         return Reprojected(points, torch.where(shown, index, -1))
@@ -59,12 +59,12 @@ def observe(
     valid = torch.rand(height, width, scale**2, generator=generator) < 0.66
     valid = (valid & matter[..., None]).float()
     picture = torch.rand(height, width, scale**2, 3, generator=generator) * valid[..., None]
-    at_surface = land(0.66)
+    at_surface = land(0.66, channels + 1)
     frame = FeatureFrame(CAMERA, values, torch.where(matter, 1.5, torch.inf), matter.float())
     return Observation(
         frame,
         background,
-        [land(0.33) for _ in range(frames)],
+        [land(0.33, channels) for _ in range(frames)],
         Detail(picture, valid) if history else None,
         at_surface if surface else None,
         phase,

@@ -98,7 +98,8 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
     )
     options = replace(OPTIONS, through=through)
     with torch.no_grad():
-        renderer.leave.weight.normal_(0, 0.1)
+        for layer in filter(None, (renderer.leave, renderer.read)):
+            layer.weight.normal_(0, 0.1)
     training = new_training(ball_scene, options, pipeline, field.float(), renderer)
     patches = [training.patches.cut(training.patches.pool.draw()) for _ in range(16)]
     after_two = [patch for patch in patches if len(patch.shown) == 2]
@@ -168,7 +169,7 @@ def test_joint_trains_table_networks_and_renderer(ball_scene: Scene) -> None:
     after = training.result()
     changed = {name for name in before if not torch.equal(before[name], after[name])}
     assert {"field.table", "field.layers.density_out", "field.layers.feature_out"} <= changed
-    assert {"mean.leave.weight", "mean.leave.bias"} <= changed
+    assert {"mean.leave.weight", "mean.leave.bias", "mean.read.weight"} <= changed
 
 
 @pytest.mark.parametrize("frames", [0, 2])

@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bench.cameras import cast, project
+from bench.cameras import cast, pixel_grid, project, unproject
 from bench.types import NullProbe
 from methods.buffer import RenderingBuffer
-from methods.pipeline import Pipeline, PipelineOptions, View, sample_phase
+from methods.pipeline import LAYER, Pipeline, PipelineOptions, View, sample_phase
 from methods.space_to_depth import SpaceToDepth
 from tests.methods.conftest import look_at_the_middle
 from tests.methods.test_joint import misty_field, shell
@@ -99,6 +99,37 @@ def test_the_preceding_picture_of_a_still_camera_is_where_it_was() -> None:
     assert known.float().mean() > 0.2
     # Positions are off by some ulps of 32 pixels, and neighbours differ by at most 1.
     assert (history.values - blocks)[known].abs().max() < 1e-4
+
+
+def test_the_opacity_at_the_surface_is_that_of_a_layer_of_the_field() -> None:
+    """At a pixel's own point, z in front of it; pixels without a depth have no point."""
+    pipeline, view, z = new_pipeline(), View.of(CAMERA, OPTIONS, 0), 1.5
+    pipeline.field = misty_field("fp32")
+    depth = torch.full((8, 8), torch.inf)
+    depth[3:5, 2:5] = z
+    surface = pipeline.surface(depth, view, NullProbe())
+    assert surface is not None
+    near = torch.zeros(32, 32, dtype=torch.bool)
+    near[10:22, 6:22] = True  # half a cell around: depths are enlarged bilinearly
+    assert torch.equal(surface.index >= 0, near)
+    index = surface.index[near].long()
+    assert torch.equal(index.sort().values, torch.arange(int(near.sum())))
+    pixels = pixel_grid(32, 32, near.device)[near.flatten()]
+    points = unproject(view.full, pixels, torch.full((len(pixels),), z))
+    opacity = 1 - torch.exp(-LAYER * pipeline.field.density(points)[0])
+    assert opacity.std() > 1e-3  # not the same everywhere
+    assert surface.values.shape == (len(pixels), OPTIONS.channels + 1)
+    torch.testing.assert_close(surface.values[index, -1], opacity, rtol=1e-5, atol=1e-6)
+
+
+def test_where_no_pixel_has_a_depth_there_is_no_surface() -> None:
+    view = View.of(CAMERA, OPTIONS, 0)
+    surface = new_pipeline().surface(torch.full((8, 8), torch.inf), view, NullProbe())
+    assert surface is not None
+    assert surface.values.shape == (0, OPTIONS.channels + 1)
+    assert (surface.index == -1).all()
+    unused = new_pipeline(replace(OPTIONS, surface=False))
+    assert unused.surface(torch.ones(8, 8), view, NullProbe()) is None
 
 
 @pytest.mark.parametrize("wrong", [{"channels": 2}, {"frames": -1}, {"scale": 0}, {"steps": 0.0}])

@@ -1,4 +1,4 @@
-"""The lean 2D renderer: against a dense network, its base, its offers, where it starts."""
+"""The lean 2D renderer: against a dense network, its base, what it reads, where it starts."""
 
 from __future__ import annotations
 
@@ -92,18 +92,17 @@ def dense(renderer: SpaceToDepth, observation: Observation) -> Tensor:
     for points in observation.preceding:
         values, known = shown_by(points)
         planes.append(in_cells(told((values - background) * known[..., None], known)))
-    offers = []
     if renderer.history:
         assert observation.history is not None
-        picture = to_picture(observation.history.values, scale) - background[:3]
-        offers.append((picture, to_picture(observation.history.valid[..., None], scale)[..., 0]))
+        known = to_picture(observation.history.valid[..., None], scale)
+        recent = (to_picture(observation.history.values, scale) - background[:3] - base) * known
+        planes.append(in_cells(told(recent, known[..., 0])))
     if renderer.surface:
         assert observation.surface is not None
         values, known = shown_by(observation.surface)
-        offers.append((values - background, known))
-    for values, known in offers:
-        less = torch.cat((values[..., :3] - base, values[..., 3:]), dim=-1)
-        planes.append(in_cells(told(less * known[..., None], known)))
+        less, opacity = (values[..., :-1] - background) * known[..., None], values[..., -1] * known
+        less[..., :3] -= base * known[..., None]
+        planes.append(in_cells(told(less, opacity)))
 
     def pointwise(x: Tensor, layer: torch.nn.Linear) -> Tensor:
         return functional.conv2d(x, layer.weight[:, :, None, None], layer.bias)
@@ -114,13 +113,19 @@ def dense(renderer: SpaceToDepth, observation: Observation) -> Tensor:
         mixed = functional.conv2d(hidden, kernel, padding=1, groups=len(kernel))
         grown = functional.leaky_relu(pointwise(mixed, block.grow), LEAK)
         hidden = (hidden + pointwise(grown, block.shrink)) * active
-    out = pointwise(functional.leaky_relu(hidden, LEAK), renderer.leave)[0]
-    slots = out.view(scale**2, -1, *active.shape).transpose(0, 1).flatten(0, 1)
-    fine = functional.pixel_shuffle(slots[None], scale)[0].permute(1, 2, 0)  # [H, W, 3 + offers]
+    hidden = functional.leaky_relu(hidden, LEAK)
+    slots = pointwise(hidden, renderer.leave)[0].view(scale**2, -1, *active.shape)
+    fine = functional.pixel_shuffle(slots.transpose(0, 1).flatten(0, 1)[None], scale)
+    fine = fine[0].permute(1, 2, 0)  # [H, W, 3 or 4]
     drawn = base + fine[..., :3]
-    for number, (values, known) in enumerate(offers):
-        share = fine[..., 3 + number].sigmoid() * known
-        drawn = drawn + share[..., None] * (values[..., :3] - base)
+    if renderer.history:
+        drawn = drawn + fine[..., 3:].sigmoid() * recent
+    if renderer.read is not None:
+        matrices = pointwise(hidden, renderer.read)[0]
+        matrices = matrices.repeat_interleave(scale, 1).repeat_interleave(scale, 2)
+        colours, opacity = less[..., :3] * opacity[..., None], opacity[..., None]
+        read = torch.cat((colours, opacity, less[..., 3:]), dim=-1).permute(2, 0, 1)
+        drawn = drawn + (matrices.view(3, *read.shape) * read).sum(dim=1).permute(1, 2, 0)
     return torch.where(everywhere, drawn, 0) + background[:3]
 
 
@@ -198,9 +203,14 @@ def test_gradients_reach_every_parameter_and_the_features_of_all_that_is_shown(
 
 
 @pytest.mark.parametrize("scale", [1, 2, 4])
-def test_an_untrained_network_without_offers_draws_the_aligned_bilinear_base(scale: int) -> None:
-    renderer = new_renderer(scale=scale)
-    observation = observe(6, 5, scale=scale, history=False, surface=False)
+@pytest.mark.parametrize("history", [False, True])
+def test_an_untrained_network_draws_the_aligned_bilinear_base(history: bool, scale: int) -> None:
+    """Whatever is at the surface. A preceding picture is blended in half and half, so there is
+    none, or none that the network looks at."""
+    renderer = new_renderer(scale=scale, history=not history)
+    observation = observe(6, 5, scale=scale, history=history)
+    assert observation.surface is not None
+    assert (observation.surface.index >= 0).any()
     base = renderer.base([observation])
     # Weights and values are multiples of 1/4096: nothing is rounded.
     assert torch.equal(base[0], enlarged(observation, scale))
@@ -318,39 +328,65 @@ def test_a_cell_sees_as_far_as_a_patch_has_to_reach() -> None:
         assert (difference > ROUNDING) == seen
 
 
-OFFERS = ["history", "surface"]
+BLENDING = 6 * 2.0**-24
+"""Error of base + share (other - base), less the background and with it again, of size 1."""
 
 
-@pytest.mark.parametrize("offer", OFFERS)
 @pytest.mark.parametrize("share", [0.0, 1.0])
-def test_an_offer_is_blended_in_where_it_is_known(offer: str, share: float) -> None:
+def test_the_preceding_picture_is_blended_in_where_it_is_known(share: float) -> None:
     scale = 4
     renderer = new_renderer()
     with torch.no_grad():
-        bias = renderer.leave.bias.view(scale**2, 5)
-        bias[:, 3:] = -200.0
-        bias[:, 3 + OFFERS.index(offer)] = 40.0 if share else -200.0
+        renderer.leave.bias.view(scale**2, 4)[:, 3] = 40.0 if share else -200.0
     observation = observe()
     assert observation.history is not None
-    assert observation.surface is not None
-    if offer == "history":
-        picture = to_picture(observation.history.values, scale)
-        valid = to_picture(observation.history.valid[..., None], scale)
-    else:
-        values, known = shown_by(observation.surface)
-        picture, valid = values[..., :3], known[..., None]
+    picture = to_picture(observation.history.values, scale)
+    valid = to_picture(observation.history.valid[..., None], scale)
     base = enlarged(observation, scale)
     want = torch.where(valid > 0, share * picture + (1 - share) * base, base)
     assert 0.5 < valid.mean() < 0.8
-    # base + (offer - base), less the background and with it again, of size 1.
-    torch.testing.assert_close(renderer([observation])[0], want, rtol=0, atol=6 * 2.0**-24)
+    torch.testing.assert_close(renderer([observation])[0], want, rtol=0, atol=BLENDING)
 
 
-@pytest.mark.parametrize("offer", OFFERS)
-def test_a_renderer_without_an_offer_ignores_it(offer: str) -> None:
-    renderer = shaken(new_renderer(**{offer: False}))
+def test_the_surface_covers_the_base_as_far_as_it_is_opaque() -> None:
+    """Where the matrix of every cell is the identity on RGB and looks at nothing else."""
+    scale, channels = 4, 6
+    renderer = new_renderer(channels, history=False)
+    assert renderer.read is not None
+    with torch.no_grad():
+        renderer.read.bias.view(3, channels + 1)[:, :3] = torch.eye(3)
+    observation = observe(channels=channels)
+    assert observation.surface is not None
+    values, known = shown_by(observation.surface)
+    base = enlarged(observation, scale)
+    covered = base + values[..., -1:] * (values[..., :3] - base)
+    want = torch.where(known[..., None] > 0, covered, base)
+    assert 0.5 < known.mean() < 0.8
+    torch.testing.assert_close(renderer([observation])[0], want, rtol=0, atol=BLENDING)
+
+
+@pytest.mark.parametrize("column", [3, 4, 6])
+def test_a_matrix_reads_opacity_and_other_features_less_the_background(column: int) -> None:
+    """Of K = 6: the opacity is behind the colours, then come the others."""
+    scale, channels = 4, 6
+    renderer = new_renderer(channels, history=False)
+    assert renderer.read is not None
+    with torch.no_grad():
+        renderer.read.bias.view(3, channels + 1)[1, column] = 1.0  # into green
+    observation = observe(channels=channels)
+    assert observation.surface is not None
+    values, known = shown_by(observation.surface)
+    read = values[..., -1] if column == 3 else values[..., column - 1] - BACKGROUND[column - 1]
+    want = enlarged(observation, scale)
+    want[..., 1] += known * read
+    torch.testing.assert_close(renderer([observation])[0], want, rtol=0, atol=BLENDING)
+
+
+@pytest.mark.parametrize("part", ["history", "surface"])
+def test_a_renderer_without_a_part_ignores_what_is_known_of_it(part: str) -> None:
+    renderer = shaken(new_renderer(**{part: False}))
     observation = observe()
-    without = replace(observation, **{offer: None})
+    without = replace(observation, **{part: None})
     assert torch.equal(renderer([observation]), renderer([without]))
     other = shaken(new_renderer())
     assert not torch.equal(other([observation]), other([without]))
@@ -395,12 +431,15 @@ def widened(observation: Observation) -> Observation:
         return functional.pad(values, (0, 3), value=0.5)
 
     surface = observation.surface
+    if surface is not None:  # whose last value, the opacity, stays the last
+        colours, opacity = surface.values[:, :-1], surface.values[:, -1:]
+        surface = replace(surface, values=torch.cat((wide(colours), opacity), dim=1))
     return replace(
         observation,
         frame=replace(observation.frame, values=wide(observation.frame.values)),
         background=wide(observation.background),
         preceding=[replace(p, values=wide(p.values)) for p in observation.preceding],
-        surface=surface and replace(surface, values=wide(surface.values)),
+        surface=surface,
     )
 
 
@@ -438,12 +477,18 @@ def test_a_renderer_starts_as_the_generic_one_draws(channels: int, parts: dict) 
 
 def test_the_weights_of_what_the_generic_one_never_saw_stay() -> None:
     renderer = new_renderer(4, 3)
-    before = renderer.enter.weight.detach().clone()
+    before = {name: x.clone() for name, x in renderer.state_dict().items()}
     renderer._start_from(generic_renderer().state_dict())
-    stayed = (renderer.enter.weight == before).all(dim=0)
+    stayed = {name: x == before[name] for name, x in renderer.state_dict().items()}
     cell = [False, False, False, False, True]  # the colour, whether it is known, a feature
     preceding = 2 * 16 * cell + 16 * [True] * 5
-    assert stayed.tolist() == cell + preceding + 16 * cell[:4] + 16 * cell
+    assert (
+        stayed["enter.weight"].all(dim=0).tolist() == cell + preceding + 16 * cell[:4] + 16 * cell
+    )
+    assert stayed["read.weight"].all(dim=1).tolist() == 3 * cell
+    assert stayed["read.bias"].tolist() == 3 * cell
+    for name in ("leave.weight", "leave.bias", "trunk.0.spread"):
+        assert not stayed[name].any(), name
 
 
 def test_generic_weights_are_read_from_their_file(

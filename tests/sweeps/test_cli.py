@@ -18,7 +18,7 @@ from bench.results import COLUMNS
 def test_without_a_command_the_help_shows_every_command_and_examples(steerbench):
     outcome = steerbench()
     assert outcome.status == 0
-    for word in ("run", "list", "results", "kernels", "scenes", "+experiment=demo"):
+    for word in ("run", "list", "results", "kernels", "scenes", "generic", "+experiment=demo"):
         assert word in outcome.out
 
 

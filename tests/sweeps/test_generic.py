@@ -1,0 +1,86 @@
+"""`steerbench generic`: which scenes, which settings, and what is refused before any training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from omegaconf import DictConfig
+
+
+class Recorder:
+    """In place of all that is built: notes the settings, trains nothing."""
+
+    def __init__(self) -> None:
+        self.config: dict[str, dict] = {}
+        self.variants: list[int] = []
+        self.fitted: list[tuple] = []
+
+    def build(self, config: DictConfig, group: str, **extra: object) -> object:
+        self.config[group] = dict(config[group])
+        if group != "scene":
+            return self if group == "method" else group
+        self.variants.append(config.scene.variant)
+        return f"medley {config.scene.variant}"
+
+    def fit_generic(self, scenes: list[str], budget: str, output: Path, log: object) -> None:
+        self.fitted.append((scenes, budget, output))
+
+
+@pytest.fixture
+def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
+    """What `steerbench generic` has built and trained."""
+    recorder = Recorder()
+    monkeypatch.setattr("sweeps.generic.build", recorder.build)
+    return recorder
+
+
+def test_help_says_what_it_does_and_what_can_be_set(steerbench):
+    outcome = steerbench("generic", "--help")
+    assert outcome.status == 0
+    words = " ".join(outcome.out.split())
+    for text in (
+        "train one 2D renderer on all",
+        "--scenes",
+        "--output FILE",
+        "settings as of `steerbench run`",
+    ):
+        assert text in words
+
+
+def test_one_renderer_is_trained_on_as_many_scenes_as_asked_for(steerbench, recorder):
+    outcome = steerbench("generic", "--scenes", "3", "--output", "w.safetensors", "seed=5")
+    assert outcome.status == 0
+    scenes = ["medley 0", "medley 1", "medley 2"]
+    assert recorder.fitted == [(scenes, "budget", Path("w.safetensors"))]
+    assert recorder.config["budget"]["name"] == "generic"
+    method = recorder.config["method"]
+    assert method["name"] == "steernerf"
+    assert method["seed"] == 5
+    assert method["pipeline"]["channels"] == 3
+    assert method["renderer"]["init"] == "scratch"
+
+
+@pytest.mark.parametrize("scenes", ["0", "-2"])
+def test_no_scenes_at_all_are_refused(steerbench, recorder, scenes):
+    outcome = steerbench("generic", "--scenes", scenes, "--output", "w.safetensors")
+    assert outcome.status == 2
+    assert f"--scenes: expected 1 or more, got {scenes}" in outcome.err
+    assert recorder.config == {}
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["--scenes", "two", "--output", "w"], "--scenes: invalid int value: 'two'"),
+        (["--scenes", "2"], "the following arguments are required: --output"),
+        (["--output", "w", "method.joint.rat=1"], "Did you mean method.joint.rate?"),
+        (["--output", "w", "budget=genric"], "Did you mean generic?"),
+        (["--output", "w", "seed"], "cannot read 'seed'"),
+    ],
+)
+def test_a_wrong_word_is_answered_with_what_is_expected(steerbench, recorder, argv, message):
+    outcome = steerbench("generic", *argv)
+    assert outcome.status == 2
+    assert message in outcome.err
+    assert recorder.fitted == []
