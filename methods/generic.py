@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from bench.results import explained
 from bench.types import Budget, Log, Scene, SteerbenchError
 from methods import checkpoint, loop
 from methods.joint import JointOptions, RendererTraining
@@ -39,12 +40,13 @@ def train_generic(
     joint: JointOptions,
     scenes: Sequence[Scene],
     budget: Budget,
+    folder: Path,
     output: Path,
     log: Log,
 ) -> None:
     """Fit a field to each of `scenes`, train one renderer on all of them, write it to `output`.
 
-    The fields are frozen: what a renderer learns from them must hold for fields it never saw.
+    What was trained stays in `folder`, and is found there again. The fields are frozen: what a renderer learns from them must hold for fields it never saw.
 
     Raises:
         SteerbenchError: K is not 3. Other features mean something else in every scene.
@@ -54,6 +56,8 @@ def train_generic(
             f"a generic renderer knows colours alone: expected channels (K) of 3, got "
             f"{options.channels}"
         )
+    with explained(output.parent):
+        output.parent.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(setup.seed)
     generator = torch.Generator().manual_seed(setup.seed)
     renderer = make_renderer(options.channels, options.frames, options.scale)
@@ -74,15 +78,12 @@ def train_generic(
     training = RendererTraining(renderer, patches, joint, budget.renderer_steps, generator)
     for pipeline in pipelines:
         pipeline.renderer = training.mean
-    key = {
-        "scenes": [setup.key(scene, budget) for scene in scenes],
-        "pipeline": asdict(options),
-        "joint": asdict(joint),
-        "steps": budget.renderer_steps,
-    }
-    finished = log.stage_dir("generic", key) / "generic.safetensors"
-    loop.train(training, finished, "training a generic renderer", log)
+    finished = folder / "generic.safetensors"
+    if finished.exists():
+        training.restore_result(checkpoint.read(finished)[0])
+        log.info(f"trained renderer found: {finished}")
+    else:
+        loop.train(training, finished, "training a generic renderer", log)
     halves = {name: x.half() for name, x in training.mean.state_dict().items()}
-    output.parent.mkdir(parents=True, exist_ok=True)
     checkpoint.write(output, halves, {"scenes": len(scenes), "steps": training.steps})
     log.info(f"written: {output}")

@@ -265,7 +265,7 @@ class SpaceToDepth(Renderer2d):
         matrix = [(self.channels + 1) * row + column for row in range(3) for column in range(4)]
         try:
             if weights.keys() != generic.keys() - unused or self.scale != GENERIC_SCALE:
-                raise KeyError("of other layers")
+                raise RuntimeError("other layers, or another scale")
             for name, weight in weights.items():
                 new = generic[name].float()
                 if name == "enter.weight":
@@ -274,10 +274,10 @@ class SpaceToDepth(Renderer2d):
                     weight[matrix] = new
                 else:
                     weight.copy_(new[written] if name.startswith("leave") else new)
-        except (KeyError, RuntimeError) as error:
+        except RuntimeError as error:
             raise ValueError(
-                f"renderer.init=generic: this renderer is {error}: use renderer.init=scratch, or "
-                "the scale, width and blocks of the default"
+                "renderer.init=generic: the weights are those of a renderer of the default scale, "
+                f"width and blocks ({error}): use renderer.init=scratch"
             ) from error
 
 

@@ -103,8 +103,18 @@ class SteerNerf:
 
     def fit_generic(self, scenes: Sequence[Scene], budget: Budget, output: Path, log: Log) -> None:
         """Train a 2D renderer on many scenes, for others to start from; see `methods.generic`."""
+        fields = [self.setup.key(scene, budget) for scene in scenes]
+        folder = log.stage_dir("generic", {"fields": fields, **self._key(budget)})
         train_generic(
-            self.setup, self.options, self.make_renderer, self.joint, scenes, budget, output, log
+            self.setup,
+            self.options,
+            self.make_renderer,
+            self.joint,
+            scenes,
+            budget,
+            folder,
+            output,
+            log,
         )
 
     def reset(self) -> None:

@@ -35,7 +35,9 @@ def train(
     scenes: list[Scene], output: Path, log: Log, options: PipelineOptions = OPTIONS
 ) -> dict[str, Tensor]:
     make = partial(RENDERER, init="scratch")
-    train_generic(SETUP, options, make, JOINT, scenes, BUDGET, output, log)
+    folder = output.with_suffix(".stage")
+    folder.mkdir(parents=True)
+    train_generic(SETUP, options, make, JOINT, scenes, BUDGET, folder, output, log)
     return load_file(output)
 
 
