@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from bench.motion import viewing_target
 from bench.results import explained
 from bench.types import Budget, Log, Scene, SteerbenchError
 from methods import checkpoint, loop
@@ -17,7 +18,7 @@ from methods.patches import Patches, PatchSource
 from methods.pipeline import Pipeline, PipelineOptions
 from methods.pretrained import Setup, pretrain
 from methods.renderer2d import Observation, Renderer2d
-from methods.sequences import SequencePool, TrueView
+from methods.sequences import SequencePool, true_views
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,8 @@ def train_generic(
 ) -> None:
     """Fit a field to each of `scenes`, train one renderer on all of them, write it to `output`.
 
-    What was trained stays in `folder`, and is found there again. The fields are frozen: what a renderer learns from them must hold for fields it never saw.
+    What was trained stays in `folder`, and is found there again. The fields are frozen: what a
+    renderer learns from them must hold for fields it never saw.
 
     Raises:
         SteerbenchError: K is not 3. Other features mean something else in every scene.
@@ -68,9 +70,7 @@ def train_generic(
         trained = pretrain(setup, scene, budget, log)
         background = scene.background.to(setup.device)
         pipeline = Pipeline(trained.field, trained.occupancy, background, renderer, options)
-        split = scene.splits["train"]
-        views = [TrueView(c, p) for c, p in zip(split.cameras, split.images, strict=True)]
-        target = scene.bounds.mean(dim=0)
+        views, target = true_views(scene), viewing_target(scene)
         pool = SequencePool(pipeline, views, [], 0.0, target, joint.motion, generator)
         sources.append(PatchSource(pipeline, pool, joint.patch, False, "present", generator))
         pipelines.append(pipeline)

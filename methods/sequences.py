@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from bench.motion import preceding
-from bench.types import Camera, NullProbe
+from bench.types import Camera, NullProbe, Scene
 from methods.buffer import RenderingBuffer
 from methods.pipeline import Pipeline, View
 
@@ -25,6 +25,12 @@ class TrueView:
 
     camera: Camera
     picture: Tensor
+
+
+def true_views(scene: Scene) -> list[TrueView]:
+    """The training pictures of `scene`."""
+    split = scene.splits["train"]
+    return [TrueView(c, p) for c, p in zip(split.cameras, split.images, strict=True)]
 
 
 @dataclass

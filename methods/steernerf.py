@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from bench.motion import viewing_target
 from bench.provenance import ROOT, digest
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods import checkpoint, loop
@@ -23,7 +24,7 @@ from methods.patches import PatchSource
 from methods.pipeline import Pipeline, PipelineOptions
 from methods.pretrained import Pretrained, Setup, pretrain
 from methods.renderer2d import Renderer2d
-from methods.sequences import SequencePool, TrueView
+from methods.sequences import SequencePool, TrueView, true_views
 from methods.train import TrainingOptions
 
 SOURCES = (
@@ -81,7 +82,7 @@ class SteerNerf:
         seed, options = self.setup.seed, self.options
         trained = pretrain(self.setup, scene, budget, log)
         key = self.setup.key(scene, budget)
-        target = scene.bounds.mean(dim=0)
+        target = viewing_target(scene)
         distilled: list[TrueView] = []
         if views := self.joint.distilled(budget.renderer_steps):
             folder = log.stage_dir("distilled", {**key, "views": views})
@@ -150,12 +151,16 @@ class SteerNerf:
         pipeline = Pipeline(
             trained.field, trained.occupancy, scene.background.to(device), renderer, shape
         )
-        split = scene.splits["train"]
-        real = [TrueView(c, p) for c, p in zip(split.cameras, split.images, strict=True)]
         generator = torch.Generator().manual_seed(self.setup.seed)
         options = self.joint
         pool = SequencePool(
-            pipeline, real, distilled, options.distilled_share, target, options.motion, generator
+            pipeline,
+            true_views(scene),
+            distilled,
+            options.distilled_share,
+            target,
+            options.motion,
+            generator,
         )
         learning = options.field == "joint"
         patches = PatchSource(pipeline, pool, options.patch, learning, options.through, generator)
