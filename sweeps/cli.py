@@ -28,7 +28,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "20000")
 
 EXAMPLES = """\
 examples
-  steerbench run +experiment=demo              train on an embedded scene, write a page about it
+  steerbench run +experiment=demo              three methods on an embedded scene, and a page
   steerbench run scene=blender scene.path=DIR  the same on your copy of a NeRF-Synthetic scene
   steerbench run --help                        all choices and settings
   steerbench list                              what there is, and what of it is usable here
