@@ -12,6 +12,7 @@ import pytest
 from bench.results import Store
 
 SMALL = ["scene.width=64", "scene.train=6", "scene.test=3", "budget=tiny", "budget.frames=0"]
+METHODS = ("ngp", "steernerf", "steernerf_paper")
 MEASURED_ANEW = ("frame_ms", "fps", "stage_ms", "train_s", "peak_bytes")
 """Metrics that differ from one run to the next on any machine."""
 
@@ -41,29 +42,37 @@ def first(tmp_path_factory: pytest.TempPathFactory, lpips_weights: Path) -> tupl
     return folder, done.stdout
 
 
-def test_the_table_has_quality_time_by_stage_and_memory(first: tuple[Path, str]) -> None:
+def test_the_table_compares_quality_time_and_memory_of_the_methods(
+    first: tuple[Path, str],
+) -> None:
     printed = first[1]
-    for word in ("PSNR", "SSIM", "LPIPS alex", "LPIPS vgg", "FPS", "march", "field", "composite"):
+    for word in ("PSNR", "SSIM", "LPIPS alex", "LPIPS vgg", "FPS", "model, MB", *METHODS):
         assert word in printed
-    for word in ("hash_table", "field_networks", "occupancy", "peak"):
-        assert word.replace("_", " ") in printed.replace("_", " ")
 
 
-def test_the_report_shows_three_frames_with_their_errors(first: tuple[Path, str]) -> None:
+def test_the_report_shows_three_frames_of_every_method_with_their_errors(
+    first: tuple[Path, str],
+) -> None:
     folder = first[0] / "outputs" / "demo"
     text = (folder / "report.md").read_text()
     pictures = list((folder / "pictures").glob("frames-*.png"))
     assert len(pictures) == 3
     for picture in pictures:
+        assert f"![Ground truth, {', '.join(METHODS)}; a detail of each; error maps](" in text
         assert picture.name in text
-    assert "Error maps show the absolute error" in text
+    for stage in ("march", "field", "depth_reprojection", "feature_reprojection", "renderer2d"):
+        assert stage in text
 
 
-def test_the_stages_add_up_to_the_frame(first: tuple[Path, str]) -> None:
-    values = rows(first[0]).set_index("metric")["value"]
-    stages = values[values.index.str.startswith("stage_ms.")]
-    assert stages.sum() == pytest.approx(values["frame_ms"], rel=1e-9)
-    assert set(stages.index) >= {"stage_ms.march", "stage_ms.field", "stage_ms.composite"}
+def test_the_stages_of_every_method_add_up_to_its_frame(first: tuple[Path, str]) -> None:
+    table = rows(first[0])
+    parts = table.groupby(["method", "phase"])
+    assert {method for method, _ in parts.groups} == set(METHODS)
+    for _, part in parts:
+        values = part.set_index("metric")["value"]
+        stages = values[values.index.str.startswith("stage_ms.")]
+        if "frame_ms" in values:
+            assert stages.sum() == pytest.approx(values["frame_ms"], rel=1e-9)
 
 
 def test_the_same_seed_gives_the_same_rows(
@@ -71,7 +80,9 @@ def test_the_same_seed_gives_the_same_rows(
 ) -> None:
     assert demo(tmp_path, lpips_weights).returncode == 0
     kept = [
-        table[~table["metric"].str.startswith(MEASURED_ANEW)].reset_index(drop=True)
+        table[~table["metric"].str.startswith(MEASURED_ANEW)]
+        .sort_values(["method", "phase", "metric"])
+        .reset_index(drop=True)
         for table in (rows(first[0]), rows(tmp_path))
     ]
     assert {"psnr", "ssim", "lpips_alex", "lpips_vgg", "work.samples"} <= set(kept[0]["metric"])
@@ -87,10 +98,12 @@ def test_what_was_measured_is_not_measured_again(
     pd.testing.assert_frame_equal(rows(first[0]), before, check_exact=True)
 
 
-def test_training_is_shared_by_runs_that_differ_in_rendering_only(
+def test_training_is_shared_by_methods_and_by_runs_that_differ_in_rendering_only(
     first: tuple[Path, str], lpips_weights: Path
 ) -> None:
-    done = demo(first[0], lpips_weights, "method.stop=1e-2")
+    done = demo(first[0], lpips_weights, "method=ngp", "method.stop=1e-2")
     assert "trained field found" in done.stderr
-    assert len(rows(first[0])["run"].unique()) == 2
-    assert len(list((first[0] / "outputs" / "stages").iterdir())) == 1
+    assert len(rows(first[0])["run"].unique()) == len(METHODS) + 1
+    stages = [path.name.split("-")[0] for path in (first[0] / "outputs" / "stages").iterdir()]
+    assert stages.count("field") == 1
+    assert stages.count("steernerf") == 2
