@@ -19,8 +19,14 @@ VERSIONS_OF = ("torch", "numpy", "numba", "scikit-image", "lpips")
 
 @functools.cache
 def code_digest() -> str:
-    """SHA-256 of every source file that can change a row: paths and bytes of bench and methods."""
-    return digest(path for name in MEASURING_PACKAGES for path in (ROOT / name).rglob("*.py"))
+    """SHA-256 of what can change a row: paths and bytes of all sources and weights of bench and
+    methods."""
+    return digest(
+        path
+        for name in MEASURING_PACKAGES
+        for kind in ("*.py", "*.safetensors")
+        for path in (ROOT / name).rglob(kind)
+    )
 
 
 def digest(sources: Iterable[Path]) -> str:

@@ -25,6 +25,7 @@ from methods.pipeline import Pipeline, PipelineOptions
 from methods.pretrained import Pretrained, Setup, pretrain
 from methods.renderer2d import Renderer2d
 from methods.sequences import SequencePool, TrueView, true_views
+from methods.space_to_depth import GENERIC
 from methods.train import TrainingOptions
 
 SOURCES = (
@@ -186,9 +187,10 @@ class SteerNerf:
 
 @cache
 def stage2_digest() -> str:
-    """SHA-256 of the sources that decide what stage 2 results in, beside those of stage 1."""
+    """SHA-256 of the sources and weights that decide what stage 2 results in, beside those of
+    stage 1."""
     sources = [ROOT / "methods" / f"{name}.py" for name in SOURCES]
     for kernel in ("depthwise", "splat", "warp"):
         folder = ROOT / "methods" / "kernels" / kernel
         sources += [path for path in folder.glob("*.py") if path.stem != "cases"]
-    return digest([*sources, ROOT / "bench" / "motion.py"])
+    return digest([*sources, GENERIC, ROOT / "bench" / "motion.py"])
