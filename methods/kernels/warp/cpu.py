@@ -26,18 +26,14 @@ def warp(
             f"backend 'cpu' warps float32, got picture {picture.dtype}, depth {depth.dtype}: "
             "use backend='reference'"
         )
-    height, width = depth.shape
-    values = torch.zeros(height, width, scale**2, picture.shape[2])
-    valid = torch.zeros(height, width, scale**2)
+    fine = enlarge(depth, scale, phase)
+    values, valid = torch.zeros(*fine.shape, picture.shape[2]), torch.zeros(fine.shape)
     _warp(
         picture.contiguous().numpy(),
-        depth.contiguous().numpy(),
+        fine.numpy(),
         matrix.float().numpy(),
         offset.float().numpy(),
         scale,
-        f32(phase[0]),
-        f32(phase[1]),
-        f32(TOLERANCE),
         values.numpy(),
         valid.numpy(),
     )
@@ -82,23 +78,16 @@ def _enlarge(depth, scale, phase_u, phase_v, tolerance, out):
 
 
 @njit(cache=True, parallel=True)
-def _warp(picture, depth, matrix, offset, scale, phase_u, phase_v, tolerance, values, valid):
-    height, width = depth.shape
+def _warp(picture, fine, matrix, offset, scale, values, valid):
+    height, width, subs = fine.shape
     for row in prange(height):
         for column in range(width):
-            if not _anything_near(depth, row, column):
-                continue
-            for sub in range(scale * scale):
-                v = f32(row * scale + sub // scale) + f32(0.5)
-                u = f32(column * scale + sub % scale) + f32(0.5)
-                z = _depth_at(
-                    depth,
-                    (v - phase_v) / f32(scale) - f32(0.5),
-                    (u - phase_u) / f32(scale) - f32(0.5),
-                    tolerance,
-                )
+            for sub in range(subs):
+                z = fine[row, column, sub]
                 if not z < math.inf:
                     continue
+                v = f32(row * scale + sub // scale) + f32(0.5)
+                u = f32(column * scale + sub % scale) + f32(0.5)
                 w = z * (matrix[2, 0] * u + matrix[2, 1] * v + matrix[2, 2]) + offset[2]
                 if not w > 0:
                     continue
