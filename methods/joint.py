@@ -14,7 +14,7 @@ from torch.optim.swa_utils import AveragedModel
 
 from methods import checkpoint, loop
 from methods.fields import HashField
-from methods.kernels.adam import AdamState, sparse_adam_
+from methods.optimise import FieldOptimiser, step_at
 from methods.patches import Patches, Through
 from methods.renderer2d import Renderer2d
 from methods.sequences import MotionOptions
@@ -131,7 +131,7 @@ class RendererTraining:
 
     def _update(self, share: float) -> None:
         """Change the weights, at `share` of the learning rates of the beginning."""
-        _step(self.optimiser, share * self.options.rate)
+        step_at(self.optimiser, share * self.options.rate)
         self._averaged.update_parameters(self.renderer)
 
     @torch.no_grad()
@@ -156,7 +156,7 @@ class RendererTraining:
         """Renderer, optimiser, random numbers. The sequences are not in it: going on, they are
         rendered anew."""
         tensors = {f"renderer.{name}": x for name, x in self.renderer.state_dict().items()}
-        tensors |= checkpoint.optimiser_tensors(self.optimiser, "adam.renderer.")
+        tensors |= checkpoint.optimiser_tensors(self.optimiser, "renderer_adam.")
         return tensors | {
             "generator": self.generator.get_state(),
             "averaged": self._averaged.n_averaged,
@@ -166,7 +166,7 @@ class RendererTraining:
         """See `loop.Training`."""
         self.restore_result(tensors)
         self.renderer.load_state_dict(checkpoint.part(tensors, "renderer."))
-        checkpoint.restore_optimiser(self.optimiser, tensors, "adam.renderer.")
+        checkpoint.restore_optimiser(self.optimiser, tensors, "renderer_adam.")
         self.generator.set_state(tensors["generator"].cpu())
         self._averaged.n_averaged.copy_(tensors["averaged"])
 
@@ -189,15 +189,7 @@ class JointTraining(RendererTraining):
     ) -> None:
         super().__init__(renderer, patches, options, steps, generator)
         self.field = field
-        self.table_state = AdamState.like(field.table.detach())
-        self.networks = torch.optim.Adam(
-            list(field.layers.values()),
-            lr=options.field_rate,
-            betas=(0.9, 0.99),
-            eps=1e-15,
-            fused=True,
-        )
-        field.grad_buffer = torch.zeros_like(field.table)
+        self.field_optimiser = FieldOptimiser(field, fused=True)
 
     def _regularisation(self, opacity: Tensor) -> Tensor | float:
         if not len(opacity):
@@ -207,17 +199,7 @@ class JointTraining(RendererTraining):
 
     def _update(self, share: float) -> None:
         super()._update(share)
-        rate = share * self.options.field_rate
-        _step(self.networks, rate)
-        assert self.field.grad_buffer is not None
-        sparse_adam_(
-            self.field.table.detach(),
-            self.field.grad_buffer,
-            self.table_state,
-            rate,
-            packed=self.field.packed,
-            backend=self.field.backend,
-        )
+        self.field_optimiser.step(share * self.options.field_rate)
 
     def watched(self) -> dict[str, Tensor]:
         """Table, networks, 2D renderer."""
@@ -237,23 +219,9 @@ class JointTraining(RendererTraining):
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         """The optimisers of the field, too."""
         tensors, figures = super().state()
-        adam = self.table_state
-        tensors |= checkpoint.optimiser_tensors(self.networks, "adam.networks.")
-        tensors |= {"first": adam.first, "second": adam.second, "steps": adam.steps}
-        return tensors, figures
+        return tensors | self.field_optimiser.tensors(), figures
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
         """See `loop.Training`."""
         super().restore(tensors, figures)
-        checkpoint.restore_optimiser(self.networks, tensors, "adam.networks.")
-        device = self.field.table.device
-        self.table_state = AdamState(
-            *(tensors[name].to(device) for name in ("first", "second", "steps"))
-        )
-
-
-def _step(optimiser: torch.optim.Optimizer, rate: float) -> None:
-    for group in optimiser.param_groups:
-        group["lr"] = rate
-    optimiser.step()
-    optimiser.zero_grad(set_to_none=True)
+        self.field_optimiser.restore(tensors)

@@ -16,14 +16,14 @@ from bench.provenance import ROOT, digest
 from bench.types import Budget, Log, Rays, Scene, Split, SteerbenchError
 from methods import checkpoint, loop
 from methods.fields import HashField
-from methods.kernels.adam import AdamState, sparse_adam_
 from methods.occupancy import EVERY, MIN_VIEWS, DensityGrid, learnable_cells
+from methods.optimise import FieldOptimiser
 from methods.volume import render_batch
 
 KERNELS = ("adam", "composite", "encode", "march", "spherical")
 """Kernels that a training of a field runs through."""
 
-SOURCES = ("checkpoint", "fields", "loop", "occupancy", "train", "volume")
+SOURCES = ("checkpoint", "fields", "loop", "occupancy", "optimise", "train", "volume")
 """Modules beside this one that decide what a training of a field results in."""
 
 MIN_RAYS = 64
@@ -127,11 +127,7 @@ class FieldTraining:
         self.rays = 1024
         self.seconds = 0.0
         self.generator = torch.Generator(device).manual_seed(seed)
-        self.table_state = AdamState.like(field.table.detach())
-        self.network_optimiser = torch.optim.Adam(
-            list(field.layers.values()), lr=options.rate, betas=(0.9, 0.99), eps=1e-15
-        )
-        field.grad_buffer = torch.zeros_like(field.table)
+        self.optimiser = FieldOptimiser(field)
 
     def learning_rate(self) -> float:
         """Cosine from `rate` to `rate * final_rate`: monotone."""
@@ -178,20 +174,7 @@ class FieldTraining:
         return rgb * alpha + background * (1 - alpha), background
 
     def _update(self) -> None:
-        rate = self.learning_rate()
-        for group in self.network_optimiser.param_groups:
-            group["lr"] = rate
-        self.network_optimiser.step()
-        self.network_optimiser.zero_grad(set_to_none=True)
-        assert self.field.grad_buffer is not None
-        sparse_adam_(
-            self.field.table.detach(),
-            self.field.grad_buffer,
-            self.table_state,
-            rate,
-            packed=self.field.packed,
-            backend=self.field.backend,
-        )
+        self.optimiser.step(self.learning_rate())
 
     def _fit_batch(self, samples: int) -> None:
         """Choose the next number of rays so that it brings about `budget.samples` samples."""
@@ -200,7 +183,7 @@ class FieldTraining:
 
     def watched(self) -> dict[str, Tensor]:
         """Table and its moments, networks."""
-        moments = self.table_state.first + self.table_state.second
+        moments = self.optimiser.table_moments
         return {"table": self.field.table, "table moments": moments, **self.field.layers}
 
     def result(self) -> dict[str, Tensor]:
@@ -210,21 +193,15 @@ class FieldTraining:
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         """Optimisers, random numbers, size of the batch."""
-        adam = self.table_state
-        tensors = {"adam.first": adam.first, "adam.second": adam.second, "adam.steps": adam.steps}
-        tensors |= checkpoint.optimiser_tensors(self.network_optimiser, "network.")
-        return tensors | {"generator": self.generator.get_state()}, {"rays": self.rays}
+        generator = {"generator": self.generator.get_state()}
+        return self.optimiser.tensors() | generator, {"rays": self.rays}
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
         """See `loop.Training`."""
         restore_field(self.field, self.grid, tensors)
         self.rays = int(figures["rays"])
-        device = self.field.table.device
-        self.table_state = AdamState(
-            *(tensors[f"adam.{name}"].to(device) for name in ("first", "second", "steps"))
-        )
+        self.optimiser.restore(tensors)
         self.generator.set_state(tensors["generator"].cpu())
-        checkpoint.restore_optimiser(self.network_optimiser, tensors, "network.")
 
 
 @cache
