@@ -15,7 +15,7 @@ from methods.buffer import Cloud
 from methods.kernels.composite import Pixels
 from methods.occupancy import STEP
 from methods.pipeline import Pipeline, View
-from methods.renderer2d import Observation, Reprojected
+from methods.renderer2d import Observation, Points
 from methods.sequences import Sequence, SequencePool
 from methods.volume import FeatureFrame, rays_at_matter, render_batch
 
@@ -146,16 +146,9 @@ class PatchSource:
         for age, pixels in enumerate(preceding):
             shine = (1 - pixels.alpha)[:, None] * self.pipeline.background
             values[age] = values[age].index_copy(0, patch.shown[age], pixels.values + shine)
+        points = [Points(v, i) for v, i in zip(values, patch.indices, strict=True)]
         newest = frames[0] if frames else None
-        return Observation(
-            frame,
-            self.pipeline.background,
-            [Reprojected(v, i) for v, i in zip(values, patch.indices, strict=True)],
-            self.pipeline.history(newest, frame.depth, patch.view),
-            self.pipeline.surface(frame.depth, patch.view, NullProbe()),
-            patch.view.phase,
-            self.pipeline.backend,
-        )
+        return self.pipeline.observe(frame, points, newest, patch.view, NullProbe())
 
     def _spread(self, patch: Patch, pixels: Pixels) -> FeatureFrame:
         """All pixels of the patch, from those that were rendered."""

@@ -8,6 +8,7 @@ renderer2d            the 2D neural renderer                                 Eq.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -24,7 +25,7 @@ from methods.kernels.march import Occupancy
 from methods.kernels.warp import enlarge, warp
 from methods.occupancy import STEP
 from methods.range_reduction import RangeReduction, evidence, render_guided
-from methods.renderer2d import Detail, Observation, Renderer2d, Reprojected
+from methods.renderer2d import Detail, Observation, Points, Renderer2d, cells_at_matter
 from methods.volume import FeatureFrame, query
 
 LAYER = 4 * STEP
@@ -102,67 +103,77 @@ class Pipeline:
         newest = buffer.frames[0] if buffer.frames else None
         features = self._features(view, newest, probe)
         with probe.stage("feature_reprojection"):
-            observation = Observation(
-                features,
-                self.background,
-                [self.reproject(frame.cloud, view) for frame in buffer.frames],
-                self.history(newest, features.depth, view),
-                self.surface(features.depth, view, probe),
-                view.phase,
-                self.backend,
-            )
+            preceding = [self.reproject(frame.cloud, view) for frame in buffer.frames]
+            observation = self.observe(features, preceding, newest, view, probe)
         with probe.stage("renderer2d"):
-            picture = self.renderer([observation])[0].clamp(0, 1)
+            picture = self.renderer([observation])[0].clamp_(0, 1)
         with probe.stage("finish"):
             cloud = Cloud.of(features, self.options.reprojection)
             buffer.push(Remembered(cloud, view.full, picture))
             return _finish(camera, picture, features, self.options.scale)
 
-    def reproject(self, cloud: Cloud, view: View) -> Reprojected:
+    def reproject(self, cloud: Cloud, view: View) -> Points:
         """The features of a preceding frame where the present picture sees them."""
         index, _ = cloud.land(view.full, self.options.reprojection, self.backend)
-        return Reprojected(cloud.values, index)
+        return Points(cloud.values, index)
 
-    def history(self, newest: Remembered | None, depth: Tensor, view: View) -> Detail | None:
-        """The preceding picture where the present one, of low-resolution `depth`, sees it."""
+    def observe(
+        self,
+        frame: FeatureFrame,
+        preceding: Sequence[Points],
+        newest: Remembered | None,
+        view: View,
+        probe: Probe,
+    ) -> Observation:
+        """All that is known of the picture of `view` from its `frame` and the `preceding` ones."""
+        options = self.options
+        cells = cells_at_matter(frame.alpha, preceding)
+        history = surface = None
+        if options.history or options.surface:
+            depth = enlarge(
+                frame.depth.detach(), cells, options.scale, view.phase, backend=self.backend
+            )
+            history = self.history(newest, depth, cells, view)
+            surface = self.surface(depth, cells, view, probe)
+        return Observation(
+            frame, self.background, preceding, cells, history, surface, view.phase, self.backend
+        )
+
+    def history(
+        self, newest: Remembered | None, depth: Tensor, cells: Tensor, view: View
+    ) -> Detail | None:
+        """The preceding picture where the present one, of `depth` [N, s^2] in `cells`, sees it."""
         if newest is None or not self.options.history:
             return None
+        scale, backend = self.options.scale, self.backend
         values, valid = warp(
-            newest.picture,
-            newest.camera,
-            depth,
-            view.full,
-            self.options.scale,
-            view.phase,
-            backend=self.backend,
+            newest.picture, newest.camera, depth, cells, view.full, scale, backend=backend
         )
         return Detail(values, valid)
 
-    def surface(self, depth: Tensor, view: View, probe: Probe) -> Reprojected | None:
-        """Features and, as the last of [N, K + 1], opacity at full resolution: one sample a pixel,
-        where `depth` [h, w] has the surface, standing for a layer of `LAYER`.
+    def surface(self, depth: Tensor, cells: Tensor, view: View, probe: Probe) -> Points | None:
+        """Features and, as the last of [P, K + 1], opacity of a sample at every pixel of `cells`
+        whose `depth` [N, s^2] is finite, standing for a layer of `LAYER`.
 
         Differentiable in the field, not in its depth.
         """
         if not self.options.surface:
             return None
         with probe.stage("surface"):
-            scale, width = self.options.scale, view.full.width
-            fine = enlarge(depth.detach(), scale, view.phase, backend=self.backend)
-            row, column, sub = fine.isfinite().nonzero().unbind(dim=1)
-            z = fine[row, column, sub]
-            cell = row * view.low.width + column
+            scale, known = self.options.scale, depth.isfinite()
+            place, sub = known.nonzero().unbind(dim=1)
+            cell = cells[place]
+            row, column = cell // view.low.width, cell % view.low.width
             row, column = row * scale + sub // scale, column * scale + sub % scale
             pixels = torch.stack((column, row), dim=1) + 0.5
-            points = unproject(view.full, pixels, z)
-            probe.count("surface_samples", len(points), fine.numel())
+            points = unproject(view.full, pixels, depth[known])
+            probe.count("surface_samples", len(points), view.full.width * view.full.height)
             # The pixels of a cell share the view direction of its middle.
             sigma, values = query(self.field, points, cell, cast(view.low).directions)
             alpha = -torch.expm1(-LAYER * sigma)
-            index = torch.full((view.full.height, width), -1, dtype=torch.int32, device=z.device)
-            number = torch.arange(len(points), dtype=torch.int32, device=z.device)
-            index.view(-1)[row * width + column] = number
-        return Reprojected(torch.cat((values, alpha[:, None]), dim=1), index)
+            index = torch.full(known.shape, -1, dtype=torch.int32, device=depth.device)
+            index[known] = torch.arange(len(points), dtype=torch.int32, device=depth.device)
+        return Points(torch.cat((values, alpha[:, None]), dim=1), index)
 
     def _features(self, view: View, newest: Remembered | None, probe: Probe) -> FeatureFrame:
         """The field at low resolution, looked at where the newest preceding frame says."""

@@ -13,10 +13,7 @@ from torch.nn import functional
 
 from methods.kernels.depthwise import TAPS, depthwise, neighbours_of
 from methods.kernels.splat import gather
-from methods.renderer2d import Observation, Renderer2d, Reprojected
-
-REACH = 2
-"""Cells around matter that are still drawn: what is further from all that was seen is empty."""
+from methods.renderer2d import Observation, Renderer2d
 
 LEAK = 0.1
 """Slope of the activations below 0. With a slope of 0 the sparse inputs kill a trunk for good."""
@@ -49,9 +46,9 @@ class SpaceToDepth(Renderer2d):
     corrections and matrices come from a trunk of depthwise 3 x 3 convolutions and matrix products,
     after ConvNeXt (Liu et al. 2022).
 
-    A cell within `REACH` of anything that was seen is active; all others are background, and 0 to
-    their neighbours. So nothing is computed for them, and a part of a frame is drawn exactly as in
-    the whole. All features enter less their background, so that nothing is 0.
+    Only the cells of an observation are drawn; all others are background, and 0 to their
+    neighbours. So nothing is computed for them, and a part of a frame is drawn exactly as in the
+    whole. All features enter less their background, so that nothing is 0.
 
     Args:
         channels: K.
@@ -103,25 +100,21 @@ class SpaceToDepth(Renderer2d):
 
     def forward(self, observations: Sequence[Observation]) -> Tensor:
         """See `Renderer2d`."""
-        active, places = self._cells(observations)
-        base = self._bases(observations, places)
-        inputs = self._seen(observations, places)
-        if self.history:
-            recent, known = self._recent(observations, places, base)
-            inputs.append(_tell(recent, known))
-        if self.surface:
-            detail = self._detail(observations, places, base)  # [N, s^2, K + 1]
-            inputs.append(detail)
+        parts = [self._inputs(o) for o in observations]
+        base, *groups = (_join(some) for some in zip(*parts, strict=True))
+        active = _active(observations)
         neighbours, backend = neighbours_of(active), observations[0].backend
-        hidden = self._enter([x.flatten(start_dim=1) for x in inputs]).to(base)  # [N, width]
+        hidden = self._enter([x.flatten(start_dim=1) for x in groups]).to(base)  # [N, width]
         for block in self.trunk:
             hidden = block(hidden, neighbours, backend)
         hidden = functional.leaky_relu(hidden, LEAK)
         out = self.leave(hidden).to(base).view(-1, self.scale**2, 3 + self.history)
         drawn = base + out[..., :3]
         if self.history:
-            drawn = drawn + (out[..., 3].sigmoid() * known)[..., None] * recent
+            recent, known = groups[1 + self.frames].split((3, 1), dim=-1)
+            drawn = drawn + (out[..., 3:].sigmoid() * known) * recent
         if self.read is not None:
+            detail = groups[-1]
             matrix = self.read(hidden).to(base).view(-1, 3, self.channels + 1)
             # The colour of what is hardly there counts little.
             weighed = torch.cat((detail[..., :3] * detail[..., 3:4], detail[..., 3:]), dim=-1)
@@ -137,105 +130,74 @@ class SpaceToDepth(Renderer2d):
 
     def base(self, observations: Sequence[Observation]) -> Tensor:
         """See `Renderer2d`."""
-        active, places = self._cells(observations)
-        base = self._bases(observations, places)
-        return self._paint(active, base, observations[0].background[:3])
+        base = _join([self._base(o) for o in observations])
+        return self._paint(_active(observations), base, observations[0].background[:3])
 
-    def _cells(self, observations: Sequence[Observation]) -> tuple[Tensor, list[Tensor]]:
-        """Which cells are active, [B, h, w]; and for each picture where they are, row by row."""
-        active = torch.stack([self._active(o) for o in observations])
-        return active, [cells.flatten().nonzero().squeeze(1) for cells in active]
+    def _inputs(self, observation: Observation) -> list[Tensor]:
+        """The base [N, s^2, 3], then what each group of `_input_groups` has in every cell,
+        [N, slots, features]."""
+        o, base = observation, self._base(observation)
+        values = o.frame.values.flatten(0, 1)[o.cells] - o.background
+        inputs = [base, _tell(values, o.frame.alpha.flatten()[o.cells, None])[:, None]]
+        inputs += [self._preceding(o, age) for age in range(self.frames)]
+        if self.history:
+            inputs.append(self._recent(o, base))
+        if self.surface:
+            inputs.append(self._detail(o, base))
+        return inputs
 
-    def _bases(self, observations: Sequence[Observation], places: Sequence[Tensor]) -> Tensor:
-        return torch.cat([self._base(o, p) for o, p in zip(observations, places, strict=True)])
-
-    def _active(self, observation: Observation) -> Tensor:
-        """[h, w] bool: where there is anything within `REACH`."""
-        some = (observation.frame.alpha > 0).float()
-        for frame in observation.preceding:
-            shown = (frame.index >= 0).float()
-            some = some + functional.max_pool2d(shown[None], self.scale)[0]
-        size = 2 * REACH + 1
-        return functional.max_pool2d(some[None], size, stride=1, padding=REACH)[0] > 0
-
-    def _base(self, observation: Observation, places: Tensor) -> Tensor:
-        """RGB of the frame less the background, enlarged bilinearly: [n, s^2, 3].
+    def _base(self, observation: Observation) -> Tensor:
+        """RGB of the frame less the background, enlarged bilinearly: [N, s^2, 3].
 
         A pixel lies between its 3 x 3 nearest samples, whatever the phase; beyond the frame its
         border goes on.
         """
+        cells = observation.cells
         height, width, _ = observation.frame.values.shape
-        around = torch.arange(-1, 2, device=places.device)
-        row = (places // width)[:, None] + around.repeat_interleave(3)
-        column = (places % width)[:, None] + around.repeat(3)
-        near = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)  # [n, 9]
+        around = torch.arange(-1, 2, device=cells.device)
+        row = (cells // width)[:, None] + around.repeat_interleave(3)
+        column = (cells % width)[:, None] + around.repeat(3)
+        near = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)  # [N, 9]
         colours = (observation.frame.values[..., :3] - observation.background[:3]).flatten(0, 1)
         across, down = (_tent(self.scale, shift).to(colours) for shift in observation.phase)
         weights = (down[:, None, :, None] * across[None, :, None, :]).reshape(-1, TAPS)  # [s^2, 9]
         with torch.autocast(colours.device.type, enabled=False):
             return weights @ colours[near]
 
-    def _seen(self, observations: Sequence[Observation], places: Sequence[Tensor]) -> list[Tensor]:
-        """What the present and the preceding frames have in every cell, [N, ...]."""
-        pairs = list(zip(observations, places, strict=True))
-        parts = []
-        for o, cells in pairs:
-            values = o.frame.values.flatten(0, 1)[cells] - o.background
-            parts.append(_tell(values, o.frame.alpha.flatten()[cells]))
-        seen = [torch.cat(parts)]
-        for age in range(self.frames):
-            parts = []
-            for o, cells in pairs:
-                frame = o.preceding[age] if age < len(o.preceding) else None
-                values, known = self._points(frame, cells, o.background, o.backend)
-                parts.append(_tell(values, known))
-            seen.append(torch.cat(parts))
-        return seen
+    def _preceding(self, observation: Observation, age: int) -> Tensor:
+        """What a preceding frame has, [N, s^2, K + 1]: less the background, and whether."""
+        background = observation.background
+        if age >= len(observation.preceding):
+            shape = len(observation.cells), self.scale**2, self.channels + 1
+            return background.new_zeros(shape)
+        points = observation.preceding[age]
+        less = points.values - background
+        index = self._blocks(points.index, observation.cells)
+        return gather(_tell(less, torch.ones_like(less[:, :1])), index, backend=observation.backend)
 
-    def _recent(
-        self, observations: Sequence[Observation], places: Sequence[Tensor], base: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """The preceding picture less the base, [N, s^2, 3], and where it is known, [N, s^2]."""
-        values, valid = [], []
-        for o, cells in zip(observations, places, strict=True):
-            if o.history is None:
-                valid.append(base.new_zeros(len(cells), self.scale**2))
-                values.append(base.new_zeros(len(cells), self.scale**2, 3))
-            else:
-                valid.append(o.history.valid.flatten(0, 1)[cells])
-                values.append(o.history.values.flatten(0, 1)[cells] - o.background[:3])
-        known = torch.cat(valid)
-        return (torch.cat(values) - base) * known[..., None], known
+    def _recent(self, observation: Observation, base: Tensor) -> Tensor:
+        """The preceding picture less the base, and where it is known, [N, s^2, 4]."""
+        recent = observation.history
+        if recent is None:
+            return base.new_zeros(*base.shape[:2], 4)
+        known = recent.valid[..., None]
+        return torch.cat(((recent.values - observation.background[:3] - base) * known, known), -1)
 
-    def _detail(
-        self, observations: Sequence[Observation], places: Sequence[Tensor], base: Tensor
-    ) -> Tensor:
+    def _detail(self, observation: Observation, base: Tensor) -> Tensor:
         """Of the surface of each pixel, [N, s^2, K + 1]: RGB less the base, opacity, the rest."""
-        parts, valid = [], []
-        for o, cells in zip(observations, places, strict=True):
-            background = functional.pad(o.background, (0, 1))
-            values, known = self._points(o.surface, cells, background, o.backend)
-            parts.append(_tell(values[..., :-1], values[..., -1]))
-            valid.append(known)
-        less = functional.pad(base, (0, self.channels - 2))
-        return (torch.cat(parts) - less) * torch.cat(valid)[..., None]
-
-    def _points(
-        self, points: Reprojected | None, cells: Tensor, background: Tensor, backend: str
-    ) -> tuple[Tensor, Tensor]:
-        """[n, s^2, C] less the background and [n, s^2] in {0, 1}; 0 where there is no point."""
+        points = observation.surface
         if points is None:
-            blank = background.new_zeros(len(cells), self.scale**2)
-            return blank[..., None].expand(-1, -1, len(background)), blank
-        index = self._blocks(points.index).flatten(0, 1)[cells]
-        shown = gather(points.values - background, index, backend=backend)
-        return shown, (index >= 0).to(shown.dtype)
+            return base.new_zeros(*base.shape[:2], self.channels + 1)
+        told = _tell(points.values[:, :-1] - observation.background, points.values[:, -1:])
+        shown = gather(told, points.index, backend=observation.backend)
+        less = base * (points.index >= 0)[..., None]
+        return shown - functional.pad(less, (0, self.channels - 2))
 
-    def _blocks(self, index: Tensor) -> Tensor:
-        """[H, W] to [h, w, s^2]: the pixels of each cell, row by row."""
-        height, width = index.shape
-        blocks = index.view(height // self.scale, self.scale, width // self.scale, self.scale)
-        return blocks.transpose(1, 2).flatten(start_dim=2)
+    def _blocks(self, index: Tensor, cells: Tensor) -> Tensor:
+        """Of [H, W] the pixels of each of `cells`, row by row: [N, s^2]."""
+        side, width = self.scale, index.shape[1] // self.scale
+        blocks = index.view(-1, side, width, side).transpose(1, 2)
+        return blocks[cells // width, cells % width].flatten(start_dim=1)
 
     def _paint(self, active: Tensor, cells: Tensor, background: Tensor) -> Tensor:
         """Pictures [B, H, W, 3] of `cells` [N, s^2, 3], less the background, on the background."""
@@ -312,9 +274,24 @@ class _Block(nn.Module):
         return x + self.shrink(functional.leaky_relu(self.grow(mixed), LEAK))
 
 
+def _active(observations: Sequence[Observation]) -> Tensor:
+    """[B, h, w] bool: the cells of each observation."""
+    height, width = observations[0].frame.alpha.shape
+    device = observations[0].cells.device
+    active = torch.zeros(len(observations), height * width, dtype=torch.bool, device=device)
+    for picture, observation in zip(active, observations, strict=True):
+        picture[observation.cells] = True
+    return active.view(-1, height, width)
+
+
+def _join(parts: Sequence[Tensor]) -> Tensor:
+    """One after the other; nothing is copied if there is one."""
+    return torch.cat(list(parts)) if len(parts) > 1 else parts[0]
+
+
 def _tell(values: Tensor, known: Tensor) -> Tensor:
-    """`known` [...] put behind the colours of `values` [..., K]."""
-    return torch.cat((values[..., :3], known[..., None], values[..., 3:]), dim=-1)
+    """`known` [N, 1] put behind the colours of `values` [N, K]."""
+    return torch.cat((values[:, :3], known, values[:, 3:]), dim=1)
 
 
 def _tent(scale: int, shift: float) -> Tensor:

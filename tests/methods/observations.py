@@ -9,7 +9,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from methods.renderer2d import Detail, Observation, Renderer2d, Reprojected
+from methods.renderer2d import Detail, Observation, Points, Renderer2d, cells_at_matter
 from methods.volume import FeatureFrame
 from tests.methods.conftest import look_at_the_middle
 
@@ -50,25 +50,44 @@ def observe(
     values = torch.where(matter[..., None], values, background)
     fine = matter.repeat_interleave(scale, 0).repeat_interleave(scale, 1)
 
-    def land(share: float, features: int) -> Reprojected:
+    def land(share: float, features: int) -> Points:
         points = torch.rand(POINTS, features, generator=generator)
         index = torch.randint(POINTS, fine.shape, generator=generator, dtype=torch.int32)
         shown = fine & (torch.rand(fine.shape, generator=generator) < share)
-        return Reprojected(points, torch.where(shown, index, -1))
+        return Points(points, torch.where(shown, index, -1))
 
+    preceding = [land(0.33, channels) for _ in range(frames)]
+    cells = cells_at_matter(matter.float(), preceding)
     valid = torch.rand(height, width, scale**2, generator=generator) < 0.66
     valid = (valid & matter[..., None]).float()
     picture = torch.rand(height, width, scale**2, 3, generator=generator) * valid[..., None]
     at_surface = land(0.66, channels + 1)
+    index = to_blocks(at_surface.index[..., None], scale).squeeze(-1)
     frame = FeatureFrame(CAMERA, values, torch.where(matter, 1.5, torch.inf), matter.float())
     return Observation(
         frame,
         background,
-        [land(0.33, channels) for _ in range(frames)],
-        Detail(picture, valid) if history else None,
-        at_surface if surface else None,
+        preceding,
+        cells,
+        Detail(picture.flatten(0, 1)[cells], valid.flatten(0, 1)[cells]) if history else None,
+        Points(at_surface.values, index.flatten(0, 1)[cells]) if surface else None,
         phase,
     )
+
+
+def to_blocks(picture: Tensor, scale: int) -> Tensor:
+    """[h s, w s, C] to [h, w, s^2, C]."""
+    height, width, channels = picture.shape
+    parts = picture.view(height // scale, scale, width // scale, scale, channels)
+    return parts.transpose(1, 2).flatten(2, 3)
+
+
+def everywhere(part: Tensor, observation: Observation, otherwise: float = 0) -> Tensor:
+    """[h, w, ...] of what is known of the cells [N, ...]."""
+    height, width = observation.frame.alpha.shape
+    whole = torch.full((height * width, *part.shape[1:]), otherwise, dtype=part.dtype)
+    whole[observation.cells] = part
+    return whole.view(height, width, *part.shape[1:])
 
 
 def spot(height: int, width: int, row: int, column: int) -> Tensor:
@@ -101,17 +120,25 @@ def cut(observation: Observation, scale: int, rows: slice, columns: slice) -> Ob
     """The low-resolution pixels `rows` x `columns` of an observation, and all that is in them."""
     fine = tuple(slice(scale * part.start, scale * part.stop) for part in (rows, columns))
     frame, history, surface = observation.frame, observation.history, observation.surface
+    alpha = frame.alpha[rows, columns]
+    preceding = [replace(p, index=p.index[fine]) for p in observation.preceding]
+    cells = cells_at_matter(alpha, preceding)
+
+    def inside(part: Tensor, otherwise: float = 0) -> Tensor:
+        return everywhere(part, observation, otherwise)[rows, columns].flatten(0, 1)[cells]
+
     return replace(
         observation,
         frame=replace(
             frame,
             values=frame.values[rows, columns],
             depth=frame.depth[rows, columns],
-            alpha=frame.alpha[rows, columns],
+            alpha=alpha,
         ),
-        preceding=[replace(p, index=p.index[fine]) for p in observation.preceding],
-        history=history and Detail(history.values[rows, columns], history.valid[rows, columns]),
-        surface=surface and replace(surface, index=surface.index[fine]),
+        preceding=preceding,
+        cells=cells,
+        history=history and Detail(inside(history.values), inside(history.valid)),
+        surface=surface and replace(surface, index=inside(surface.index, -1)),
     )
 
 

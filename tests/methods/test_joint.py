@@ -17,7 +17,7 @@ from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy
 from methods.patches import PatchSource, Through
 from methods.pipeline import Pipeline, PipelineOptions, View
-from methods.renderer2d import Renderer2d, Reprojected
+from methods.renderer2d import Points, Renderer2d
 from methods.sequences import MotionOptions, SequencePool, TrueView
 from methods.space_to_depth import SpaceToDepth
 from methods.unet_release import UnetRelease
@@ -114,8 +114,10 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
         object.__setattr__(cloud, "values", values)
     look, depths = training.patches.pipeline.surface, {}
 
-    def look_at_first_depth(depth: Tensor, view: View, probe: Probe) -> Reprojected | None:
-        return look(depths.setdefault(id(view), depth.detach()), view, probe)
+    def look_at_first_depth(
+        depth: Tensor, cells: Tensor, view: View, probe: Probe
+    ) -> Points | None:
+        return look(depths.setdefault(id(view), depth.detach()), cells, view, probe)
 
     monkeypatch.setattr(training.patches.pipeline, "surface", look_at_first_depth)
 

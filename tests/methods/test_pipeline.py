@@ -10,13 +10,17 @@ import torch
 from bench.cameras import cast, pixel_grid, project, unproject
 from bench.types import NullProbe
 from methods.buffer import RenderingBuffer
+from methods.kernels.warp import enlarge
 from methods.pipeline import LAYER, Pipeline, PipelineOptions, View, sample_phase
 from methods.space_to_depth import SpaceToDepth
 from tests.methods.conftest import look_at_the_middle
+from tests.methods.observations import to_blocks
 from tests.methods.test_joint import misty_field, shell
 
 OPTIONS = PipelineOptions(channels=4, frames=2, steps=8)
 CAMERA = look_at_the_middle(0.1, 0.3)
+ALL_CELLS = torch.arange(64)
+"""Of its 32 x 32 pixels."""
 
 
 def new_pipeline(options: PipelineOptions = OPTIONS) -> Pipeline:
@@ -92,9 +96,10 @@ def test_the_preceding_picture_of_a_still_camera_is_where_it_was() -> None:
     frame = pipeline.render(CAMERA, buffer, NullProbe())
     view = View.of(CAMERA, OPTIONS, 1)
     low_depth = frame.depth[::4, ::4]
-    history = pipeline.history(buffer.frames[0], low_depth, view)
+    fine = enlarge(low_depth, ALL_CELLS, 4)
+    history = pipeline.history(buffer.frames[0], fine, ALL_CELLS, view)
     assert history is not None
-    blocks = frame.rgb.view(8, 4, 8, 4, 3).transpose(1, 2).reshape(8, 8, 16, 3)
+    blocks = frame.rgb.view(8, 4, 8, 4, 3).transpose(1, 2).reshape(64, 16, 3)
     known = history.valid > 0
     assert known.float().mean() > 0.2
     # Positions are off by some ulps of 32 pixels, and neighbours differ by at most 1.
@@ -105,14 +110,15 @@ def test_the_opacity_at_the_surface_is_that_of_a_layer_of_the_field() -> None:
     """At a pixel's own point, z in front of it; pixels without a depth have no point."""
     pipeline, view, z = new_pipeline(), View.of(CAMERA, OPTIONS, 0), 1.5
     pipeline.field = misty_field("fp32")
-    depth = torch.full((8, 8), torch.inf)
-    depth[3:5, 2:5] = z
-    surface = pipeline.surface(depth, view, NullProbe())
-    assert surface is not None
     near = torch.zeros(32, 32, dtype=torch.bool)
-    near[10:22, 6:22] = True  # half a cell around: depths are enlarged bilinearly
-    assert torch.equal(surface.index >= 0, near)
-    index = surface.index[near].long()
+    near[10:22, 6:22] = True
+    cells = torch.arange(8, 64)  # not the first row
+    blocks = to_blocks(near[..., None], 4).flatten(0, 1)[cells, :, 0]
+    surface = pipeline.surface(torch.where(blocks, z, torch.inf), cells, view, NullProbe())
+    assert surface is not None
+    assert torch.equal(surface.index >= 0, blocks)
+    whole = torch.full((64, 16), -1).index_copy(0, cells, surface.index.long())
+    index = whole.view(8, 8, 4, 4).transpose(1, 2).reshape(32, 32)[near]
     assert torch.equal(index.sort().values, torch.arange(int(near.sum())))
     pixels = pixel_grid(32, 32, near.device)[near.flatten()]
     points = unproject(view.full, pixels, torch.full((len(pixels),), z))
@@ -124,12 +130,13 @@ def test_the_opacity_at_the_surface_is_that_of_a_layer_of_the_field() -> None:
 
 def test_where_no_pixel_has_a_depth_there_is_no_surface() -> None:
     view = View.of(CAMERA, OPTIONS, 0)
-    surface = new_pipeline().surface(torch.full((8, 8), torch.inf), view, NullProbe())
+    nowhere = torch.full((64, 16), torch.inf)
+    surface = new_pipeline().surface(nowhere, ALL_CELLS, view, NullProbe())
     assert surface is not None
     assert surface.values.shape == (0, OPTIONS.channels + 1)
     assert (surface.index == -1).all()
     unused = new_pipeline(replace(OPTIONS, surface=False))
-    assert unused.surface(torch.ones(8, 8), view, NullProbe()) is None
+    assert unused.surface(torch.ones(64, 16), ALL_CELLS, view, NullProbe()) is None
 
 
 @pytest.mark.parametrize("wrong", [{"channels": 2}, {"frames": -1}, {"scale": 0}, {"steps": 0.0}])

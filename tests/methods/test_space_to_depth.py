@@ -12,13 +12,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from methods import space_to_depth
-from methods.renderer2d import Detail, Observation, Reprojected
-from methods.space_to_depth import LEAK, REACH, SpaceToDepth
+from methods.renderer2d import REACH, Detail, Observation, Points, cells_at_matter
+from methods.space_to_depth import LEAK, SpaceToDepth
 from tests.methods.observations import (
     BACKGROUND,
     ROUNDING,
     cut,
     doubled,
+    everywhere,
     features_of,
     observe,
     shaken,
@@ -43,9 +44,25 @@ def to_picture(blocks: Tensor, scale: int) -> Tensor:
     return parts.reshape(height * scale, width * scale, channels)
 
 
-def shown_by(points: Reprojected) -> tuple[Tensor, Tensor]:
-    """[H, W, K] and [H, W]: what each pixel shows, and whether."""
+def shown_by(points: Points) -> tuple[Tensor, Tensor]:
+    """[..., C] and [...]: what each pixel shows, and whether."""
     return points.values[points.index.clamp(min=0).long()], (points.index >= 0).to(points.values)
+
+
+def at_surface(observation: Observation, scale: int) -> tuple[Tensor, Tensor]:
+    """[H, W, K + 1] and [H, W]: what each pixel shows of the surface, and whether."""
+    assert observation.surface is not None
+    parts = shown_by(observation.surface)
+    values, known = (everywhere(part, observation) for part in parts)
+    return to_picture(values, scale), to_picture(known[..., None], scale)[..., 0]
+
+
+def before(observation: Observation, scale: int) -> tuple[Tensor, Tensor]:
+    """[H, W, 3] and [H, W, 1]: the preceding picture, and where it is known."""
+    assert observation.history is not None
+    values = everywhere(observation.history.values, observation)
+    valid = everywhere(observation.history.valid[..., None], observation)
+    return to_picture(values, scale), to_picture(valid, scale)
 
 
 def reached(observation: Observation, scale: int) -> Tensor:
@@ -73,7 +90,7 @@ def dense(renderer: SpaceToDepth, observation: Observation) -> Tensor:
     """The same network on all cells, with dense convolutions of pictures that are masked."""
     scale, background = renderer.scale, observation.background
     active = reached(observation, scale)
-    everywhere = active.repeat_interleave(scale, 0).repeat_interleave(scale, 1)[..., None]
+    drawn_at = active.repeat_interleave(scale, 0).repeat_interleave(scale, 1)[..., None]
     base = enlarged(observation, scale) - background[:3]
 
     def told(values: Tensor, known: Tensor) -> Tensor:
@@ -93,13 +110,11 @@ def dense(renderer: SpaceToDepth, observation: Observation) -> Tensor:
         values, known = shown_by(points)
         planes.append(in_cells(told((values - background) * known[..., None], known)))
     if renderer.history:
-        assert observation.history is not None
-        known = to_picture(observation.history.valid[..., None], scale)
-        recent = (to_picture(observation.history.values, scale) - background[:3] - base) * known
+        picture, known = before(observation, scale)
+        recent = (picture - background[:3] - base) * known
         planes.append(in_cells(told(recent, known[..., 0])))
     if renderer.surface:
-        assert observation.surface is not None
-        values, known = shown_by(observation.surface)
+        values, known = at_surface(observation, scale)
         less, opacity = (values[..., :-1] - background) * known[..., None], values[..., -1] * known
         less[..., :3] -= base * known[..., None]
         planes.append(in_cells(told(less, opacity)))
@@ -126,7 +141,7 @@ def dense(renderer: SpaceToDepth, observation: Observation) -> Tensor:
         colours, opacity = less[..., :3] * opacity[..., None], opacity[..., None]
         read = torch.cat((colours, opacity, less[..., 3:]), dim=-1).permute(2, 0, 1)
         drawn = drawn + (matrices.view(3, *read.shape) * read).sum(dim=1).permute(1, 2, 0)
-    return torch.where(everywhere, drawn, 0) + background[:3]
+    return torch.where(drawn_at, drawn, 0) + background[:3]
 
 
 @pytest.mark.parametrize("history", [False, True])
@@ -259,9 +274,10 @@ def test_a_point_of_a_preceding_frame_alone_is_something() -> None:
     renderer = shaken(new_renderer(frames=1))
     index = observation.preceding[0].index.clone()
     index[18, 17] = 3  # in cell (4, 4)
-    seen = renderer(
-        [replace(observation, preceding=[replace(observation.preceding[0], index=index)])]
-    )
+    preceding = [replace(observation.preceding[0], index=index)]
+    cells = cells_at_matter(observation.frame.alpha, preceding)
+    alone = replace(observation, preceding=preceding, cells=cells, history=None, surface=None)
+    seen = renderer([alone])
     changed = (seen[0] != 1).any(dim=-1).nonzero()
     assert changed.amin(dim=0).tolist() == [4 * (4 - REACH)] * 2
     assert changed.amax(dim=0).tolist() == [4 * (5 + REACH) - 1] * 2
@@ -339,9 +355,7 @@ def test_the_preceding_picture_is_blended_in_where_it_is_known(share: float) -> 
     with torch.no_grad():
         renderer.leave.bias.view(scale**2, 4)[:, 3] = 40.0 if share else -200.0
     observation = observe()
-    assert observation.history is not None
-    picture = to_picture(observation.history.values, scale)
-    valid = to_picture(observation.history.valid[..., None], scale)
+    picture, valid = before(observation, scale)
     base = enlarged(observation, scale)
     want = torch.where(valid > 0, share * picture + (1 - share) * base, base)
     assert 0.5 < valid.mean() < 0.8
@@ -356,8 +370,7 @@ def test_the_surface_covers_the_base_as_far_as_it_is_opaque() -> None:
     with torch.no_grad():
         renderer.read.bias.view(3, channels + 1)[:, :3] = torch.eye(3)
     observation = observe(channels=channels)
-    assert observation.surface is not None
-    values, known = shown_by(observation.surface)
+    values, known = at_surface(observation, scale)
     base = enlarged(observation, scale)
     covered = base + values[..., -1:] * (values[..., :3] - base)
     want = torch.where(known[..., None] > 0, covered, base)
@@ -374,8 +387,7 @@ def test_a_matrix_reads_opacity_and_other_features_less_the_background(column: i
     with torch.no_grad():
         renderer.read.bias.view(3, channels + 1)[1, column] = 1.0  # into green
     observation = observe(channels=channels)
-    assert observation.surface is not None
-    values, known = shown_by(observation.surface)
+    values, known = at_surface(observation, scale)
     read = values[..., -1] if column == 3 else values[..., column - 1] - BACKGROUND[column - 1]
     want = enlarged(observation, scale)
     want[..., 1] += known * read

@@ -5,6 +5,10 @@ point, and shows what the preceding picture shows at that point, interpolated bi
 averaged bilinearly over those of the four nearest low-resolution pixels that have one and lie no
 deeper than `TOLERANCE` behind the nearest of the four: what moves with the front surface hides what
 is behind it.
+
+The pixels of a picture are grouped for a network at low resolution: the s x s pixels of a
+low-resolution pixel, its cell, stand beside each other, and only cells that are asked for are
+looked at.
 """
 
 from __future__ import annotations
@@ -19,61 +23,64 @@ TOLERANCE = 0.02
 """Scene units along z by which a depth may lie behind the nearest one and still be averaged."""
 
 
-def warp(
-    picture: Tensor,
-    source: Camera,
-    depth: Tensor,
-    camera: Camera,
-    scale: int,
-    phase: tuple[float, float] = (0.0, 0.0),
-    *,
-    backend: str = "auto",
-) -> tuple[Tensor, Tensor]:
-    """Warp `picture` [H', W', C] of `source` into the view of `camera`. Not differentiable.
-
-    The result is laid out for a network at low resolution: the s x s pixels of a low-resolution
-    pixel, row by row, beside each other.
-
-    Args:
-        depth: [h, w] z-depth at low resolution, not finite where there is none. Pixel (i, j) of it
-            is sampled at (s (i + 1/2), s (j + 1/2)) + `phase` in the full-resolution picture.
-        camera: the view, of `w s` x `h s` pixels.
-        scale: s.
-
-    Returns:
-        values [h, w, s^2, C], zero where nothing is known, and valid [h, w, s^2] in {0, 1}.
-
-    Raises:
-        ValueError: a size is wrong.
-    """
-    check_shape("picture", picture, source.height, source.width, None)
-    check_shape("depth", depth, None, None)
-    height, width = depth.shape
-    if (camera.width, camera.height) != (width * scale, height * scale):
-        raise ValueError(
-            f"camera: expected {width * scale} x {height * scale} pixels, {scale} times those of "
-            f"depth, got {camera.width} x {camera.height}"
-        )
-    matrix, offset = _source_from_camera(source, camera)
-    return implementation("warp", backend, picture.device).warp(
-        picture, depth, matrix, offset, scale, phase
-    )
-
-
 def enlarge(
     depth: Tensor,
+    cells: Tensor,
     scale: int,
     phase: tuple[float, float] = (0.0, 0.0),
     *,
     backend: str = "auto",
 ) -> Tensor:
-    """The depth that `warp` gives to the pixels of the picture: [h, w, s^2], inf for none.
+    """Depth of the s x s pixels of some cells, row by row: [N, s^2], inf for none.
 
     Args:
-        depth, scale, phase: as of `warp`.
+        depth: [h, w] z-depth at low resolution, not finite where there is none. Pixel (i, j) of it
+            is sampled at (s (i + 1/2), s (j + 1/2)) + `phase` in the full-resolution picture.
+        cells: [N] int64 low-resolution pixels, counted row by row.
+        scale: s.
     """
     check_shape("depth", depth, None, None)
-    return implementation("warp", backend, depth.device).enlarge(depth, scale, phase)
+    check_shape("cells", cells, None)
+    return implementation("warp", backend, depth.device).enlarge(depth, cells, scale, phase)
+
+
+def warp(
+    picture: Tensor,
+    source: Camera,
+    depth: Tensor,
+    cells: Tensor,
+    camera: Camera,
+    scale: int,
+    *,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor]:
+    """Warp `picture` [H, W, C] of `source` into some cells of the view of `camera`. Not
+    differentiable.
+
+    Args:
+        depth: [N, s^2] z-depth of the pixels of `cells`, as of `enlarge`.
+        cells: [N] int64 cells of s x s pixels, counted row by row.
+        camera: the view, of whole cells.
+        scale: s.
+
+    Returns:
+        values [N, s^2, C], zero where nothing is known, and valid [N, s^2] in {0, 1}.
+
+    Raises:
+        ValueError: a size is wrong.
+    """
+    check_shape("picture", picture, source.height, source.width, None)
+    check_shape("cells", cells, None)
+    check_shape("depth", depth, len(cells), scale**2)
+    if camera.width % scale or camera.height % scale:
+        raise ValueError(
+            f"camera: expected cells of {scale} x {scale} pixels, got {camera.width} x "
+            f"{camera.height} pixels"
+        )
+    matrix, offset = _source_from_camera(source, camera)
+    return implementation("warp", backend, picture.device).warp(
+        picture, depth, cells, camera.width // scale, scale, matrix, offset
+    )
 
 
 def _source_from_camera(source: Camera, camera: Camera) -> tuple[Tensor, Tensor]:

@@ -40,7 +40,8 @@ def cases() -> list[Case]:
 
     A kind has the size of its depth, the scale and options: `turn`, a rotation vector of the
     source, in radians; `move`, its offset along the axes of the camera; `zoom`, its focal length
-    over the camera's; `holes` and `edge` in the depth; `phase`; `channels`.
+    over the camera's; `holes` and `edge` in the depth; `phase`; `channels`; `every`: only every
+    so many-th cell is looked at, 0: none.
     """
     kinds: list[tuple[str, int, int, int, dict]] = [
         ("one pixel", 1, 1, 1, {}),
@@ -59,6 +60,7 @@ def cases() -> list[Case]:
         ("partly behind the source", 24, 17, 4, {"move": (0.0, 0.0, 2.25), "edge": 2.0}),
         ("half of it empty", 24, 17, 4, {"edge": math.inf}),
         ("nothing known", 1, 17, 4, {"edge": math.inf}),
+        ("some cells", 24, 17, 4, {"move": (0.03, 0.0, 0.1), "every": 5}),
     ]
     depth_kinds: list[tuple[str, int, int, int, dict]] = [
         ("one pixel", 1, 1, 4, {}),
@@ -70,13 +72,15 @@ def cases() -> list[Case]:
         ("edges and holes", 24, 17, 4, {"edge": 0.5, "holes": True}),
         ("half of it empty", 24, 17, 4, {"edge": math.inf}),
         ("nothing known", 1, 17, 4, {"edge": math.inf}),
+        ("some cells", 24, 17, 4, {"every": 5}),
+        ("no cell", 24, 17, 4, {"every": 0}),
     ]
     found = [
         Case(
             kernel,
             name,
             "fp32",
-            width * height * scale**2,
+            len(_cells(width, height, options)) * scale**2,
             partial(prepare, width, height, scale, options),
         )
         for kernel, prepare, some in (
@@ -122,6 +126,11 @@ def _depth(width: int, height: int, options: dict) -> Tensor:
     return depth
 
 
+def _cells(width: int, height: int, options: dict) -> Tensor:
+    every = options.get("every", 1)
+    return torch.arange(width * height)[::every] if every else torch.arange(0)
+
+
 def _prepare(width: int, height: int, scale: int, options: dict, device: str) -> Prepared:
     camera = _camera(width * scale, height * scale)
     source = _source(camera, options)
@@ -129,11 +138,13 @@ def _prepare(width: int, height: int, scale: int, options: dict, device: str) ->
     shape = camera.height, camera.width, options.get("channels", CHANNELS)
     picture = torch.rand(shape, generator=torch.Generator().manual_seed(width + scale))
     shift = _position_error(source, camera, depth, scale)
-    sure = _sure(source, camera, depth, scale, phase, shift).to(device)
-    picture, depth = picture.to(device), depth.to(device)
+    cells = _cells(width, height, options)
+    sure = _sure(source, camera, depth, cells, scale, phase, shift).to(device)
+    picture, depth, cells = picture.to(device), depth.to(device), cells.to(device)
 
     def call(backend: str) -> tuple[Tensor, ...]:
-        values, valid = warp(picture, source, depth, camera, scale, phase, backend=backend)
+        fine = enlarge(depth, cells, scale, phase, backend=backend)
+        values, valid = warp(picture, source, fine, cells, camera, scale, backend=backend)
         return values * sure[..., None], valid * sure
 
     # Neighbours differ by 1 at most, so a value by no more than its place along each axis; and it
@@ -146,10 +157,11 @@ def _prepare_enlarge(width: int, height: int, scale: int, options: dict, device:
     known = depth[depth.isfinite()]
     farthest = known.max().item() if len(known) else 0.0
     depth, phase = depth.to(device), options.get("phase", (0.0, 0.0))
+    cells = _cells(width, height, options).to(device)
 
     def call(backend: str) -> tuple[Tensor, ...]:
         # No depth is 0: a finite number in its place can be compared.
-        z = enlarge(depth, scale, phase, backend=backend)
+        z = enlarge(depth, cells, scale, phase, backend=backend)
         return (z.nan_to_num(nan=-1.0, posinf=0.0),)
 
     return Prepared(call, 2 * MEAN_ROUNDINGS * U32 * farthest)
@@ -184,21 +196,23 @@ def _sure(
     source: Camera,
     camera: Camera,
     depth: Tensor,
+    cells: Tensor,
     scale: int,
     phase: tuple[float, float],
     margin: float,
 ) -> Tensor:
-    """[h, w, s^2] pixels that stay valid, or not, when the source picture shifts by `margin`."""
+    """[N, s^2] pixels that stay valid, or not, when the source picture shifts by `margin`."""
     picture = torch.ones(source.height, source.width, 1, dtype=torch.float64)
+    fine = enlarge(depth.double(), cells, scale, phase, backend="reference")
     shifts = [(margin, 0.0), (-margin, 0.0), (0.0, margin), (0.0, -margin)]
     valid = [
         warp(
             picture,
             replace(source, cx=source.cx + right, cy=source.cy + down),
-            depth.double(),
+            fine,
+            cells,
             camera,
             scale,
-            phase,
             backend="reference",
         )[1]
         for right, down in shifts

@@ -1,4 +1,4 @@
-"""Backward warping with numba: a low-resolution pixel at a time, nothing where no depth is near."""
+"""Backward warping with numba, a cell at a time."""
 
 from __future__ import annotations
 
@@ -12,44 +12,16 @@ from methods.kernels.cpu import f32
 from methods.kernels.warp import TOLERANCE
 
 
-def warp(
-    picture: Tensor,
-    depth: Tensor,
-    matrix: Tensor,
-    offset: Tensor,
-    scale: int,
-    phase: tuple[float, float],
-) -> tuple[Tensor, Tensor]:
-    """See `methods.kernels.warp.warp`."""
-    if not picture.dtype == depth.dtype == torch.float32:
-        raise ValueError(
-            f"backend 'cpu' warps float32, got picture {picture.dtype}, depth {depth.dtype}: "
-            "use backend='reference'"
-        )
-    fine = enlarge(depth, scale, phase)
-    values, valid = torch.zeros(*fine.shape, picture.shape[2]), torch.zeros(fine.shape)
-    _warp(
-        picture.contiguous().numpy(),
-        fine.numpy(),
-        matrix.float().numpy(),
-        offset.float().numpy(),
-        scale,
-        values.numpy(),
-        valid.numpy(),
-    )
-    return values, valid
-
-
-def enlarge(depth: Tensor, scale: int, phase: tuple[float, float]) -> Tensor:
+def enlarge(depth: Tensor, cells: Tensor, scale: int, phase: tuple[float, float]) -> Tensor:
     """See `methods.kernels.warp.enlarge`."""
     if depth.dtype != torch.float32:
         raise ValueError(
             f"backend 'cpu' enlarges float32, got depth {depth.dtype}: use backend='reference'"
         )
-    height, width = depth.shape
-    out = torch.full((height, width, scale**2), torch.inf)
+    out = torch.empty(len(cells), scale**2)
     _enlarge(
         depth.contiguous().numpy(),
+        cells.numpy(),
         scale,
         f32(phase[0]),
         f32(phase[1]),
@@ -59,43 +31,75 @@ def enlarge(depth: Tensor, scale: int, phase: tuple[float, float]) -> Tensor:
     return out
 
 
+def warp(
+    picture: Tensor,
+    depth: Tensor,
+    cells: Tensor,
+    width: int,
+    scale: int,
+    matrix: Tensor,
+    offset: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """See `methods.kernels.warp.warp`."""
+    if not picture.dtype == depth.dtype == torch.float32:
+        raise ValueError(
+            f"backend 'cpu' warps float32, got picture {picture.dtype}, depth {depth.dtype}: "
+            "use backend='reference'"
+        )
+    values, valid = torch.empty(*depth.shape, picture.shape[2]), torch.empty(depth.shape)
+    _warp(
+        picture.contiguous().numpy(),
+        depth.contiguous().numpy(),
+        cells.numpy(),
+        width,
+        scale,
+        matrix.float().numpy(),
+        offset.float().numpy(),
+        values.numpy(),
+        valid.numpy(),
+    )
+    return values, valid
+
+
 @njit(cache=True, parallel=True)
-def _enlarge(depth, scale, phase_u, phase_v, tolerance, out):
-    height, width = depth.shape
-    for row in prange(height):
-        for column in range(width):
-            if not _anything_near(depth, row, column):
+def _enlarge(depth, cells, scale, phase_u, phase_v, tolerance, out):
+    width = depth.shape[1]
+    for n in prange(len(cells)):
+        row, column = cells[n] // width, cells[n] % width
+        if not _anything_near(depth, row, column):
+            out[n] = math.inf
+            continue
+        for sub in range(scale * scale):
+            v = f32(row * scale + sub // scale) + f32(0.5)
+            u = f32(column * scale + sub % scale) + f32(0.5)
+            out[n, sub] = _depth_at(
+                depth,
+                (v - phase_v) / f32(scale) - f32(0.5),
+                (u - phase_u) / f32(scale) - f32(0.5),
+                tolerance,
+            )
+
+
+@njit(cache=True, parallel=True)
+def _warp(picture, depth, cells, width, scale, matrix, offset, values, valid):
+    for n in prange(len(cells)):
+        row, column = cells[n] // width, cells[n] % width
+        for sub in range(scale * scale):
+            values[n, sub] = 0
+            valid[n, sub] = 0
+            z = depth[n, sub]
+            if not z < math.inf:
                 continue
-            for sub in range(scale * scale):
-                v = f32(row * scale + sub // scale) + f32(0.5)
-                u = f32(column * scale + sub % scale) + f32(0.5)
-                out[row, column, sub] = _depth_at(
-                    depth,
-                    (v - phase_v) / f32(scale) - f32(0.5),
-                    (u - phase_u) / f32(scale) - f32(0.5),
-                    tolerance,
-                )
-
-
-@njit(cache=True, parallel=True)
-def _warp(picture, fine, matrix, offset, scale, values, valid):
-    height, width, subs = fine.shape
-    for row in prange(height):
-        for column in range(width):
-            for sub in range(subs):
-                z = fine[row, column, sub]
-                if not z < math.inf:
-                    continue
-                v = f32(row * scale + sub // scale) + f32(0.5)
-                u = f32(column * scale + sub % scale) + f32(0.5)
-                w = z * (matrix[2, 0] * u + matrix[2, 1] * v + matrix[2, 2]) + offset[2]
-                if not w > 0:
-                    continue
-                x = (z * (matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 2]) + offset[0]) / w
-                y = (z * (matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2]) + offset[1]) / w
-                if 0 <= x < picture.shape[1] and 0 <= y < picture.shape[0]:
-                    valid[row, column, sub] = f32(1)
-                    _look_up(picture, y - f32(0.5), x - f32(0.5), values[row, column, sub])
+            v = f32(row * scale + sub // scale) + f32(0.5)
+            u = f32(column * scale + sub % scale) + f32(0.5)
+            w = z * (matrix[2, 0] * u + matrix[2, 1] * v + matrix[2, 2]) + offset[2]
+            if not w > 0:
+                continue
+            x = (z * (matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 2]) + offset[0]) / w
+            y = (z * (matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2]) + offset[1]) / w
+            if 0 <= x < picture.shape[1] and 0 <= y < picture.shape[0]:
+                valid[n, sub] = f32(1)
+                _look_up(picture, y - f32(0.5), x - f32(0.5), values[n, sub])
 
 
 @njit(cache=True)

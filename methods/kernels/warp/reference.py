@@ -8,52 +8,18 @@ from torch import Tensor
 from methods.kernels.warp import TOLERANCE
 
 
-def warp(
-    picture: Tensor,
-    depth: Tensor,
-    matrix: Tensor,
-    offset: Tensor,
-    scale: int,
-    phase: tuple[float, float],
-) -> tuple[Tensor, Tensor]:
-    """See `methods.kernels.warp.warp`."""
-    height, width = depth.shape
-    matrix, offset = matrix.to(picture), offset.to(picture)
-    v = torch.arange(height * scale, device=depth.device, dtype=picture.dtype) + 0.5
-    u = torch.arange(width * scale, device=depth.device, dtype=picture.dtype) + 0.5
-    z = _upsample(depth.to(picture.dtype), v, u, scale, phase)  # [H, W], inf where there is none
-    known = z.isfinite()
-    grid = torch.stack((*torch.meshgrid(u, v, indexing="xy"), torch.ones_like(z)), dim=-1)
-    at = torch.where(known, z, 1)[..., None] * (grid @ matrix.T) + offset  # [H, W, 3]
-    known &= at[..., 2] > 0
-    position = at[..., :2] / torch.where(known, at[..., 2], 1)[..., None]
-    size = position.new_tensor((picture.shape[1], picture.shape[0]))
-    known &= ((position >= 0) & (position < size)).all(dim=-1)
-    values = _look_up(picture, torch.where(known[..., None], position, 0)) * known[..., None]
-    return _blocks(values, scale), _blocks(known[..., None].to(values), scale).squeeze(-1)
-
-
-def enlarge(depth: Tensor, scale: int, phase: tuple[float, float]) -> Tensor:
+def enlarge(depth: Tensor, cells: Tensor, scale: int, phase: tuple[float, float]) -> Tensor:
     """See `methods.kernels.warp.enlarge`."""
-    height, width = depth.shape
-    v = torch.arange(height * scale, device=depth.device, dtype=depth.dtype) + 0.5
-    u = torch.arange(width * scale, device=depth.device, dtype=depth.dtype) + 0.5
-    return _blocks(_upsample(depth, v, u, scale, phase)[..., None], scale).squeeze(-1)
-
-
-def _upsample(
-    depth: Tensor, v: Tensor, u: Tensor, scale: int, phase: tuple[float, float]
-) -> Tensor:
-    """Depth at the full-resolution rows `v` and columns `u`; see the module's words."""
+    v, u = (place.to(depth) for place in _pixels(cells, depth.shape[1], scale))
     rows, columns = (v - phase[1]) / scale - 0.5, (u - phase[0]) / scale - 0.5
     corners = []
     for down in (0, 1):
         for right in (0, 1):
             row, column = rows.floor() + down, columns.floor() + right
-            weight = (1 - (rows - row).abs())[:, None] * (1 - (columns - column).abs())
+            weight = (1 - (rows - row).abs()) * (1 - (columns - column).abs())
             row = row.clamp(0, depth.shape[0] - 1).long()
             column = column.clamp(0, depth.shape[1] - 1).long()
-            corners.append((depth[row][:, column], weight))
+            corners.append((depth[row, column], weight))
     weight = torch.stack([weight for _, weight in corners])
     z = torch.stack([z for z, _ in corners])
     z = torch.where(z.isfinite() & (weight > 0), z, torch.inf)
@@ -61,6 +27,36 @@ def _upsample(
     total = weight.sum(dim=0)
     mean = (weight * torch.where(z.isfinite(), z, 0)).sum(dim=0) / torch.where(total > 0, total, 1)
     return torch.where(total > 0, mean, torch.inf)
+
+
+def warp(
+    picture: Tensor,
+    depth: Tensor,
+    cells: Tensor,
+    width: int,
+    scale: int,
+    matrix: Tensor,
+    offset: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """See `methods.kernels.warp.warp`."""
+    matrix, offset, z = matrix.to(picture), offset.to(picture), depth.to(picture)
+    v, u = (place.to(picture) for place in _pixels(cells, width, scale))
+    known = z < torch.inf
+    pixel = torch.stack((u, v, torch.ones_like(u)), dim=-1)
+    at = torch.where(known, z, 1)[..., None] * (pixel @ matrix.T) + offset  # [N, s^2, 3]
+    known &= at[..., 2] > 0
+    position = at[..., :2] / torch.where(known, at[..., 2], 1)[..., None]
+    size = position.new_tensor((picture.shape[1], picture.shape[0]))
+    known &= ((position >= 0) & (position < size)).all(dim=-1)
+    values = _look_up(picture, torch.where(known[..., None], position, 0)) * known[..., None]
+    return values, known.to(values)
+
+
+def _pixels(cells: Tensor, width: int, scale: int) -> tuple[Tensor, Tensor]:
+    """Centres (v, u), [N, s^2] each, of the pixels of `cells`, of which a row has `width`."""
+    sub = torch.arange(scale**2, device=cells.device)
+    row, column = (cells // width)[:, None], (cells % width)[:, None]
+    return row * scale + sub // scale + 0.5, column * scale + sub % scale + 0.5
 
 
 def _look_up(picture: Tensor, position: Tensor) -> Tensor:
@@ -75,10 +71,3 @@ def _look_up(picture: Tensor, position: Tensor) -> Tensor:
             column = column.clamp(0, picture.shape[1] - 1).long()
             total = total + weight[..., None] * picture[row, column]
     return total
-
-
-def _blocks(image: Tensor, scale: int) -> Tensor:
-    """[h s, w s, C] to [h, w, s^2, C]."""
-    height, width, channels = image.shape
-    blocks = image.view(height // scale, scale, width // scale, scale, channels)
-    return blocks.transpose(1, 2).reshape(height // scale, width // scale, scale**2, channels)

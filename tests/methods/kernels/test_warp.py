@@ -11,7 +11,9 @@ from torch import Tensor
 
 from bench.cameras import look_at
 from bench.types import Camera
-from methods.kernels.warp import TOLERANCE, enlarge, warp
+from methods.kernels.warp import TOLERANCE
+from methods.kernels.warp import enlarge as enlarge_cells
+from methods.kernels.warp import warp as warp_cells
 
 BACKENDS = ["reference", "cpu"]
 ERROR = 1e-4
@@ -41,6 +43,31 @@ def uneven_depth() -> Tensor:
     depth[2, 2], depth[3, 6], depth[6, 0] = math.inf, math.nan, -math.inf
     depth[4:, 7:] = math.inf
     return depth
+
+
+def enlarge(
+    depth: Tensor, scale: int, phase: tuple[float, float] = (0.0, 0.0), *, backend: str = "auto"
+) -> Tensor:
+    """Of all cells, [h, w, s^2]."""
+    cells = torch.arange(depth.numel())
+    return enlarge_cells(depth, cells, scale, phase, backend=backend).view(*depth.shape, -1)
+
+
+def warp(
+    picture: Tensor,
+    source: Camera,
+    depth: Tensor,
+    camera: Camera,
+    scale: int,
+    phase: tuple[float, float] = (0.0, 0.0),
+    *,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor]:
+    """Into all cells, whose depth is [h, w] enlarged: [h, w, s^2, C] and [h, w, s^2]."""
+    cells = torch.arange(depth.numel())
+    fine = enlarge_cells(depth, cells, scale, phase, backend=backend)
+    values, valid = warp_cells(picture, source, fine, cells, camera, scale, backend=backend)
+    return values.view(*depth.shape, *values.shape[1:]), valid.view(*depth.shape, -1)
 
 
 def whole(blocks: Tensor, scale: int) -> Tensor:
@@ -165,21 +192,21 @@ def test_an_enlarged_depth_is_the_definition(
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize(("scale", "phase"), [(4, (0.0, 0.0)), (4, (1.5, -0.5)), (3, (-1.0, 1.0))])
-def test_a_picture_is_warped_with_the_enlarged_depth(
-    scale: int, phase: tuple[float, float], backend: str
-) -> None:
-    """With a depth for every pixel there is nothing left to average: the same bits."""
-    depth = uneven_depth()
+def test_some_cells_are_those_of_the_whole(backend: str) -> None:
+    depth, scale = uneven_depth(), 4
     camera = straight(9 * scale, 7 * scale, focal=8.0 * scale)
     source = elsewhere(camera)
     picture = noise(source.height, source.width)
-    fine = whole(enlarge(depth, scale, phase, backend=backend)[..., None], scale)[..., 0]
-    got = warp(picture, source, fine, camera, 1, backend=backend)
-    want = warp(picture, source, depth, camera, scale, phase, backend=backend)
-    assert want[1].any()
-    assert torch.equal(whole(got[0], 1), whole(want[0], scale))
-    assert torch.equal(whole(got[1][..., None], 1), whole(want[1][..., None], scale))
+    cells = torch.tensor([40, 0, 17, 17, 62])
+    fine = enlarge_cells(depth, cells, scale, (1.5, -0.5), backend=backend)
+    assert torch.equal(
+        fine, enlarge(depth, scale, (1.5, -0.5), backend=backend).view(63, -1)[cells]
+    )
+    got = warp_cells(picture, source, fine, cells, camera, scale, backend=backend)
+    want = warp(picture, source, depth, camera, scale, (1.5, -0.5), backend=backend)
+    assert 0 < got[1].mean() < 1
+    for some, all_of_them in zip(got, want, strict=True):
+        assert torch.equal(some, all_of_them.flatten(0, 1)[cells])
 
 
 def test_an_enlarged_depth_of_float64_keeps_its_digits() -> None:
@@ -343,17 +370,17 @@ def test_strided_pictures_are_read_as_they_stand(backend: str) -> None:
 
 
 def test_wrong_arguments_are_named() -> None:
-    camera, depth = straight(12, 8), torch.ones(2, 3)
+    camera, depth, cells = straight(12, 8), torch.ones(6, 16), torch.arange(6)
     picture = torch.zeros(8, 12, 3)
     with pytest.raises(ValueError, match=r"picture: expected shape \[8, 12, any\], got \[8, 11, 3"):
-        warp(picture[:, 1:], camera, depth, camera, 4)
-    with pytest.raises(ValueError, match=r"depth: expected shape \[any, any\], got \[6\]"):
-        warp(picture, camera, depth.flatten(), camera, 4)
-    with pytest.raises(ValueError, match=r"camera: expected 6 x 4 pixels, 2 times .*, got 12 x 8"):
-        warp(picture, camera, depth, camera, 2)
+        warp_cells(picture[:, 1:], camera, depth, cells, camera, 4)
+    with pytest.raises(ValueError, match=r"depth: expected shape \[6, 16\], got \[96\]"):
+        warp_cells(picture, camera, depth.flatten(), cells, camera, 4)
+    with pytest.raises(ValueError, match=r"camera: expected cells of 4 x 4 pixels, got 12 x 9"):
+        warp_cells(picture, camera, depth, cells, replace(camera, height=9), 4)
     with pytest.raises(ValueError, match="warps float32"):
-        warp(picture.double(), camera, depth, camera, 4, backend="cpu")
-    with pytest.raises(ValueError, match=r"depth: expected shape \[any, any\], got \[6\]"):
-        enlarge(depth.flatten(), 4)
+        warp_cells(picture.double(), camera, depth, cells, camera, 4, backend="cpu")
+    with pytest.raises(ValueError, match=r"depth: expected shape \[any, any\], got \[96\]"):
+        enlarge_cells(depth.flatten(), cells, 4)
     with pytest.raises(ValueError, match="enlarges float32"):
-        enlarge(depth.double(), 4, backend="cpu")
+        enlarge_cells(depth.double(), cells, 4, backend="cpu")
