@@ -332,14 +332,15 @@ def test_a_cell_sees_as_far_as_a_patch_has_to_reach() -> None:
     """
     assert REACH == 2
     blocks, size = 2, 12
-    observation = observe(size, size, frames=0, matter=spot(size, size, 6, 5))
-    renderer = shaken(new_renderer(frames=0, blocks=blocks)).double()
+    observation = observe(size, size, frames=0, surface=False, matter=spot(size, size, 6, 5))
+    renderer = shaken(new_renderer(frames=0, blocks=blocks, surface=False)).double()
     middle = 0, slice(20, 24), slice(20, 24)  # cell (5, 5)
     without = renderer([doubled(observation)])[middle]
     for away, seen in ((blocks + REACH, True), (blocks + REACH + 1, False)):
         alpha = observation.frame.alpha.clone()
         alpha[5 - away, 5] = 1e-6
-        changed = replace(observation, frame=replace(observation.frame, alpha=alpha))
+        frame = replace(observation.frame, alpha=alpha)
+        changed = replace(observation, frame=frame, cells=cells_at_matter(alpha, []))
         difference = (renderer([doubled(changed)])[middle] - without).abs().max()
         assert (difference > ROUNDING) == seen
 
