@@ -67,6 +67,18 @@ class Rays:
     origins: Tensor
     directions: Tensor
 
+    @classmethod
+    def joined(cls, parts: Sequence[Rays]) -> Rays:
+        """The rays of all `parts`, one part after the other."""
+        return cls(
+            torch.cat([rays.origins for rays in parts]),
+            torch.cat([rays.directions for rays in parts]),
+        )
+
+    def take(self, index: Tensor) -> Rays:
+        """The rays at `index`."""
+        return Rays(self.origins[index], self.directions[index])
+
 
 @dataclass(frozen=True)
 class Frame:

@@ -7,17 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from bench.motion import viewing_target
 from bench.results import explained
 from bench.types import Budget, Log, Scene, SteerbenchError
 from methods import checkpoint, loop
 from methods.joint import JointOptions, RendererTraining
-from methods.patches import Patches, PatchSource
+from methods.patches import Batch, Patches, PatchSource
 from methods.pipeline import Pipeline, PipelineOptions
 from methods.pretrained import Setup, pretrain
-from methods.renderer2d import Observation, Renderer2d
+from methods.renderer2d import Renderer2d
 from methods.sequences import SequencePool, true_views
 
 
@@ -28,7 +27,7 @@ class AnyOf:
     sources: Sequence[Patches]
     generator: torch.Generator
 
-    def draw(self, count: int) -> tuple[list[Observation], Tensor, Tensor]:
+    def draw(self, count: int) -> Batch:
         """See `methods.patches.Patches`."""
         place = int(torch.randint(len(self.sources), (), generator=self.generator))
         return self.sources[place].draw(count)

@@ -12,12 +12,19 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel
 
+from bench.cameras import cast
+from bench.types import Rays
 from methods import checkpoint, loop
-from methods.fields import HashField
+from methods.cells import centres, pixels_of
 from methods.optimise import FieldOptimiser, step_at
-from methods.patches import Patches, Through
-from methods.renderer2d import Renderer2d
+from methods.patches import Batch, Patches, Through
+from methods.pipeline import Pipeline, most_doubted
+from methods.renderer2d import Drawing, Renderer2d
 from methods.sequences import MotionOptions
+from methods.volume import render_batch
+
+LEAST_ERROR = 1e-6
+"""Mean squared error of a cell below which one is as good as another."""
 
 Tensors = tuple[Tensor, ...] | list[Tensor]
 
@@ -37,6 +44,9 @@ class JointOptions:
         batch: patches of a step.
         precision: of the 2D renderer's convolutions while it is trained.
         opacity_entropy: weight of -o ln o of the rays.
+        doubt: weight of the squared error of the doubt, in log.
+        refined: share of the cells that are refined while it is trained.
+        refined_rays: pixels of those that the field learns from in a step.
         clip: largest norm of the 2D renderer's gradient.
         average: decay of the running mean of the 2D renderer's weights that is used in the end.
         distilled_views: most pictures of the stage 1 field at random views, to learn from as well.
@@ -53,6 +63,9 @@ class JointOptions:
     batch: int = 2
     precision: Literal["bf16", "fp32"] = "bf16"
     opacity_entropy: float = 1e-3
+    doubt: float = 1e-4
+    refined: float = 0.06
+    refined_rays: int = 512
     clip: float = 1.0
     average: float = 0.999
     distilled_views: int = 100
@@ -109,24 +122,37 @@ class RendererTraining:
         Raises:
             SteerbenchError: the loss is not finite.
         """
-        observations, truth, opacity = self.patches.draw(self.options.batch)
+        batch = self.patches.draw(self.options.batch)
         half = self.options.precision == "bf16"
-        with torch.autocast(truth.device.type, torch.bfloat16, enabled=half):
-            drawn = self.renderer(observations)
-        loss = functional.mse_loss(drawn, truth)
-        (loss + self._regularisation(opacity)).backward()
+        with torch.autocast(batch.truth.device.type, torch.bfloat16, enabled=half):
+            drawing = self.renderer(batch.observations)
+        loss = functional.mse_loss(drawing.pictures, batch.truth)
+        (loss + self._doubt_loss(batch, drawing) + self._field_loss(batch, drawing)).backward()
         value = loss.item()
         if not math.isfinite(value):
-            loop.check_finite(self, {"loss": loss, "picture": drawn})
+            loop.check_finite(self, {"loss": loss, "picture": drawing.pictures})
         nn.utils.clip_grad_norm_(self.renderer.parameters(), self.options.clip)
         low = self.options.final_rate
         self._update(low + (1 - low) * 0.5 * (1 + math.cos(math.pi * self.step / self.steps)))
         self.step += 1
         with torch.no_grad():
-            base = functional.mse_loss(self.renderer.base(observations), truth).item()
+            base = functional.mse_loss(self.renderer.base(batch.observations), batch.truth).item()
         return {"": value, "base": base}
 
-    def _regularisation(self, opacity: Tensor) -> Tensor | float:
+    def _doubt_loss(self, batch: Batch, drawing: Drawing) -> Tensor | float:
+        """How far the errors that the renderer expected are from those it made."""
+        if drawing.doubt is None:
+            return 0.0
+        errors = (drawing.pictures.detach() - batch.truth).square().mean(dim=-1)
+        made = [
+            pixels_of(error, o.cells, self.renderer.scale).mean(dim=1)
+            for error, o in zip(errors, batch.observations, strict=True)
+        ]
+        wanted = (torch.cat(made) + LEAST_ERROR).log()
+        return self.options.doubt * functional.mse_loss(drawing.doubt, wanted)
+
+    def _field_loss(self, batch: Batch, drawing: Drawing) -> Tensor | float:
+        """What the field learns from, beside the pictures that are drawn."""
         return 0.0
 
     def _update(self, share: float) -> None:
@@ -180,7 +206,7 @@ class JointTraining(RendererTraining):
 
     def __init__(
         self,
-        field: HashField,
+        pipeline: Pipeline,
         renderer: Renderer2d,
         patches: Patches,
         options: JointOptions,
@@ -188,14 +214,46 @@ class JointTraining(RendererTraining):
         generator: torch.Generator,
     ) -> None:
         super().__init__(renderer, patches, options, steps, generator)
-        self.field = field
-        self.field_optimiser = FieldOptimiser(field, fused=True)
+        self.pipeline, self.field = pipeline, pipeline.field
+        self.field_optimiser = FieldOptimiser(self.field, fused=True)
 
-    def _regularisation(self, opacity: Tensor) -> Tensor | float:
+    def _field_loss(self, batch: Batch, drawing: Drawing) -> Tensor | float:
+        return self._opacity_loss(batch.opacity) + self._refinement_loss(batch, drawing)
+
+    def _opacity_loss(self, opacity: Tensor) -> Tensor | float:
         if not len(opacity):
             return 0.0
         opacity = opacity.clamp(1e-5, 1 - 1e-5)
         return -self.options.opacity_entropy * (opacity * opacity.log()).mean()
+
+    def _refinement_loss(self, batch: Batch, drawing: Drawing) -> Tensor | float:
+        """Mean squared error that the pixels to be refined add to the pictures, estimated from
+        `refined_rays` of them."""
+        pipeline = self.pipeline
+        if not pipeline.options.refined or drawing.doubt is None:
+            return 0.0
+        scale, rays, truth = pipeline.options.scale, [], []
+        doubts = drawing.doubt.detach().split([len(o.cells) for o in batch.observations])
+        for o, view, picture, doubt in zip(
+            batch.observations, batch.views, batch.truth, doubts, strict=True
+        ):
+            worst = o.cells[most_doubted(doubt, pipeline.options.refined)]
+            rays.append(cast(view.full, centres(worst, view.low.width, scale).flatten(0, 1)))
+            truth.append(pixels_of(picture, worst, scale).flatten(0, 1))
+        wanted, every = torch.cat(truth), Rays.joined(rays)
+        if not len(wanted):
+            return 0.0
+        some = torch.randperm(len(wanted), generator=self.generator)[: self.options.refined_rays]
+        pixels, _ = render_batch(
+            self.field,
+            every.take(some),
+            pipeline.occupancy,
+            jitter=None,
+            background=pipeline.background,
+            stop=pipeline.options.stop,
+        )
+        error = (pixels.values[:, :3] - wanted[some]).square().sum() / len(some)
+        return error * len(wanted) / batch.truth.numel()
 
     def _update(self, share: float) -> None:
         super()._update(share)

@@ -45,12 +45,28 @@ class Patch:
     rays: list[Rays]
 
 
+@dataclass(frozen=True)
+class Batch:
+    """Patches to learn from.
+
+    Attributes:
+        observations: what is known of each, with a gradient if the field is to learn.
+        views: the cameras of each.
+        truth: their true pictures, [B, H, W, 3].
+        opacity: of the rays that were rendered.
+    """
+
+    observations: list[Observation]
+    views: list[View]
+    truth: Tensor
+    opacity: Tensor
+
+
 class Patches(Protocol):
     """Where a training gets its patches from."""
 
-    def draw(self, count: int) -> tuple[list[Observation], Tensor, Tensor]:
-        """`count` patches: what is known of them, with a gradient if the field is to learn; their
-        true pictures [count, H, W, 3]; and the opacity of the rays that were rendered."""
+    def draw(self, count: int) -> Batch:
+        """`count` patches."""
 
 
 class PatchSource:
@@ -74,11 +90,12 @@ class PatchSource:
         self.pipeline, self.pool, self.side = pipeline, pool, side
         self.learning, self.through, self.generator = learning, through, generator
 
-    def draw(self, count: int) -> tuple[list[Observation], Tensor, Tensor]:
+    def draw(self, count: int) -> Batch:
         """See `Patches`."""
         patches = [self.cut(self.pool.draw()) for _ in range(count)]
         observations, opacity = self.observe(patches)
-        return observations, torch.stack([patch.truth for patch in patches]), opacity
+        truth = torch.stack([patch.truth for patch in patches])
+        return Batch(observations, [patch.view for patch in patches], truth, opacity)
 
     def cut(self, sequence: Sequence) -> Patch:
         """A random patch of `sequence` in which there is more than background."""
@@ -120,9 +137,7 @@ class PatchSource:
     def observe(self, patches: list[Patch]) -> tuple[list[Observation], Tensor]:
         """What the renderer is given of `patches`, with the gradient it is to have; opacities."""
         rays = [rays for patch in patches for rays in patch.rays]
-        together = Rays(
-            torch.cat([r.origins for r in rays]), torch.cat([r.directions for r in rays])
-        )
+        together = Rays.joined(rays)
         pipeline = self.pipeline
         with torch.set_grad_enabled(self.learning):
             pixels, _ = render_batch(

@@ -4,10 +4,12 @@ depth_reprojection    the newest preceding depth narrows where rays look     Eq.
 field                 features, depth and opacity at h x w = H/s x W/s       Eq. 3 to 5
 feature_reprojection  preceding features, and the preceding picture, at H x W   Eq. 9, 10
 renderer2d            the 2D neural renderer                                 Eq. 11
+refinement            the field at H x W, where the 2D renderer doubts itself   not in the paper
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -19,14 +21,15 @@ from torch.nn import functional
 from bench.cameras import cast, scale_camera, unproject
 from bench.types import Camera, Frame, Probe
 from methods.buffer import Cloud, Remembered, RenderingBuffer, Reprojection
+from methods.cells import centres, put_pixels
 from methods.fields import HashField
 from methods.kernels.composite import STOP
 from methods.kernels.march import Occupancy
 from methods.kernels.warp import enlarge, warp
 from methods.occupancy import STEP
-from methods.range_reduction import RangeReduction, evidence, render_guided
+from methods.range_reduction import RangeReduction, depths_around, evidence, render_guided
 from methods.renderer2d import Detail, Observation, Points, Renderer2d, cells_at_matter
-from methods.volume import FeatureFrame, query
+from methods.volume import FeatureFrame, query, render_rays
 
 LAYER = 4 * STEP
 """Thickness, in scene units, of what a single sample of the surface stands for."""
@@ -40,7 +43,7 @@ class PipelineOptions:
         channels: K, features of the field; the first three are RGB.
         frames: L, preceding frames.
         scale: s, the field is rendered at 1/s of the resolution.
-        range: where rays look for a surface.
+        range: where rays look for a surface. It is not trained for, and can be chosen afterwards.
         reprojection: how preceding frames are brought into the present view.
         history: the preceding picture is reprojected, too.
         surface: the field is looked at once a pixel at full resolution, too, where the
@@ -50,8 +53,10 @@ class PipelineOptions:
         feature_background: what the features beyond RGB are composited on. 1/2 is what an
             untrained feature is everywhere.
         stop: transmittance at which a ray ends.
-        steps: length of a ray-marching step, in those of stage 1: stage 2 teaches the field to do
-            with longer ones.
+        steps: length of a ray-marching step at low resolution, in those of stage 1: stage 2
+            teaches the field to do with longer ones.
+        refined: share of the cells whose pixels are rendered by the field after all, those that
+            the 2D renderer doubts most. It can be chosen after the training, too.
     """
 
     channels: int = 6
@@ -65,6 +70,7 @@ class PipelineOptions:
     feature_background: float = 0.5
     stop: float = STOP
     steps: float = 1.0
+    refined: float = 0.0
 
     def __post_init__(self) -> None:
         if not (self.channels >= 3 and self.frames >= 0 and self.scale >= 1 and self.steps > 0):
@@ -72,6 +78,8 @@ class PipelineOptions:
                 f"expected channels (K) >= 3, frames (L) >= 0, scale (s) >= 1, steps > 0, "
                 f"got {self.channels}, {self.frames}, {self.scale}, {self.steps}"
             )
+        if not 0 <= self.refined <= 1:
+            raise ValueError(f"refined: expected a share of 0 to 1, got {self.refined}")
 
 
 class Pipeline:
@@ -80,6 +88,9 @@ class Pipeline:
     Args:
         field: with `options.channels` features.
         background: [3] of the scene.
+
+    Raises:
+        ValueError: cells are to be refined, and the renderer does not say which.
     """
 
     def __init__(
@@ -90,6 +101,11 @@ class Pipeline:
         renderer: Renderer2d,
         options: PipelineOptions,
     ) -> None:
+        if options.refined and not renderer.doubts:
+            raise ValueError(
+                f"pipeline.refined: {type(renderer).__name__} does not say where it may be wrong, "
+                f"expected 0, got {options.refined}"
+            )
         self.field, self.occupancy, self.renderer = field, occupancy, renderer
         self.options, self.backend = options, field.backend
         self.background = functional.pad(
@@ -99,18 +115,24 @@ class Pipeline:
     @torch.no_grad()
     def render(self, camera: Camera, buffer: RenderingBuffer, probe: Probe) -> Frame:
         """Render one frame that follows those in `buffer`, and remember it there."""
-        view = View.of(camera, self.options, buffer.turn)
+        options, view = self.options, View.of(camera, self.options, buffer.turn)
         newest = buffer.frames[0] if buffer.frames else None
         features = self._features(view, newest, probe)
         with probe.stage("feature_reprojection"):
             preceding = [self.reproject(frame.cloud, view) for frame in buffer.frames]
             observation = self.observe(features, preceding, newest, view, probe)
         with probe.stage("renderer2d"):
-            picture = self.renderer([observation])[0].clamp_(0, 1)
+            drawing = self.renderer([observation])
+            picture = drawing.pictures[0].clamp_(0, 1)
+        if options.refined and drawing.doubt is not None:
+            with probe.stage("refinement"):
+                worst = observation.cells[most_doubted(drawing.doubt, options.refined)]
+                colours = self.refine(worst, features, view, probe).clamp_(0, 1)
+                put_pixels(picture, worst, options.scale, colours)
         with probe.stage("finish"):
-            cloud = Cloud.of(features, self.options.reprojection)
+            cloud = Cloud.of(features, options.reprojection)
             buffer.push(Remembered(cloud, view.full, picture))
-            return _finish(camera, picture, features, self.options.scale)
+            return _finish(camera, picture, features, options.scale)
 
     def reproject(self, cloud: Cloud, view: View) -> Points:
         """The features of a preceding frame where the present picture sees them."""
@@ -126,8 +148,7 @@ class Pipeline:
         probe: Probe,
     ) -> Observation:
         """All that is known of the picture of `view` from its `frame` and the `preceding` ones."""
-        options = self.options
-        cells = cells_at_matter(frame.alpha, preceding)
+        options, cells = self.options, cells_at_matter(frame.alpha, preceding)
         history = surface = None
         if options.history or options.surface:
             depth = enlarge(
@@ -160,12 +181,9 @@ class Pipeline:
         if not self.options.surface:
             return None
         with probe.stage("surface"):
-            scale, known = self.options.scale, depth.isfinite()
-            place, sub = known.nonzero().unbind(dim=1)
-            cell = cells[place]
-            row, column = cell // view.low.width, cell % view.low.width
-            row, column = row * scale + sub // scale, column * scale + sub % scale
-            pixels = torch.stack((column, row), dim=1) + 0.5
+            known, width = depth.isfinite(), view.low.width
+            cell = cells[known.nonzero()[:, 0]]
+            pixels = centres(cells, width, self.options.scale)[known]
             points = unproject(view.full, pixels, depth[known])
             probe.count("surface_samples", len(points), view.full.width * view.full.height)
             # The pixels of a cell share the view direction of its middle.
@@ -174,6 +192,31 @@ class Pipeline:
             index = torch.full(known.shape, -1, dtype=torch.int32, device=depth.device)
             index[known] = torch.arange(len(points), dtype=torch.int32, device=depth.device)
         return Points(torch.cat((values, alpha[:, None]), dim=1), index)
+
+    def refine(self, cells: Tensor, frame: FeatureFrame, view: View, probe: Probe) -> Tensor:
+        """Colours [n, s^2, 3] of `cells` [n], by a ray of the field through each of their pixels,
+        in the steps of stage 1.
+
+        With range reduction in mode "window" rays look where the low-resolution `frame` has
+        something around their cell.
+        """
+        options = self.options
+        pixels = centres(cells, view.low.width, options.scale)
+        window = None
+        if options.range.mode == "window":
+            window = depths_around(frame.depth, options.range.epsilon).view(-1, 2)[cells]
+            window = window.repeat_interleave(options.scale**2, dim=0)
+        probe.count("refined_rays", pixels[..., 0].numel(), view.full.width * view.full.height)
+        found = render_rays(
+            self.field,
+            cast(view.full, pixels.flatten(0, 1)),
+            self.occupancy,
+            probe,
+            stop=options.stop,
+            window=window,
+        )
+        colours = found.values[:, :3] + (1 - found.alpha)[:, None] * self.background[:3]
+        return colours.view(*pixels.shape[:2], 3)
 
     def _features(self, view: View, newest: Remembered | None, probe: Probe) -> FeatureFrame:
         """The field at low resolution, looked at where the newest preceding frame says."""
@@ -194,6 +237,11 @@ class Pipeline:
                 stop=options.stop,
                 step=options.steps * STEP,
             )
+
+
+def most_doubted(doubt: Tensor, share: float) -> Tensor:
+    """Which of N cells, `share` of them, have the largest `doubt` [N]."""
+    return doubt.topk(math.ceil(share * len(doubt)), sorted=False).indices
 
 
 @dataclass(frozen=True)

@@ -82,6 +82,15 @@ def evidence(
     return Evidence(window, alpha, binding=options.mode == "paper")
 
 
+def depths_around(depth: Tensor, epsilon: float) -> Tensor:
+    """[h, w, 2] nearest and farthest z-depth within `epsilon` of those of the 3 x 3 neighbourhood
+    in `depth` [h, w]; [0, inf) where none of them is finite."""
+    near = -_highest(-depth)
+    far = _highest(torch.where(depth.isfinite(), depth, -torch.inf))
+    window = torch.stack((near - epsilon, far + epsilon), dim=-1)
+    return torch.where(near.isfinite()[..., None], window, window.new_tensor((0.0, torch.inf)))
+
+
 def _at(values: Tensor, index: Tensor, otherwise: float) -> Tensor:
     """`values` [N] at `index` [h, w], `otherwise` where that is -1."""
     return functional.pad(values, (0, 1), value=otherwise)[index.long()]  # -1 is the last one
@@ -139,7 +148,7 @@ def _march_within(
     inside = narrow.nonzero().squeeze(1)
     expected = alpha[inside]
     loose = max(stop, 1 - KEPT_ALPHA)
-    first = march(_take(rays, inside), stop=loose, window=window[inside])
+    first = march(rays.take(inside), stop=loose, window=window[inside])
     enough = first.alpha >= KEPT_ALPHA * expected
     # What is left of the opacity looks like what was found.
     more = torch.where(enough & (first.alpha < expected), expected / first.alpha, 1)
@@ -152,9 +161,5 @@ def _march_within(
     rest = unfinished.nonzero().squeeze(1)
     begin = torch.where(narrow, window[:, 1], 0)[rest]
     behind = torch.stack((begin, torch.full_like(begin, torch.inf)), dim=1)
-    canvas.put(rest, march(_take(rays, rest), stop=stop, window=behind, carry=canvas.take(rest)))
+    canvas.put(rest, march(rays.take(rest), stop=stop, window=behind, carry=canvas.take(rest)))
     return canvas
-
-
-def _take(rays: Rays, index: Tensor) -> Rays:
-    return Rays(rays.origins[index], rays.directions[index])

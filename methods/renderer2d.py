@@ -7,12 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torch import Tensor, nn
-from torch.nn import functional
 
+from methods.cells import any_in_cell, cells_near
 from methods.volume import FeatureFrame
-
-REACH = 2
-"""Cells around matter that are still drawn: what is further from all that was seen is empty."""
 
 
 @dataclass(frozen=True)
@@ -36,15 +33,12 @@ class Detail:
 class Observation:
     """All that is known of a picture before it is drawn.
 
-    A cell are the s x s pixels of the picture that a pixel of the present frame stands for.
-
     Attributes:
         frame: the present features, [h, w, K].
         background: [K] that they are composited on.
         preceding: newest first, with an index for every pixel [H, W]; fewer than L after a cold
             start.
-        cells: [N] int64, the cells in which there may be anything, counted row by row; see
-            `cells_at_matter`.
+        cells: [N] int64, the cells in which there may be anything; see `methods.cells`.
         history: the newest preceding picture in `cells`; None after a cold start, or where it is
             not used.
         surface: features of the field where the low-resolution depth has the surface of a pixel,
@@ -66,25 +60,42 @@ class Observation:
 
 
 def cells_at_matter(alpha: Tensor, preceding: Sequence[Points]) -> Tensor:
-    """The cells [N] within `REACH` of anything seen: in the present frame, of opacity `alpha`
-    [h, w], or in a preceding one."""
-    height, width = alpha.shape
-    some = alpha > 0
+    """The cells [N] near anything seen: in the present frame, of opacity `alpha` [h, w], or in a
+    preceding one."""
+    seen = alpha > 0
     for points in preceding:
-        scale = points.index.shape[0] // height
-        shown = (points.index >= 0).view(height, scale, width, scale)
-        some = some | shown.any(dim=3).any(dim=1)
-    size = 2 * REACH + 1
-    near = functional.max_pool2d(some[None].float(), size, stride=1, padding=REACH)
-    return near.flatten().nonzero().squeeze(1)
+        seen = seen | any_in_cell(points.index >= 0, points.index.shape[0] // len(alpha))
+    return cells_near(seen)
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What a 2D renderer makes of observations.
+
+    Attributes:
+        pictures: [B, H, W, 3].
+        doubt: [N] of all cells of the observations, one observation after the other: log of the
+            mean squared error that is expected there. None: the renderer does not say.
+    """
+
+    pictures: Tensor
+    doubt: Tensor | None = None
 
 
 class Renderer2d(nn.Module, ABC):
-    """A network that turns observations into pictures."""
+    """A network that turns observations into pictures.
+
+    Attributes:
+        scale: s.
+        doubts: it says where its pictures may be wrong.
+    """
+
+    scale: int
+    doubts = False
 
     @abstractmethod
-    def forward(self, observations: Sequence[Observation]) -> Tensor:
-        """Pictures [B, H, W, 3]."""
+    def forward(self, observations: Sequence[Observation]) -> Drawing:
+        """Draw all of them."""
 
     @abstractmethod
     def base(self, observations: Sequence[Observation]) -> Tensor:

@@ -11,9 +11,10 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional
 
+from methods.cells import number, paint, pixels_of
 from methods.kernels.depthwise import TAPS, depthwise, neighbours_of
 from methods.kernels.splat import gather
-from methods.renderer2d import Observation, Renderer2d
+from methods.renderer2d import Drawing, Observation, Renderer2d
 
 LEAK = 0.1
 """Slope of the activations below 0. With a slope of 0 the sparse inputs kill a trunk for good."""
@@ -44,7 +45,7 @@ class SpaceToDepth(Renderer2d):
     pixel with the preceding picture where that is known, plus a correction, plus what the features
     at the surface of each pixel say, read by a matrix that all pixels of a cell share. Shares,
     corrections and matrices come from a trunk of depthwise 3 x 3 convolutions and matrix products,
-    after ConvNeXt (Liu et al. 2022).
+    after ConvNeXt (Liu et al. 2022); so does the error to be expected in the cell.
 
     Only the cells of an observation are drawn; all others are background, and 0 to their
     neighbours. So nothing is computed for them, and a part of a frame is drawn exactly as in the
@@ -61,6 +62,8 @@ class SpaceToDepth(Renderer2d):
         history: use the preceding picture.
         surface: use the features at the surface, pixel by pixel.
     """
+
+    doubts = True
 
     def __init__(
         self,
@@ -82,7 +85,8 @@ class SpaceToDepth(Renderer2d):
         self.trunk = nn.ModuleList(_Block(width) for _ in range(blocks))
         self.leave = nn.Linear(width, scale**2 * (3 + self.history))
         self.read = nn.Linear(width, 3 * (channels + 1)) if surface else None
-        for layer in filter(None, (self.leave, self.read)):
+        self.doubt = nn.Linear(width, 1)
+        for layer in filter(None, (self.leave, self.read, self.doubt)):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
         if init == "generic":
@@ -98,12 +102,11 @@ class SpaceToDepth(Renderer2d):
             *[("surface", cell, features)] * self.surface,
         ]
 
-    def forward(self, observations: Sequence[Observation]) -> Tensor:
+    def forward(self, observations: Sequence[Observation]) -> Drawing:
         """See `Renderer2d`."""
         parts = [self._inputs(o) for o in observations]
         base, *groups = (_join(some) for some in zip(*parts, strict=True))
-        active = _active(observations)
-        neighbours, backend = neighbours_of(active), observations[0].backend
+        neighbours, backend = self._neighbours(observations), observations[0].backend
         hidden = self._enter([x.flatten(start_dim=1) for x in groups]).to(base)  # [N, width]
         for block in self.trunk:
             hidden = block(hidden, neighbours, backend)
@@ -120,7 +123,8 @@ class SpaceToDepth(Renderer2d):
             weighed = torch.cat((detail[..., :3] * detail[..., 3:4], detail[..., 3:]), dim=-1)
             with torch.autocast(base.device.type, enabled=False):
                 drawn = drawn + weighed @ matrix.transpose(1, 2)
-        return self._paint(active, drawn, observations[0].background[:3])
+        doubt = self.doubt(hidden).to(base).squeeze(1)
+        return Drawing(self._paint(observations, drawn), doubt)
 
     def _enter(self, inputs: Sequence[Tensor]) -> Tensor:
         """`enter` of all inputs beside each other, without writing them there."""
@@ -130,8 +134,7 @@ class SpaceToDepth(Renderer2d):
 
     def base(self, observations: Sequence[Observation]) -> Tensor:
         """See `Renderer2d`."""
-        base = _join([self._base(o) for o in observations])
-        return self._paint(_active(observations), base, observations[0].background[:3])
+        return self._paint(observations, _join([self._base(o) for o in observations]))
 
     def _inputs(self, observation: Observation) -> list[Tensor]:
         """The base [N, s^2, 3], then what each group of `_input_groups` has in every cell,
@@ -152,11 +155,10 @@ class SpaceToDepth(Renderer2d):
         A pixel lies between its 3 x 3 nearest samples, whatever the phase; beyond the frame its
         border goes on.
         """
-        cells = observation.cells
         height, width, _ = observation.frame.values.shape
-        around = torch.arange(-1, 2, device=cells.device)
-        row = (cells // width)[:, None] + around.repeat_interleave(3)
-        column = (cells % width)[:, None] + around.repeat(3)
+        around = torch.arange(-1, 2, device=observation.cells.device)
+        row = (observation.cells // width)[:, None] + around.repeat_interleave(3)
+        column = (observation.cells % width)[:, None] + around.repeat(3)
         near = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)  # [N, 9]
         colours = (observation.frame.values[..., :3] - observation.background[:3]).flatten(0, 1)
         across, down = (_tent(self.scale, shift).to(colours) for shift in observation.phase)
@@ -172,7 +174,7 @@ class SpaceToDepth(Renderer2d):
             return background.new_zeros(shape)
         points = observation.preceding[age]
         less = points.values - background
-        index = self._blocks(points.index, observation.cells)
+        index = pixels_of(points.index, observation.cells, self.scale)
         return gather(_tell(less, torch.ones_like(less[:, :1])), index, backend=observation.backend)
 
     def _recent(self, observation: Observation, base: Tensor) -> Tensor:
@@ -193,22 +195,18 @@ class SpaceToDepth(Renderer2d):
         less = base * (points.index >= 0)[..., None]
         return shown - functional.pad(less, (0, self.channels - 2))
 
-    def _blocks(self, index: Tensor, cells: Tensor) -> Tensor:
-        """Of [H, W] the pixels of each of `cells`, row by row: [N, s^2]."""
-        side, width = self.scale, index.shape[1] // self.scale
-        blocks = index.view(-1, side, width, side).transpose(1, 2)
-        return blocks[cells // width, cells % width].flatten(start_dim=1)
+    def _neighbours(self, observations: Sequence[Observation]) -> Tensor:
+        height, width = observations[0].frame.alpha.shape
+        batch, device = len(observations), observations[0].cells.device
+        active = torch.zeros(batch * height * width, dtype=torch.bool, device=device)
+        active[number([o.cells for o in observations], observations[0].frame.alpha.shape)] = True
+        return neighbours_of(active.view(batch, height, width))
 
-    def _paint(self, active: Tensor, cells: Tensor, background: Tensor) -> Tensor:
-        """Pictures [B, H, W, 3] of `cells` [N, s^2, 3], less the background, on the background."""
-        batch, height, width = active.shape
-        side = self.scale
-        canvas = background.repeat(batch, height, side, width, side, 1)
-        blocks = (cells + background).view(-1, side, side, 3)
-        picture, row, column = active.nonzero().unbind(dim=1)
-        # Advanced indices with a slice between them: the cells come first, as they do in `blocks`.
-        canvas[picture, row, :, column] = blocks
-        return canvas.view(batch, height * side, width * side, 3)
+    def _paint(self, observations: Sequence[Observation], less: Tensor) -> Tensor:
+        """Pictures [B, H, W, 3] of all cells, of which `less` [N, s^2, 3] has no background."""
+        size, background = observations[0].frame.alpha.shape, observations[0].background[:3]
+        shown = [o.cells for o in observations]
+        return paint(shown, size, self.scale, less + background, background)
 
     @torch.no_grad()
     def _start_from(self, generic: Mapping[str, Tensor]) -> None:
@@ -272,16 +270,6 @@ class _Block(nn.Module):
         """`x` [N, width] of cells with `neighbours` [N, 9]."""
         mixed = depthwise(x, neighbours, self.spread, backend=backend)
         return x + self.shrink(functional.leaky_relu(self.grow(mixed), LEAK))
-
-
-def _active(observations: Sequence[Observation]) -> Tensor:
-    """[B, h, w] bool: the cells of each observation."""
-    height, width = observations[0].frame.alpha.shape
-    device = observations[0].cells.device
-    active = torch.zeros(len(observations), height * width, dtype=torch.bool, device=device)
-    for picture, observation in zip(active, observations, strict=True):
-        picture[observation.cells] = True
-    return active.view(-1, height, width)
 
 
 def _join(parts: Sequence[Tensor]) -> Tensor:

@@ -23,6 +23,7 @@ from methods.kernels.encode import HashGrid
 from methods.patches import PatchSource
 from methods.pipeline import Pipeline, PipelineOptions
 from methods.pretrained import Pretrained, Setup, pretrain
+from methods.range_reduction import RangeReduction
 from methods.renderer2d import Renderer2d
 from methods.sequences import SequencePool, TrueView, true_views
 from methods.space_to_depth import GENERIC
@@ -30,6 +31,7 @@ from methods.train import TrainingOptions
 
 SOURCES = (
     "buffer",
+    "cells",
     "distil",
     "joint",
     "patches",
@@ -145,17 +147,18 @@ class SteerNerf:
         target: Tensor,
         budget: Budget,
     ) -> tuple[Pipeline, RendererTraining]:
-        device, shape = self.setup.device, self.options
+        device, shape, options = self.setup.device, self.options, self.joint
         torch.manual_seed(self.setup.seed)  # of the renderer's weights
         renderer = self.make_renderer(shape.channels, shape.frames, shape.scale)
         renderer = renderer.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        pipeline = Pipeline(
-            trained.field, trained.occupancy, scene.background.to(device), renderer, shape
-        )
+        background = scene.background.to(device)
+        pipeline = Pipeline(trained.field, trained.occupancy, background, renderer, shape)
+        # Where to look can be chosen afterwards: one training serves all choices.
+        everywhere = replace(shape, range=RangeReduction("off"), refined=options.refined)
+        taught = Pipeline(trained.field, trained.occupancy, background, renderer, everywhere)
         generator = torch.Generator().manual_seed(self.setup.seed)
-        options = self.joint
         pool = SequencePool(
-            pipeline,
+            taught,
             true_views(scene),
             distilled,
             options.distilled_share,
@@ -164,10 +167,10 @@ class SteerNerf:
             generator,
         )
         learning = options.field == "joint"
-        patches = PatchSource(pipeline, pool, options.patch, learning, options.through, generator)
+        patches = PatchSource(taught, pool, options.patch, learning, options.through, generator)
         rest = (renderer, patches, options, budget.renderer_steps, generator)
-        training = JointTraining(trained.field, *rest) if learning else RendererTraining(*rest)
-        pipeline.renderer = training.mean
+        training = JointTraining(taught, *rest) if learning else RendererTraining(*rest)
+        pipeline.renderer = taught.renderer = training.mean
         return pipeline, training
 
     def _key(self, budget: Budget) -> dict[str, object]:
@@ -176,9 +179,14 @@ class SteerNerf:
         kind, settings = make, {}
         if isinstance(make, partial):
             kind, settings = make.func, make.keywords
+        trained_for = {
+            name: value
+            for name, value in asdict(self.options).items()
+            if name not in ("range", "refined")
+        }
         return {
             "renderer_steps": budget.renderer_steps,
-            "pipeline": asdict(self.options),
+            "pipeline": trained_for,
             "renderer": {"kind": kind.__qualname__, **settings},
             "joint": asdict(self.joint),
             "stage2": stage2_digest(),

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from methods.kernels.splat import gather
-from methods.renderer2d import Observation, Renderer2d
+from methods.renderer2d import Drawing, Observation, Renderer2d
 
 
 class UnetRelease(Renderer2d):
@@ -42,10 +42,10 @@ class UnetRelease(Renderer2d):
         self.merge_full = _conv(128, 64)
         self.last = nn.Sequential(_conv(64, 64), nn.ReLU(), _conv(64, 3))
 
-    def forward(self, observations: Sequence[Observation]) -> Tensor:
+    def forward(self, observations: Sequence[Observation]) -> Drawing:
         """See `Renderer2d`."""
         inputs = torch.stack([self._inputs(o) for o in observations])
-        return self.base(observations) + self._network(inputs).permute(0, 2, 3, 1)
+        return Drawing(self.base(observations) + self._network(inputs).permute(0, 2, 3, 1))
 
     def base(self, observations: Sequence[Observation]) -> Tensor:
         """See `Renderer2d`."""

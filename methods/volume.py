@@ -19,7 +19,8 @@ CHUNK_RAYS = 1 << 16
 """Rays rendered together: enough to keep all threads busy, few enough to stay in the cache."""
 
 ROUND_SAMPLES = 8
-"""Samples a ray may take in a round: more are evaluated in vain, fewer take more rounds."""
+"""Samples a ray may take in the first round, twice as many in each that follows: more are evaluated
+in vain, fewer take more rounds, and the few rays that are left then are not worth many of them."""
 
 CHUNK_SAMPLES = 1 << 18
 """Samples whose density is evaluated together, without gradient: bounds the memory of a step."""
@@ -180,10 +181,12 @@ def render_rays(
     for first in range(0, len(rays.origins), CHUNK_RAYS):
         alive = torch.arange(first, min(first + CHUNK_RAYS, len(rays.origins)), device=device)
         start = torch.zeros(len(alive), dtype=torch.int32, device=device)
+        limit = ROUND_SAMPLES
         while len(alive):
             alive, start = _render_round(
-                field, rays, window, occupancy, probe, canvas, alive, start, stop, step
+                field, rays, window, occupancy, probe, canvas, alive, start, limit, stop, step
             )
+            limit *= 2
     return canvas
 
 
@@ -196,10 +199,12 @@ def _render_round(
     canvas: Pixels,
     alive: Tensor,
     start: Tensor,
+    limit: int,
     stop: float,
     step: float,
 ) -> tuple[Tensor, Tensor]:
-    """One round of the rays `alive` from their steps `start`; those left and where they go on."""
+    """One round of at most `limit` samples of the rays `alive` from their steps `start`; those left
+    and where they go on."""
     with probe.stage("march"):
         origins, directions = rays.origins[alive], rays.directions[alive]
         samples = march(
@@ -209,7 +214,7 @@ def _render_round(
             step,
             window=None if window is None else window[alive],
             start=start,
-            limit=ROUND_SAMPLES,
+            limit=limit,
             backend=field.backend,
         )
     probe.count("samples", len(samples))

@@ -16,9 +16,9 @@ from methods import checkpoint, space_to_depth
 from methods.generic import AnyOf, train_generic
 from methods.joint import JointOptions
 from methods.kernels.encode import HashGrid
+from methods.patches import Batch
 from methods.pipeline import PipelineOptions
 from methods.pretrained import Setup
-from methods.renderer2d import Observation
 from methods.sequences import MotionOptions
 from methods.space_to_depth import SpaceToDepth
 from methods.train import TrainingOptions
@@ -89,15 +89,15 @@ class Source:
     def __init__(self, number: int) -> None:
         self.number = number
 
-    def draw(self, count: int) -> tuple[list[Observation], Tensor, Tensor]:
-        return [], torch.full((count,), self.number), torch.zeros(0)
+    def draw(self, count: int) -> Batch:
+        return Batch([], [], torch.full((count,), self.number), torch.zeros(0))
 
 
 def test_a_batch_is_of_one_source_and_every_source_has_its_turn() -> None:
     def drawn(seed: int) -> list[int]:
         generator = torch.Generator().manual_seed(seed)
         patches = AnyOf([Source(number) for number in range(3)], generator)
-        batches = [patches.draw(2)[1].tolist() for _ in range(300)]
+        batches = [patches.draw(2).truth.tolist() for _ in range(300)]
         assert all(first == second for first, second in batches)
         return [first for first, _ in batches]
 

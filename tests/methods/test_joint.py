@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,18 +10,21 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.types import Camera, Log, Probe, Scene, SteerbenchError
+from bench.types import Camera, Log, NullProbe, Probe, Scene, SteerbenchError
 from methods import loop
+from methods.cells import pixels_of
 from methods.fields import HashField
-from methods.joint import JointOptions, JointTraining, RendererTraining
+from methods.joint import LEAST_ERROR, JointOptions, JointTraining, RendererTraining
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy
-from methods.patches import PatchSource, Through
+from methods.patches import Batch, PatchSource, Through
 from methods.pipeline import Pipeline, PipelineOptions, View
+from methods.range_reduction import RangeReduction
 from methods.renderer2d import Points, Renderer2d
 from methods.sequences import MotionOptions, SequencePool, TrueView
 from methods.space_to_depth import SpaceToDepth
 from methods.unet_release import UnetRelease
+from tests.methods.observations import shaken
 
 GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)
 MOTION = MotionOptions(pool=3, uses=4, length=2)
@@ -75,7 +79,7 @@ def new_training(
     learning = options.field == "joint"
     patches = PatchSource(whole, pool, options.patch, learning, options.through, generator)
     rest = (renderer, patches, options, steps, generator)
-    training = JointTraining(field, *rest) if learning else RendererTraining(*rest)
+    training = JointTraining(whole, *rest) if learning else RendererTraining(*rest)
     whole.renderer = training.mean
     return training
 
@@ -98,7 +102,7 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
     )
     options = replace(OPTIONS, through=through)
     with torch.no_grad():
-        for layer in filter(None, (renderer.leave, renderer.read)):
+        for layer in filter(None, (renderer.leave, renderer.read, renderer.doubt)):
             layer.weight.normal_(0, 0.1)
     training = new_training(ball_scene, options, pipeline, field.float(), renderer)
     patches = [training.patches.cut(training.patches.pool.draw()) for _ in range(16)]
@@ -123,9 +127,11 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
 
     def loss() -> Tensor:
         observations, opacity = training.patches.observe(patches)
-        drawn = renderer(observations)
+        drawing = renderer(observations)
+        assert drawing.doubt is not None
         truth = torch.stack([patch.truth for patch in patches])
-        return (drawn - truth).square().mean() + 1e-2 * opacity.square().mean()
+        more = opacity.square().mean() + drawing.doubt.square().mean()
+        return (drawing.pictures - truth).square().mean() + 1e-2 * more
 
     parameters = [field.table, *field.layers.values(), *renderer.parameters()]
     gradient = torch.autograd.grad(loss(), parameters)
@@ -186,12 +192,64 @@ def test_the_error_falls(ball_scene: Scene, frames: int) -> None:
     @torch.no_grad()
     def error() -> float:
         observations, _ = training.patches.observe(kept)
-        return (training.mean(observations) - truth).square().mean().item()
+        return (training.mean(observations).pictures - truth).square().mean().item()
 
     before = error()
     for _ in range(120):
         training.advance()
     assert error() < 0.8 * before
+
+
+def refined_loss(training: JointTraining, batch: Batch) -> Tensor:
+    loss = training._refinement_loss(batch, training.renderer(batch.observations))
+    assert isinstance(loss, Tensor)
+    return loss
+
+
+def test_the_field_learns_from_the_pixels_it_is_to_refine(ball_scene: Scene) -> None:
+    """From all of them: the squared error of the field's own rays, over all numbers of the
+    pictures. From some: the same in the mean."""
+    pipeline = replace(PIPELINE, refined=0.25, range=RangeReduction("off"))
+    training = new_training(ball_scene, replace(OPTIONS, refined_rays=10**6), pipeline)
+    assert isinstance(training, JointTraining)
+    shaken(training.renderer)
+    batch = training.patches.draw(2)
+    doubt = training.renderer(batch.observations).doubt
+    assert doubt is not None
+    error, first = 0.0, 0
+    for o, view, truth in zip(batch.observations, batch.views, batch.truth, strict=True):
+        own = doubt[first : first + len(o.cells)]
+        first += len(o.cells)
+        worst = own.sort(descending=True).indices[: math.ceil(0.25 * len(own))]
+        shown = training.pipeline.refine(o.cells[worst], o.frame, view, NullProbe())
+        error += (shown - pixels_of(truth, o.cells[worst], 4)).square().sum().item()
+    whole = refined_loss(training, batch)
+    # The same samples, taken in rounds or at once, and a thousand squares added up.
+    torch.testing.assert_close(whole.item(), error / batch.truth.numel(), rtol=1e-4, atol=0)
+    whole.backward()
+    assert training.field.grad_buffer is not None
+    assert training.field.grad_buffer.any()
+
+    training.options = replace(OPTIONS, refined_rays=64)
+    some = torch.stack([refined_loss(training, batch).detach() for _ in range(200)])
+    # 5 standard deviations of the mean of 200.
+    assert (some.mean() - whole.detach()).abs() < 5 * some.std() / math.sqrt(200)
+
+
+def test_doubt_learns_the_log_of_the_error(ball_scene: Scene) -> None:
+    training = new_training(ball_scene)
+    batch = training.patches.draw(2)
+    drawing = training.renderer(batch.observations)
+    assert drawing.doubt is not None
+    made = [
+        pixels_of((picture - truth).square(), o.cells, 4).flatten(1).mean(dim=1)
+        for picture, truth, o in zip(drawing.pictures, batch.truth, batch.observations, strict=True)
+    ]
+    right = (torch.cat(made) + LEAST_ERROR).log()
+    at_best = training._doubt_loss(batch, replace(drawing, doubt=right))
+    assert at_best < 1e-12  # the logarithm is rounded
+    off = training._doubt_loss(batch, replace(drawing, doubt=right + 2))
+    torch.testing.assert_close(off, torch.tensor(4 * OPTIONS.doubt), rtol=1e-5, atol=0)
 
 
 def test_the_renderer_of_the_release_can_be_trained(ball_scene: Scene) -> None:

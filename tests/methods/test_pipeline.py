@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from typing import Literal
 
 import pytest
 import torch
@@ -10,15 +12,19 @@ import torch
 from bench.cameras import cast, pixel_grid, project, unproject
 from bench.types import NullProbe
 from methods.buffer import RenderingBuffer
+from methods.cells import cells_near, pixels_of
 from methods.kernels.warp import enlarge
 from methods.pipeline import LAYER, Pipeline, PipelineOptions, View, sample_phase
+from methods.range_reduction import RangeReduction, render_guided
 from methods.space_to_depth import SpaceToDepth
+from methods.unet_release import UnetRelease
 from tests.methods.conftest import look_at_the_middle
-from tests.methods.observations import to_blocks
+from tests.methods.observations import shaken, to_blocks
 from tests.methods.test_joint import misty_field, shell
 
 OPTIONS = PipelineOptions(channels=4, frames=2, steps=8)
 CAMERA = look_at_the_middle(0.1, 0.3)
+Mode = Literal["off", "window"]
 ALL_CELLS = torch.arange(64)
 """Of its 32 x 32 pixels."""
 
@@ -139,7 +145,59 @@ def test_where_no_pixel_has_a_depth_there_is_no_surface() -> None:
     assert unused.surface(torch.ones(64, 16), ALL_CELLS, view, NullProbe()) is None
 
 
+@pytest.mark.parametrize("mode", ["off", "window"])
+def test_where_every_cell_is_refined_the_picture_is_that_of_the_field(mode: Mode) -> None:
+    options = replace(OPTIONS, refined=1.0, range=RangeReduction(mode, epsilon=1.0))
+    pipeline, buffer = new_pipeline(options), RenderingBuffer(2)
+    shown = pipeline.render(CAMERA, buffer, NullProbe()).rgb
+    white = pipeline.background
+    field = render_guided(pipeline.field, CAMERA, pipeline.occupancy, white, NullProbe(), None)
+    drawn = cells_near(pipeline._features(View.of(CAMERA, options, 0), None, NullProbe()).alpha > 0)
+    assert 10 < len(drawn) < 64
+    want = pixels_of(field.values[..., :3], drawn, 4)
+    assert want.std() > 0.01
+    # The same rays among others: products of bfloat16 may be added up in another order.
+    torch.testing.assert_close(pixels_of(shown, drawn, 4), want, rtol=0, atol=1e-3)
+    assert torch.equal(buffer.frames[0].picture, shown)  # and that is what is remembered
+
+
+def test_the_cells_in_most_doubt_are_refined() -> None:
+    """A share of them, rounded up; the others stay as they were drawn."""
+    share = 0.1
+    drawn, refined = (new_pipeline(replace(OPTIONS, refined=part)) for part in (0.0, share))
+    refined.renderer = shaken(drawn.renderer)
+    pictures = [p.render(CAMERA, RenderingBuffer(2), NullProbe()).rgb for p in (drawn, refined)]
+    view = View.of(CAMERA, OPTIONS, 0)
+    frame = drawn._features(view, None, NullProbe())
+    observation = drawn.observe(frame, [], None, view, NullProbe())
+    doubt = drawn.renderer([observation]).doubt
+    assert doubt is not None
+    order = doubt.sort(descending=True).indices
+    count = math.ceil(share * len(order))
+    before, after = (pixels_of(picture, observation.cells, 4) for picture in pictures)
+    changed = (before != after).flatten(1).any(dim=1)
+    assert set(changed.nonzero().flatten().tolist()) <= set(order[:count].tolist())
+    assert changed.sum() > 0.5 * count
+
+
+def test_what_a_renderer_that_knows_no_doubt_drew_cannot_be_refined() -> None:
+    pipeline = new_pipeline()
+    with pytest.raises(ValueError, match=r"pipeline\.refined: UnetRelease .* expected 0, got 0\.1"):
+        Pipeline(
+            pipeline.field,
+            pipeline.occupancy,
+            torch.ones(3),
+            UnetRelease(4, 2, 4),
+            replace(OPTIONS, refined=0.1),
+        )
+
+
 @pytest.mark.parametrize("wrong", [{"channels": 2}, {"frames": -1}, {"scale": 0}, {"steps": 0.0}])
 def test_options_that_make_no_frame_are_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="expected channels"):
         replace(OPTIONS, **wrong)
+
+
+def test_a_share_of_cells_is_between_0_and_1() -> None:
+    with pytest.raises(ValueError, match=r"refined: expected a share of 0 to 1, got 1\.5"):
+        replace(OPTIONS, refined=1.5)

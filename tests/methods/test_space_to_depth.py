@@ -12,7 +12,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from methods import space_to_depth
-from methods.renderer2d import REACH, Detail, Observation, Points, cells_at_matter
+from methods.cells import REACH
+from methods.renderer2d import Detail, Observation, Points, cells_at_matter
 from methods.space_to_depth import LEAK, SpaceToDepth
 from tests.methods.observations import (
     BACKGROUND,
@@ -155,9 +156,9 @@ def test_cells_are_drawn_as_by_a_dense_network(history: bool, surface: bool, sha
     assert (active.float().mean() < 0.9) == (share < 1)
     want = dense(renderer.double(), doubled(observation))
     assert (want != 1).any()
-    got = renderer([doubled(observation)])[0]
+    got = renderer([doubled(observation)]).pictures[0]
     torch.testing.assert_close(got, want, rtol=0, atol=ROUNDING)
-    quick = renderer.float()([observation])[0]
+    quick = renderer.float()([observation]).pictures[0]
     torch.testing.assert_close(quick.double(), want, rtol=0, atol=FLOAT32_ERROR)
 
 
@@ -174,7 +175,7 @@ def test_any_features_frames_and_sizes_are_taken(
         for seed in range(2)
     ]
     for batch in (observations[:1], observations):
-        pictures, base = renderer(batch), renderer.base(batch)
+        pictures, base = renderer(batch).pictures, renderer.base(batch)
         assert pictures.shape == base.shape == (len(batch), height * scale, width * scale, 3)
         assert pictures.isfinite().all()
 
@@ -194,10 +195,10 @@ def test_frames_that_are_missing_after_a_cold_start_show_nothing() -> None:
         surface=replace(warm.surface, index=torch.full_like(warm.surface.index, -1)),
     )
     missing = replace(warm, preceding=warm.preceding[:1], history=None, surface=None)
-    assert torch.equal(renderer([nothing]), renderer([missing]))
-    cold = renderer([replace(missing, preceding=[])])
+    assert torch.equal(renderer([nothing]).pictures, renderer([missing]).pictures)
+    cold = renderer([replace(missing, preceding=[])]).pictures
     assert cold.isfinite().all()
-    assert (cold - renderer([missing])).abs().max() > 1e-3
+    assert (cold - renderer([missing]).pictures).abs().max() > 1e-3
 
 
 @pytest.mark.parametrize("history", [False, True])
@@ -208,7 +209,9 @@ def test_gradients_reach_every_parameter_and_the_features_of_all_that_is_shown(
     observation = observe(history=history)
     features = [tensor.requires_grad_() for tensor in features_of(observation)]
     assert len(features) == 4  # of the present, two preceding frames, the surface
-    renderer([observation]).square().sum().backward()
+    drawing = renderer([observation])
+    assert drawing.doubt is not None
+    (drawing.pictures.square().sum() + drawing.doubt.sum()).backward()
     for name, parameter in renderer.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.any(), name
@@ -229,7 +232,7 @@ def test_an_untrained_network_draws_the_aligned_bilinear_base(history: bool, sca
     base = renderer.base([observation])
     # Weights and values are multiples of 1/4096: nothing is rounded.
     assert torch.equal(base[0], enlarged(observation, scale))
-    assert torch.equal(renderer([observation]), base)
+    assert torch.equal(renderer([observation]).pictures, base)
 
 
 @pytest.mark.parametrize("phase", [(0.0, 0.0), (1.5, -0.5), (-1.5, 1.5), (2.0, -2.0)])
@@ -257,7 +260,7 @@ def test_far_from_anything_the_picture_is_the_background(batch: int) -> None:
     height, width, scale = 14, 16, 4
     observation = observe(height, width, matter=spot(height, width, 5, 6))
     renderer = shaken(new_renderer())
-    pictures, base = renderer([observation] * batch), renderer.base([observation] * batch)
+    pictures, base = renderer([observation] * batch).pictures, renderer.base([observation] * batch)
     near = torch.zeros(height * scale, width * scale, dtype=torch.bool)
     rows = slice(scale * (5 - REACH), scale * (7 + REACH))
     columns = slice(scale * (6 - REACH), scale * (9 + REACH))
@@ -277,7 +280,7 @@ def test_a_point_of_a_preceding_frame_alone_is_something() -> None:
     preceding = [replace(observation.preceding[0], index=index)]
     cells = cells_at_matter(observation.frame.alpha, preceding)
     alone = replace(observation, preceding=preceding, cells=cells, history=None, surface=None)
-    seen = renderer([alone])
+    seen = renderer([alone]).pictures
     changed = (seen[0] != 1).any(dim=-1).nonzero()
     assert changed.amin(dim=0).tolist() == [4 * (4 - REACH)] * 2
     assert changed.amax(dim=0).tolist() == [4 * (5 + REACH) - 1] * 2
@@ -286,10 +289,10 @@ def test_a_point_of_a_preceding_frame_alone_is_something() -> None:
 def test_where_nothing_is_the_picture_is_the_background() -> None:
     observation = observe(matter=torch.zeros(5, 7, dtype=torch.bool))
     renderer = shaken(new_renderer())
-    assert (renderer([observation]) == 1).all()
+    assert (renderer([observation]).pictures == 1).all()
     assert (renderer.base([observation]) == 1).all()
     for empty in (observation, replace(observation, preceding=[], history=None, surface=None)):
-        renderer([empty]).sum().backward()  # a patch without matter stops no training
+        renderer([empty]).pictures.sum().backward()  # a patch without matter stops no training
 
 
 @pytest.mark.parametrize(("row", "column"), [(5, 6), (0, 0), (12, 13)])
@@ -299,7 +302,7 @@ def test_a_batch_of_two_is_one_after_the_other(row: int, column: int) -> None:
         doubled(observe(14, 16, matter=spot(14, 16, 3, 3), seed=1)),
     ]
     renderer = shaken(new_renderer()).double()
-    for draw in (renderer, renderer.base):
+    for draw in (lambda shown: renderer(shown).pictures, renderer.base):
         alone = torch.cat([draw([observation]) for observation in observations])
         torch.testing.assert_close(draw(observations), alone, rtol=0, atol=ROUNDING)
 
@@ -318,7 +321,7 @@ def test_a_patch_is_drawn_as_the_whole_frame(blocks: int) -> None:
     patch = cut(observation, scale, side, side)
     inside = slice(scale * halo, scale * (halo + end - begin))
     there = slice(scale * begin, scale * end)
-    for draw in (renderer, renderer.base):
+    for draw in (lambda shown: renderer(shown).pictures, renderer.base):
         want = draw([observation])[0, there, there]
         assert (want != 1).any()
         got = draw([patch])[0, inside, inside]
@@ -328,20 +331,20 @@ def test_a_patch_is_drawn_as_the_whole_frame(blocks: int) -> None:
 def test_a_cell_sees_as_far_as_a_patch_has_to_reach() -> None:
     """Whether something is `blocks + REACH` away decides whether the cell `blocks` away is there.
 
-    The cells between are there in either case, because of what is one cell to the other side.
+    The cell between them is there in either case, because of what is in the first.
     """
-    assert REACH == 2
+    assert REACH == 1
     blocks, size = 2, 12
-    observation = observe(size, size, frames=0, surface=False, matter=spot(size, size, 6, 5))
+    observation = observe(size, size, frames=0, surface=False, matter=spot(size, size, 5, 5))
     renderer = shaken(new_renderer(frames=0, blocks=blocks, surface=False)).double()
     middle = 0, slice(20, 24), slice(20, 24)  # cell (5, 5)
-    without = renderer([doubled(observation)])[middle]
+    without = renderer([doubled(observation)]).pictures[middle]
     for away, seen in ((blocks + REACH, True), (blocks + REACH + 1, False)):
         alpha = observation.frame.alpha.clone()
         alpha[5 - away, 5] = 1e-6
         frame = replace(observation.frame, alpha=alpha)
         changed = replace(observation, frame=frame, cells=cells_at_matter(alpha, []))
-        difference = (renderer([doubled(changed)])[middle] - without).abs().max()
+        difference = (renderer([doubled(changed)]).pictures[middle] - without).abs().max()
         assert (difference > ROUNDING) == seen
 
 
@@ -360,7 +363,7 @@ def test_the_preceding_picture_is_blended_in_where_it_is_known(share: float) -> 
     base = enlarged(observation, scale)
     want = torch.where(valid > 0, share * picture + (1 - share) * base, base)
     assert 0.5 < valid.mean() < 0.8
-    torch.testing.assert_close(renderer([observation])[0], want, rtol=0, atol=BLENDING)
+    torch.testing.assert_close(renderer([observation]).pictures[0], want, rtol=0, atol=BLENDING)
 
 
 def test_the_surface_covers_the_base_as_far_as_it_is_opaque() -> None:
@@ -376,7 +379,7 @@ def test_the_surface_covers_the_base_as_far_as_it_is_opaque() -> None:
     covered = base + values[..., -1:] * (values[..., :3] - base)
     want = torch.where(known[..., None] > 0, covered, base)
     assert 0.5 < known.mean() < 0.8
-    torch.testing.assert_close(renderer([observation])[0], want, rtol=0, atol=BLENDING)
+    torch.testing.assert_close(renderer([observation]).pictures[0], want, rtol=0, atol=BLENDING)
 
 
 @pytest.mark.parametrize("column", [3, 4, 6])
@@ -392,7 +395,7 @@ def test_a_matrix_reads_opacity_and_other_features_less_the_background(column: i
     read = values[..., -1] if column == 3 else values[..., column - 1] - BACKGROUND[column - 1]
     want = enlarged(observation, scale)
     want[..., 1] += known * read
-    torch.testing.assert_close(renderer([observation])[0], want, rtol=0, atol=BLENDING)
+    torch.testing.assert_close(renderer([observation]).pictures[0], want, rtol=0, atol=BLENDING)
 
 
 @pytest.mark.parametrize("part", ["history", "surface"])
@@ -400,9 +403,9 @@ def test_a_renderer_without_a_part_ignores_what_is_known_of_it(part: str) -> Non
     renderer = shaken(new_renderer(**{part: False}))
     observation = observe()
     without = replace(observation, **{part: None})
-    assert torch.equal(renderer([observation]), renderer([without]))
+    assert torch.equal(renderer([observation]).pictures, renderer([without]).pictures)
     other = shaken(new_renderer())
-    assert not torch.equal(other([observation]), other([without]))
+    assert not torch.equal(other([observation]).pictures, other([without]).pictures)
 
 
 def test_without_preceding_frames_there_is_no_preceding_picture() -> None:
@@ -416,20 +419,32 @@ def test_a_point_that_looks_like_the_background_is_not_nothing() -> None:
     like_background = replace(observation.preceding[0], values=BACKGROUND[:6].expand(20, 6))
     none = replace(like_background, index=torch.full_like(like_background.index, -1))
     shown, hidden = (
-        renderer([replace(observation, preceding=[p])]) for p in (like_background, none)
+        renderer([replace(observation, preceding=[p])]).pictures for p in (like_background, none)
     )
     assert (shown - hidden).abs().max() > FLOAT32_ERROR
+
+
+def test_a_doubt_belongs_to_each_cell_of_each_observation() -> None:
+    observations = [observe(9, 9, matter=spot(9, 9, 3, 3)), observe(9, 9, seed=1)]
+    renderer = shaken(new_renderer())
+    doubt = renderer(observations).doubt
+    assert doubt is not None
+    assert doubt.shape == (len(observations[0].cells) + len(observations[1].cells),)
+    alone = renderer(observations[1:]).doubt
+    assert alone is not None
+    assert alone.std() > 0
+    torch.testing.assert_close(doubt[-len(alone) :], alone, rtol=0, atol=FLOAT32_ERROR)
 
 
 def test_half_precision_changes_little() -> None:
     renderer = shaken(new_renderer())
     observation = observe()
     with torch.autocast("cpu", torch.bfloat16):
-        half = renderer([observation])
+        half = renderer([observation]).pictures
         assert torch.equal(renderer.base([observation]), new_renderer().base([observation]))
     assert half.dtype == torch.float32
     # A correction below 1, of sums of which each term is off by 1/256.
-    assert 0 < (half - renderer([observation])).abs().max() < 0.1
+    assert 0 < (half - renderer([observation]).pictures).abs().max() < 0.1
 
 
 def generic_renderer() -> SpaceToDepth:
@@ -483,8 +498,8 @@ def test_a_renderer_starts_as_the_generic_one_draws(channels: int, parts: dict) 
             surface=renderer.surface,
         )
     )
-    want = generic.double()([known])
-    got = renderer.double()([widened(known) if channels == 6 else known])
+    want = generic.double()([known]).pictures
+    got = renderer.double()([widened(known) if channels == 6 else known]).pictures
     torch.testing.assert_close(got, want, rtol=0, atol=ROUNDING)
 
 

@@ -32,7 +32,7 @@ def test_any_features_frames_and_sizes_are_taken(
         for seed in range(2)
     ]
     for batch in (observations[:1], observations):
-        pictures, base = renderer(batch), renderer.base(batch)
+        pictures, base = renderer(batch).pictures, renderer.base(batch)
         assert pictures.shape == base.shape == (len(batch), height * scale, width * scale, 3)
         assert pictures.isfinite().all()
 
@@ -41,10 +41,10 @@ def test_frames_that_are_missing_after_a_cold_start_show_nothing() -> None:
     renderer = shaken(UnetRelease(6, 2, 4)).double()
     warm = doubled(observe())
     empty = replace(warm.preceding[1], index=torch.full_like(warm.preceding[1].index, -1))
-    pictures = renderer([replace(warm, preceding=warm.preceding[:1])])
-    unseen = renderer([replace(warm, preceding=[warm.preceding[0], empty])])
+    pictures = renderer([replace(warm, preceding=warm.preceding[:1])]).pictures
+    unseen = renderer([replace(warm, preceding=[warm.preceding[0], empty])]).pictures
     assert torch.equal(pictures, unseen)
-    cold = renderer([replace(warm, preceding=[])])
+    cold = renderer([replace(warm, preceding=[])]).pictures
     assert cold.isfinite().all()
     assert (cold - pictures).abs().max() > 1e-3
 
@@ -52,22 +52,22 @@ def test_frames_that_are_missing_after_a_cold_start_show_nothing() -> None:
 def test_a_batch_of_two_is_one_after_the_other() -> None:
     renderer = shaken(UnetRelease(6, 1, 4)).double()
     observations = [doubled(observe(frames=1, seed=seed)) for seed in range(2)]
-    alone = torch.cat([renderer([observation]) for observation in observations])
-    torch.testing.assert_close(renderer(observations), alone, rtol=0, atol=ROUNDING)
+    alone = torch.cat([renderer([observation]).pictures for observation in observations])
+    torch.testing.assert_close(renderer(observations).pictures, alone, rtol=0, atol=ROUNDING)
 
 
 def test_neither_the_preceding_picture_nor_the_surface_is_looked_at() -> None:
     renderer = shaken(UnetRelease(6, 1, 4))
     observation = observe(frames=1)
     without = replace(observation, history=None, surface=None)
-    assert torch.equal(renderer([observation]), renderer([without]))
+    assert torch.equal(renderer([observation]).pictures, renderer([without]).pictures)
 
 
 def test_gradients_reach_every_parameter_and_the_features_of_all_frames() -> None:
     renderer = shaken(UnetRelease(6, 2, 4))
     observation = observe(surface=False)
     features = [tensor.requires_grad_() for tensor in features_of(observation)]
-    renderer([observation]).square().sum().backward()
+    renderer([observation]).pictures.square().sum().backward()
     for name, parameter in renderer.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.any(), name
@@ -99,7 +99,7 @@ def test_without_an_output_of_the_network_the_picture_is_the_base() -> None:
         torch.nn.init.zeros_(layer)
     observation = observe()
     base = renderer.base([observation])
-    assert torch.equal(renderer([observation]), base)
+    assert torch.equal(renderer([observation]).pictures, base)
     rgb = observation.frame.values[..., :3].permute(2, 0, 1)[None]
     want = functional.interpolate(rgb, scale_factor=4, mode="bilinear", align_corners=False)
     assert torch.equal(base, want.permute(0, 2, 3, 1))
