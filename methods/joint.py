@@ -16,6 +16,7 @@ from bench.cameras import cast
 from bench.types import Rays
 from methods import checkpoint, loop
 from methods.cells import centres, pixels_of
+from methods.occupancy import STEP
 from methods.optimise import FieldOptimiser, step_at
 from methods.patches import Batch, Patches, Through
 from methods.pipeline import Pipeline, most_doubted
@@ -57,15 +58,15 @@ class JointOptions:
     field: Literal["joint", "frozen"] = "joint"
     through: Through = "present"
     rate: float = 1e-3
-    field_rate: float = 3e-3
+    field_rate: float = 1e-3
     final_rate: float = 0.01
     patch: int = 32
     batch: int = 2
     precision: Literal["bf16", "fp32"] = "bf16"
     opacity_entropy: float = 1e-3
     doubt: float = 1e-4
-    refined: float = 0.06
-    refined_rays: int = 512
+    refined: float = 0.2
+    refined_rays: int = 2048
     clip: float = 1.0
     average: float = 0.999
     distilled_views: int = 100
@@ -251,6 +252,7 @@ class JointTraining(RendererTraining):
             jitter=None,
             background=pipeline.background,
             stop=pipeline.options.stop,
+            step=pipeline.options.steps * STEP,
         )
         error = (pixels.values[:, :3] - wanted[some]).square().sum() / len(some)
         return error * len(wanted) / batch.truth.numel()

@@ -53,8 +53,8 @@ class PipelineOptions:
         feature_background: what the features beyond RGB are composited on. 1/2 is what an
             untrained feature is everywhere.
         stop: transmittance at which a ray ends.
-        steps: length of a ray-marching step at low resolution, in those of stage 1: stage 2
-            teaches the field to do with longer ones.
+        steps: length of a ray-marching step, in those of stage 1: stage 2 teaches the field to do
+            with longer ones.
         refined: share of the cells whose pixels are rendered by the field after all, those that
             the 2D renderer doubts most. It can be chosen after the training, too.
     """
@@ -182,20 +182,19 @@ class Pipeline:
             return None
         with probe.stage("surface"):
             known, width = depth.isfinite(), view.low.width
-            cell = cells[known.nonzero()[:, 0]]
             pixels = centres(cells, width, self.options.scale)[known]
             points = unproject(view.full, pixels, depth[known])
             probe.count("surface_samples", len(points), view.full.width * view.full.height)
             # The pixels of a cell share the view direction of its middle.
-            sigma, values = query(self.field, points, cell, cast(view.low).directions)
+            middles = cast(view.low, centres(cells, width, 1)[:, 0])
+            sigma, values = query(self.field, points, known.nonzero()[:, 0], middles.directions)
             alpha = -torch.expm1(-LAYER * sigma)
             index = torch.full(known.shape, -1, dtype=torch.int32, device=depth.device)
             index[known] = torch.arange(len(points), dtype=torch.int32, device=depth.device)
         return Points(torch.cat((values, alpha[:, None]), dim=1), index)
 
     def refine(self, cells: Tensor, frame: FeatureFrame, view: View, probe: Probe) -> Tensor:
-        """Colours [n, s^2, 3] of `cells` [n], by a ray of the field through each of their pixels,
-        in the steps of stage 1.
+        """Colours [n, s^2, 3] of `cells` [n], by a ray of the field through each of their pixels.
 
         With range reduction in mode "window" rays look where the low-resolution `frame` has
         something around their cell.
@@ -204,7 +203,8 @@ class Pipeline:
         pixels = centres(cells, view.low.width, options.scale)
         window = None
         if options.range.mode == "window":
-            window = depths_around(frame.depth, options.range.epsilon).view(-1, 2)[cells]
+            # Between the samples of the frame a surface may lie farther off.
+            window = depths_around(frame.depth, 2 * options.range.epsilon).view(-1, 2)[cells]
             window = window.repeat_interleave(options.scale**2, dim=0)
         probe.count("refined_rays", pixels[..., 0].numel(), view.full.width * view.full.height)
         found = render_rays(
@@ -213,6 +213,7 @@ class Pipeline:
             self.occupancy,
             probe,
             stop=options.stop,
+            step=options.steps * STEP,
             window=window,
         )
         colours = found.values[:, :3] + (1 - found.alpha)[:, None] * self.background[:3]

@@ -19,6 +19,9 @@ from methods.renderer2d import Drawing, Observation, Renderer2d
 LEAK = 0.1
 """Slope of the activations below 0. With a slope of 0 the sparse inputs kill a trunk for good."""
 
+QUANTUM = 256
+"""While it is trained, the trunk is given cells in multiples of this."""
+
 GENERIC = Path(__file__).parent / "weights" / "generic.safetensors"
 """Weights trained on other scenes, by `steerbench generic`."""
 
@@ -106,11 +109,7 @@ class SpaceToDepth(Renderer2d):
         """See `Renderer2d`."""
         parts = [self._inputs(o) for o in observations]
         base, *groups = (_join(some) for some in zip(*parts, strict=True))
-        neighbours, backend = self._neighbours(observations), observations[0].backend
-        hidden = self._enter([x.flatten(start_dim=1) for x in groups]).to(base)  # [N, width]
-        for block in self.trunk:
-            hidden = block(hidden, neighbours, backend)
-        hidden = functional.leaky_relu(hidden, LEAK)
+        hidden = self._think([x.flatten(start_dim=1) for x in groups], observations)  # [N, width]
         out = self.leave(hidden).to(base).view(-1, self.scale**2, 3 + self.history)
         drawn = base + out[..., :3]
         if self.history:
@@ -125,6 +124,20 @@ class SpaceToDepth(Renderer2d):
                 drawn = drawn + weighed @ matrix.transpose(1, 2)
         doubt = self.doubt(hidden).to(base).squeeze(1)
         return Drawing(self._paint(observations, drawn), doubt)
+
+    def _think(self, inputs: Sequence[Tensor], observations: Sequence[Observation]) -> Tensor:
+        """The trunk on the `inputs` of all cells: [N, width]."""
+        neighbours, backend = self._neighbours(observations), observations[0].backend
+        count = len(neighbours)
+        if torch.is_grad_enabled():
+            # The library behind the products prepares code for every new size: have few sizes.
+            more = (0, 0, 0, -count % QUANTUM)
+            inputs = [functional.pad(x, more) for x in inputs]
+            neighbours = functional.pad(neighbours, more, value=-1)
+        hidden = self._enter(inputs).to(inputs[0])
+        for block in self.trunk:
+            hidden = block(hidden, neighbours, backend)
+        return functional.leaky_relu(hidden[:count], LEAK)
 
     def _enter(self, inputs: Sequence[Tensor]) -> Tensor:
         """`enter` of all inputs beside each other, without writing them there."""

@@ -19,8 +19,9 @@ CHUNK_RAYS = 1 << 16
 """Rays rendered together: enough to keep all threads busy, few enough to stay in the cache."""
 
 ROUND_SAMPLES = 8
-"""Samples a ray may take in the first round, twice as many in each that follows: more are evaluated
-in vain, fewer take more rounds, and the few rays that are left then are not worth many of them."""
+"""Samples a ray may take in a round: more are evaluated in vain, fewer take more rounds. The few
+rays that are left in the end are not worth many rounds: they may take as many more as they are
+fewer than half of all."""
 
 CHUNK_SAMPLES = 1 << 18
 """Samples whose density is evaluated together, without gradient: bounds the memory of a step."""
@@ -181,12 +182,12 @@ def render_rays(
     for first in range(0, len(rays.origins), CHUNK_RAYS):
         alive = torch.arange(first, min(first + CHUNK_RAYS, len(rays.origins)), device=device)
         start = torch.zeros(len(alive), dtype=torch.int32, device=device)
-        limit = ROUND_SAMPLES
+        count = len(alive)
         while len(alive):
+            limit = ROUND_SAMPLES * max(count // (2 * len(alive)), 1)
             alive, start = _render_round(
                 field, rays, window, occupancy, probe, canvas, alive, start, limit, stop, step
             )
-            limit *= 2
     return canvas
 
 

@@ -14,6 +14,7 @@ from bench.types import NullProbe
 from methods.buffer import RenderingBuffer
 from methods.cells import cells_near, pixels_of
 from methods.kernels.warp import enlarge
+from methods.occupancy import STEP
 from methods.pipeline import LAYER, Pipeline, PipelineOptions, View, sample_phase
 from methods.range_reduction import RangeReduction, render_guided
 from methods.space_to_depth import SpaceToDepth
@@ -150,8 +151,15 @@ def test_where_every_cell_is_refined_the_picture_is_that_of_the_field(mode: Mode
     options = replace(OPTIONS, refined=1.0, range=RangeReduction(mode, epsilon=1.0))
     pipeline, buffer = new_pipeline(options), RenderingBuffer(2)
     shown = pipeline.render(CAMERA, buffer, NullProbe()).rgb
-    white = pipeline.background
-    field = render_guided(pipeline.field, CAMERA, pipeline.occupancy, white, NullProbe(), None)
+    field = render_guided(
+        pipeline.field,
+        CAMERA,
+        pipeline.occupancy,
+        pipeline.background,
+        NullProbe(),
+        None,
+        step=OPTIONS.steps * STEP,
+    )
     drawn = cells_near(pipeline._features(View.of(CAMERA, options, 0), None, NullProbe()).alpha > 0)
     assert 10 < len(drawn) < 64
     want = pixels_of(field.values[..., :3], drawn, 4)
