@@ -181,16 +181,18 @@ class Pipeline:
         if not self.options.surface:
             return None
         with probe.stage("surface"):
-            known, width = depth.isfinite(), view.low.width
-            pixels = centres(cells, width, self.options.scale)[known]
-            points = unproject(view.full, pixels, depth[known])
+            scale, width = self.options.scale, view.low.width
+            known = depth.isfinite().flatten().nonzero().squeeze(1)
+            pixels = centres(cells, width, scale).flatten(0, 1)[known]
+            points = unproject(view.full, pixels, depth.flatten()[known])
             probe.count("surface_samples", len(points), view.full.width * view.full.height)
             # The pixels of a cell share the view direction of its middle.
-            middles = cast(view.low, centres(cells, width, 1)[:, 0])
-            sigma, values = query(self.field, points, known.nonzero()[:, 0], middles.directions)
+            middles = cast(view.low, centres(cells, width, 1)[:, 0]).directions
+            sigma, values = query(self.field, points, known // scale**2, middles)
             alpha = -torch.expm1(-LAYER * sigma)
-            index = torch.full(known.shape, -1, dtype=torch.int32, device=depth.device)
-            index[known] = torch.arange(len(points), dtype=torch.int32, device=depth.device)
+            index = torch.full(depth.shape, -1, dtype=torch.int32, device=depth.device)
+            number = torch.arange(len(points), dtype=torch.int32, device=depth.device)
+            index.view(-1)[known] = number
         return Points(torch.cat((values, alpha[:, None]), dim=1), index)
 
     def refine(self, cells: Tensor, frame: FeatureFrame, view: View, probe: Probe) -> Tensor:

@@ -20,7 +20,7 @@ LEAK = 0.1
 """Slope of the activations below 0. With a slope of 0 the sparse inputs kill a trunk for good."""
 
 QUANTUM = 256
-"""While it is trained, the trunk is given cells in multiples of this."""
+"""The trunk is given cells in multiples of this."""
 
 GENERIC = Path(__file__).parent / "weights" / "generic.safetensors"
 """Weights trained on other scenes, by `steerbench generic`."""
@@ -84,11 +84,11 @@ class SpaceToDepth(Renderer2d):
         self.channels, self.frames, self.scale = channels, frames, scale
         self.history, self.surface = history and frames > 0, surface
         groups = self._input_groups()
-        self.enter = nn.Linear(sum(slots * features for _, slots, features in groups), width)
+        self.enter = _Linear(sum(slots * features for _, slots, features in groups), width)
         self.trunk = nn.ModuleList(_Block(width) for _ in range(blocks))
-        self.leave = nn.Linear(width, scale**2 * (3 + self.history))
-        self.read = nn.Linear(width, 3 * (channels + 1)) if surface else None
-        self.doubt = nn.Linear(width, 1)
+        self.leave = _Linear(width, scale**2 * (3 + self.history))
+        self.read = _Linear(width, 3 * (channels + 1)) if surface else None
+        self.doubt = _Linear(width, 1)
         for layer in filter(None, (self.leave, self.read, self.doubt)):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
@@ -109,35 +109,41 @@ class SpaceToDepth(Renderer2d):
         """See `Renderer2d`."""
         parts = [self._inputs(o) for o in observations]
         base, *groups = (_join(some) for some in zip(*parts, strict=True))
-        hidden = self._think([x.flatten(start_dim=1) for x in groups], observations)  # [N, width]
-        out = self.leave(hidden).to(base).view(-1, self.scale**2, 3 + self.history)
+        hidden = self._think([x.flatten(start_dim=1) for x in groups], observations)
+        count = len(base)
+        out = self.leave(hidden)[:count].to(base).view(-1, self.scale**2, 3 + self.history)
         drawn = base + out[..., :3]
         if self.history:
             recent, known = groups[1 + self.frames].split((3, 1), dim=-1)
             drawn = drawn + (out[..., 3:].sigmoid() * known) * recent
         if self.read is not None:
             detail = groups[-1]
-            matrix = self.read(hidden).to(base).view(-1, 3, self.channels + 1)
+            matrix = self.read(hidden)[:count].to(base).view(-1, 3, self.channels + 1)
             # The colour of what is hardly there counts little.
             weighed = torch.cat((detail[..., :3] * detail[..., 3:4], detail[..., 3:]), dim=-1)
             with torch.autocast(base.device.type, enabled=False):
                 drawn = drawn + weighed @ matrix.transpose(1, 2)
-        doubt = self.doubt(hidden).to(base).squeeze(1)
+        doubt = self.doubt(hidden)[:count].to(base).squeeze(1)
         return Drawing(self._paint(observations, drawn), doubt)
 
     def _think(self, inputs: Sequence[Tensor], observations: Sequence[Observation]) -> Tensor:
-        """The trunk on the `inputs` of all cells: [N, width]."""
+        """The trunk on the `inputs` of all cells, [N, width], and some rows more.
+
+        The library behind the products prepares code for every new size, which takes longer than
+        the product itself: it sees few sizes.
+        """
         neighbours, backend = self._neighbours(observations), observations[0].backend
         count = len(neighbours)
+        more = (0, 0, 0, max(-(-count // QUANTUM), 1) * QUANTUM - count)
         if torch.is_grad_enabled():
-            # The library behind the products prepares code for every new size: have few sizes.
-            more = (0, 0, 0, -count % QUANTUM)
             inputs = [functional.pad(x, more) for x in inputs]
-            neighbours = functional.pad(neighbours, more, value=-1)
         hidden = self._enter(inputs).to(inputs[0])
+        if len(hidden) == count:
+            hidden = functional.pad(hidden, more)
+        neighbours = functional.pad(neighbours, more, value=-1)
         for block in self.trunk:
             hidden = block(hidden, neighbours, backend)
-        return functional.leaky_relu(hidden[:count], LEAK)
+        return functional.leaky_relu(hidden, LEAK)
 
     def _enter(self, inputs: Sequence[Tensor]) -> Tensor:
         """`enter` of all inputs beside each other, without writing them there."""
@@ -176,8 +182,9 @@ class SpaceToDepth(Renderer2d):
         colours = (observation.frame.values[..., :3] - observation.background[:3]).flatten(0, 1)
         across, down = (_tent(self.scale, shift).to(colours) for shift in observation.phase)
         weights = (down[:, None, :, None] * across[None, :, None, :]).reshape(-1, TAPS)  # [s^2, 9]
+        samples = colours[near].transpose(1, 2).flatten(0, 1)  # [3 N, 9]
         with torch.autocast(colours.device.type, enabled=False):
-            return weights @ colours[near]
+            return (samples @ weights.T).view(-1, 3, len(weights)).transpose(1, 2)
 
     def _preceding(self, observation: Observation, age: int) -> Tensor:
         """What a preceding frame has, [N, s^2, K + 1]: less the background, and whether."""
@@ -268,21 +275,39 @@ def _same_columns(ours: Groups, theirs: Groups) -> tuple[list[int], list[int]]:
     return [columns[0][key] for key in both], [columns[1][key] for key in both]
 
 
+class _Linear(nn.Linear):
+    def forward(self, x: Tensor) -> Tensor:
+        return _product(x, self.weight, self.bias)
+
+
+def _product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """x W^T + b of `x` [N, C] and `weight` [D, C].
+
+    Without gradient, a convolution of 1 x 1: torch hands products of float32 to MKL and
+    convolutions to oneDNN, which is twice as fast on processors that are not Intel's.
+    """
+    if torch.is_grad_enabled():
+        return functional.linear(x, weight, bias)
+    picture = x[None, :, None].permute(0, 3, 1, 2)  # [1, C, N, 1], the channels last in memory
+    return functional.conv2d(picture, weight[:, :, None, None], bias)[0, :, :, 0].T
+
+
 class _Block(nn.Module):
     """x + W2 act(W1 (x convolved channel by channel))."""
 
     def __init__(self, width: int, growth: int = 2) -> None:
         super().__init__()
         self.spread = nn.Parameter(torch.randn(TAPS, width) / 3)
-        self.grow = nn.Linear(width, growth * width)
-        self.shrink = nn.Linear(growth * width, width)
+        self.grow = _Linear(width, growth * width)
+        self.shrink = _Linear(growth * width, width)
         with torch.no_grad():
             self.shrink.weight.mul_(0.1)
 
     def forward(self, x: Tensor, neighbours: Tensor, backend: str) -> Tensor:
         """`x` [N, width] of cells with `neighbours` [N, 9]."""
         mixed = depthwise(x, neighbours, self.spread, backend=backend)
-        return x + self.shrink(functional.leaky_relu(self.grow(mixed), LEAK))
+        grown = functional.leaky_relu(self.grow(mixed), LEAK, inplace=not torch.is_grad_enabled())
+        return x + self.shrink(grown)
 
 
 def _join(parts: Sequence[Tensor]) -> Tensor:

@@ -433,6 +433,18 @@ def test_a_doubt_belongs_to_each_cell_of_each_observation() -> None:
     torch.testing.assert_close(doubt[-len(alone) :], alone, rtol=0, atol=FLOAT32_ERROR)
 
 
+@pytest.mark.parametrize("share", [0.03, 1.0])
+def test_without_gradient_the_same_is_drawn(share: float) -> None:
+    """Where products are convolutions, of another order of sums."""
+    matter = torch.rand(20, 14, generator=torch.Generator().manual_seed(2)) < share
+    renderer, observation = shaken(new_renderer()), observe(20, 14, matter=matter)
+    want = renderer([observation])
+    with torch.no_grad():
+        got = renderer([observation])
+    torch.testing.assert_close(got.pictures, want.pictures, rtol=0, atol=FLOAT32_ERROR)
+    torch.testing.assert_close(got.doubt, want.doubt, rtol=0, atol=FLOAT32_ERROR)
+
+
 def test_half_precision_changes_little() -> None:
     renderer = shaken(new_renderer())
     observation = observe()
