@@ -4,16 +4,18 @@
 #   VENV=.venv             where the environment lives
 #   PIP_ARGS="..."         further arguments for pip, e.g. an index of CPU-only wheels of torch
 #   DEMO_ARGS="..."        overrides for the demo, e.g. DEMO_ARGS="seed=1 scene=wires"
+#   PAPER_ARGS="..."       overrides for the paper's tables, e.g. PAPER_ARGS="budget=small"
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint format clean
+.PHONY: help install demo paper test lint format clean
 
 VENV ?= .venv
 BIN := $(VENV)/bin
 PYTHON ?=
 PIP_ARGS ?=
 DEMO_ARGS ?=
+PAPER_ARGS ?= budget=demo scene=totem
 
 # A complete interpreter is one that is new enough and can make environments with pip in them.
 SUITS := import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))
@@ -25,6 +27,9 @@ install: $(VENV)/.installed ## make $(VENV) and install steerbench into it, vers
 
 demo: install ## build a scene, train on it, render it, write outputs/demo/report.md
 	@$(BIN)/steerbench run +experiment=demo $(DEMO_ARGS)
+
+paper: install ## measure every table of the SteerNeRF paper, write outputs/paper/report.md
+	@$(BIN)/steerbench paper $(PAPER_ARGS)
 
 test: lint ## lint, then all tests
 	$(BIN)/python -m pytest

@@ -32,10 +32,11 @@ examples
   steerbench run scene=blender scene.path=DIR  the same on your copy of a NeRF-Synthetic scene
   steerbench run --help                        all choices and settings
   steerbench list                              what there is, and what of it is usable here
+  steerbench paper budget=demo                 every table of the SteerNeRF paper, as a page
   steerbench results --format csv              every number measured so far
 """
 
-COMMANDS = ("run", "list", "results", "kernels", "scenes", "generic")
+COMMANDS = ("run", "paper", "list", "results", "kernels", "scenes", "generic")
 
 # What the disk refuses: worth a plain sentence, not a traceback.
 REFUSALS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR}
@@ -103,6 +104,20 @@ def _parser() -> Parser:
     parser.set_defaults(module=None, parser=parser)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     commands.add_parser("run", help="train, render, measure; print and store the table")
+
+    paper = commands.add_parser(
+        "paper",
+        help="every table of the SteerNeRF paper, measured, as one page",
+        description="Measure every table of the SteerNeRF paper and write them beside the paper's "
+        "figures. What was measured before is taken from the store: after an interruption, type "
+        "the same again.",
+    )
+    paper.add_argument("--table", metavar="NAME", help="only this one: table1 to table6")
+    paper.add_argument(
+        "--report", type=Path, metavar="DIR", help="where the page goes (default OUTPUTS/paper)"
+    )
+    paper.add_argument("overrides", nargs="*", help="settings as of `steerbench run`")
+    paper.set_defaults(module="paper", parser=paper)
 
     listing = commands.add_parser("list", help="methods, scenes, backends, engines")
     listing.set_defaults(module="catalogue", parser=listing)

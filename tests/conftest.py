@@ -1,4 +1,4 @@
-"""What all tests share: devices, a poisoned `torch.empty`, a quiet log, a tiny scene and method."""
+"""What all tests share: devices, a poisoned `torch.empty`, a quiet log, tiny scene, method, run."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import re
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import hypothesis
@@ -17,6 +18,10 @@ from torch import Tensor
 from bench.console import ConsoleLog
 from bench.lpips_weights import BACKBONES
 from bench.metrics import _lpips_package
+from bench.protocol import EvaluationProtocol
+from bench.results import Store
+from bench.run import measure
+from bench.trajectories import from_split
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene, Split
 
 hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True)
@@ -161,3 +166,31 @@ def lpips_weights(shared_data: Path | None, tmp_path_factory: pytest.TempPathFac
             names = {name: re.sub(r"^slice\d+", "features", name) for name in state}
             torch.save({names[name]: state[name] for name in state}, folder / backbone.features)
     return folder
+
+
+@pytest.fixture
+def store(tmp_path: Path, offset_method, tiny_scene, quiet_log) -> Store:
+    """A store with one run, key `stored_run`, six frames, three of them pictured."""
+    measurement = measure(
+        offset_method,
+        tiny_scene,
+        from_split(tiny_scene),
+        EvaluationProtocol(name="quick", lpips=()),
+        Budget("none", steps=1, samples=1),
+        quiet_log,
+        seed=5,
+    )
+    record = {
+        **measurement.record,
+        "command": "steerbench run method=offset",
+        "missing": {"lpips_alex": "no weights were found"},
+    }
+    store = Store(tmp_path)
+    store.save({"what": "offset"}, replace(measurement, record=record))
+    return store
+
+
+@pytest.fixture
+def stored_run(store: Store) -> str:
+    """The key of the run in `store`."""
+    return store.rows()["run"].iloc[0]

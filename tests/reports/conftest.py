@@ -1,21 +1,15 @@
-"""Rows and a stored run whose figures are known."""
+"""Rows whose figures are known, and several runs."""
 
 from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from bench.protocol import EvaluationProtocol
 from bench.results import COLUMNS, Store
-from bench.run import measure
-from bench.trajectories import from_split
-from bench.types import Budget
 
 FIGURES = {
     "psnr": (30.456, 29.5, 31.5),
@@ -62,28 +56,6 @@ def rows_with_cold(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 @pytest.fixture
-def store(tmp_path: Path, offset_method, tiny_scene, quiet_log) -> Store:
-    """A store with one run, key `stored_run`, six frames, three of them pictured."""
-    measurement = measure(
-        offset_method,
-        tiny_scene,
-        from_split(tiny_scene),
-        EvaluationProtocol(name="quick", lpips=()),
-        Budget("none", steps=1, samples=1),
-        quiet_log,
-        seed=5,
-    )
-    record = {
-        **measurement.record,
-        "command": "steerbench run method=offset",
-        "missing": {"lpips_alex": "no weights were found"},
-    }
-    store = Store(tmp_path)
-    store.save({"what": "offset"}, replace(measurement, record=record))
-    return store
-
-
-@pytest.fixture
 def several(store: Store, stored_run: str) -> tuple[Store, dict[str, str]]:
     """A store with six runs of the same frames, and what each is called.
 
@@ -101,9 +73,3 @@ def several(store: Store, stored_run: str) -> tuple[Store, dict[str, str]]:
     record["machine"]["cpu"] = "another"
     (folder / "record.json").write_text(json.dumps(record))
     return store, labels
-
-
-@pytest.fixture
-def stored_run(store: Store) -> str:
-    """The key of the run in `store`."""
-    return store.rows()["run"].iloc[0]

@@ -93,7 +93,7 @@ def test_results_can_be_narrowed_down(steerbench, run):
     ("line", "completed"),
     [
         ("steerbench run trajectory=sm", ["trajectory=smooth"]),
-        ("steerbench run +experiment=", ["+experiment=demo"]),
+        ("steerbench run +experiment=d", ["+experiment=demo"]),
         ("steerbench run thre", ["threads="]),
     ],
 )

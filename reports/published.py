@@ -1,0 +1,126 @@
+"""The tables of the SteerNeRF paper, and what was measured in their place."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+from reports.comparison import COST, setting
+from reports.runs import Run
+from reports.tables import QUALITY, Table, number
+
+FOLDER = Path(__file__).parent / "paper"
+ABSENT = "–"
+"""In place of a figure that the paper does not give, or that there is nothing to measure with."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of a table.
+
+    Attributes:
+        label: what it is called.
+        job: the settings that make it, beside those of all lines; None where no method here is
+            that of the line.
+        published: the paper's figures by metric; bytes, ms, dB as in our rows.
+    """
+
+    label: str
+    job: Mapping[str, str] | None = None
+    published: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PaperTable:
+    """A table of the paper.
+
+    Attributes:
+        name: as the experiment that measures it is called.
+        title: what it shows.
+        published_on: on what the paper measured it.
+        metrics: its columns.
+        lines: in the paper's order.
+        notes: what a reader should know before comparing.
+    """
+
+    name: str
+    title: str
+    published_on: str
+    metrics: Sequence[str]
+    lines: Sequence[Line]
+    notes: Sequence[str]
+
+
+def paper_tables() -> list[PaperTable]:
+    """All of them, in the paper's order."""
+    return [_table(path) for path in sorted(FOLDER.glob("table*.toml"))]
+
+
+def _table(path: Path) -> PaperTable:
+    content = tomllib.loads(path.read_text(encoding="utf-8"))
+    lines = [Line(**line) for line in content.pop("line")]
+    return PaperTable(path.stem, lines=lines, notes=content.pop("notes", []), **content)
+
+
+def beside(
+    table: PaperTable, runs: Mapping[str, Run], failures: Mapping[str, str] | None = None
+) -> Table:
+    """What was measured beside what the paper gives, and the difference.
+
+    Args:
+        runs: by the label of a line; lines without one have nothing measured.
+        failures: why a line has none, by its label.
+    """
+    columns = [(metric, *_written(metric)) for metric in table.metrics]
+    lines = []
+    for line in table.lines:
+        run, why = runs.get(line.label), (failures or {}).get(line.label)
+        measured = run.values if run is not None else {}
+        cells = (
+            _cell(measured.get(metric), line.published.get(metric), write)
+            for metric, _, write in columns
+        )
+        label = f"{line.label}: failed: {why}" if why else line.label
+        lines.append((label, *cells))
+    title = f"{table.name.replace('table', 'Table ')}: {table.title}"
+    return Table(title, ("measured / paper / difference", *(c[1] for c in columns)), tuple(lines))
+
+
+def section(
+    table: PaperTable, runs: Mapping[str, Run], failures: Mapping[str, str] | None = None
+) -> str:
+    """A table as a part of a page: what was measured where, the figures, the notes."""
+    shown = beside(table, runs, failures)
+    parts = [f"## {shown.title}"]
+    if runs:
+        parts.append(f"Measured: {setting(list(runs.values()))}.")
+    parts.append(f"Paper: {table.published_on}.")
+    parts.append(shown.markdown())
+    parts += [f"- {note}" for note in table.notes]
+    return "\n\n".join(parts)
+
+
+def _cell(
+    measured: float | None, published: float | None, write: Callable[[float | None], str]
+) -> str:
+    if measured is None and published is None:
+        return ABSENT
+    told = [ABSENT if figure is None else write(figure) for figure in (measured, published)]
+    if measured is None or published is None or math.isnan(measured):
+        return " / ".join(told)
+    difference = write(abs(measured - published))
+    return " / ".join((*told, f"{'-' if measured < published else '+'}{difference}"))
+
+
+def _written(metric: str) -> tuple[str, Callable[[float | None], str]]:
+    """Label of a column and how its figures are written."""
+    if metric in QUALITY:
+        label, decimals = QUALITY[metric]
+        return label, partial(number, decimals=decimals)
+    if metric in COST:
+        return COST[metric]
+    return f"{metric.removeprefix('stage_ms.')}, ms ↓", partial(number, decimals=2)

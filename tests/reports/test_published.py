@@ -1,0 +1,74 @@
+"""The paper's tables: what their files hold, and cells of measured beside published figures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from bench.results import Store
+from reports.published import ABSENT, Line, PaperTable, beside, paper_tables, section
+from reports.runs import Run, load
+from reports.tables import QUALITY
+
+METRICS = {*QUALITY, "fps", "frame_ms", "size_bytes.total"}
+TABLE = PaperTable(
+    "table9",
+    "What is shown",
+    "Chair",
+    ["psnr", "frame_ms", "size_bytes.total", "stage_ms.other"],
+    [
+        Line("here", {"method": "a"}, {"psnr": 31.0, "frame_ms": 9.98}),
+        Line("elsewhere", None, {"size_bytes.total": 5e6}),
+    ],
+    ["Mind this."],
+)
+
+
+@pytest.fixture
+def run(store: Store, stored_run: str) -> Run:
+    """A run of known figures."""
+    (found,) = load(store, {stored_run: "here"})
+    figures = {"psnr": 30.456, "frame_ms": 12.0, "stage_ms.other": 8.0}
+    rows = found.rows.copy()
+    for metric, value in figures.items():
+        rows.loc[rows["metric"] == metric, "value"] = value
+    return replace(found, rows=rows[rows["metric"].isin(figures)])
+
+
+def test_the_files_are_the_six_tables_of_the_paper() -> None:
+    tables = paper_tables()
+    assert [table.name for table in tables] == [f"table{number}" for number in range(1, 7)]
+    for table in tables:
+        labels = [line.label for line in table.lines]
+        assert len(set(labels)) == len(labels)
+        for line in table.lines:
+            assert set(line.published) <= set(table.metrics), line.label
+        for metric in table.metrics:
+            assert metric in METRICS or metric.startswith("stage_ms."), metric
+
+
+def test_a_cell_is_measured_published_and_their_difference(run: Run) -> None:
+    shown = beside(TABLE, {"here": run})
+    assert shown.columns[1:] == ("PSNR, dB ↑", "ms / frame ↓", "model, MB ↓", "other, ms ↓")
+    assert shown.lines[0] == (
+        "here",
+        "30.46 / 31.00 / -0.54",
+        "12.0 / 10.0 / +2.0",
+        ABSENT,
+        f"8.00 / {ABSENT}",
+    )
+    assert shown.lines[1] == ("elsewhere", ABSENT, ABSENT, f"{ABSENT} / 5.00", ABSENT)
+
+
+def test_a_line_that_failed_says_why() -> None:
+    shown = beside(TABLE, {}, {"here": "no room"})
+    assert shown.lines[0][:2] == ("here: failed: no room", f"{ABSENT} / 31.00")
+
+
+def test_a_section_says_on_what_and_what_to_mind(run: Run) -> None:
+    text = section(TABLE, {"here": run})
+    assert text.startswith("## Table 9: What is shown")
+    assert "Paper: Chair." in text
+    assert f"scene {run.facts['scene']}" in text
+    assert "- Mind this." in text
