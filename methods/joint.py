@@ -80,6 +80,8 @@ class JointOptions:
             raise ValueError(f"expected patch, batch >= 1, clip > 0, average in [0, 1): {self}")
         if not (self.distilled_views >= 0 and 0 <= self.distilled_share <= 1):
             raise ValueError(f"expected distilled_views >= 0 and distilled_share in [0, 1]: {self}")
+        if not (self.doubt >= 0 and 0 <= self.refined <= 1 and self.refined_rays >= 1):
+            raise ValueError(f"expected doubt >= 0, refined in [0, 1], refined_rays >= 1: {self}")
 
     def distilled(self, steps: int) -> int:
         """Distilled views of a training of so many steps: no more than it has a use for."""
@@ -202,7 +204,7 @@ class JointTraining(RendererTraining):
     """Stage 2 end to end: the field learns through the 2D renderer.
 
     Args:
-        field: that `patches` are rendered from; trained in place.
+        pipeline: that `patches` go through; its field is trained in place.
     """
 
     def __init__(
@@ -229,7 +231,10 @@ class JointTraining(RendererTraining):
 
     def _refinement_loss(self, batch: Batch, drawing: Drawing) -> Tensor | float:
         """Mean squared error that the pixels to be refined add to the pictures, estimated from
-        `refined_rays` of them."""
+        `refined_rays` of them.
+
+        Without it the field forgets how to look at full resolution.
+        """
         pipeline = self.pipeline
         if not pipeline.options.refined or drawing.doubt is None:
             return 0.0

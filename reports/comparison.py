@@ -41,7 +41,7 @@ def comparison(runs: Sequence[Run], failures: Mapping[str, str]) -> Table:
     bold = frozenset(
         (row, column)
         for column, (metric, label, write) in enumerate(columns, 1)
-        for row in _best(parts, metric, write, highest=label.endswith("↑"))
+        for row in best(parts, metric, write, highest=label.endswith("↑"))
     )
     blank = ("",) * len(columns)
     lines += [(f"{label}: failed: {reason}", *blank) for label, reason in failures.items()]
@@ -60,8 +60,11 @@ def _columns(runs: Sequence[Run]) -> list[tuple[str, str, Write]]:
     return [(metric, label, write) for metric, (label, write) in (quality | COST).items()]
 
 
-def _best(runs: Sequence[Run], metric: str, write: Write, highest: bool) -> Iterator[int]:
-    """Lines whose figure is the best of their conditions, or is written like the best."""
+def best(runs: Sequence[Run], metric: str, write: Write, highest: bool) -> Iterator[int]:
+    """Which of `runs` have the best figure of their conditions, or one written like the best.
+
+    Where only one was made under its conditions, there is no best.
+    """
     known: dict[tuple[object, ...], dict[int, float]] = {}
     for row, run in enumerate(runs):
         if math.isfinite(run.values.get(metric, math.nan)):

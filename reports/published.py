@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from reports.comparison import COST, setting
+from reports.comparison import COST, best, setting
 from reports.runs import Run
 from reports.tables import QUALITY, Table, number
 
@@ -76,6 +76,13 @@ def beside(
         failures: why a line has none, by its label.
     """
     columns = [(metric, *_written(metric)) for metric in table.metrics]
+    rows = [row for row, line in enumerate(table.lines) if line.label in runs]
+    there = [runs[table.lines[row].label] for row in rows]
+    bold = frozenset(
+        (rows[place], column)
+        for column, (metric, label, write) in enumerate(columns, 1)
+        for place in best(there, metric, write, highest=label.endswith("↑"))
+    )
     lines = []
     for line in table.lines:
         run, why = runs.get(line.label), (failures or {}).get(line.label)
@@ -87,7 +94,8 @@ def beside(
         label = f"{line.label}: failed: {why}" if why else line.label
         lines.append((label, *cells))
     title = f"{table.name.replace('table', 'Table ')}: {table.title}"
-    return Table(title, ("measured / paper / difference", *(c[1] for c in columns)), tuple(lines))
+    heads = ("measured / paper / difference", *(label for _, label, _ in columns))
+    return Table(title, heads, tuple(lines), bold=bold)
 
 
 def section(
@@ -97,11 +105,22 @@ def section(
     shown = beside(table, runs, failures)
     parts = [f"## {shown.title}"]
     if runs:
-        parts.append(f"Measured: {setting(list(runs.values()))}.")
+        parts.append(f"Measured: {setting(list(runs.values()))}, {_origin(list(runs.values()))}.")
     parts.append(f"Paper: {table.published_on}.")
     parts.append(shown.markdown())
     parts += [f"- {note}" for note in table.notes]
     return "\n\n".join(parts)
+
+
+def _origin(runs: Sequence[Run]) -> str:
+    """Seeds, commits and processors of `runs`."""
+    machines = [run.record["machine"] for run in runs]
+    told = {
+        "seed": [str(run.facts["seed"]) for run in runs],
+        "commit": [run.facts["commit"] for run in runs],
+        "on": [f"{each['cpu']} with {each['threads']} threads" for each in machines],
+    }
+    return ", ".join(f"{name} {' / '.join(dict.fromkeys(of))}" for name, of in told.items())
 
 
 def _cell(

@@ -6,6 +6,7 @@ import re
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +85,7 @@ def obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
     log, store = ConsoleLog(root), Store(root)
 
     method, budget, protocol = (build(config, group) for group in ("method", "budget", "protocol"))
-    scene = build(config, "scene", log=log)
+    scene = _scene(OmegaConf.to_yaml(config.scene, resolve=True), root)
     trajectory = build(config, "trajectory", scene)
     weights = Path(settings.weights_dir) if settings.weights_dir else None
     parts = _identity(config, scene, method) | {"lpips": protocol.find_lpips(weights, log)}
@@ -105,6 +106,12 @@ def obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
     record = {**measurement.record, "command": shlex.join(command)}
     store.save(parts, replace(measurement, record=record))
     return Obtained(store, run, measured=True)
+
+
+@lru_cache(maxsize=1)
+def _scene(node: str, root: Path) -> Scene:
+    """The scene that `node`, as YAML, describes; the jobs of a sweep share it."""
+    return build(OmegaConf.create({"scene": OmegaConf.create(node)}), "scene", log=ConsoleLog(root))
 
 
 def _settings(config: DictConfig) -> Settings:
