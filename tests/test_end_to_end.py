@@ -60,7 +60,7 @@ def test_the_report_shows_three_frames_of_every_method_with_their_errors(
     for picture in pictures:
         assert f"![Ground truth, {', '.join(METHODS)}; a detail of each; error maps](" in text
         assert picture.name in text
-    for stage in ("march", "field", "depth_reprojection", "feature_reprojection", "renderer2d"):
+    for stage in ("march", "field", "feature_reprojection", "renderer2d", "refinement"):
         assert stage in text
 
 
