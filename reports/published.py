@@ -81,14 +81,14 @@ def beside(
     bold = frozenset(
         (rows[place], column)
         for column, (metric, label, write) in enumerate(columns, 1)
+        if not metric.startswith("stage_ms.")
         for place in best(there, metric, write, highest=label.endswith("↑"))
     )
     lines = []
     for line in table.lines:
         run, why = runs.get(line.label), (failures or {}).get(line.label)
-        measured = run.values if run is not None else {}
         cells = (
-            _cell(measured.get(metric), line.published.get(metric), write)
+            _cell(_measured(run, metric), line.published.get(metric), write)
             for metric, _, write in columns
         )
         label = f"{line.label}: failed: {why}" if why else line.label
@@ -121,6 +121,16 @@ def _origin(runs: Sequence[Run]) -> str:
         "on": [f"{each['cpu']} with {each['threads']} threads" for each in machines],
     }
     return ", ".join(f"{name} {' / '.join(dict.fromkeys(of))}" for name, of in told.items())
+
+
+def _measured(run: Run | None, metric: str) -> float | None:
+    """A figure of `run`, if there is one; that of a stage with the stages inside it."""
+    if run is None:
+        return None
+    inside = [value for name, value in run.values.items() if name.startswith(f"{metric}/")]
+    if metric in run.values or inside:
+        return run.values.get(metric, 0.0) + sum(inside)
+    return None
 
 
 def _cell(

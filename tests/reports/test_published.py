@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pandas as pd
 import pytest
 
 from bench.results import Store
@@ -59,6 +60,15 @@ def test_a_cell_is_measured_published_and_their_difference(run: Run) -> None:
         f"8.00 / {ABSENT}",
     )
     assert shown.lines[1] == ("elsewhere", ABSENT, ABSENT, f"{ABSENT} / 5.00", ABSENT)
+
+
+def test_a_stage_holds_the_stages_inside_it(run: Run) -> None:
+    rows = run.rows.copy()
+    inside = rows[rows["metric"] == "stage_ms.other"].assign(
+        metric="stage_ms.other/march", value=3.0
+    )
+    shown = beside(TABLE, {"here": replace(run, rows=pd.concat([rows, inside]))})
+    assert shown.lines[0][4] == f"11.00 / {ABSENT}"
 
 
 def test_a_line_that_failed_says_why() -> None:
