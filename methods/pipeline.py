@@ -81,6 +81,11 @@ class PipelineOptions:
         if not 0 <= self.refined <= 1:
             raise ValueError(f"refined: expected a share of 0 to 1, got {self.refined}")
 
+    def taught(self, refined: float) -> PipelineOptions:
+        """The options of a training. It looks everywhere, so that one serves all choices of where
+        to look that are made afterwards."""
+        return replace(self, range=RangeReduction("off"), refined=refined)
+
 
 class Pipeline:
     """A field and a 2D renderer that together render frames, one after the other.

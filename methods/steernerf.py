@@ -23,7 +23,6 @@ from methods.kernels.encode import HashGrid
 from methods.patches import PatchSource
 from methods.pipeline import Pipeline, PipelineOptions
 from methods.pretrained import Pretrained, Setup, pretrain
-from methods.range_reduction import RangeReduction
 from methods.renderer2d import Renderer2d
 from methods.sequences import SequencePool, TrueView, true_views
 from methods.space_to_depth import GENERIC
@@ -153,8 +152,7 @@ class SteerNerf:
         renderer = renderer.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         background = scene.background.to(device)
         pipeline = Pipeline(trained.field, trained.occupancy, background, renderer, shape)
-        # Where to look can be chosen afterwards: one training serves all choices.
-        everywhere = replace(shape, range=RangeReduction("off"), refined=options.refined)
+        everywhere = shape.taught(options.refined)
         taught = Pipeline(trained.field, trained.occupancy, background, renderer, everywhere)
         generator = torch.Generator().manual_seed(self.setup.seed)
         pool = SequencePool(
