@@ -41,16 +41,20 @@ def centres(cells: Tensor, width: int, scale: int) -> Tensor:
 def pixels_of(image: Tensor, cells: Tensor, scale: int) -> Tensor:
     """Of `image` [h s, w s, ...] the pixels of `cells`: [N, s^2, ...]."""
     width = image.shape[1] // scale
-    blocks = image.unflatten(0, (-1, scale)).unflatten(2, (width, scale)).transpose(1, 2)
-    return blocks[cells // width, cells % width].flatten(1, 2)
+    return _blocks(image, scale)[cells // width, cells % width].flatten(1, 2)
 
 
 def put_pixels(image: Tensor, cells: Tensor, scale: int, pixels: Tensor) -> None:
     """Replace, in place, the pixels of `cells` in `image` [h s, w s, ...] by `pixels`
     [N, s^2, ...]."""
     width = image.shape[1] // scale
-    blocks = image.unflatten(0, (-1, scale)).unflatten(2, (width, scale)).transpose(1, 2)
-    blocks[cells // width, cells % width] = pixels.unflatten(1, (scale, scale))
+    _blocks(image, scale)[cells // width, cells % width] = pixels.unflatten(1, (scale, scale))
+
+
+def _blocks(image: Tensor, scale: int) -> Tensor:
+    """`image` [h s, w s, ...] seen as [h, w, s, s, ...]; nothing is copied."""
+    rows, columns = (side // scale for side in image.shape[:2])
+    return image.unflatten(0, (rows, scale)).unflatten(2, (columns, scale)).transpose(1, 2)
 
 
 def paint(

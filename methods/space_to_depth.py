@@ -134,13 +134,12 @@ class SpaceToDepth(Renderer2d):
         """
         neighbours, backend = self._neighbours(observations), observations[0].backend
         count = len(neighbours)
-        more = (0, 0, 0, max(-(-count // QUANTUM), 1) * QUANTUM - count)
+        rows = max(-(-count // QUANTUM), 1) * QUANTUM
         if torch.is_grad_enabled():
-            inputs = [functional.pad(x, more) for x in inputs]
+            inputs = [functional.pad(x, (0, 0, 0, rows - count)) for x in inputs]
         hidden = self._enter(inputs).to(inputs[0])
-        if len(hidden) == count:
-            hidden = functional.pad(hidden, more)
-        neighbours = functional.pad(neighbours, more, value=-1)
+        hidden = functional.pad(hidden, (0, 0, 0, rows - len(hidden)))
+        neighbours = functional.pad(neighbours, (0, 0, 0, rows - count), value=-1)
         for block in self.trunk:
             hidden = block(hidden, neighbours, backend)
         return functional.leaky_relu(hidden, LEAK)
