@@ -10,7 +10,6 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 REACH = 1
 """Cells around matter that are still drawn: what is further from all that was seen is empty."""
@@ -18,16 +17,21 @@ REACH = 1
 
 def cells_near(seen: Tensor) -> Tensor:
     """The cells [N] within `REACH` of those that are `seen`, [h, w] bool."""
-    size = 2 * REACH + 1
-    near = functional.max_pool2d(seen[None].float(), size, stride=1, padding=REACH)
+    near = seen.clone()
+    for axis in (0, 1):
+        line = near.clone()
+        for far in range(1, REACH + 1):
+            rest = line.shape[axis] - far
+            near.narrow(axis, far, rest).logical_or_(line.narrow(axis, 0, rest))
+            near.narrow(axis, 0, rest).logical_or_(line.narrow(axis, far, rest))
     return near.flatten().nonzero().squeeze(1)
 
 
-def any_in_cell(marked: Tensor, scale: int) -> Tensor:
-    """[h, w] bool: whether any pixel of a cell is `marked`, [h s, w s] bool."""
-    height, width = marked.shape
-    cells = marked.view(height // scale, scale, width // scale, scale)
-    return cells.any(dim=3).any(dim=1)
+def largest_in_cell(image: Tensor, scale: int) -> Tensor:
+    """[h, w]: of `image` [h s, w s] the largest pixel of each cell."""
+    height, width = image.shape
+    cells = image.view(height // scale, scale, width // scale, scale)
+    return cells.amax(dim=1).amax(dim=2)  # four times as fast as both at once
 
 
 def centres(cells: Tensor, width: int, scale: int) -> Tensor:

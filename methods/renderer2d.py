@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
-from methods.cells import any_in_cell, cells_near
+from methods.cells import cells_near, largest_in_cell
 from methods.volume import FeatureFrame
 
 
@@ -64,7 +64,8 @@ def cells_at_matter(alpha: Tensor, preceding: Sequence[Points]) -> Tensor:
     preceding one."""
     seen = alpha > 0
     for points in preceding:
-        seen = seen | any_in_cell(points.index >= 0, points.index.shape[0] // len(alpha))
+        scale = points.index.shape[0] // len(alpha)
+        seen = seen | (largest_in_cell(points.index, scale) >= 0)
     return cells_near(seen)
 
 

@@ -196,7 +196,7 @@ def stage2_digest() -> str:
     """SHA-256 of the sources and weights that decide what stage 2 results in, beside those of
     stage 1."""
     sources = [ROOT / "methods" / f"{name}.py" for name in SOURCES]
-    for kernel in ("depthwise", "splat", "warp"):
+    for kernel in ("depthwise", "lift", "splat", "warp"):
         folder = ROOT / "methods" / "kernels" / kernel
         sources += [path for path in folder.glob("*.py") if path.stem != "cases"]
     return digest([*sources, GENERIC, ROOT / "bench" / "motion.py"])

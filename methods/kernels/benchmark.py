@@ -23,6 +23,7 @@ CASE_MODULES = (
     "methods.kernels.splat.cases",
     "methods.kernels.warp.cases",
     "methods.kernels.depthwise.cases",
+    "methods.kernels.lift.cases",
     "methods.step_cases",
 )
 

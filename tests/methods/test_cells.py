@@ -7,9 +7,9 @@ import torch
 from bench.cameras import pixel_grid
 from methods.cells import (
     REACH,
-    any_in_cell,
     cells_near,
     centres,
+    largest_in_cell,
     number,
     paint,
     pixels_of,
@@ -40,10 +40,12 @@ def test_cells_near_matter_are_within_reach_of_it() -> None:
     assert cells_near(torch.zeros_like(seen)).tolist() == []
 
 
-def test_a_cell_is_marked_by_any_of_its_pixels() -> None:
-    marked = torch.zeros(HEIGHT * SCALE, WIDTH * SCALE, dtype=torch.bool)
-    marked[5, 3] = marked[11, 14] = True
-    assert any_in_cell(marked, SCALE).nonzero().tolist() == [[1, 1], [3, 4]]
+def test_a_cell_has_the_largest_of_its_pixels() -> None:
+    image = torch.full((HEIGHT * SCALE, WIDTH * SCALE), -1, dtype=torch.int32)
+    image[5, 3], image[11, 14], image[9, 12] = 7, 2, 1
+    want = torch.full((HEIGHT, WIDTH), -1, dtype=torch.int32)
+    want[1, 1], want[3, 4] = 7, 2
+    assert torch.equal(largest_in_cell(image, SCALE), want)
 
 
 def test_pixels_of_a_cell_are_those_at_their_centres() -> None:

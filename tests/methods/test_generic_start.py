@@ -65,8 +65,8 @@ def test_a_renderer_starts_as_the_generic_one_draws(channels: int, parts: dict) 
         observe(
             channels=3,
             frames=min(parts["frames"], 2),
-            history=renderer.history,
-            surface=renderer.surface,
+            history=renderer.layout.history,
+            surface=renderer.layout.surface,
         )
     )
     want = generic.double()([known]).pictures

@@ -107,11 +107,11 @@ def dense(renderer: SpaceToDepth, observation: Observation) -> Tensor:
     for points in observation.preceding:
         values, known = shown_by(points)
         planes.append(in_cells(told((values - background) * known[..., None], known)))
-    if renderer.history:
+    if renderer.layout.history:
         picture, known = before(observation, scale)
         recent = (picture - background[:3] - base) * known
         planes.append(in_cells(told(recent, known[..., 0])))
-    if renderer.surface:
+    if renderer.layout.surface:
         values, known = at_surface(observation, scale)
         less, opacity = (values[..., :-1] - background) * known[..., None], values[..., -1] * known
         less[..., :3] -= base * known[..., None]
@@ -131,7 +131,7 @@ def dense(renderer: SpaceToDepth, observation: Observation) -> Tensor:
     fine = functional.pixel_shuffle(slots.transpose(0, 1).flatten(0, 1)[None], scale)
     fine = fine[0].permute(1, 2, 0)  # [H, W, 3 or 4]
     drawn = base + fine[..., :3]
-    if renderer.history:
+    if renderer.layout.history:
         drawn = drawn + fine[..., 3:].sigmoid() * recent
     if renderer.read is not None:
         matrices = pointwise(hidden, renderer.read)[0]
@@ -406,8 +406,8 @@ def test_a_renderer_without_a_part_ignores_what_is_known_of_it(part: str) -> Non
 
 
 def test_without_preceding_frames_there_is_no_preceding_picture() -> None:
-    assert not new_renderer(frames=0).history
-    assert new_renderer(frames=0).surface
+    assert not new_renderer(frames=0).layout.history
+    assert new_renderer(frames=0).layout.surface
 
 
 def test_a_point_that_looks_like_the_background_is_not_nothing() -> None:

@@ -14,6 +14,7 @@ from functools import cached_property
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from bench.types import check_shape
 from methods.kernels.dispatch import implementation
@@ -28,8 +29,8 @@ BRICK = 4
 class Occupancy:
     """Which cells of the unit cube may hold matter.
 
-    `cells` [G, G, G] bool is indexed (x, y, z); G is a multiple of 16. The derived pyramid lets a
-    ray leave an empty brick of 4^3 cells, or an empty block of 4^3 bricks, in one step.
+    `cells` [G, G, G] bool is indexed (x, y, z); G is a multiple of 16. What is derived from them
+    lets a ray cross all that is known to be empty around it in one step.
     """
 
     def __init__(self, cells: Tensor) -> None:
@@ -50,9 +51,15 @@ class Occupancy:
         return _pack_bricks(self.cells)
 
     @cached_property
-    def blocks(self) -> Tensor:
-        """One bit a brick, one int64 word a block of 4^3 bricks: [G/16, G/16, G/16]."""
-        return _pack_bricks(self.words != 0)
+    def clearance(self) -> Tensor:
+        """How far off the nearest brick with anything in it is, in bricks along the farthest axis,
+        0 in such a brick, at most G/4: [G/4, G/4, G/4] uint8."""
+        near = (self.words != 0)[None, None].float()
+        clearance = torch.zeros_like(near)
+        for _ in range(self.resolution // BRICK):
+            clearance += near == 0
+            near = functional.max_pool3d(near, 3, stride=1, padding=1)
+        return clearance[0, 0].to(torch.uint8)
 
     @cached_property
     def bounds(self) -> Tensor:

@@ -1,4 +1,4 @@
-"""Ray marching with numba: a ray leaves empty cells, bricks and blocks in one step each.
+"""Ray marching with numba: a ray crosses all that is empty around a cell or brick in one step.
 
 Samples are found once. A chunk of rays writes the t of its samples into its own part of a scratch
 array, whose pages cost nothing until they are written; when all counts are known, the samples are
@@ -19,6 +19,7 @@ from methods.kernels.march import Occupancy, Samples
 
 CHUNK = 64  # rays
 f64 = np.float64
+INF = f32(np.inf)
 UNIT_CUBE = np.array([[0, 0, 0], [1, 1, 1]], np.float32)
 
 
@@ -45,7 +46,7 @@ def march(
         origins.numpy(),
         directions.numpy(),
         occupancy.words.numpy(),
-        occupancy.blocks.numpy(),
+        occupancy.clearance.numpy(),
         occupancy.bounds.numpy(),
         f32(step),
         window.contiguous().numpy(),
@@ -91,15 +92,8 @@ def _cross(origin, direction, box):
 
 
 @njit(cache=True)
-def _empty_side(words, blocks, x, y, z):
-    """Cells along the side of the largest empty cube of the pyramid around a cell; 0: occupied."""
-    if blocks[x >> 4, y >> 4, z >> 4] == 0:
-        return 16
-    word = words[x >> 2, y >> 2, z >> 2]
-    if word == 0:
-        return 4
-    bit = (x & 3) + ((y & 3) << 2) + ((z & 3) << 4)
-    return 0 if (word >> bit) & 1 else 1
+def _occupied(word, x, y, z):
+    return (word >> ((x & 3) + ((y & 3) << 2) + ((z & 3) << 4))) & 1
 
 
 @njit(cache=True)
@@ -108,16 +102,22 @@ def _cell(coordinate, size):
 
 
 @njit(cache=True)
-def _leave_slab(origin, slope, cell, side, width):
-    """t at which a ray leaves, along one axis, the aligned `side` cells that contain `cell`."""
-    corner = cell & ~(side - 1)
-    if slope > 0:
-        corner += side
-    return (f32(corner) * width - origin) * slope if slope != 0 else f32(np.inf)
+def _leave_slab(origin, slope, first, end, width):
+    """t at which a ray leaves, along one axis, the cells `first` to `end`, excluded."""
+    return (f32(end if slope > 0 else first) * width - origin) * slope if slope != 0 else INF
 
 
 @njit(cache=True)
-def _march_ray(origin, direction, words, blocks, bounds, step, window, phase, k, limit, out):
+def _empty_cells(cell, free):
+    """Along one axis, the cells that are empty with `cell`, if `free` bricks are."""
+    if free == 0:
+        return cell, cell + 1
+    brick = cell >> 2
+    return (brick - free + 1) << 2, (brick + free) << 2
+
+
+@njit(cache=True)
+def _march_ray(origin, direction, words, clearance, bounds, step, window, phase, k, limit, out):
     """Write the t of a ray's samples to `out`; return their number and the step to resume from."""
     ox, oy, oz = origin
     dx, dy, dz = direction
@@ -148,20 +148,24 @@ def _march_ray(origin, direction, words, blocks, bounds, step, window, phase, k,
         if not t < far:
             return count, -1
         x, y, z = _cell(ox + t * dx, size), _cell(oy + t * dy, size), _cell(oz + t * dz, size)
-        side = _empty_side(words, blocks, x, y, z)
+        bx, by, bz = x >> 2, y >> 2, z >> 2
+        free = np.int64(clearance[bx, by, bz])
         if t < window[0]:
             k += 1
-        elif side == 0:
+        elif free == 0 and _occupied(words[bx, by, bz], x, y, z):
             out[count] = t
             count += 1
             k += 1
             if count == limit:
                 return count, k
         else:
+            x0, x1 = _empty_cells(x, free)
+            y0, y1 = _empty_cells(y, free)
+            z0, z1 = _empty_cells(z, free)
             leave = min(
-                _leave_slab(ox, sx, x, side, width),
-                _leave_slab(oy, sy, y, side, width),
-                _leave_slab(oz, sz, z, side, width),
+                _leave_slab(ox, sx, x0, x1, width),
+                _leave_slab(oy, sy, y0, y1, width),
+                _leave_slab(oz, sz, z0, z1, width),
             )
             # Rounded down, so that the first step outside the cube is never passed over.
             k = max(k + 1, int((leave - near) * steps_per_t - phase))
@@ -172,7 +176,7 @@ def _find(
     origins,
     directions,
     words,
-    blocks,
+    clearance,
     bounds,
     step,
     window,
@@ -193,7 +197,7 @@ def _find(
                     origins[ray],
                     directions[ray],
                     words,
-                    blocks,
+                    clearance,
                     bounds,
                     step,
                     window[ray],

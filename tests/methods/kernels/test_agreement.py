@@ -16,7 +16,17 @@ from methods.kernels.benchmark import all_cases
 from methods.kernels.case import Case, Prepared, largest_error
 
 CASES = [case for case in all_cases() if not case.timed]
-KERNELS = ("adam", "composite", "depthwise", "encode", "march", "spherical", "splat", "warp")
+KERNELS = (
+    "adam",
+    "composite",
+    "depthwise",
+    "lift",
+    "encode",
+    "march",
+    "spherical",
+    "splat",
+    "warp",
+)
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.kernel}: {case.name}")

@@ -189,7 +189,7 @@ def test_the_front_of_a_ray_is_its_first_samples() -> None:
             assert torch.equal(getattr(front, name)[kept], getattr(samples, name)[whole])
 
 
-def test_pyramid_bounds_and_share_describe_the_cells() -> None:
+def test_words_bounds_and_share_describe_the_cells() -> None:
     cells = torch.zeros(32, 32, 32, dtype=torch.bool)
     cells[3, 17, 30] = cells[5, 20, 31] = True
     grid = Occupancy(cells)
@@ -197,11 +197,19 @@ def test_pyramid_bounds_and_share_describe_the_cells() -> None:
     assert words.count_nonzero() == 2
     assert words[0, 4, 7] == 1 << (3 + 4 * 1 + 16 * 2)
     assert words[1, 5, 7] == -(1 << 63) >> 63 << (1 + 4 * 0 + 16 * 3) & 1 << 49
-    assert grid.blocks[0, 1, 1] == (1 << (0 + 4 * 0 + 16 * 3)) + (1 << (1 + 4 * 1 + 16 * 3))
     assert torch.equal(
         grid.bounds, torch.tensor([[3 / 32, 17 / 32, 30 / 32], [6 / 32, 21 / 32, 1.0]])
     )
     assert grid.fraction == 2 / 32**3
+
+
+def test_clearance_is_the_distance_to_the_nearest_brick_along_the_farthest_axis() -> None:
+    cells = torch.zeros(32, 32, 32, dtype=torch.bool)
+    cells[3, 17, 30] = cells[21, 20, 31] = True  # in the bricks (0, 4, 7) and (5, 5, 7)
+    brick = torch.cartesian_prod(*3 * [torch.arange(8)])
+    apart = [(brick - torch.tensor(of)).abs().amax(dim=1) for of in ((0, 4, 7), (5, 5, 7))]
+    assert torch.equal(Occupancy(cells).clearance.flatten(), torch.minimum(*apart).to(torch.uint8))
+    assert (Occupancy(torch.zeros_like(cells)).clearance == 8).all()
 
 
 def test_the_last_bit_of_a_word_is_a_cell_too() -> None:
