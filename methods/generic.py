@@ -84,6 +84,6 @@ def train_generic(
         log.info(f"trained renderer found: {finished}")
     else:
         loop.train(training, finished, "training a generic renderer", log)
-    halves = {name: x.half() for name, x in training.mean.state_dict().items()}
+    halves = {name: x.half() for name, x in training.mean.network.state_dict().items()}
     checkpoint.write(output, halves, {"scenes": len(scenes), "steps": training.steps})
     log.info(f"written: {output}")

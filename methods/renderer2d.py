@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from torch import Tensor, nn
@@ -83,16 +83,36 @@ class Drawing:
     doubt: Tensor | None = None
 
 
+class Network(nn.Module):
+    """What is learned of a 2D renderer: tensors to a tuple of tensors, as engines can run it.
+
+    Attributes:
+        varying: of each input, the axes whose size differs from frame to frame.
+        backend: of its kernels; engines read "reference", which is plain torch.
+    """
+
+    varying: tuple[tuple[int, ...], ...]
+    backend = "auto"
+
+
 class Renderer2d(nn.Module, ABC):
-    """A network that turns observations into pictures.
+    """Turns observations into pictures, with the help of a network.
 
     Attributes:
         scale: s.
         doubts: it says where its pictures may be wrong.
+        network: what is learned.
+        engine: computes what the network does, in its place; see `methods.engines`.
     """
 
     scale: int
     doubts = False
+    network: Network
+    engine: Callable[..., tuple[Tensor, ...]] | None = None
+
+    def run(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """What the network makes of its inputs."""
+        return (self.engine or self.network)(*inputs)
 
     @abstractmethod
     def forward(self, observations: Sequence[Observation]) -> Drawing:

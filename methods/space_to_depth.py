@@ -8,16 +8,14 @@ from typing import Literal
 
 import torch
 from safetensors.torch import load_file
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
+from methods.cell_network import CellNetwork
 from methods.cells import number, paint
-from methods.kernels.depthwise import TAPS, depthwise, neighbours_of
+from methods.kernels.depthwise import neighbours_of
 from methods.kernels.lift import Layout, draw, lift
 from methods.renderer2d import Drawing, Observation, Renderer2d
-
-LEAK = 0.1
-"""Slope of the activations below 0. With a slope of 0 the sparse inputs kill a trunk for good."""
 
 QUANTUM = 256
 """The trunk is given cells in multiples of this."""
@@ -46,8 +44,7 @@ class SpaceToDepth(Renderer2d):
     A picture is the aligned bilinear enlargement of the present RGB (the base), blended pixel by
     pixel with the preceding picture where that is known, plus a correction, plus what the features
     at the surface of each pixel say, read by a matrix that all pixels of a cell share. Shares,
-    corrections and matrices come from a trunk of depthwise 3 x 3 convolutions and matrix products,
-    after ConvNeXt (Liu et al. 2022); so does the error to be expected in the cell.
+    corrections and matrices come from a network on cells; so does the error to be expected there.
 
     Only the cells of an observation are drawn; all others are background, and 0 to their
     neighbours. So nothing is computed for them, and a part of a frame is drawn exactly as in the
@@ -66,6 +63,7 @@ class SpaceToDepth(Renderer2d):
     """
 
     doubts = True
+    network: CellNetwork
 
     def __init__(
         self,
@@ -82,25 +80,18 @@ class SpaceToDepth(Renderer2d):
         super().__init__()
         self.channels, self.frames, self.scale = channels, frames, scale
         layout = self.layout = Layout(channels, frames, scale, history and frames > 0, surface)
-        self.enter = _Linear(layout.width, width)
-        self.trunk = nn.ModuleList(_Block(width) for _ in range(blocks))
-        self.leave = _Linear(width, scale**2 * (3 + layout.history))
-        self.read = _Linear(width, 3 * (channels + 1)) if surface else None
-        self.doubt = _Linear(width, 1)
-        for layer in filter(None, (self.leave, self.read, self.doubt)):
-            nn.init.zeros_(layer.weight)
-            nn.init.zeros_(layer.bias)
+        self.network = CellNetwork(layout, width, blocks)
         if init == "generic":
             self._start_from(load_file(GENERIC))
 
     def forward(self, observations: Sequence[Observation]) -> Drawing:
         """See `Renderer2d`."""
         base, rows = self._lift(observations)
-        hidden, backend = self._think(rows, observations), observations[0].backend
-        matrix = None if self.read is None else self.read(hidden).to(base)
-        drawn = draw(base, rows, self.leave(hidden).to(base), matrix, self.layout, backend=backend)
-        doubt = self.doubt(hidden).to(base)[: len(base), 0]
-        return Drawing(self._paint(observations, drawn), doubt)
+        neighbours, backend = self._neighbours(observations, len(rows)), observations[0].backend
+        self.network.backend = backend
+        answer, doubt, *matrix = (x.to(base) for x in self.run(rows, neighbours))
+        drawn = draw(base, rows, answer, next(iter(matrix), None), self.layout, backend=backend)
+        return Drawing(self._paint(observations, drawn), doubt[: len(base), 0])
 
     def base(self, observations: Sequence[Observation]) -> Tensor:
         """See `Renderer2d`."""
@@ -140,21 +131,13 @@ class SpaceToDepth(Renderer2d):
             backend=o.backend,
         )
 
-    def _think(self, rows: Tensor, observations: Sequence[Observation]) -> Tensor:
-        """The trunk on `rows`, of all cells and some more: [R, width]."""
-        neighbours, backend = self._neighbours(observations), observations[0].backend
-        neighbours = functional.pad(neighbours, (0, 0, 0, len(rows) - len(neighbours)), value=-1)
-        hidden = self.enter(rows).to(rows)
-        for block in self.trunk:
-            hidden = block(hidden, neighbours, backend)
-        return functional.leaky_relu(hidden, LEAK)
-
-    def _neighbours(self, observations: Sequence[Observation]) -> Tensor:
-        height, width = observations[0].frame.alpha.shape
-        batch, device = len(observations), observations[0].cells.device
-        active = torch.zeros(batch * height * width, dtype=torch.bool, device=device)
-        active[number([o.cells for o in observations], observations[0].frame.alpha.shape)] = True
-        return neighbours_of(active.view(batch, height, width))
+    def _neighbours(self, observations: Sequence[Observation], rows: int) -> Tensor:
+        """Of all cells, and of as many more as make `rows`, which have none: [R, 9]."""
+        size, device = observations[0].frame.alpha.shape, observations[0].cells.device
+        active = torch.zeros(len(observations), *size, dtype=torch.bool, device=device)
+        active.view(-1)[number([o.cells for o in observations], size)] = True
+        neighbours = neighbours_of(active)
+        return functional.pad(neighbours, (0, 0, 0, rows - len(neighbours)), value=-1)
 
     def _paint(self, observations: Sequence[Observation], less: Tensor) -> Tensor:
         """Pictures [B, H, W, 3] of all cells, of which `less` [N, s^2, 3] has no background."""
@@ -171,7 +154,7 @@ class SpaceToDepth(Renderer2d):
         Raises:
             ValueError: this renderer is of another shape.
         """
-        weights = dict(self.named_parameters())
+        weights = dict(self.network.named_parameters())
         unused = {name for name in generic if name.startswith("read") and not self.layout.surface}
         ours, theirs = _same_columns(self.layout.groups, GENERIC_GROUPS)
         slots = range(self.scale**2)
@@ -207,38 +190,3 @@ def _same_columns(ours: Groups, theirs: Groups) -> tuple[list[int], list[int]]:
             begin += slots * features
     both = [key for key in columns[0] if key in columns[1]]
     return [columns[0][key] for key in both], [columns[1][key] for key in both]
-
-
-class _Linear(nn.Linear):
-    def forward(self, x: Tensor) -> Tensor:
-        return _product(x, self.weight, self.bias)
-
-
-def _product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """x W^T + b of `x` [N, C] and `weight` [D, C].
-
-    Without gradient, a convolution of 1 x 1: torch hands products of float32 to MKL and
-    convolutions to oneDNN, which is twice as fast on processors that are not Intel's.
-    """
-    if torch.is_grad_enabled() or not len(x):
-        return functional.linear(x, weight, bias)
-    picture = x[None, :, None].permute(0, 3, 1, 2)  # [1, C, N, 1], the channels last in memory
-    return functional.conv2d(picture, weight[:, :, None, None], bias)[0, :, :, 0].T
-
-
-class _Block(nn.Module):
-    """x + W2 act(W1 (x convolved channel by channel))."""
-
-    def __init__(self, width: int, growth: int = 2) -> None:
-        super().__init__()
-        self.spread = nn.Parameter(torch.randn(TAPS, width) / 3)
-        self.grow = _Linear(width, growth * width)
-        self.shrink = _Linear(growth * width, width)
-        with torch.no_grad():
-            self.shrink.weight.mul_(0.1)
-
-    def forward(self, x: Tensor, neighbours: Tensor, backend: str) -> Tensor:
-        """`x` [N, width] of cells with `neighbours` [N, 9]."""
-        mixed = depthwise(x, neighbours, self.spread, backend=backend)
-        grown = functional.leaky_relu(self.grow(mixed), LEAK, inplace=not torch.is_grad_enabled())
-        return x + self.shrink(grown)

@@ -15,7 +15,9 @@ from bench.provenance import ROOT, digest
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods import checkpoint, loop
 from methods.buffer import RenderingBuffer
+from methods.calibration import recorded_inputs
 from methods.distil import distilled_views
+from methods.engines import Engine
 from methods.fields import Precision
 from methods.generic import train_generic
 from methods.joint import JointOptions, JointTraining, RendererTraining
@@ -30,6 +32,7 @@ from methods.train import TrainingOptions
 
 SOURCES = (
     "buffer",
+    "cell_network",
     "cells",
     "distil",
     "joint",
@@ -55,6 +58,7 @@ class SteerNerf:
         pipeline: what a frame is made of.
         renderer: makes the 2D renderer, called with K, L and s.
         joint: stage 2, on patches, of `budget.renderer_steps` steps.
+        engine: computes the network of the 2D renderer once it is trained.
         precision: of the field, "bf16" (packed table, bfloat16 networks) or "fp32".
         name: as it stands in result rows.
     """
@@ -67,6 +71,7 @@ class SteerNerf:
         pipeline: PipelineOptions,
         renderer: Callable[..., Renderer2d],
         joint: JointOptions,
+        engine: Engine,
         precision: Precision = "bf16",
         name: str = "steernerf",
         backend: str = "auto",
@@ -75,7 +80,7 @@ class SteerNerf:
     ) -> None:
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         self.options, self.make_renderer, self.joint, self.name = pipeline, renderer, joint, name
-        self.memory = pipeline.frames
+        self.engine, self.memory = engine, pipeline.frames
         self.buffer = RenderingBuffer(pipeline.frames)
         self.train_s = 0.0
 
@@ -91,7 +96,8 @@ class SteerNerf:
             distilled = distilled_views(trained, scene, target, views, seed, folder, log)
         trained.field.widen(options.channels)
         self.pipeline, training = self._stage2(trained, scene, distilled, target, budget)
-        folder = log.stage_dir("steernerf", {**key, **self._key(budget)})
+        key |= self._key(budget)
+        folder = log.stage_dir("steernerf", key)
         finished = folder / "steernerf.safetensors"
         if finished.exists():
             tensors, figures = checkpoint.read(finished)
@@ -103,6 +109,24 @@ class SteerNerf:
         trained.field.requires_grad_(False).grad_buffer = None
         self.trained, self.train_s = trained, trained.train_s + training.seconds
         self.pipeline.renderer.requires_grad_(False)
+        self._build(scene, target, key, log)
+
+    def _build(self, scene: Scene, target: Tensor, key: dict[str, object], log: Log) -> None:
+        """Hand the network of the 2D renderer over to the engine."""
+        renderer, engine = self.pipeline.renderer, self.engine
+        seen = partial(
+            recorded_inputs,
+            self.pipeline,
+            scene,
+            target,
+            engine.samples,
+            self.joint.motion,
+            self.setup.seed,
+            log,
+        )
+        folder = partial(log.stage_dir, "network", {**key, **engine.key()})
+        built = engine.build(renderer.network, seen, folder, log)
+        renderer.engine, self.renderer_bytes = built.run, built.size
 
     def fit_generic(self, scenes: Sequence[Scene], budget: Budget, output: Path, log: Log) -> None:
         """Train a 2D renderer on many scenes, for others to start from; see `methods.generic`."""
@@ -131,12 +155,14 @@ class SteerNerf:
 
     def sizes(self) -> dict[str, int]:
         """Bytes of table, networks, occupancy bits and 2D renderer."""
-        weights = self.pipeline.renderer.parameters()
-        return self.trained.sizes() | {"renderer2d": sum(w.numel() * 4 for w in weights)}
+        return self.trained.sizes() | {"renderer2d": self.renderer_bytes}
 
     def settings(self) -> dict[str, str]:
-        """See `bench.types.Method.settings`."""
-        return self.setup.settings()
+        """See `bench.types.Method.settings`; engine and precision are those of the 2D renderer."""
+        return self.setup.settings() | {
+            "engine": self.engine.name,
+            "precision": self.engine.precision,
+        }
 
     def _stage2(
         self,

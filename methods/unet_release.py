@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from methods.kernels.splat import gather
-from methods.renderer2d import Drawing, Observation, Renderer2d
+from methods.renderer2d import Drawing, Network, Observation, Renderer2d
 
 
 class UnetRelease(Renderer2d):
@@ -30,22 +30,13 @@ class UnetRelease(Renderer2d):
     def __init__(self, channels: int, frames: int, scale: int, *, aligned: bool = False) -> None:
         super().__init__()
         self.channels, self.frames, self.scale, self.aligned = channels, frames, scale, aligned
-        self.first = _conv(channels * (frames + 1), 64)
-        self.enter = _conv(64, 64)
-        self.at_half = _Residual(64)
-        self.narrow = _conv(64, 128)
-        self.at_quarter = nn.Sequential(*(_Residual(128) for _ in range(3)))
-        self.widen_quarter = _conv(128, 512)
-        self.merge_half = _conv(192, 64)
-        self.half_again = _Residual(64)
-        self.widen_half = _conv(64, 256)
-        self.merge_full = _conv(128, 64)
-        self.last = nn.Sequential(_conv(64, 64), nn.ReLU(), _conv(64, 3))
+        self.network = _Unet(channels * (frames + 1))
 
     def forward(self, observations: Sequence[Observation]) -> Drawing:
         """See `Renderer2d`."""
         inputs = torch.stack([self._inputs(o) for o in observations])
-        return Drawing(self.base(observations) + self._network(inputs).permute(0, 2, 3, 1))
+        (correction,) = self.run(inputs)
+        return Drawing(self.base(observations) + correction.to(inputs).permute(0, 2, 3, 1))
 
     def base(self, observations: Sequence[Observation]) -> Tensor:
         """See `Renderer2d`."""
@@ -68,7 +59,26 @@ class UnetRelease(Renderer2d):
         rgb, rest = ([f[..., part] for f in frames] for part in (slice(0, 3), slice(3, None)))
         return torch.cat((*rgb, *rest), dim=-1).permute(2, 0, 1)
 
-    def _network(self, inputs: Tensor) -> Tensor:
+
+class _Unet(Network):
+    varying = ((),)
+
+    def __init__(self, inputs: int) -> None:
+        super().__init__()
+        self.first = _conv(inputs, 64)
+        self.enter = _conv(64, 64)
+        self.at_half = _Residual(64)
+        self.narrow = _conv(64, 128)
+        self.at_quarter = nn.Sequential(*(_Residual(128) for _ in range(3)))
+        self.widen_quarter = _conv(128, 512)
+        self.merge_half = _conv(192, 64)
+        self.half_again = _Residual(64)
+        self.widen_half = _conv(64, 256)
+        self.merge_full = _conv(128, 64)
+        self.last = nn.Sequential(_conv(64, 64), nn.ReLU(), _conv(64, 3))
+
+    def forward(self, inputs: Tensor) -> tuple[Tensor]:
+        """[B, C, H, W] to [B, 3, H, W]."""
         height, width = inputs.shape[-2:]
         # Two halvings: sizes that are no multiple of 4 are padded, and the padding cut off.
         padded = functional.pad(inputs, (0, -width % 4, 0, -height % 4))
@@ -81,7 +91,7 @@ class UnetRelease(Renderer2d):
         merged = self.widen_half(self.half_again(merged)).relu()
         merged = functional.pixel_shuffle(merged, 2)
         merged = self.merge_full(torch.cat((merged, full), dim=1)).relu()
-        return self.last(merged)[..., :height, :width]
+        return (self.last(merged)[..., :height, :width],)
 
 
 class _Residual(nn.Module):

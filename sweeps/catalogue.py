@@ -12,10 +12,10 @@ from reports.tables import Table
 from sweeps.overrides import CONFIGS
 from sweeps.terminal import console, rich_table
 
-GROUPS = ("method", "scene", "trajectory", "protocol", "budget", "experiment")
+GROUPS = ("method", "engine", "scene", "trajectory", "protocol", "budget", "experiment")
 
-EXTRAS = {"openvino": "openvino", "onnxruntime": "onnx", "tensorrt": "tensorrt"}
-"""Engines that run the networks of a method beside torch, and the extra that installs each."""
+EXTRAS = {"openvino": "openvino", "onnxruntime": "onnx"}
+"""Engines that run the network of a 2D renderer beside torch, and the extra that installs each."""
 
 
 def main(options: argparse.Namespace) -> int:
@@ -45,12 +45,11 @@ def engines() -> tuple[tuple[str, str], ...]:
     """Every engine, and whether it can be used here or how to get it."""
     rows = [("torch", f"usable (version {torch.__version__})")]
     for name, extra in EXTRAS.items():
-        if name == "tensorrt" and not torch.cuda.is_available():
-            rows.append((name, "needs an NVIDIA GPU; torch sees none"))
-        elif importlib.util.find_spec(name) is None:
+        if importlib.util.find_spec(name) is None:
             rows.append((name, f'not installed: pip install -c constraints.txt -e ".[{extra}]"'))
         else:
             rows.append((name, f"usable (version {metadata.version(name)})"))
+    rows.append(("tensorrt", "not yet: on a GPU, engine=torch precision=fp16"))
     return tuple(rows)
 
 

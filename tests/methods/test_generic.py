@@ -54,12 +54,12 @@ def test_the_weights_of_several_scenes_are_what_a_renderer_starts_from(
         assert written[name].any(), name  # the last three were 0 before the training
     monkeypatch.setattr(space_to_depth, "GENERIC", output)
     started = RENDERER(3, 2, 4)
-    assert started.state_dict().keys() == written.keys()
-    for name, weight in started.state_dict().items():
+    assert started.network.state_dict().keys() == written.keys()
+    for name, weight in started.network.state_dict().items():
         assert torch.equal(weight, written[name].float()), name
     for channels, frames, history in ((6, 2, True), (3, 0, False), (4, 1, False)):
         other = RENDERER(channels, frames, 4, history=history)
-        assert torch.equal(other.trunk[0].spread, started.trunk[0].spread)
+        assert torch.equal(other.network.trunk[0].spread, started.network.trunk[0].spread)
 
 
 def test_the_same_training_results_in_the_same_weights(

@@ -60,7 +60,7 @@ def test_a_renderer_starts_as_the_generic_one_draws(channels: int, parts: dict) 
     """Of what both know: the same picture, whatever else it may be shown later."""
     generic = generic_renderer()
     renderer = new_renderer(channels, scale=4, **parts)
-    renderer._start_from(generic.state_dict())
+    renderer._start_from(generic.network.state_dict())
     known = doubled(
         observe(
             channels=3,
@@ -76,9 +76,9 @@ def test_a_renderer_starts_as_the_generic_one_draws(channels: int, parts: dict) 
 
 def test_the_weights_of_what_the_generic_one_never_saw_stay() -> None:
     renderer = new_renderer(4, 3)
-    before = {name: x.clone() for name, x in renderer.state_dict().items()}
-    renderer._start_from(generic_renderer().state_dict())
-    stayed = {name: x == before[name] for name, x in renderer.state_dict().items()}
+    before = {name: x.clone() for name, x in renderer.network.state_dict().items()}
+    renderer._start_from(generic_renderer().network.state_dict())
+    stayed = {name: x == before[name] for name, x in renderer.network.state_dict().items()}
     cell = [False, False, False, False, True]  # the colour, whether it is known, a feature
     preceding = 2 * 16 * cell + 16 * [True] * 5
     assert (
@@ -93,11 +93,11 @@ def test_the_weights_of_what_the_generic_one_never_saw_stay() -> None:
 def test_generic_weights_are_read_from_their_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    halves = {name: x.half() for name, x in generic_renderer().state_dict().items()}
+    halves = {name: x.half() for name, x in generic_renderer().network.state_dict().items()}
     save_file(halves, tmp_path / "generic.safetensors")
     monkeypatch.setattr(space_to_depth, "GENERIC", tmp_path / "generic.safetensors")
     renderer = SpaceToDepth(3, 2, 4, width=16, blocks=2)
-    for name, weight in renderer.state_dict().items():
+    for name, weight in renderer.network.state_dict().items():
         assert torch.equal(weight, halves[name].float()), name
 
 
@@ -105,4 +105,4 @@ def test_generic_weights_are_read_from_their_file(
 def test_generic_weights_of_another_shape_are_refused(other: dict[str, int]) -> None:
     renderer = new_renderer(3, **other)
     with pytest.raises(ValueError, match=r"renderer\.init=generic: .* use renderer\.init=scratch"):
-        renderer._start_from(generic_renderer().state_dict())
+        renderer._start_from(generic_renderer().network.state_dict())

@@ -102,7 +102,9 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
     )
     options = replace(OPTIONS, through=through)
     with torch.no_grad():
-        for layer in filter(None, (renderer.leave, renderer.read, renderer.doubt)):
+        for layer in filter(
+            None, (renderer.network.leave, renderer.network.read, renderer.network.doubt)
+        ):
             layer.weight.normal_(0, 0.1)
     training = new_training(ball_scene, options, pipeline, field.float(), renderer)
     patches = [training.patches.cut(training.patches.pool.draw()) for _ in range(16)]
@@ -177,7 +179,11 @@ def test_joint_trains_table_networks_and_renderer(ball_scene: Scene) -> None:
     after = training.result()
     changed = {name for name in before if not torch.equal(before[name], after[name])}
     assert {"field.table", "field.layers.density_out", "field.layers.feature_out"} <= changed
-    assert {"mean.leave.weight", "mean.leave.bias", "mean.read.weight"} <= changed
+    assert {
+        "mean.network.leave.weight",
+        "mean.network.leave.bias",
+        "mean.network.read.weight",
+    } <= changed
 
 
 @pytest.mark.parametrize("frames", [0, 2])
@@ -339,6 +345,8 @@ def test_without_preceding_frames_a_killed_training_ends_as_if_it_had_never_stop
 def test_a_loss_that_is_no_number_stops_and_names_what_is_not_finite(ball_scene: Scene) -> None:
     training = new_training(ball_scene)
     with torch.no_grad():
-        training.renderer.leave.bias[0] = torch.nan
-    with pytest.raises(SteerbenchError, match=r"step 0: not finite: .*renderer\.leave\.bias.*rate"):
+        training.renderer.network.leave.bias[0] = torch.nan
+    with pytest.raises(
+        SteerbenchError, match=r"step 0: not finite: .*renderer\.network\.leave\.bias.*rate"
+    ):
         training.advance()

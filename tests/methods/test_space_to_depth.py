@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from methods.cell_network import LEAK
 from methods.cells import REACH
 from methods.renderer2d import Detail, Observation, Points, cells_at_matter
-from methods.space_to_depth import LEAK, SpaceToDepth
+from methods.space_to_depth import SpaceToDepth
 from tests.methods.observations import (
     BACKGROUND,
     ROUNDING,
@@ -120,21 +121,21 @@ def dense(renderer: SpaceToDepth, observation: Observation) -> Tensor:
     def pointwise(x: Tensor, layer: torch.nn.Linear) -> Tensor:
         return functional.conv2d(x, layer.weight[:, :, None, None], layer.bias)
 
-    hidden = pointwise(torch.cat(planes)[None], renderer.enter) * active
-    for block in renderer.trunk:
+    hidden = pointwise(torch.cat(planes)[None], renderer.network.enter) * active
+    for block in renderer.network.trunk:
         kernel = block.spread.T.reshape(-1, 1, 3, 3)
         mixed = functional.conv2d(hidden, kernel, padding=1, groups=len(kernel))
         grown = functional.leaky_relu(pointwise(mixed, block.grow), LEAK)
         hidden = (hidden + pointwise(grown, block.shrink)) * active
     hidden = functional.leaky_relu(hidden, LEAK)
-    slots = pointwise(hidden, renderer.leave)[0].view(scale**2, -1, *active.shape)
+    slots = pointwise(hidden, renderer.network.leave)[0].view(scale**2, -1, *active.shape)
     fine = functional.pixel_shuffle(slots.transpose(0, 1).flatten(0, 1)[None], scale)
     fine = fine[0].permute(1, 2, 0)  # [H, W, 3 or 4]
     drawn = base + fine[..., :3]
     if renderer.layout.history:
         drawn = drawn + fine[..., 3:].sigmoid() * recent
-    if renderer.read is not None:
-        matrices = pointwise(hidden, renderer.read)[0]
+    if renderer.network.read is not None:
+        matrices = pointwise(hidden, renderer.network.read)[0]
         matrices = matrices.repeat_interleave(scale, 1).repeat_interleave(scale, 2)
         colours, opacity = less[..., :3] * opacity[..., None], opacity[..., None]
         read = torch.cat((colours, opacity, less[..., 3:]), dim=-1).permute(2, 0, 1)
@@ -354,7 +355,7 @@ def test_the_preceding_picture_is_blended_in_where_it_is_known(share: float) -> 
     scale = 4
     renderer = new_renderer()
     with torch.no_grad():
-        renderer.leave.bias.view(scale**2, 4)[:, 3] = 40.0 if share else -200.0
+        renderer.network.leave.bias.view(scale**2, 4)[:, 3] = 40.0 if share else -200.0
     observation = observe()
     picture, valid = before(observation, scale)
     base = enlarged(observation, scale)
@@ -367,9 +368,9 @@ def test_the_surface_covers_the_base_as_far_as_it_is_opaque() -> None:
     """Where the matrix of every cell is the identity on RGB and looks at nothing else."""
     scale, channels = 4, 6
     renderer = new_renderer(channels, history=False)
-    assert renderer.read is not None
+    assert renderer.network.read is not None
     with torch.no_grad():
-        renderer.read.bias.view(3, channels + 1)[:, :3] = torch.eye(3)
+        renderer.network.read.bias.view(3, channels + 1)[:, :3] = torch.eye(3)
     observation = observe(channels=channels)
     values, known = at_surface(observation, scale)
     base = enlarged(observation, scale)
@@ -384,9 +385,9 @@ def test_a_matrix_reads_opacity_and_other_features_less_the_background(column: i
     """Of K = 6: the opacity is behind the colours, then come the others."""
     scale, channels = 4, 6
     renderer = new_renderer(channels, history=False)
-    assert renderer.read is not None
+    assert renderer.network.read is not None
     with torch.no_grad():
-        renderer.read.bias.view(3, channels + 1)[1, column] = 1.0  # into green
+        renderer.network.read.bias.view(3, channels + 1)[1, column] = 1.0  # into green
     observation = observe(channels=channels)
     values, known = at_surface(observation, scale)
     read = values[..., -1] if column == 3 else values[..., column - 1] - BACKGROUND[column - 1]

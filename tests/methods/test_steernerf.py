@@ -10,6 +10,7 @@ import torch
 
 from bench.console import ConsoleLog
 from bench.types import Budget, NullProbe, Scene
+from methods.engines.torch import TorchEngine
 from methods.joint import JointOptions
 from methods.kernels.encode import HashGrid
 from methods.pipeline import PipelineOptions
@@ -33,6 +34,7 @@ def new_method(frames: int = 2, rate: float = 1e-3) -> SteerNerf:
             distilled_views=2,
             motion=MotionOptions(pool=2, length=2),
         ),
+        engine=TorchEngine(),
     )
 
 

@@ -95,7 +95,7 @@ def test_the_base_puts_the_corners_on_corners_or_centres(aligned: bool) -> None:
 
 def test_without_an_output_of_the_network_the_picture_is_the_base() -> None:
     renderer = UnetRelease(6, 2, 4, aligned=True)
-    for layer in renderer.last[2].parameters():
+    for layer in renderer.network.last[2].parameters():
         torch.nn.init.zeros_(layer)
     observation = observe()
     base = renderer.base([observation])

@@ -1,0 +1,56 @@
+"""Inputs of a 2D renderer's network on real frames, for engines that have to see some."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from bench.motion import preceding
+from bench.types import Log, NullProbe, Scene
+from methods.buffer import RenderingBuffer
+from methods.engines import Inputs
+from methods.pipeline import Pipeline
+from methods.sequences import MotionOptions
+
+
+def recorded_inputs(
+    pipeline: Pipeline,
+    scene: Scene,
+    target: Tensor,
+    count: int,
+    motion: MotionOptions,
+    seed: int,
+    log: Log,
+) -> list[Inputs]:
+    """What the network is given in `count` training views of `scene`, evenly spread.
+
+    Each view ends a random smooth motion, as in `methods.sequences`, of as many frames as the
+    buffer holds and one more.
+
+    Args:
+        target: [3] the point that motions turn about.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    cameras = scene.splits["train"].cameras
+    renderer, seen = pipeline.renderer, []
+
+    def record(*inputs: Tensor) -> Inputs:
+        seen.append(inputs)
+        return renderer.network(*inputs)
+
+    renderer.engine, frames = record, []
+    try:
+        with log.progress("frames to build the network on", count) as progress:
+            for place in range(count):
+                camera = cameras[place * len(cameras) // count]
+                buffer = RenderingBuffer(pipeline.options.frames)
+                before = pipeline.options.frames + 1
+                for earlier in preceding(camera, target, before, motion.degrees, generator):
+                    pipeline.render(earlier, buffer, NullProbe())
+                pipeline.render(camera, buffer, NullProbe())
+                frames.append(seen[-1])
+                seen.clear()
+                progress.advance()
+    finally:
+        renderer.engine = None
+    return frames

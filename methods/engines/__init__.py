@@ -1,0 +1,99 @@
+"""Engines: what computes the network of a 2D renderer once it is trained, and at which precision.
+
+An engine makes of a network, and of inputs that it saw on real frames, a function of the same
+tensors. Kernels, reprojection and the field stay what they are.
+"""
+
+from __future__ import annotations
+
+import importlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import ClassVar, Literal
+
+from torch import Tensor
+
+from bench.errors import Unavailable
+from bench.types import Log
+from methods.renderer2d import Network
+
+Precision = Literal["fp32", "bf16", "fp16", "int8"]
+
+Inputs = tuple[Tensor, ...]
+
+CALIBRATION = 16
+"""Frames whose inputs tell the range of every number that is rounded to 8 bits."""
+
+
+@dataclass(frozen=True)
+class Built:
+    """A network as an engine runs it.
+
+    Attributes:
+        run: as the network. What it returns may be overwritten by the next call.
+        size: bytes of its weights, as they are stored.
+    """
+
+    run: Callable[..., Inputs]
+    size: int
+
+
+class Engine(ABC):
+    """Builds networks at one `precision`.
+
+    Raises:
+        Unavailable: the engine does not have this precision, or cannot be used here.
+    """
+
+    name: ClassVar[str]
+    precisions: ClassVar[tuple[Precision, ...]]
+
+    def __init__(self, precision: Precision) -> None:
+        if precision not in self.precisions:
+            raise Unavailable(
+                f"precision={precision}: expected one of {', '.join(self.precisions)}, which "
+                f"engine={self.name} has"
+            )
+        self.precision = precision
+
+    @property
+    def samples(self) -> int:
+        """Frames whose inputs `build` wants to see."""
+        return CALIBRATION if self.precision == "int8" else 1
+
+    @abstractmethod
+    def key(self) -> dict[str, object]:
+        """Everything that what is built depends on, beside the network and its inputs."""
+
+    @abstractmethod
+    def build(
+        self,
+        network: Network,
+        samples: Callable[[], Sequence[Inputs]],
+        folder: Callable[[], Path],
+        log: Log,
+    ) -> Built:
+        """Make `network` run, or load what the same build left behind.
+
+        Args:
+            samples: called if they are needed: the inputs of `self.samples` frames.
+            folder: called if something is kept there: of this network and engine alone.
+        """
+
+
+def required(library: str, extra: str) -> ModuleType:
+    """Import a library that an engine stands on.
+
+    Raises:
+        Unavailable: it is not installed.
+    """
+    try:
+        return importlib.import_module(library)
+    except ImportError as error:
+        raise Unavailable(
+            f"engine={library.partition('.')[0]} cannot be used here ({error}): "
+            f'pip install -c constraints.txt -e ".[{extra}]"'
+        ) from error

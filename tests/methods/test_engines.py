@@ -1,0 +1,131 @@
+"""Engines: every one computes what the network does, as closely as its precision allows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+
+from bench.console import ConsoleLog
+from bench.errors import Unavailable
+from methods.engines import Engine, Inputs, required
+from methods.engines.onnxruntime import OnnxRuntime
+from methods.engines.openvino import OpenVino
+from methods.engines.torch import TorchEngine
+from methods.kernels.depthwise import neighbours_of
+from methods.renderer2d import Network
+from methods.space_to_depth import SpaceToDepth
+from methods.unet_release import UnetRelease
+from tests.methods.observations import shaken
+
+ENGINES = [
+    *(partial(TorchEngine, p) for p in ("fp32", "bf16")),
+    *(partial(OpenVino, p) for p in ("fp32", "bf16", "int8")),
+    *(partial(OnnxRuntime, p) for p in ("fp32", "int8")),
+]
+
+TOLERANCE = {"fp32": 1e-5, "bf16": 0.03, "int8": 0.1}
+"""Of the root mean square of what the network says. fp32: sums of a few hundred products in another
+order. Below, a number is rounded by half of 2^-8 (bf16), or by half of 1/255 of the range that it
+was seen in (int8), before each of half a dozen layers; single layers are kept higher."""
+
+
+def cells(count: int, seed: int = 0) -> Inputs:
+    """Rows and neighbours of `count` cells in a square."""
+    renderer = SpaceToDepth(6, 2, 4, init="scratch")
+    generator = torch.Generator().manual_seed(seed)
+    side = round(count**0.5)
+    neighbours = neighbours_of(torch.ones(1, side, side, dtype=torch.bool))
+    return torch.rand(side * side, renderer.layout.width, generator=generator) - 0.5, neighbours
+
+
+def lean() -> tuple[Network, list[Inputs]]:
+    """The lean network, and inputs of three sizes."""
+    renderer = shaken(SpaceToDepth(6, 2, 4, init="scratch")).requires_grad_(False)
+    return renderer.network, [cells(count, seed) for seed, count in enumerate((64, 100, 64, 144))]
+
+
+def unet() -> tuple[Network, list[Inputs]]:
+    renderer = shaken(UnetRelease(6, 1, 4)).requires_grad_(False)
+    generator = torch.Generator().manual_seed(0)
+    return renderer.network, [(torch.rand(1, 12, 36, 44, generator=generator),) for _ in range(3)]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Callable[[], Path]:
+    return lambda: tmp_path
+
+
+def of(engine: Engine) -> str:
+    return f"{engine.name} {engine.precision}"
+
+
+@pytest.mark.parametrize("make", ENGINES, ids=lambda make: of(make()))
+@pytest.mark.parametrize("network", [lean, unet])
+def test_an_engine_computes_what_the_network_does(
+    make: Callable[[], Engine],
+    network: Callable[[], tuple[Network, list[Inputs]]],
+    folder: Callable[[], Path],
+    quiet_log: ConsoleLog,
+) -> None:
+    engine, (module, inputs) = make(), network()
+    built = engine.build(module, lambda: inputs, folder, quiet_log)
+    with torch.no_grad():
+        for some in inputs:
+            for got, want in zip(built.run(*some), module(*some), strict=True):
+                assert got.shape == want.shape
+                error = (got.float() - want).square().mean().sqrt()
+                assert error < TOLERANCE[engine.precision] * want.square().mean().sqrt()
+
+
+@pytest.mark.parametrize("kind", [OpenVino, OnnxRuntime])
+def test_int8_weights_take_a_quarter(
+    kind: Callable[[str], Engine], tmp_path: Path, quiet_log: ConsoleLog
+) -> None:
+    module, inputs = unet()
+    sizes = {}
+    for precision in ("fp32", "int8"):
+        folder = tmp_path / precision
+        folder.mkdir()
+        built = kind(precision).build(module, lambda: inputs, lambda at=folder: at, quiet_log)
+        sizes[precision] = built.size
+    exact = 4 * sum(weight.numel() for weight in module.parameters())
+    assert exact <= sizes["fp32"] < 1.01 * exact  # and a few sizes and shapes
+    assert 0.25 * exact <= sizes["int8"] < 0.27 * exact  # biases and scales stay as they are
+
+
+@pytest.mark.parametrize("make", [partial(OpenVino, "int8"), partial(OnnxRuntime, "int8")])
+def test_what_was_built_is_found_again(
+    make: Callable[[], Engine], folder: Callable[[], Path], quiet_log: ConsoleLog
+) -> None:
+    module, inputs = lean()
+    first = make().build(module, lambda: inputs, folder, quiet_log)
+    before = {path.name for path in folder().iterdir()}
+
+    def never() -> list[Inputs]:
+        raise AssertionError("the frames are not needed again")
+
+    again = make().build(module, never, folder, quiet_log)
+    for got, want in zip(again.run(*inputs[0]), first.run(*inputs[0]), strict=True):
+        assert torch.equal(got, want)
+    assert {path.name for path in folder().iterdir()} == before
+    assert not any("new" in name or "exported" in name for name in before)
+
+
+def test_a_precision_that_an_engine_does_not_have_is_refused_by_name() -> None:
+    with pytest.raises(Unavailable, match="expected one of fp32, int8, which engine=onnxruntime"):
+        OnnxRuntime("bf16")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_half_precision_without_a_gpu_is_refused() -> None:
+    with pytest.raises(Unavailable, match="GPU, here use bf16"):
+        TorchEngine("fp16")
+
+
+def test_a_library_that_is_missing_is_named_with_the_command_that_installs_it() -> None:
+    with pytest.raises(Unavailable, match=r'engine=nowhere .*pip install .*"\.\[extra\]"'):
+        required("nowhere", "extra")
