@@ -127,7 +127,7 @@ class Pipeline:
             preceding = [self.reproject(frame.cloud, view) for frame in buffer.frames]
             observation = self.observe(features, preceding, newest, view, probe)
         with probe.stage("renderer2d"):
-            drawing = self.renderer([observation])
+            drawing = self.renderer([observation], probe)
             picture = drawing.pictures[0].clamp_(0, 1)
         if options.refined and drawing.doubt is not None:
             with probe.stage("refinement"):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
+from bench.types import NullProbe, Probe
 from methods.cells import cells_near, largest_in_cell
 from methods.volume import FeatureFrame
 
@@ -83,6 +84,9 @@ class Drawing:
     doubt: Tensor | None = None
 
 
+UNWATCHED = NullProbe()
+
+
 class Network(nn.Module):
     """What is learned of a 2D renderer: tensors to a tuple of tensors, as engines can run it.
 
@@ -110,12 +114,13 @@ class Renderer2d(nn.Module, ABC):
     network: Network
     engine: Callable[..., tuple[Tensor, ...]] | None = None
 
-    def run(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+    def run(self, probe: Probe, *inputs: Tensor) -> tuple[Tensor, ...]:
         """What the network makes of its inputs."""
-        return (self.engine or self.network)(*inputs)
+        with probe.stage("network"):
+            return (self.engine or self.network)(*inputs)
 
     @abstractmethod
-    def forward(self, observations: Sequence[Observation]) -> Drawing:
+    def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Drawing:
         """Draw all of them."""
 
     @abstractmethod

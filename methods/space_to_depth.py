@@ -11,11 +11,12 @@ from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn import functional
 
+from bench.types import Probe
 from methods.cell_network import CellNetwork
 from methods.cells import number, paint
 from methods.kernels.depthwise import neighbours_of
 from methods.kernels.lift import Layout, draw, lift
-from methods.renderer2d import Drawing, Observation, Renderer2d
+from methods.renderer2d import UNWATCHED, Drawing, Observation, Renderer2d
 
 QUANTUM = 256
 """The trunk is given cells in multiples of this."""
@@ -84,12 +85,12 @@ class SpaceToDepth(Renderer2d):
         if init == "generic":
             self._start_from(load_file(GENERIC))
 
-    def forward(self, observations: Sequence[Observation]) -> Drawing:
+    def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Drawing:
         """See `Renderer2d`."""
         base, rows = self._lift(observations)
         neighbours, backend = self._neighbours(observations, len(rows)), observations[0].backend
         self.network.backend = backend
-        answer, doubt, *matrix = (x.to(base) for x in self.run(rows, neighbours))
+        answer, doubt, *matrix = (x.to(base) for x in self.run(probe, rows, neighbours))
         drawn = draw(base, rows, answer, next(iter(matrix), None), self.layout, backend=backend)
         return Drawing(self._paint(observations, drawn), doubt[: len(base), 0])
 

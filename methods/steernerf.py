@@ -109,24 +109,17 @@ class SteerNerf:
         trained.field.requires_grad_(False).grad_buffer = None
         self.trained, self.train_s = trained, trained.train_s + training.seconds
         self.pipeline.renderer.requires_grad_(False)
-        self._build(scene, target, key, log)
+        self._fitted = scene, target, key, log
+        self.use(self.engine)
 
-    def _build(self, scene: Scene, target: Tensor, key: dict[str, object], log: Log) -> None:
-        """Hand the network of the 2D renderer over to the engine."""
-        renderer, engine = self.pipeline.renderer, self.engine
-        seen = partial(
-            recorded_inputs,
-            self.pipeline,
-            scene,
-            target,
-            engine.samples,
-            self.joint.motion,
-            self.setup.seed,
-            log,
-        )
+    def use(self, engine: Engine) -> None:
+        """Have `engine` compute the network of the 2D renderer from now on; after `fit`."""
+        scene, target, key, log = self._fitted
+        renderer, options = self.pipeline.renderer, (self.joint.motion, self.setup.seed, log)
+        seen = partial(recorded_inputs, self.pipeline, scene, target, engine.samples, *options)
         folder = partial(log.stage_dir, "network", {**key, **engine.key()})
         built = engine.build(renderer.network, seen, folder, log)
-        renderer.engine, self.renderer_bytes = built.run, built.size
+        self.engine, renderer.engine, self.renderer_bytes = engine, built.run, built.size
 
     def fit_generic(self, scenes: Sequence[Scene], budget: Budget, output: Path, log: Log) -> None:
         """Train a 2D renderer on many scenes, for others to start from; see `methods.generic`."""

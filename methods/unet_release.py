@@ -8,8 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from bench.types import Probe
 from methods.kernels.splat import gather
-from methods.renderer2d import Drawing, Network, Observation, Renderer2d
+from methods.renderer2d import UNWATCHED, Drawing, Network, Observation, Renderer2d
 
 
 class UnetRelease(Renderer2d):
@@ -32,10 +33,10 @@ class UnetRelease(Renderer2d):
         self.channels, self.frames, self.scale, self.aligned = channels, frames, scale, aligned
         self.network = _Unet(channels * (frames + 1))
 
-    def forward(self, observations: Sequence[Observation]) -> Drawing:
+    def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Drawing:
         """See `Renderer2d`."""
         inputs = torch.stack([self._inputs(o) for o in observations])
-        (correction,) = self.run(inputs)
+        (correction,) = self.run(probe, inputs)
         return Drawing(self.base(observations) + correction.to(inputs).permute(0, 2, 3, 1))
 
     def base(self, observations: Sequence[Observation]) -> Tensor:

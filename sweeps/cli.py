@@ -33,10 +33,11 @@ examples
   steerbench run --help                        all choices and settings
   steerbench list                              what there is, and what of it is usable here
   steerbench paper budget=demo                 every table of the SteerNeRF paper, as a page
+  steerbench parity scene=totem budget=demo    what int8 costs, in decibels, and saves, in time
   steerbench results --format csv              every number measured so far
 """
 
-COMMANDS = ("run", "paper", "list", "results", "kernels", "scenes", "generic")
+COMMANDS = ("run", "paper", "list", "results", "kernels", "parity", "scenes", "generic")
 
 # What the disk refuses: worth a plain sentence, not a traceback.
 REFUSALS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR}
@@ -133,6 +134,19 @@ def _parser() -> Parser:
     kernels.add_argument("--filter", default="", help="only kernels whose name contains this")
     kernels.add_argument("--repeats", type=int, default=5, help="timed calls of each (default 5)")
     kernels.set_defaults(module="kernels", parser=kernels)
+
+    parity = commands.add_parser(
+        "parity",
+        help="every engine and precision of the 2D renderer on the same frames",
+        description="Train SteerNeRF, or take what the same training left behind; then render the "
+        "same frames with every engine and precision that can be used here, and compare them with "
+        "torch in fp32.",
+    )
+    parity.add_argument(
+        "--frames", type=int, default=60, help="first frames of the trajectory (default 60)"
+    )
+    parity.add_argument("overrides", nargs="*", help="settings as of `steerbench run`")
+    parity.set_defaults(module="parity", parser=parity)
 
     scenes = commands.add_parser("scenes", help="look after copies of data sets")
     actions = scenes.add_subparsers(title="actions", metavar="ACTION", required=True)
