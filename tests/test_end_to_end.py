@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -107,3 +108,23 @@ def test_training_is_shared_by_methods_and_by_runs_that_differ_in_rendering_only
     stages = [path.name.split("-")[0] for path in (first[0] / "outputs" / "stages").iterdir()]
     assert stages.count("field") == 1
     assert stages.count("steernerf") == 2
+
+
+def test_parity_compares_every_engine_with_torch_in_fp32(first: tuple[Path, str]) -> None:
+    steerbench = Path(sys.executable).with_name("steerbench")
+    command = [steerbench, "parity", "--frames", "4", "scene=totem", *SMALL]
+    done = subprocess.run(command, cwd=first[0], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "trained renderer found" in done.stderr
+    found = {
+        (row["engine"], row["precision"]): row for row in json.loads(done.stdout.splitlines()[-1])
+    }
+    standard = found["torch", "fp32"]
+    assert standard["lost"] == 0
+    for engine in ("openvino", "onnxruntime"):
+        # Refinement may choose another one of cells that are doubted alike.
+        assert found[engine, "fp32"]["psnr_to_fp32"] > 60
+        assert abs(found[engine, "int8"]["lost"]) < 1
+        assert found[engine, "int8"]["bytes"] < 0.5 * standard["bytes"]
+    for row in found.values():
+        assert 0 < row["network_ms"] < row["frame_ms"]
