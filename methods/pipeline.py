@@ -36,6 +36,21 @@ LAYER = 4 * STEP
 
 
 @dataclass(frozen=True)
+class Skips:
+    """What is not computed because no picture shows it; switched off, to see what that saves.
+
+    Attributes:
+        empty: samples where the field holds nothing, and rays that meet nothing else.
+        hidden: samples behind a transmittance of `PipelineOptions.stop`.
+        background: cells near which nothing is seen.
+    """
+
+    empty: bool = True
+    hidden: bool = True
+    background: bool = True
+
+
+@dataclass(frozen=True)
 class PipelineOptions:
     """What a frame is made of.
 
@@ -57,6 +72,7 @@ class PipelineOptions:
             with longer ones.
         refined: share of the cells whose pixels are rendered by the field after all, those that
             the 2D renderer doubts most. It can be chosen after the training, too.
+        skip: what is not computed. Nor is it trained for.
     """
 
     channels: int = 6
@@ -71,6 +87,7 @@ class PipelineOptions:
     stop: float = STOP
     steps: float = 1.0
     refined: float = 0.0
+    skip: Skips = Skips()
 
     def __post_init__(self) -> None:
         if not (self.channels >= 3 and self.frames >= 0 and self.scale >= 1 and self.steps > 0):
@@ -84,7 +101,7 @@ class PipelineOptions:
     def taught(self, refined: float) -> PipelineOptions:
         """The options of a training. It looks everywhere, so that one serves all choices of where
         to look that are made afterwards."""
-        return replace(self, range=RangeReduction("off"), refined=refined)
+        return replace(self, range=RangeReduction("off"), refined=refined, skip=Skips())
 
 
 class Pipeline:
@@ -111,8 +128,12 @@ class Pipeline:
                 f"pipeline.refined: {type(renderer).__name__} does not say where it may be wrong, "
                 f"expected 0, got {options.refined}"
             )
-        self.field, self.occupancy, self.renderer = field, occupancy, renderer
+        self.field, self.renderer = field, renderer
         self.options, self.backend = options, field.backend
+        skip = options.skip
+        everywhere = torch.ones_like(occupancy.cells)
+        self.occupancy = occupancy if skip.empty else Occupancy(everywhere)
+        self.stop = options.stop if skip.hidden else 0.0
         self.background = functional.pad(
             background, (0, options.channels - 3), value=options.feature_background
         )  # [K]
@@ -153,7 +174,12 @@ class Pipeline:
         probe: Probe,
     ) -> Observation:
         """All that is known of the picture of `view` from its `frame` and the `preceding` ones."""
-        options, cells = self.options, cells_at_matter(frame.alpha, preceding)
+        options = self.options
+        if options.skip.background:
+            cells = cells_at_matter(frame.alpha, preceding)
+        else:
+            cells = torch.arange(frame.alpha.numel(), device=frame.alpha.device)
+        probe.count("cells", len(cells), frame.alpha.numel())
         history = surface = None
         if options.history or options.surface:
             depth = enlarge(
@@ -219,7 +245,7 @@ class Pipeline:
             cast(view.full, pixels.flatten(0, 1)),
             self.occupancy,
             probe,
-            stop=options.stop,
+            stop=self.stop,
             step=options.steps * STEP,
             window=window,
         )
@@ -242,7 +268,7 @@ class Pipeline:
                 self.background,
                 probe,
                 found,
-                stop=options.stop,
+                stop=self.stop,
                 step=options.steps * STEP,
             )
 

@@ -91,7 +91,8 @@ class Network(nn.Module):
     """What is learned of a 2D renderer: tensors to a tuple of tensors, as engines can run it.
 
     Attributes:
-        varying: of each input, the axes whose size differs from frame to frame.
+        varying: of each input, the axes whose size, the same for all of them, differs from frame to
+            frame.
         backend: of its kernels; engines read "reference", which is plain torch.
     """
 

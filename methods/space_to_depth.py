@@ -18,8 +18,8 @@ from methods.kernels.depthwise import neighbours_of
 from methods.kernels.lift import Layout, draw, lift
 from methods.renderer2d import UNWATCHED, Drawing, Observation, Renderer2d
 
-QUANTUM = 256
-"""The trunk is given cells in multiples of this."""
+QUANTUM = 512
+"""The network is given cells in multiples of this."""
 
 GENERIC = Path(__file__).parent / "weights" / "generic.safetensors"
 """Weights trained on other scenes, by `steerbench generic`."""

@@ -47,6 +47,9 @@ SOURCES = (
 )
 """Modules beside this one that decide what stage 2 results in, with those of stage 1."""
 
+NOT_TRAINED_FOR = ("range", "refined", "skip")
+"""Options of a pipeline that stage 2 does not depend on; see `PipelineOptions.taught`."""
+
 
 class SteerNerf:
     """Low-resolution features of a field, preceding frames and a 2D renderer.
@@ -109,17 +112,7 @@ class SteerNerf:
         trained.field.requires_grad_(False).grad_buffer = None
         self.trained, self.train_s = trained, trained.train_s + training.seconds
         self.pipeline.renderer.requires_grad_(False)
-        self._fitted = scene, target, key, log
-        self.use(self.engine)
-
-    def use(self, engine: Engine) -> None:
-        """Have `engine` compute the network of the 2D renderer from now on; after `fit`."""
-        scene, target, key, log = self._fitted
-        renderer, options = self.pipeline.renderer, (self.joint.motion, self.setup.seed, log)
-        seen = partial(recorded_inputs, self.pipeline, scene, target, engine.samples, *options)
-        folder = partial(log.stage_dir, "network", {**key, **engine.key()})
-        built = engine.build(renderer.network, seen, folder, log)
-        self.engine, renderer.engine, self.renderer_bytes = engine, built.run, built.size
+        self._hand_over(scene, target, key, log)
 
     def fit_generic(self, scenes: Sequence[Scene], budget: Budget, output: Path, log: Log) -> None:
         """Train a 2D renderer on many scenes, for others to start from; see `methods.generic`."""
@@ -150,12 +143,34 @@ class SteerNerf:
         """Bytes of table, networks, occupancy bits and 2D renderer."""
         return self.trained.sizes() | {"renderer2d": self.renderer_bytes}
 
+    def unit_work(self) -> dict[str, int]:
+        """What one unit of work takes: every weight of the field is multiplied once a sample, every
+        weight of a network on cells once a cell."""
+        field = self.trained.field
+        return {
+            "reads a sample": 8 * field.grid.levels,
+            "products a sample": sum(layer.numel() for layer in field.layers.values()),
+            "products a cell": sum(w.numel() for w in self.pipeline.renderer.parameters()),
+        }
+
     def settings(self) -> dict[str, str]:
         """See `bench.types.Method.settings`; engine and precision are those of the 2D renderer."""
         return self.setup.settings() | {
             "engine": self.engine.name,
             "precision": self.engine.precision,
         }
+
+    def _hand_over(self, scene: Scene, target: Tensor, key: dict[str, object], log: Log) -> None:
+        """Have the engine compute the network of the 2D renderer from now on."""
+        renderer, engine = self.pipeline.renderer, self.engine
+        options = (engine.samples(renderer.network), self.joint.motion, self.setup.seed, log)
+        seen = partial(recorded_inputs, self.pipeline, scene, target, *options)
+        calibration = digest([ROOT / "methods" / "calibration.py"])
+        folder = partial(
+            log.stage_dir, "network", {**key, **engine.key(), "calibration": calibration}
+        )
+        built = engine.build(renderer.network, seen, folder, log)
+        renderer.engine, self.renderer_bytes = built.run, built.size
 
     def _stage2(
         self,
@@ -199,7 +214,7 @@ class SteerNerf:
         trained_for = {
             name: value
             for name, value in asdict(self.options).items()
-            if name not in ("range", "refined")
+            if name not in NOT_TRAINED_FOR
         }
         return {
             "renderer_steps": budget.renderer_steps,

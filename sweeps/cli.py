@@ -37,7 +37,7 @@ examples
   steerbench results --format csv              every number measured so far
 """
 
-COMMANDS = ("run", "paper", "list", "results", "kernels", "parity", "scenes", "generic")
+COMMANDS = ("run", "paper", "list", "results", "kernels", "parity", "skips", "scenes", "generic")
 
 # What the disk refuses: worth a plain sentence, not a traceback.
 REFUSALS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR}
@@ -135,18 +135,36 @@ def _parser() -> Parser:
     kernels.add_argument("--repeats", type=int, default=5, help="timed calls of each (default 5)")
     kernels.set_defaults(module="kernels", parser=kernels)
 
-    parity = commands.add_parser(
-        "parity",
-        help="every engine and precision of the 2D renderer on the same frames",
-        description="Train SteerNeRF, or take what the same training left behind; then render the "
-        "same frames with every engine and precision that can be used here, and compare them with "
-        "torch in fp32.",
-    )
-    parity.add_argument(
-        "--frames", type=int, default=60, help="first frames of the trajectory (default 60)"
-    )
-    parity.add_argument("overrides", nargs="*", help="settings as of `steerbench run`")
-    parity.set_defaults(module="parity", parser=parity)
+    for name, short, long, frames in (
+        (
+            "parity",
+            "every engine and precision of the 2D renderer on the same frames",
+            "with every engine and precision that can be used here, and compare them with torch in "
+            "fp32.",
+            60,
+        ),
+        (
+            "skips",
+            "what is not computed, what that saves and what it costs",
+            "with everything computed that could be left out, with each of it left out alone, and "
+            "with all of it.",
+            8,
+        ),
+    ):
+        variants = commands.add_parser(
+            name,
+            help=short,
+            description="Train SteerNeRF, or take what the same training left behind; then render "
+            f"the same frames {long}",
+        )
+        variants.add_argument(
+            "--frames",
+            type=int,
+            default=frames,
+            help=f"first frames of the trajectory (default {frames})",
+        )
+        variants.add_argument("overrides", nargs="*", help="settings as of `steerbench run`")
+        variants.set_defaults(module=name, parser=variants)
 
     scenes = commands.add_parser("scenes", help="look after copies of data sets")
     actions = scenes.add_subparsers(title="actions", metavar="ACTION", required=True)

@@ -116,15 +116,29 @@ def test_parity_compares_every_engine_with_torch_in_fp32(first: tuple[Path, str]
     done = subprocess.run(command, cwd=first[0], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "trained renderer found" in done.stderr
-    found = {
-        (row["engine"], row["precision"]): row for row in json.loads(done.stdout.splitlines()[-1])
-    }
-    standard = found["torch", "fp32"]
+    found = {row["engine"]: row for row in json.loads(done.stdout.splitlines()[-1])}
+    standard = found["torch, fp32"]
     assert standard["lost"] == 0
+    assert standard["apart"] is None  # there is no difference
     for engine in ("openvino", "onnxruntime"):
         # Refinement may choose another one of cells that are doubted alike.
-        assert found[engine, "fp32"]["psnr_to_fp32"] > 60
-        assert abs(found[engine, "int8"]["lost"]) < 1
-        assert found[engine, "int8"]["bytes"] < 0.5 * standard["bytes"]
+        assert found[f"{engine}, fp32"]["apart"] > 60
+        assert abs(found[f"{engine}, int8"]["lost"]) < 1
+        assert found[f"{engine}, int8"]["bytes"] < 0.5 * standard["bytes"]
     for row in found.values():
         assert 0 < row["network_ms"] < row["frame_ms"]
+
+
+def test_skips_lists_the_work_of_a_frame_with_and_without_each_switch(
+    first: tuple[Path, str],
+) -> None:
+    steerbench = Path(sys.executable).with_name("steerbench")
+    command = [steerbench, "skips", "--frames", "3", "scene=totem", *SMALL]
+    done = subprocess.run(command, cwd=first[0], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    found = {row["skipped"]: row for row in json.loads(done.stdout.splitlines()[-1])}
+    dense = found.pop("nothing")
+    assert dense["cells"] == 16 * 16
+    assert found["empty space"]["samples"] < dense["samples"]
+    for row in found.values():
+        assert all(row[work] <= dense[work] for work in ("rays", "cells"))

@@ -59,8 +59,7 @@ class Engine(ABC):
             )
         self.precision = precision
 
-    @property
-    def samples(self) -> int:
+    def samples(self, network: Network) -> int:
         """Frames whose inputs `build` wants to see."""
         return CALIBRATION if self.precision == "int8" else 1
 
@@ -79,7 +78,7 @@ class Engine(ABC):
         """Make `network` run, or load what the same build left behind.
 
         Args:
-            samples: called if they are needed: the inputs of `self.samples` frames.
+            samples: called if they are needed: the inputs of `self.samples(network)` frames.
             folder: called if something is kept there: of this network and engine alone.
         """
 

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bench.provenance import digest
 from bench.types import Log
 from methods.engines import Built, Engine, Inputs, Precision, required
 from methods.renderer2d import Network
@@ -39,7 +40,12 @@ class OnnxRuntime(Engine):
     def key(self) -> dict[str, object]:
         """See `Engine.key`."""
         versions = {library: metadata.version(library) for library in ("onnx", "onnxruntime")}
-        return {"engine": self.name, "stored": self.precision, "code": 1, **versions}
+        return {
+            "engine": self.name,
+            "stored": self.precision,
+            "code": digest([Path(__file__)]),
+            **versions,
+        }
 
     def build(
         self,

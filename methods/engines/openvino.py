@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import logging
+import math
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -11,15 +14,23 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from bench.provenance import digest
 from bench.types import Log
-from methods.engines import Built, Engine, Inputs, Precision, required
+from methods.engines import CALIBRATION, Built, Engine, Inputs, Precision, required
 from methods.renderer2d import Network
 
 # Neither OpenVINO nor NNCF is to tell anybody that it is used: both do without this package.
 sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
+
+
+SIZES = "steerbench_sizes"
+"""Where a stored model says for which sizes it is compiled beforehand."""
+
+Varying = tuple[tuple[int, ...], ...]
 
 
 class OpenVino(Engine):
@@ -41,9 +52,12 @@ class OpenVino(Engine):
         """See `Engine.key`."""
         libraries = ("openvino", "nncf") if self._nncf else ("openvino",)
         versions = {library: metadata.version(library) for library in libraries}
-        # What bfloat16 is read from is float32.
-        stored = "int8" if self.precision == "int8" else "fp32"
-        return {"engine": self.name, "stored": stored, "code": 1, **versions}
+        code = digest([Path(__file__)])
+        return {"engine": self.name, "precision": self.precision, "code": code, **versions}
+
+    def samples(self, network: Network) -> int:
+        """See `Engine.samples`: enough to know the sizes that come."""
+        return CALIBRATION if any(network.varying) else super().samples(network)
 
     def build(
         self,
@@ -57,10 +71,19 @@ class OpenVino(Engine):
         if path.exists():
             log.info(f"built network found: {path}")
         else:
-            self._write(self._convert(network, samples()), path)
+            seen = samples()
+            model = self._convert(network, seen)
+            model.set_rt_info(json.dumps(_sizes(seen, network.varying)), SIZES)
+            self._write(model, path)
         model = self._openvino.Core().read_model(path)
-        size = sum(op.data.nbytes for op in model.get_ops() if op.get_type_name() == "Constant")
-        return Built(_Compiled(self._openvino, model, self.precision), size)
+        compiled = _Compiled(self._openvino, model, network.varying, self.precision)
+        sizes = json.loads(model.get_rt_info(SIZES).value)
+        with log.progress("compiling", len(sizes)) as progress:
+            for size in sizes:
+                compiled.prepare(size)
+                progress.advance()
+        weights = [op for op in model.get_ops() if op.get_type_name() == "Constant"]
+        return Built(compiled, sum(op.data.nbytes for op in weights))
 
     def _convert(self, network: Network, samples: Sequence[Inputs]) -> Any:
         readable = deepcopy(network)
@@ -76,35 +99,64 @@ class OpenVino(Engine):
             return model
         logging.getLogger("nncf").setLevel(logging.ERROR)
         frames = self._nncf.Dataset(samples, lambda inputs: [x.numpy() for x in inputs])
-        return self._nncf.quantize(model, frames, subset_size=len(samples))
+        with contextlib.redirect_stdout(sys.stderr):  # its progress bars
+            return self._nncf.quantize(model, frames, subset_size=len(samples))
 
     def _write(self, model: Any, path: Path) -> None:
         """Leave the model at `path`, whole or not at all."""
         new = path.with_name("new.xml")
-        self._openvino.save_model(model, new, compress_to_fp16=False)
+        self._openvino.save_model(model, new, compress_to_fp16=self.precision == "bf16")
         new.with_suffix(".bin").replace(path.with_suffix(".bin"))
         new.replace(path)
+
+
+def _sizes(samples: Sequence[Inputs], varying: Varying) -> list[int]:
+    """The sizes of varying axes that were seen, those between, and one beyond on either side."""
+    seen = {
+        x.shape[axis]
+        for inputs in samples
+        for x, axes in zip(inputs, varying, strict=True)
+        for axis in axes
+    }
+    if len(seen) < 2:
+        return sorted(seen)
+    step = math.gcd(*seen)
+    return list(range(max(min(seen) - step, step), max(seen) + step + 1, step))
 
 
 class _Compiled:
     """A model, compiled for every size of its inputs that comes: a fixed size is a third faster."""
 
-    def __init__(self, openvino: Any, model: Any, precision: Precision) -> None:
-        self._model, self._core = model, openvino.Core()
-        self._requests: dict[tuple[torch.Size, ...], Any] = {}
+    def __init__(self, openvino: Any, model: Any, varying: Varying, precision: Precision) -> None:
+        self._model, self._varying, self._core = model, varying, openvino.Core()
+        self._requests: dict[tuple[tuple[int, ...], ...], Any] = {}
         self._settings = {
             "INFERENCE_PRECISION_HINT": "f32" if precision == "fp32" else "bf16",
             "PERFORMANCE_HINT": "LATENCY",
             "INFERENCE_NUM_THREADS": torch.get_num_threads(),
         }
 
+    def prepare(self, size: int) -> None:
+        """Compile for varying axes of `size`; what is done at the first call is done, too."""
+        told = []
+        for port, axes in zip(self._model.inputs, self._varying, strict=True):
+            shape = [
+                size if axis in axes else part.get_length()
+                for axis, part in enumerate(port.partial_shape)
+            ]
+            told.append(np.zeros(shape, port.element_type.to_dtype()))
+        self._request(tuple(x.shape for x in told)).infer(told)
+
     def __call__(self, *inputs: Tensor) -> Inputs:
         arrays = [x.contiguous().numpy() for x in inputs]
-        shapes = tuple(x.shape for x in inputs)
+        request = self._request(tuple(x.shape for x in arrays))
+        found = request.infer(arrays, share_inputs=True, share_outputs=True)
+        return tuple(torch.from_numpy(found[place]) for place in range(len(found)))
+
+    def _request(self, shapes: tuple[tuple[int, ...], ...]) -> Any:
         if shapes not in self._requests:
             model = self._model.clone()
-            model.reshape({place: list(shape) for place, shape in enumerate(shapes)})
+            model.reshape(dict(enumerate(map(list, shapes))))
             compiled = self._core.compile_model(model, "CPU", self._settings)
             self._requests[shapes] = compiled.create_infer_request()
-        found = self._requests[shapes].infer(arrays, share_inputs=True, share_outputs=True)
-        return tuple(torch.from_numpy(found[i]) for i in range(len(found)))
+        return self._requests[shapes]

@@ -27,8 +27,7 @@ class TorchEngine(Engine):
         if precision == "fp16" and not torch.cuda.is_available():
             raise Unavailable("precision=fp16: engine=torch has it on a GPU, here use bf16")
 
-    @property
-    def samples(self) -> int:
+    def samples(self, network: Network) -> int:
         """None: nothing is prepared."""
         return 0
 

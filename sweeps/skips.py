@@ -1,0 +1,89 @@
+"""`steerbench skips`: what is not computed, what that saves, and what it adds in error."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+from reports.tables import Table, number, share
+from sweeps.terminal import console, rich_table
+from sweeps.variants import Rendered, Variant, apart_text, finite, render_variants
+
+SETTINGS = ("method=steernerf", "trajectory=smooth")
+
+SWITCHES = {
+    "empty space": ("method.pipeline.skip.empty",),
+    "hidden samples": ("method.pipeline.skip.hidden",),
+    "background cells": ("method.pipeline.skip.background",),
+}
+
+WORK = ("rays", "samples", "table reads, M", "cells", "products, G")
+
+COLUMNS = ("skipped", "PSNR to nothing skipped, dB ↑", "PSNR, dB ↑", "lost, dB ↓", "frame, ms ↓")
+
+
+def main(options: argparse.Namespace) -> int:
+    """Print a table and, as the last line, the same rows as JSON."""
+    overrides = [*SETTINGS, *options.overrides]
+    found = render_variants(overrides, _variants(), options.frames, "variants")
+    rows = [_row(one, found[0]) for one in found]
+    title = f"{found[0].method.name}, {options.frames} frames: mean work of a frame, and its share"
+    lines = tuple(_line(row, rows[0]) for row in rows)
+    console().print(rich_table(Table(title, (*COLUMNS, *WORK), lines)))
+    print(json.dumps([finite(row) for row in rows]))
+    return 0
+
+
+def _variants() -> list[Variant]:
+    """Nothing skipped, each alone, all of them, and range reduction on top."""
+    keys = [key for some in SWITCHES.values() for key in some]
+    off = {key: f"{key}=false" for key in keys}
+    alone = [
+        Variant(name, tuple(line for key, line in off.items() if key not in some))
+        for name, some in SWITCHES.items()
+    ]
+    window = "method.pipeline.range.mode=window"
+    return [
+        Variant("nothing", tuple(off.values())),
+        *alone,
+        Variant("all of these"),
+        Variant("and a window of depths", (window,)),
+    ]
+
+
+def _row(one: Rendered, standard: Rendered) -> dict[str, Any]:
+    method: Any = one.method
+    unit, done = method.unit_work(), one.done
+    samples = done["samples"] + done.get("surface_samples", 0)
+    products = samples * unit["products a sample"] + done["cells"] * unit["products a cell"]
+    work = (
+        done["rays"] + done.get("refined_rays", 0),
+        samples,
+        samples * unit["reads a sample"] / 1e6,
+        done["cells"],
+        products / 1e9,
+    )
+    return {
+        "skipped": one.variant.name,
+        "apart": one.apart,
+        "psnr": one.psnr,
+        "lost": standard.psnr - one.psnr,
+        "frame_ms": one.frame_ms,
+        **dict(zip(WORK, work, strict=True)),
+    }
+
+
+def _line(row: dict[str, Any], dense: dict[str, Any]) -> tuple[str, ...]:
+    figures = (
+        f"{number(row[name], 2 if ',' in name else 0)} ({share(row[name], dense[name])})"
+        for name in WORK
+    )
+    return (
+        row["skipped"],
+        apart_text(row["apart"]),
+        number(row["psnr"], 2),
+        number(row["lost"], 3),
+        number(row["frame_ms"], 1),
+        *figures,
+    )
