@@ -5,14 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hydra import compose, initialize_config_dir
-from hydra.errors import HydraException
-from omegaconf.errors import OmegaConfBaseException
-
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from sweeps.build import build
-from sweeps.overrides import CONFIGS, explain
+from sweeps.overrides import composed
 
 SETTINGS = (
     "method=steernerf",
@@ -27,12 +23,7 @@ def main(options: argparse.Namespace) -> int:
     """Fit a field to each of many random scenes, train one renderer on all, write its weights."""
     if options.scenes < 1:
         raise SteerbenchError(f"--scenes: expected 1 or more, got {options.scenes}")
-    overrides = [*SETTINGS, *options.overrides]
-    try:
-        with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-            config = compose("run", overrides=overrides)
-    except (HydraException, OmegaConfBaseException) as error:
-        raise explain(error, overrides) from error
+    config = composed([*SETTINGS, *options.overrides])
     log = ConsoleLog(Path(config.outputs))
     method, budget = build(config, "method"), build(config, "budget")
     scenes = []

@@ -1,4 +1,5 @@
-"""What is wrong with the overrides of `steerbench run`, in the words of who typed them."""
+"""The configuration that overrides describe; what is wrong with them, in the words of who typed
+them."""
 
 from __future__ import annotations
 
@@ -8,13 +9,26 @@ from pathlib import Path
 
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.errors import SteerbenchError
 from sweeps.names import unknown
 
 CONFIGS = Path(__file__).parent / "configs"
+
+
+def composed(overrides: Sequence[str], **options: bool) -> DictConfig:
+    """The configuration of a run; `options` as of Hydra's `compose`.
+
+    Raises:
+        SteerbenchError: a setting or a choice does not exist, or cannot be read.
+    """
+    try:
+        with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+            return compose("run", overrides=list(overrides), **options)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise explain(error, overrides) from error
 
 
 def explain(error: HydraException | OmegaConfBaseException, argv: Sequence[str]) -> SteerbenchError:

@@ -11,11 +11,8 @@ from datetime import timedelta
 from itertools import product
 from pathlib import Path
 
-from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
 from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
 
 from bench.results import Store, explained
 from reports.published import PaperTable, paper_tables, section
@@ -23,7 +20,7 @@ from reports.runs import load
 from reports.tables import number
 from sweeps.measurement import Obtained, obtain
 from sweeps.names import unknown
-from sweeps.overrides import CONFIGS, explain
+from sweeps.overrides import composed
 
 
 @dataclass(frozen=True)
@@ -59,16 +56,11 @@ def plan(table: str, overrides: Sequence[str]) -> list[Planned]:
     """
     together = [f"+experiment={table}", *overrides]
     jobs = []
-    try:
-        with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-            experiment = compose("run", overrides=together, return_hydra_config=True)
-            for settings in _grid(experiment.hydra.sweeper.params):
-                own = [f"{name}={value}" for name, value in settings.items()]
-                config = compose("run", overrides=[*together, *own])
-                command = ["steerbench", "run", *together, *own, "hydra.mode=RUN"]
-                jobs.append(Planned(table, settings, config, command))
-    except (HydraException, OmegaConfBaseException) as error:
-        raise explain(error, list(overrides)) from error
+    experiment = composed(together, return_hydra_config=True)
+    for settings in _grid(experiment.hydra.sweeper.params):
+        own = [f"{name}={value}" for name, value in settings.items()]
+        command = ["steerbench", "run", *together, *own, "hydra.mode=RUN"]
+        jobs.append(Planned(table, settings, composed([*together, *own]), command))
     return jobs
 
 

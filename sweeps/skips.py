@@ -12,11 +12,8 @@ from sweeps.variants import Rendered, Variant, apart_text, finite, render_varian
 
 SETTINGS = ("method=steernerf", "trajectory=smooth")
 
-SWITCHES = {
-    "empty space": ("method.pipeline.skip.empty",),
-    "hidden samples": ("method.pipeline.skip.hidden",),
-    "background cells": ("method.pipeline.skip.background",),
-}
+SWITCHES = {"empty space": "empty", "hidden samples": "hidden", "background cells": "background"}
+"""The settings below `method.pipeline.skip`, in words."""
 
 WORK = ("rays", "samples", "table reads, M", "cells", "products, G")
 
@@ -37,18 +34,15 @@ def main(options: argparse.Namespace) -> int:
 
 def _variants() -> list[Variant]:
     """Nothing skipped, each alone, all of them, and range reduction on top."""
-    keys = [key for some in SWITCHES.values() for key in some]
-    off = {key: f"{key}=false" for key in keys}
+    off = {name: f"method.pipeline.skip.{switch}=false" for name, switch in SWITCHES.items()}
     alone = [
-        Variant(name, tuple(line for key, line in off.items() if key not in some))
-        for name, some in SWITCHES.items()
+        Variant(name, tuple(line for other, line in off.items() if other != name)) for name in off
     ]
-    window = "method.pipeline.range.mode=window"
     return [
         Variant("nothing", tuple(off.values())),
         *alone,
         Variant("all of these"),
-        Variant("and a window of depths", (window,)),
+        Variant("and a window of depths", ("method.pipeline.range.mode=window",)),
     ]
 
 

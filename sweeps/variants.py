@@ -9,10 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.errors import HydraException
-from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
 from torch import Tensor
 
 from bench.console import ConsoleLog
@@ -22,7 +18,7 @@ from bench.protocol import composite
 from bench.trajectories import Step
 from bench.types import Method, NullProbe, Scene
 from sweeps.build import build
-from sweeps.overrides import CONFIGS, explain
+from sweeps.overrides import composed
 
 
 @dataclass(frozen=True)
@@ -71,7 +67,7 @@ def render_variants(
     """
     if frames < 1:
         raise SteerbenchError(f"--frames: expected 1 or more, got {frames}")
-    configs = [_composed([*overrides, *variant.settings]) for variant in variants]
+    configs = [composed([*overrides, *variant.settings]) for variant in variants]
     log = ConsoleLog(Path(configs[0].outputs))
     scene = build(configs[0], "scene", log=log)
     steps = build(configs[0], "trajectory", scene).steps[:frames]
@@ -93,14 +89,6 @@ def render_variants(
             found.append(_compared(variant, method, pictures, standard, scene, steps))
             progress.advance()
     return found
-
-
-def _composed(overrides: Sequence[str]) -> DictConfig:
-    try:
-        with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-            return compose("run", overrides=list(overrides))
-    except (HydraException, OmegaConfBaseException) as error:
-        raise explain(error, list(overrides)) from error
 
 
 def _pictures(method: Method, steps: Sequence[Step]) -> list[Tensor]:
