@@ -34,10 +34,23 @@ examples
   steerbench list                              what there is, and what of it is usable here
   steerbench paper budget=demo                 every table of the SteerNeRF paper, as a page
   steerbench parity scene=totem budget=demo    what int8 costs, in decibels, and saves, in time
+  steerbench check BASELINE.json               is everything as good as it was
   steerbench results --format csv              every number measured so far
 """
 
-COMMANDS = ("run", "paper", "list", "results", "kernels", "parity", "skips", "scenes", "generic")
+COMMANDS = (
+    "run",
+    "paper",
+    "list",
+    "results",
+    "kernels",
+    "parity",
+    "skips",
+    "check",
+    "compare",
+    "scenes",
+    "generic",
+)
 
 # What the disk refuses: worth a plain sentence, not a traceback.
 REFUSALS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR}
@@ -92,7 +105,8 @@ def dispatch(argv: Sequence[str]) -> int:
     if options.module is None:
         parser.print_help()
         return 0
-    return importlib.import_module(f"sweeps.{options.module}").main(options)
+    module = importlib.import_module(f"sweeps.{options.module}")
+    return getattr(module, options.function)(options)
 
 
 def _parser() -> Parser:
@@ -102,7 +116,7 @@ def _parser() -> Parser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.set_defaults(module=None, parser=parser)
+    parser.set_defaults(module=None, function="main", parser=parser)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     commands.add_parser("run", help="train, render, measure; print and store the table")
 
@@ -165,6 +179,28 @@ def _parser() -> Parser:
         )
         variants.add_argument("overrides", nargs="*", help="settings as of `steerbench run`")
         variants.set_defaults(module=name, parser=variants)
+
+    check = commands.add_parser(
+        "check",
+        help="compare what was measured with a recorded baseline",
+        description="Compare the runs of the store with those of a baseline that were made by the "
+        "same command, metric by metric with its own limit, frame by frame where both have them. "
+        "Exits with 1 if anything is worse or missing.",
+    )
+    check.add_argument("baseline", type=Path, metavar="BASELINE.json")
+    check.add_argument("--record", action="store_true", help="write the baseline from the store")
+    check.add_argument("--outputs", type=Path, default=Path("outputs"), metavar="DIR")
+    check.set_defaults(module="check", parser=check)
+
+    compare = commands.add_parser(
+        "compare",
+        help="what one run is against another",
+        description="Compare two runs of the store, as `steerbench check` does.",
+    )
+    compare.add_argument("old", metavar="RUN_A", help="its key, or how that begins")
+    compare.add_argument("new", metavar="RUN_B")
+    compare.add_argument("--outputs", type=Path, default=Path("outputs"), metavar="DIR")
+    compare.set_defaults(module="check", function="compare", parser=compare)
 
     scenes = commands.add_parser("scenes", help="look after copies of data sets")
     actions = scenes.add_subparsers(title="actions", metavar="ACTION", required=True)

@@ -1,0 +1,143 @@
+"""Whether a run is as good as an earlier one: metric by metric, frame by frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from bench.results import STEADY
+from reports.runs import Run
+from reports.tables import Table
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Limit:
+    """How much worse a metric may become.
+
+    Attributes:
+        better: 1 where more is better, -1 where less is.
+        absolute: in the unit of the metric.
+        relative: share of what it was.
+        here: it depends on the machine, and is compared on the same one only.
+    """
+
+    better: int
+    absolute: float = 0.0
+    relative: float = 0.0
+    here: bool = False
+
+
+LIMITS: Mapping[str, Limit] = {
+    "psnr": Limit(1, absolute=0.1),
+    "ssim": Limit(1, absolute=0.002),
+    "lpips_alex": Limit(-1, absolute=0.003),
+    "lpips_vgg": Limit(-1, absolute=0.003),
+    "lpips_squeeze": Limit(-1, absolute=0.003),
+    "flicker": Limit(-1, relative=0.05),
+    "size_bytes.total": Limit(-1, relative=0.001),
+    "frame_ms": Limit(-1, relative=0.25, here=True),
+    "peak_bytes": Limit(-1, relative=0.2, here=True),
+}
+"""What is compared, unless a baseline says otherwise."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What is kept of a run to compare later ones with.
+
+    Attributes:
+        values: of its headline, by metric.
+        frames: of its steady frames with ground truth, by metric and name of the frame.
+        machine: name of its processor and graphics processors.
+    """
+
+    values: Mapping[str, float]
+    frames: Mapping[str, Mapping[str, float]]
+    machine: str
+
+    @classmethod
+    def of(cls, run: Run) -> Figures:
+        """The figures of `run` that have a limit."""
+        values = {
+            metric: run.values[metric]
+            for metric in LIMITS
+            if math.isfinite(run.values.get(metric, math.nan))
+        }
+        steady = run.frames[run.frames["phase"] == STEADY]
+        scored = (steady if len(steady) else run.frames).dropna(subset=["psnr"])
+        frames = {
+            metric: dict(zip(scored["name"], scored[metric].astype(float), strict=True))
+            for metric in LIMITS
+            if metric in scored and metric in values and scored[metric].notna().all()
+        }
+        machine = run.record["machine"]
+        return cls(values, frames, ", ".join((machine["cpu"], *machine["gpus"])))
+
+    def plain(self) -> dict[str, Any]:
+        """As JSON can hold it."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Change:
+    """What became of one metric.
+
+    Attributes:
+        by: new less old; of metrics that frames have, the mean over those that both runs have.
+        interval: of that mean, 95 %; None where only two figures are known.
+        worse: by more than its limit, and not by chance.
+    """
+
+    metric: str
+    old: float
+    new: float
+    by: float
+    interval: tuple[float, float] | None
+    worse: bool
+
+
+def changes(old: Figures, new: Figures, limits: Mapping[str, Limit] = LIMITS) -> Iterator[Change]:
+    """What became of every metric that has a limit and that both runs have."""
+    for metric, limit in limits.items():
+        if metric not in old.values or metric not in new.values:
+            continue
+        if limit.here and old.machine != new.machine:
+            continue
+        before, after = old.values[metric], new.values[metric]
+        by, interval = after - before, None
+        one, other = old.frames.get(metric, {}), new.frames.get(metric, {})
+        both = [name for name in one if name in other]
+        if len(both) > 1:
+            apart = np.array([other[name] - one[name] for name in both])
+            by = float(apart.mean())
+            half = stats.t.ppf(0.5 + CONFIDENCE / 2, len(apart) - 1) * stats.sem(apart)
+            interval = (by - half, by + half)
+        allowed = limit.absolute + limit.relative * abs(before)
+        by_chance = interval is not None and interval[0] <= 0 <= interval[1]
+        worse = limit.better * by < -allowed and not by_chance
+        yield Change(metric, before, after, by, interval, worse)
+
+
+def table(title: str, found: Sequence[Change]) -> Table:
+    """`found` as a table; what is worse says so."""
+    columns = ("metric", "was", "is", "change", "95 % interval", "")
+    return Table(title, columns, tuple(map(_line, found)))
+
+
+def _line(change: Change) -> tuple[str, ...]:
+    ends = () if change.interval is None else change.interval
+    return (
+        change.metric,
+        f"{change.old:.6g}",
+        f"{change.new:.6g}",
+        f"{change.by:+.4g}",
+        " – ".join(f"{end:+.4g}" for end in ends),
+        "worse" if change.worse else "",
+    )

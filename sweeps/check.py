@@ -1,0 +1,100 @@
+"""`steerbench check` and `steerbench compare`: are the figures as good as they were."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from bench.errors import SteerbenchError
+from bench.results import Store, explained
+from reports.regression import LIMITS, Figures, Limit, changes, table
+from reports.runs import Run, load
+from sweeps.measurement import PLACES
+from sweeps.terminal import console, rich_table
+
+SCHEMA = 1
+"""Of baseline files."""
+
+
+def main(options: argparse.Namespace) -> int:
+    """Compare the store with a baseline, or write one; 1 if anything is worse or missing."""
+    found = _by_command(Store(options.outputs))
+    if options.record:
+        _write(options.baseline, found)
+        return 0
+    runs, limits = _read(options.baseline)
+    failed = 0
+    for command, figures in runs.items():
+        if command not in found:
+            console().print(f"{command}: no such run below {options.outputs}", markup=False)
+            failed += 1
+            continue
+        rows = list(changes(figures, Figures.of(found[command]), limits))
+        failed += sum(row.worse for row in rows)
+        console().print(rich_table(table(command, rows)))
+    console().print("as good as the baseline" if not failed else f"worse or missing: {failed}")
+    return int(failed > 0)
+
+
+def compare(options: argparse.Namespace) -> int:
+    """Print what the second of two runs of the store is, less the first; 1 if it is worse."""
+    store = Store(options.outputs)
+    keys = [_whole(store, key) for key in (options.old, options.new)]
+    old, new = (Figures.of(load(store, {key: key})[0]) for key in keys)
+    rows = list(changes(old, new))
+    console().print(rich_table(table(" to ".join(keys), rows)))
+    return int(any(row.worse for row in rows))
+
+
+def _whole(store: Store, key: str) -> str:
+    """The key of the one run whose key begins so."""
+    keys = [path.name for path in store.folder.glob(f"{key}*") if store.find(path.name)]
+    if len(keys) != 1:
+        raise SteerbenchError(
+            f"run {key!r}: expected the beginning of one key, {len(keys)} runs below "
+            f"{store.folder} have it; see `steerbench results`"
+        )
+    return keys[0]
+
+
+def _by_command(store: Store) -> dict[str, Run]:
+    """Every run, by what was typed for it; of several, the last that was stored."""
+    folders = [path for path in store.folder.glob("[!.]*") if store.find(path.name)]
+    folders.sort(key=lambda path: path.stat().st_mtime)
+    runs = load(store, {path.name: path.name for path in folders})
+    return {_command(str(run.record["command"])): run for run in runs}
+
+
+def _command(typed: str) -> str:
+    """What was typed, in one order, without what does not change a row."""
+    words = shlex.split(typed)[2:]
+    places = (*PLACES, "hydra.mode")
+    return shlex.join(sorted(word for word in words if word.partition("=")[0] not in places))
+
+
+def _write(path: Path, found: Mapping[str, Run]) -> None:
+    if not found:
+        raise SteerbenchError("there are no runs to record: `steerbench run` makes one")
+    runs = {command: Figures.of(run).plain() for command, run in found.items()}
+    limits = {metric: vars(limit) for metric, limit in LIMITS.items()}
+    text = json.dumps({"schema": SCHEMA, "limits": limits, "runs": runs}, indent=1)
+    with explained(path.parent):
+        path.write_text(text + "\n", encoding="utf-8")
+    console().print(f"{path}: {len(runs)} runs", markup=False)
+
+
+def _read(path: Path) -> tuple[dict[str, Figures], dict[str, Limit]]:
+    try:
+        held: Any = json.loads(path.read_text(encoding="utf-8"))
+        if held["schema"] != SCHEMA:
+            raise ValueError(f"schema {held['schema']}, expected {SCHEMA}")
+        runs = {command: Figures(**figures) for command, figures in held["runs"].items()}
+        return runs, {metric: Limit(**limit) for metric, limit in held["limits"].items()}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SteerbenchError(
+            f"{path}: no baseline ({error}); `steerbench check --record {path}` writes one"
+        ) from error

@@ -1,0 +1,72 @@
+"""What counts as worse: limits, directions, pairs of frames, chance, other machines."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from scipy import stats
+
+from reports.regression import LIMITS, Change, Figures, Limit, changes
+
+OLD = Figures({"psnr": 30.0, "frame_ms": 100.0, "size_bytes.total": 1000.0}, {}, "one machine")
+
+
+def change(metric: str, value: float, old: Figures = OLD) -> Change | None:
+    new = replace(old, values={**old.values, metric: value})
+    return next((found for found in changes(old, new) if found.metric == metric), None)
+
+
+@pytest.mark.parametrize(
+    ("metric", "value", "worse"),
+    [
+        ("psnr", 29.95, False),
+        ("psnr", 29.85, True),
+        ("psnr", 40.0, False),
+        ("frame_ms", 120.0, False),
+        ("frame_ms", 130.0, True),
+        ("frame_ms", 10.0, False),
+        ("size_bytes.total", 1002.0, True),
+    ],
+)
+def test_worse_is_what_passes_the_limit_in_the_wrong_direction(
+    metric: str, value: float, worse: bool
+) -> None:
+    found = change(metric, value)
+    assert found is not None
+    assert found.worse == worse
+
+
+def test_what_depends_on_the_machine_is_compared_on_the_same_one_only() -> None:
+    other = replace(OLD, machine="another machine", values={**OLD.values, "frame_ms": 500.0})
+    assert {found.metric for found in changes(OLD, other)} == {"psnr", "size_bytes.total"}
+
+
+def paired(*by: float) -> Change:
+    """PSNR of frames that changed by so much, on top of very different values."""
+    before = {str(i): 20.0 + 5 * i for i in range(len(by))}
+    after = {name: value + by[int(name)] for name, value in before.items()}
+    old = replace(OLD, frames={"psnr": before | {"left": 0.0}})
+    new = replace(OLD, frames={"psnr": after | {"right": 99.0}})
+    return next(found for found in changes(old, new) if found.metric == "psnr")
+
+
+def test_frames_that_both_have_are_compared_in_pairs() -> None:
+    found = paired(-0.3, -0.2, -0.4, -0.3)
+    assert found.by == pytest.approx(-0.3)
+    half = stats.t.ppf(0.975, 3) * (0.02 / 3) ** 0.5 / 2  # standard deviation over sqrt(n)
+    assert found.interval == pytest.approx((-0.3 - half, -0.3 + half))
+    assert found.worse
+
+
+def test_a_change_that_may_be_chance_is_not_worse() -> None:
+    found = paired(-3.0, 2.0, -2.0, 1.0)
+    assert found.by == pytest.approx(-0.5)
+    assert not found.worse
+
+
+def test_a_baseline_can_have_limits_of_its_own() -> None:
+    new = replace(OLD, values={**OLD.values, "psnr": 29.0})
+    (wide,) = changes(OLD, new, {"psnr": Limit(1, absolute=2.0)})
+    assert not wide.worse
+    assert LIMITS["psnr"].absolute < 1

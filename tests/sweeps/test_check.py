@@ -1,0 +1,92 @@
+"""`steerbench check` and `compare`: exit statuses, what is missing, files that are no baseline."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from bench.errors import SteerbenchError
+from bench.results import Store
+from sweeps.cli import dispatch
+
+
+@pytest.fixture
+def outputs(store: Store, stored_run: str) -> Path:
+    """A folder of outputs with one run that says how it was made."""
+    path = store.folder / stored_run / "record.json"
+    record = json.loads(path.read_text())
+    record["command"] = "steerbench run scene=tiny method=offset outputs=somewhere"
+    path.write_text(json.dumps(record))
+    return store.folder.parent
+
+
+def check(baseline: Path, outputs: Path, *more: str) -> int:
+    return dispatch(["check", str(baseline), "--outputs", str(outputs), *more])
+
+
+@pytest.fixture
+def baseline(outputs: Path, tmp_path: Path) -> Path:
+    path = tmp_path / "baseline.json"
+    assert check(path, outputs, "--record") == 0
+    return path
+
+
+def test_a_store_is_as_good_as_itself(
+    baseline: Path, outputs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert check(baseline, outputs) == 0
+    assert "as good as the baseline" in capsys.readouterr().out
+
+
+def test_a_figure_that_became_worse_is_shown_and_fails(
+    baseline: Path, outputs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    held = json.loads(baseline.read_text())
+    (figures,) = held["runs"].values()
+    figures["values"]["psnr"] += 1
+    figures["frames"]["psnr"] = {name: x + 1 for name, x in figures["frames"]["psnr"].items()}
+    baseline.write_text(json.dumps(held))
+    assert check(baseline, outputs) == 1
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "psnr" in line]
+    assert "-1" in line
+    assert "worse" in line
+
+
+def test_a_run_is_known_by_what_was_typed_in_any_order_but_for_places(
+    baseline: Path, outputs: Path
+) -> None:
+    held = json.loads(baseline.read_text())
+    assert list(held["runs"]) == ["method=offset scene=tiny"]
+
+
+def test_a_run_that_is_missing_fails(
+    baseline: Path, outputs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    held = json.loads(baseline.read_text())
+    (figures,) = held["runs"].values()
+    held["runs"] = {"method=other": figures}
+    baseline.write_text(json.dumps(held))
+    assert check(baseline, outputs) == 1
+    assert "method=other: no such run" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("text", [None, "", "{}", '{"schema": 99}'])
+def test_what_is_no_baseline_is_refused_with_the_way_to_make_one(
+    text: str | None, outputs: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "none.json"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(SteerbenchError, match=r"no baseline .*check --record"):
+        check(path, outputs)
+
+
+def test_two_runs_are_compared_by_the_beginning_of_their_keys(
+    outputs: Path, stored_run: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert dispatch(["compare", stored_run[:6], stored_run, "--outputs", str(outputs)]) == 0
+    assert "psnr" in capsys.readouterr().out
+    with pytest.raises(SteerbenchError, match="expected the beginning of one key, 0 runs"):
+        dispatch(["compare", "nothing", stored_run, "--outputs", str(outputs)])
