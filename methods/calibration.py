@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -29,6 +31,9 @@ def recorded_inputs(
 
     Args:
         target: [3] the point that motions turn about.
+        count: of views, 1 or more.
+        motion: says how fast the motions turn.
+        seed: of the motions.
     """
     generator = torch.Generator().manual_seed(seed)
     cameras = scene.splits["train"].cameras
@@ -43,6 +48,7 @@ def recorded_inputs(
         with log.progress("frames to build the network on", count) as progress:
             for place in range(count):
                 camera = cameras[place * len(cameras) // count]
+                camera = replace(camera, c2w=camera.c2w.to(pipeline.background.device))
                 buffer = RenderingBuffer(pipeline.options.frames)
                 before = pipeline.options.frames + 1
                 for earlier in preceding(camera, target, before, motion.degrees, generator):

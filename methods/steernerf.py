@@ -47,6 +47,9 @@ SOURCES = (
 )
 """Modules beside this one that decide what stage 2 results in, with those of stage 1."""
 
+CALIBRATED_BY = ("calibration.py", "engines/__init__.py")
+"""Files below this folder that decide on which frames an engine's network is built."""
+
 NOT_TRAINED_FOR = ("range", "refined", "skip")
 """Options of a pipeline that stage 2 does not depend on; see `PipelineOptions.taught`."""
 
@@ -83,6 +86,7 @@ class SteerNerf:
     ) -> None:
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         self.options, self.make_renderer, self.joint, self.name = pipeline, renderer, joint, name
+        engine.check(self.setup.device)
         self.engine, self.memory = engine, pipeline.frames
         self.buffer = RenderingBuffer(pipeline.frames)
         self.train_s = 0.0
@@ -144,13 +148,13 @@ class SteerNerf:
         return self.trained.sizes() | {"renderer2d": self.renderer_bytes}
 
     def unit_work(self) -> dict[str, int]:
-        """What one unit of work takes: every weight of the field is multiplied once a sample, every
-        weight of a network on cells once a cell."""
-        field = self.trained.field
+        """What one unit of work takes, with a network on cells: every weight of the field is
+        multiplied once a sample, every matrix of the network once a cell."""
+        field, matrices = self.trained.field, self.pipeline.renderer.network.parameters()
         return {
             "reads a sample": 8 * field.grid.levels,
             "products a sample": sum(layer.numel() for layer in field.layers.values()),
-            "products a cell": sum(w.numel() for w in self.pipeline.renderer.parameters()),
+            "products a cell": sum(matrix.numel() for matrix in matrices if matrix.dim() > 1),
         }
 
     def settings(self) -> dict[str, str]:
@@ -163,13 +167,17 @@ class SteerNerf:
     def _hand_over(self, scene: Scene, target: Tensor, key: dict[str, object], log: Log) -> None:
         """Have the engine compute the network of the 2D renderer from now on."""
         renderer, engine = self.pipeline.renderer, self.engine
+        # What is not trained for is not calibrated for, either: one network serves all of it.
+        usual = self.options.taught(self.joint.refined)
+        trained, background = self.trained, self.pipeline.background[:3]
+        pipeline = Pipeline(trained.field, trained.occupancy, background, renderer, usual)
         options = (engine.samples(renderer.network), self.joint.motion, self.setup.seed, log)
-        seen = partial(recorded_inputs, self.pipeline, scene, target, *options)
-        calibration = digest([ROOT / "methods" / "calibration.py"])
-        folder = partial(
-            log.stage_dir, "network", {**key, **engine.key(), "calibration": calibration}
+        seen = partial(recorded_inputs, pipeline, scene, target, *options)
+        code = digest(
+            [ROOT / "methods" / f"{name}.py" for name in ("calibration", "engines/__init__")]
         )
-        built = engine.build(renderer.network, seen, folder, log)
+        parts = {"trained": key, "engine": engine.key(), "calibration": code}
+        built = engine.build(renderer.network, seen, partial(log.stage_dir, "network", parts), log)
         renderer.engine, self.renderer_bytes = built.run, built.size
 
     def _stage2(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
+from bench.errors import SteerbenchError
 from bench.results import STEADY
 from reports.runs import Run
 from reports.tables import Table
@@ -54,13 +55,16 @@ class Figures:
 
     Attributes:
         values: of its headline, by metric.
-        frames: of its steady frames with ground truth, by metric and name of the frame.
+        frames: of its steady frames with ground truth, by metric and by number and name of the
+            frame.
         machine: name of its processor and graphics processors.
+        views: the same where the same frames of the same scene were rendered by one protocol.
     """
 
     values: Mapping[str, float]
     frames: Mapping[str, Mapping[str, float]]
     machine: str
+    views: str
 
     @classmethod
     def of(cls, run: Run) -> Figures:
@@ -72,13 +76,21 @@ class Figures:
         }
         steady = run.frames[run.frames["phase"] == STEADY]
         scored = (steady if len(steady) else run.frames).dropna(subset=["psnr"])
+        names = [f"{row.frame}: {row.name}" for row in scored[["frame", "name"]].itertuples(False)]
         frames = {
-            metric: dict(zip(scored["name"], scored[metric].astype(float), strict=True))
+            metric: dict(zip(names, scored[metric].astype(float), strict=True))
             for metric in LIMITS
             if metric in scored and metric in values and scored[metric].notna().all()
         }
         machine = run.record["machine"]
-        return cls(values, frames, ", ".join((machine["cpu"], *machine["gpus"])))
+        views = ", ".join(map(str, (*run.views, run.facts["protocol"])))
+        return cls(values, frames, ", ".join((machine["cpu"], *machine["gpus"])), views)
+
+    def of_metrics(self, metrics: Collection[str]) -> Figures:
+        """Only those of `metrics`."""
+        values = {metric: value for metric, value in self.values.items() if metric in metrics}
+        frames = {metric: value for metric, value in self.frames.items() if metric in metrics}
+        return replace(self, values=values, frames=frames)
 
     def plain(self) -> dict[str, Any]:
         """As JSON can hold it."""
@@ -90,9 +102,10 @@ class Change:
     """What became of one metric.
 
     Attributes:
+        old, new: `new` is nan where the metric is gone.
         by: new less old; of metrics that frames have, the mean over those that both runs have.
-        interval: of that mean, 95 %; None where only two figures are known.
-        worse: by more than its limit, and not by chance.
+        interval: of that mean over the frames, 95 %; None where only two figures are known.
+        verdict: "" as good, "worse" by more than its limit, "missing" if it or a frame is gone.
     """
 
     metric: str
@@ -100,17 +113,21 @@ class Change:
     new: float
     by: float
     interval: tuple[float, float] | None
-    worse: bool
+    verdict: str
 
 
 def changes(old: Figures, new: Figures, limits: Mapping[str, Limit] = LIMITS) -> Iterator[Change]:
-    """What became of every metric that has a limit and that both runs have."""
+    """What became of every metric of `old` that has a limit.
+
+    Raises:
+        SteerbenchError: the runs rendered other frames.
+    """
+    if old.views != new.views:
+        raise SteerbenchError(f"these are figures of other frames: {old.views}; {new.views}")
     for metric, limit in limits.items():
-        if metric not in old.values or metric not in new.values:
+        if metric not in old.values or (limit.here and old.machine != new.machine):
             continue
-        if limit.here and old.machine != new.machine:
-            continue
-        before, after = old.values[metric], new.values[metric]
+        before, after = old.values[metric], new.values.get(metric, math.nan)
         by, interval = after - before, None
         one, other = old.frames.get(metric, {}), new.frames.get(metric, {})
         both = [name for name in one if name in other]
@@ -119,14 +136,14 @@ def changes(old: Figures, new: Figures, limits: Mapping[str, Limit] = LIMITS) ->
             by = float(apart.mean())
             half = stats.t.ppf(0.5 + CONFIDENCE / 2, len(apart) - 1) * stats.sem(apart)
             interval = (by - half, by + half)
-        allowed = limit.absolute + limit.relative * abs(before)
-        by_chance = interval is not None and interval[0] <= 0 <= interval[1]
-        worse = limit.better * by < -allowed and not by_chance
-        yield Change(metric, before, after, by, interval, worse)
+        worse = limit.better * by < -limit.absolute - limit.relative * abs(before)
+        gone = math.isnan(after) or len(both) < len(one)
+        verdict = "missing" if gone else "worse" if worse else ""
+        yield Change(metric, before, after, by, interval, verdict)
 
 
 def table(title: str, found: Sequence[Change]) -> Table:
-    """`found` as a table; what is worse says so."""
+    """`found` as a table."""
     columns = ("metric", "was", "is", "change", "95 % interval", "")
     return Table(title, columns, tuple(map(_line, found)))
 
@@ -139,5 +156,5 @@ def _line(change: Change) -> tuple[str, ...]:
         f"{change.new:.6g}",
         f"{change.by:+.4g}",
         " – ".join(f"{end:+.4g}" for end in ends),
-        "worse" if change.worse else "",
+        change.verdict,
     )

@@ -24,7 +24,7 @@ def main(options: argparse.Namespace) -> int:
     """Compare the store with a baseline, or write one; 1 if anything is worse or missing."""
     found = _by_command(Store(options.outputs))
     if options.record:
-        _write(options.baseline, found)
+        _record(options.baseline, found)
         return 0
     runs, limits = _read(options.baseline)
     failed = 0
@@ -34,7 +34,7 @@ def main(options: argparse.Namespace) -> int:
             failed += 1
             continue
         rows = list(changes(figures, Figures.of(found[command]), limits))
-        failed += sum(row.worse for row in rows)
+        failed += sum(row.verdict != "" for row in rows)
         console().print(rich_table(table(command, rows)))
     console().print("as good as the baseline" if not failed else f"worse or missing: {failed}")
     return int(failed > 0)
@@ -47,7 +47,7 @@ def compare(options: argparse.Namespace) -> int:
     old, new = (Figures.of(load(store, {key: key})[0]) for key in keys)
     rows = list(changes(old, new))
     console().print(rich_table(table(" to ".join(keys), rows)))
-    return int(any(row.worse for row in rows))
+    return int(any(row.verdict for row in rows))
 
 
 def _whole(store: Store, key: str) -> str:
@@ -76,14 +76,24 @@ def _command(typed: str) -> str:
     return shlex.join(sorted(word for word in words if word.partition("=")[0] not in places))
 
 
-def _write(path: Path, found: Mapping[str, Run]) -> None:
+def _record(path: Path, found: Mapping[str, Run]) -> None:
+    """Write the figures of `found` to `path`; limits and choice of runs of a baseline that is there
+    stay."""
+    limits: Mapping[str, Limit] = LIMITS
+    if path.exists():
+        known, limits = _read(path)
+        if missing := known.keys() - found.keys():
+            raise SteerbenchError(f"{path}: no such run in the store: {sorted(missing)[0]}")
+        found = {command: found[command] for command in known}
     if not found:
         raise SteerbenchError("there are no runs to record: `steerbench run` makes one")
-    runs = {command: Figures.of(run).plain() for command, run in found.items()}
-    limits = {metric: vars(limit) for metric, limit in LIMITS.items()}
-    text = json.dumps({"schema": SCHEMA, "limits": limits, "runs": runs}, indent=1)
+    runs = {command: Figures.of(run).of_metrics(limits).plain() for command, run in found.items()}
+    plain = {metric: vars(limit) for metric, limit in limits.items()}
+    text = json.dumps({"schema": SCHEMA, "limits": plain, "runs": runs}, indent=1)
+    new = path.with_name(f".{path.name}.new")
     with explained(path.parent):
-        path.write_text(text + "\n", encoding="utf-8")
+        new.write_text(text + "\n", encoding="utf-8")
+        new.replace(path)
     console().print(f"{path}: {len(runs)} runs", markup=False)
 
 

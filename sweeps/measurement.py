@@ -77,9 +77,7 @@ def obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
     Raises:
         SteerbenchError: a setting is wrong, or something in the measurement went wrong.
     """
-    settings = _settings(config)
-    if settings.threads is not None:
-        torch.set_num_threads(settings.threads)
+    settings = checked_settings(config)
     torch.manual_seed(settings.seed)
     root = Path(settings.outputs)
     log, store = ConsoleLog(root), Store(root)
@@ -114,7 +112,12 @@ def _scene(node: str, root: Path) -> Scene:
     return build(OmegaConf.create({"scene": OmegaConf.create(node)}), "scene", log=ConsoleLog(root))
 
 
-def _settings(config: DictConfig) -> Settings:
+def checked_settings(config: DictConfig) -> Settings:
+    """The settings in `config`; from now on torch uses as many threads as they say.
+
+    Raises:
+        SteerbenchError: one of them is wrong.
+    """
     values = {field.name: config[field.name] for field in fields(Settings)}
     check_settings(Settings, values)
     settings = Settings(**values)
@@ -126,17 +129,20 @@ def _settings(config: DictConfig) -> Settings:
         raise SteerbenchError(f"device: expected auto, cpu, cuda or cuda:N, got {settings.device}")
     if settings.device.startswith("cuda") and not torch.cuda.is_available():
         raise Unavailable(f"device={settings.device}: torch sees no GPU here; use device=cpu")
+    if settings.threads is not None:
+        torch.set_num_threads(settings.threads)
     return settings
 
 
 def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any]:
     """Everything that can change the rows but for the weights at hand: what makes a run's key.
 
-    Where scene and weights lie is not part of it.
+    Where scene and weights lie is not part of it, nor an engine that the method has no use for.
     """
     plain = OmegaConf.to_container(config, resolve=True)
     assert isinstance(plain, dict)
-    kept = {key: value for key, value in plain.items() if key not in PLACES}
+    unused = () if "engine" in plain["method"] else ("engine", "precision")
+    kept = {key: value for key, value in plain.items() if key not in (*PLACES, *unused)}
     kept["scene"] = {k: v for k, v in plain["scene"].items() if k not in ("path", "root")}
     return {
         "code": code_digest(),

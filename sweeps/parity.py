@@ -10,8 +10,9 @@ from typing import Any
 from hydra.utils import get_class
 from omegaconf import OmegaConf
 
+from bench.errors import SteerbenchError
 from reports.tables import Table, megabytes, number
-from sweeps.overrides import CONFIGS
+from sweeps.overrides import CONFIGS, composed
 from sweeps.terminal import console, rich_table
 from sweeps.variants import Rendered, Variant, apart_text, finite, render_variants
 
@@ -25,6 +26,7 @@ COLUMNS = (
     "lost, dB ↓",
     "network, ms ↓",
     "frame, ms ↓",
+    "p99 / p50",
     "network, MB ↓",
 )
 
@@ -32,6 +34,11 @@ COLUMNS = (
 def main(options: argparse.Namespace) -> int:
     """Print a table and, as the last line, the same rows as JSON."""
     overrides = [*SETTINGS, *options.overrides]
+    if "engine" not in composed(overrides).method:
+        raise SteerbenchError(
+            "steerbench parity compares engines of a 2D renderer: expected method=steernerf or "
+            "steernerf_paper"
+        )
     found = render_variants(overrides, list(_engines()), options.frames, "engines")
     rows = [_row(one, found[0]) for one in found]
     title = f"{found[0].method.name}, {options.frames} frames"
@@ -56,10 +63,11 @@ def _row(one: Rendered, standard: Rendered) -> dict[str, Any]:
         "engine": one.variant.name,
         "apart": one.apart,
         "worst": one.worst,
-        "psnr": one.psnr,
-        "lost": standard.psnr - one.psnr,
-        "network_ms": one.stage_ms["renderer2d/network"],
-        "frame_ms": one.frame_ms,
+        "psnr": one.values["psnr"],
+        "lost": standard.values["psnr"] - one.values["psnr"],
+        "network_ms": one.values["stage_ms.renderer2d/network"],
+        "frame_ms": one.values["frame_ms"],
+        "p99_to_p50": one.values["frame_ms.p99"] / one.values["frame_ms.p50"],
         "bytes": one.method.sizes()["renderer2d"],
     }
 
@@ -73,5 +81,6 @@ def _line(row: dict[str, Any]) -> tuple[str, ...]:
         number(row["lost"], 3),
         number(row["network_ms"], 2),
         number(row["frame_ms"], 1),
+        number(row["p99_to_p50"], 2),
         megabytes(row["bytes"]),
     )

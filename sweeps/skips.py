@@ -6,11 +6,15 @@ import argparse
 import json
 from typing import Any
 
+from bench.errors import SteerbenchError
 from reports.tables import Table, number, share
+from sweeps.overrides import composed
 from sweeps.terminal import console, rich_table
 from sweeps.variants import Rendered, Variant, apart_text, finite, render_variants
 
 SETTINGS = ("method=steernerf", "trajectory=smooth")
+
+LEAN = "methods.space_to_depth.SpaceToDepth"
 
 SWITCHES = {"empty space": "empty", "hidden samples": "hidden", "background cells": "background"}
 """The settings below `method.pipeline.skip`, in words."""
@@ -23,6 +27,11 @@ COLUMNS = ("skipped", "PSNR to nothing skipped, dB ↑", "PSNR, dB ↑", "lost, 
 def main(options: argparse.Namespace) -> int:
     """Print a table and, as the last line, the same rows as JSON."""
     overrides = [*SETTINGS, *options.overrides]
+    if composed(overrides).method.get("renderer", {}).get("_target_") != LEAN:
+        raise SteerbenchError(
+            "steerbench skips counts the work of a network on cells: expected a method with "
+            "renderer=s2d, as method=steernerf"
+        )
     found = render_variants(overrides, _variants(), options.frames, "variants")
     rows = [_row(one, found[0]) for one in found]
     title = f"{found[0].method.name}, {options.frames} frames: mean work of a frame, and its share"
@@ -48,22 +57,22 @@ def _variants() -> list[Variant]:
 
 def _row(one: Rendered, standard: Rendered) -> dict[str, Any]:
     method: Any = one.method
-    unit, done = method.unit_work(), one.done
-    samples = done["samples"] + done.get("surface_samples", 0)
-    products = samples * unit["products a sample"] + done["cells"] * unit["products a cell"]
+    unit, done = method.unit_work(), one.values
+    samples = done["work.samples"] + done.get("work.surface_samples", 0)
+    products = samples * unit["products a sample"] + done["work.cells"] * unit["products a cell"]
     work = (
-        done["rays"] + done.get("refined_rays", 0),
+        done["work.rays"] + done.get("work.refined_rays", 0),
         samples,
         samples * unit["reads a sample"] / 1e6,
-        done["cells"],
+        done["work.cells"],
         products / 1e9,
     )
     return {
         "skipped": one.variant.name,
         "apart": one.apart,
-        "psnr": one.psnr,
-        "lost": standard.psnr - one.psnr,
-        "frame_ms": one.frame_ms,
+        "psnr": done["psnr"],
+        "lost": standard.values["psnr"] - done["psnr"],
+        "frame_ms": done["frame_ms"],
         **dict(zip(WORK, work, strict=True)),
     }
 

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
-from bench.probes import StageClock
-from bench.protocol import composite
-from bench.trajectories import Step
-from bench.types import Method, NullProbe, Scene
+from bench.results import COLD, STEADY, Measurement
+from bench.run import measure
+from bench.types import Method
 from sweeps.build import build
+from sweeps.measurement import checked_settings
 from sweeps.overrides import composed
+
+RENDERED = "-rendered"
+"""How the names of renderings end; see `bench.scoring`."""
 
 
 @dataclass(frozen=True)
@@ -35,27 +38,25 @@ class Rendered:
 
     Attributes:
         method: as it was used.
-        apart: mean PSNR against the first variant, dB; inf where there is no difference.
-        worst: largest difference of a channel from the first variant.
-        psnr: mean against the ground truth, dB; nan if no frame has one.
-        frame_ms: median of the steady frames, and `stage_ms` of each of their stages.
-        done: mean work of a steady frame, by counter.
+        apart: PSNR against the first variant, of all steady frames with ground truth together, as
+            8-bit pictures, dB; inf where there is no difference.
+        worst: largest difference of a channel from the first variant, of 1.
+        values: of the steady frames and of the whole run, by metric, as `bench.run.measure` has
+            them.
     """
 
     variant: Variant
     method: Method
     apart: float
     worst: float
-    psnr: float
-    frame_ms: float
-    stage_ms: dict[str, float]
-    done: dict[str, float]
+    values: Mapping[str, float]
 
 
 def render_variants(
     overrides: Sequence[str], variants: Sequence[Variant], frames: int, label: str
 ) -> list[Rendered]:
-    """Render the first `frames` of the trajectory with every variant that can be used here.
+    """Measure the first `frames` of the trajectory, without LPIPS, with every variant that can be
+    used here.
 
     What a variant is trained from is trained if need be, or found.
 
@@ -63,18 +64,24 @@ def render_variants(
         overrides: settings of all variants, as of `steerbench run`.
 
     Raises:
-        SteerbenchError: a setting is wrong, or the first variant cannot be used here.
+        SteerbenchError: a setting is wrong, the first variant cannot be used here, or there is no
+            steady frame with ground truth among the first ones.
     """
     if frames < 1:
         raise SteerbenchError(f"--frames: expected 1 or more, got {frames}")
     configs = [composed([*overrides, *variant.settings]) for variant in variants]
-    log = ConsoleLog(Path(configs[0].outputs))
+    settings = checked_settings(configs[0])
+    log = ConsoleLog(Path(settings.outputs))
     scene = build(configs[0], "scene", log=log)
-    steps = build(configs[0], "trajectory", scene).steps[:frames]
+    path = build(configs[0], "trajectory", scene)
+    path = replace(path, name=f"{path.name}-first{frames}", steps=path.steps[:frames])
+    protocol = build(configs[0], "protocol")
+    protocol = replace(protocol, name=f"{protocol.name} without LPIPS", lpips=())
     found: list[Rendered] = []
-    standard: list[Tensor] = []
+    standard: dict[str, np.ndarray] = {}
     with log.progress(label, len(variants)) as progress:
         for variant, config in zip(variants, configs, strict=True):
+            torch.manual_seed(settings.seed)
             try:
                 method = build(config, "method")
             except Unavailable as error:
@@ -83,69 +90,56 @@ def render_variants(
                 log.info(f"{variant.name}: {error}")
                 progress.advance()
                 continue
-            method.fit(scene, build(config, "budget"), log)
-            pictures = _pictures(method, steps)
+            budget = build(config, "budget")
+            measured = measure(
+                method, scene, path, protocol, budget, log, seed=settings.seed, pictures=frames
+            )
+            pictures = _steady_pictures(measured, frames)
             standard = standard or pictures
-            found.append(_compared(variant, method, pictures, standard, scene, steps))
+            found.append(_compared(variant, method, measured, pictures, standard))
             progress.advance()
     return found
 
 
-def _pictures(method: Method, steps: Sequence[Step]) -> list[Tensor]:
-    method.reset()
-    return [method.render(step.camera, NullProbe()).rgb.cpu().clone() for step in steps]
+def _steady_pictures(measured: Measurement, frames: int) -> dict[str, np.ndarray]:
+    steady = measured.frames.loc[measured.frames["phase"] == STEADY, "frame"]
+    names = {f"{frame:04d}{RENDERED}" for frame in steady}
+    pictures = {name: pixels for name, pixels in measured.pictures.items() if name in names}
+    if not pictures:
+        raise SteerbenchError(
+            f"--frames={frames}: none of these frames has a ground truth and as many frames before "
+            "it as the method looks back on; give more"
+        )
+    return pictures
 
 
 def _compared(
     variant: Variant,
     method: Method,
-    pictures: Sequence[Tensor],
-    standard: Sequence[Tensor],
-    scene: Scene,
-    steps: Sequence[Step],
+    measured: Measurement,
+    pictures: Mapping[str, np.ndarray],
+    standard: Mapping[str, np.ndarray],
 ) -> Rendered:
-    pairs = list(zip(pictures, standard, strict=True))
-    true = [
-        _psnr(picture, composite(scene.splits["test"].images[step.truth], scene.background).cpu())
-        for picture, step in zip(pictures, steps, strict=True)
-        if step.truth is not None
-    ]
-    clock = StageClock(method.settings()["device"])
-    method.reset()
-    for step in steps:
-        with clock.frame():
-            method.render(step.camera, clock)
-    steady = clock.frames[min(method.memory, len(steps) - 1) :]
+    apart = np.stack([pictures[name] / 255.0 - standard[name] / 255.0 for name in standard])
+    error = float(np.square(apart).mean())
+    rows = measured.rows[measured.rows["phase"] != COLD]
     return Rendered(
         variant,
         method,
-        float(np.mean([_psnr(*pair) for pair in pairs])),
-        max((one - other).abs().max().item() for one, other in pairs),
-        float(np.mean(true)) if true else float("nan"),
-        float(np.median([frame.total_ns for frame in steady])) / 1e6,
-        {
-            stage: float(np.median([frame.stages_ns.get(stage, 0) for frame in steady])) / 1e6
-            for stage in dict.fromkeys(stage for frame in steady for stage in frame.stages_ns)
-        },
-        {
-            counter: float(np.mean([frame.done.get(counter, 0) for frame in steady]))
-            for counter in dict.fromkeys(name for frame in steady for name in frame.done)
-        },
+        -10 * math.log10(error) if error else math.inf,
+        float(np.abs(apart).max()),
+        dict(zip(rows["metric"], rows["value"], strict=True)),
     )
-
-
-def _psnr(picture: Tensor, other: Tensor) -> float:
-    return -10 * torch.log10((picture - other).square().mean()).item()
 
 
 def apart_text(psnr: float) -> str:
     """PSNR between two pictures for a table."""
-    return f"{psnr:.1f}" if np.isfinite(psnr) else "the same"
+    return f"{psnr:.1f}" if math.isfinite(psnr) else "the same"
 
 
-def finite(row: dict[str, Any]) -> dict[str, Any]:
+def finite(row: Mapping[str, Any]) -> dict[str, Any]:
     """`row` with None, which JSON has, for figures that are not finite, which it has not."""
     return {
-        key: None if isinstance(value, float) and not np.isfinite(value) else value
+        key: None if isinstance(value, float) and not math.isfinite(value) else value
         for key, value in row.items()
     }

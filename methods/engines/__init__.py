@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import ClassVar, Literal
 
+import torch
 from torch import Tensor
 
 from bench.errors import Unavailable
@@ -34,7 +35,7 @@ class Built:
 
     Attributes:
         run: as the network. What it returns may be overwritten by the next call.
-        size: bytes of its weights, as they are stored.
+        size: bytes of its weights, as a file needs them at its precision.
     """
 
     run: Callable[..., Inputs]
@@ -51,13 +52,21 @@ class Engine(ABC):
     name: ClassVar[str]
     precisions: ClassVar[tuple[Precision, ...]]
 
-    def __init__(self, precision: Precision) -> None:
+    def __init__(self, precision: Precision = "fp32") -> None:
         if precision not in self.precisions:
             raise Unavailable(
                 f"precision={precision}: expected one of {', '.join(self.precisions)}, which "
                 f"engine={self.name} has"
             )
         self.precision = precision
+
+    def check(self, device: torch.device) -> None:
+        """Raise `Unavailable` unless the engine computes at this precision on `device`."""
+        if device.type != "cpu":
+            raise Unavailable(
+                f"engine={self.name} computes on the CPU, this is device={device}: use "
+                "engine=torch or device=cpu"
+            )
 
     def samples(self, network: Network) -> int:
         """Frames whose inputs `build` wants to see."""
@@ -83,8 +92,8 @@ class Engine(ABC):
         """
 
 
-def required(library: str, extra: str) -> ModuleType:
-    """Import a library that an engine stands on.
+def required(engine: str, library: str, extra: str) -> ModuleType:
+    """Import a library that `engine` stands on.
 
     Raises:
         Unavailable: it is not installed.
@@ -93,6 +102,6 @@ def required(library: str, extra: str) -> ModuleType:
         return importlib.import_module(library)
     except ImportError as error:
         raise Unavailable(
-            f"engine={library.partition('.')[0]} cannot be used here ({error}): "
+            f"engine={engine} cannot be used here ({error}): "
             f'pip install -c constraints.txt -e ".[{extra}]"'
         ) from error

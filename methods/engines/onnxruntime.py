@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from bench.provenance import digest
+from bench.results import explained
 from bench.types import Log
 from methods.engines import Built, Engine, Inputs, Precision, required
 from methods.renderer2d import Network
@@ -33,8 +34,8 @@ class OnnxRuntime(Engine):
 
     def __init__(self, precision: Precision = "fp32") -> None:
         super().__init__(precision)
-        required("onnx", "onnx")
-        self._runtime = required("onnxruntime", "onnx")
+        required(self.name, "onnx", "onnx")
+        self._runtime = required(self.name, "onnxruntime", "onnx")
         self._runtime.disable_telemetry_events()
 
     def key(self) -> dict[str, object]:
@@ -42,7 +43,7 @@ class OnnxRuntime(Engine):
         versions = {library: metadata.version(library) for library in ("onnx", "onnxruntime")}
         return {
             "engine": self.name,
-            "stored": self.precision,
+            "precision": self.precision,
             "code": digest([Path(__file__)]),
             **versions,
         }
@@ -73,7 +74,7 @@ class OnnxRuntime(Engine):
 
     def _write(self, network: Network, samples: Sequence[Inputs], path: Path) -> None:
         """Leave the model at `path`, whole or not at all."""
-        with tempfile.TemporaryDirectory(dir=path.parent) as place:
+        with explained(path.parent), tempfile.TemporaryDirectory(dir=path.parent) as place:
             exported, ready = Path(place) / "exported.onnx", Path(place) / "ready.onnx"
             _export(network, samples[0], exported)
             if self.precision == "int8":

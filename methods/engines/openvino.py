@@ -7,6 +7,7 @@ import json
 import logging
 import math
 import sys
+import tempfile
 import warnings
 from collections.abc import Callable, Sequence
 from copy import deepcopy
@@ -19,6 +20,7 @@ import torch
 from torch import Tensor
 
 from bench.provenance import digest
+from bench.results import explained
 from bench.types import Log
 from methods.engines import CALIBRATION, Built, Engine, Inputs, Precision, required
 from methods.renderer2d import Network
@@ -45,8 +47,8 @@ class OpenVino(Engine):
 
     def __init__(self, precision: Precision = "fp32") -> None:
         super().__init__(precision)
-        self._openvino = required("openvino", "openvino")
-        self._nncf = required("nncf", "openvino") if precision == "int8" else None
+        self._openvino = required(self.name, "openvino", "openvino")
+        self._nncf = required(self.name, "nncf", "openvino") if precision == "int8" else None
 
     def key(self) -> dict[str, object]:
         """See `Engine.key`."""
@@ -104,10 +106,11 @@ class OpenVino(Engine):
 
     def _write(self, model: Any, path: Path) -> None:
         """Leave the model at `path`, whole or not at all."""
-        new = path.with_name("new.xml")
-        self._openvino.save_model(model, new, compress_to_fp16=self.precision == "bf16")
-        new.with_suffix(".bin").replace(path.with_suffix(".bin"))
-        new.replace(path)
+        with explained(path.parent), tempfile.TemporaryDirectory(dir=path.parent) as place:
+            new = Path(place) / path.name
+            self._openvino.save_model(model, new, compress_to_fp16=self.precision == "bf16")
+            new.with_suffix(".bin").replace(path.with_suffix(".bin"))
+            new.replace(path)
 
 
 def _sizes(samples: Sequence[Inputs], varying: Varying) -> list[int]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bench.errors import Unavailable
 from bench.types import Log
-from methods.engines import Built, Engine, Inputs, Precision
+from methods.engines import Built, Engine, Inputs
 from methods.renderer2d import Network
 
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
@@ -22,10 +22,10 @@ class TorchEngine(Engine):
     name = "torch"
     precisions = ("fp32", "bf16", "fp16")
 
-    def __init__(self, precision: Precision = "fp32") -> None:
-        super().__init__(precision)
-        if precision == "fp16" and not torch.cuda.is_available():
-            raise Unavailable("precision=fp16: engine=torch has it on a GPU, here use bf16")
+    def check(self, device: torch.device) -> None:
+        """See `Engine.check`."""
+        if self.precision == "fp16" and device.type == "cpu":
+            raise Unavailable("precision=fp16: engine=torch has it on a GPU, on a CPU use bf16")
 
     def samples(self, network: Network) -> int:
         """None: nothing is prepared."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import replace
 from typing import Literal
 
@@ -15,7 +16,7 @@ from methods.buffer import RenderingBuffer
 from methods.cells import cells_near, pixels_of
 from methods.kernels.warp import enlarge
 from methods.occupancy import STEP
-from methods.pipeline import LAYER, Pipeline, PipelineOptions, View, sample_phase
+from methods.pipeline import LAYER, Pipeline, PipelineOptions, Skips, View, sample_phase
 from methods.range_reduction import RangeReduction, render_guided
 from methods.space_to_depth import SpaceToDepth
 from methods.unet_release import UnetRelease
@@ -209,3 +210,30 @@ def test_options_that_make_no_frame_are_refused(wrong: dict[str, int]) -> None:
 def test_a_share_of_cells_is_between_0_and_1() -> None:
     with pytest.raises(ValueError, match=r"refined: expected a share of 0 to 1, got 1\.5"):
         replace(OPTIONS, refined=1.5)
+
+
+class Work(NullProbe):
+    """What was counted, by name."""
+
+    def __init__(self) -> None:
+        self.done: Counter[str] = Counter()
+
+    def count(self, name: str, done: int, dense: int | None = None) -> None:
+        self.done[name] += done
+
+
+@pytest.mark.parametrize(
+    ("skip", "work"),
+    [
+        (Skips(empty=False), "samples"),
+        (Skips(hidden=False), "samples"),
+        (Skips(background=False), "cells"),
+    ],
+)
+def test_what_is_not_skipped_is_more_work(skip: Skips, work: str) -> None:
+    done = []
+    for skips in (Skips(), skip):
+        probe, options = Work(), replace(OPTIONS, stop=0.5, skip=skips)
+        new_pipeline(options).render(CAMERA, RenderingBuffer(2), probe)
+        done.append(probe.done)
+    assert done[1][work] > done[0][work] > 0

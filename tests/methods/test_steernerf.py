@@ -9,7 +9,10 @@ import pytest
 import torch
 
 from bench.console import ConsoleLog
+from bench.errors import Unavailable
 from bench.types import Budget, NullProbe, Scene
+from methods.engines import Engine
+from methods.engines.openvino import OpenVino
 from methods.engines.torch import TorchEngine
 from methods.joint import JointOptions
 from methods.kernels.encode import HashGrid
@@ -22,11 +25,13 @@ from methods.train import TrainingOptions
 BUDGET = Budget("test", steps=40, samples=4096, renderer_steps=4)
 
 
-def new_method(frames: int = 2, rate: float = 1e-3) -> SteerNerf:
+def new_method(
+    frames: int = 2, rate: float = 1e-3, engine: Engine | None = None, refined: float = 0.0
+) -> SteerNerf:
     return SteerNerf(
         grid=HashGrid(levels=8, log2_table=12, n_min=8, n_max=64),
         training=TrainingOptions(),
-        pipeline=PipelineOptions(channels=5, frames=frames, steps=4),
+        pipeline=PipelineOptions(channels=5, frames=frames, steps=4, refined=refined),
         renderer=partial(SpaceToDepth, width=8, blocks=1, init="scratch"),
         joint=JointOptions(
             patch=4,
@@ -34,7 +39,7 @@ def new_method(frames: int = 2, rate: float = 1e-3) -> SteerNerf:
             distilled_views=2,
             motion=MotionOptions(pool=2, length=2),
         ),
-        engine=TorchEngine(),
+        engine=engine or TorchEngine(),
     )
 
 
@@ -89,3 +94,23 @@ def test_sizes_are_those_of_all_that_a_frame_needs(ball_scene: Scene, log: Conso
     numbers = sum(p.numel() for p in renderer.parameters())
     assert method.sizes()["renderer2d"] == 4 * numbers
     assert set(method.sizes()) == {"hash_table", "field_networks", "occupancy", "renderer2d"}
+
+
+def test_a_network_is_built_once_for_each_training_and_for_no_other(
+    ball_scene: Scene, log: ConsoleLog, tmp_path: Path
+) -> None:
+    def built(rate: float = 1e-3, refined: float = 0.0) -> int:
+        method = new_method(rate=rate, engine=OpenVino("int8"), refined=refined)
+        method.fit(ball_scene, BUDGET, log)
+        for camera in ball_scene.splits["test"].cameras:
+            assert method.render(camera, NullProbe()).rgb.isfinite().all()
+        return stages(tmp_path).count("network")
+
+    assert built() == 1
+    assert built(refined=0.5) == 1  # not trained for, nor calibrated for
+    assert built(rate=3e-3) == 2
+
+
+def test_an_engine_that_does_not_compute_on_the_device_is_refused() -> None:
+    with pytest.raises(Unavailable, match="engine=openvino computes on the CPU"):
+        OpenVino("fp32").check(torch.device("cuda"))

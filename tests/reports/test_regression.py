@@ -7,9 +7,12 @@ from dataclasses import replace
 import pytest
 from scipy import stats
 
+from bench.errors import SteerbenchError
 from reports.regression import LIMITS, Change, Figures, Limit, changes
 
-OLD = Figures({"psnr": 30.0, "frame_ms": 100.0, "size_bytes.total": 1000.0}, {}, "one machine")
+OLD = Figures(
+    {"psnr": 30.0, "frame_ms": 100.0, "size_bytes.total": 1000.0}, {}, "one machine", "views"
+)
 
 
 def change(metric: str, value: float, old: Figures = OLD) -> Change | None:
@@ -34,7 +37,7 @@ def test_worse_is_what_passes_the_limit_in_the_wrong_direction(
 ) -> None:
     found = change(metric, value)
     assert found is not None
-    assert found.worse == worse
+    assert found.verdict == ("worse" if worse else "")
 
 
 def test_what_depends_on_the_machine_is_compared_on_the_same_one_only() -> None:
@@ -46,8 +49,8 @@ def paired(*by: float) -> Change:
     """PSNR of frames that changed by so much, on top of very different values."""
     before = {str(i): 20.0 + 5 * i for i in range(len(by))}
     after = {name: value + by[int(name)] for name, value in before.items()}
-    old = replace(OLD, frames={"psnr": before | {"left": 0.0}})
-    new = replace(OLD, frames={"psnr": after | {"right": 99.0}})
+    old = replace(OLD, frames={"psnr": before})
+    new = replace(OLD, frames={"psnr": after | {"more": 99.0}})
     return next(found for found in changes(old, new) if found.metric == "psnr")
 
 
@@ -56,17 +59,30 @@ def test_frames_that_both_have_are_compared_in_pairs() -> None:
     assert found.by == pytest.approx(-0.3)
     half = stats.t.ppf(0.975, 3) * (0.02 / 3) ** 0.5 / 2  # standard deviation over sqrt(n)
     assert found.interval == pytest.approx((-0.3 - half, -0.3 + half))
-    assert found.worse
+    assert found.verdict == "worse"
 
 
-def test_a_change_that_may_be_chance_is_not_worse() -> None:
-    found = paired(-3.0, 2.0, -2.0, 1.0)
-    assert found.by == pytest.approx(-0.5)
-    assert not found.worse
+def test_one_broken_frame_among_many_is_worse() -> None:
+    found = paired(*[0.0] * 23, -20.0)
+    assert found.by == pytest.approx(-20 / 24)
+    assert found.verdict == "worse"
+
+
+def test_a_metric_or_a_frame_that_is_gone_is_missing() -> None:
+    gone = replace(OLD, values={"frame_ms": 100.0, "size_bytes.total": 1000.0})
+    assert {found.metric: found.verdict for found in changes(OLD, gone)}["psnr"] == "missing"
+    old = replace(OLD, frames={"psnr": {"0": 30.0, "1": 30.0, "2": 30.0}})
+    new = replace(OLD, frames={"psnr": {"0": 30.0, "1": 30.0}})
+    assert next(changes(old, new)).verdict == "missing"
+
+
+def test_figures_of_other_frames_are_not_compared() -> None:
+    with pytest.raises(SteerbenchError, match="other frames: views; another scene"):
+        list(changes(OLD, replace(OLD, views="another scene")))
 
 
 def test_a_baseline_can_have_limits_of_its_own() -> None:
     new = replace(OLD, values={**OLD.values, "psnr": 29.0})
     (wide,) = changes(OLD, new, {"psnr": Limit(1, absolute=2.0)})
-    assert not wide.worse
+    assert wide.verdict == ""
     assert LIMITS["psnr"].absolute < 1

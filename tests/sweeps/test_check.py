@@ -61,6 +61,20 @@ def test_a_run_is_known_by_what_was_typed_in_any_order_but_for_places(
     assert list(held["runs"]) == ["method=offset scene=tiny"]
 
 
+def test_a_baseline_that_is_recorded_anew_keeps_its_limits_and_its_runs(
+    baseline: Path, outputs: Path
+) -> None:
+    held = json.loads(baseline.read_text())
+    held["limits"] = {"psnr": {"better": 1, "absolute": 0.5}}
+    baseline.write_text(json.dumps(held))
+    assert check(baseline, outputs, "--record") == 0
+    again = json.loads(baseline.read_text())
+    assert again["limits"]["psnr"]["absolute"] == 0.5
+    assert again["runs"].keys() == held["runs"].keys()
+    (figures,) = again["runs"].values()
+    assert list(figures["values"]) == ["psnr"]
+
+
 def test_a_run_that_is_missing_fails(
     baseline: Path, outputs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

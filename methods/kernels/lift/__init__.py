@@ -86,15 +86,16 @@ def lift(
     The base is the present RGB enlarged bilinearly; beyond the frame its border goes on. Colours of
     history and surface are told less the base.
 
-    Differentiable in all values and in `alpha`.
+    Differentiable in `values`, `alpha` and what `preceding` and `surface` have, not in `history`.
 
     Args:
         values: [h, w, K] features of the present low-resolution frame.
         alpha: [h, w] opacity.
         background: [K] that features are composited on.
-        cells: [N] int64 low-resolution pixels, counted row by row.
-        preceding: newest first, features [P, K] of points and the index [h s, w s] int32 of the one
-            that each pixel shows, -1 for none; columns of frames that are missing are 0.
+        cells: [N] int64 low-resolution pixels, counted row by row, 0 to h w - 1.
+        preceding: newest first, no more than `layout.frames`: features [P, K] of points and the
+            index [h s, w s] int32 of the one that each pixel shows, -1 for none; columns of frames
+            that are missing are 0.
         history: preceding picture [N, s^2, 3] in the cells, and where it is known, [N, s^2] in
             {0, 1}; None: columns of 0.
         surface: features and, last, opacity [P, K + 1], and the index [N, s^2] int32 of the one
@@ -115,6 +116,10 @@ def lift(
     check_shape("alpha", alpha, height, width)
     check_shape("background", background, layout.channels)
     check_shape("cells", cells, None)
+    if len(preceding) > layout.frames:
+        raise ValueError(f"preceding: expected at most {layout.frames}, got {len(preceding)}")
+    if (history is not None and not layout.history) or (surface is not None and not layout.surface):
+        raise ValueError(f"history, surface: expected None without their columns, got {layout}")
     for points, index in preceding:
         check_shape("preceding values", points, None, layout.channels)
         check_shape("preceding index", index, height * layout.scale, width * layout.scale)
@@ -126,18 +131,12 @@ def lift(
         check_shape("surface index", surface[1], count, pixels)
     across, down = (_tent(layout.scale, shift) for shift in phase)
     taps = (down[:, None, :, None] * across[None, :, None, :]).reshape(-1, TAPS).to(values)
-    return implementation("lift", backend, values.device).lift(
-        values,
-        alpha,
-        background,
-        cells,
-        preceding,
-        history,
-        surface,
-        layout,
-        taps,
-        multiple * -(-count // multiple),
-    )
+    kernel = implementation("lift", backend, values.device)
+    rows = multiple * -(-count // multiple)
+    with torch.autocast(values.device.type, enabled=False):
+        return kernel.lift(
+            values, alpha, background, cells, preceding, history, surface, layout, taps, rows
+        )
 
 
 def draw(
@@ -175,7 +174,9 @@ def draw(
         raise ValueError("matrix: expected one with layout.surface, None without")
     if matrix is not None:
         check_shape("matrix", matrix, count, 3 * (layout.channels + 1))
-    return implementation("lift", backend, base.device).draw(base, rows, answer, matrix, layout)
+    kernel = implementation("lift", backend, base.device)
+    with torch.autocast(base.device.type, enabled=False):
+        return kernel.draw(base, rows, answer, matrix, layout)
 
 
 def _tent(scale: int, shift: float) -> Tensor:
