@@ -161,7 +161,7 @@ def _parser() -> Parser:
             "skips",
             "what is not computed, what that saves and what it costs",
             "with everything computed that could be left out, with each of it left out alone, and "
-            "with all of it.",
+            "with all of it; without refinement.",
             8,
         ),
     ):
