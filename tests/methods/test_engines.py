@@ -12,9 +12,9 @@ import torch
 from bench.console import ConsoleLog
 from bench.errors import Unavailable
 from methods.engines import Engine, Inputs, required
-from methods.engines.onnxruntime import OnnxRuntime
-from methods.engines.openvino import OpenVino
-from methods.engines.torch import TorchEngine
+from methods.engines.onnxruntime_engine import OnnxRuntime
+from methods.engines.openvino_engine import OpenVino
+from methods.engines.torch_engine import TorchEngine
 from methods.kernels.depthwise import neighbours_of
 from methods.renderer2d import Network
 from methods.space_to_depth import SpaceToDepth

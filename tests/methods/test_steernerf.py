@@ -12,8 +12,8 @@ from bench.console import ConsoleLog
 from bench.errors import Unavailable
 from bench.types import Budget, NullProbe, Scene
 from methods.engines import Engine
-from methods.engines.openvino import OpenVino
-from methods.engines.torch import TorchEngine
+from methods.engines.openvino_engine import OpenVino
+from methods.engines.torch_engine import TorchEngine
 from methods.joint import JointOptions
 from methods.kernels.encode import HashGrid
 from methods.pipeline import PipelineOptions
