@@ -134,8 +134,9 @@ def test_parity_compares_every_engine_with_torch_in_fp32(first: tuple[Path, str]
     assert standard["lost"] == 0
     assert standard["apart"] is None  # there is no difference
     for engine in ("openvino", "onnxruntime"):
-        # Refinement may choose another one of cells that are doubted alike.
-        assert found[f"{engine}, fp32"]["apart"] > 60
+        # The same in 8 bits, but that refinement may choose another one of cells doubted alike.
+        apart = found[f"{engine}, fp32"]["apart"]
+        assert apart is None or apart > 60
         assert abs(found[f"{engine}, int8"]["lost"]) < 1
         assert found[f"{engine}, int8"]["bytes"] < 0.5 * standard["bytes"]
     for row in found.values():
