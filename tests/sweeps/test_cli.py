@@ -74,7 +74,9 @@ def test_results_before_any_run_say_so(steerbench):
 
 def test_results_are_the_same_in_every_format(steerbench, run):
     run("seed=4")
-    csv = pd.read_csv(io.StringIO(steerbench("results", "--format", "csv").out))
+    # A commit or a key may consist of digits alone.
+    names = {"run": "str", "commit": "str"}
+    csv = pd.read_csv(io.StringIO(steerbench("results", "--format", "csv").out), dtype=names)
     loaded = pd.DataFrame(json.loads(steerbench("results", "--format", "json").out))
     table = steerbench("results").out
     assert list(csv.columns) == list(loaded.columns) == COLUMNS
