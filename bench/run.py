@@ -211,10 +211,7 @@ def _mean(metric: str, values: pd.Series) -> dict[str, Any]:
     """
     known = values.dropna().to_numpy(dtype=float)
     value = known.mean() if len(known) else math.nan
-    half = math.nan
-    if len(known) > 1 and np.isfinite(known).all():
-        quantile = stats.t.ppf(0.5 + CONFIDENCE / 2, len(known) - 1)
-        half = quantile * known.std(ddof=1) / math.sqrt(len(known))
+    half = half_interval(known)
     return {
         "metric": metric,
         "value": value,
@@ -222,6 +219,15 @@ def _mean(metric: str, values: pd.Series) -> dict[str, Any]:
         "lo": value - half,
         "hi": value + half,
     }
+
+
+def half_interval(values: np.ndarray) -> float:
+    """Half of the t-interval of the mean of `values` [n]; nan for fewer than two, or where one is
+    not finite."""
+    if len(values) < 2 or not np.isfinite(values).all():
+        return math.nan
+    quantile = stats.t.ppf(0.5 + CONFIDENCE / 2, len(values) - 1)
+    return quantile * values.std(ddof=1) / math.sqrt(len(values))
 
 
 def _rate(ms: dict) -> dict[str, float]:

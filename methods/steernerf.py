@@ -173,9 +173,7 @@ class SteerNerf:
         pipeline = Pipeline(trained.field, trained.occupancy, background, renderer, usual)
         options = (engine.samples(renderer.network), self.joint.motion, self.setup.seed, log)
         seen = partial(recorded_inputs, pipeline, scene, target, *options)
-        code = digest(
-            [ROOT / "methods" / f"{name}.py" for name in ("calibration", "engines/__init__")]
-        )
+        code = digest([ROOT / "methods" / path for path in CALIBRATED_BY])
         parts = {"trained": key, "engine": engine.key(), "calibration": code}
         built = engine.build(renderer.network, seen, partial(log.stage_dir, "network", parts), log)
         renderer.engine, self.renderer_bytes = built.run, built.size

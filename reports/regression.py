@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from bench.errors import SteerbenchError
 from bench.results import STEADY
+from bench.run import half_interval
 from reports.runs import Run
 from reports.tables import Table
-
-CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
@@ -92,10 +89,6 @@ class Figures:
         frames = {metric: value for metric, value in self.frames.items() if metric in metrics}
         return replace(self, values=values, frames=frames)
 
-    def plain(self) -> dict[str, Any]:
-        """As JSON can hold it."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class Change:
@@ -134,7 +127,7 @@ def changes(old: Figures, new: Figures, limits: Mapping[str, Limit] = LIMITS) ->
         if len(both) > 1:
             apart = np.array([other[name] - one[name] for name in both])
             by = float(apart.mean())
-            half = stats.t.ppf(0.5 + CONFIDENCE / 2, len(apart) - 1) * stats.sem(apart)
+            half = half_interval(apart)
             interval = (by - half, by + half)
         worse = limit.better * by < -limit.absolute - limit.relative * abs(before)
         gone = math.isnan(after) or len(both) < len(one)

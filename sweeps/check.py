@@ -6,6 +6,7 @@ import argparse
 import json
 import shlex
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -87,8 +88,8 @@ def _record(path: Path, found: Mapping[str, Run]) -> None:
         found = {command: found[command] for command in known}
     if not found:
         raise SteerbenchError("there are no runs to record: `steerbench run` makes one")
-    runs = {command: Figures.of(run).of_metrics(limits).plain() for command, run in found.items()}
-    plain = {metric: vars(limit) for metric, limit in limits.items()}
+    runs = {command: asdict(Figures.of(run).of_metrics(limits)) for command, run in found.items()}
+    plain = {metric: asdict(limit) for metric, limit in limits.items()}
     text = json.dumps({"schema": SCHEMA, "limits": plain, "runs": runs}, indent=1)
     new = path.with_name(f".{path.name}.new")
     with explained(path.parent):

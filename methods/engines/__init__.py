@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -90,6 +91,13 @@ class Engine(ABC):
             samples: called if they are needed: the inputs of `self.samples(network)` frames.
             folder: called if something is kept there: of this network and engine alone.
         """
+
+
+def readable(network: Network) -> Network:
+    """A copy of `network` in plain torch, which the converters of engines can follow."""
+    copy = deepcopy(network)
+    copy.backend = "reference"
+    return copy
 
 
 def required(engine: str, library: str, extra: str) -> ModuleType:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from copy import deepcopy
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from torch import Tensor
 from bench.provenance import digest
 from bench.results import explained
 from bench.types import Log
-from methods.engines import Built, Engine, Inputs, Precision, required
+from methods.engines import Built, Engine, Inputs, Precision, readable, required
 from methods.renderer2d import Network
 
 OPSET = 17
@@ -85,14 +84,12 @@ class OnnxRuntime(Engine):
 
 
 def _export(network: Network, sample: Inputs, path: Path) -> None:
-    readable = deepcopy(network)
-    readable.backend = "reference"
     names = [f"input{place}" for place in range(len(sample))]
     varying = dict(zip(names, map(list, network.varying), strict=True))
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the exporter, on itself
         torch.onnx.export(
-            readable,
+            readable(network),
             sample,
             path,
             input_names=names,

@@ -10,7 +10,6 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Sequence
-from copy import deepcopy
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from torch import Tensor
 from bench.provenance import digest
 from bench.results import explained
 from bench.types import Log
-from methods.engines import CALIBRATION, Built, Engine, Inputs, Precision, required
+from methods.engines import CALIBRATION, Built, Engine, Inputs, Precision, readable, required
 from methods.renderer2d import Network
 
 # Neither OpenVINO nor NNCF is to tell anybody that it is used: both do without this package.
@@ -88,15 +87,15 @@ class OpenVino(Engine):
         return Built(compiled, sum(op.data.nbytes for op in weights))
 
     def _convert(self, network: Network, samples: Sequence[Inputs]) -> Any:
-        readable = deepcopy(network)
-        readable.backend = "reference"
         shapes = [list(x.shape) for x in samples[0]]
         for shape, axes in zip(shapes, network.varying, strict=True):
             for axis in axes:
                 shape[axis] = -1
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of the tracer: on itself, and on checks of arguments
-            model = self._openvino.convert_model(readable, example_input=samples[0], input=shapes)
+            model = self._openvino.convert_model(
+                readable(network), example_input=samples[0], input=shapes
+            )
         if self._nncf is None:
             return model
         logging.getLogger("nncf").setLevel(logging.ERROR)
