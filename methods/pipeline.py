@@ -131,8 +131,7 @@ class Pipeline:
         self.field, self.renderer = field, renderer
         self.options, self.backend = options, field.backend
         skip = options.skip
-        everywhere = torch.ones_like(occupancy.cells)
-        self.occupancy = occupancy if skip.empty else Occupancy(everywhere)
+        self.occupancy = occupancy if skip.empty else Occupancy(torch.ones_like(occupancy.cells))
         self.stop = options.stop if skip.hidden else 0.0
         self.background = functional.pad(
             background, (0, options.channels - 3), value=options.feature_background

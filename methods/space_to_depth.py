@@ -96,7 +96,23 @@ class SpaceToDepth(Renderer2d):
 
     def base(self, observations: Sequence[Observation]) -> Tensor:
         """See `Renderer2d`."""
-        return self._paint(observations, self._lift(observations)[0])
+        alone = Layout(self.channels, 0, self.scale, history=False, surface=False)
+        parts = [
+            lift(
+                o.frame.values,
+                o.frame.alpha,
+                o.background,
+                o.cells,
+                [],
+                None,
+                None,
+                alone,
+                o.phase,
+                backend=o.backend,
+            )[0]
+            for o in observations
+        ]
+        return self._paint(observations, torch.cat(parts))
 
     def _lift(self, observations: Sequence[Observation]) -> tuple[Tensor, Tensor]:
         """The base and the rows of all their cells, rows of 0 behind them; see `lift`.
