@@ -29,7 +29,8 @@ from methods.kernels.warp import enlarge, warp
 from methods.occupancy import STEP
 from methods.range_reduction import RangeReduction, depths_around, evidence, render_guided
 from methods.renderer2d import Detail, Observation, Points, Renderer2d, cells_at_matter
-from methods.volume import FeatureFrame, query, render_rays
+from methods.rounds import render_rays
+from methods.volume import FeatureFrame, query
 
 LAYER = 4 * STEP
 """Thickness, in scene units, of what a single sample of the surface stands for."""

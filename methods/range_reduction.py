@@ -17,7 +17,8 @@ from methods.fields import HashField
 from methods.kernels.composite import STOP, Pixels
 from methods.kernels.march import Occupancy
 from methods.occupancy import STEP
-from methods.volume import FeatureFrame, rays_at_matter, render_rays
+from methods.rounds import render_rays
+from methods.volume import FeatureFrame, rays_at_matter
 
 KEPT_ALPHA = 0.95
 """Share of the expected opacity at which a ray has found what was to be expected."""

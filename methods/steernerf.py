@@ -21,6 +21,7 @@ from methods.engines import Engine
 from methods.fields import Precision
 from methods.generic import train_generic
 from methods.joint import JointOptions, JointTraining, RendererTraining
+from methods.kernels import sources
 from methods.kernels.encode import HashGrid
 from methods.patches import PatchSource
 from methods.pipeline import Pipeline, PipelineOptions
@@ -40,6 +41,7 @@ SOURCES = (
     "pipeline",
     "range_reduction",
     "renderer2d",
+    "rounds",
     "sequences",
     "space_to_depth",
     "steernerf",
@@ -235,8 +237,6 @@ class SteerNerf:
 def stage2_digest() -> str:
     """SHA-256 of the sources and weights that decide what stage 2 results in, beside those of
     stage 1."""
-    sources = [ROOT / "methods" / f"{name}.py" for name in SOURCES]
-    for kernel in ("depthwise", "lift", "splat", "warp"):
-        folder = ROOT / "methods" / "kernels" / kernel
-        sources += [path for path in folder.glob("*.py") if path.stem != "cases"]
-    return digest([*sources, GENERIC, ROOT / "bench" / "motion.py"])
+    modules = [ROOT / "methods" / f"{name}.py" for name in SOURCES]
+    kernels = sources("depthwise", "lift", "splat", "warp")
+    return digest([*modules, *kernels, GENERIC, ROOT / "bench" / "motion.py"])

@@ -16,6 +16,7 @@ from bench.provenance import ROOT, digest
 from bench.types import Budget, Log, Rays, Scene, Split, SteerbenchError
 from methods import checkpoint, loop
 from methods.fields import HashField
+from methods.kernels import sources
 from methods.occupancy import EVERY, MIN_VIEWS, DensityGrid, learnable_cells
 from methods.optimise import FieldOptimiser
 from methods.volume import render_batch
@@ -208,12 +209,11 @@ class FieldTraining:
 def training_digest() -> str:
     """SHA-256 of the sources that decide what a training results in."""
     methods, bench = ROOT / "methods", ROOT / "bench"
-    sources = [methods / f"{name}.py" for name in SOURCES]
-    kernels = methods / "kernels"
-    sources += [kernels / "dispatch.py", kernels / "cpu.py"]
-    sources += [p for k in KERNELS for p in (kernels / k).glob("*.py") if p.stem != "cases"]
-    sources += [bench / "cameras.py", *(bench / "scenes").glob("*.py")]  # pixels and rays
-    return digest(sources)
+    used = [methods / f"{name}.py" for name in SOURCES]
+    used += [methods / "kernels" / "dispatch.py", methods / "kernels" / "cpu.py"]
+    used += sources(*KERNELS)
+    used += [bench / "cameras.py", *(bench / "scenes").glob("*.py")]  # pixels and rays
+    return digest(used)
 
 
 def train_field(

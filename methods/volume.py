@@ -1,4 +1,4 @@
-"""Volume rendering of a field along rays: all samples at once to train, in rounds to render."""
+"""Volume rendering of a field along rays, all samples at once: to train."""
 
 from __future__ import annotations
 
@@ -9,19 +9,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench.cameras import cast, project
-from bench.types import EMPTY_ALPHA, Camera, Probe, Rays
+from bench.types import EMPTY_ALPHA, Camera, Rays
 from methods.fields import HashField
 from methods.kernels.composite import STOP, Pixels, composite, visible_counts
 from methods.kernels.march import BRICK, Occupancy, march
 from methods.occupancy import STEP
-
-CHUNK_RAYS = 1 << 16
-"""Rays rendered together: enough to keep all threads busy, few enough to stay in the cache."""
-
-ROUND_SAMPLES = 8
-"""Samples a ray may take in a round: more are evaluated in vain, fewer take more rounds. The few
-rays that are left in the end are not worth many rounds: they may take as many more as they are
-fewer than half of all."""
 
 CHUNK_SAMPLES = 1 << 18
 """Samples whose density is evaluated together, without gradient: bounds the memory of a step."""
@@ -81,7 +73,7 @@ def render_batch(
     weight nor gradient: the density of all samples, without gradient, tells which they are.
 
     Args:
-        jitter: [R] phase of the samples of each ray, in [0, 1); None: as `render_rays`.
+        jitter: [R] phase of the samples of each ray, in [0, 1); None: as `rounds.render_rays`.
         background: [K] or [R, K]; None: not composited on any.
         stop: transmittance at which a ray ends.
         step: world length of a ray-marching step.
@@ -154,86 +146,3 @@ class FeatureFrame:
         depth = torch.where(seen, pixels.depth_sum / pixels.alpha, torch.inf)
         shape = (camera.height, camera.width)
         return cls(camera, values.view(*shape, -1), depth.view(shape), pixels.alpha.view(shape))
-
-
-@torch.no_grad()
-def render_rays(
-    field: HashField,
-    rays: Rays,
-    occupancy: Occupancy,
-    probe: Probe,
-    *,
-    stop: float = STOP,
-    step: float = STEP,
-    window: Tensor | None = None,
-    carry: Pixels | None = None,
-) -> Pixels:
-    """Render `rays` in rounds, so that samples behind the early stop are hardly ever evaluated.
-
-    Values are not composited onto a background. A round takes the next few samples of the rays
-    that are still open, evaluates and composites them, and drops the rays that are done.
-
-    Args:
-        window: [R, 2] nearest and farthest t of each ray; None: all.
-        carry: what lies in front of the windows; taken over and changed in place.
-    """
-    device = rays.origins.device
-    canvas = carry or Pixels.blank(len(rays.origins), field.channels, device)
-    for first in range(0, len(rays.origins), CHUNK_RAYS):
-        alive = torch.arange(first, min(first + CHUNK_RAYS, len(rays.origins)), device=device)
-        start = torch.zeros(len(alive), dtype=torch.int32, device=device)
-        count = len(alive)
-        while len(alive):
-            limit = ROUND_SAMPLES * max(count // (2 * len(alive)), 1)
-            alive, start = _render_round(
-                field, rays, window, occupancy, probe, canvas, alive, start, limit, stop, step
-            )
-    return canvas
-
-
-def _render_round(
-    field: HashField,
-    rays: Rays,
-    window: Tensor | None,
-    occupancy: Occupancy,
-    probe: Probe,
-    canvas: Pixels,
-    alive: Tensor,
-    start: Tensor,
-    limit: int,
-    stop: float,
-    step: float,
-) -> tuple[Tensor, Tensor]:
-    """One round of at most `limit` samples of the rays `alive` from their steps `start`; those left
-    and where they go on."""
-    with probe.stage("march"):
-        origins, directions = rays.origins[alive], rays.directions[alive]
-        samples = march(
-            origins,
-            directions,
-            occupancy,
-            step,
-            window=None if window is None else window[alive],
-            start=start,
-            limit=limit,
-            backend=field.backend,
-        )
-    probe.count("samples", len(samples))
-    if len(samples) == 0:
-        return alive[:0], start[:0]
-    with probe.stage("field"):
-        sigma, values = query(field, samples.positions, samples.ray, directions)
-    with probe.stage("composite"):
-        pixels = composite(
-            sigma,
-            values,
-            samples.t,
-            samples.delta,
-            samples.offsets,
-            stop=stop,
-            carry=canvas.take(alive),
-            backend=field.backend,
-        )
-        canvas.put(alive, pixels)
-        left = (samples.resume >= 0) & (1 - pixels.alpha > stop)
-        return alive[left], samples.resume[left]

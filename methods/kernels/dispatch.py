@@ -6,6 +6,7 @@ import difflib
 import importlib
 import importlib.util
 from functools import cache
+from pathlib import Path
 from types import ModuleType
 
 import torch
@@ -59,6 +60,13 @@ def implementation(kernel: str, backend: str, device: torch.device) -> ModuleTyp
     if name == "cpu":
         _load("methods.kernels.cpu").follow_torch_threads()
     return _load(f"methods.kernels.{kernel}.{name}")
+
+
+def sources(*kernels: str) -> list[Path]:
+    """The files that decide what `kernels` compute, on any backend."""
+    folders = [Path(__file__).parent / kernel for kernel in kernels]
+    names = [f"{name}.py" for name in ("__init__", *BACKENDS)]
+    return [path for folder in folders for name in names if (path := folder / name).exists()]
 
 
 # Imported when first used: numba and Triton are heavy, and not every machine has both.

@@ -1,4 +1,4 @@
-"""A scene that a field can learn in seconds."""
+"""A scene that a field can learn in seconds, and a field that has learned nothing."""
 
 from __future__ import annotations
 
@@ -10,8 +10,13 @@ from torch import Tensor
 
 from bench.cameras import cast
 from bench.types import Camera, Scene, Split
+from methods.fields import HashField
+from methods.kernels.encode import HashGrid
+from methods.kernels.march import Occupancy
 
 SIZE = 32
+
+GRID = HashGrid(levels=4, log2_table=10, n_min=4, n_max=32)
 
 
 def ball(camera: Camera) -> Tensor:
@@ -54,3 +59,14 @@ def ball_scene() -> Scene:
         splits[name] = Split(cameras, [ball(camera) for camera in cameras], names)
     bounds = torch.tensor([[0.1, 0.1, 0.1], [0.9, 0.9, 0.9]])
     return Scene("ball", splits, torch.ones(3), bounds, unit_length=1.0, digest="ball")
+
+
+@pytest.fixture
+def cloud(device: str) -> tuple[HashField, Occupancy]:
+    """A random field, dense enough to stop rays, in a box of the cube."""
+    field = HashField(GRID, precision="fp32", generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        field.table.mul_(3e4)
+    cells = torch.zeros(32, 32, 32, dtype=torch.bool, device=device)
+    cells[8:20, 4:28, 10:22] = True
+    return field.to(device), Occupancy(cells)

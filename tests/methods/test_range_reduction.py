@@ -15,7 +15,8 @@ from methods.kernels.march import Occupancy
 from methods.occupancy import STEP
 from methods.range_reduction import EDGE, KEPT_ALPHA, Evidence, RangeReduction, evidence
 from methods.range_reduction import render_guided as render_guided_by
-from methods.volume import ROUND_SAMPLES, FeatureFrame
+from methods.rounds import ROUND_SAMPLES
+from methods.volume import FeatureFrame
 from tests.methods.conftest import look_at_the_middle
 from tests.methods.solids import Counter, Solid, ball, slab, wall
 

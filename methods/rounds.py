@@ -1,0 +1,104 @@
+"""Volume rendering of a field along rays, a few samples at a time: to render."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from bench.types import Probe, Rays
+from methods.fields import HashField
+from methods.kernels.composite import STOP, Pixels, composite
+from methods.kernels.march import Occupancy, march
+from methods.occupancy import STEP
+from methods.volume import query
+
+CHUNK_RAYS = 1 << 16
+"""Rays rendered together: enough to keep all threads busy, few enough to stay in the cache."""
+
+ROUND_SAMPLES = 6
+"""Samples a ray may take in a round: more are evaluated in vain, fewer take more rounds. The few
+rays that are left in the end are not worth many rounds: they may take as many more as they are
+fewer than half of all."""
+
+
+@torch.no_grad()
+def render_rays(
+    field: HashField,
+    rays: Rays,
+    occupancy: Occupancy,
+    probe: Probe,
+    *,
+    stop: float = STOP,
+    step: float = STEP,
+    window: Tensor | None = None,
+    carry: Pixels | None = None,
+) -> Pixels:
+    """Render `rays` in rounds, so that samples behind the early stop are hardly ever evaluated.
+
+    Values are not composited onto a background. A round takes the next few samples of the rays
+    that are still open, evaluates and composites them, and drops the rays that are done.
+
+    Args:
+        window: [R, 2] nearest and farthest t of each ray; None: all.
+        carry: what lies in front of the windows; taken over and changed in place.
+    """
+    device = rays.origins.device
+    canvas = carry or Pixels.blank(len(rays.origins), field.channels, device)
+    for first in range(0, len(rays.origins), CHUNK_RAYS):
+        alive = torch.arange(first, min(first + CHUNK_RAYS, len(rays.origins)), device=device)
+        start = torch.zeros(len(alive), dtype=torch.int32, device=device)
+        count = len(alive)
+        while len(alive):
+            limit = ROUND_SAMPLES * max(count // (2 * len(alive)), 1)
+            alive, start = _render_round(
+                field, rays, window, occupancy, probe, canvas, alive, start, limit, stop, step
+            )
+    return canvas
+
+
+def _render_round(
+    field: HashField,
+    rays: Rays,
+    window: Tensor | None,
+    occupancy: Occupancy,
+    probe: Probe,
+    canvas: Pixels,
+    alive: Tensor,
+    start: Tensor,
+    limit: int,
+    stop: float,
+    step: float,
+) -> tuple[Tensor, Tensor]:
+    """One round of at most `limit` samples of the rays `alive` from their steps `start`; those left
+    and where they go on."""
+    with probe.stage("march"):
+        origins, directions = rays.origins[alive], rays.directions[alive]
+        samples = march(
+            origins,
+            directions,
+            occupancy,
+            step,
+            window=None if window is None else window[alive],
+            start=start,
+            limit=limit,
+            backend=field.backend,
+        )
+    probe.count("samples", len(samples))
+    if len(samples) == 0:
+        return alive[:0], start[:0]
+    with probe.stage("field"):
+        sigma, values = query(field, samples.positions, samples.ray, directions)
+    with probe.stage("composite"):
+        pixels = composite(
+            sigma,
+            values,
+            samples.t,
+            samples.delta,
+            samples.offsets,
+            stop=stop,
+            carry=canvas.take(alive),
+            backend=field.backend,
+        )
+        canvas.put(alive, pixels)
+        left = (samples.resume >= 0) & (1 - pixels.alpha > stop)
+        return alive[left], samples.resume[left]
