@@ -114,6 +114,12 @@ class RenderingBuffer:
         self._frames.appendleft(frame)
         self.turn += 1
 
+    def copy(self) -> RenderingBuffer:
+        """A buffer that has seen the same frames, and goes on by itself."""
+        other = RenderingBuffer(self._frames.maxlen or 0, self.turn)
+        other._frames.extend(self._frames)
+        return other
+
     def reset(self) -> None:
         """Forget all: a new sequence starts."""
         self._frames.clear()

@@ -61,12 +61,15 @@ class MotionOptions:
         length: most frames that precede a view; fewer, and none at times, teach the cold start.
         pool: sequences kept at a time.
         uses: patches cut out of a sequence before it is rendered anew.
+        longer: share of the sequences that then go on, there and back to their view, instead of
+            beginning anew: what is drawn must also do as its own history, again and again.
     """
 
     degrees: tuple[float, float] = (0.0, 2.5)
     length: int = 4
-    pool: int = 32
-    uses: int = 64
+    pool: int = 16
+    uses: int = 32
+    longer: float = 0.75
 
     def __post_init__(self) -> None:
         low, high = self.degrees
@@ -74,6 +77,8 @@ class MotionOptions:
             raise ValueError(
                 f"expected 0 <= degrees[0] <= degrees[1], length >= 0, pool and uses >= 1: {self}"
             )
+        if not 0 <= self.longer < 1:
+            raise ValueError(f"longer: expected a share from 0 to less than 1, got {self.longer}")
 
 
 class SequencePool:
@@ -109,7 +114,8 @@ class SequencePool:
             self._pool.append(self._make())
             place = len(self._pool) - 1
         elif self._pool[place].uses <= 0:
-            self._pool[place] = self._make()
+            longer = torch.rand((), generator=self._generator).item() < self._options.longer
+            self._pool[place] = self._go_on(self._pool[place]) if longer else self._make()
         sequence = self._pool[place]
         sequence.uses -= 1
         return sequence
@@ -118,17 +124,32 @@ class SequencePool:
         distilled = torch.rand((), generator=self._generator).item() < self._share
         views = self._distilled if distilled else self._real
         truth = views[self._random(len(views))]
-        pipeline, options = self._pipeline, self._options
-        frames = pipeline.options.frames
-        buffer = RenderingBuffer(frames, turn=self._random(pipeline.options.scale**2))
-        if frames:
-            count = self._random(options.length + 1)
-            motion = preceding(truth.camera, self._target, count, options.degrees, self._generator)
+        options = self._pipeline.options
+        buffer = RenderingBuffer(options.frames, turn=self._random(options.scale**2))
+        cells = _cells_with_content(truth.picture, self._pipeline)
+        return self._ended(truth, self._motion(truth), buffer, cells)
+
+    def _go_on(self, old: Sequence) -> Sequence:
+        """Go on from the view that `old` ends in, there and back."""
+        back = self._motion(old.truth)
+        back = back[len(back) // 2 :]
+        path = [old.truth.camera, *reversed(back), *back[1:]]
+        return self._ended(old.truth, path, old.buffer.copy(), old.cells)
+
+    def _motion(self, truth: TrueView) -> list[Camera]:
+        options = self._options
+        count = self._random(options.length + 1)
+        return preceding(truth.camera, self._target, count, options.degrees, self._generator)
+
+    def _ended(
+        self, truth: TrueView, motion: Seq[Camera], buffer: RenderingBuffer, cells: Tensor
+    ) -> Sequence:
+        """The sequence of `truth` whose `buffer` has seen the frames of a `motion` besides."""
+        if self._pipeline.options.frames:
             for camera in motion:
-                pipeline.render(camera, buffer, NullProbe())
-        view = View.of(truth.camera, pipeline.options, buffer.turn)
-        cells = _cells_with_content(truth.picture, pipeline)
-        return Sequence(truth, view, buffer, cells, options.uses)
+                self._pipeline.render(camera, buffer, NullProbe())
+        view = View.of(truth.camera, self._pipeline.options, buffer.turn)
+        return Sequence(truth, view, buffer, cells, self._options.uses)
 
     def _random(self, below: int) -> int:
         return int(torch.randint(below, (), generator=self._generator))

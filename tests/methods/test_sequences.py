@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -56,13 +58,36 @@ def test_cold_and_steady_starts_both_occur(ball_scene: Scene) -> None:
 
 
 def test_the_newest_preceding_frame_is_a_step_away(ball_scene: Scene) -> None:
-    pool = new_pool(ball_scene, MotionOptions(degrees=(2.0, 2.0), pool=1, uses=1, length=3))
+    motion = MotionOptions(degrees=(2.0, 2.0), pool=1, uses=1, length=3, longer=0.0)
+    pool = new_pool(ball_scene, motion)
     for sequence in (pool.draw() for _ in range(12)):
         away = sequence.truth.camera.c2w[:, 3] - TARGET
         for age, frame in enumerate(sequence.buffer.frames, 1):
             then = frame.camera.c2w[:, 3] - TARGET
             turn = torch.rad2deg(torch.acos(torch.cosine_similarity(away, then, dim=0)))
             assert turn.item() == pytest.approx(2.0 * age, rel=0.05)  # the bend makes it shorter
+
+
+def test_a_sequence_goes_on_there_and_back_to_its_view(ball_scene: Scene) -> None:
+    motion = MotionOptions(degrees=(2.0, 2.0), pool=1, uses=1, length=4, longer=0.999)
+    pool = new_pool(ball_scene, motion)
+    drawn = [pool.draw() for _ in range(12)]
+    assert len({id(sequence.truth) for sequence in drawn}) == 1
+    centre = drawn[0].truth.camera.c2w[:, 3]
+    for before, after in pairwise(drawn):
+        frames = after.buffer.turn - before.buffer.turn
+        assert frames in (1, 2, 4)  # the view, and if the camera leaves it, out and back
+        moved = (after.buffer.frames[0].camera.c2w[:, 3] - centre).norm().item()
+        step = 2 * (centre - TARGET).norm().item() * math.sin(math.radians(1.0))
+        assert moved == pytest.approx(0.0 if frames == 1 else step, rel=0.02, abs=1e-6)
+
+
+def test_going_on_leaves_what_was_drawn_before_as_it_was(ball_scene: Scene) -> None:
+    pool = new_pool(ball_scene, MotionOptions(pool=1, uses=1, length=3, longer=0.999))
+    first = pool.draw()
+    frames = first.buffer.frames
+    pool.draw()
+    assert first.buffer.frames == frames
 
 
 def test_cells_are_those_in_which_something_is(ball_scene: Scene) -> None:
