@@ -74,6 +74,20 @@ def scale_camera(camera: Camera, width: int, height: int) -> Camera:
     )
 
 
+def frame_camera(camera: Camera, width: int, height: int) -> Camera:
+    """The view on a grid of `width` x `height`: as much from top to bottom, more or less aside."""
+    zoom = height / camera.height
+    return replace(
+        camera,
+        fx=camera.fx * zoom,
+        fy=camera.fy * zoom,
+        cx=width / 2 + (camera.cx - camera.width / 2) * zoom,
+        cy=camera.cy * zoom,
+        width=width,
+        height=height,
+    )
+
+
 def crop_camera(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
     """The camera of the `width` x `height` pixels whose first is column `left`, row `top`."""
     return replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=width, height=height)

@@ -46,6 +46,7 @@ COMMANDS = (
     "kernels",
     "parity",
     "skips",
+    "scaling",
     "check",
     "compare",
     "scenes",
@@ -179,6 +180,19 @@ def _parser() -> Parser:
         )
         variants.add_argument("overrides", nargs="*", help="settings as of `steerbench run`")
         variants.set_defaults(module=name, parser=variants)
+
+    scaling = commands.add_parser(
+        "scaling",
+        help="how a frame's time and memory grow with its size, L, K, T and threads",
+        description="Render the first steady frames of a trajectory at several sizes, with several "
+        "numbers of threads, preceding frames (L) and features (K), and lengths of the hash table "
+        "(T), and fit a power of each to time and memory. A field is trained for each T; 2D "
+        "renderers hardly, for what they have learned does not change what they cost.",
+    )
+    scaling.add_argument("--frames", type=int, default=20, help="steady frames each (default 20)")
+    scaling.add_argument("--plot", type=Path, metavar="FILE.png", help="draw it, too")
+    scaling.add_argument("overrides", nargs="*", help="settings as of `steerbench run`")
+    scaling.set_defaults(module="scaling", parser=scaling)
 
     check = commands.add_parser(
         "check",

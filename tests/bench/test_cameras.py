@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from bench.cameras import (
     cast,
     crop_camera,
+    frame_camera,
     look_at,
     move_camera,
     pixel_grid,
@@ -95,6 +96,20 @@ def test_a_cropped_pixel_keeps_its_ray() -> None:
     whole = cast(camera).directions.reshape(36, 52, 3)
     part = cast(crop_camera(camera, left=5, top=7, width=20, height=11)).directions
     torch.testing.assert_close(part.reshape(11, 20, 3), whole[7:18, 5:25], rtol=0, atol=4 * FLOAT32)
+
+
+def test_a_wider_frame_shows_the_same_in_its_middle() -> None:
+    camera = camera_at((2.0, 2.0, 2.0))
+    wide = frame_camera(camera, 52 + 2 * 20, 36)
+    whole = cast(wide).directions.reshape(36, 92, 3)
+    middle = cast(camera).directions.reshape(36, 52, 3)
+    torch.testing.assert_close(whole[:, 20:-20], middle, rtol=0, atol=4 * FLOAT32)
+
+
+def test_a_larger_frame_of_the_same_shape_is_the_camera_scaled() -> None:
+    camera = camera_at((2.0, 2.0, 2.0))
+    large = frame_camera(camera, 104, 72)
+    assert large == scale_camera(camera, 104, 72)
 
 
 def test_moving_camera_and_points_alike_keeps_pixels_and_scales_depth() -> None:

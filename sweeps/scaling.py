@@ -1,0 +1,174 @@
+"""`steerbench scaling`: how time and memory of a frame grow with its size, L, K, T and threads."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import DictConfig
+
+from bench.cameras import frame_camera
+from bench.console import ConsoleLog
+from bench.errors import SteerbenchError
+from bench.results import COLD, Measurement, explained
+from bench.run import measure
+from bench.trajectories import Step
+from bench.types import Log, Scene
+from reports.figures import growth_panels
+from reports.tables import Table, megabytes, number
+from sweeps.build import build
+from sweeps.measurement import checked_settings
+from sweeps.overrides import composed
+from sweeps.terminal import console, rich_table
+
+SETTINGS = ("method=steernerf", "trajectory=smooth", "budget.renderer_steps=8")
+"""What a 2D renderer has learned does not change what it costs."""
+
+SIZES = ((200, 200), (400, 400), (800, 800), (1920, 1080), (3840, 2160))
+
+COLUMNS = ("", "ms / frame ↓", "p99 / p50 ↓", "FPS ↑", "field samples", "peak, MB ↓", "model, MB ↓")
+
+
+@dataclass(frozen=True)
+class Point:
+    """One measurement.
+
+    Attributes:
+        axis: what is varied.
+        value: of that, in the unit that the cost is fitted over.
+        label: the value as it is shown.
+        settings: that make it, as of `steerbench run`.
+        size: width and height of the frames; None: as the trajectory has them.
+        threads: None: as many as usual.
+    """
+
+    axis: str
+    value: float
+    label: str
+    settings: tuple[str, ...] = ()
+    size: tuple[int, int] | None = None
+    threads: int | None = None
+
+
+def _points() -> Iterator[Point]:
+    for width, height in SIZES:
+        yield Point("pixels", width * height, f"{width} x {height}", size=(width, height))
+    for threads in range(1, torch.get_num_threads() + 1):
+        yield Point("threads", threads, f"{threads}", threads=threads)
+    for frames in (0, 1, 2, 3):
+        yield Point("L", frames, f"L = {frames}", (f"method.pipeline.frames={frames}",))
+    for channels in (3, 6, 9):
+        yield Point("K", channels, f"K = {channels}", (f"method.pipeline.channels={channels}",))
+    for log2 in (14, 16, 17, 19):
+        yield Point("T", 2**log2, f"T = 2^{log2}", (f"method.grid.log2_table={log2}",))
+
+
+def main(options: argparse.Namespace) -> int:
+    """Print a table with the fitted exponents and, as the last line, the rows as JSON."""
+    if options.frames < 1:
+        raise SteerbenchError(f"--frames: expected 1 or more, got {options.frames}")
+    overrides = [*SETTINGS, *options.overrides]
+    config = composed(overrides)
+    settings = checked_settings(config)
+    log = ConsoleLog(Path(settings.outputs))
+    scene = build(config, "scene", log=log)
+    points, rows = list(_points()), []
+    with log.progress("scaling", len(points)) as progress:
+        for point in points:
+            made = composed([*overrides, *point.settings])
+            rows.append(_row(point, _measured(point, made, scene, options.frames, log)))
+            progress.advance(note=point.label)
+    title = f"{config.method.name} on {scene.name}, {options.frames} frames"
+    axes: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        axes.setdefault(row["axis"], []).append(row)
+    lines = [line for of_axis in axes.values() for line in _lines(of_axis)]
+    console().print(rich_table(Table(title, COLUMNS, tuple(lines))))
+    if options.plot is not None:
+        _plot(axes, options.plot)
+        log.info(f"plot: {options.plot}")
+    print(json.dumps(rows))
+    return 0
+
+
+def _measured(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) -> Measurement:
+    """The first steady `frames` of the trajectory, none scored, as large as `point` says."""
+    method = build(config, "method")
+    path = build(config, "trajectory", scene)
+    cameras = [step.camera for step in path.steps[: frames + method.memory]]
+    if point.size:
+        cameras = [frame_camera(camera, *point.size) for camera in cameras]
+    steps = tuple(Step(camera, None) for camera in cameras)
+    protocol = replace(build(config, "protocol"), name="unscored", lpips=())
+    usual = torch.get_num_threads()
+    torch.set_num_threads(point.threads or usual)
+    try:
+        return measure(
+            method,
+            scene,
+            replace(path, steps=steps),
+            protocol,
+            build(config, "budget"),
+            log,
+            seed=config.seed,
+        )
+    finally:
+        torch.set_num_threads(usual)
+
+
+def _row(point: Point, measured: Measurement) -> dict[str, Any]:
+    rows = measured.rows[measured.rows["phase"] != COLD].set_index("metric")["value"]
+    return {
+        "axis": point.axis,
+        "label": point.label,
+        "value": point.value,
+        "frame_ms": rows["frame_ms.p50"],
+        "p99_to_p50": rows["frame_ms.p99"] / rows["frame_ms.p50"],
+        "samples": rows["work.samples"] + rows.get("work.surface_samples", 0.0),
+        "peak_bytes": rows["peak_bytes"],
+        "size_bytes": rows["size_bytes.total"],
+    }
+
+
+def _lines(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
+    """The rows of one axis, and below them how fast each figure grows."""
+    lines = [
+        (
+            row["label"],
+            number(row["frame_ms"], 1),
+            number(row["p99_to_p50"], 2),
+            number(1e3 / row["frame_ms"], 2),
+            number(row["samples"], 0),
+            megabytes(row["peak_bytes"]),
+            megabytes(row["size_bytes"]),
+        )
+        for row in rows
+    ]
+    exponents = [growth(rows, name) for name in ("frame_ms", "samples", "peak_bytes", "size_bytes")]
+    ms, samples, peak, size = (number(exponent, 2) for exponent in exponents)
+    return [*lines, (f"exponent of {rows[0]['axis']}", ms, "", "", samples, peak, size)]
+
+
+def _plot(axes: Mapping[str, Sequence[dict[str, Any]]], path: Path) -> None:
+    figures = {"frame_ms": "ms / frame", "peak_bytes": "peak memory, bytes"}
+    exponents = {(axis, key): growth(axes[axis], key) for axis in axes for key in figures}
+    with explained(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        growth_panels(axes, figures, exponents, path)
+
+
+def growth(rows: Sequence[dict[str, Any]], figure: str) -> float:
+    """The exponent p of `figure` ~ value^p, a least-squares line through the logarithms; nan if
+    there are fewer than two values above 0."""
+    points = [(row["value"], row[figure]) for row in rows if row["value"] > 0 and row[figure] > 0]
+    if len({value for value, _ in points}) < 2:
+        return math.nan
+    value, of = np.log(np.array(points)).T
+    return float(np.polyfit(value, of, 1)[0])

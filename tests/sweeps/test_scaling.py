@@ -1,0 +1,26 @@
+"""`steerbench scaling`: the exponents it fits."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sweeps.scaling import growth
+
+
+@given(power=st.floats(-3, 3), factor=st.floats(1e-3, 1e3))
+def test_the_exponent_of_a_power_is_found(power: float, factor: float) -> None:
+    rows = [{"value": value, "ms": factor * value**power} for value in (1.0, 4.0, 9.0, 100.0)]
+    assert growth(rows, "ms") == pytest.approx(power, abs=1e-9)
+
+
+def test_a_value_of_0_is_left_out() -> None:
+    rows = [{"value": value, "ms": 5.0 + value} for value in (0.0, 1.0, 7.0)]
+    assert growth(rows, "ms") == pytest.approx(math.log(2) / math.log(7))
+
+
+def test_a_single_value_has_no_exponent() -> None:
+    assert math.isnan(growth([{"value": 2.0, "ms": 1.0}, {"value": 2.0, "ms": 2.0}], "ms"))
