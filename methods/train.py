@@ -26,6 +26,9 @@ KERNELS = ("adam", "composite", "encode", "march", "spherical")
 SOURCES = ("checkpoint", "fields", "loop", "occupancy", "optimise", "train", "volume")
 """Modules beside this one that decide what a training of a field results in."""
 
+UNUSED = ("cases", "stress")
+"""Modules of a kernel that no training runs through."""
+
 MIN_RAYS = 64
 """Fewest rays of a step."""
 
@@ -211,7 +214,7 @@ def training_digest() -> str:
     sources = [methods / f"{name}.py" for name in SOURCES]
     kernels = methods / "kernels"
     sources += [kernels / "dispatch.py", kernels / "cpu.py"]
-    sources += [p for k in KERNELS for p in (kernels / k).glob("*.py") if p.stem != "cases"]
+    sources += [p for k in KERNELS for p in (kernels / k).glob("*.py") if p.stem not in UNUSED]
     sources += [bench / "cameras.py", *(bench / "scenes").glob("*.py")]  # pixels and rays
     return digest(sources)
 

@@ -46,6 +46,7 @@ COMMANDS = (
     "kernels",
     "parity",
     "skips",
+    "stress",
     "check",
     "compare",
     "scenes",
@@ -179,6 +180,17 @@ def _parser() -> Parser:
         )
         variants.add_argument("overrides", nargs="*", help="settings as of `steerbench run`")
         variants.set_defaults(module=name, parser=variants)
+
+    stress = commands.add_parser(
+        "stress",
+        help="what must hold where numbers are extreme",
+        description="Run every numerical stress case with every backend, engine and precision that "
+        "it is for; print what must hold, the worst error seen and the largest that is right. "
+        "Exits with 1 if anything fails.",
+    )
+    stress.add_argument("--filter", default="", help="only subjects and cases with this in it")
+    stress.add_argument("--format", choices=["table", "markdown"], default="table")
+    stress.set_defaults(module="stress", parser=stress)
 
     check = commands.add_parser(
         "check",

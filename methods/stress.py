@@ -1,0 +1,14 @@
+"""All stress cases of the methods; each stands beside what it tests."""
+
+from __future__ import annotations
+
+import importlib
+
+from bench.stress import StressCase
+
+CASE_MODULES = ("methods.kernels.composite.stress",)
+
+
+def all_cases() -> list[StressCase]:
+    """The cases of all modules."""
+    return [case for name in CASE_MODULES for case in importlib.import_module(name).cases()]
