@@ -6,7 +6,11 @@ import importlib
 
 from bench.stress import StressCase
 
-CASE_MODULES = ("methods.kernels.composite.stress",)
+CASE_MODULES = (
+    "methods.kernels.composite.stress",
+    "methods.kernels.encode.stress",
+    "methods.kernels.march.stress",
+)
 
 
 def all_cases() -> list[StressCase]:
