@@ -7,9 +7,12 @@ import importlib
 from bench.stress import StressCase
 
 CASE_MODULES = (
+    "bench.camera_stress",
     "methods.kernels.composite.stress",
     "methods.kernels.encode.stress",
     "methods.kernels.march.stress",
+    "methods.kernels.splat.stress",
+    "methods.kernels.warp.stress",
 )
 
 
