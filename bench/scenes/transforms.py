@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import ChainMap
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +13,7 @@ from bench.scenes.bounds import Box
 from bench.scenes.files import (
     data_folder,
     describe,
+    focal_length,
     frames_of,
     inside,
     number,
@@ -140,7 +140,7 @@ def focal(settings: ChainMap, axis: str, size: float, where: str) -> float | Non
         if length in level:
             return number(level[length], f"{where}.{length}", 0)
         if angle in level:
-            return size / 2 / math.tan(number(level[angle], f"{where}.{angle}", 0, math.pi) / 2)
+            return focal_length(level[angle], size, f"{where}.{angle}")
     return None
 
 

@@ -143,3 +143,9 @@ def test_wrong_size_and_truncation_are_named(folder, picture, log) -> None:
     (folder / "rgb" / "2_003.png").write_bytes(b"")
     with pytest.raises(SteerbenchError, match=r"2_003.png: expected a whole picture"):
         nsvf.load(folder, log=log)
+
+
+def test_a_box_beyond_float32_is_refused(folder, log) -> None:
+    (folder / "bbox.txt").write_text("-1 -1 -1 1e308 1 1 0.4\n")
+    with pytest.raises(SteerbenchError, match="bounds: expected lengths that float32 has"):
+        nsvf.load(folder, log=log)
