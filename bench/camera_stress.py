@@ -81,17 +81,17 @@ def cases() -> list[StressCase]:
                 partial(_not_in_front, depths),
             )
         )
-    for side in (1e-6, 1e6):
-        found.append(
-            StressCase(
-                "normalisation",
-                f"a scene {side:g} wide",
-                "rays of the unit cube go through the pixels of the data set's",
-                "the camera's position rounded, projected: 16 (reach + f) u",
-                {("torch", "fp32"): 16 * (32 + 42) * U32},
-                partial(_normalisation_error, side),
-            )
+    found += [
+        StressCase(
+            "normalisation",
+            f"a scene {side:g} wide",
+            "rays of the unit cube go through the pixels of the data set's",
+            "the camera's position rounded, projected: 16 (reach + f) u",
+            {("torch", "fp32"): 16 * (32 + 42) * U32},
+            partial(_normalisation_error, side),
         )
+        for side in (1e-6, 1e6)
+    ]
     found += [
         StressCase(
             "cameras",

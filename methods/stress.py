@@ -13,6 +13,8 @@ CASE_MODULES = (
     "methods.kernels.march.stress",
     "methods.kernels.splat.stress",
     "methods.kernels.warp.stress",
+    "methods.training_stress",
+    "methods.engines.stress",
 )
 
 

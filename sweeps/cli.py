@@ -189,7 +189,12 @@ def _parser() -> Parser:
         "Exits with 1 if anything fails.",
     )
     stress.add_argument("--filter", default="", help="only subjects and cases with this in it")
-    stress.add_argument("--format", choices=["table", "markdown"], default="table")
+    stress.add_argument(
+        "--format",
+        choices=["table", "markdown"],
+        default="table",
+        help="markdown: for a page, a line a case",
+    )
     stress.set_defaults(module="stress", parser=stress)
 
     check = commands.add_parser(

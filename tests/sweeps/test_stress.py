@@ -7,6 +7,7 @@ import json
 import pytest
 
 from bench.stress import StressCase
+from bench.types import Unavailable
 
 
 @pytest.fixture(autouse=True)
@@ -42,6 +43,17 @@ def test_a_filter_that_fits_nothing_is_an_error(steerbench):
     assert "no subject or case has 'quotient' in it" in outcome.err
 
 
-def test_markdown_for_a_page(steerbench):
-    outcome = steerbench("stress", "--format", "markdown")
-    assert outcome.out.startswith("| subject | case |")
+def test_on_a_page_the_cell_nearest_to_its_tolerance_stands_for_a_case(steerbench, monkeypatch):
+    seen = {"cpu": 5e-7, "reference": 4e-7, "gpu": Unavailable("no GPU")}
+    cells = {("cpu", "fp32"): 1e-6, ("reference", "fp32"): 5e-7, ("gpu", "fp32"): 1e-6}
+
+    def worst(backend: str, device: str, precision: str) -> float:
+        if isinstance(seen[backend], Unavailable):
+            raise seen[backend]
+        return seen[backend]
+
+    case = StressCase("sum", "long", "all is there", "of rounding", cells, worst)
+    monkeypatch.setattr("methods.stress.all_cases", lambda: [case])
+    lines = steerbench("stress", "--format", "markdown").out.splitlines()
+    figures = "3 | reference fp32 | 4.0e-07 | 5.0e-07 | ok | of rounding"
+    assert lines[2] == f"| sum | long | all is there | {figures} |"

@@ -165,9 +165,8 @@ def _points_error(
         if 0 <= u < WIDTH and 0 <= v < HEIGHT and 0 < z < math.inf:
             cell = int(v), int(u)
             before = shown.get(cell)
-            if before is None or rule == "last":
-                shown[cell] = point
-            elif (z, u, v) < (depth[before].item(), *pixels[before].tolist()):
+            hidden = before is not None and rule == "nearest"
+            if not hidden or (z, u, v) < (depth[before].item(), *pixels[before].tolist()):
                 shown[cell] = point
     want = torch.full((HEIGHT, WIDTH), -1)
     for cell, point in shown.items():

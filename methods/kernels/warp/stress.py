@@ -23,20 +23,18 @@ BACK = "x, y and w rounded 6 times at the size of the picture, looked up twice: 
 
 def cases() -> list[StressCase]:
     """Same and opposite views, no depth and extreme ones, inside of what is seen, a walk."""
-    found = []
-    for name, camera in CAMERAS.items():
-        reach = max(abs(camera.cx), abs(camera.cy), camera.width, camera.height)
-        for depth in (1e-20, 1.0, 1e20):
-            found.append(
-                _case(
-                    f"same pose, {name}, depth {depth:g}",
-                    "the picture stays what it is",
-                    BACK,
-                    24 * reach + 8,
-                    partial(_same_error, camera, camera, depth, False),
-                    exact=not camera.c2w[:, 3].any(),
-                )
-            )
+    found = [
+        _case(
+            f"same pose, {name}, depth {depth:g}",
+            "the picture stays what it is",
+            BACK,
+            24 * max(abs(camera.cx), abs(camera.cy), camera.width, camera.height) + 8,
+            partial(_same_error, camera, camera, depth, False),
+            exact=not camera.c2w[:, 3].any(),
+        )
+        for name, camera in CAMERAS.items()
+        for depth in (1e-20, 1.0, 1e20)
+    ]
     here = CAMERAS["looking at the cube"]
     found += [
         _case(
@@ -81,17 +79,17 @@ def cases() -> list[StressCase]:
             _enlarged_error,
         ),
     ]
-    for frames in (300, 10_000):
-        found.append(
-            _case(
-                f"{frames:,} frames there and back",
-                "a constant stays what it is, and the rest within its range",
-                "a look-up has 4 roundings, all of which may point the same way: 4 n u",
-                4 * frames,
-                partial(_walk_error, frames),
-                slow=frames > 1000,
-            )
+    found += [
+        _case(
+            f"{frames:,} frames there and back",
+            "a constant stays what it is, and the rest within its range",
+            "a look-up has 4 roundings, all of which may point the same way: 4 n u",
+            4 * frames,
+            partial(_walk_error, frames),
+            slow=frames > 1000,
         )
+        for frames in (300, 10_000)
+    ]
     return found
 
 

@@ -1,0 +1,152 @@
+"""Engines on constants, on what they never saw, and on what is no number."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from bench.console import ConsoleLog
+from bench.stress import StressCase
+from methods.engines import Engine, Inputs, Precision
+from methods.engines.onnxruntime_engine import OnnxRuntime
+from methods.engines.openvino_engine import OpenVino
+from methods.engines.torch_engine import TorchEngine
+from methods.kernels.depthwise import neighbours_of
+from methods.renderer2d import Network
+from methods.space_to_depth import SpaceToDepth
+
+ENGINES: tuple[type[Engine], ...] = (TorchEngine, OpenVino, OnnxRuntime)
+CELLS = [(engine.name, precision) for engine in ENGINES for precision in engine.precisions]
+
+TOLERANCE = {"fp32": 1e-5, "bf16": 0.03, "fp16": 0.03, "int8": 0.1}
+SHARE = (
+    "of the root mean square: fp32 adds hundreds of products in another order; below, numbers are "
+    "rounded by 2^-9, or 1/510 of the range seen, before each of some ten layers"
+)
+
+SIDE, BLOCKS = 16, 6
+"""Cells along a side of the view; blocks of the network, each of which reaches a cell further."""
+
+
+def cases() -> list[StressCase]:
+    """Constants, numbers far beyond those an engine was calibrated on, a cell of NaN."""
+    kinds: tuple[tuple[str, str, str, float | None, Callable[[str, str, str], float]], ...] = (
+        ("all inputs 0", "it says what the network says", SHARE, None, partial(_error, 0.0)),
+        ("all inputs 1/2", "it says what the network says", SHARE, None, partial(_error, 0.5)),
+        ("inputs up to 1e4", "what it says is finite", "it is, or is not: 0", 0.0, _not_finite),
+        (
+            "a cell of NaN",
+            "it is reported, but in int8, and cells out of its reach say what they said",
+            SHARE,
+            None,
+            _spread_of_nan,
+        ),
+    )
+    return [
+        StressCase(
+            "engine",
+            name,
+            holds,
+            derivation,
+            {c: TOLERANCE[c[1]] if tolerance is None else tolerance for c in CELLS},
+            worst,
+            slow=True,  # engines take seconds to build
+        )
+        for name, holds, derivation, tolerance, worst in kinds
+    ] + [
+        StressCase(
+            "engine",
+            "inputs 8 times as large as those seen",
+            "int8 saturates: twice as large, they say the same, number by number",
+            "numbers that differ are counted: 0",
+            {c: 0.0 for c in CELLS if c[1] == "int8"},
+            _not_saturated,
+            slow=True,
+        )
+    ]
+
+
+@cache
+def _network() -> Network:
+    return SpaceToDepth(3, 2, 4).requires_grad_(False).network
+
+
+def _inputs(rows: Tensor) -> Inputs:
+    return rows, neighbours_of(torch.ones(1, SIDE, SIDE, dtype=torch.bool))
+
+
+def _random_rows(seed: int) -> Tensor:
+    """What a view of 16 x 16 cells may look like."""
+    width = _network().enter.in_features  # type: ignore[union-attr]
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(SIDE**2, width, generator=generator) - 0.5  # type: ignore[arg-type]
+
+
+@cache
+def _built(engine: str, device: str, precision: Precision) -> Callable[..., Inputs]:
+    """The network as an engine runs it, calibrated on random views and a constant one.
+
+    Raises:
+        Unavailable: the engine, or its precision, cannot be had on `device`.
+    """
+    chosen = next(kind for kind in ENGINES if kind.name == engine)(precision)
+    chosen.check(torch.device(device))
+    constant = torch.full_like(_random_rows(0), 0.5)
+    views = [_inputs(rows) for rows in (constant, *map(_random_rows, range(3)))]
+    with tempfile.TemporaryDirectory() as folder:
+        log = ConsoleLog(Path(folder), quiet=True)
+        return chosen.build(_network(), lambda: views, lambda: Path(folder), log).run
+
+
+def _said(engine: str, device: str, precision: str, rows: Tensor) -> list[Tensor]:
+    """All that the engine says of `rows`, in float64."""
+    run = _built(engine, device, precision)  # type: ignore[arg-type]
+    with torch.no_grad():
+        return [x.cpu().double().clone() for x in run(*(x.to(device) for x in _inputs(rows)))]
+
+
+def _apart(got: list[Tensor], want: list[Tensor]) -> float:
+    """Root mean square of the difference over that of `want`, of the worst output."""
+    shares = [
+        ((g - w).square().mean() / w.square().mean()).sqrt().item()
+        for g, w in zip(got, want, strict=True)
+    ]
+    return math.inf if any(map(math.isnan, shares)) else max(shares)
+
+
+def _error(value: float, engine: str, device: str, precision: str) -> float:
+    rows = torch.full_like(_random_rows(0), value)
+    with torch.no_grad():
+        want = [x.double() for x in _network()(*_inputs(rows))]
+    return _apart(_said(engine, device, precision, rows), want)
+
+
+def _not_finite(engine: str, device: str, precision: str) -> float:
+    """How many of the numbers said are not finite."""
+    said = _said(engine, device, precision, 2e4 * _random_rows(0))
+    return float(sum((~x.isfinite()).sum() for x in said))
+
+
+def _not_saturated(engine: str, device: str, precision: str) -> float:
+    """How many of the numbers said still change when inputs out of range double."""
+    rows = _random_rows(0).sign() * 4
+    once, twice = (_said(engine, device, precision, factor * rows) for factor in (1, 2))
+    return float(sum((a != b).sum() for a, b in zip(once, twice, strict=True)))
+
+
+def _spread_of_nan(engine: str, device: str, precision: str) -> float:
+    rows = _random_rows(0)
+    want = _said(engine, device, precision, rows)
+    rows[0] = torch.nan
+    got = _said(engine, device, precision, rows)
+    if precision != "int8" and not all(x[0].isnan().all() for x in got):
+        return math.inf
+    cell = torch.arange(SIDE**2)
+    far = (cell // SIDE > BLOCKS) | (cell % SIDE > BLOCKS)
+    return _apart([x[far] for x in got], [x[far] for x in want])
