@@ -34,7 +34,7 @@ paper: install ## measure every table of the SteerNeRF paper, write outputs/pape
 test: lint ## lint, then all tests
 	$(BIN)/python -m pytest
 
-fuzz: install ## loaders and settings on whatever comes, for an hour or so
+fuzz: install ## loaders and settings on whatever comes, for some minutes
 	$(BIN)/python -m pytest --hypothesis-profile=fuzz tests/bench/scenes/test_fuzz.py tests/sweeps/test_fuzz.py
 
 lint: install ## ruff and mypy

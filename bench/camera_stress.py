@@ -17,27 +17,20 @@ U32 = 2.0**-24
 """Unit roundoff of float32."""
 
 IDENTITY = torch.eye(4)[:3]
-EYE = torch.tensor([1.7, -0.8, 1.1])
+ROLL = torch.tensor([[-1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0]])
+EYE, UP = torch.tensor([1.7, -0.8, 1.1]), torch.tensor([0.0, 0.0, 1.0])
 
 CAMERAS = {
     "at the origin": Camera(IDENTITY, 40.0, 40.0, 16.0, 12.0, 32, 24),
     "looking at the cube": Camera(
-        look_at(EYE, torch.full((3,), 0.5), torch.tensor([0.0, 0.0, 1.0])),
-        40.0,
-        42.0,
-        16,
-        12,
-        32,
-        24,
+        look_at(EYE, torch.full((3,), 0.5), UP), 40.0, 42.0, 16.0, 12.0, 32, 24
     ),
     "1 x 1 picture": Camera(IDENTITY, 1.0, 1.0, 0.5, 0.5, 1, 1),
     "4097 x 3 picture": Camera(IDENTITY, 4000.0, 4000.0, 2048.5, 1.5, 4097, 3),
     "principal point off the picture": Camera(IDENTITY, 40.0, 40.0, -500.0, 900.0, 32, 24),
     "focal length 1e-3": Camera(IDENTITY, 1e-3, 1e-3, 16.0, 12.0, 32, 24),
     "focal length 1e6": Camera(IDENTITY, 1e6, 1e6, 16.0, 12.0, 32, 24),
-    "rolled by 180 degrees": Camera(
-        torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))[:3], 40.0, 40.0, 16.0, 12.0, 32, 24
-    ),
+    "rolled by 180 degrees": Camera(ROLL, 40.0, 40.0, 16.0, 12.0, 32, 24),
 }
 
 DEPTHS = (1e-20, 1e-3, 1.0, 1e6, 1e20)
@@ -50,19 +43,18 @@ def cases() -> list[StressCase]:
     for name, camera in CAMERAS.items():
         reach = max(abs(camera.cx), abs(camera.cy), camera.width, camera.height)
         for depth in DEPTHS:
-            if depth < 1 and camera.c2w[:, 3].any():
+            distance, units = _distance(camera), 8 * reach
+            if distance and depth < 1:
                 continue  # nearer than the roundings of where the camera is
-            # A rotated vector is 3 products; the position of the camera is rounded at its size.
-            units = 16 * reach + 8 * max(camera.fx, camera.fy) * (1 + _distance(camera) / depth)
-            if not camera.c2w[:, 3].any():
-                units = 8 * reach
+            if distance:
+                units += 8 * reach + 8 * max(camera.fx, camera.fy) * (1 + distance / depth)
             found.append(
                 StressCase(
                     "projection",
                     f"{name}, depth {depth:g}",
                     "a pixel unprojected and projected is where it was",
-                    "x and x / f rounded 4 times each at the size of the picture: 8 reach u; away "
-                    "from the origin, of a rotation and of the distance, too",
+                    "(u - c) / f and back, 4 roundings each at the size of the picture: 8 reach u; "
+                    "turned, as many more; away from the origin by r, 8 f (1 + r / z) u more",
                     {("torch", "fp32"): units * U32},
                     partial(_round_trip, camera, depth),
                 )
@@ -142,12 +134,11 @@ def _not_in_front(depths: tuple[float, ...], backend: str, device: str, precisio
 
 
 def _normalisation_error(side: float, backend: str, device: str, precision: str) -> float:
-    """A cube of `side` at (100, -200, 300) sides."""
+    """A cube of `side`, as many sides away from the origin as a town is wide in metres."""
     camera = CAMERAS["looking at the cube"]
-    origin = side * torch.tensor([100.0, -200.0, 300.0], dtype=torch.float64)
+    origin = side * torch.tensor([1e4, -2e4, 3e4], dtype=torch.float64)
     given = camera.c2w.double()
     given = torch.cat((given[:, :3], (origin + side * given[:, 3])[:, None]), dim=1)
-    # A data set's positions come rounded to float32, and so do those of the scene.
     moved = move_camera(replace(camera, c2w=given), 1 / side, -origin / side)
     rays = cast(replace(moved, c2w=moved.c2w.to(device)))
     points = (rays.origins + 2 * rays.directions).cpu().double()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -29,7 +30,7 @@ BY = [("reference", "fp32"), ("cpu", "fp32"), ("cpu", "bf16")]
 HOLDS = dict.fromkeys(BY, 0.0)
 BOOLEAN = "it does, or does not: 0"
 
-QUICK = {"grid_samples": 1 << 12, "max_rays": MIN_RAYS}
+QUICK = TrainingOptions(grid_samples=1 << 12, max_rays=MIN_RAYS)
 
 FORGOTTEN_AFTER = math.ceil((LOG_DENSITY_CLAMP - math.log(THRESHOLD)) / -math.log(DECAY))
 """Visits after which a cell that was as dense as can be counts as empty."""
@@ -51,7 +52,7 @@ def cases() -> list[StressCase]:
             f"losses and all that is learned stay finite for {STEPS} steps",
             BOOLEAN,
             HOLDS,
-            partial(_stays_finite, make, TrainingOptions(**QUICK)),
+            partial(_stays_finite, make),
         )
         for name, make in data.items()
     ]
@@ -152,17 +153,15 @@ def _training(
     return training
 
 
-def _stays_finite(
-    make: Callable[[], Scene], options: TrainingOptions, backend: str, device: str, precision: str
-) -> float:
-    training = _training(make(), options, backend, device, precision)
+def _stays_finite(make: Callable[[], Scene], backend: str, device: str, precision: str) -> float:
+    training = _training(make(), QUICK, backend, device, precision)
     losses = [training.advance()[""] for _ in range(STEPS)]
     loop.check_finite(training)
     return 0.0 if all(map(math.isfinite, losses)) else math.inf
 
 
 def _keeps_a_good_state(rate: float, backend: str, device: str, precision: str) -> float:
-    options = TrainingOptions(rate=rate, **QUICK)
+    options = replace(QUICK, rate=rate)
     new = partial(_training, _scene(128), options, backend, device, precision)
     with tempfile.TemporaryDirectory() as folder:
         kept, training = Path(folder) / "kept.safetensors", new()
@@ -179,8 +178,7 @@ def _keeps_a_good_state(rate: float, backend: str, device: str, precision: str) 
 
 
 def _reports(value: float, backend: str, device: str, precision: str) -> float:
-    options = TrainingOptions(**QUICK)
-    training = _training(_scene(128), options, backend, device, precision)
+    training = _training(_scene(128), QUICK, backend, device, precision)
     with torch.no_grad():
         training.field.table.fill_(value)
         training.field.repack()

@@ -96,7 +96,7 @@ def read_split(root: Path, split: str, log: Log) -> list[View]:
         pose = opengl_to_opencv(
             rigid_pose(frame.get("transform_matrix"), f"{field}.transform_matrix")
         )
-        camera = Camera(pose.float(), focal, focal, width / 2, height / 2, width, height)
+        camera = Camera(pose, focal, focal, width / 2, height / 2, width, height)
         views.append(View(str(file.relative_to(root)), file, camera))
     return views
 

@@ -27,7 +27,8 @@ bytes can announce more than any machine holds."""
 
 @dataclass(frozen=True)
 class View:
-    """A picture that a data set describes: `camera` in the data set's units, OpenCV axes.
+    """A picture that a data set describes: `camera` in the data set's units, OpenCV axes, float64,
+    because a scene may lie far from its data set's origin.
 
     `distortion` is (k1, k2, p1, p2, k3) of OpenCV's lens model, empty for a pinhole.
     """

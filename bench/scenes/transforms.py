@@ -127,7 +127,7 @@ def read_camera(settings: ChainMap, pose: torch.Tensor, file: Path, where: str) 
     fy = focal(settings, "y", height, where) or fx
     cx = number(settings.get("cx", width / 2), f"{where}.cx", 0, width)
     cy = number(settings.get("cy", height / 2), f"{where}.cy", 0, height)
-    return Camera(pose.float(), fx, fy, cx, cy, int(width), int(height))
+    return Camera(pose, fx, fy, cx, cy, int(width), int(height))
 
 
 def focal(settings: ChainMap, axis: str, size: float, where: str) -> float | None:

@@ -18,7 +18,6 @@ from methods.engines.onnxruntime_engine import OnnxRuntime
 from methods.engines.openvino_engine import OpenVino
 from methods.engines.torch_engine import TorchEngine
 from methods.kernels.depthwise import neighbours_of
-from methods.renderer2d import Network
 from methods.space_to_depth import SpaceToDepth
 
 ENGINES: tuple[type[Engine], ...] = (TorchEngine, OpenVino, OnnxRuntime)
@@ -73,8 +72,9 @@ def cases() -> list[StressCase]:
 
 
 @cache
-def _network() -> Network:
-    return SpaceToDepth(3, 2, 4).requires_grad_(False).network
+def _renderer() -> SpaceToDepth:
+    """With the weights that come with the package."""
+    return SpaceToDepth(3, 2, 4).requires_grad_(False)
 
 
 def _inputs(rows: Tensor) -> Inputs:
@@ -83,9 +83,8 @@ def _inputs(rows: Tensor) -> Inputs:
 
 def _random_rows(seed: int) -> Tensor:
     """What a view of 16 x 16 cells may look like."""
-    width = _network().enter.in_features  # type: ignore[union-attr]
     generator = torch.Generator().manual_seed(seed)
-    return torch.rand(SIDE**2, width, generator=generator) - 0.5  # type: ignore[arg-type]
+    return torch.rand(SIDE**2, _renderer().layout.width, generator=generator) - 0.5
 
 
 @cache
@@ -101,7 +100,7 @@ def _built(engine: str, device: str, precision: Precision) -> Callable[..., Inpu
     views = [_inputs(rows) for rows in (constant, *map(_random_rows, range(3)))]
     with tempfile.TemporaryDirectory() as folder:
         log = ConsoleLog(Path(folder), quiet=True)
-        return chosen.build(_network(), lambda: views, lambda: Path(folder), log).run
+        return chosen.build(_renderer().network, lambda: views, lambda: Path(folder), log).run
 
 
 def _said(engine: str, device: str, precision: str, rows: Tensor) -> list[Tensor]:
@@ -123,7 +122,7 @@ def _apart(got: list[Tensor], want: list[Tensor]) -> float:
 def _error(value: float, engine: str, device: str, precision: str) -> float:
     rows = torch.full_like(_random_rows(0), value)
     with torch.no_grad():
-        want = [x.double() for x in _network()(*_inputs(rows))]
+        want = [x.double() for x in _renderer().network(*_inputs(rows))]
     return _apart(_said(engine, device, precision, rows), want)
 
 

@@ -34,19 +34,18 @@ def cases() -> list[StressCase]:
             partial(_frame_error, camera, camera, lambda own: own),
         )
         for name, camera in CAMERAS.items()
-        if name != "focal length 1e-3"  # where a pixel spans 89 degrees, and u is rounded by half
     ]
     here = CAMERAS["looking at the cube"]
     found += [
         _case(
             "turned by 180 degrees",
             "nothing is seen",
-            partial(_frame_error, here, _rotated(here, TURNED), lambda own: -torch.ones_like(own)),
+            partial(_frame_error, here, rotated(here, TURNED), lambda own: -torch.ones_like(own)),
         ),
         _case(
             "rolled by 180 degrees",
             "every pixel is opposite",
-            partial(_frame_error, here, _rotated(here, ROLLED), lambda own: own.flip(0, 1)),
+            partial(_frame_error, here, rotated(here, ROLLED), lambda own: own.flip(0, 1)),
         ),
         _case(
             "rigid motion of scene and cameras",
@@ -80,7 +79,7 @@ def _case(name: str, holds: str, worst: Callable[[str, str, str], float]) -> Str
     )
 
 
-def _rotated(camera: Camera, rotation: Tensor) -> Camera:
+def rotated(camera: Camera, rotation: Tensor) -> Camera:
     """The camera turned about its own axes."""
     c2w = torch.cat((camera.c2w[:, :3] @ rotation, camera.c2w[:, 3:]), dim=1)
     return replace(camera, c2w=c2w)

@@ -15,7 +15,7 @@ from bench.cameras import look_at, pixel_grid
 from bench.stress import StressCase
 from bench.types import Camera
 from methods.kernels.case import DTYPES, on_backends
-from methods.kernels.splat.stress import ROLLED, TURNED, _rotated
+from methods.kernels.splat.stress import ROLLED, TURNED, rotated
 from methods.kernels.warp import enlarge, warp
 
 BACK = "x, y and w rounded 6 times at the size of the picture, looked up twice: 24 reach + 8 u"
@@ -42,7 +42,7 @@ def cases() -> list[StressCase]:
             "the picture stands on its head",
             BACK,
             24 * 32 + 8,
-            partial(_same_error, here, _rotated(here, ROLLED), 1.0, True),
+            partial(_same_error, here, rotated(here, ROLLED), 1.0, True),
             exact=False,
         ),
         _case(
@@ -55,7 +55,7 @@ def cases() -> list[StressCase]:
         *(
             _case(name, "nothing is known", "comparisons: 0", 0, partial(_seen, there, depth))
             for name, there, depth in (
-                ("turned by 180 degrees", _rotated(here, TURNED), 1.0),
+                ("turned by 180 degrees", rotated(here, TURNED), 1.0),
                 ("depth inf", here, math.inf),
                 ("depth NaN", here, math.nan),
                 ("depth 0", here, 0.0),
