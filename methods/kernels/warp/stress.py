@@ -67,14 +67,15 @@ def cases() -> list[StressCase]:
         _case(
             "camera inside the object",
             "what is known is what float64 says",
-            "as at the same pose, where the depth is as small as the motion: 96 reach u",
-            96 * 32,
+            "24 reach u as at the same pose, twice that with an offset as large as what it is added "
+            "to, in a picture that rises by 1 over its width, and looked up: 56 u",
+            56,
             _inside_error,
         ),
         _case(
             "enlarged depth of inf, NaN, 1e20 and 1",
             "finite only where a neighbour is, and one of them",
-            "neighbours farther apart than the tolerance do not mix: 8 u of 1e20 is its own size",
+            "depths that far apart do not mix; a mean of one has 8 roundings: 8 u",
             8,
             _enlarged_error,
         ),

@@ -6,6 +6,7 @@ import copy
 import io
 import json
 import math
+import resource
 import struct
 import warnings
 import zlib
@@ -130,6 +131,14 @@ def headers(draw: st.DrawFn) -> bytes:
         struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
         for kind, body in chunks
     )
+
+
+@pytest.fixture(autouse=True)
+def within_a_gigabyte() -> Iterator[None]:
+    """No test makes the process grow by 1 GiB at its peak."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # KiB
+    yield
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1 << 20
 
 
 @pytest.fixture(scope="module")
