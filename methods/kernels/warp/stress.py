@@ -67,8 +67,8 @@ def cases() -> list[StressCase]:
         _case(
             "camera inside the object",
             "what is known is what float64 says",
-            "24 reach u as at the same pose, twice that with an offset as large as what it is added "
-            "to, in a picture that rises by 1 over its width, and looked up: 56 u",
+            "24 reach u as at the same pose, twice with an offset as large as what it is added to, "
+            "in a picture that rises by 1 over its width, and looked up: 56 u",
             56,
             _inside_error,
         ),
