@@ -66,12 +66,13 @@ def _settings(argv: Sequence[str]) -> list[str]:
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
         config = OmegaConf.to_container(compose("run", overrides=choices), resolve=False)
     assert isinstance(config, dict)
-    return [*groups, *_leaves(config)]
+    return [*groups, *leaves(config)]
 
 
-def _leaves(config: Mapping, prefix: str = "") -> Iterator[str]:
+def leaves(config: Mapping, prefix: str = "") -> Iterator[str]:
+    """The names of all settings in `config`, with dots between the levels."""
     for key, value in config.items():
         if isinstance(value, dict):
-            yield from _leaves(value, f"{prefix}{key}.")
+            yield from leaves(value, f"{prefix}{key}.")
         elif not key.startswith("_"):
             yield f"{prefix}{key}"

@@ -10,10 +10,10 @@ from omegaconf import OmegaConf
 
 from bench.errors import SteerbenchError
 from sweeps.build import build
-from sweeps.overrides import CONFIGS, _leaves, composed
+from sweeps.overrides import CONFIGS, composed, leaves
 
 GROUPS = {path.name for path in CONFIGS.iterdir() if path.is_dir()}
-KEYS = sorted({*_leaves(OmegaConf.to_container(composed(["method=steernerf"]))), *GROUPS})
+KEYS = sorted({*leaves(OmegaConf.to_container(composed(["method=steernerf"]))), *GROUPS})
 SOME = (
     "|null|true|nan|inf|-1|0|0.0|1e400|1e-400|[]|{}|[1,2]|{a:1}|abc|'|\"|${seed}|${nothing}|${seed|["
     "|\0|steernerf|a,b"
