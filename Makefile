@@ -8,7 +8,7 @@
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help install demo paper test lint format clean
+.PHONY: help install demo paper test fuzz lint format clean
 
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -33,6 +33,9 @@ paper: install ## measure every table of the SteerNeRF paper, write outputs/pape
 
 test: lint ## lint, then all tests
 	$(BIN)/python -m pytest
+
+fuzz: install ## loaders and settings on whatever comes, for some minutes
+	$(BIN)/python -m pytest --hypothesis-profile=fuzz tests/bench/scenes/test_fuzz.py tests/sweeps/test_fuzz.py
 
 lint: install ## ruff and mypy
 	$(BIN)/ruff check .

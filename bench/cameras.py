@@ -94,9 +94,13 @@ def crop_camera(camera: Camera, left: int, top: int, width: int, height: int) ->
 
 
 def move_camera(camera: Camera, scale: float, offset: Tensor) -> Camera:
-    """The same view after every world point x became scale * x + offset (`offset` [3])."""
-    centre = scale * camera.c2w[:, 3:].double() + offset.to(camera.c2w.device).double()[:, None]
-    return replace(camera, c2w=torch.cat((camera.c2w[:, :3], centre.float()), dim=1))
+    """The same view after every world point x became scale * x + offset (`offset` [3]).
+
+    Computed in float64: what lies far from its origin keeps the digits that `camera.c2w` has.
+    """
+    pose = camera.c2w.double()
+    centre = scale * pose[:, 3:] + offset.to(pose)[:, None]
+    return replace(camera, c2w=torch.cat((pose[:, :3], centre), dim=1).float())
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:

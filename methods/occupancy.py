@@ -18,7 +18,7 @@ from torch import Tensor
 
 from bench.cameras import project
 from bench.types import Camera
-from methods.fields import HashField
+from methods.fields import LOG_DENSITY_CLAMP, HashField
 from methods.kernels.march import BRICK, MAX_SAMPLES, Occupancy
 
 RESOLUTION = 128
@@ -34,6 +34,9 @@ DECAY = 0.8
 MIN_ALPHA = 0.01
 THRESHOLD = MIN_ALPHA / STEP
 INITIAL = 1.2 * THRESHOLD
+
+LARGEST = math.exp(LOG_DENSITY_CLAMP)
+"""A cell that was denser is remembered as this and can be forgotten: infinity does not decay."""
 
 MIN_VIEWS = 2
 """Training cameras that must see a place before anything is believed to be there."""
@@ -97,7 +100,7 @@ class DensityGrid:
             corner = torch.stack(torch.unravel_index(part, self.density.shape), dim=-1)
             jitter = torch.rand(len(part), 3, generator=generator, device=part.device)
             sigma, _ = field.density((corner + jitter) / RESOLUTION)
-            found.scatter_reduce_(0, part, sigma, "amax")
+            found.scatter_reduce_(0, part, sigma.clamp(max=LARGEST), "amax")
         found = found.view_as(self.density)
         visited = torch.maximum(DECAY * self.density, found)
         self.density = torch.where(found >= 0, visited, self.density)

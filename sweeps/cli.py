@@ -47,6 +47,7 @@ COMMANDS = (
     "parity",
     "skips",
     "scaling",
+    "stress",
     "check",
     "compare",
     "scenes",
@@ -193,6 +194,22 @@ def _parser() -> Parser:
     scaling.add_argument("--plot", type=Path, metavar="FILE.png", help="draw it, too")
     scaling.add_argument("overrides", nargs="*", help="settings as of `steerbench run`")
     scaling.set_defaults(module="scaling", parser=scaling)
+
+    stress = commands.add_parser(
+        "stress",
+        help="what must hold where numbers are extreme",
+        description="Run every numerical stress case with every backend, engine and precision that "
+        "it is for; print what must hold, the worst error seen and the largest that is right. "
+        "Exits with 1 if anything fails.",
+    )
+    stress.add_argument("--filter", default="", help="only subjects and cases with this in it")
+    stress.add_argument(
+        "--format",
+        choices=["table", "markdown"],
+        default="table",
+        help="markdown: for a page, a line a case",
+    )
+    stress.set_defaults(module="stress", parser=stress)
 
     check = commands.add_parser(
         "check",

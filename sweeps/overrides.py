@@ -4,13 +4,13 @@ them."""
 from __future__ import annotations
 
 import re
+import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
-from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from bench.errors import SteerbenchError
 from sweeps.names import unknown
@@ -27,11 +27,20 @@ def composed(overrides: Sequence[str], **options: bool) -> DictConfig:
     try:
         with initialize_config_dir(str(CONFIGS), version_base="1.3"):
             return compose("run", overrides=list(overrides), **options)
-    except (HydraException, OmegaConfBaseException) as error:
+    except Exception as error:
+        if not of_hydra(error):
+            raise
         raise explain(error, overrides) from error
 
 
-def explain(error: HydraException | OmegaConfBaseException, argv: Sequence[str]) -> SteerbenchError:
+def of_hydra(error: Exception) -> bool:
+    """Whether Hydra raised it. Its own exceptions are not all: some of the wrong things that can be
+    typed (budget=0.0) it answers with a ValueError or with what its parser stumbled over."""
+    *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
+    return innermost.f_globals["__name__"].partition(".")[0] in ("hydra", "omegaconf", "antlr4")
+
+
+def explain(error: Exception, argv: Sequence[str]) -> SteerbenchError:
     """Translate an error of Hydra's; names that do not exist come with the nearest that do."""
     if isinstance(error, OverrideParseException):
         return SteerbenchError(
@@ -52,20 +61,18 @@ def explain(error: HydraException | OmegaConfBaseException, argv: Sequence[str])
 def _settings(argv: Sequence[str]) -> list[str]:
     """All that can be set, given the choices (scene=blender) in `argv`."""
     groups = [path.name for path in CONFIGS.iterdir() if path.is_dir()]
-    choices = [
-        argument
-        for argument in argv
-        if (CONFIGS / f"{argument.replace('=', '/', 1)}.yaml").is_file()
-    ]
+    there = {str(path.relative_to(CONFIGS))[:-5] for path in CONFIGS.glob("*/*.yaml")}
+    choices = [argument for argument in argv if argument.replace("=", "/", 1) in there]
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
         config = OmegaConf.to_container(compose("run", overrides=choices), resolve=False)
     assert isinstance(config, dict)
-    return [*groups, *_leaves(config)]
+    return [*groups, *leaves(config)]
 
 
-def _leaves(config: Mapping, prefix: str = "") -> Iterator[str]:
+def leaves(config: Mapping, prefix: str = "") -> Iterator[str]:
+    """The names of all settings in `config`, with dots between the levels."""
     for key, value in config.items():
         if isinstance(value, dict):
-            yield from _leaves(value, f"{prefix}{key}.")
+            yield from leaves(value, f"{prefix}{key}.")
         elif not key.startswith("_"):
             yield f"{prefix}{key}"

@@ -8,13 +8,11 @@ from collections.abc import Sequence
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
 
 from sweeps.announced import Announced
-from sweeps.overrides import CONFIGS, explain
+from sweeps.overrides import CONFIGS, explain, of_hydra
 
 
 def main(argv: Sequence[str]) -> int:
@@ -61,12 +59,12 @@ def _launch(argv: Sequence[str]) -> Exception | None:
 
     try:
         hydra.main(str(CONFIGS), "run", version_base="1.3")(job)()
-    except (HydraException, OmegaConfBaseException) as error:
+    except Exception as error:
+        if not of_hydra(error):
+            return error
         explained = explain(error, argv)
         explained.__cause__ = error
         return explained
-    except Exception as error:
-        return error
     return failures[0] if failures else None
 
 

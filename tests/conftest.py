@@ -25,6 +25,7 @@ from bench.trajectories import from_split
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene, Split
 
 hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True)
+hypothesis.settings.register_profile("fuzz", max_examples=10_000, deadline=5000)  # ms; no hang
 hypothesis.settings.load_profile("repeatable")
 
 DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]

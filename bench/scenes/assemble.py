@@ -16,6 +16,9 @@ from bench.types import Log, Scene, Split, SteerbenchError
 
 BACKGROUNDS = {"white": 1.0, "black": 0.0}
 
+SMALLEST, LARGEST = torch.finfo(torch.float32).tiny, torch.finfo(torch.float32).max
+"""Lengths that float32 has at its full precision."""
+
 
 def decode_splits(
     views: Mapping[str, Sequence[View]], downscale: int, log: Log
@@ -41,10 +44,12 @@ def assemble(
 
     The digest covers the bytes of `camera_files` and of all picture files, the background, the
     resolution and the place of the box.
+    Raises SteerbenchError where the box, or a camera in its units, is beyond float32.
     """
     if background not in BACKGROUNDS:
         names = " or ".join(BACKGROUNDS)
         raise SteerbenchError(f"background: expected {names}, got {background!r}")
+    _check_float32("bounds", [box.side], box.origin.tolist())
     splits = {
         split: Split(
             cameras=[
@@ -56,6 +61,10 @@ def assemble(
         )
         for split in views
     }
+    for part in splits.values():
+        for view, camera in zip(part.names, part.cameras, strict=True):
+            others = [camera.cx, camera.cy, *camera.c2w.flatten().tolist()]
+            _check_float32(view, [camera.fx, camera.fy], others)
     digest = hashlib.sha256(repr((background, box.origin.tolist(), box.side)).encode())
     for path in camera_files:
         digest.update(hashlib.sha256(path.read_bytes()).digest())
@@ -72,3 +81,13 @@ def assemble(
         digest=digest.hexdigest(),
         origin=box.origin.float(),
     )
+
+
+def _check_float32(where: str, lengths: Sequence[float], others: Sequence[float]) -> None:
+    """Raise unless float32 holds all of them, and `lengths` are more than 0 there."""
+    good = all(SMALLEST <= x <= LARGEST for x in lengths) and all(abs(x) <= LARGEST for x in others)
+    if not good:
+        raise SteerbenchError(
+            f"{where}: expected lengths that float32 has, {SMALLEST:.0e} to {LARGEST:.0e}, once "
+            f"the box is the unit cube; got {[*lengths, *others]}: look at the poses and the bounds"
+        )

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 from bench.scenes.assemble import assemble, decode_splits
 from bench.scenes.bounds import Box, cube, hull_box, parse_box
 from bench.scenes.files import (
     data_folder,
+    focal_length,
     frames_of,
     inside,
-    number,
     opengl_to_opencv,
     read_json,
     rigid_pose,
@@ -91,14 +90,13 @@ def read_split(root: Path, split: str, log: Log) -> list[View]:
             f"{fields[missing[0]]}.file_path", "a picture", f"no file {files[missing[0]]}"
         )
     width, height = image_size(files[0])
-    angle = number(record.get("camera_angle_x"), f"{path}: camera_angle_x", 0, math.pi)
-    focal = width / 2 / math.tan(angle / 2)
+    focal = focal_length(record.get("camera_angle_x"), width, f"{path}: camera_angle_x")
     views = []
     for frame, field, file in zip(frames, fields, files, strict=True):
         pose = opengl_to_opencv(
             rigid_pose(frame.get("transform_matrix"), f"{field}.transform_matrix")
         )
-        camera = Camera(pose.float(), focal, focal, width / 2, height / 2, width, height)
+        camera = Camera(pose, focal, focal, width / 2, height / 2, width, height)
         views.append(View(str(file.relative_to(root)), file, camera))
     return views
 

@@ -9,6 +9,7 @@ import torch
 from kornia.geometry.calibration import distort_points
 from kornia.geometry.transform import remap
 from torch import Tensor
+from torch.nn.functional import pad
 
 from bench.cameras import crop_camera, pixel_grid
 from bench.scenes.files import unexpected
@@ -60,7 +61,7 @@ def pinhole_window(
     lens = torch.tensor(coefficients, dtype=torch.float64)
     points = distort_points(pixel_grid(width, height).double(), matrix, lens)
     source = points.reshape(height, width, 2).float()
-    if (area_of_cells(source) <= 0).any():
+    if not (area_of_cells(source) > 0).all():  # nor is what is no number
         raise ValueError("it folds the picture over itself")
     left, top, right, bottom = seen_rectangle(source)
     return source[top:bottom, left:right], left, top
@@ -80,16 +81,25 @@ def seen_rectangle(source: Tensor) -> tuple[int, int, int, int]:
     """
     height, width = source.shape[:2]
     limit = source.new_tensor((width, height)) - 0.5  # last pixel centre: bilinear needs no border
-    unseen = ((source < 0.5) | (source > limit)).any(-1)
+    unseen = ~((source >= 0.5) & (source <= limit)).all(-1)  # what is no number, too
+    # A summed-area table: every side of every rectangle costs the same.
+    table = pad(unseen.int(), (1, 0, 1, 0)).cumsum(0).cumsum(1).numpy()
+
+    def share(left: int, top: int, right: int, bottom: int) -> float:
+        count = table[bottom, right] - table[top, right] - table[bottom, left] + table[top, left]
+        return count / ((right - left) * (bottom - top))
+
     left, top, right, bottom = 0, 0, width, height
     while left < right and top < bottom:
-        part = unseen[top:bottom, left:right].float()
-        shares = torch.stack(
-            (part[:, 0].mean(), part[0].mean(), part[:, -1].mean(), part[-1].mean())
-        )
-        if not part.any():
+        if not share(left, top, right, bottom):
             return left, top, right, bottom
-        worst = int(shares.argmax())
+        shares = (
+            share(left, top, left + 1, bottom),
+            share(left, top, right, top + 1),
+            share(right - 1, top, right, bottom),
+            share(left, bottom - 1, right, bottom),
+        )
+        worst = shares.index(max(shares))
         left, top = left + (worst == 0), top + (worst == 1)
         right, bottom = right - (worst == 2), bottom - (worst == 3)
     raise ValueError("it leaves no pixel")

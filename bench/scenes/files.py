@@ -16,6 +16,9 @@ from torch import Tensor
 
 from bench.types import SteerbenchError
 
+SMALLEST_ANGLE = 1e-9
+"""Of a view, in radians: less than any telescope's, and its tangent is not 0."""
+
 ORTHONORMAL_TOLERANCE = 1e-3
 """Largest entry of R^T R - I: poses are stored with three digits or more."""
 
@@ -96,6 +99,11 @@ def number(value: object, where: str, low: float = -math.inf, high: float = math
     raise unexpected(
         where, " ".join(("a finite number", " and ".join(limits))).rstrip(), describe(value)
     )
+
+
+def focal_length(angle: object, size: float, where: str) -> float:
+    """In pixels, of a view of `angle` radians across `size` pixels."""
+    return size / 2 / math.tan(number(angle, where, SMALLEST_ANGLE, math.pi) / 2)
 
 
 def whole_number(value: object, where: str, low: int) -> int:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,10 +20,15 @@ from bench.scenes.files import unexpected
 from bench.scenes.parallel import in_parallel
 from bench.types import Camera, Log
 
+MOST_PIXELS = 1 << 26
+"""Of a picture: decoded, converted and copied it takes 12 bytes a pixel, 0.8 GB. A header of a few
+bytes can announce more than any machine holds."""
+
 
 @dataclass(frozen=True)
 class View:
-    """A picture that a data set describes: `camera` in the data set's units, OpenCV axes.
+    """A picture that a data set describes: `camera` in the data set's units, OpenCV axes, float64,
+    because a scene may lie far from its data set's origin.
 
     `distortion` is (k1, k2, p1, p2, k3) of OpenCV's lens model, empty for a pinhole.
     """
@@ -42,13 +48,27 @@ class Picture:
     sha256: str
 
 
+@contextmanager
+def opened(source: Path | io.BytesIO, where: Path) -> Iterator[Image.Image]:
+    """The picture in `source`, of which nothing but the header was read yet.
+
+    Raises:
+        SteerbenchError: it is none, or too large, or turns out to be damaged while it is used.
+    """
+    try:
+        with Image.open(source) as image:
+            if image.width * image.height > MOST_PIXELS:
+                size = f"{image.width} x {image.height}"
+                raise unexpected(where, f"a picture of at most {MOST_PIXELS:,} pixels", size)
+            yield image
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise unexpected(where, "a whole picture", error) from error
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height in pixels, from the file's header alone."""
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise unexpected(path, "a picture", error) from error
+    with opened(path, path) as image:
+        return image.size
 
 
 def decode_all(views: Sequence[View], downscale: int, log: Log) -> list[Picture]:
@@ -75,14 +95,11 @@ def decode(view: View, downscale: int) -> Picture:
 
 def decode_bytes(content: bytes, path: Path) -> Tensor:
     """The 8-bit picture in `content` as uint8 [H, W, 3], or [H, W, 4] when it has an alpha."""
-    try:
-        with Image.open(io.BytesIO(content)) as image:
-            if image.mode.startswith(("I", "F")):
-                raise unexpected(path, "8 bits a channel", f"mode {image.mode}")
-            mode = "RGBA" if image.has_transparency_data else "RGB"
-            return torch.from_numpy(np.array(image.convert(mode)))
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise unexpected(path, "a whole picture", error) from error
+    with opened(io.BytesIO(content), path) as image:
+        if image.mode.startswith(("I", "F")):
+            raise unexpected(path, "8 bits a channel", f"mode {image.mode}")
+        mode = "RGBA" if image.has_transparency_data else "RGB"
+        return torch.from_numpy(np.array(image.convert(mode)))
 
 
 def shrink(image: Tensor, camera: Camera, factor: int, where: Path) -> tuple[Tensor, Camera]:

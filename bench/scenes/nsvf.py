@@ -59,7 +59,7 @@ def load(
         camera_files.append(root / relative)
         where = f"{root / relative}"
         pose = rigid_pose(numbers(read_text(root, relative), where), where)
-        camera = Camera(pose.float(), focal_x, focal_y, cx, cy, width, height)
+        camera = Camera(pose, focal_x, focal_y, cx, cy, width, height)
         view = View(f"rgb/{file.name}", file, camera)
         views.setdefault(SPLITS[file.name[0]], []).append(view)
     if "test" not in views and "val" in views:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import ChainMap
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +13,7 @@ from bench.scenes.bounds import Box
 from bench.scenes.files import (
     data_folder,
     describe,
+    focal_length,
     frames_of,
     inside,
     number,
@@ -127,7 +127,7 @@ def read_camera(settings: ChainMap, pose: torch.Tensor, file: Path, where: str) 
     fy = focal(settings, "y", height, where) or fx
     cx = number(settings.get("cx", width / 2), f"{where}.cx", 0, width)
     cy = number(settings.get("cy", height / 2), f"{where}.cy", 0, height)
-    return Camera(pose.float(), fx, fy, cx, cy, int(width), int(height))
+    return Camera(pose, fx, fy, cx, cy, int(width), int(height))
 
 
 def focal(settings: ChainMap, axis: str, size: float, where: str) -> float | None:
@@ -140,7 +140,7 @@ def focal(settings: ChainMap, axis: str, size: float, where: str) -> float | Non
         if length in level:
             return number(level[length], f"{where}.{length}", 0)
         if angle in level:
-            return size / 2 / math.tan(number(level[angle], f"{where}.{angle}", 0, math.pi) / 2)
+            return focal_length(level[angle], size, f"{where}.{angle}")
     return None
 
 

@@ -1,8 +1,9 @@
 """A case: inputs on which every backend of a kernel must agree with the reference.
 
-The cases of a kernel stand in its `cases.py`, once, and serve the tests, the benchmark and, where
-they are numerically hard, the stress table. Tolerances are derived from the arithmetic, in terms of
-the unit roundoff u of the type that the result is computed in, and stated beside the case.
+The cases of a kernel stand in its `cases.py`, once, and serve the tests and the benchmark; what is
+held against exact answers at the extremes stands in its `stress.py`. Tolerances are derived from
+the arithmetic, in terms of the unit roundoff u of the type that the result is computed in, and
+stated beside the case.
 """
 
 from __future__ import annotations
@@ -12,6 +13,13 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+DTYPES = {
+    "fp64": torch.float64,
+    "fp32": torch.float32,
+    "fp16": torch.float16,
+    "bf16": torch.bfloat16,
+}
 
 U32 = 2.0**-24
 """Unit roundoff of float32."""
@@ -50,6 +58,13 @@ class Case:
     items: int
     prepare: Callable[[str], Prepared]
     timed: bool = False
+
+
+def on_backends(units: float, *precisions: str) -> dict[tuple[str, str], float]:
+    """Cells of a `bench.stress.StressCase` that is right to within `units` u: in fp32 by every
+    backend, in further `precisions` by the reference, which alone has them."""
+    cells = [("reference", "fp32"), ("cpu", "fp32"), *(("reference", p) for p in precisions)]
+    return {cell: units * torch.finfo(DTYPES[cell[1]]).eps / 2 for cell in cells}
 
 
 def largest_error(results: tuple[Tensor, ...], reference: tuple[Tensor, ...]) -> float:

@@ -53,7 +53,7 @@ def test_list_says_how_to_get_an_engine_that_is_not_installed(steerbench, monkey
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["resuts"], "unknown command 'resuts'. Did you mean results?"),
+        (["rsults"], "unknown command 'rsults'. Did you mean results?"),
         (["results", "--fromat", "csv"], "unknown argument '--fromat'. Did you mean --format?"),
         (["results", "--format", "cvs"], "invalid choice: 'cvs'"),
         (["kernels", "--repeats", "0"], "--repeats: expected 1 or more, got 0"),

@@ -48,3 +48,11 @@ def test_deleting_what_is_not_there_is_an_error_without_traceback(run):
     assert outcome.status == 2
     assert "'nothing' does not exist" in outcome.err
     assert "Traceback" not in outcome.err
+
+
+@pytest.mark.parametrize("argument", ["budget=0.0", "~budget=0.0", "scene=null"])
+def test_a_choice_that_is_no_name_is_an_error_without_traceback(run, argument):
+    outcome = run(argument)
+    assert outcome.status == 2
+    assert outcome.err.startswith("steerbench: ")
+    assert "Traceback" not in outcome.err

@@ -1,15 +1,23 @@
-"""Compositing with numba: a ray at a time, front to back, stopping where nothing shines through."""
+"""Compositing with numba: a ray at a time, front to back, stopping where nothing shines through.
+
+What a sample takes from the light, the pixel gets: T_{i+1} = T_i - w_i. Light and sums are float64:
+a product of many factors next to 1 in float32 drifts, all of its roundings being the same.
+"""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from numba import njit, prange
 from torch import Tensor
 
 from methods.kernels.composite import Pixels
 from methods.kernels.cpu import f32
+
+CHUNK = 64  # rays
+f64 = np.float64
 
 
 def composite(
@@ -77,35 +85,39 @@ class _Composite(torch.autograd.Function):
 
 
 @njit(cache=True)
-def _thickness(sigma, delta):
+def _opacity(sigma, delta):
     # A sample without length is without matter, however dense: 0, not inf * 0.
-    return sigma * delta if delta > 0 else f32(0)
+    return -math.expm1(-f64(sigma * delta)) if delta > 0 else 0.0
 
 
 @njit(cache=True, parallel=True)
 def _forward(sigma, values, t, delta, offsets, stop, front, out, depth_sum, alpha):
-    channels = values.shape[1]
-    for ray in prange(len(offsets) - 1):
-        transmittance = front[ray]
-        for i in range(offsets[ray], offsets[ray + 1]):
-            if transmittance <= stop:
-                break
-            tau = _thickness(sigma[i], delta[i])
-            weight = transmittance * -f32(math.expm1(-tau))
-            for channel in range(channels):
-                out[ray, channel] += weight * values[i, channel]
-            depth_sum[ray] += weight * t[i]
-            alpha[ray] += weight
-            transmittance *= f32(math.exp(-tau))
+    rays, channels = out.shape
+    for chunk in prange((rays + CHUNK - 1) // CHUNK):
+        sums = np.empty(channels)
+        for ray in range(chunk * CHUNK, min(rays, (chunk + 1) * CHUNK)):
+            sums[:] = out[ray]
+            depth, transmittance = f64(depth_sum[ray]), f64(front[ray])
+            for i in range(offsets[ray], offsets[ray + 1]):
+                if transmittance <= stop:
+                    break
+                weight = transmittance * _opacity(sigma[i], delta[i])
+                for channel in range(channels):
+                    sums[channel] += weight * values[i, channel]
+                depth += weight * t[i]
+                transmittance -= weight
+            out[ray] = sums
+            depth_sum[ray] = depth
+            alpha[ray] += f64(front[ray]) - transmittance
 
 
 @njit(cache=True, parallel=True)
 def _visible(sigma, delta, offsets, stop, counts):
     for ray in prange(len(offsets) - 1):
-        transmittance = f32(1)
+        transmittance = 1.0
         i = offsets[ray]
         while i < offsets[ray + 1] and transmittance > stop:
-            transmittance *= f32(math.exp(-_thickness(sigma[i], delta[i])))
+            transmittance -= transmittance * _opacity(sigma[i], delta[i])
             i += 1
         counts[ray] = i - offsets[ray]
 
@@ -131,12 +143,11 @@ def _backward(
     """
     channels = values.shape[1]
     for ray in prange(len(offsets) - 1):
-        behind = f32(0)  # sum of w_j g_j of samples behind i; first of all samples
-        transmittance = front[ray]
+        behind = 0.0  # sum of w_j g_j of samples behind i; first of all samples
+        transmittance = f64(front[ray])
         end = offsets[ray]
         while end < offsets[ray + 1] and transmittance > stop:
-            tau = _thickness(sigma[end], delta[end])
-            weight = transmittance * -f32(math.expm1(-tau))
+            weight = transmittance * _opacity(sigma[end], delta[end])
             gain = grad_depth[ray] * t[end] + grad_alpha[ray]
             for channel in range(channels):
                 gain += grad_out[ray, channel] * values[end, channel]
@@ -144,12 +155,12 @@ def _backward(
             # Kept until the second pass, which needs every sample's gain and weight again.
             grad_sigma[end] = gain
             behind += weight * gain
-            transmittance *= f32(math.exp(-tau))
+            transmittance -= weight
             end += 1
-        transmittance = front[ray]
+        transmittance = f64(front[ray])
         for i in range(offsets[ray], end):
-            tau = _thickness(sigma[i], delta[i])
             gain = grad_sigma[i]
-            behind -= transmittance * -f32(math.expm1(-tau)) * gain
-            transmittance *= f32(math.exp(-tau))
+            weight = transmittance * _opacity(sigma[i], delta[i])
+            behind -= weight * gain
+            transmittance -= weight
             grad_sigma[i] = delta[i] * (transmittance * gain - behind)

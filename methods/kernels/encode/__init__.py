@@ -99,8 +99,9 @@ def encode(
 ) -> Tensor:
     """Encode `positions` [N, 3] with `table` [entries, F]: [N, levels * F], level by level.
 
-    Positions are clamped to [0, 1]; NaN counts as 0, so that no bad position reaches the memory
-    of another. Differentiable in `table`; in `positions` only with backend="reference".
+    Positions are clamped to [0, 1]. One with a NaN has features that are all NaN, changes no other
+    and has no part in the gradient. Differentiable in `table`; in `positions` only with
+    backend="reference".
 
     Args:
         packed: `pack(table)`, read in place of `table` when given (half the memory traffic;
@@ -117,9 +118,12 @@ def encode(
         check_shape("packed", packed, grid.entries)
     if grad_buffer is not None:
         check_shape("grad_buffer", grad_buffer, grid.entries, grid.features)
-    return implementation("encode", backend, positions.device).encode(
+    features = implementation("encode", backend, positions.device).encode(
         positions, table, grid, packed=packed, grad_buffer=grad_buffer
     )
+    if positions.sum().isnan():  # hardly ever, and one sum tells
+        features = torch.where(positions.isnan().any(dim=1, keepdim=True), torch.nan, features)
+    return features
 
 
 def pack(table: Tensor) -> Tensor:

@@ -22,6 +22,9 @@ from methods.kernels.dispatch import implementation
 MAX_SAMPLES = 1024
 """Most samples of a ray; a step of sqrt(3) / 1024 crosses the unit cube with as many."""
 
+PARALLEL = 2.0**-127
+"""A direction below this lies in the planes of its axis: its reciprocal is no float32."""
+
 BRICK = 4
 """Cells along the side of a brick, the 64 cells of one word of `Occupancy.words`."""
 
@@ -141,7 +144,8 @@ def march(
 ) -> Samples:
     """Sample rays `origins` + t `directions` ([R, 3] each) inside the unit cube.
 
-    Not differentiable. A ray that misses the cube, has no direction or is not finite gets none.
+    Not differentiable. A ray that misses the cube, has no direction, or one too short for
+    its t to be numbers, or is not finite, gets none.
 
     Args:
         step: world length of a step, scene units.

@@ -15,7 +15,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from methods.kernels.cpu import f32
-from methods.kernels.march import Occupancy, Samples
+from methods.kernels.march import PARALLEL, Occupancy, Samples
 
 CHUNK = 64  # rays
 f64 = np.float64
@@ -76,15 +76,21 @@ def march(
 
 
 @njit(cache=True)
+def _slope(direction):
+    """t by length along an axis; 0 for a ray that does not move along it."""
+    return f32(1) / direction if abs(direction) >= PARALLEL else f32(0)
+
+
+@njit(cache=True)
 def _cross(origin, direction, box):
     """Where a ray enters and leaves a box; enter > leave where it misses (slab test)."""
     enter, leave = f32(-np.inf), f32(np.inf)
     for axis in range(3):
-        if direction[axis] == 0:
+        slope = _slope(direction[axis])
+        if slope == 0:
             if origin[axis] < box[0, axis] or origin[axis] > box[1, axis]:
                 return f32(np.inf), f32(-np.inf)
         else:
-            slope = f32(1) / direction[axis]
             a = (box[0, axis] - origin[axis]) * slope
             b = (box[1, axis] - origin[axis]) * slope
             enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
@@ -125,14 +131,12 @@ def _march_ray(origin, direction, words, clearance, bounds, step, window, phase,
     enter, leave = _cross(origin, direction, UNIT_CUBE)
     near, far = max(enter, f32(0)), min(leave, window[1])
     finite = abs(ox) + abs(oy) + abs(oz) < np.inf and 0 < length < np.inf
-    if not (finite and near < far):
+    if not (finite and near < far < np.inf):
         return 0, -1
     step_t, steps_per_t = step / length, length / step
     size = words.shape[0] * 4
     width = f32(1) / f32(size)
-    sx = f32(1) / dx if dx != 0 else f32(0)
-    sy = f32(1) / dy if dy != 0 else f32(0)
-    sz = f32(1) / dz if dz != 0 else f32(0)
+    sx, sy, sz = _slope(dx), _slope(dy), _slope(dz)
 
     # Skip what lies before the window and the box of occupied cells, with a step to spare for
     # rounding.

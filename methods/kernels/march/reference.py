@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from methods.kernels.march import Occupancy, Samples
+from methods.kernels.march import PARALLEL, Occupancy, Samples
 
 BLOCK = 1 << 12
 """Rays whose steps are tested at once: [BLOCK, 1024, 3] positions are 50 MB."""
@@ -58,7 +58,7 @@ def _march_block(
     length = directions.double().norm(dim=-1).to(directions.dtype)
     # A true division: `step / length` would multiply by the reciprocal, an ulp away.
     step_t = torch.full_like(length, step) / length
-    alive = (near < far) & step_t.isfinite() & near.isfinite() & (start >= 0)
+    alive = (near < far) & far.isfinite() & step_t.isfinite() & (start >= 0)
 
     count = torch.where(alive, (far - near) / step_t, 0).ceil().clamp(min=0)
     k = torch.arange(int(count.max()) if len(count) else 0, device=origins.device)
@@ -77,7 +77,7 @@ def _march_block(
 
 def _cross_unit_cube(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
     """Where rays enter and leave [0, 1]^3; enter > leave where they miss it (slab test)."""
-    parallel = directions == 0
+    parallel = directions.abs() < PARALLEL
     slope = 1 / torch.where(parallel, 1, directions)
     first, second = -origins * slope, (1 - origins) * slope
     inside = (origins >= 0) & (origins <= 1)

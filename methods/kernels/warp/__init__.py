@@ -58,7 +58,8 @@ def warp(
     differentiable.
 
     Args:
-        depth: [N, s^2] z-depth of the pixels of `cells`, as of `enlarge`.
+        depth: [N, s^2] z-depth of the pixels of `cells`, as of `enlarge`; nothing is known where it
+            is not positive and finite.
         cells: [N] int64 cells of s x s pixels, counted row by row.
         camera: the view, of whole cells.
         scale: s.

@@ -88,7 +88,7 @@ def _warp(picture, depth, cells, width, scale, matrix, offset, values, valid):
             values[n, sub] = 0
             valid[n, sub] = 0
             z = depth[n, sub]
-            if not z < math.inf:
+            if not 0 < z < math.inf:
                 continue
             v = f32(row * scale + sub // scale) + f32(0.5)
             u = f32(column * scale + sub % scale) + f32(0.5)

@@ -41,7 +41,7 @@ def warp(
     """See `methods.kernels.warp.warp`."""
     matrix, offset, z = matrix.to(picture), offset.to(picture), depth.to(picture)
     v, u = (place.to(picture) for place in _pixels(cells, width, scale))
-    known = z < torch.inf
+    known = (z > 0) & (z < torch.inf)
     pixel = torch.stack((u, v, torch.ones_like(u)), dim=-1)
     at = torch.where(known, z, 1)[..., None] * (pixel @ matrix.T) + offset  # [N, s^2, 3]
     known &= at[..., 2] > 0

@@ -10,8 +10,8 @@ import pytest
 import torch
 from PIL import Image
 
-from bench.scenes.images import decode_bytes, shrink
-from bench.types import Camera
+from bench.scenes.images import MOST_PIXELS, decode_bytes, image_size, shrink
+from bench.types import Camera, SteerbenchError
 
 HERE = Path("picture.png")
 
@@ -70,3 +70,14 @@ def test_every_8_bit_mode_becomes_rgb_or_rgba(mode, channels) -> None:
     image = decode_bytes(buffer.getvalue(), HERE)
     assert image.dtype == torch.uint8
     assert image.shape == (4, 5, channels)
+
+
+def test_a_header_that_announces_more_than_memory_holds_is_refused(tmp_path: Path) -> None:
+    buffer = io.BytesIO()
+    Image.new("1", (1 << 14, (MOST_PIXELS >> 14) + 1)).save(buffer, "png")
+    path = tmp_path / "large.png"
+    path.write_bytes(buffer.getvalue())
+    assert path.stat().st_size < 1 << 15
+    for read in (lambda: image_size(path), lambda: decode_bytes(path.read_bytes(), path)):
+        with pytest.raises(SteerbenchError, match="at most 67,108,864 pixels, got 16384 x 4097"):
+            read()

@@ -143,3 +143,22 @@ def test_wrong_size_and_truncation_are_named(folder, picture, log) -> None:
     (folder / "rgb" / "2_003.png").write_bytes(b"")
     with pytest.raises(SteerbenchError, match=r"2_003.png: expected a whole picture"):
         nsvf.load(folder, log=log)
+
+
+def test_a_box_beyond_float32_is_refused(folder, log) -> None:
+    (folder / "bbox.txt").write_text("-1 -1 -1 1e308 1 1 0.4\n")
+    with pytest.raises(SteerbenchError, match="bounds: expected lengths that float32 has"):
+        nsvf.load(folder, log=log)
+
+
+def test_a_scene_far_from_its_origin_keeps_its_cameras(folder, log) -> None:
+    near = nsvf.load(folder, log=log).splits["train"].cameras
+    far = 1e6
+    (folder / "bbox.txt").write_text(f"{far - 1} {far - 2} {far - 1} {far + 1} {far + 2} {far + 1}")
+    for path in (folder / "pose").iterdir():
+        pose = np.loadtxt(path)
+        pose[:3, 3] += far
+        np.savetxt(path, pose)
+    for camera, other in zip(near, nsvf.load(folder, log=log).splits["train"].cameras, strict=True):
+        # Rounded to float32 in the data set's units, they would be off by 1e6 u = 0.06.
+        torch.testing.assert_close(other.c2w, camera.c2w, rtol=0, atol=1e-6)

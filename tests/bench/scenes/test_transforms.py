@@ -270,3 +270,33 @@ def test_a_capture_with_a_lens_is_cropped_alike_everywhere(folder, edit_json, pi
     assert shapes == {(camera.height, camera.width, 3)}
     assert camera.width < 50
     assert camera.fx == 45
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"camera_angle_x": 5e-324}, "camera_angle_x: expected a finite number above 1e-09"),
+        ({"fl_x": 1e-310}, r"images/\d+.png: expected lengths that float32 has"),
+        ({"fl_x": 1e300}, r"images/\d+.png: expected lengths that float32 has"),
+        ({"scale": 1e-300}, "bounds: expected lengths that float32 has"),
+        ({"k1": 1e300, "k2": -1e300}, "expected a lens distortion that can be undone"),
+    ],
+)
+def test_what_float32_cannot_hold_is_refused(folder, edit_json, log, change, message) -> None:
+    def edit(record: dict) -> None:
+        if "camera_angle_x" in change:
+            del record["fl_x"]
+        record.update(change)
+
+    edit_json(folder / "transforms.json", edit)
+    with pytest.raises(SteerbenchError, match=message):
+        transforms.load(folder, log=log)
+
+
+def test_a_camera_too_far_away_for_float32_is_refused(folder, edit_json, log) -> None:
+    edit_json(
+        folder / "transforms.json",
+        lambda record: record["frames"][0]["transform_matrix"][0].__setitem__(3, 1e308),
+    )
+    with pytest.raises(SteerbenchError, match=r"images/009.png: expected lengths that float32 has"):
+        transforms.load(folder, log=log)

@@ -1,0 +1,186 @@
+"""Projection and its inverse: near and far, tiny scenes, odd pictures, any rigid motion."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from bench.cameras import cast, look_at, move_camera, pixel_grid, project, scale_camera, unproject
+from bench.stress import StressCase
+from bench.types import Camera
+
+U32 = 2.0**-24
+"""Unit roundoff of float32."""
+
+IDENTITY = torch.eye(4)[:3]
+ROLL = torch.tensor([[-1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0]])
+EYE, UP = torch.tensor([1.7, -0.8, 1.1]), torch.tensor([0.0, 0.0, 1.0])
+
+CAMERAS = {
+    "at the origin": Camera(IDENTITY, 40.0, 40.0, 16.0, 12.0, 32, 24),
+    "looking at the cube": Camera(
+        look_at(EYE, torch.full((3,), 0.5), UP), 40.0, 42.0, 16.0, 12.0, 32, 24
+    ),
+    "1 x 1 picture": Camera(IDENTITY, 1.0, 1.0, 0.5, 0.5, 1, 1),
+    "4097 x 3 picture": Camera(IDENTITY, 4000.0, 4000.0, 2048.5, 1.5, 4097, 3),
+    "principal point off the picture": Camera(IDENTITY, 40.0, 40.0, -500.0, 900.0, 32, 24),
+    "focal length 1e-3": Camera(IDENTITY, 1e-3, 1e-3, 16.0, 12.0, 32, 24),
+    "focal length 1e6": Camera(IDENTITY, 1e6, 1e6, 16.0, 12.0, 32, 24),
+    "rolled by 180 degrees": Camera(ROLL, 40.0, 40.0, 16.0, 12.0, 32, 24),
+}
+
+DEPTHS = (1e-20, 1e-3, 1.0, 1e6, 1e20)
+CELL = {("torch", "fp32"): 0.0}
+
+
+def cases() -> list[StressCase]:
+    """There and back; planes of the camera; scales of scenes; motions."""
+    found = []
+    for name, camera in CAMERAS.items():
+        reach = max(abs(camera.cx), abs(camera.cy), camera.width, camera.height)
+        for depth in DEPTHS:
+            distance, units = _distance(camera), 8 * reach
+            if distance and depth < 1:
+                continue  # nearer than the roundings of where the camera is
+            if distance:
+                units += 8 * reach + 8 * max(camera.fx, camera.fy) * (1 + distance / depth)
+            found.append(
+                StressCase(
+                    "projection",
+                    f"{name}, depth {depth:g}",
+                    "a pixel unprojected and projected is where it was",
+                    "(u - c) / f and back, 4 roundings each at the size of the picture: 8 reach u; "
+                    "turned, as many more; away from the origin by r, 8 f (1 + r / z) u more",
+                    {("torch", "fp32"): units * U32},
+                    partial(_round_trip, camera, depth),
+                )
+            )
+    for name, depths in (
+        ("behind the camera", (-1e20, -1.0, -1e-20)),
+        ("on the camera's plane", (0.0, -0.0)),
+    ):
+        found.append(
+            StressCase(
+                "projection",
+                name,
+                "its depth is not positive, its pixel finite",
+                "comparisons: 0",
+                CELL,
+                partial(_not_in_front, depths),
+            )
+        )
+    found += [
+        StressCase(
+            "normalisation",
+            f"a scene {side:g} wide",
+            "rays of the unit cube go through the pixels of the data set's",
+            "the camera's position rounded, projected: 16 (reach + f) u",
+            {("torch", "fp32"): 16 * (32 + 42) * U32},
+            partial(_normalisation_error, side),
+        )
+        for side in (1e-6, 1e6)
+    ]
+    found += [
+        StressCase(
+            "cameras",
+            "a quarter and back",
+            "intrinsics are what they were",
+            "powers of 2: 0",
+            CELL,
+            _scaling_error,
+        ),
+        StressCase(
+            "cameras",
+            "rigid motion of scene and camera",
+            "pixels stay where they are",
+            "points of size 3 in a rotation of 3 products, twice: 64 (reach + f) u",
+            {("torch", "fp32"): 64 * (32 + 42) * U32},
+            _fixed_motion,
+        ),
+    ]
+    return found
+
+
+def _distance(camera: Camera) -> float:
+    return camera.c2w[:, 3].norm().item()
+
+
+def _apart(got: Tensor, want: Tensor) -> float:
+    """Largest difference; inf where one is not finite."""
+    return (got.double() - want.double()).abs().nan_to_num(nan=math.inf).max().item()
+
+
+def _round_trip(camera: Camera, depth: float, backend: str, device: str, precision: str) -> float:
+    camera = replace(camera, c2w=camera.c2w.to(device))
+    pixels = pixel_grid(camera.width, camera.height, device)
+    points = unproject(camera, pixels, torch.full_like(pixels[:, 0], depth))
+    got, got_depth = project(camera, points)
+    relative = (got_depth / depth - 1).abs().max().item()
+    tolerated = 16 * (1 + _distance(camera) / depth) * U32
+    return _apart(got, pixels) if relative <= tolerated else math.inf
+
+
+def _not_in_front(depths: tuple[float, ...], backend: str, device: str, precision: str) -> float:
+    camera = CAMERAS["at the origin"]
+    sides = torch.cartesian_prod(torch.tensor([-1e20, -1.0, 0.0, 1.0]), torch.tensor(depths))
+    points = torch.stack((sides[:, 0], sides[:, 0], sides[:, 1]), dim=1).to(device)
+    pixels, depth = project(replace(camera, c2w=camera.c2w.to(device)), points)
+    fine = bool((depth <= 0).all()) and bool(pixels.isfinite().all())
+    return 0.0 if fine else math.inf
+
+
+def _normalisation_error(side: float, backend: str, device: str, precision: str) -> float:
+    """A cube of `side`, as many sides away from the origin as a town is wide in metres."""
+    camera = CAMERAS["looking at the cube"]
+    origin = side * torch.tensor([1e4, -2e4, 3e4], dtype=torch.float64)
+    given = camera.c2w.double()
+    given = torch.cat((given[:, :3], (origin + side * given[:, 3])[:, None]), dim=1)
+    moved = move_camera(replace(camera, c2w=given), 1 / side, -origin / side)
+    rays = cast(replace(moved, c2w=moved.c2w.to(device)))
+    points = (rays.origins + 2 * rays.directions).cpu().double()
+    local = (origin + side * points - given[:, 3]) @ given[:, :3]
+    u = camera.fx * local[:, 0] / local[:, 2] + camera.cx
+    v = camera.fy * local[:, 1] / local[:, 2] + camera.cy
+    return _apart(torch.stack((u, v), dim=1), pixel_grid(camera.width, camera.height))
+
+
+def _scaling_error(backend: str, device: str, precision: str) -> float:
+    camera = replace(CAMERAS["looking at the cube"], fx=0.1, cx=1 / 3)
+    back = scale_camera(scale_camera(camera, 8, 6), 32, 24)
+    return max(abs(getattr(back, k) - getattr(camera, k)) for k in ("fx", "fy", "cx", "cy"))
+
+
+def random_motion(seed: int) -> tuple[Tensor, Tensor]:
+    """A rotation [3, 3] and a translation [3] of at most 1 along each axis, in float64."""
+    generator = torch.Generator().manual_seed(seed)
+    rotation, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))
+    rotation[:, 0] *= torch.linalg.det(rotation).sign()
+    return rotation, 2 * torch.rand(3, generator=generator, dtype=torch.float64) - 1
+
+
+def moved_by(camera: Camera, rotation: Tensor, translation: Tensor) -> Camera:
+    """The camera after a rigid motion of everything."""
+    pose = camera.c2w.double().cpu()
+    centre = rotation @ pose[:, 3] + translation
+    c2w = torch.cat((rotation @ pose[:, :3], centre[:, None]), dim=1)
+    return replace(camera, c2w=c2w.to(camera.c2w))
+
+
+def motion_error(seed: int, device: str) -> float:
+    """By how many pixels points of the unit cube move when they and the camera do together."""
+    rotation, translation = random_motion(seed)
+    camera = CAMERAS["looking at the cube"]
+    camera = replace(camera, c2w=camera.c2w.to(device))
+    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(seed))
+    there = (points.double() @ rotation.T + translation).float()
+    pixels, _ = project(camera, points.to(device))
+    again, _ = project(moved_by(camera, rotation, translation), there.to(device))
+    return _apart(again, pixels)
+
+
+def _fixed_motion(backend: str, device: str, precision: str) -> float:
+    return motion_error(0, device)

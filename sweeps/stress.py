@@ -1,0 +1,86 @@
+"""`steerbench stress`: what must hold where numbers are extreme, and whether it does."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from bench.console import ConsoleLog
+from bench.errors import SteerbenchError
+from bench.stress import failed, run_cases
+from reports.tables import Table
+from sweeps.terminal import console, rich_table
+
+COLUMNS = ("subject", "case", "what must hold", "by", "precision", "worst", "at most", "status")
+CASE_COLUMNS = (
+    "subject",
+    "case",
+    "what must hold",
+    "cells",
+    "nearest by",
+    "worst",
+    "at most",
+    "status",
+    "the tolerance",
+)
+"""A line a case: the cell that comes nearest to its tolerance stands for all."""
+
+
+def main(options: argparse.Namespace) -> int:
+    """Print a table and, as the last line, the same rows as JSON; 1 if anything fails."""
+    import torch
+
+    from methods.stress import all_cases
+
+    cases = [c for c in all_cases() if options.filter in f"{c.subject}, {c.name}"]
+    if not cases:
+        raise SteerbenchError(f"--filter: no subject or case has {options.filter!r} in it")
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    rows = list(run_cases(cases, device, ConsoleLog(Path())))
+    wrong = sum(failed(row) for row in rows)
+    title = f"Stress: {len(cases)} cases, {len(rows)} cells, {wrong} failed"
+    if options.format == "markdown":
+        print(Table(title, CASE_COLUMNS, tuple(_case_lines(rows)), figures=False).markdown())
+    else:
+        lines = tuple(_line(row) for row in rows)
+        console().print(rich_table(Table(title, COLUMNS, lines, figures=False)))
+    print(json.dumps(rows))
+    return int(wrong > 0)
+
+
+def _line(row: Mapping[str, Any]) -> tuple[str, ...]:
+    return (
+        *(row[name] for name in ("subject", "case", "holds", "backend", "precision")),
+        *_end(row),
+    )
+
+
+def _end(row: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Worst, at most, status."""
+    seen = "not finite" if row["error"] is None else f"{row['error']:.1e}"
+    if row["status"].startswith("unavailable"):
+        seen = ""
+    return seen, f"{row['tolerance']:.1e}", row["status"]
+
+
+def _case_lines(rows: Iterable[Mapping[str, Any]]) -> Iterator[tuple[str, ...]]:
+    """A line a case: of its cells the one that is nearest to its tolerance, or beyond it."""
+    for (subject, case), cells in groupby(rows, key=lambda row: (row["subject"], row["case"])):
+        those = list(cells)
+        worst = max(those, key=_nearness)
+        by = f"{worst['backend']} {worst['precision']}"
+        labels = (subject, case, worst["holds"], str(len(those)), by)
+        yield (*labels, *_end(worst), worst["derivation"])
+
+
+def _nearness(row: Mapping[str, Any]) -> float:
+    if row["status"].startswith("unavailable"):
+        return -1.0
+    if failed(row):
+        return math.inf
+    return row["error"] / row["tolerance"] if row["tolerance"] else 0.0

@@ -1,0 +1,240 @@
+"""Loaders on anything: a scene to be rendered, or a SteerbenchError. `make fuzz` runs long."""
+
+from __future__ import annotations
+
+import copy
+import io
+import json
+import math
+import resource
+import struct
+import warnings
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from bench.console import ConsoleLog
+from bench.scenes import blender, nsvf, transforms
+from bench.scenes.images import decode_bytes
+from bench.types import Scene, SteerbenchError
+
+QUIET = ConsoleLog(Path(), quiet=True)
+IN_ONE_FOLDER = settings(
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
+
+NUMBERS = st.one_of(
+    st.sampled_from(
+        [0, -1, 5e-324, 1e-310, 1e-30, 1e-5, 1e30, 1e308, 10**400, math.nan, math.inf, 1 << 40]
+    ),
+    st.integers(-3, 3),
+    st.floats(),
+)
+LEAVES = st.one_of(
+    st.none(), st.booleans(), NUMBERS, st.text(max_size=8), st.sampled_from(["a.png", "..", "\0"])
+)
+VALUES = st.recursive(
+    LEAVES,
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=3)
+    ),
+    max_leaves=6,
+)
+KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "aabb_scale",
+        "scale", "offset", "k1", "k2", "p1", "k3", "k4", "camera_model", "is_fisheye")  # fmt: skip
+POSE = [[1.0, 0, 0, 0.5], [0, 0, -1, -4], [0, 1, 0, 0.25], [0, 0, 0, 1]]
+RECORD = {
+    "camera_angle_x": 0.7,
+    "frames": [{"file_path": f"{i}.png", "transform_matrix": POSE} for i in range(3)],
+}
+
+
+def places(value: Any, at: tuple = ()) -> Iterator[tuple]:
+    """Where everything in a nest of lists and objects is."""
+    yield at
+    if isinstance(value, dict | list):
+        for key in value if isinstance(value, dict) else range(len(value)):
+            yield from places(value[key], (*at, key))
+
+
+@st.composite
+def records(draw: st.DrawFn) -> Any:
+    """The record with a few things in it replaced, added or taken away."""
+    record: Any = copy.deepcopy(RECORD)
+    for _ in range(draw(st.integers(0, 3))):
+        inside = [place for place in places(record) if place]
+        if draw(st.booleans()) or not inside:
+            target = record
+            if not isinstance(record, dict):
+                return record
+            target[draw(st.sampled_from(KEYS))] = draw(NUMBERS | VALUES)
+            continue
+        *way, last = draw(st.sampled_from(inside))
+        parent = record
+        for key in way:
+            parent = parent[key]
+        if draw(st.integers(0, 3)):
+            parent[last] = draw(NUMBERS | VALUES)
+        else:
+            del parent[last]
+    return record
+
+
+def changed(content: bytes) -> st.SearchStrategy[bytes]:
+    """`content` cut, or with some of its bytes replaced or more put in."""
+
+    @st.composite
+    def bytes_(draw: st.DrawFn) -> bytes:
+        some = bytearray(content)
+        for _ in range(draw(st.integers(1, 4))):
+            at = draw(st.integers(0, len(some)))
+            more = draw(st.binary(max_size=5))
+            some[at : at + draw(st.sampled_from([0, 1, len(more), 1 << 20]))] = more
+        return bytes(some)
+
+    return bytes_()
+
+
+def encoded(mode: str, kind: str) -> bytes:
+    file = io.BytesIO()
+    Image.new(mode, (8, 6)).save(file, kind)
+    return file.getvalue()
+
+
+PICTURES = [
+    *(encoded(mode, "PNG") for mode in ("1", "L", "LA", "P", "RGB", "RGBA", "I;16")),
+    *(encoded(mode, "JPEG") for mode in ("L", "RGB", "CMYK")),
+    encoded("P", "GIF"),
+    encoded("RGBA", "TIFF"),
+    encoded("RGB", "BMP"),
+    encoded("RGBA", "WEBP"),
+]
+
+
+@st.composite
+def headers(draw: st.DrawFn) -> bytes:
+    """A PNG whose header says anything, and whose checksums are right."""
+    size = st.sampled_from([0, 1, 8, 6, 1 << 13, 1 << 14, 1 << 20, (1 << 31) - 1, (1 << 32) - 1])
+    header = struct.pack(
+        ">IIBBBBB", draw(size), draw(size), *(draw(st.integers(0, 17)) for _ in range(5))
+    )
+    data = zlib.compress(draw(st.binary(max_size=64)) + bytes(draw(st.sampled_from([0, 200]))))
+    chunks = ((b"IHDR", header), (b"IDAT", data), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        for kind, body in chunks
+    )
+
+
+@pytest.fixture(autouse=True)
+def within_a_gigabyte() -> Iterator[None]:
+    """No test makes the process grow by 1 GiB at its peak."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # KiB
+    yield
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1 << 20
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Pictures and camera files of all formats, which a test may overwrite."""
+    root = tmp_path_factory.mktemp("scene")
+    for i in range(3):
+        (root / f"{i}.png").write_bytes(encoded("RGBA", "PNG"))
+    (root / "pose").mkdir()
+    (root / "rgb").mkdir()
+    for name in ("0_a", "0_b", "2_c"):
+        (root / "rgb" / f"{name}.png").write_bytes(encoded("RGBA", "PNG"))
+        (root / "pose" / f"{name}.txt").write_text(TEXTS["pose"])
+    (root / "transforms_test.json").write_text(json.dumps(RECORD))
+    return root
+
+
+TEXTS = {
+    "bbox": "-1 -1 -1 1 1 1 0.1",
+    "intrinsics": "10 4 3 0\n0 0 0\n0\n1\n6 8",
+    "pose": "\n".join(" ".join(map(str, row)) for row in POSE),
+}
+
+
+def loads_or_refuses(load: Callable[[], Scene]) -> None:
+    """What is loaded is fit to be rendered."""
+    try:
+        scene = load()
+    except SteerbenchError:
+        return
+    assert scene.bounds.isfinite().all()
+    assert 0 < scene.unit_length < math.inf
+    assert scene.origin.isfinite().all()
+    for split in scene.splits.values():
+        for camera, image in zip(split.cameras, split.images, strict=True):
+            assert camera.c2w.isfinite().all()
+            numbers = torch.tensor((camera.fx, camera.fy, camera.cx, camera.cy))
+            assert numbers.isfinite().all()
+            assert (numbers[:2] > 0).all()
+            assert image.shape[:2] == (camera.height, camera.width)
+            assert image.dtype == torch.uint8
+
+
+@IN_ONE_FOLDER
+@given(records(), st.sampled_from([1, 2]))
+def test_a_capture_of_any_structure(folder: Path, record: Any, downscale: int) -> None:
+    (folder / "transforms.json").write_text(json.dumps(record))
+    loads_or_refuses(lambda: transforms.load(folder, downscale=downscale, log=QUIET))
+
+
+@IN_ONE_FOLDER
+@given(records())
+def test_a_synthetic_scene_of_any_structure(folder: Path, record: Any) -> None:
+    (folder / "transforms_train.json").write_text(json.dumps(record))
+    loads_or_refuses(lambda: blender.load(folder, bounds="full", log=QUIET))
+
+
+@IN_ONE_FOLDER
+@given(changed(json.dumps(RECORD).encode()))
+def test_a_capture_of_any_bytes(folder: Path, content: bytes) -> None:
+    (folder / "transforms.json").write_bytes(content)
+    loads_or_refuses(lambda: transforms.load(folder, log=QUIET))
+
+
+@st.composite
+def texts(draw: st.DrawFn) -> tuple[str, str]:
+    """A file of NSVF's layout with some of its words replaced, or none left alone."""
+    name = draw(st.sampled_from(sorted(TEXTS)))
+    lines = [line.split() for line in TEXTS[name].splitlines()]
+    for _ in range(draw(st.integers(1, 3))):
+        line = draw(st.sampled_from(lines))
+        if line:
+            at = draw(st.integers(0, len(line) - 1))
+            line[at : at + 1] = draw(st.lists(NUMBERS.map(str) | st.text(max_size=4), max_size=2))
+    return name, "\n".join(" ".join(line) for line in lines)
+
+
+@IN_ONE_FOLDER
+@given(texts())
+def test_an_nsvf_scene_of_any_text(folder: Path, changed_file: tuple[str, str]) -> None:
+    name, text = changed_file
+    path = folder / ("pose/0_a.txt" if name == "pose" else f"{name}.txt")
+    for other, good in TEXTS.items():
+        place = folder / ("pose/0_a.txt" if other == "pose" else f"{other}.txt")
+        place.write_text(good)
+    path.write_text(text, errors="replace")
+    loads_or_refuses(lambda: nsvf.load(folder, log=QUIET))
+
+
+@given(st.sampled_from(PICTURES).flatmap(changed) | headers())
+def test_a_picture_of_any_bytes(content: bytes) -> None:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow's, of things it puts up with
+            picture = decode_bytes(content, Path("a.png"))
+    except SteerbenchError:
+        return
+    assert picture.dtype == torch.uint8
+    assert picture.shape[2] in (3, 4)
