@@ -34,6 +34,7 @@ examples
   steerbench list                              what there is, and what of it is usable here
   steerbench paper budget=demo                 every table of the SteerNeRF paper, as a page
   steerbench parity scene=totem budget=demo    what int8 costs, in decibels, and saves, in time
+  steerbench accuracy --within 0.1dB           the fastest setting that loses no more than that
   steerbench check BASELINE.json               is everything as good as it was
   steerbench results --format csv              every number measured so far
 """
@@ -46,6 +47,7 @@ COMMANDS = (
     "kernels",
     "parity",
     "skips",
+    "accuracy",
     "check",
     "compare",
     "scenes",
@@ -179,6 +181,41 @@ def _parser() -> Parser:
         )
         variants.add_argument("overrides", nargs="*", help="settings as of `steerbench run`")
         variants.set_defaults(module=name, parser=variants)
+
+    accuracy = commands.add_parser(
+        "accuracy",
+        help="run time against error of every knob, and which setting to take",
+        description="Turn every knob that trades time for error and measure both: of the kernels "
+        "where the exact answer is known, of SteerNeRF on the frames of one trained model, all "
+        "settings in turn. Prints what no other setting beats (the Pareto frontier); table, plot "
+        "and rows go to OUTPUTS/accuracy.",
+    )
+    accuracy.add_argument(
+        "--within",
+        metavar="DECIBELS",
+        help="also print the fastest setting that loses at most so much PSNR against everything "
+        "off, as a command: --within 0.1dB",
+    )
+    accuracy.add_argument(
+        "--kernels", action="store_true", help="only the kernels: seconds, and nothing is trained"
+    )
+    accuracy.add_argument(
+        "--trained",
+        action="store_true",
+        help="also what asks for a training of its own: L, K, s, T, steps, fp32 (some 25 minutes)",
+    )
+    accuracy.add_argument(
+        "--frames", type=int, default=24, help="first frames of the trajectory (default 24)"
+    )
+    accuracy.add_argument(
+        "--repeats", type=int, default=5, help="timed rounds over all settings (default 5)"
+    )
+    accuracy.add_argument(
+        "overrides",
+        nargs="*",
+        help="settings as of `steerbench run` (default scene=totem budget=demo trajectory=orbit)",
+    )
+    accuracy.set_defaults(module="accuracy", parser=accuracy)
 
     check = commands.add_parser(
         "check",
