@@ -25,7 +25,7 @@ def best_instead(cost: Sequence[float], error: Sequence[float]) -> list[int]:
 
 
 def cheapest_within(cost: Sequence[float], error: Sequence[float], limit: float) -> int | None:
-    """The index of the cheapest setting whose error is at most `limit`; None where there is none."""
+    """The cheapest setting whose error is at most `limit`, as an index; None: there is none."""
     allowed = [index for index, size in enumerate(error) if size <= limit]
     return min(allowed, key=lambda index: (cost[index], error[index]), default=None)
 

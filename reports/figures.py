@@ -11,7 +11,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import ScalarFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 from numpy.typing import ArrayLike
 
 from reports.runs import Run
@@ -60,53 +60,58 @@ def _is_stage(metric: str) -> bool:
 def frontier_plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Write a PNG: error of a frame against its time, log-log, a point for each setting.
 
-    Beside each other the error against the ground truth, with the Pareto frontier, and that against
-    the first row, which stands for everything off. A knob has one colour and marker.
+    To the left the error against the ground truth, with the Pareto frontier as a staircase through
+    the settings that none beats, to the right that against the first row, which stands for
+    everything off. These and what is shipped are circled and named.
 
     Args:
         rows: knob, setting, ms, ms_lo, ms_hi, psnr, psnr_to_first and instead: the setting itself
             on the frontier.
     """
-    figure = Figure(figsize=(12, 6), layout="constrained")
+    figure = Figure(figsize=(13, 7), layout="constrained")
     truth, off = figure.subplots(1, 2, sharex=True)
-    knobs = list(dict.fromkeys(row["knob"] for row in rows))
+    best = sorted((row for row in rows if row["instead"] == row["setting"]), key=lambda r: r["ms"])
     for axes, column in ((truth, "psnr"), (off, "psnr_to_first")):
-        for number, knob in enumerate(knobs):
-            some = [row for row in rows if row["knob"] == knob and math.isfinite(row[column])]
-            ms, error = [row["ms"] for row in some], [_rms(row[column]) for row in some]
-            spread = [
-                [row["ms"] - row["ms_lo"] for row in some],
-                [row["ms_hi"] - row["ms"] for row in some],
-            ]
-            look = {"color": COLOURS[number % len(COLOURS)], "fmt": MARKERS[number % len(MARKERS)]}
-            axes.errorbar(ms, error, xerr=spread, label=knob, elinewidth=0.7, alpha=0.8, **look)
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.set_xlabel("ms of a frame (median of the rounds; bars: fastest and slowest round)")
-        decibels = axes.secondary_yaxis("right", functions=(_psnr, _rms))
-        decibels.set_ylabel("PSNR, dB")
-        for axis in (axes.xaxis, axes.yaxis, decibels.yaxis):
-            axis.set_major_formatter(ScalarFormatter())
-            axis.set_minor_formatter(ScalarFormatter())
-        axes.grid(which="both", color="0.92")
-        axes.set_axisbelow(True)
-    truth.set_ylabel("error of a pixel, root mean square, of 1")
+        _error_against_time(axes, rows, column)
+        named = [rows[0], *best] if column == "psnr" else []
+        named += [row for row in rows if row["setting"] == "as shipped"]
+        for row in {row["setting"]: row for row in named}.values():
+            place = (row["ms"], _rms(row[column]))
+            axes.plot(*place, "o", markersize=11, fillstyle="none", color="black")
+            apart = {"xytext": (-5, -5), "textcoords": "offset points", "ha": "right", "va": "top"}
+            axes.annotate(row["setting"], place, size=8, **apart)
+    stairs = [row["ms"] for row in best], [_rms(row["psnr"]) for row in best]
+    truth.step(*stairs, where="post", color="black", linewidth=1, label="frontier")
     truth.set_title("against the ground truth: lower left is better")
     off.set_title("against the same model with everything off")
-    _draw_frontier(truth, rows)
     figure.legend(*truth.get_legend_handles_labels(), loc="outside lower center", ncols=6)
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=100)
 
 
-def _draw_frontier(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
-    """A staircase through the settings that none beats, each with its name."""
-    best = sorted((row for row in rows if row["instead"] == row["setting"]), key=lambda r: r["ms"])
-    ms, error = [row["ms"] for row in best], [_rms(row["psnr"]) for row in best]
-    axes.step(ms, error, where="post", color="black", linewidth=1, label="frontier")
-    for row, x, y in zip(best, ms, error, strict=True):
-        axes.annotate(
-            row["setting"], (x, y), xytext=(-4, -10), textcoords="offset points", size=7, ha="right"
-        )
+def _error_against_time(axes: Axes, rows: Sequence[Mapping[str, Any]], column: str) -> None:
+    """The points of one panel; a knob has one colour and one marker."""
+    knobs = list(dict.fromkeys(row["knob"] for row in rows))
+    for number, knob in enumerate(knobs):
+        some = [row for row in rows if row["knob"] == knob and math.isfinite(row[column])]
+        ms, error = [row["ms"] for row in some], [_rms(row[column]) for row in some]
+        low = [row["ms"] - row["ms_lo"] for row in some]
+        high = [row["ms_hi"] - row["ms"] for row in some]
+        colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
+        axes.errorbar(ms, error, xerr=(low, high), fmt=marker, color=colour, alpha=0.8, label=knob)
+    axes.loglog()
+    axes.margins(0.12)
+    axes.set_xlabel("ms of a frame: median of the rounds, bars from the fastest to the slowest")
+    axes.set_ylabel("error of a pixel (root mean square; 1 is black against white)")
+    decibels = axes.secondary_yaxis("right", functions=(_psnr, _rms))
+    decibels.set_ylabel("PSNR, dB")
+    decibels.yaxis.set_major_locator(MaxNLocator(10))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
+    for axis in (axes.xaxis, axes.yaxis, decibels.yaxis):
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_locator(NullLocator())
+    axes.grid(color="0.92")
+    axes.set_axisbelow(True)
 
 
 def _rms(psnr: ArrayLike) -> np.ndarray:

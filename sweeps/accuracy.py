@@ -19,12 +19,11 @@ from sweeps.build import build
 from sweeps.knobs import EVERYTHING_OFF, knobs
 from sweeps.measurement import checked_settings
 from sweeps.overrides import composed
+from sweeps.skips import LEAN
 from sweeps.terminal import console, rich_table
 from sweeps.variants import common_ground, finite, usable_method
 
 SETTINGS = ("method=steernerf", "scene=totem", "budget=demo", "trajectory=orbit")
-
-RENDERER = "methods.steernerf.SteerNerf"
 
 
 def main(options: argparse.Namespace) -> int:
@@ -35,10 +34,10 @@ def main(options: argparse.Namespace) -> int:
     overrides = _last_words([*SETTINGS, *options.overrides])
     config = composed(overrides)
     outputs = Path(checked_settings(config).outputs)
-    if config.method["_target_"] != RENDERER:
+    if config.method.get("renderer", {}).get("_target_") != LEAN:
         raise SteerbenchError(
-            "steerbench accuracy turns the knobs of SteerNeRF: expected method=steernerf, "
-            f"got method={config.method['name']}"
+            "steerbench accuracy turns all knobs of SteerNeRF: expected a method with "
+            "renderer=s2d, as method=steernerf"
         )
     log = _Once(outputs)
     from methods.kernels.accuracy import all_experiments
@@ -88,7 +87,7 @@ def _setting_rows(
 ) -> list[dict[str, Any]]:
     """Of every setting its knob, overrides, times and errors, what it loses against everything off
     and, in its place, the setting on the frontier; see `bench.accuracy.render_in_turns`."""
-    turned = [(knob, variant) for knob, some in knobs(options.trained) for variant in some]
+    turned = [(knob, v) for knob, some in knobs(options.trained).items() for v in some]
     lines = {v.name: _last_words([*overrides, *v.settings]) for _, v in turned}
     configs = {name: composed(words) for name, words in lines.items()}
     scene, path, protocol = common_ground(configs[EVERYTHING_OFF.name], options.frames, log)

@@ -202,7 +202,7 @@ def _parser() -> Parser:
     accuracy.add_argument(
         "--trained",
         action="store_true",
-        help="also what asks for a training of its own: L, K, s, T, steps, fp32 (some 25 minutes)",
+        help="also what asks for trainings of its own: L, K, s, T, taught steps, a field in fp32",
     )
     accuracy.add_argument(
         "--frames", type=int, default=24, help="first frames of the trajectory (default 24)"

@@ -1,0 +1,49 @@
+"""The settings that `steerbench accuracy` compares: they exist, and need one training."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from sweeps.knobs import EVERYTHING_OFF, knobs
+from sweeps.overrides import composed
+from sweeps.variants import Variant
+
+NOT_TRAINED_FOR = ("range", "refined", "skip")
+
+
+def variants(trained: bool) -> list[Variant]:
+    return [variant for some in knobs(trained).values() for variant in some]
+
+
+def method(variant: Variant) -> dict[str, Any]:
+    """Its settings, as they are trained for, where the method may be rendered otherwise."""
+    config = composed(["method=steernerf", *variant.settings])
+    node: Any = OmegaConf.to_container(config.method, resolve=True)
+    pipeline = {k: v for k, v in node["pipeline"].items() if k not in NOT_TRAINED_FOR}
+    if node["_target_"].endswith("UntaughtSteerNerf"):
+        pipeline |= {"steps": pipeline.pop("taught_steps"), "stop": pipeline.pop("taught_stop")}
+    trained_for = {k: v for k, v in pipeline.items() if k != "_target_"}
+    return {k: v for k, v in node.items() if k not in ("_target_", "engine")} | {
+        "pipeline": trained_for
+    }
+
+
+def test_there_are_forty_settings_and_no_two_have_one_name():
+    assert len(variants(trained=False)) >= 40
+    names = [variant.name for variant in variants(trained=True)]
+    assert len(set(names)) == len(names)
+    assert variants(trained=False)[0] is EVERYTHING_OFF
+
+
+def test_by_default_one_training_serves_all_settings():
+    shipped = method(Variant("as shipped"))
+    for variant in variants(trained=False):
+        assert method(variant) == shipped, variant.name
+
+
+@pytest.mark.parametrize("variant", variants(trained=True)[len(variants(trained=False)) :])
+def test_what_is_added_asks_for_another_training(variant):
+    assert method(variant) != method(Variant("as shipped"))
