@@ -20,8 +20,8 @@ from bench.frontier import observed_order
 from bench.metrics import psnr
 from bench.probes import StageClock
 from bench.protocol import EvaluationProtocol, composite
-from bench.trajectories import Step, Trajectory
-from bench.types import Frame, Log, Method, Scene, SteerbenchError
+from bench.trajectories import Trajectory
+from bench.types import Log, Method, Scene, SteerbenchError
 
 
 @dataclass(frozen=True)
@@ -124,9 +124,10 @@ def render_in_turns(
     repeats: int,
     log: Log,
 ) -> list[dict[str, Any]]:
-    """Render the same frames with every one of the fitted `methods`, frame by frame in turn.
+    """Render the same trajectory with every one of the fitted `methods` in turn, again and again.
 
-    A first round over the trajectory warms up and is scored; `repeats` more are timed.
+    A first round warms up and is scored; `repeats` more are timed. A turn is the whole trajectory,
+    not a frame, which would find the caches full of another model.
 
     Returns:
         One row for each method, of the frames that have a ground truth and as many frames before
@@ -147,52 +148,52 @@ def render_in_turns(
             "frames before it to look back on; give more frames"
         )
     clocks = {name: StageClock(method.settings()["device"]) for name, method in methods.items()}
-    scores = _Scores(scene, trajectory.split, protocol)
-    with torch.no_grad(), log.progress("rendering", (repeats + 1) * len(steps)) as progress:
+    scores = _Scores(scene, trajectory, protocol)
+    with torch.no_grad(), log.progress("rendering", (repeats + 1) * len(methods)) as progress:
         for round_ in range(repeats + 1):
-            for method in methods.values():
+            for name, method in methods.items():
                 method.reset()
-            for number, step in enumerate(steps):
-                frames = {
-                    name: _rendered(method, step, clocks[name]) for name, method in methods.items()
-                }
-                if round_ == 0 and number in scored:
-                    scores.add(step, frames)
+                for number, step in enumerate(steps):
+                    with clocks[name].frame():
+                        frame = method.render(step.camera, clocks[name])
+                    if round_ == 0 and number in scored:
+                        scores.add(name, number, frame.rgb)
                 progress.advance(note=f"round {round_} of {repeats}" if round_ else "warming up")
-    rows = []
-    for name, clock in clocks.items():
-        timed = [record.total_ns / 1e6 for record in clock.frames[len(steps) :]]
-        rounds = [timed[first : first + len(steps)] for first in range(0, len(timed), len(steps))]
-        means = [statistics.fmean(of_round[n] for n in scored) for of_round in rounds]
-        rows.append({"setting": name, **_spread(means), **scores.of(name)})
-    return rows
+    return [
+        {"setting": name, **_spread(_round_means(clock, len(steps), scored)), **scores.of(name)}
+        for name, clock in clocks.items()
+    ]
 
 
-def _rendered(method: Method, step: Step, clock: StageClock) -> Frame:
-    with clock.frame():
-        return method.render(step.camera, clock)
+def _round_means(clock: StageClock, frames: int, scored: Sequence[int]) -> list[float]:
+    """Mean ms of the `scored` frames of each round of `frames` but the first."""
+    ms = [record.total_ns / 1e6 for record in clock.frames]
+    rounds = [ms[first : first + frames] for first in range(frames, len(ms), frames)]
+    return [statistics.fmean(of_round[number] for number in scored) for of_round in rounds]
 
 
 class _Scores:
-    """PSNR of each method's frames, against the ground truth and against those of the first."""
+    """PSNR of each method's pictures, against the ground truth and against those of the first."""
 
-    def __init__(self, scene: Scene, split: str, protocol: EvaluationProtocol) -> None:
-        self._split, self._background = scene.splits[split], scene.background
-        self._rounded = protocol.rounded
+    def __init__(self, scene: Scene, path: Trajectory, protocol: EvaluationProtocol) -> None:
+        self._split, self._background = scene.splits[path.split], scene.background
+        self._steps, self._rounded = path.steps, protocol.rounded
+        self._first: dict[int, Tensor] = {}
         self._psnr: dict[str, list[float]] = {}
         self._apart: dict[str, list[float]] = {}
 
-    def add(self, step: Step, frames: Mapping[str, Frame]) -> None:
-        assert step.truth is not None
-        truth = composite(self._split.images[step.truth], self._background)
-        pictures = {name: self._rounded(frame.rgb).cpu() for name, frame in frames.items()}
-        first = next(iter(pictures.values()))
-        for name, picture in pictures.items():
-            self._psnr.setdefault(name, []).append(psnr(picture, truth))
-            apart = (picture.double() - first.double()).square().mean().item()
-            self._apart.setdefault(name, []).append(apart)
+    def add(self, name: str, number: int, rgb: Tensor) -> None:
+        """The frame `number` of the trajectory, as the method `name` rendered it."""
+        truth = self._steps[number].truth
+        assert truth is not None
+        picture = self._rounded(rgb).cpu()
+        exact = composite(self._split.images[truth], self._background)
+        apart = picture.double() - self._first.setdefault(number, picture).double()
+        self._psnr.setdefault(name, []).append(psnr(picture, exact))
+        self._apart.setdefault(name, []).append(apart.square().mean().item())
 
     def of(self, name: str) -> dict[str, float]:
+        """The scores of a method in a row."""
         apart = statistics.fmean(self._apart[name])
         return {
             "psnr": statistics.fmean(self._psnr[name]),

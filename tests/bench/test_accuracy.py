@@ -80,11 +80,10 @@ def in_turns(tiny_scene, quiet_log):
     return rendered
 
 
-def test_methods_take_turns_frame_by_frame_in_every_round(in_turns, tiny_scene):
+def test_methods_take_turns_in_every_round_and_begin_each_anew(in_turns, tiny_scene):
     _, turns = in_turns(0, 8)
     count = len(tiny_scene.splits["test"])
-    round_ = [(0, "reset"), (8, "reset")]
-    round_ += [(levels, number) for number in range(count) for levels in (0, 8)]
+    round_ = [(levels, turn) for levels in (0, 8) for turn in ("reset", *range(count))]
     assert turns == 3 * round_  # one that warms up, two that are timed
 
 
