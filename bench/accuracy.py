@@ -61,14 +61,15 @@ def experiment_rows(
     experiments: Sequence[Experiment], repeats: int, log: Log
 ) -> list[dict[str, Any]]:
     """One row for each trial: subject, knob, setting, error (the largest, absolute), ms (median of
-    `repeats`), ms_lo and ms_hi (the extremes), and the observed order of its experiment with the
-    range that it was fitted over, None where there is none."""
+    `repeats`), ms_lo and ms_hi (the extremes), and the observed order of its experiment with
+    order_from and order_to, between which it was fitted; None where there is none."""
     rows = []
     with log.progress("experiments", len(experiments)) as progress:
         for experiment in experiments:
             trials = experiment.trials
             errors = [_largest_error(trial) for trial in trials]  # and warms up
             order = _order(experiment, errors)
+            fitted = experiment.smooth or (None, None)
             for trial, error, times in zip(
                 trials, errors, _times_ms([t.call for t in trials], repeats), strict=True
             ):
@@ -80,7 +81,8 @@ def experiment_rows(
                         "error": error,
                         **_spread(times),
                         "order": order,
-                        "order_range": experiment.smooth,
+                        "order_from": fitted[0],
+                        "order_to": fitted[1],
                     }
                 )
             progress.advance(note=experiment.subject)

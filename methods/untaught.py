@@ -36,8 +36,6 @@ class UntaughtSteerNerf(SteerNerf):
     Its `pipeline` is of `UntaughtOptions`.
     """
 
-    options: PipelineOptions
-
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Train as for the options that are taught, or load that; render with those asked for."""
         asked = self.options

@@ -67,11 +67,18 @@ def setting_table(rows: Sequence[Row]) -> Table:
         for row in ordered
     )
     bold = frozenset((line, 0) for line, text in enumerate(lines) if text[-1] == ON_FRONTIER)
-    return Table("Settings: run time against error of a frame", SETTINGS, lines, bold=bold)
+    where = ", ".join(str(rows[0][name]) for name in ("scene", "trajectory", "resolution"))
+    return Table(
+        f"Settings: run time against error of a frame, {where}", SETTINGS, lines, bold=bold
+    )
 
 
-def write_accuracy(experiments: Sequence[Row], settings: Sequence[Row], folder: Path) -> Path:
+def write_accuracy(
+    experiments: Sequence[Row], settings: Sequence[Row], folder: Path, command: str
+) -> Path:
     """Write `folder/report.md` with its plot and all rows as CSV beside it; return its path.
+
+    `command` is what was typed.
 
     Raises:
         SteerbenchError: `folder` cannot be written to.
@@ -80,7 +87,8 @@ def write_accuracy(experiments: Sequence[Row], settings: Sequence[Row], folder: 
     with explained(folder):
         folder.mkdir(parents=True, exist_ok=True)
         pd.DataFrame(experiments).to_csv(folder / "kernels.csv", index=False)
-        parts = ["# Run time against error", f"Commit {commit()}, {machine()['cpu']}."]
+        made = f"```sh\n{command}\n```\n\nCommit {commit()}, {machine()['cpu']}."
+        parts = ["# Run time against error", made]
         if settings:
             pd.DataFrame(settings).to_csv(folder / "settings.csv", index=False)
             frontier_plot(settings, folder / "frontier.png")
@@ -93,10 +101,10 @@ def write_accuracy(experiments: Sequence[Row], settings: Sequence[Row], folder: 
 
 
 def _setting(value: float | str) -> str:
-    """A number as short as it is exact enough to be told from its neighbours; 1/64 stays 1/64."""
+    """In few digits; a power of two below 1 as a fraction."""
     if isinstance(value, str):
         return value
-    if 0 < value < 1 and (1 / value).is_integer() and math.log2(value).is_integer():
+    if 0 < value < 1 and math.frexp(value)[0] == 0.5:
         return f"1/{1 / value:.0f}"
     return f"{value:g}"
 
@@ -104,5 +112,4 @@ def _setting(value: float | str) -> str:
 def _order(row: Row) -> str:
     if row["order"] is None:
         return ""
-    low, high = (_setting(end) for end in row["order_range"])
-    return f"{row['order']:.2f} ({low} to {high})"
+    return f"{row['order']:.2f} ({_setting(row['order_from'])} to {_setting(row['order_to'])})"

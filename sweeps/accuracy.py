@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import shlex
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -48,10 +50,11 @@ def main(options: argparse.Namespace) -> int:
     if not options.kernels:
         settings = _setting_rows(overrides, options, log)
         console().print(rich_table(setting_table(settings)))
-    page = write_accuracy(experiments, settings, outputs / "accuracy")
+    command = shlex.join(["steerbench", *sys.argv[1:]])
+    page = write_accuracy(experiments, settings, outputs / "accuracy", command)
     log.info(f"report: {page}")
     if settings and limit is not None:
-        print(_recommended(settings, overrides, limit))
+        print(_recommended(settings, limit))
     print(json.dumps({"kernels": experiments, "settings": [finite(row) for row in settings]}))
     return 0
 
@@ -105,6 +108,9 @@ def _setting_rows(
     best = best_instead([row["ms"] for row in rendered], [-row["psnr"] for row in rendered])
     return [
         {
+            "scene": scene.name,
+            "trajectory": path.name,
+            "resolution": path.resolution,
             "knob": knob_of[row["setting"]],
             **row,
             "lost": rendered[0]["psnr"] - row["psnr"],
@@ -115,7 +121,7 @@ def _setting_rows(
     ]
 
 
-def _recommended(rows: Sequence[dict[str, Any]], overrides: Sequence[str], limit: float) -> str:
+def _recommended(rows: Sequence[dict[str, Any]], limit: float) -> str:
     """The fastest setting that loses at most `limit` dB, as a command; everything off loses 0."""
     index = cheapest_within([row["ms"] for row in rows], [row["lost"] for row in rows], limit)
     assert index is not None

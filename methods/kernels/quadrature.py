@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from bench.accuracy import Experiment, Trial
-from methods.kernels.composite import Pixels, composite
+from methods.kernels.composite import composite
 from methods.kernels.march import Occupancy, march
 
 Quantity = Literal["alpha", "depth_sum"]
@@ -59,11 +59,12 @@ class Medium:
 
 
 def _strength(y: Tensor) -> Tensor:
-    """Density of a medium on the ray at y: from half to nearly opaque across the cube."""
+    """Density on the ray at y: the cube is opaque to two thirds at one end, to nearly all at the
+    other."""
     return 1 + 7 * y
 
 
-def _gaussian(centre: float, width: float = 0.1) -> Medium:
+def _gaussian(name: str, centre: float, width: float = 0.1) -> Medium:
     def sigma(x: Tensor, y: Tensor) -> Tensor:
         return 4 * _strength(y) * torch.exp(-(((x - centre) / width) ** 2) / 2)
 
@@ -72,8 +73,7 @@ def _gaussian(centre: float, width: float = 0.1) -> Medium:
         area = torch.erf((x - centre) / root) + math.erf(centre / root)
         return 4 * _strength(y) * width * math.sqrt(math.pi / 2) * area
 
-    inside = "inside" if centre == 0.5 else "cut off by a face"
-    return Medium(f"Gaussian density, {inside}", sigma, thickness)
+    return Medium(name, sigma, thickness)
 
 
 def _first_face(y: Tensor) -> Tensor:
@@ -88,7 +88,8 @@ SLAB = Medium(
     lambda x, y: _strength(y) * ((x > _first_face(y)) & (x < 0.7)),
     lambda x, y: _strength(y) * (x.clamp(max=0.7) - _first_face(y)).clamp(min=0),
 )
-INSIDE, CUT = _gaussian(0.5), _gaussian(0.1)
+INSIDE = _gaussian("Gaussian density", 0.5)
+CUT = _gaussian("Gaussian density, cut off by a face", 0.1)
 
 FINE = (2.0**-7, 2.0**-4)
 """Steps that resolve the media below and leave errors that are far above rounding."""
@@ -150,15 +151,10 @@ def render(medium: Medium, quantity: Quantity, y: Tensor, step: float, phase: fl
 
 
 def _stops() -> Experiment:
-    """Rays of 1024 samples of thickness `THIN`, ended at a transmittance."""
-    sigma, delta, offsets = _thin_rays(RAYS, 1024, 1024 * THIN)
-    exact = torch.ones(RAYS, dtype=torch.float64) - math.exp(-1024 * THIN)
-
-    def opacity(stop: float) -> Tensor:
-        return _composite(sigma, delta, offsets, stop).alpha
-
+    """Rays of samples of thickness `THIN`, ended at a transmittance."""
+    inputs, exact = _even_rays(RAYS, 1024, 1024 * THIN)
     stops = [0.0, *(10.0**-power for power in range(7, 0, -1))]
-    trials = [Trial(stop, partial(opacity, stop), exact) for stop in stops]
+    trials = [Trial(stop, partial(_opacity, *inputs, stop), exact) for stop in stops]
     return Experiment("early stop: light that leaks", "stop", trials, (1e-5, 1e-1))
 
 
@@ -170,31 +166,32 @@ ACCUMULATORS: tuple[tuple[str, torch.dtype], ...] = (
 
 
 def _accumulation(backend: str, dtype: torch.dtype) -> Experiment:
-    """Opacity of rays that are divided into more and more samples, 2^18 of all rays together."""
+    """Opacity of rays that are divided into more and more samples, 2^18 of all rays together.
 
+    All samples are alike, so that they are all rounded the same way.
+    """
     trials = []
     for count in (64, 1024, 65536):
-        sigma, delta, offsets = _thin_rays((1 << 18) // count, count, 4.0)
-        thickness = (sigma.double() * delta.double()).view(-1, count).sum(dim=1)
-        call = partial(_alpha, sigma.to(dtype), delta.to(dtype), offsets, backend)
-        trials.append(Trial(float(count), call, -torch.expm1(-thickness)))
+        (sigma, delta, offsets), exact = _even_rays((1 << 18) // count, count, 4.0)
+        inputs = sigma.to(dtype), delta.to(dtype), offsets
+        trials.append(Trial(count, partial(_opacity, *inputs, 0.0, backend), exact))
     kind = str(dtype).removeprefix("torch.")
     return Experiment(f"opacity added up: {backend} in {kind}", "samples of a ray", trials)
 
 
-def _alpha(sigma: Tensor, delta: Tensor, offsets: Tensor, backend: str) -> Tensor:
-    return _composite(sigma, delta, offsets, 0.0, backend).alpha
-
-
-def _thin_rays(rays: int, count: int, thickness: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Density, interval and offsets of `rays` of `count` samples each, of a total `thickness`."""
+def _even_rays(
+    rays: int, count: int, thickness: float
+) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
+    """Density, interval and offsets of `rays` that are divided evenly into `count` samples each, a
+    power of 2, and their exact opacity."""
     delta = torch.full((rays * count,), 1 / count)
     offsets = torch.arange(rays + 1) * count
-    return torch.full_like(delta, thickness), delta, offsets
+    exact = torch.full((rays,), -math.expm1(-thickness), dtype=torch.float64)
+    return (torch.full_like(delta, thickness), delta, offsets), exact
 
 
-def _composite(
+def _opacity(
     sigma: Tensor, delta: Tensor, offsets: Tensor, stop: float, backend: str = "auto"
-) -> Pixels:
+) -> Tensor:
     nothing = torch.zeros(len(sigma), 1, dtype=sigma.dtype)
-    return composite(sigma, nothing, delta, delta, offsets, stop=stop, backend=backend)
+    return composite(sigma, nothing, delta, delta, offsets, stop=stop, backend=backend).alpha

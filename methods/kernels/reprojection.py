@@ -7,6 +7,7 @@ is known in closed form.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -29,12 +30,16 @@ NEARER = 1 / 16
 picture, and so comes to lie anywhere in a pixel."""
 
 
+Brought = tuple[Callable[[], Tensor], Tensor]
+"""What computes the colours of some pixels of the present view, and which these are."""
+
+
 def experiments() -> list[Experiment]:
     """Error of the depth; size of the pixels that points are rounded to."""
     return [
         _depth_error(),
-        _pixel_size("the nearest point of each pixel (splat)", splatted),
-        _pixel_size("looked up between four pixels (warp)", warped),
+        _pixel_size("the nearest point of each pixel (splat)", _splatted),
+        _pixel_size("looked up between four pixels (warp)", _warped),
     ]
 
 
@@ -56,10 +61,10 @@ def _depth_error() -> Experiment:
     errors = [10.0**-power for power in range(6, 0, -1)]
     trials = [Trial(error, partial(looked_up, error), exact) for error in errors]
     name = "where a pixel is looked up, in pixels"
-    return Experiment(name, "error of the depth, of 1", trials, (1e-4, 1e-1))
+    return Experiment(name, "relative error of the depth", trials, (1e-4, 1e-1))
 
 
-def _pixel_size(name: str, bring) -> Experiment:
+def _pixel_size(name: str, bring: Callable[[Tensor, Camera, Camera], Brought]) -> Experiment:
     """A smooth picture, brought into a view from nearer by."""
     trials = []
     for side in (32, 64, 128, 256, 512):
@@ -71,8 +76,8 @@ def _pixel_size(name: str, bring) -> Experiment:
     return Experiment(f"colour: {name}", "pixel, sides of the picture", trials, (1 / 512, 1 / 64))
 
 
-def splatted(picture: Tensor, preceding: Camera, present: Camera):
-    """What computes the colours of the pixels that a point lands in, and which these are."""
+def _splatted(picture: Tensor, preceding: Camera, present: Camera) -> Brought:
+    """The pixels that a point lands in."""
     side = preceding.width
     points = unproject(preceding, pixel_grid(side, side), torch.full((side**2,), WALL))
     pixels, depth = project(present, points)
@@ -84,8 +89,8 @@ def splatted(picture: Tensor, preceding: Camera, present: Camera):
     return lambda: gather(picture.view(-1, 1), shown())[seen, 0], seen
 
 
-def warped(picture: Tensor, preceding: Camera, present: Camera):
-    """What computes the colours of all pixels but those of the rim, and which these are."""
+def _warped(picture: Tensor, preceding: Camera, present: Camera) -> Brought:
+    """All pixels but those of the rim."""
     side = preceding.width
     rim = torch.zeros(side, side, dtype=torch.bool)
     rim[1:-1, 1:-1] = True

@@ -30,7 +30,7 @@ def test_an_experiment_has_a_row_a_setting_with_its_largest_error_and_its_order(
     assert [row["error"] for row in rows] == pytest.approx([step**3 for step in steps])
     for row in rows:
         assert row["order"] == pytest.approx(3)
-        assert row["order_range"] == (0.1, 0.3)
+        assert (row["order_from"], row["order_to"]) == (0.1, 0.3)
         assert 0 <= row["ms_lo"] <= row["ms"] <= row["ms_hi"]
 
 

@@ -10,18 +10,20 @@ from PIL import Image
 from reports.accuracy import experiment_table, setting_table, write_accuracy
 from reports.figures import frontier_plot
 
-STEP = {"subject": "ramp: depth", "knob": "step", "order": 1.996, "order_range": (1 / 64, 0.25),
+STEP = {"subject": "ramp: depth", "knob": "step", "order": 1.996, "order_from": 1 / 64, "order_to": 0.25,
         "ms_lo": 1.0, "ms_hi": 2.0}  # fmt: skip
 EXPERIMENTS = [
     STEP | {"setting": 0.25, "error": 0.00384, "ms": 0.39},
     STEP | {"setting": 1 / 64, "error": 1.5e-5, "ms": 0.6},
     {"subject": "encoding", "knob": "table", "setting": "packed bf16", "error": 3.7e-3, "ms": 6.0,
-     "ms_lo": 5.0, "ms_hi": 7.0, "order": None, "order_range": None},
+     "ms_lo": 5.0, "ms_hi": 7.0, "order": None, "order_from": None,
+     "order_to": None},
 ]  # fmt: skip
 
 
 def setting(name: str, ms: float, psnr: float, instead: str) -> dict:
-    return {"knob": name.split()[0], "setting": name, "ms": ms, "ms_lo": 0.9 * ms,
+    return {"scene": "totem", "trajectory": "test-orbit", "resolution": "400x400",
+            "knob": name.split()[0], "setting": name, "ms": ms, "ms_lo": 0.9 * ms,
             "ms_hi": 1.2 * ms, "psnr": psnr, "lost": 31 - psnr, "instead": instead,
             "psnr_to_first": math.inf if name == "everything off" else psnr + 8,
             "overrides": ""}  # fmt: skip
@@ -52,16 +54,19 @@ def test_settings_stand_in_the_order_of_their_time_and_the_frontier_is_bold():
 
 
 def test_the_page_shows_both_tables_and_the_plot(tmp_path):
-    page = write_accuracy(EXPERIMENTS, SETTINGS, tmp_path / "accuracy")
+    page = write_accuracy(
+        EXPERIMENTS, SETTINGS, tmp_path / "accuracy", "steerbench accuracy seed=3"
+    )
     text = page.read_text()
     assert "](frontier.png)" in text
+    assert "steerbench accuracy seed=3" in text
     assert setting_table(SETTINGS).markdown() in text
     assert experiment_table(EXPERIMENTS).markdown() in text
     assert not list(page.parent.glob(".*"))
 
 
 def test_without_settings_the_page_is_that_of_the_kernels(tmp_path):
-    page = write_accuracy(EXPERIMENTS, [], tmp_path)
+    page = write_accuracy(EXPERIMENTS, [], tmp_path, "steerbench accuracy --kernels")
     assert "frontier" not in page.read_text()
     assert {path.name for path in tmp_path.iterdir()} == {"report.md", "kernels.csv"}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from types import SimpleNamespace
 
 import pytest
 
@@ -13,7 +14,7 @@ from sweeps.knobs import EVERYTHING_OFF
 from sweeps.variants import Variant
 
 ERROR = {"subject": "ramp", "knob": "step", "setting": 0.25, "error": 0.125, "order": None,
-         "order_range": None, "ms": 1.5, "ms_lo": 1.0, "ms_hi": 2.0}  # fmt: skip
+         "order_from": None, "order_to": None, "ms": 1.5, "ms_lo": 1.0, "ms_hi": 2.0}  # fmt: skip
 FIGURES = {"everything off": (100.0, 30.0), "fast": (10.0, 29.9), "faster": (5.0, 29.0),
            "poor": (20.0, 20.0)}  # fmt: skip
 
@@ -35,12 +36,14 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> None:
          "psnr_to_first": 40.0 if index else math.inf}
         for index, (name, (ms, psnr)) in enumerate(FIGURES.items())
     ]  # fmt: skip
+    ground = SimpleNamespace(name="totem"), SimpleNamespace(name="orbit", resolution="8x8"), None
     known = {"reference": [EVERYTHING_OFF], "refined": variants}
     monkeypatch.setattr("sweeps.accuracy.knobs", lambda trained: known)
-    monkeypatch.setattr("sweeps.accuracy.common_ground", lambda *arguments: (None, None, None))
+    monkeypatch.setattr("sweeps.accuracy.common_ground", lambda *arguments: ground)
     monkeypatch.setattr("sweeps.accuracy.usable_method", lambda *arguments, **options: Fitted())
     monkeypatch.setattr("sweeps.accuracy.render_in_turns", lambda *arguments: rows)
     monkeypatch.setattr("sweeps.accuracy.experiment_rows", lambda *arguments: [ERROR])
+    monkeypatch.setattr("reports.accuracy.frontier_plot", lambda rows, path: path.touch())
 
 
 @pytest.mark.parametrize("text", ["0.1dB", "0.1 dB", ".1", "0.1", "0.10db"])

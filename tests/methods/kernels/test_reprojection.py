@@ -24,7 +24,7 @@ def errors(experiment: Experiment) -> dict[float, float]:
 
 
 def test_a_wrong_depth_looks_up_beside_by_the_difference_of_the_parallaxes(by_knob):
-    (experiment,) = by_knob["error of the depth, of 1"]
+    (experiment,) = by_knob["relative error of the depth"]
     parallax = 256 * BESIDE / WALL
     for wrong, error in errors(experiment).items():
         # Coordinates up to 256 in float32, rounded a dozen times.
