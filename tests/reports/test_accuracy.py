@@ -10,8 +10,8 @@ from PIL import Image
 from reports.accuracy import experiment_table, setting_table, write_accuracy
 from reports.figures import frontier_plot
 
-STEP = {"subject": "ramp: depth", "knob": "step", "order": 1.996, "order_from": 1 / 64, "order_to": 0.25,
-        "ms_lo": 1.0, "ms_hi": 2.0}  # fmt: skip
+STEP = {"subject": "ramp: depth", "knob": "step", "order": 1.996,
+        "order_from": 1 / 64, "order_to": 0.25, "ms_lo": 1.0, "ms_hi": 2.0}  # fmt: skip
 EXPERIMENTS = [
     STEP | {"setting": 0.25, "error": 0.00384, "ms": 0.39},
     STEP | {"setting": 1 / 64, "error": 1.5e-5, "ms": 0.6},

@@ -43,6 +43,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sweeps.accuracy.usable_method", lambda *arguments, **options: Fitted())
     monkeypatch.setattr("sweeps.accuracy.render_in_turns", lambda *arguments: rows)
     monkeypatch.setattr("sweeps.accuracy.experiment_rows", lambda *arguments: [ERROR])
+    monkeypatch.setattr("methods.kernels.accuracy.all_experiments", lambda: [])
     monkeypatch.setattr("reports.accuracy.frontier_plot", lambda rows, path: path.touch())
 
 
