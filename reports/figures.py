@@ -61,11 +61,11 @@ def frontier_plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Write a PNG: error of a frame against its time, log-log, a point for each setting.
 
     To the left the error against the ground truth, with the Pareto frontier as a staircase through
-    the settings that none beats, to the right that against the first row, which stands for
-    everything off. These and what is shipped are circled and named.
+    the settings that none beats, to the right that against everything off. The frontier and the
+    first two rows are circled and named.
 
     Args:
-        rows: knob, setting, ms, ms_lo, ms_hi, psnr, psnr_to_first and instead: the setting itself
+        rows: first everything off, then the setting that nothing is changed in. Of each its knob, setting, ms, ms_lo, ms_hi, psnr, psnr_to_first and instead: the setting itself
             on the frontier.
     """
     figure = Figure(figsize=(13, 7), layout="constrained")
@@ -73,8 +73,7 @@ def frontier_plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     best = sorted((row for row in rows if row["instead"] == row["setting"]), key=lambda r: r["ms"])
     for axes, column in ((truth, "psnr"), (off, "psnr_to_first")):
         _error_against_time(axes, rows, column)
-        named = [rows[0], *best] if column == "psnr" else []
-        named += [row for row in rows if row["setting"] == "as shipped"]
+        named = (*rows[:2], *best) if column == "psnr" else rows[1:2]
         for row in {row["setting"]: row for row in named}.values():
             place = (row["ms"], _rms(row[column]))
             axes.plot(*place, "o", markersize=11, fillstyle="none", color="black")

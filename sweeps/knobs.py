@@ -11,6 +11,9 @@ EVERYTHING_OFF = Variant(
     "everything off",
     (
         "method=steernerf_untaught",
+        "engine=torch",
+        "precision=fp32",
+        "method.pipeline.range.mode=off",
         "method.pipeline.steps=1",
         "method.pipeline.refined=1",
         "method.pipeline.skip.hidden=false",
@@ -19,6 +22,8 @@ EVERYTHING_OFF = Variant(
 )
 """The trained field by a ray for every pixel, at the step of stage 1, each to its end. Where the
 field is empty belongs to the model: what it holds there was never held against a picture."""
+
+AS_IT_IS = Variant("as it is")
 
 TRAININGS = (
     ("L", "method.pipeline.frames", (0, 1, 3), ()),
@@ -32,14 +37,14 @@ TRAININGS = (
 
 
 def knobs(trained: bool) -> Mapping[str, Sequence[Variant]]:
-    """By the name of a knob the settings it is turned to, all else as shipped; everything off comes
-    first.
+    """By the name of a knob the settings it is turned to, all else as it is; everything off comes
+    first, then what is not turned at all.
 
     All are rendered from one training, but for those that are added with `trained`.
     """
     return {
         "reference": [EVERYTHING_OFF],
-        "as shipped": [Variant("as shipped")],
+        "as it is": [AS_IT_IS],
         "step length": [_step(value) for value in (1, 1.5, 3, 4)],
         "stop": [_stop(value) for value in ("1e-1", "3e-2", "1e-3", "1e-4")],
         "range reduction": [
@@ -50,7 +55,7 @@ def knobs(trained: bool) -> Mapping[str, Sequence[Variant]]:
             Variant(f"{name} not skipped", (f"method.pipeline.skip.{switch}=false",))
             for name, switch in SWITCHES.items()
         ],
-        "engine": list(engines())[1:],  # the first is the one that is shipped
+        "engine": list(engines())[1:],  # the first is the default
         "two knobs": [
             _both(_refined(share), other)
             for share in (0, 0.06, 0.25, 0.5, 1)

@@ -31,7 +31,7 @@ def setting(name: str, ms: float, psnr: float, instead: str) -> dict:
 
 SETTINGS = [
     setting("everything off", 400.0, 31.0, "everything off"),
-    setting("as shipped", 50.0, 30.0, "refined 0"),
+    setting("as it is", 50.0, 30.0, "refined 0"),
     setting("refined 0", 40.0, 30.25, "refined 0"),
 ]
 
@@ -45,10 +45,10 @@ def test_an_experiment_is_told_once_with_its_order_and_where_that_was_fitted():
 
 def test_settings_stand_in_the_order_of_their_time_and_the_frontier_is_bold():
     table = setting_table(SETTINGS)
-    assert [line[0] for line in table.lines] == ["refined 0", "as shipped", "everything off"]
+    assert [line[0] for line in table.lines] == ["refined 0", "as it is", "everything off"]
     assert table.bold == {(0, 0), (2, 0)}
     assert table.lines[1] == (
-        "as shipped", "50.0", "45.0 – 60.0", "30.00", "1.00", "38.0", "refined 0"
+        "as it is", "50.0", "45.0 – 60.0", "30.00", "1.00", "38.0", "refined 0"
     )  # fmt: skip
     assert table.lines[2][5] == "the same"
 
