@@ -65,8 +65,8 @@ def frontier_plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     first two rows are circled and named.
 
     Args:
-        rows: first everything off, then the setting that nothing is changed in. Of each its knob, setting, ms, ms_lo, ms_hi, psnr, psnr_to_first and instead: the setting itself
-            on the frontier.
+        rows: first everything off, then the setting in which nothing is changed. Of each its knob,
+            setting, ms, ms_lo, ms_hi, psnr, psnr_to_first and instead: itself on the frontier.
     """
     figure = Figure(figsize=(13, 7), layout="constrained")
     truth, off = figure.subplots(1, 2, sharex=True)
