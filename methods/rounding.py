@@ -59,7 +59,7 @@ def _in_precision(field: HashField, precision: Precision) -> HashField:
     other = HashField(field.grid, field.channels, precision=precision)
     other.load_state_dict(field.state_dict())
     other.repack()
-    return other
+    return other.requires_grad_(False)
 
 
 def _answer(field: HashField, positions: Tensor, directions: Tensor, index: int) -> Tensor:

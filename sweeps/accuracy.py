@@ -42,14 +42,14 @@ def main(options: argparse.Namespace) -> int:
             "renderer=s2d, as method=steernerf"
         )
     log = _Once(outputs)
-    from methods.kernels.accuracy import all_experiments
-
-    experiments = experiment_rows(all_experiments(), options.repeats, log)
-    console().print(rich_table(experiment_table(experiments)))
     settings: list[dict[str, Any]] = []
     if not options.kernels:
         settings = _setting_rows(overrides, options, log)
         console().print(rich_table(setting_table(settings)))
+    from methods.kernels.accuracy import all_experiments
+
+    experiments = experiment_rows(all_experiments(), options.repeats, log)
+    console().print(rich_table(experiment_table(experiments)))
     command = shlex.join(["steerbench", *sys.argv[1:]])
     page = write_accuracy(experiments, settings, outputs / "accuracy", command)
     log.info(f"report: {page}")

@@ -43,7 +43,7 @@ def knobs(trained: bool) -> Mapping[str, Sequence[Variant]]:
     All are rendered from one training, but for those that are added with `trained`.
     """
     return {
-        "reference": [EVERYTHING_OFF],
+        "everything off": [EVERYTHING_OFF],
         "as it is": [AS_IT_IS],
         "step length": [_step(value) for value in (1, 1.5, 3, 4)],
         "stop": [_stop(value) for value in ("1e-1", "3e-2", "1e-3", "1e-4")],
