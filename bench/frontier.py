@@ -11,8 +11,8 @@ def best_instead(cost: Sequence[float], error: Sequence[float]) -> list[int]:
     """Of each setting, the index of the one to take in its place: the least `error` among those
     that cost no more, of equals the cheapest, of equals the first.
 
-    A setting stands for itself exactly where it lies on the Pareto frontier, or is the first of
-    several alike on it; any other is dominated by the setting that stands for it.
+    A setting stands for itself if it lies on the Pareto frontier (of several alike there, the
+    first); any other is dominated by the setting that stands for it.
     """
     costs, errors = np.asarray(cost, float), np.asarray(error, float)
     best: list[int] = [0] * len(costs)

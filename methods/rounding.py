@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bench.accuracy import Experiment, Trial
-from methods.fields import HashField, Precision
+from methods.fields import HashField
 from methods.kernels.encode import HashGrid, encode, pack
 
 SAMPLES = 1 << 16
@@ -41,7 +41,7 @@ def _networks(field: HashField, positions: Tensor, directions: Tensor) -> list[E
     exact_field = copy.deepcopy(field).double()
     exact_field.backend = "reference"
     exact = _answers(exact_field, positions.double(), directions.double())
-    fields = {"float32": field, "bf16": _in_precision(field, "bf16")}
+    fields = {"float32": field, "bf16": _in_bf16(field)}
     return [
         Experiment(
             f"field: {name}",
@@ -55,8 +55,8 @@ def _networks(field: HashField, positions: Tensor, directions: Tensor) -> list[E
     ]
 
 
-def _in_precision(field: HashField, precision: Precision) -> HashField:
-    other = HashField(field.grid, field.channels, precision=precision)
+def _in_bf16(field: HashField) -> HashField:
+    other = HashField(field.grid, field.channels, precision="bf16")
     other.load_state_dict(field.state_dict())
     other.repack()
     return other.requires_grad_(False)

@@ -37,7 +37,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> None:
         for index, (name, (ms, psnr)) in enumerate(FIGURES.items())
     ]  # fmt: skip
     ground = SimpleNamespace(name="totem"), SimpleNamespace(name="orbit", resolution="8x8"), None
-    known = {"reference": [EVERYTHING_OFF], "refined": variants}
+    known = {"everything off": [EVERYTHING_OFF], "refined": variants}
     monkeypatch.setattr("sweeps.accuracy.knobs", lambda trained: known)
     monkeypatch.setattr("sweeps.accuracy.common_ground", lambda *arguments: ground)
     monkeypatch.setattr("sweeps.accuracy.usable_method", lambda *arguments, **options: Fitted())
