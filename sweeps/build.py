@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Collection, Mapping
+from dataclasses import is_dataclass
 from types import UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -56,7 +57,9 @@ def check_settings(
     `prefix` stands before their names in the error; parameters `given` by the caller are no
     settings. Settings that are nodes with a `_target_` are checked against that.
     """
-    hints = get_type_hints(target.__init__ if inspect.isclass(target) else target)
+    # The fields of a dataclass may come from bases whose modules alone know their types.
+    plain = inspect.isclass(target) and not is_dataclass(target)
+    hints = get_type_hints(target.__init__ if plain else target)
     parameters = inspect.signature(target).parameters
     names = [name for name in parameters if name not in given]
     for name, value in settings.items():

@@ -16,7 +16,7 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from bench.errors import SteerbenchError
 from sweeps.names import unknown
@@ -34,6 +34,7 @@ examples
   steerbench list                              what there is, and what of it is usable here
   steerbench paper budget=demo                 every table of the SteerNeRF paper, as a page
   steerbench parity scene=totem budget=demo    what int8 costs, in decibels, and saves, in time
+  steerbench accuracy --within 0.1dB           the fastest setting that loses no more than that
   steerbench check BASELINE.json               is everything as good as it was
   steerbench results --format csv              every number measured so far
 """
@@ -48,6 +49,7 @@ COMMANDS = (
     "skips",
     "scaling",
     "stress",
+    "accuracy",
     "check",
     "compare",
     "scenes",
@@ -211,6 +213,8 @@ def _parser() -> Parser:
     )
     stress.set_defaults(module="stress", parser=stress)
 
+    _add_accuracy(commands)
+
     check = commands.add_parser(
         "check",
         help="compare what was measured with a recorded baseline",
@@ -252,6 +256,43 @@ def _parser() -> Parser:
     generic.add_argument("overrides", nargs="*", help="settings as of `steerbench run`")
     generic.set_defaults(module="generic", parser=generic)
     return parser
+
+
+def _add_accuracy(commands: Any) -> None:
+    accuracy = commands.add_parser(
+        "accuracy",
+        help="run time against error of every knob, and which setting to take",
+        description="Turn every knob that trades time for error and measure both: of the kernels "
+        "where the exact answer is known, of SteerNeRF on the frames of one trained model, all "
+        "settings in turn. Prints what no other setting beats (the Pareto frontier); table, plot "
+        "and rows go to OUTPUTS/accuracy.",
+    )
+    accuracy.add_argument(
+        "--within",
+        metavar="DECIBELS",
+        help="also print the fastest setting that loses at most so much PSNR against everything "
+        "off, as a command: --within 0.1dB",
+    )
+    accuracy.add_argument(
+        "--kernels", action="store_true", help="only the kernels: seconds, and nothing is trained"
+    )
+    accuracy.add_argument(
+        "--trained",
+        action="store_true",
+        help="also what asks for trainings of its own: L, K, s, T, taught steps, a field in fp32",
+    )
+    accuracy.add_argument(
+        "--frames", type=int, default=24, help="first frames of the trajectory (default 24)"
+    )
+    accuracy.add_argument(
+        "--repeats", type=int, default=5, help="timed rounds over all settings (default 5)"
+    )
+    accuracy.add_argument(
+        "overrides",
+        nargs="*",
+        help="settings as of `steerbench run` (default scene=totem budget=demo trajectory=orbit)",
+    )
+    accuracy.set_defaults(module="accuracy", parser=accuracy)
 
 
 def _terminate(signum: int, frame: object) -> NoReturn:

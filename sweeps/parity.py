@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator
 from typing import Any
-
-from hydra.utils import get_class
-from omegaconf import OmegaConf
 
 from bench.errors import SteerbenchError
 from reports.tables import Table, megabytes, number
-from sweeps.overrides import CONFIGS, composed
+from sweeps.overrides import composed
 from sweeps.terminal import console, rich_table
-from sweeps.variants import Rendered, Variant, apart_text, finite, render_variants
+from sweeps.variants import Rendered, apart_text, engines, finite, render_variants
 
 SETTINGS = ("method=steernerf", "trajectory=smooth")
 
@@ -39,23 +35,12 @@ def main(options: argparse.Namespace) -> int:
             "steerbench parity compares engines of a 2D renderer: expected method=steernerf or "
             "steernerf_paper"
         )
-    found = render_variants(overrides, list(_engines()), options.frames, "engines")
+    found = render_variants(overrides, list(engines()), options.frames, "engines")
     rows = [_row(one, found[0]) for one in found]
     title = f"{found[0].method.name}, {options.frames} frames"
     console().print(rich_table(Table(title, COLUMNS, tuple(_line(row) for row in rows))))
     print(json.dumps([finite(row) for row in rows]))
     return 0
-
-
-def _engines() -> Iterator[Variant]:
-    """All engines at all precisions; torch in fp32, the standard, first."""
-    names = sorted(path.stem for path in (CONFIGS / "engine").glob("*.yaml"))
-    for name in sorted(names, key=lambda name: name != "torch"):
-        node: Any = OmegaConf.load(CONFIGS / "engine" / f"{name}.yaml")
-        kind: Any = get_class(node["_target_"])
-        for precision in kind.precisions:
-            settings = (f"engine={name}", f"precision={precision}")
-            yield Variant(f"{name}, {precision}", settings)
 
 
 def _row(one: Rendered, standard: Rendered) -> dict[str, Any]:

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from hydra.utils import get_class
+from omegaconf import DictConfig, OmegaConf
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
+from bench.protocol import EvaluationProtocol
 from bench.results import COLD, STEADY, Measurement
 from bench.run import measure
-from bench.types import Method
+from bench.trajectories import Trajectory
+from bench.types import Log, Method, Scene
 from sweeps.build import build
 from sweeps.measurement import checked_settings
-from sweeps.overrides import composed
+from sweeps.overrides import CONFIGS, composed
 
 RENDERED = "-rendered"
 """How the names of renderings end; see `bench.scoring`."""
@@ -67,38 +71,69 @@ def render_variants(
         SteerbenchError: a setting is wrong, the first variant cannot be used here, or there is no
             steady frame with ground truth among the first ones.
     """
-    if frames < 1:
-        raise SteerbenchError(f"--frames: expected 1 or more, got {frames}")
     configs = [composed([*overrides, *variant.settings]) for variant in variants]
     settings = checked_settings(configs[0])
     log = ConsoleLog(Path(settings.outputs))
-    scene = build(configs[0], "scene", log=log)
-    path = build(configs[0], "trajectory", scene)
-    path = replace(path, name=f"{path.name}-first{frames}", steps=path.steps[:frames])
-    protocol = build(configs[0], "protocol")
-    protocol = replace(protocol, name=f"{protocol.name} without LPIPS", lpips=())
+    scene, path, protocol = common_ground(configs[0], frames, log)
     found: list[Rendered] = []
     standard: dict[str, np.ndarray] = {}
     with log.progress(label, len(variants)) as progress:
         for variant, config in zip(variants, configs, strict=True):
-            torch.manual_seed(settings.seed)
-            try:
-                method = build(config, "method")
-            except Unavailable as error:
-                if not found:
-                    raise
-                log.info(f"{variant.name}: {error}")
-                progress.advance()
-                continue
-            budget = build(config, "budget")
-            measured = measure(
-                method, scene, path, protocol, budget, log, seed=settings.seed, pictures=frames
-            )
-            pictures = _steady_pictures(measured, frames)
-            standard = standard or pictures
-            found.append(_compared(variant, method, measured, pictures, standard))
+            method = usable_method(config, variant, log, required=not found)
+            if method is not None:
+                budget = build(config, "budget")
+                measured = measure(
+                    method, scene, path, protocol, budget, log, seed=settings.seed, pictures=frames
+                )
+                pictures = _steady_pictures(measured, frames)
+                standard = standard or pictures
+                found.append(_compared(variant, method, measured, pictures, standard))
             progress.advance()
     return found
+
+
+def common_ground(
+    config: DictConfig, frames: int, log: Log
+) -> tuple[Scene, Trajectory, EvaluationProtocol]:
+    """What all variants render and are scored by: the first `frames` of the trajectory, and the
+    protocol without LPIPS.
+
+    Raises:
+        SteerbenchError: a setting is wrong.
+    """
+    if frames < 1:
+        raise SteerbenchError(f"--frames: expected 1 or more, got {frames}")
+    scene = build(config, "scene", log=log)
+    path = build(config, "trajectory", scene)
+    path = replace(path, name=f"{path.name}-first{frames}", steps=path.steps[:frames])
+    protocol = build(config, "protocol")
+    return scene, path, replace(protocol, name=f"{protocol.name} without LPIPS", lpips=())
+
+
+def usable_method(
+    config: DictConfig, variant: Variant, log: Log, *, required: bool
+) -> Method | None:
+    """The method of `variant`, not yet trained. Where it cannot be used here: None, and the log is
+    told; Unavailable if it is `required`."""
+    torch.manual_seed(config.seed)
+    try:
+        return build(config, "method")
+    except Unavailable as error:
+        if required:
+            raise
+        log.info(f"{variant.name}: {error}")
+        return None
+
+
+def engines() -> Iterator[Variant]:
+    """All engines at all precisions; torch in fp32, the standard, first."""
+    names = sorted(path.stem for path in (CONFIGS / "engine").glob("*.yaml"))
+    for name in sorted(names, key=lambda name: name != "torch"):
+        node: Any = OmegaConf.load(CONFIGS / "engine" / f"{name}.yaml")
+        kind: Any = get_class(node["_target_"])
+        for precision in kind.precisions:
+            settings = (f"engine={name}", f"precision={precision}")
+            yield Variant(f"{name}, {precision}", settings)
 
 
 def _steady_pictures(measured: Measurement, frames: int) -> dict[str, np.ndarray]:

@@ -9,10 +9,11 @@ from types import ModuleType
 from typing import Literal
 
 import pytest
+from hydra.utils import get_object
 from omegaconf import OmegaConf
 
 from bench.errors import SteerbenchError
-from sweeps.build import build
+from sweeps.build import build, check_settings
 
 
 @dataclass
@@ -107,3 +108,10 @@ def test_a_fitting_setting_is_taken(override, expected):
 def test_a_setting_that_does_not_fit_is_named_in_full(override, message):
     with pytest.raises(SteerbenchError, match=message):
         built(override)
+
+
+def test_a_dataclass_may_have_fields_of_types_that_only_the_module_of_its_base_knows():
+    options = get_object("methods.untaught.UntaughtOptions")  # does not import RangeReduction
+    check_settings(options, {"steps": 3.0, "taught_steps": 2.0})
+    with pytest.raises(SteerbenchError, match="jitter: expected bool, got 'much'"):
+        check_settings(options, {"jitter": "much"})

@@ -1,0 +1,203 @@
+"""Run time against error, for computations whose exact answer is known and for whole methods.
+
+What is compared takes turns, so that a drifting clock hits all of it alike; its errors and its
+times come from the same runs.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bench.frontier import observed_order
+from bench.metrics import psnr
+from bench.probes import StageClock
+from bench.protocol import EvaluationProtocol, composite
+from bench.trajectories import Trajectory
+from bench.types import Log, Method, Scene, SteerbenchError
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One setting of a knob.
+
+    Attributes:
+        setting: the value of the knob, in words where it is no number.
+        call: computes, from inputs that are in place, what `exact` holds.
+        exact: the answer, float64.
+    """
+
+    setting: float | str
+    call: Callable[[], Tensor]
+    exact: Tensor
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A computation whose exact answer is known, and a knob that trades its time for its error.
+
+    Attributes:
+        subject: what is computed.
+        knob: what is turned, with its unit.
+        trials: the settings of the knob.
+        smooth: the lowest and the highest setting between which the error should be a power of
+            the knob; None: it is none, or rounding hides it.
+    """
+
+    subject: str
+    knob: str
+    trials: Sequence[Trial]
+    smooth: tuple[float, float] | None = None
+
+
+def experiment_rows(
+    experiments: Sequence[Experiment], repeats: int, log: Log
+) -> list[dict[str, Any]]:
+    """One row for each trial: subject, knob, setting, error (the largest, absolute), ms (median of
+    `repeats`), ms_lo and ms_hi (the extremes), and the observed order of its experiment with
+    order_from and order_to, between which it was fitted; None where there is none."""
+    rows = []
+    with log.progress("experiments", len(experiments)) as progress:
+        for experiment in experiments:
+            trials = experiment.trials
+            errors = [_largest_error(trial) for trial in trials]  # and warms up
+            order = _order(experiment, errors)
+            fitted = experiment.smooth or (None, None)
+            for trial, error, times in zip(
+                trials, errors, _times_ms([t.call for t in trials], repeats), strict=True
+            ):
+                rows.append(
+                    {
+                        "subject": experiment.subject,
+                        "knob": experiment.knob,
+                        "setting": trial.setting,
+                        "error": error,
+                        **_spread(times),
+                        "order": order,
+                        "order_from": fitted[0],
+                        "order_to": fitted[1],
+                    }
+                )
+            progress.advance(note=experiment.subject)
+    return rows
+
+
+def _largest_error(trial: Trial) -> float:
+    return float((trial.call().double() - trial.exact).abs().max())
+
+
+def _order(experiment: Experiment, errors: Sequence[float]) -> float | None:
+    if experiment.smooth is None:
+        return None
+    low, high = experiment.smooth
+    settings = [float(trial.setting) for trial in experiment.trials]
+    pairs = zip(settings, errors, strict=True)
+    fitted = [(setting, error) for setting, error in pairs if low <= setting <= high]
+    return observed_order(*zip(*fitted, strict=True))
+
+
+def _times_ms(calls: Sequence[Callable[[], Tensor]], repeats: int) -> list[list[float]]:
+    """Of each call `repeats` times, in turn with the others."""
+    times: list[list[float]] = [[] for _ in calls]
+    for _ in range(repeats):
+        for call, of_call in zip(calls, times, strict=True):
+            begun = time.perf_counter()
+            call()
+            of_call.append(1e3 * (time.perf_counter() - begun))
+    return times
+
+
+def _spread(times: Sequence[float]) -> dict[str, float]:
+    return {"ms": statistics.median(times), "ms_lo": min(times), "ms_hi": max(times)}
+
+
+def render_in_turns(
+    methods: Mapping[str, Method],
+    scene: Scene,
+    trajectory: Trajectory,
+    protocol: EvaluationProtocol,
+    repeats: int,
+    log: Log,
+) -> list[dict[str, Any]]:
+    """Render the same trajectory with every one of the fitted `methods` in turn, again and again.
+
+    A first round warms up and is scored; `repeats` more are timed. A turn is the whole trajectory,
+    not a frame, which would find the caches full of another model.
+
+    Returns:
+        One row for each method, of the frames that have a ground truth and as many frames before
+        them as any of the methods looks back on: setting (its name), ms (a round's mean time of a
+        frame; median over the rounds), ms_lo and ms_hi (its extremes), psnr (mean over the frames)
+        and psnr_to_first (against the pictures of the first method, all frames together, inf where
+        there is no difference), both of pictures as `protocol` rounds them.
+
+    Raises:
+        SteerbenchError: there is no such frame.
+    """
+    start = max(method.memory for method in methods.values())
+    steps = trajectory.steps
+    scored = [n for n, step in enumerate(steps) if n >= start and step.truth is not None]
+    if not scored:
+        raise SteerbenchError(
+            f"{trajectory.name}: none of its {len(steps)} frames has a ground truth and {start} "
+            "frames before it to look back on; give more frames"
+        )
+    clocks = {name: StageClock(method.settings()["device"]) for name, method in methods.items()}
+    scores = _Scores(scene, trajectory, protocol)
+    with torch.no_grad(), log.progress("rendering", (repeats + 1) * len(methods)) as progress:
+        for round_ in range(repeats + 1):
+            for name, method in methods.items():
+                method.reset()
+                for number, step in enumerate(steps):
+                    with clocks[name].frame():
+                        frame = method.render(step.camera, clocks[name])
+                    if round_ == 0 and number in scored:
+                        scores.add(name, number, frame.rgb)
+                progress.advance(note=f"round {round_} of {repeats}" if round_ else "warming up")
+    return [
+        {"setting": name, **_spread(_round_means(clock, len(steps), scored)), **scores.of(name)}
+        for name, clock in clocks.items()
+    ]
+
+
+def _round_means(clock: StageClock, frames: int, scored: Sequence[int]) -> list[float]:
+    """Mean ms of the `scored` frames of each round of `frames` but the first."""
+    ms = [record.total_ns / 1e6 for record in clock.frames]
+    rounds = [ms[first : first + frames] for first in range(frames, len(ms), frames)]
+    return [statistics.fmean(of_round[number] for number in scored) for of_round in rounds]
+
+
+class _Scores:
+    """PSNR of each method's pictures, against the ground truth and against those of the first."""
+
+    def __init__(self, scene: Scene, path: Trajectory, protocol: EvaluationProtocol) -> None:
+        self._split, self._background = scene.splits[path.split], scene.background
+        self._steps, self._rounded = path.steps, protocol.rounded
+        self._first: dict[int, Tensor] = {}
+        self._psnr: dict[str, list[float]] = {}
+        self._apart: dict[str, list[float]] = {}
+
+    def add(self, name: str, number: int, rgb: Tensor) -> None:
+        """The frame `number` of the trajectory, as the method `name` rendered it."""
+        truth = self._steps[number].truth
+        assert truth is not None
+        picture = self._rounded(rgb).cpu()
+        exact = composite(self._split.images[truth], self._background)
+        apart = picture.double() - self._first.setdefault(number, picture).double()
+        self._psnr.setdefault(name, []).append(psnr(picture, exact))
+        self._apart.setdefault(name, []).append(apart.square().mean().item())
+
+    def of(self, name: str) -> dict[str, float]:
+        """The scores of a method in a row."""
+        apart = statistics.fmean(self._apart[name])
+        return {
+            "psnr": statistics.fmean(self._psnr[name]),
+            "psnr_to_first": -10 * math.log10(apart) if apart else math.inf,
+        }

@@ -1,0 +1,37 @@
+"""Settings that cost time and make errors: which are worth having, which to take."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+
+def best_instead(cost: Sequence[float], error: Sequence[float]) -> list[int]:
+    """Of each setting, the index of the one to take in its place: the least `error` among those
+    that cost no more, of equals the cheapest, of equals the first.
+
+    A setting stands for itself if it lies on the Pareto frontier (of several alike there, the
+    first); any other is dominated by the setting that stands for it.
+    """
+    costs, errors = np.asarray(cost, float), np.asarray(error, float)
+    best: list[int] = [0] * len(costs)
+    least = -1
+    for index in np.lexsort((errors, costs)):  # the cheapest first; lexsort keeps the order of ties
+        if least < 0 or errors[index] < errors[least]:
+            least = int(index)
+        best[index] = least
+    return best
+
+
+def cheapest_within(cost: Sequence[float], error: Sequence[float], limit: float) -> int | None:
+    """The cheapest setting whose error is at most `limit`, as an index; None: there is none."""
+    allowed = [index for index, size in enumerate(error) if size <= limit]
+    return min(allowed, key=lambda index: (cost[index], error[index]), default=None)
+
+
+def observed_order(knob: Sequence[float], error: Sequence[float]) -> float:
+    """p of the power law error = c knob^p that fits best: the slope of the logarithms, by least
+    squares. `knob` and `error` are positive, and two or more."""
+    slope, _ = np.polyfit(np.log(knob), np.log(error), 1)
+    return float(slope)

@@ -1,0 +1,19 @@
+"""Experiments on the kernels: knobs that trade time for error, where the exact answer is known."""
+
+from __future__ import annotations
+
+import importlib
+
+from bench.accuracy import Experiment
+
+EXPERIMENT_MODULES = (
+    "methods.kernels.quadrature",
+    "methods.kernels.reprojection",
+    "methods.rounding",
+)
+
+
+def all_experiments() -> list[Experiment]:
+    """Those of all modules, on the CPU."""
+    modules = map(importlib.import_module, EXPERIMENT_MODULES)
+    return [experiment for module in modules for experiment in module.experiments()]

@@ -1,0 +1,197 @@
+"""Experiments on the quadrature of volume rendering: march and compositing in analytic media.
+
+Rays run along x through the unit cube, from its face x = 0; y says how dense the medium is on a
+ray. With the optical thickness tau(x) = int_0^x sigma, opacity and depth are
+
+alpha = 1 - exp(-tau(1)),  depth_sum = int_0^1 x sigma exp(-tau) = int_0^1 exp(-tau) - exp(-tau(1)).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bench.accuracy import Experiment, Trial
+from methods.kernels.composite import composite
+from methods.kernels.march import Occupancy, march
+
+Quantity = Literal["alpha", "depth_sum"]
+
+RAYS = 256
+NODES = 256
+"""Of the Gauss-Legendre rule for the depth: enough for rounding alone to be left."""
+
+STEPS = [2.0**-power for power in range(2, 11)]
+"""Of the march, in sides of the cube: with the last one a ray has the most samples it may have."""
+
+THIN = 1 / 32
+"""Optical thickness of a sample where rays are ended early."""
+
+
+@dataclass(frozen=True)
+class Medium:
+    """A density in the unit cube, and what lies in front of a point on rays along x.
+
+    Attributes:
+        sigma: of x and y [N], density [N].
+        thickness: of x and y [N], optical thickness [N] from 0 to x.
+    """
+
+    name: str
+    sigma: Callable[[Tensor, Tensor], Tensor]
+    thickness: Callable[[Tensor, Tensor], Tensor]
+
+    def exact(self, quantity: Quantity, y: Tensor) -> Tensor:
+        """Of the rays at `y` [R] float64; the depth where `thickness` is smooth in x."""
+        behind = torch.exp(-self.thickness(torch.ones_like(y), y))
+        if quantity == "alpha":
+            return 1 - behind
+        x, weight = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(NODES))
+        x, at = torch.meshgrid((x + 1) / 2, y, indexing="ij")
+        return weight / 2 @ torch.exp(-self.thickness(x, at)) - behind
+
+
+def _strength(y: Tensor) -> Tensor:
+    """Density on the ray at y: the cube is opaque to two thirds at one end, to nearly all at the
+    other."""
+    return 1 + 7 * y
+
+
+def _gaussian(name: str, centre: float, width: float = 0.1) -> Medium:
+    def sigma(x: Tensor, y: Tensor) -> Tensor:
+        return 4 * _strength(y) * torch.exp(-(((x - centre) / width) ** 2) / 2)
+
+    def thickness(x: Tensor, y: Tensor) -> Tensor:
+        root = math.sqrt(2) * width
+        area = torch.erf((x - centre) / root) + math.erf(centre / root)
+        return 4 * _strength(y) * width * math.sqrt(math.pi / 2) * area
+
+    return Medium(name, sigma, thickness)
+
+
+def _first_face(y: Tensor) -> Tensor:
+    """Where the slab begins: between the samples, at another place on every ray."""
+    return 0.3 + 0.1 * y
+
+
+HOMOGENEOUS = Medium("homogeneous medium", lambda x, y: _strength(y), lambda x, y: _strength(y) * x)
+RAMP = Medium("linear ramp", lambda x, y: _strength(y) * x, lambda x, y: _strength(y) * x**2 / 2)
+SLAB = Medium(
+    "homogeneous slab",
+    lambda x, y: _strength(y) * ((x > _first_face(y)) & (x < 0.7)),
+    lambda x, y: _strength(y) * (x.clamp(max=0.7) - _first_face(y)).clamp(min=0),
+)
+INSIDE = _gaussian("Gaussian density", 0.5)
+CUT = _gaussian("Gaussian density, cut off by a face", 0.1)
+
+FINE = (2.0**-7, 2.0**-4)
+"""Steps that resolve the media below and leave errors that are far above rounding."""
+
+MEDIA: tuple[tuple[Medium, Quantity, tuple[float, float] | None], ...] = (
+    (HOMOGENEOUS, "alpha", None),
+    (HOMOGENEOUS, "depth_sum", FINE),
+    (RAMP, "alpha", None),
+    (RAMP, "depth_sum", FINE),
+    (INSIDE, "alpha", None),
+    (INSIDE, "depth_sum", FINE),
+    (CUT, "alpha", FINE),
+    (SLAB, "alpha", (STEPS[-1], STEPS[0])),
+)
+"""What is integrated, and over which steps its order is fitted; None: no power law."""
+
+NAMES: dict[Quantity, str] = {"alpha": "opacity", "depth_sum": "depth"}
+
+
+def experiments() -> list[Experiment]:
+    """Step length, position of the sample, early stop, and what adds the samples up."""
+    return [
+        *(_steps(medium, quantity, smooth) for medium, quantity, smooth in MEDIA),
+        _steps(RAMP, "depth_sum", FINE, phase=0.0),
+        _stops(),
+        *(_accumulation(*kind) for kind in ACCUMULATORS),
+    ]
+
+
+def _steps(
+    medium: Medium, quantity: Quantity, smooth: tuple[float, float] | None, phase: float = 0.5
+) -> Experiment:
+    y = _ray_heights()
+    exact = medium.exact(quantity, y.double())
+    subject = f"{medium.name}: {NAMES[quantity]}"
+    if phase != 0.5:
+        subject += ", samples where their intervals begin"
+    trials = [
+        Trial(step, partial(render, medium, quantity, y, step, phase), exact) for step in STEPS
+    ]
+    return Experiment(subject, "step, sides of the cube", trials, smooth)
+
+
+def _ray_heights() -> Tensor:
+    return (torch.arange(RAYS) + 0.5) / RAYS
+
+
+def render(medium: Medium, quantity: Quantity, y: Tensor, step: float, phase: float) -> Tensor:
+    """Opacity or depth [R] of the rays at `y` [R], by march and compositing, without a stop."""
+    origins = torch.stack((torch.zeros_like(y), y, torch.full_like(y, 0.5)), dim=1)
+    directions = torch.eye(3)[:1].expand(len(y), 3)
+    occupancy = Occupancy(torch.ones(16, 16, 16))
+    jitter = torch.full_like(y, phase)
+    samples = march(origins, directions, occupancy, step, jitter=jitter)
+    sigma = medium.sigma(samples.positions[:, 0], samples.positions[:, 1])
+    values = torch.zeros(len(samples), 1)
+    pixels = composite(sigma, values, samples.t, samples.delta, samples.offsets, stop=0.0)
+    return getattr(pixels, quantity)
+
+
+def _stops() -> Experiment:
+    """Rays of samples of thickness `THIN`, ended at a transmittance."""
+    inputs, exact = _even_rays(RAYS, 1024, 1024 * THIN)
+    stops = [0.0, *(10.0**-power for power in range(7, 0, -1))]
+    trials = [Trial(stop, partial(_opacity, *inputs, stop), exact) for stop in stops]
+    return Experiment("early stop: light that leaks", "stop", trials, (1e-5, 1e-1))
+
+
+ACCUMULATORS: tuple[tuple[str, torch.dtype], ...] = (
+    ("cpu", torch.float32),
+    ("reference", torch.float32),
+    ("reference", torch.float64),
+)
+
+
+def _accumulation(backend: str, dtype: torch.dtype) -> Experiment:
+    """Opacity of rays that are divided into more and more samples, 2^18 of all rays together.
+
+    All samples are alike, so that they are all rounded the same way.
+    """
+    trials = []
+    for count in (64, 1024, 65536):
+        (sigma, delta, offsets), exact = _even_rays((1 << 18) // count, count, 4.0)
+        inputs = sigma.to(dtype), delta.to(dtype), offsets
+        trials.append(Trial(count, partial(_opacity, *inputs, 0.0, backend), exact))
+    kind = str(dtype).removeprefix("torch.")
+    return Experiment(f"opacity added up: {backend} in {kind}", "samples of a ray", trials)
+
+
+def _even_rays(
+    rays: int, count: int, thickness: float
+) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
+    """Density, interval and offsets of `rays` that are divided evenly into `count` samples each, a
+    power of 2, and their exact opacity."""
+    delta = torch.full((rays * count,), 1 / count)
+    offsets = torch.arange(rays + 1) * count
+    exact = torch.full((rays,), -math.expm1(-thickness), dtype=torch.float64)
+    return (torch.full_like(delta, thickness), delta, offsets), exact
+
+
+def _opacity(
+    sigma: Tensor, delta: Tensor, offsets: Tensor, stop: float, backend: str = "auto"
+) -> Tensor:
+    nothing = torch.zeros(len(sigma), 1, dtype=sigma.dtype)
+    return composite(sigma, nothing, delta, delta, offsets, stop=stop, backend=backend).alpha

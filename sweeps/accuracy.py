@@ -1,0 +1,132 @@
+"""`steerbench accuracy`: run time against error of every knob that trades them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bench.accuracy import experiment_rows, render_in_turns
+from bench.console import ConsoleLog
+from bench.errors import SteerbenchError
+from bench.frontier import best_instead, cheapest_within
+from bench.types import Method
+from reports.accuracy import experiment_table, setting_table, write_accuracy
+from sweeps.build import build
+from sweeps.knobs import EVERYTHING_OFF, knobs
+from sweeps.measurement import checked_settings
+from sweeps.overrides import composed
+from sweeps.skips import LEAN
+from sweeps.terminal import console, rich_table
+from sweeps.variants import common_ground, finite, usable_method
+
+SETTINGS = ("method=steernerf", "scene=totem", "budget=demo", "trajectory=orbit")
+
+
+def main(options: argparse.Namespace) -> int:
+    """Print both tables and the setting that was asked for; as the last line, all rows as JSON."""
+    limit = None if options.within is None else decibels(options.within)
+    if options.repeats < 1:
+        raise SteerbenchError(f"--repeats: expected 1 or more, got {options.repeats}")
+    overrides = _last_words([*SETTINGS, *options.overrides])
+    config = composed(overrides)
+    outputs = Path(checked_settings(config).outputs)
+    if config.method.get("renderer", {}).get("_target_") != LEAN:
+        raise SteerbenchError(
+            "steerbench accuracy turns all knobs of SteerNeRF: expected a method with "
+            "renderer=s2d, as method=steernerf"
+        )
+    log = _Once(outputs)
+    settings: list[dict[str, Any]] = []
+    if not options.kernels:
+        settings = _setting_rows(overrides, options, log)
+        console().print(rich_table(setting_table(settings)))
+    from methods.kernels.accuracy import all_experiments
+
+    experiments = experiment_rows(all_experiments(), options.repeats, log)
+    console().print(rich_table(experiment_table(experiments)))
+    command = shlex.join(["steerbench", *sys.argv[1:]])
+    page = write_accuracy(experiments, settings, outputs / "accuracy", command)
+    log.info(f"report: {page}")
+    if settings and limit is not None:
+        print(_recommended(settings, limit))
+    print(json.dumps({"kernels": experiments, "settings": [finite(row) for row in settings]}))
+    return 0
+
+
+def decibels(text: str) -> float:
+    """The number in "0.1dB", "0.1 dB" or "0.1"; SteerbenchError where it is none or negative."""
+    number = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)\s*(dB)?", text, re.IGNORECASE)
+    if not number:
+        raise SteerbenchError(f"--within: expected decibels, 0.1dB for example, got {text!r}")
+    return float(number[1])
+
+
+class _Once(ConsoleLog):
+    """A log that says nothing twice: most settings find the same training."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        self._said: set[str] = set()
+
+    def info(self, message: str) -> None:
+        if message not in self._said:
+            self._said.add(message)
+            super().info(message)
+
+
+def _last_words(overrides: Sequence[str]) -> list[str]:
+    """`overrides` without those that a later one of the same name replaces."""
+    return list({line.partition("=")[0]: line for line in overrides}.values())
+
+
+def _setting_rows(
+    overrides: Sequence[str], options: argparse.Namespace, log: ConsoleLog
+) -> list[dict[str, Any]]:
+    """Of every setting its knob, overrides, times and errors, what it loses against everything off
+    and, in its place, the setting on the frontier; see `bench.accuracy.render_in_turns`."""
+    turned = [(knob, v) for knob, some in knobs(options.trained).items() for v in some]
+    lines = {v.name: _last_words([*overrides, *v.settings]) for _, v in turned}
+    configs = {name: composed(words) for name, words in lines.items()}
+    scene, path, protocol = common_ground(configs[EVERYTHING_OFF.name], options.frames, log)
+    methods: dict[str, Method] = {}
+    with log.progress("settings", len(turned)) as progress:
+        for _, variant in turned:
+            config = configs[variant.name]
+            method = usable_method(config, variant, log, required=not methods)
+            if method is not None:
+                method.fit(scene, build(config, "budget"), log)
+                methods[variant.name] = method
+            progress.advance(note=variant.name)
+    rendered = render_in_turns(methods, scene, path, protocol, options.repeats, log)
+    knob_of = {variant.name: knob for knob, variant in turned}
+    best = best_instead([row["ms"] for row in rendered], [-row["psnr"] for row in rendered])
+    return [
+        {
+            "scene": scene.name,
+            "trajectory": path.name,
+            "resolution": path.resolution,
+            "knob": knob_of[row["setting"]],
+            **row,
+            "lost": rendered[0]["psnr"] - row["psnr"],
+            "instead": rendered[instead]["setting"],
+            "overrides": " ".join(lines[row["setting"]]),
+        }
+        for row, instead in zip(rendered, best, strict=True)
+    ]
+
+
+def _recommended(rows: Sequence[dict[str, Any]], limit: float) -> str:
+    """The fastest setting that loses at most `limit` dB, as a command; everything off loses 0."""
+    index = cheapest_within([row["ms"] for row in rows], [row["lost"] for row in rows], limit)
+    assert index is not None
+    row = rows[index]
+    return (
+        f"within {limit:g} dB of everything off: {row['setting']}, {row['ms']:.1f} ms, "
+        f"{row['lost']:.3f} dB lost\nsteerbench run {row['overrides']}"
+    )

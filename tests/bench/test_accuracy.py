@@ -1,0 +1,113 @@
+"""Experiments report the error they made and its order; methods take turns on the same frames."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from bench.accuracy import Experiment, Trial, experiment_rows, render_in_turns
+from bench.errors import SteerbenchError
+from bench.protocol import EvaluationProtocol, composite
+from bench.trajectories import Step, Trajectory, from_split
+from bench.types import Frame
+
+QUICK = EvaluationProtocol(name="quick", lpips=())
+
+
+def cubic(step: float) -> Trial:
+    """Wrong by step^3 in one of two numbers, by less in the other."""
+    answer = torch.tensor([1 - step**3, 2.0], dtype=torch.float64)
+    return Trial(step, lambda: answer, torch.tensor([1.0, 2.0], dtype=torch.float64))
+
+
+def test_an_experiment_has_a_row_a_setting_with_its_largest_error_and_its_order(quiet_log):
+    steps = [0.5, 0.25, 0.125, 0.0625]
+    experiment = Experiment("cube", "step", [cubic(step) for step in steps], (0.1, 0.3))
+    rows = experiment_rows([experiment], 3, quiet_log)
+    assert [row["setting"] for row in rows] == steps
+    assert [row["error"] for row in rows] == pytest.approx([step**3 for step in steps])
+    for row in rows:
+        assert row["order"] == pytest.approx(3)
+        assert (row["order_from"], row["order_to"]) == (0.1, 0.3)
+        assert 0 <= row["ms_lo"] <= row["ms"] <= row["ms_hi"]
+
+
+def test_settings_outside_the_smooth_range_do_not_count_for_the_order(quiet_log):
+    wrong = Trial(1.0, lambda: torch.zeros(2), torch.full((2,), 1e6, dtype=torch.float64))
+    experiment = Experiment("cube", "step", [wrong, cubic(0.2), cubic(0.1)], (0.1, 0.2))
+    assert experiment_rows([experiment], 1, quiet_log)[0]["order"] == pytest.approx(3)
+
+
+def test_settings_in_words_have_no_order(quiet_log):
+    trial = Trial("packed", lambda: torch.ones(1), torch.zeros(1, dtype=torch.float64))
+    (row,) = experiment_rows([Experiment("table", "format", [trial])], 1, quiet_log)
+    assert (row["setting"], row["error"], row["order"]) == ("packed", 1.0, None)
+
+
+class Brighter:
+    """Renders the ground truth brighter by some 8-bit levels, and notes its turn in `turns`."""
+
+    def __init__(self, scene, levels: int, turns: list, memory: int = 0) -> None:
+        self.name, self.levels, self.turns, self.memory = "brighter", levels, turns, memory
+        self.split, self.background = scene.splits["test"], scene.background
+
+    def reset(self) -> None:
+        self.turns.append((self.levels, "reset"))
+
+    def render(self, camera, probe) -> Frame:
+        number = next(n for n, known in enumerate(self.split.cameras) if known is camera)
+        self.turns.append((self.levels, number))
+        dark = composite(self.split.images[number], self.background) / 2
+        picture = dark + self.levels / 255
+        return Frame(picture, torch.ones_like(picture[..., 0]), torch.ones_like(picture[..., 0]))
+
+    def settings(self) -> dict[str, str]:
+        return {"device": "cpu"}
+
+
+@pytest.fixture
+def in_turns(tiny_scene, quiet_log):
+    """Render the test split with methods of these brightnesses; rows, and who had which turn."""
+
+    def rendered(*levels: int, memory: int = 0, repeats: int = 2, trajectory=None):
+        turns: list = []
+        methods = {str(n): Brighter(tiny_scene, n, turns, memory) for n in levels}
+        path = trajectory or from_split(tiny_scene)
+        return render_in_turns(methods, tiny_scene, path, QUICK, repeats, quiet_log), turns
+
+    return rendered
+
+
+def test_methods_take_turns_in_every_round_and_begin_each_anew(in_turns, tiny_scene):
+    _, turns = in_turns(0, 8)
+    count = len(tiny_scene.splits["test"])
+    round_ = [(levels, turn) for levels in (0, 8) for turn in ("reset", *range(count))]
+    assert turns == 3 * round_  # one that warms up, two that are timed
+
+
+def test_pictures_are_held_against_those_of_the_first_and_against_the_truth(in_turns):
+    rows, _ = in_turns(0, 8)
+    assert [row["setting"] for row in rows] == ["0", "8"]
+    assert rows[0]["psnr_to_first"] == math.inf
+    # Halves of odd levels round to even ones: by up to one level more or less than 8.
+    assert -20 * math.log10(9 / 255) <= rows[1]["psnr_to_first"] <= -20 * math.log10(7 / 255)
+    assert rows[1]["psnr"] > rows[0]["psnr"]  # half the truth is too dark
+    for row in rows:
+        assert 0 < row["ms_lo"] <= row["ms"] <= row["ms_hi"]
+
+
+def test_only_frames_that_every_method_has_enough_before_are_scored(in_turns, tiny_scene):
+    cameras = tiny_scene.splits["test"].cameras
+    steps = [Step(cameras[0], 1), Step(cameras[1], 1)]  # the truth of the first is another frame's
+    path = Trajectory("two", "test", tuple(steps))
+    warm = Trajectory("one", "test", (Step(cameras[1], 1),))
+    rows, _ = in_turns(0, memory=1, trajectory=path)
+    alone, _ = in_turns(0, trajectory=warm)
+    assert rows[0]["psnr"] == alone[0]["psnr"]
+
+
+def test_without_a_frame_to_score_the_answer_is_to_give_more(in_turns, tiny_scene):
+    with pytest.raises(SteerbenchError, match="give more frames"):
+        in_turns(0, memory=len(tiny_scene.splits["test"]))

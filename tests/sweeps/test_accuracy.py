@@ -1,0 +1,117 @@
+"""`steerbench accuracy`: what is asked for, what is recommended, what is left behind."""
+
+from __future__ import annotations
+
+import json
+import math
+from types import SimpleNamespace
+
+import pytest
+
+from bench.errors import SteerbenchError
+from sweeps.accuracy import decibels
+from sweeps.knobs import EVERYTHING_OFF
+from sweeps.variants import Variant
+
+ERROR = {"subject": "ramp", "knob": "step", "setting": 0.25, "error": 0.125, "order": None,
+         "order_from": None, "order_to": None, "ms": 1.5, "ms_lo": 1.0, "ms_hi": 2.0}  # fmt: skip
+FIGURES = {"everything off": (100.0, 30.0), "fast": (10.0, 29.9), "faster": (5.0, 29.0),
+           "poor": (20.0, 20.0)}  # fmt: skip
+
+
+class Fitted:
+    """In place of a method."""
+
+    def fit(self, *arguments: object) -> None:
+        """Nothing to be done."""
+
+
+@pytest.fixture
+def measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`FIGURES`, in place of what the settings take and lose."""
+    variants = [Variant(name, (f"method.pipeline.refined={ms / 100}",)) for name, (ms, _) in
+                list(FIGURES.items())[1:]]  # fmt: skip
+    rows = [
+        {"setting": name, "ms": ms, "ms_lo": ms, "ms_hi": ms, "psnr": psnr,
+         "psnr_to_first": 40.0 if index else math.inf}
+        for index, (name, (ms, psnr)) in enumerate(FIGURES.items())
+    ]  # fmt: skip
+    ground = SimpleNamespace(name="totem"), SimpleNamespace(name="orbit", resolution="8x8"), None
+    known = {"everything off": [EVERYTHING_OFF], "refined": variants}
+    monkeypatch.setattr("sweeps.accuracy.knobs", lambda trained: known)
+    monkeypatch.setattr("sweeps.accuracy.common_ground", lambda *arguments: ground)
+    monkeypatch.setattr("sweeps.accuracy.usable_method", lambda *arguments, **options: Fitted())
+    monkeypatch.setattr("sweeps.accuracy.render_in_turns", lambda *arguments: rows)
+    monkeypatch.setattr("sweeps.accuracy.experiment_rows", lambda *arguments: [ERROR])
+    monkeypatch.setattr("methods.kernels.accuracy.all_experiments", lambda: [])
+    monkeypatch.setattr("reports.accuracy.frontier_plot", lambda rows, path: path.touch())
+
+
+@pytest.mark.parametrize("text", ["0.1dB", "0.1 dB", ".1", "0.1", "0.10db"])
+def test_a_budget_is_read_with_its_unit_or_without(text):
+    assert decibels(text) == 0.1
+
+
+@pytest.mark.parametrize("text", ["", "dB", "-1dB", "1e", "nan", "1 ms"])
+def test_what_is_no_budget_is_refused(text):
+    with pytest.raises(SteerbenchError, match="expected decibels"):
+        decibels(text)
+
+
+def test_the_last_line_has_every_row_as_json(steerbench, measured):
+    outcome = steerbench("accuracy")
+    assert outcome.status == 0
+    found = json.loads(outcome.out.splitlines()[-1])
+    assert found["kernels"] == [ERROR]
+    settings = {row["setting"]: row for row in found["settings"]}
+    assert list(settings) == list(FIGURES)
+    assert settings["everything off"]["psnr_to_first"] is None
+    assert settings["fast"]["lost"] == pytest.approx(0.1)
+    assert settings["fast"]["instead"] == "fast"
+    assert settings["poor"]["instead"] == "fast"
+
+
+@pytest.mark.parametrize(("budget", "refined"), [("0.2dB", "0.1"), ("1dB", "0.05"), ("20", "0.05")])
+def test_the_fastest_setting_within_the_budget_is_printed_as_a_command(
+    steerbench, measured, budget, refined
+):
+    outcome = steerbench("accuracy", "--within", budget, "seed=3")
+    command = outcome.out.splitlines()[-2]
+    assert command == (
+        "steerbench run method=steernerf scene=totem budget=demo trajectory=orbit seed=3 "
+        f"method.pipeline.refined={refined}"
+    )
+
+
+def test_where_nothing_faster_keeps_within_it_everything_off_is_recommended(steerbench, measured):
+    outcome = steerbench("accuracy", "--within", "0.01")
+    command = outcome.out.splitlines()[-2]
+    assert "method=steernerf_untaught" in command
+    assert "method=steernerf " not in command
+
+
+def test_a_report_a_plot_and_the_rows_are_left_in_outputs(steerbench, measured, tmp_path):
+    steerbench("accuracy", "outputs=here")
+    names = {path.name for path in (tmp_path / "here" / "accuracy").iterdir()}
+    assert names == {"report.md", "frontier.png", "kernels.csv", "settings.csv"}
+
+
+def test_the_kernels_alone_train_and_render_nothing(steerbench, measured, monkeypatch):
+    monkeypatch.setattr("sweeps.accuracy.common_ground", None)
+    outcome = steerbench("accuracy", "--kernels")
+    assert json.loads(outcome.out.splitlines()[-1]) == {"kernels": [ERROR], "settings": []}
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["--repeats", "0"], "--repeats: expected 1 or more, got 0"),
+        (["--within", "much"], "--within: expected decibels, 0.1dB for example, got 'much'"),
+        (["method=ngp"], "expected a method with renderer=s2d, as method=steernerf"),
+        (["budget=demmo"], "Did you mean demo?"),
+    ],
+)
+def test_what_is_wrong_is_said_before_anything_is_computed(steerbench, argv, message):
+    outcome = steerbench("accuracy", *argv)
+    assert outcome.status == 2
+    assert message in outcome.err
