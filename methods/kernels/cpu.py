@@ -16,7 +16,10 @@ f32, i32, u32 = np.float32, np.int32, np.uint32
 
 def follow_torch_threads() -> None:
     """Let the kernels run on as many threads as torch does, as far as numba has started them."""
-    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
+    threads = torch.get_num_threads()
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+    if torch.get_num_threads() != threads:  # numba started its own, and told OpenMP how many
+        torch.set_num_threads(threads)
 
 
 @njit(cache=True)

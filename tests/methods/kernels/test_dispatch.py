@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 
 from bench.errors import Unavailable
@@ -26,3 +29,16 @@ def test_backend_that_cannot_be_used_says_why() -> None:
 def test_cpu_backend_refuses_tensors_of_another_device() -> None:
     with pytest.raises(Unavailable, match="serves CPU tensors, these are on 'cuda'"):
         resolve("cpu", "cuda")
+
+
+def test_torch_keeps_its_threads_when_the_first_kernel_starts_its_own() -> None:
+    program = """
+import torch
+from methods.kernels.spherical import spherical_harmonics
+
+torch.set_num_threads(1)
+spherical_harmonics(torch.rand(100, 3), backend="cpu")
+print(torch.get_num_threads())
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "1\n"), done.stderr
