@@ -67,7 +67,7 @@ class MotionOptions:
 
     degrees: tuple[float, float] = (0.0, 2.5)
     length: int = 4
-    pool: int = 16
+    pool: int = 32
     uses: int = 32
     longer: float = 0.75
 
