@@ -8,6 +8,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -29,6 +31,28 @@ def composed(overrides: Sequence[str], **options: bool) -> DictConfig:
             return compose("run", overrides=list(overrides), **options)
     except (HydraException, OmegaConfBaseException) as error:
         raise explain(error, overrides) from error
+
+
+def swept(overrides: Sequence[str], loader: ConfigLoader | None = None) -> dict[str, list[str]]:
+    """The values of every setting that takes several in turn (seed=0,1,2); later ones count.
+
+    Args:
+        loader: of Hydra's, where a choice may be given as a pattern (method=*).
+
+    Raises:
+        SteerbenchError: one of them cannot be read.
+    """
+    try:
+        parsed = OverridesParser.create(loader).parse_overrides(list(overrides))
+    except OverrideParseException as error:
+        raise explain(error, overrides) from error
+    values = {
+        override.get_key_element(): list(override.sweep_string_iterator())
+        if override.is_discrete_sweep()
+        else []
+        for override in parsed
+    }
+    return {name: several for name, several in values.items() if several}
 
 
 def explain(error: HydraException | OmegaConfBaseException, argv: Sequence[str]) -> SteerbenchError:
