@@ -56,8 +56,8 @@ TIME = """\
 
 ![Mean time of a frame in ms, one bar per run, divided into stages](pictures/stages.png)
 
-One bar per run: the mean time of a frame, divided into the stages of the method. What was spent
-between the stages is `other`."""
+One bar per run: the mean time of a frame, divided into the stages of the method; a stage holds
+those inside it. What was spent between the stages is `other`."""
 
 
 def _heading(runs: Sequence[Run], failures: Mapping[str, str]) -> str:

@@ -32,7 +32,10 @@ ABLATION = {
 }
 """The same of the figure of the paper's ablations."""
 
-RANGE = {("table2", label): label for label in ("without range reduction", "with range reduction")}
+RANGE = {
+    ("table2", "without range reduction"): "ours, without range reduction",
+    ("table2", "with range reduction"): "ours, with range reduction",
+}
 
 
 def write_paper_page(
@@ -99,15 +102,17 @@ def _plots(lines: Lines, folder: Path) -> Iterator[str]:
             "PSNR against the mean time of a frame, one mark a line of Table 1: further up is"
             " better, further left is faster. Time has a logarithmic scale.",
         )
-    sized = [*first, *(line for line in lines.get("table6", ()) if line.runs)]
+    lengths = [line for line in lines.get("table6", ()) if line.runs]
+    sized = [*first, *(replace(line, label=f"ours, {line.label}") for line in lengths)]
     if sized:
         path = folder / "psnr-bytes.png"
         figures.quality_against(sized, "size_bytes.total", 1e6, "MB of the model", path)
         yield _figure(
             "Quality against memory",
             path.name,
-            "PSNR against the size of the model, one mark a line of Tables 1 and 6: further"
-            " up is better, further left is smaller. Size has a logarithmic scale.",
+            "PSNR against the size of the model, one mark a line of Tables 1 and 6, the latter with"
+            " another length T of the hash table: further up is better, further left is smaller."
+            " Size has a logarithmic scale.",
         )
     if divided := _named(METHODS | RANGE, lines):
         figures.stage_bars(divided, folder / "stages.png")
@@ -115,7 +120,8 @@ def _plots(lines: Lines, folder: Path) -> Iterator[str]:
             "Where the time goes",
             "stages.png",
             "The mean time of a frame, one bar for each run, divided into the stages of its method."
-            " What was spent between the stages is `other`.",
+            " Rays, march, field, composite and finish of Instant-NGP are what SteerNeRF does in"
+            " its stage `field`, at a lower resolution. What is in no stage is `other`.",
         )
     if followed := _named(METHODS, lines):
         figures.quality_over_frames(followed, folder / "psnr-frames.png")
@@ -138,7 +144,7 @@ def _compared(
     runs = _named(shown, lines)
     runs = [run for run in runs if run.views == runs[0].views]
     if runs and (frames := shown_frames(runs[0])):
-        yield f"## {title}"
+        yield f"## {title}\n\nThe middle one of the {len(frames)} frames that were kept."
         yield from beside(runs, frames[len(frames) // 2], title.lower(), folder)
 
 

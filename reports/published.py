@@ -103,13 +103,15 @@ def section(table: PaperTable, lines: Sequence[Repeated]) -> str:
     measured = {line.label: line for line in lines}
     shown = beside(table, measured)
     parts = [f"## {shown.title}"]
-    if runs := [run for line in lines for run in line.runs]:
+    runs = [run for line in lines for run in line.runs]
+    if runs:
         parts.append(f"Measured: {setting(runs)}, {_origin(runs)}.")
     parts.append(f"Paper: {table.published_on}.")
     parts.append(shown.markdown())
     if found := [step for trend in table.trends for step in trends.steps(trend, measured)]:
         parts.append(trends.table(found).markdown())
-    parts.append("\n".join(f"- {note}" for note in table.notes))
+    missing = (f"{name}: n/a. {why}" for run in runs for name, why in run.record["missing"].items())
+    parts.append("\n".join(f"- {note}" for note in dict.fromkeys((*table.notes, *missing))))
     return "\n\n".join(filter(None, parts))
 
 

@@ -47,9 +47,9 @@ def run(store: Store, stored_run: str) -> Run:
     return replace(found, rows=rows[rows["metric"].isin(figures)])
 
 
-def test_the_files_are_the_six_tables_of_the_paper() -> None:
+def test_the_first_files_are_the_six_tables_of_the_paper() -> None:
     tables = paper_tables()
-    assert [table.name for table in tables] == [f"table{number}" for number in range(1, 7)]
+    assert [table.name for table in tables][:6] == [f"table{number}" for number in range(1, 7)]
     for table in tables:
         labels = [line.label for line in table.lines]
         assert len(set(labels)) == len(labels)
@@ -115,3 +115,4 @@ def test_a_section_says_on_what_and_what_to_mind_and_whether_trends_hold(run: Ru
     assert f"scene {run.facts['scene']}" in text
     assert "| PSNR, dB: elsewhere < here | " in text
     assert "- Mind this." in text
+    assert "- lpips_alex: n/a. no weights were found" in text
