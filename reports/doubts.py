@@ -59,13 +59,14 @@ def doubts(runs: Sequence[Run]) -> list[Doubt]:
 
 def far_from_other_scenes(runs: Sequence[Run]) -> Iterator[Doubt]:
     """PSNR far below the median of the same method and settings on at least three scenes."""
-    for same in _alike(runs, lambda run: _settings(run, "scene", "seed", "method.seed")):
+    scored = [run for run in runs if math.isfinite(_psnr(run))]
+    for same in _alike(scored, lambda run: _settings(run, "scene", "seed", "method.seed")):
         scenes: dict[str, list[float]] = {}
         for run in same:
-            scenes.setdefault(run.facts["scene"], []).append(run.values.get("psnr", math.nan))
+            scenes.setdefault(run.facts["scene"], []).append(_psnr(run))
         usual = median(median(values) for values in scenes.values())
         for run in same:
-            below = usual - run.values.get("psnr", math.nan)
+            below = usual - _psnr(run)
             if len(scenes) > 2 and below > OTHER_SCENES_DB:
                 yield Doubt(
                     run.key, f"PSNR {below:.1f} dB below the median of {len(scenes)} scenes"
@@ -76,7 +77,7 @@ def far_from_reference(runs: Sequence[Run], references: Mapping[str, float]) -> 
     """PSNR far below what is known of the scene."""
     for run in runs:
         known = references.get(run.facts["scene"], math.nan)
-        below = known - run.values.get("psnr", math.nan)
+        below = known - _psnr(run)
         if below > REFERENCE_DB:
             yield Doubt(run.key, f"PSNR {below:.1f} dB below the {known} dB of Instant-NGP")
 
@@ -97,12 +98,11 @@ def stages_do_not_add_up(runs: Sequence[Run]) -> Iterator[Doubt]:
 def int8_far_from_fp32(runs: Sequence[Run]) -> Iterator[Doubt]:
     """int8 loses more than rounding should."""
     for same in _alike(runs, lambda run: _settings(run, "engine", "precision", "method.engine")):
-        exact = [run.values["psnr"] for run in same if run.facts["precision"] == "fp32"]
+        exact = [_psnr(run) for run in same if run.facts["precision"] == "fp32"]
         for run in same:
-            if run.facts["precision"] == "int8" and exact:
-                lost = median(exact) - run.values["psnr"]
-                if lost > INT8_DB:
-                    yield Doubt(run.key, f"int8 {lost:.2f} dB below fp32")
+            lost = max(exact, default=math.nan) - _psnr(run)
+            if run.facts["precision"] == "int8" and lost > INT8_DB:
+                yield Doubt(run.key, f"int8 {lost:.2f} dB below fp32")
 
 
 def faster_with_more_pixels(runs: Sequence[Run]) -> Iterator[Doubt]:
@@ -125,6 +125,10 @@ def table(found: Sequence[Doubt], runs: Sequence[Run]) -> Table:
         if doubt.key in facts
     )
     return Table("Rows to be doubted", ("run", *FACTS, "why"), lines, figures=False)
+
+
+def _psnr(run: Run) -> float:
+    return run.values.get("psnr", math.nan)
 
 
 def _pixels(run: Run) -> int:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
@@ -67,8 +68,7 @@ def quality_against(
 
     Both have the bars of their intervals where there are several seeds.
     """
-    figure = Figure(figsize=(8, 4), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = _quality(4.0, axis)
     for number, line in enumerate(lines):
         across, up = line.mean(metric), line.mean("psnr")
         if across is None or up is None:
@@ -88,10 +88,6 @@ def quality_against(
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5, 7)))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_locator(NullLocator())
-    axes.set_xlabel(axis)
-    axes.set_ylabel("PSNR, dB")
-    axes.grid(alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
     figure.legend(loc="outside right upper", frameon=False)
     figure.savefig(path, dpi=150)
 
@@ -99,16 +95,22 @@ def quality_against(
 def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
     """Write a PNG: PSNR of every frame with a ground truth along the path, a curve for each run;
     cold frames are hollow."""
-    figure = Figure(figsize=(8, 3.5), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = _quality(3.5, "frame of the path")
     for number, run in enumerate(runs):
         scored = run.frames.dropna(subset=["psnr"])
         colour, cold = COLOURS[number % len(COLOURS)], scored[scored["phase"] == COLD]
         axes.plot(scored["frame"], scored["psnr"], marker="o", color=colour, label=run.label)
         axes.plot(cold["frame"], cold["psnr"], "o", color=colour, markerfacecolor="white")
-    axes.set_xlabel("frame of the path")
+    figure.legend(loc="outside upper center", ncols=LEGEND_COLUMNS, frameon=False)
+    figure.savefig(path, dpi=150)
+
+
+def _quality(height: float, across: str) -> tuple[Figure, Axes]:
+    """Axes for PSNR, upwards, and what `across` says; `height` in inches."""
+    figure = Figure(figsize=(8, height), layout="constrained")
+    axes = figure.subplots()
+    axes.set_xlabel(across)
     axes.set_ylabel("PSNR, dB")
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="outside upper center", ncols=LEGEND_COLUMNS, frameon=False)
-    figure.savefig(path, dpi=150)
+    return figure, axes

@@ -52,7 +52,7 @@ def write_paper_page(
     pictures = folder / "pictures"
     with explained(folder):
         pictures.mkdir(parents=True, exist_ok=True)
-        for stale in pictures.glob("*.png"):  # of an earlier page
+        for stale in pictures.glob("frames-*.png"):  # of an earlier page
             stale.unlink()
         parts = [
             "# The tables of SteerNeRF, measured",
@@ -145,7 +145,7 @@ def _compared(
     runs = [run for run in runs if run.views == runs[0].views]
     if runs and (frames := shown_frames(runs[0])):
         yield f"## {title}\n\nThe middle one of the {len(frames)} frames that were kept."
-        yield from beside(runs, frames[len(frames) // 2], title.lower(), folder)
+        yield from beside(runs, frames[len(frames) // 2], f"frames-{title.lower()}", folder)
 
 
 def _named(wanted: Mapping[tuple[str, str], str], lines: Lines) -> list[Run]:

@@ -69,7 +69,7 @@ def execute(config: DictConfig, command: Sequence[str]) -> None:
 
 
 def obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
-    """Measure what `config` describes, unless the store has it.
+    """Measure what `config` describes, unless the store has it; its failures are forgotten then.
 
     Args:
         config: the composed run.yaml.

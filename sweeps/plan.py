@@ -94,7 +94,8 @@ def _seeds(overrides: Sequence[str]) -> tuple[list[str], list[list[str]]]:
             f"{REPEATED} may take several here"
         )
     fixed = [text for text in overrides if REPEATED not in swept([text])]
-    return fixed, [[f"{REPEATED}={value}"] for value in several.get(REPEATED, [])] or [[]]
+    values = dict.fromkeys(several.get(REPEATED, ()))
+    return fixed, [[f"{REPEATED}={value}"] for value in values] or [[]]
 
 
 def newest(store: Store) -> dict[str, Run]:
@@ -104,7 +105,7 @@ def newest(store: Store) -> dict[str, Run]:
     keys = {}
     for folder in folders:
         record: Any = store.record(folder.name)
-        if record["schema_version"] == SCHEMA_VERSION and "config" in record["made_of"]:
+        if record.get("schema_version") == SCHEMA_VERSION and "config" in record["made_of"]:
             keys[content_key(record["made_of"]["config"])] = folder.name
     runs = {run.key: run for run in load(store, {key: key for key in keys.values()})}
     return {job: runs[key] for job, key in keys.items()}

@@ -11,16 +11,17 @@ from bench.results import Store
 from reports.doubts import doubts, table
 from reports.paper_page import write_paper_page
 from reports.published import PaperTable
+from sweeps.overrides import composed
 from sweeps.plan import Planned, chosen, gather, newest, plan
 from sweeps.terminal import console, rich_table
 
 
 def main(options: argparse.Namespace) -> int:
     """Write the page, or with `--check` name the broken rows of the store: 1 if there are any."""
+    if options.check:
+        return _check(Store(Path(composed(options.overrides).outputs)))
     tables = chosen(options.table)
     jobs = [job for table in tables for job in plan(table, options.overrides)]
-    if options.check:
-        return _check(Store(Path(jobs[0].config.outputs)))
     write(tables, jobs, options.report)
     return 0
 
