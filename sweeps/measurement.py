@@ -27,6 +27,7 @@ from reports.tables import blocks
 from sweeps import failures
 from sweeps.build import build, check_settings
 from sweeps.terminal import console, rich_table
+from sweeps.turns import turn
 
 PLACES = ("outputs", "report", "weights_dir")
 """Settings that say where things lie: they do not change a row."""
@@ -98,16 +99,17 @@ def _obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
     if store.find(run) is not None:
         log.info(f"already measured; to measure again, remove {store.folder / run}")
         return Obtained(store, run, measured=False)
-    measurement = measure(
-        method,
-        scene,
-        trajectory,
-        protocol,
-        budget,
-        log,
-        seed=settings.seed,
-        weights_dir=weights,
-    )
+    with turn(root, method.settings()["device"], log):
+        measurement = measure(
+            method,
+            scene,
+            trajectory,
+            protocol,
+            budget,
+            log,
+            seed=settings.seed,
+            weights_dir=weights,
+        )
     record = {**measurement.record, "command": shlex.join(command)}
     store.save(parts, replace(measurement, record=record))
     return Obtained(store, run, measured=True)
