@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import importlib.util
 from pathlib import Path
 
 import pytest
@@ -52,8 +51,7 @@ def test_a_failure_ends_the_turn(tmp_path: Path) -> None:
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local", "ray"])
 def test_a_launcher_runs_every_job_and_tells_of_those_that_fail(spawn, launcher: str) -> None:
     plugin = f"hydra_{launcher.partition('_')[0]}_launcher"
-    if importlib.util.find_spec(f"hydra_plugins.{plugin}") is None:
-        pytest.skip(f"{plugin} is not installed: pip install -e '.[joblib,ray,slurm]'")
+    pytest.importorskip(f"hydra_plugins.{plugin}", reason=f"{plugin} is an extra")
     process = spawn("-m", "method.level=0.3,0.6,7", f"hydra/launcher={launcher}")
     out, err = process.communicate()
     assert process.returncode == 2, err
