@@ -71,7 +71,12 @@ def test_nothing_but_outputs_is_left_behind(run, tmp_path):
     run()
     run("-m", "seed=0,1")
     assert [path.name for path in tmp_path.iterdir()] == ["outputs"]
-    assert {path.name for path in (tmp_path / "outputs").iterdir()} == {"runs", "stages", "sweeps"}
+    assert {path.name for path in (tmp_path / "outputs").iterdir()} == {
+        "locks",
+        "runs",
+        "stages",
+        "sweeps",
+    }
 
 
 def test_a_sweep_takes_flags_after_overrides_and_runs_every_combination(run, tmp_path):
