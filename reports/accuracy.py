@@ -11,7 +11,7 @@ import pandas as pd
 
 from bench.provenance import commit, machine
 from bench.results import explained
-from reports.figures import frontier_plot
+from reports.frontier import frontier_plot
 from reports.tables import Table, number
 
 Row = Mapping[str, Any]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from typing import Protocol
 
 from reports.runs import Run
 from reports.tables import QUALITY, Table, megabytes, number
@@ -18,6 +19,19 @@ COST: dict[str, tuple[str, Write]] = {
     "train_s": ("training, s ↓", partial(number, decimals=0)),
 }
 """Label of each figure that is no quality, and how it is written."""
+
+
+class Comparable(Protocol):
+    """What can be held against others that were made under the same conditions."""
+
+    @property
+    def values(self) -> Mapping[str, float]:
+        """Figures by metric."""
+
+    @property
+    def conditions(self) -> tuple[object, ...]:
+        """See `Run.conditions`."""
+
 
 COMMON = ("scene", "resolution", "trajectory", "budget", "protocol", "device")
 
@@ -40,8 +54,9 @@ def comparison(runs: Sequence[Run], failures: Mapping[str, str]) -> Table:
     ]
     bold = frozenset(
         (row, column)
-        for column, (metric, label, write) in enumerate(columns, 1)
-        for row in best(parts, metric, write, highest=label.endswith("↑"))
+        for column, (metric, _, _) in enumerate(columns, 1)
+        for row, place in ranks(parts, metric).items()
+        if place == 1
     )
     blank = ("",) * len(columns)
     lines += [(f"{label}: failed: {reason}", *blank) for label, reason in failures.items()]
@@ -52,27 +67,38 @@ def comparison(runs: Sequence[Run], failures: Mapping[str, str]) -> Table:
 
 def _columns(runs: Sequence[Run]) -> list[tuple[str, str, Write]]:
     """Metric, label and writer of every column; of the qualities, those that any run has."""
-    quality: dict[str, tuple[str, Write]] = {
-        metric: (label, partial(number, decimals=decimals))
-        for metric, (label, decimals) in QUALITY.items()
-        if any(metric in run.values for run in runs)
-    }
-    return [(metric, label, write) for metric, (label, write) in (quality | COST).items()]
+    quality = [metric for metric in QUALITY if any(metric in run.values for run in runs)]
+    return [(metric, *written(metric)) for metric in (*quality, *COST)]
 
 
-def best(runs: Sequence[Run], metric: str, write: Write, highest: bool) -> Iterator[int]:
-    """Which of `runs` have the best figure of their conditions, or one written like the best.
+def written(metric: str) -> tuple[str, Write]:
+    """What the column of a metric is called, with an arrow to better, and how it is written."""
+    if metric in QUALITY:
+        label, decimals = QUALITY[metric]
+        return label, partial(number, decimals=decimals)
+    if metric in COST:
+        return COST[metric]
+    return f"{metric.removeprefix('stage_ms.')}, ms ↓", partial(number, decimals=2)
 
-    Where only one was made under its conditions, there is no best.
+
+def ranks(runs: Sequence[Comparable], metric: str) -> dict[int, int]:
+    """The place, from 1, that each of `runs` has among those of its conditions.
+
+    Figures written alike share a place; where only one run was made under its conditions, it has
+    none.
     """
+    label, write = written(metric)
     known: dict[tuple[object, ...], dict[int, float]] = {}
     for row, run in enumerate(runs):
         if math.isfinite(run.values.get(metric, math.nan)):
             known.setdefault(run.conditions, {})[row] = run.values[metric]
+    places: dict[int, int] = {}
     for figures in known.values():
-        best = (max if highest else min)(figures.values())
+        ordered = sorted(figures.values(), reverse=label.endswith("↑"))
+        texts = list(dict.fromkeys(map(write, ordered)))
         if len(figures) > 1:
-            yield from (row for row, value in figures.items() if write(value) == write(best))
+            places |= {row: texts.index(write(value)) + 1 for row, value in figures.items()}
+    return places
 
 
 def setting(runs: Sequence[Run]) -> str:

@@ -2,47 +2,43 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import matplotlib
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
-from numpy.typing import ArrayLike
+from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
+from bench.results import COLD
 from reports.runs import Run
+from reports.seeds import Repeated
 
 STAGE = "stage_ms."
-LEGEND_COLUMNS = 6
+LEGEND_COLUMNS = 4
+MARKERS = "osD^vP*X<>"
 COLOURS = [matplotlib.colormaps["tab20"](index) for index in (*range(0, 20, 2), *range(1, 20, 2))]
 COLOURS = [colour for colour in COLOURS if len(set(colour[:3])) > 1]  # grey is for "other"
-
-MARKERS = "s*ovDP^X<>ph"
-NAME_SIZE = (130, 13)
-"""Room that the name of a setting takes on a plot, in pixels."""
 
 
 def stage_bars(runs: Sequence[Run], path: Path) -> None:
     """Write a PNG: one bar per run, its mean frame time in ms divided into stages.
 
-    A stage has one colour in all bars; what lies in no stage is grey and comes last.
+    A stage, which holds the stages inside it, has one colour in all bars; what lies in no stage is
+    grey and comes last.
     """
-    stages = list(dict.fromkeys(name for run in runs for name in run.values if _is_stage(name)))
-    stages.sort(key=lambda name: name == f"{STAGE}other")
+    bars = [_stages(run) for run in runs]
+    stages = list(dict.fromkeys(name for bar in bars for name in bar))
+    stages.sort(key=lambda name: name == "other")
     legend_lines = -(-len(stages) // LEGEND_COLUMNS)
     height = 0.7 + 0.25 * legend_lines + 0.5 * len(runs)
     figure = Figure(figsize=(8, height), layout="constrained")
     axes = figure.subplots()
     ends = [0.0] * len(runs)
     for number, stage in enumerate(stages):
-        widths = [run.values.get(stage, 0.0) for run in runs]
-        name = stage.removeprefix(STAGE)
-        colour = "lightgrey" if name == "other" else COLOURS[number % len(COLOURS)]
-        axes.barh(range(len(runs)), widths, left=ends, height=0.6, label=name, color=colour)
+        widths = [bar.get(stage, 0.0) for bar in bars]
+        colour = "lightgrey" if stage == "other" else COLOURS[number % len(COLOURS)]
+        axes.barh(range(len(runs)), widths, left=ends, height=0.6, label=stage, color=colour)
         ends = [end + width for end, width in zip(ends, widths, strict=True)]
     for line, end in enumerate(ends):
         axes.text(end, line, f" {end:.1f}", va="center")
@@ -55,131 +51,66 @@ def stage_bars(runs: Sequence[Run], path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-def growth_panels(
-    axes: Mapping[str, Sequence[Mapping[str, Any]]],
-    figures: Mapping[str, str],
-    exponents: Mapping[tuple[str, str], float],
-    path: Path,
+def _stages(run: Run) -> dict[str, float]:
+    """Mean ms of every stage, with the stages inside it."""
+    stages: dict[str, float] = {}
+    for name, ms in run.values.items():
+        if name.startswith(STAGE):
+            outermost = name.removeprefix(STAGE).partition("/")[0]
+            stages[outermost] = stages.get(outermost, 0.0) + ms
+    return stages
+
+
+def quality_against(
+    lines: Sequence[Repeated], metric: str, unit: float, axis: str, path: Path
 ) -> None:
-    """Write a PNG: a column of panels for each of `axes`, a line of them for each of `figures`.
+    """Write a PNG: PSNR of each of `lines` against its `metric`, in `unit`, called `axis`.
 
-    Both scales are logarithmic, so that a power is a straight line; only where an axis begins at 0
-    its own is not.
-
-    Args:
-        axes: by name, rows with "value" and a value of every figure.
-        figures: key in a row, and label with unit.
-        exponents: by axis and figure, shown where they are finite.
+    Both have the bars of their intervals where there are several seeds.
     """
-    size = (0.5 + 2.2 * len(axes), 0.5 + 2.0 * len(figures))
-    figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(len(figures), len(axes), squeeze=False, sharey="row")
-    for line, (key, label) in zip(panels, figures.items(), strict=True):
-        for panel, (axis, rows) in zip(line, axes.items(), strict=True):
-            values = [row["value"] for row in rows]
-            panel.plot(values, [row[key] for row in rows], "o-", color=COLOURS[0], markersize=4)
-            panel.set_yscale("log")
-            if min(values) > 0:
-                panel.set_xscale("log", base=2 if axis != "pixels" else 10)
-            if (exponent := exponents[axis, key]) == exponent:
-                panel.set_title(f"~ {axis}^{exponent:.2f}", fontsize="small")
-            panel.set_xlabel(axis)
-            panel.grid(alpha=0.3, which="both")
-            panel.spines[["top", "right"]].set_visible(False)
-        line[0].set_ylabel(label)
+    figure, axes = _quality(4.0, axis)
+    for number, line in enumerate(lines):
+        across, up = line.mean(metric), line.mean("psnr")
+        if across is None or up is None:
+            continue
+        bars = [half if half > 0 else None for half in (line.half(metric), line.half("psnr"))]
+        axes.errorbar(
+            across / unit,
+            up,
+            xerr=bars[0] and bars[0] / unit,
+            yerr=bars[1],
+            fmt=MARKERS[number % len(MARKERS)],
+            color=COLOURS[number % len(COLOURS)],
+            markersize=8,
+            label=line.label,
+        )
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5, 7)))
+    axes.xaxis.set_major_formatter(ScalarFormatter())
+    axes.xaxis.set_minor_locator(NullLocator())
+    figure.legend(loc="outside right upper", frameon=False)
     figure.savefig(path, dpi=150)
 
 
-def _is_stage(metric: str) -> bool:
-    return metric.startswith(STAGE)
+def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
+    """Write a PNG: PSNR of every frame with a ground truth along the path, a curve for each run;
+    cold frames are hollow."""
+    figure, axes = _quality(3.5, "frame of the path")
+    for number, run in enumerate(runs):
+        scored = run.frames.dropna(subset=["psnr"])
+        colour, cold = COLOURS[number % len(COLOURS)], scored[scored["phase"] == COLD]
+        axes.plot(scored["frame"], scored["psnr"], marker="o", color=colour, label=run.label)
+        axes.plot(cold["frame"], cold["psnr"], "o", color=colour, markerfacecolor="white")
+    figure.legend(loc="outside upper center", ncols=LEGEND_COLUMNS, frameon=False)
+    figure.savefig(path, dpi=150)
 
 
-def frontier_plot(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Write a PNG: error of a frame against its time, log-log, a point for each setting.
-
-    To the left the error against the ground truth, with the Pareto frontier as a staircase through
-    the settings that none beats, to the right that against everything off. What lies on the
-    frontier is circled, and named where there is room; so is the setting in which nothing is
-    changed.
-
-    Args:
-        rows: everything off, the setting in which nothing is changed, others. Of each its knob,
-            setting, ms, ms_lo, ms_hi, psnr, psnr_to_first and instead: itself on the frontier.
-    """
-    figure = Figure(figsize=(13, 7), layout="constrained")
-    truth, off = figure.subplots(1, 2, sharex=True)
-    best = sorted((row for row in rows if row["instead"] == row["setting"]), key=lambda r: r["ms"])
-    for axes, column in ((truth, "psnr"), (off, "psnr_to_first")):
-        _error_against_time(axes, rows, column)
-    stairs = [row["ms"] for row in best], [_rms(row["psnr"]) for row in best]
-    truth.step(*stairs, where="post", color="black", linewidth=1, label="frontier")
-    truth.set_title("against the ground truth: lower left is better")
-    off.set_title("against the same model with everything off")
-    figure.legend(*truth.get_legend_handles_labels(), loc="outside lower center", ncols=6)
-    figure.draw_without_rendering()  # from now on it is known where a point lies on the page
-    _circle(truth, [*rows[1:2], *best], "psnr")
-    _circle(off, rows[1:2], "psnr_to_first")
-    figure.savefig(path, dpi=100)
-
-
-def _circle(axes: Axes, rows: Sequence[Mapping[str, Any]], column: str) -> None:
-    """Circle the points of `rows`; name each to its left, unless another name is there already."""
-    names: list[np.ndarray] = []
-    for row in rows:
-        place = (row["ms"], _rms(row[column]))
-        axes.plot(*place, "o", markersize=11, fillstyle="none", color="black")
-        on_page = axes.transData.transform(place)
-        if all((abs(on_page - other) > NAME_SIZE).any() for other in names):
-            names.append(on_page)
-            axes.annotate(
-                row["setting"],
-                place,
-                xytext=(-5, -5),
-                textcoords="offset points",
-                size=8,
-                ha="right",
-                va="top",
-            )
-
-
-def _error_against_time(axes: Axes, rows: Sequence[Mapping[str, Any]], column: str) -> None:
-    """The points of one panel; a knob has one colour and one marker."""
-    knobs = list(dict.fromkeys(row["knob"] for row in rows))
-    for number, knob in enumerate(knobs):
-        some = [row for row in rows if row["knob"] == knob and math.isfinite(row[column])]
-        ms, error = [row["ms"] for row in some], [_rms(row[column]) for row in some]
-        low = [row["ms"] - row["ms_lo"] for row in some]
-        high = [row["ms_hi"] - row["ms"] for row in some]
-        colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
-        axes.errorbar(
-            ms,
-            error,
-            xerr=(low, high),
-            fmt=marker,
-            color=colour,
-            alpha=0.8,
-            elinewidth=0.6,
-            label=knob,
-        )
-    axes.loglog()
-    axes.margins(0.2, 0.12)  # room for names
-    axes.set_xlabel("ms of a frame: median of the rounds, bars from the fastest to the slowest")
-    axes.set_ylabel("error of a pixel (root mean square; 1 is black against white)")
-    decibels = axes.secondary_yaxis("right", functions=(_psnr, _rms))
-    decibels.set_ylabel("PSNR, dB")
-    decibels.yaxis.set_major_locator(MaxNLocator(10))
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
-    for axis in (axes.xaxis, axes.yaxis, decibels.yaxis):
-        axis.set_major_formatter("{x:g}")
-        axis.set_minor_locator(NullLocator())
-    axes.grid(color="0.92")
-    axes.set_axisbelow(True)
-
-
-def _rms(psnr: ArrayLike) -> np.ndarray:
-    return 10 ** (-np.asarray(psnr) / 20)
-
-
-def _psnr(rms: ArrayLike) -> np.ndarray:
-    return -20 * np.log10(rms)
+def _quality(height: float, across: str) -> tuple[Figure, Axes]:
+    """Axes for PSNR, upwards, and what `across` says; `height` in inches."""
+    figure = Figure(figsize=(8, height), layout="constrained")
+    axes = figure.subplots()
+    axes.set_xlabel(across)
+    axes.set_ylabel("PSNR, dB")
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure, axes

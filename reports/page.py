@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from PIL import Image
-
-from bench.results import COLD, Store, explained
+from bench.results import Store, explained
 from reports import figures, tables
 from reports.comparison import comparison, setting
+from reports.pictures import BESIDE, beside, shown_frames
+from reports.publish import publish
 from reports.runs import Run, load
-from reports.sheets import ZOOM, View, find_detail, write_sheet
-
-BESIDE = 4
-"""Renderings in one picture, beside the ground truth; more runs get further pictures."""
 
 
 def write_page(
@@ -25,7 +20,8 @@ def write_page(
     folder: Path,
     failures: Mapping[str, str] | None = None,
 ) -> Path:
-    """Write `folder/report.md` with its pictures beside it, and return its path.
+    """Write `folder/report.md` with its pictures beside it, and return its path; the same as
+    `report.html`.
 
     The page replaces an earlier one only when it is whole.
 
@@ -52,9 +48,7 @@ def write_page(
             *map(_figures, runs),
             _provenance(runs),
         ]
-        partial = folder / ".report.md.partial"
-        partial.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
-        return partial.replace(folder / "report.md")
+    return publish("\n\n".join(parts), folder)
 
 
 TIME = """\
@@ -62,8 +56,8 @@ TIME = """\
 
 ![Mean time of a frame in ms, one bar per run, divided into stages](pictures/stages.png)
 
-One bar per run: the mean time of a frame, divided into the stages of the method. What was spent
-between the stages is `other`."""
+One bar per run: the mean time of a frame, divided into the stages of the method; a stage holds
+those inside it. What was spent between the stages is `other`."""
 
 
 def _heading(runs: Sequence[Run], failures: Mapping[str, str]) -> str:
@@ -102,47 +96,10 @@ def _pictures(runs: Sequence[Run], folder: Path) -> str:
     parts = [
         text
         for number, group in enumerate(groups.values(), 1)
-        for text in _frames(group, f"frames-{number}", folder)
+        for frame in shown_frames(group[0])
+        for text in beside(group, frame, f"frames-{number}", folder)
     ]
     return "\n\n".join(("## Pictures", *(parts or ["No frame has a ground truth."])))
-
-
-def _frames(runs: Sequence[Run], stem: str, folder: Path) -> Iterator[str]:
-    """Write the pictures of every shown frame of `runs`; yield what the page has about it."""
-    for path in sorted(runs[0].pictures.glob("*-truth.png")):
-        frame, truth = path.name.split("-")[0], _read(path)
-        views = [_view(run, frame) for run in runs]
-        detail = find_detail(truth, [view.rendering for view in views])
-        name = runs[0].frames.set_index("frame")["name"][int(frame)]
-        place = f"frame {int(frame) + 1} of {len(runs[0].frames)}"
-        yield f"### {runs[0].facts['scene']}, {name}, {place}"
-        for first in range(0, len(views), BESIDE):
-            file = f"{stem}-{frame}-{first}.png"
-            beside = views[first : first + BESIDE]
-            write_sheet(truth, beside, detail, runs[0].record["error_map"], folder / file)
-            shown = ", ".join(view.titles[0] for view in beside)
-            yield f"![Ground truth, {shown}; a detail of each; error maps](pictures/{file})"
-        yield (
-            "PSNR and time above a picture are of this frame alone. The framed part, where"
-            f" {detail.where}, is enlarged {ZOOM} times."
-            f" Error maps show the {runs[0].record['error_map']}."
-        )
-
-
-def _view(run: Run, frame: str) -> View:
-    """A shown frame of a run, titled with its own PSNR and time."""
-    of_frame = run.frames.set_index("frame").loc[int(frame)]
-    figures_shown = f"PSNR {of_frame['psnr']:.2f} dB, {of_frame['frame_ms']:.1f} ms"
-    if of_frame["phase"] == COLD:
-        figures_shown += ", cold"
-    kinds = ("rendered", "error")
-    pictures = [_read(run.pictures / f"{frame}-{kind}.png") for kind in kinds]
-    return View((run.label, figures_shown), *pictures)
-
-
-def _read(path: Path) -> np.ndarray:
-    with Image.open(path) as picture:
-        return np.asarray(picture.convert("RGB"))
 
 
 def _figures(run: Run) -> str:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
-from reports.comparison import COST, best, setting
+from reports import trends
+from reports.comparison import ranks, setting, written
 from reports.runs import Run
-from reports.tables import QUALITY, Table, number
+from reports.seeds import Repeated
+from reports.tables import Table
+from reports.trends import Trend
 
 FOLDER = Path(__file__).parent / "paper"
 ABSENT = "–"
@@ -45,6 +47,7 @@ class PaperTable:
         metrics: its columns.
         lines: in the paper's order.
         notes: what a reader should know before comparing.
+        trends: what the paper concludes from it.
     """
 
     name: str
@@ -53,6 +56,7 @@ class PaperTable:
     metrics: Sequence[str]
     lines: Sequence[Line]
     notes: Sequence[str]
+    trends: Sequence[Trend] = ()
 
 
 def paper_tables() -> list[PaperTable]:
@@ -63,53 +67,52 @@ def paper_tables() -> list[PaperTable]:
 def _table(path: Path) -> PaperTable:
     content = tomllib.loads(path.read_text(encoding="utf-8"))
     lines = [Line(**line) for line in content.pop("line")]
-    return PaperTable(path.stem, lines=lines, notes=content.pop("notes", []), **content)
+    trends = [Trend(**trend) for trend in content.pop("trend", [])]
+    notes = content.pop("notes", [])
+    return PaperTable(path.stem, lines=lines, notes=notes, trends=trends, **content)
 
 
-def beside(
-    table: PaperTable, runs: Mapping[str, Run], failures: Mapping[str, str] | None = None
-) -> Table:
-    """What was measured beside what the paper gives, and the difference.
+def beside(table: PaperTable, measured: Mapping[str, Repeated]) -> Table:
+    """What was measured beside what the paper gives, and the difference, in Markdown.
+
+    The best measured figure of a column is bold, the second of at least three italic, among those
+    that may be compared.
 
     Args:
-        runs: by the label of a line; lines without one have nothing measured.
-        failures: why a line has none, by its label.
+        measured: by the label of a line; a line without one has nothing to be measured with.
     """
-    columns = [(metric, *_written(metric)) for metric in table.metrics]
-    rows = [row for row, line in enumerate(table.lines) if line.label in runs]
-    there = [runs[table.lines[row].label] for row in rows]
-    bold = frozenset(
-        (rows[place], column)
-        for column, (metric, label, write) in enumerate(columns, 1)
-        if not metric.startswith("stage_ms.")
-        for place in best(there, metric, write, highest=label.endswith("↑"))
-    )
-    lines = []
-    for line in table.lines:
-        run, why = runs.get(line.label), (failures or {}).get(line.label)
-        cells = (
-            _cell(_measured(run, metric), line.published.get(metric), write)
-            for metric, _, write in columns
+    lines = [measured.get(line.label, Repeated(line.label, ())) for line in table.lines]
+    columns = []
+    for metric in table.metrics:
+        places = {} if metric.startswith("stage_ms.") else ranks(lines, metric)
+        marks = {1: "**", 2: "*" if len(places) > 2 else ""}
+        columns.append(
+            [
+                _cell(found, line.published.get(metric), metric, marks.get(places.get(row, 0), ""))
+                for row, (found, line) in enumerate(zip(lines, table.lines, strict=True))
+            ]
         )
-        label = f"{line.label}: failed: {why}" if why else line.label
-        lines.append((label, *cells))
+    names = [": ".join((line.label, *line.gaps)) for line in lines]
     title = f"{table.name.replace('table', 'Table ')}: {table.title}"
-    heads = ("measured / paper / difference", *(label for _, label, _ in columns))
-    return Table(title, heads, tuple(lines), bold=bold)
+    heads = ("measured / paper / difference", *(written(metric)[0] for metric in table.metrics))
+    return Table(title, heads, tuple(zip(names, *columns, strict=True)))
 
 
-def section(
-    table: PaperTable, runs: Mapping[str, Run], failures: Mapping[str, str] | None = None
-) -> str:
-    """A table as a part of a page: what was measured where, the figures, the notes."""
-    shown = beside(table, runs, failures)
+def section(table: PaperTable, lines: Sequence[Repeated]) -> str:
+    """A table as a part of a page: what was measured where, the figures, trends, notes."""
+    measured = {line.label: line for line in lines}
+    shown = beside(table, measured)
     parts = [f"## {shown.title}"]
+    runs = [run for line in lines for run in line.runs]
     if runs:
-        parts.append(f"Measured: {setting(list(runs.values()))}, {_origin(list(runs.values()))}.")
+        parts.append(f"Measured: {setting(runs)}, {_origin(runs)}.")
     parts.append(f"Paper: {table.published_on}.")
     parts.append(shown.markdown())
-    parts += [f"- {note}" for note in table.notes]
-    return "\n\n".join(parts)
+    if found := [step for trend in table.trends for step in trends.steps(trend, measured)]:
+        parts.append(trends.table(found).markdown())
+    missing = (f"{name}: n/a. {why}" for run in runs for name, why in run.record["missing"].items())
+    parts.append("\n".join(f"- {note}" for note in dict.fromkeys((*table.notes, *missing))))
+    return "\n\n".join(filter(None, parts))
 
 
 def _origin(runs: Sequence[Run]) -> str:
@@ -123,33 +126,15 @@ def _origin(runs: Sequence[Run]) -> str:
     return ", ".join(f"{name} {' / '.join(dict.fromkeys(of))}" for name, of in told.items())
 
 
-def _measured(run: Run | None, metric: str) -> float | None:
-    """A figure of `run`, if there is one; that of a stage with the stages inside it."""
-    if run is None:
-        return None
-    inside = [value for name, value in run.values.items() if name.startswith(f"{metric}/")]
-    if metric in run.values or inside:
-        return run.values.get(metric, 0.0) + sum(inside)
-    return None
-
-
-def _cell(
-    measured: float | None, published: float | None, write: Callable[[float | None], str]
-) -> str:
+def _cell(found: Repeated, published: float | None, metric: str, mark: str) -> str:
+    measured, write = found.mean(metric), written(metric)[1]
     if measured is None and published is None:
         return ABSENT
     told = [ABSENT if figure is None else write(figure) for figure in (measured, published)]
+    if found.half(metric) > 0:
+        told[0] += f" ± {write(found.half(metric))}"
+    told[0] = f"{mark}{told[0]}{mark}"
     if measured is None or published is None or math.isnan(measured):
         return " / ".join(told)
     difference = write(abs(measured - published))
     return " / ".join((*told, f"{'-' if measured < published else '+'}{difference}"))
-
-
-def _written(metric: str) -> tuple[str, Callable[[float | None], str]]:
-    """Label of a column and how its figures are written."""
-    if metric in QUALITY:
-        label, decimals = QUALITY[metric]
-        return label, partial(number, decimals=decimals)
-    if metric in COST:
-        return COST[metric]
-    return f"{metric.removeprefix('stage_ms.')}, ms ↓", partial(number, decimals=2)

@@ -52,7 +52,7 @@ class Run:
             for phase, of_phase in phases(self.rows)
         ]
 
-    @property
+    @cached_property
     def facts(self) -> pd.Series:
         """What all rows of the run have in common: method, scene, protocol, device and so on."""
         return self.rows.iloc[0]
@@ -66,9 +66,14 @@ class Run:
     @property
     def conditions(self) -> tuple[object, ...]:
         """The same for runs whose figures may be held against each other."""
+        phase = self.headline["phase"].iloc[0]
+        return (*self.views, phase, self.facts["protocol"], *self.computer)
+
+    @property
+    def computer(self) -> tuple[str, ...]:
+        """The same for runs on the same device of machines with the same processors."""
         machine = self.record["machine"]
-        computer = (self.facts["device"], machine["cpu"], *machine["gpus"])
-        return (*self.views, self.headline["phase"].iloc[0], self.facts["protocol"], *computer)
+        return (self.facts["device"], machine["cpu"], *machine["gpus"])
 
 
 def load(store: Store, labels: Mapping[str, str]) -> list[Run]:
@@ -79,11 +84,12 @@ def load(store: Store, labels: Mapping[str, str]) -> list[Run]:
     """
     records = {key: store.record(key) for key in labels}
     rows = store.rows(report=lambda unreadable: None)  # others, which are not asked for
+    by_run = dict(iter(rows.groupby("run")))
     return [
         Run(
             key,
             label,
-            rows[rows["run"] == key],
+            by_run[key],
             store.frames(key),
             records[key],
             store.folder / key / "pictures",

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
+
+from sweeps.overrides import swept
 
 
 class Announced(Callback):
@@ -18,7 +19,7 @@ class Announced(Callback):
 
     Attributes:
         folder: where the jobs leave how they ended; None where there is no sweep.
-        sizes: how many values each override takes in turn.
+        sizes: how many values each setting takes that takes several in turn.
     """
 
     folder: ClassVar[Path | None] = None
@@ -27,17 +28,8 @@ class Announced(Callback):
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Keep where the sweep lies and how large it is."""
         Announced.folder = Path(config.hydra.sweep.dir)
-        Announced.sizes = _sizes(config)
-
-
-def _sizes(config: DictConfig) -> dict[str, int]:
-    """How many values every override takes: those of the configuration, then those typed."""
-    params = config.hydra.sweeper.get("params") or {}
-    lines = [f"{name}={values}" for name, values in params.items()]
-    parser = OverridesParser.create(GlobalHydra.instance().config_loader())
-    return {
-        override.get_key_element(): len(list(override.sweep_string_iterator()))
-        if override.is_discrete_sweep()
-        else 1
-        for override in parser.parse_overrides([*lines, *config.hydra.overrides.task])
-    }
+        params = config.hydra.sweeper.get("params") or {}
+        lines = [f"{name}={values}" for name, values in params.items()]
+        loader = GlobalHydra.instance().config_loader()
+        values = swept([*lines, *config.hydra.overrides.task], loader)
+        Announced.sizes = {name: len(several) for name, several in values.items()}

@@ -32,7 +32,7 @@ examples
   steerbench run scene=blender scene.path=DIR  the same on your copy of a NeRF-Synthetic scene
   steerbench run --help                        all choices and settings
   steerbench list                              what there is, and what of it is usable here
-  steerbench paper budget=demo                 every table of the SteerNeRF paper, as a page
+  steerbench paper budget=tables               every table of the SteerNeRF paper, as a page
   steerbench parity scene=totem budget=demo    what int8 costs, in decibels, and saves, in time
   steerbench accuracy --within 0.1dB           the fastest setting that loses no more than that
   steerbench check BASELINE.json               is everything as good as it was
@@ -42,6 +42,7 @@ examples
 COMMANDS = (
     "run",
     "paper",
+    "report",
     "list",
     "results",
     "kernels",
@@ -124,19 +125,39 @@ def _parser() -> Parser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     commands.add_parser("run", help="train, render, measure; print and store the table")
 
-    paper = commands.add_parser(
-        "paper",
-        help="every table of the SteerNeRF paper, measured, as one page",
-        description="Measure every table of the SteerNeRF paper and write them beside the paper's "
-        "figures. What was measured before is taken from the store: after an interruption, type "
-        "the same again.",
-    )
-    paper.add_argument("--table", metavar="NAME", help="only this one: table1 to table6")
-    paper.add_argument(
-        "--report", type=Path, metavar="DIR", help="where the page goes (default OUTPUTS/paper)"
-    )
-    paper.add_argument("overrides", nargs="*", help="settings as of `steerbench run`")
-    paper.set_defaults(module="paper", parser=paper)
+    for name, short, long in (
+        (
+            "paper",
+            "every table of the SteerNeRF paper, measured, as one page",
+            "Measure every table of the SteerNeRF paper and write them beside the paper's figures. "
+            "What was measured before is taken from the store: after an interruption, type the "
+            "same again. Exits with 1 if a job failed.",
+        ),
+        (
+            "report",
+            "the same page of what was measured so far",
+            "Write the tables of the SteerNeRF paper beside the paper's figures, as Markdown and "
+            "as one HTML file, from what the store has under the same settings. With --check: "
+            "name what looks broken in the whole store.",
+        ),
+    ):
+        tables = commands.add_parser(name, help=short, description=long)
+        tables.add_argument("--table", metavar="NAME", help="only this one: table1 to table6")
+        tables.add_argument(
+            "--report", type=Path, metavar="DIR", help="where the page goes (default OUTPUTS/paper)"
+        )
+        tables.add_argument(
+            "overrides",
+            nargs="*",
+            help="settings as of `steerbench run`; seed=0,1,2 gives means and intervals",
+        )
+        if name == "report":
+            tables.add_argument(
+                "--check",
+                action="store_true",
+                help="write nothing, exit with 1 if a row looks broken",
+            )
+        tables.set_defaults(module=name, parser=tables)
 
     listing = commands.add_parser("list", help="methods, scenes, backends, engines")
     listing.set_defaults(module="catalogue", parser=listing)

@@ -24,8 +24,10 @@ from bench.types import Method, Scene
 from reports.page import write_page
 from reports.runs import Run, load
 from reports.tables import blocks
+from sweeps import failures
 from sweeps.build import build, check_settings
 from sweeps.terminal import console, rich_table
+from sweeps.turns import turn
 
 PLACES = ("outputs", "report", "weights_dir")
 """Settings that say where things lie: they do not change a row."""
@@ -68,7 +70,7 @@ def execute(config: DictConfig, command: Sequence[str]) -> None:
 
 
 def obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
-    """Measure what `config` describes, unless the store has it.
+    """Measure what `config` describes, unless the store has it; its failures are forgotten then.
 
     Args:
         config: the composed run.yaml.
@@ -77,6 +79,12 @@ def obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
     Raises:
         SteerbenchError: a setting is wrong, or something in the measurement went wrong.
     """
+    obtained = _obtain(config, command)
+    failures.forget(Path(config.outputs), described(config))
+    return obtained
+
+
+def _obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
     settings = checked_settings(config)
     torch.manual_seed(settings.seed)
     root = Path(settings.outputs)
@@ -91,16 +99,17 @@ def obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
     if store.find(run) is not None:
         log.info(f"already measured; to measure again, remove {store.folder / run}")
         return Obtained(store, run, measured=False)
-    measurement = measure(
-        method,
-        scene,
-        trajectory,
-        protocol,
-        budget,
-        log,
-        seed=settings.seed,
-        weights_dir=weights,
-    )
+    with turn(root, method.settings()["device"], log):
+        measurement = measure(
+            method,
+            scene,
+            trajectory,
+            protocol,
+            budget,
+            log,
+            seed=settings.seed,
+            weights_dir=weights,
+        )
     record = {**measurement.record, "command": shlex.join(command)}
     store.save(parts, replace(measurement, record=record))
     return Obtained(store, run, measured=True)
@@ -134,19 +143,26 @@ def checked_settings(config: DictConfig) -> Settings:
     return settings
 
 
-def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any]:
-    """Everything that can change the rows but for the weights at hand: what makes a run's key.
+def described(config: DictConfig) -> dict[str, Any]:
+    """The settings that make a run what it is; the same for jobs that are the same.
 
-    Where scene and weights lie is not part of it, nor an engine that the method has no use for.
+    Where weights and scenes lie is not part of it, but for the last name of a scene's folder, which
+    is what rows call it; nor an engine that the method has no use for.
     """
-    plain = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(plain, dict)
+    plain: Any = OmegaConf.to_container(config, resolve=True)
     unused = () if "engine" in plain["method"] else ("engine", "precision")
     kept = {key: value for key, value in plain.items() if key not in (*PLACES, *unused)}
-    kept["scene"] = {k: v for k, v in plain["scene"].items() if k not in ("path", "root")}
+    kept["scene"] = {name: value for name, value in plain["scene"].items() if name != "root"}
+    if "path" in kept["scene"]:
+        kept["scene"]["path"] = Path(kept["scene"]["path"]).name
+    return kept
+
+
+def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any]:
+    """Everything that can change the rows but for the weights at hand: what makes a run's key."""
     return {
         "code": code_digest(),
-        "config": kept,
+        "config": described(config),
         "scene": scene.digest,
         "resolved": method.settings(),
         "threads": torch.get_num_threads(),

@@ -9,6 +9,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 
@@ -38,6 +40,30 @@ def of_hydra(error: Exception) -> bool:
     typed (budget=0.0) it answers with a ValueError or with what its parser stumbled over."""
     *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
     return innermost.f_globals["__name__"].partition(".")[0] in ("hydra", "omegaconf", "antlr4")
+
+
+def swept(overrides: Sequence[str], loader: ConfigLoader | None = None) -> dict[str, list[str]]:
+    """The values of every setting that takes several in turn (seed=0,1,2); later ones count.
+
+    Args:
+        loader: of Hydra's, where a choice may be given as a pattern (method=*).
+
+    Raises:
+        SteerbenchError: one of them cannot be read.
+    """
+    try:
+        parsed = OverridesParser.create(loader).parse_overrides(list(overrides))
+    except Exception as error:
+        if not of_hydra(error):
+            raise
+        raise explain(error, overrides) from error
+    values = {
+        override.get_key_element(): list(override.sweep_string_iterator())
+        if override.is_discrete_sweep()
+        else []
+        for override in parsed
+    }
+    return {name: several for name, several in values.items() if several}
 
 
 def explain(error: Exception, argv: Sequence[str]) -> SteerbenchError:

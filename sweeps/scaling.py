@@ -21,7 +21,7 @@ from bench.results import COLD, Measurement, explained
 from bench.run import measure
 from bench.trajectories import Step
 from bench.types import Log, Scene
-from reports.figures import growth_panels
+from reports.growth import growth_panels
 from reports.tables import Table, megabytes, number
 from sweeps.build import build
 from sweeps.measurement import checked_settings

@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from datetime import timedelta
 from math import prod
 from pathlib import Path
 
@@ -20,10 +19,10 @@ from bench.results import Store
 from reports.comparison import comparison
 from reports.page import write_page
 from reports.runs import load
-from reports.tables import number
+from sweeps import failures
 from sweeps.announced import Announced
+from sweeps.attempt import attempt, say, time_left
 from sweeps.jobs import Job, read, varying
-from sweeps.measurement import obtain
 from sweeps.terminal import console, rich_table
 
 
@@ -43,17 +42,13 @@ def run_job(config: DictConfig, command: Sequence[str]) -> None:
         begun=time.time(),
     )
     try:
-        obtained = obtain(config, command)
+        obtained = attempt(config, command, " ".join(job.overrides))
     except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        replace(job, failure=reason).write(folder)
-        print(f"steerbench: failed: {' '.join(job.overrides)}: {error}", file=sys.stderr)
+        replace(job, failure=failures.reason(error)).write(folder)
         raise
     replace(job, run=obtained.run, measured=obtained.measured).write(folder)
-    swept = [name for name, size in Announced.sizes.items() if size > 1 and name != "method"]
-    (run,) = load(obtained.store, {obtained.run: job.label(swept)})
-    psnr, ms = number(run.values.get("psnr"), 2), number(run.values["frame_ms"], 1)
-    print(f"{run.label}: {psnr} dB, {ms} ms a frame{_progress(read(folder))}", file=sys.stderr)
+    swept = [name for name in Announced.sizes if name != "method"]
+    say(obtained, job.label(swept), _progress(read(folder)))
 
 
 def finish(folder: Path) -> None:
@@ -79,12 +74,9 @@ def _progress(ended: Sequence[Job]) -> str:
     total, measured = prod(Announced.sizes.values()), sum(job.measured for job in ended)
     if Announced.folder is None or len(ended) > total:
         return ""
-    text = f"; {len(ended)} of {total} jobs done"
-    if measured and len(ended) < total:
-        each = (time.time() - min(job.begun for job in ended)) / measured
-        left = timedelta(seconds=round(each * (total - len(ended))))
-        text += f", about {left} left"
-    return text
+    seconds = time.time() - min(job.begun for job in ended)
+    left = time_left(seconds, measured, total - len(ended))
+    return f"; {len(ended)} of {total} jobs done{left}"
 
 
 def _labels(jobs: Sequence[Job], names: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:

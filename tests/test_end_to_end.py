@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -32,6 +33,13 @@ def demo(folder: Path, weights: Path, *more: str) -> subprocess.CompletedProcess
 
 def rows(folder: Path) -> pd.DataFrame:
     return Store(folder / "outputs").rows()
+
+
+def repeatable(folder: Path) -> pd.DataFrame:
+    """The rows that are the same whenever the same is measured on one machine."""
+    table = rows(folder)
+    kept = table[~table["metric"].str.startswith(MEASURED_ANEW)]
+    return kept.sort_values(["method", "run", "phase", "metric"]).reset_index(drop=True)
 
 
 @pytest.fixture(scope="module")
@@ -80,12 +88,7 @@ def test_the_same_seed_gives_the_same_rows(
     first: tuple[Path, str], tmp_path: Path, lpips_weights: Path
 ) -> None:
     assert demo(tmp_path, lpips_weights).returncode == 0
-    kept = [
-        table[~table["metric"].str.startswith(MEASURED_ANEW)]
-        .sort_values(["method", "phase", "metric"])
-        .reset_index(drop=True)
-        for table in (rows(first[0]), rows(tmp_path))
-    ]
+    kept = [repeatable(first[0]), repeatable(tmp_path)]
     assert {"psnr", "ssim", "lpips_alex", "lpips_vgg", "work.samples"} <= set(kept[0]["metric"])
     pd.testing.assert_frame_equal(*kept, check_exact=True)
 
@@ -121,6 +124,27 @@ def test_the_methods_are_as_good_as_the_recorded_baseline(first: tuple[Path, str
         [steerbench, "check", baseline], cwd=first[0], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout
+
+
+def test_the_tables_of_the_paper_go_on_after_being_killed_and_end_with_the_same_rows(
+    first: tuple[Path, str], tmp_path: Path, lpips_weights: Path
+) -> None:
+    steerbench = Path(sys.executable).with_name("steerbench")
+    command = [steerbench, "paper", "--table", "table5", "scene=totem", *SMALL]
+    command.append(f"weights_dir={lpips_weights}")
+    killed, undisturbed = tmp_path / "killed", tmp_path / "undisturbed"
+    for folder in (killed, undisturbed):  # one of two trainings is still to be done
+        shutil.copytree(first[0] / "outputs" / "stages", folder / "outputs" / "stages")
+    with subprocess.Popen(command, cwd=killed, stderr=subprocess.PIPE, text=True) as process:
+        assert any(line.startswith("2 of 2") for line in process.stderr)
+        process.kill()
+    ends = [
+        subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        for folder in (killed, undisturbed)
+    ]
+    assert [end.returncode for end in ends] == [0, 0], ends
+    assert "already measured" in ends[0].stderr
+    pd.testing.assert_frame_equal(*map(repeatable, (killed, undisturbed)), check_exact=True)
 
 
 def test_parity_compares_every_engine_with_torch_in_fp32(first: tuple[Path, str]) -> None:

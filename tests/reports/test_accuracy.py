@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from reports.accuracy import experiment_table, setting_table, write_accuracy
-from reports.figures import frontier_plot
+from reports.frontier import frontier_plot
 
 STEP = {"subject": "ramp: depth", "knob": "step", "order": 1.996,
         "order_from": 1 / 64, "order_to": 0.25, "ms_lo": 1.0, "ms_hi": 2.0}  # fmt: skip

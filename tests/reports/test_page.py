@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from bench.types import SteerbenchError
-from reports import figures
+from reports import figures, sheets
 from reports.page import write_page
 from reports.runs import Run
 
@@ -57,9 +57,12 @@ def test_a_picture_of_a_cold_frame_says_so(store, stored_run, tmp_path, monkeypa
     frames.loc[0, "phase"] = "cold"
     frames.to_csv(store.folder / stored_run / "frames.csv", index=False)
     titles = []
-    monkeypatch.setattr(
-        "reports.page.write_sheet", lambda truth, views, *_: titles.extend(views[0].titles[1:])
-    )
+
+    def write_sheet(truth, views, *rest):
+        titles.extend(views[0].titles[1:])
+        sheets.write_sheet(truth, views, *rest)
+
+    monkeypatch.setattr("reports.pictures.write_sheet", write_sheet)
     write_page(store, {stored_run: "offset"}, tmp_path)
     assert [title.endswith(" ms, cold") for title in titles] == [True, False, False]
 

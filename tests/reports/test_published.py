@@ -10,7 +10,9 @@ import pytest
 from bench.results import Store
 from reports.published import ABSENT, Line, PaperTable, beside, paper_tables, section
 from reports.runs import Run, load
+from reports.seeds import Repeated
 from reports.tables import QUALITY
+from reports.trends import Trend
 
 METRICS = {*QUALITY, "fps", "frame_ms", "size_bytes.total"}
 TABLE = PaperTable(
@@ -26,6 +28,14 @@ TABLE = PaperTable(
 )
 
 
+def with_psnr(run: Run, value: float) -> Run:
+    """`run` with another PSNR."""
+    return replace(
+        run,
+        rows=run.rows.assign(value=run.rows["value"].where(run.rows["metric"] != "psnr", value)),
+    )
+
+
 @pytest.fixture
 def run(store: Store, stored_run: str) -> Run:
     """A run of known figures."""
@@ -37,20 +47,22 @@ def run(store: Store, stored_run: str) -> Run:
     return replace(found, rows=rows[rows["metric"].isin(figures)])
 
 
-def test_the_files_are_the_six_tables_of_the_paper() -> None:
+def test_the_first_files_are_the_six_tables_of_the_paper() -> None:
     tables = paper_tables()
-    assert [table.name for table in tables] == [f"table{number}" for number in range(1, 7)]
+    assert [table.name for table in tables][:6] == [f"table{number}" for number in range(1, 7)]
     for table in tables:
         labels = [line.label for line in table.lines]
         assert len(set(labels)) == len(labels)
         for line in table.lines:
             assert set(line.published) <= set(table.metrics), line.label
+        for trend in table.trends:
+            assert set(trend.rising) <= set(labels), trend.rising
         for metric in table.metrics:
             assert metric in METRICS or metric.startswith("stage_ms."), metric
 
 
 def test_a_cell_is_measured_published_and_their_difference(run: Run) -> None:
-    shown = beside(TABLE, {"here": run})
+    shown = beside(TABLE, {"here": Repeated("here", [run])})
     assert shown.columns[1:] == ("PSNR, dB ↑", "ms / frame ↓", "model, MB ↓", "other, ms ↓")
     assert shown.lines[0] == (
         "here",
@@ -67,18 +79,40 @@ def test_a_stage_holds_the_stages_inside_it(run: Run) -> None:
     inside = rows[rows["metric"] == "stage_ms.other"].assign(
         metric="stage_ms.other/march", value=3.0
     )
-    shown = beside(TABLE, {"here": replace(run, rows=pd.concat([rows, inside]))})
+    whole = replace(run, rows=pd.concat([rows, inside]))
+    shown = beside(TABLE, {"here": Repeated("here", [whole])})
     assert shown.lines[0][4] == f"11.00 / {ABSENT}"
 
 
-def test_a_line_that_failed_says_why() -> None:
-    shown = beside(TABLE, {}, {"here": "no room"})
+def test_several_seeds_give_their_mean_and_its_interval(run: Run) -> None:
+    shown = beside(TABLE, {"here": Repeated("here", [with_psnr(run, x) for x in (29.0, 31.0)])})
+    # Half of a t-interval of two values that are 2 apart: t(0.975, 1) * sqrt(2) / sqrt(2).
+    assert shown.lines[0][1] == "30.00 ± 12.71 / 31.00 / -1.00"
+    assert shown.lines[0][2] == "12.0 / 10.0 / +2.0"
+
+
+def test_a_gap_says_why_in_its_line() -> None:
+    shown = beside(TABLE, {"here": Repeated("here", [], ["failed: no room"])})
     assert shown.lines[0][:2] == ("here: failed: no room", f"{ABSENT} / 31.00")
 
 
-def test_a_section_says_on_what_and_what_to_mind(run: Run) -> None:
-    text = section(TABLE, {"here": run})
+def test_the_best_is_bold_and_the_second_of_three_italic(run: Run) -> None:
+    table = replace(TABLE, lines=[Line(name, {"method": name}) for name in "abc"])
+    psnr = {"a": 1.0, "b": 3.0, "c": 2.0}
+    of = {name: Repeated(name, [with_psnr(run, value)]) for name, value in psnr.items()}
+    cells = [line[1] for line in beside(table, of).lines]
+    assert cells == ["1.00 / –", "**3.00** / –", "*2.00* / –"]
+    two = beside(table, {name: of[name] for name in "ab"})
+    assert [line[1] for line in two.lines] == ["1.00 / –", "**3.00** / –", ABSENT]
+
+
+def test_a_section_says_on_what_and_what_to_mind_and_whether_trends_hold(run: Run) -> None:
+    trend = Trend("psnr", ["elsewhere", "here"])
+    lines = [Repeated("here", [with_psnr(run, 31.0)]), Repeated("elsewhere", [run])]
+    text = section(replace(TABLE, trends=[trend]), lines)
     assert text.startswith("## Table 9: What is shown")
     assert "Paper: Chair." in text
     assert f"scene {run.facts['scene']}" in text
+    assert "| PSNR, dB: elsewhere < here | " in text
     assert "- Mind this." in text
+    assert "- lpips_alex: n/a. no weights were found" in text

@@ -2,59 +2,108 @@
 
 from __future__ import annotations
 
+import json
 import re
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from omegaconf import DictConfig
 
 from bench.results import Store
 from bench.types import SteerbenchError
 from reports.published import paper_tables
-from sweeps import paper
-from sweeps.measurement import Obtained
+from sweeps import attempt, failures
+from sweeps.measurement import Obtained, described
+from sweeps.overrides import composed
+from sweeps.plan import plan
 
 TABLES = {table.name: table for table in paper_tables()}
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_every_job_of_an_experiment_fills_one_line_and_every_line_has_its_job(name: str) -> None:
-    jobs = [dict(job.settings) for job in paper.plan(name, [])]
-    lines = [dict(line.job) for line in TABLES[name].lines if line.job is not None]
-    assert sorted(map(str, jobs)) == sorted(map(str, lines))
+def test_every_line_that_can_be_measured_has_its_job(name: str) -> None:
+    jobs = plan(TABLES[name], [])
+    lines = [line.label for line in TABLES[name].lines if line.job is not None]
+    assert sorted(job.line for job in jobs) == sorted(lines)
+    assert len({job.key for job in jobs}) == len(lines)
 
 
 def test_settings_hold_for_every_job() -> None:
-    for job in paper.plan("table3", ["budget=tiny", "seed=3"]):
+    for job in plan(TABLES["table3"], ["budget=tiny", "seed=3"]):
         assert job.config.budget.name == "tiny"
         assert job.config.seed == 3
-        assert str(job.config.method.pipeline.frames) == job.settings["method.pipeline.frames"]
+        assert job.line == f"L = {job.config.method.pipeline.frames}"
         assert job.config.trajectory._target_ == "bench.trajectories.smooth"
 
 
-def test_a_setting_that_does_not_exist_is_named() -> None:
-    with pytest.raises(SteerbenchError, match=r"budgt"):
-        paper.plan("table3", ["budgt=tiny"])
+def test_every_seed_is_a_job_of_its_own_and_a_command_that_makes_it() -> None:
+    jobs = plan(TABLES["table5"], ["budget=tiny", "seed=0,2"])
+    assert [(job.line[:4], job.config.seed) for job in jobs] == [
+        ("with", 0),
+        ("with", 2),
+        ("with", 0),
+        ("with", 2),
+    ]
+    for job in jobs:
+        again = composed([text for text in job.command[2:] if text != "hydra.mode=RUN"])
+        assert described(again) == described(job.config)
+
+
+def test_tables_share_the_run_that_they_have_in_common() -> None:
+    lines = [("table2", 0), ("table3", 2), ("table4", 1), ("table5", 0)]
+    jobs = [plan(TABLES[name], [])[place] for name, place in lines]
+    assert len({job.key for job in jobs}) == 1
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [("budgt=tiny", "budgt"), ("scene=totem,wires", "totem, wires"), ("a=b=,", "a=b=,")],
+)
+def test_a_setting_that_cannot_be_had_is_named(override: str, said: str) -> None:
+    with pytest.raises(SteerbenchError, match=said):
+        plan(TABLES["table3"], [override])
 
 
 @pytest.fixture
 def measured(
     store: Store, stored_run: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> list[DictConfig]:
-    """Every job but that of L = 3 finds the one run of the store; the configurations it was
-    asked for."""
+    """Every job but that of L = 3 leaves a run of known figures; the configurations it was asked
+    for."""
     asked: list[DictConfig] = []
 
     def obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
         asked.append(config)
         if config.method.pipeline.frames == 3:
             raise SteerbenchError("no room\nfor L = 3")
-        return Obtained(store, stored_run, measured=False)
+        return Obtained(store, put(store, stored_run, config), measured=True)
 
-    monkeypatch.setattr(paper, "obtain", obtain)
+    monkeypatch.setattr(attempt, "obtain", obtain)
     monkeypatch.chdir(tmp_path)
     return asked
+
+
+def put(store: Store, source: str, config: DictConfig) -> str:
+    """A copy of the run `source` as that of `config`."""
+    parts = {"config": described(config)}
+    key = store.key(parts)
+    if store.find(key) is None:
+        folder = shutil.copytree(store.folder / source, store.folder / key)
+        for file in ("rows.csv", "record.json"):
+            text = (folder / file).read_text().replace(source, key)
+            (folder / file).write_text(text)
+        record = json.loads((folder / "record.json").read_text()) | {"made_of": parts}
+        (folder / "record.json").write_text(json.dumps(record))
+    return key
+
+
+def labels(page: Path) -> list[str]:
+    """The lines of Table 3 on a page."""
+    lines = [line for line in page.read_text().splitlines() if line.startswith("| L = ")]
+    return [line.split("|")[1].strip() for line in lines]
 
 
 def test_a_job_that_fails_stands_in_its_line_and_the_others_run(
@@ -63,16 +112,59 @@ def test_a_job_that_fails_stands_in_its_line_and_the_others_run(
     outcome = steerbench("paper", "--table", "table3", f"outputs={store.folder.parent}")
     assert outcome.status == 1
     assert len(measured) == 4
-    assert "failed: table3: method.pipeline.frames=3: no room" in outcome.err
-    page = Path(re.search(r"report: (.*)", outcome.err)[1]).read_text()
-    lines = [line for line in page.splitlines() if line.startswith("| L = ")]
-    assert [line.split("|")[1].strip() for line in lines] == [
-        "L = 0",
+    assert "failed: table3: L = 3, seed 0: no room" in outcome.err
+    assert "about 0:00:0" in outcome.err
+    page = Path(re.search(r"report: (.*)", outcome.err)[1])
+    assert labels(page) == ["L = 0", "L = 1", "L = 2", "L = 3: failed: no room for L = 3"]
+    assert "/ 33.14 /" in page.read_text()
+
+
+def test_a_report_has_what_is_there_and_measures_nothing(
+    steerbench, measured: list[DictConfig], store: Store, stored_run: str
+) -> None:
+    jobs = plan(TABLES["table3"], [f"outputs={store.folder.parent}"])
+    put(store, stored_run, jobs[1].config)
+    failures.keep(store.folder.parent, described(jobs[2].config), "killed")
+    outcome = steerbench("report", "--table", "table3", f"outputs={store.folder.parent}")
+    assert (outcome.status, measured) == (0, [])
+    page = Path(re.search(r"report: (.*)", outcome.err)[1])
+    missing = "not measured yet"
+    assert labels(page) == [
+        f"L = 0: {missing}",
         "L = 1",
-        "L = 2",
-        "L = 3: failed: no room for L = 3",
+        "L = 2: failed: killed",
+        f"L = 3: {missing}",
     ]
-    assert "/ 33.14 /" in lines[2]
+    written = page.with_suffix(".html").read_text()
+    assert "<td>L = 1</td>" in written
+    assert not re.search(r'src="(?!data:)', written)
+
+
+def test_a_failure_is_forgotten_once_the_job_succeeds(tmp_path: Path) -> None:
+    job = {"seed": 1}
+    failures.keep(tmp_path, job, "no room")
+    assert failures.found(tmp_path, job) == "no room"
+    assert failures.found(tmp_path, {"seed": 2}) is None
+    failures.forget(tmp_path, job)
+    assert failures.found(tmp_path, job) is None
+
+
+def test_a_check_names_the_broken_rows_of_the_store(
+    steerbench, measured: list[DictConfig], store: Store, stored_run: str
+) -> None:
+    outputs = f"outputs={store.folder.parent}"
+    key = put(store, stored_run, plan(TABLES["table3"], [outputs])[0].config)
+    rows = store.folder / key / "rows.csv"
+    table = pd.read_csv(rows)
+    named = table["metric"].str.startswith("stage_ms.") & (table["metric"] != "stage_ms.other")
+    found = []
+    for outside_ms in (0.0, 1.0):
+        frame_ms = table.loc[named, "value"].sum() + outside_ms
+        table.loc[table["metric"] == "frame_ms", "value"] = frame_ms
+        table.to_csv(rows, index=False)
+        found.append(steerbench("report", "--check", outputs))
+    assert [outcome.status for outcome in found] == [0, 1]
+    assert key in found[1].out
 
 
 def test_the_page_goes_where_it_is_asked_for(

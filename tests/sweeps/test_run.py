@@ -42,10 +42,15 @@ def test_what_changes_rows_makes_another_run(run, tmp_path, change):
 
 
 def test_moving_data_or_report_makes_no_other_run(run, tmp_path):
-    (tmp_path / "moved").mkdir()
-    run()
-    run("scene.path=moved", "report=elsewhere")
+    run("scene.path=here/scene")
+    run("scene.path=moved/scene", "report=elsewhere")
     assert len(stored(tmp_path)) == 1
+
+
+def test_a_scene_of_another_name_makes_another_run(run, tmp_path):
+    run("scene.path=first")
+    run("scene.path=second")
+    assert len(stored(tmp_path)) == 2
 
 
 def test_the_record_holds_the_command_that_was_typed(run, tmp_path):
@@ -66,7 +71,12 @@ def test_nothing_but_outputs_is_left_behind(run, tmp_path):
     run()
     run("-m", "seed=0,1")
     assert [path.name for path in tmp_path.iterdir()] == ["outputs"]
-    assert {path.name for path in (tmp_path / "outputs").iterdir()} == {"runs", "stages", "sweeps"}
+    assert {path.name for path in (tmp_path / "outputs").iterdir()} == {
+        "locks",
+        "runs",
+        "stages",
+        "sweeps",
+    }
 
 
 def test_a_sweep_takes_flags_after_overrides_and_runs_every_combination(run, tmp_path):

@@ -1,0 +1,164 @@
+"""The page about the tables of the paper: figures beside the published ones, trends, pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from bench.results import explained
+from reports import doubts, figures
+from reports.doubts import Doubt
+from reports.pictures import beside, shown_frames
+from reports.publish import publish
+from reports.published import PaperTable, section
+from reports.runs import Run
+from reports.seeds import Repeated
+
+Lines = Mapping[str, Sequence[Repeated]]
+"""What there is of the lines of each table, by the name of the table."""
+
+METHODS = {
+    ("table1", "Instant-NGP"): "Instant-NGP",
+    ("table1", "SteerNeRF as published, fp32"): "SteerNeRF as published",
+    ("table1", "SteerNeRF, ours, fp32"): "SteerNeRF, ours",
+}
+"""Table and line of what is shown in pictures, and what it is called there."""
+
+ABLATION = {
+    ("table5", "without joint training"): "without joint training",
+    ("table4", "K = 3"): "K = 3",
+    ("table4", "K = 6"): "ours: joint training, K = 6",
+}
+"""The same of the figure of the paper's ablations."""
+
+RANGE = {
+    ("table2", "without range reduction"): "ours, without range reduction",
+    ("table2", "with range reduction"): "ours, with range reduction",
+}
+
+
+def write_paper_page(
+    tables: Sequence[PaperTable], lines: Lines, found: Sequence[Doubt], folder: Path
+) -> Path:
+    """Write `folder/report.md` with its pictures, and the same as `report.html`; return the former.
+
+    Args:
+        found: of these runs or of others.
+
+    Raises:
+        SteerbenchError: `folder` cannot be written to.
+    """
+    pictures = folder / "pictures"
+    with explained(folder):
+        pictures.mkdir(parents=True, exist_ok=True)
+        for stale in pictures.glob("frames-*.png"):  # of an earlier page
+            stale.unlink()
+        parts = [
+            "# The tables of SteerNeRF, measured",
+            READING,
+            *_doubted(lines, found),
+            *(section(table, lines.get(table.name, ())) for table in tables),
+            *_plots(lines, pictures),
+            *_compared("Methods", METHODS, lines, pictures),
+            *_compared("Ablations", ABLATION, lines, pictures),
+            _sources(lines),
+        ]
+    return publish("\n\n".join(parts), folder)
+
+
+READING = """\
+A cell is what was measured / what the paper has / the difference. The two were measured on
+different scenes, machines and trainings, which stand above each table: what can be compared is how
+the lines differ. With several seeds a measured figure is their mean ± half of its 95 % interval.
+The best figure of a column is **bold**, the second of three or more *italic*, among those of the
+same frames, protocol and machine; LPIPS columns name their network. A `–` is a figure that the
+paper does not give, or a method that does not exist here.
+
+Below each table stands what grows from line to line in the paper, and by how much it grows here. It
+`holds` where the whole 95 % interval is above zero. An interval over the frames of one seed does
+not hold the difference between one training and the next; give several seeds for that."""
+
+
+def _doubted(lines: Lines, found: Sequence[Doubt]) -> Iterator[str]:
+    listed = doubts.table(found, _runs(lines))
+    if listed.lines:
+        yield f"## {listed.title}\n\n{listed.markdown()}"
+
+
+def _runs(lines: Lines) -> list[Run]:
+    """Every run of the page, once."""
+    runs = (run for table in lines.values() for line in table for run in line.runs)
+    return list({run.key: run for run in runs}.values())
+
+
+def _plots(lines: Lines, folder: Path) -> Iterator[str]:
+    first = [line for line in lines.get("table1", ()) if line.runs]
+    if first:
+        figures.quality_against(first, "frame_ms", 1.0, "ms a frame", folder / "psnr-ms.png")
+        yield _figure(
+            "Quality against time",
+            "psnr-ms.png",
+            "PSNR against the mean time of a frame, one mark a line of Table 1: further up is"
+            " better, further left is faster. Time has a logarithmic scale.",
+        )
+    lengths = [line for line in lines.get("table6", ()) if line.runs]
+    sized = [*first, *(replace(line, label=f"ours, {line.label}") for line in lengths)]
+    if sized:
+        path = folder / "psnr-bytes.png"
+        figures.quality_against(sized, "size_bytes.total", 1e6, "MB of the model", path)
+        yield _figure(
+            "Quality against memory",
+            path.name,
+            "PSNR against the size of the model, one mark a line of Tables 1 and 6, the latter with"
+            " another length T of the hash table: further up is better, further left is smaller."
+            " Size has a logarithmic scale.",
+        )
+    if divided := _named(METHODS | RANGE, lines):
+        figures.stage_bars(divided, folder / "stages.png")
+        yield _figure(
+            "Where the time goes",
+            "stages.png",
+            "The mean time of a frame, one bar for each run, divided into the stages of its method."
+            " Rays, march, field, composite and finish of Instant-NGP are what SteerNeRF does in"
+            " its stage `field`, at a lower resolution. What is in no stage is `other`.",
+        )
+    if followed := _named(METHODS, lines):
+        figures.quality_over_frames(followed, folder / "psnr-frames.png")
+        yield _figure(
+            "Quality along the path",
+            "psnr-frames.png",
+            "PSNR of every frame of the path with a ground truth. Hollow marks are cold frames, "
+            "which had fewer preceding frames than the method looks back on.",
+        )
+
+
+def _figure(title: str, file: str, caption: str) -> str:
+    return f"## {title}\n\n![{title}](pictures/{file})\n\n{caption}"
+
+
+def _compared(
+    title: str, shown: Mapping[tuple[str, str], str], lines: Lines, folder: Path
+) -> Iterator[str]:
+    """The middle one of the frames that all runs kept."""
+    runs = _named(shown, lines)
+    runs = [run for run in runs if run.views == runs[0].views]
+    if runs and (frames := shown_frames(runs[0])):
+        yield f"## {title}\n\nThe middle one of the {len(frames)} frames that were kept."
+        yield from beside(runs, frames[len(frames) // 2], f"frames-{title.lower()}", folder)
+
+
+def _named(wanted: Mapping[tuple[str, str], str], lines: Lines) -> list[Run]:
+    """The first run of every line of `wanted` that has one, called as it says."""
+    labels = {(table, line.label): line for table in lines for line in lines[table]}
+    return [
+        replace(labels[place].runs[0], label=name)
+        for place, name in wanted.items()
+        if place in labels and labels[place].runs
+    ]
+
+
+def _sources(lines: Lines) -> str:
+    """Every run of the page: where in the store it lies and what made it."""
+    listed = "\n".join(f"{run.key}  {run.record['command']}" for run in _runs(lines))
+    return f"## Runs\n\nTheir keys in the store, and what was typed:\n\n```\n{listed}\n```"

@@ -1,0 +1,39 @@
+"""Why a job failed, kept below `outputs` until it succeeds: reports show it in place of figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from bench.results import content_key, explained
+
+
+def reason(error: Exception) -> str:
+    """What `error` says, in one line."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def keep(outputs: Path, job: Mapping[str, Any], why: str) -> None:
+    """Leave behind why `job`, as its settings describe it, failed."""
+    path = _path(outputs, job)
+    with explained(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_suffix(".partial")
+        partial.write_text(f"{why}\n", encoding="utf-8")
+        partial.replace(path)
+
+
+def forget(outputs: Path, job: Mapping[str, Any]) -> None:
+    """`job` has succeeded."""
+    _path(outputs, job).unlink(missing_ok=True)
+
+
+def found(outputs: Path, job: Mapping[str, Any]) -> str | None:
+    """Why `job` failed when it was tried last; None if it did not."""
+    path = _path(outputs, job)
+    return path.read_text(encoding="utf-8").strip() if path.exists() else None
+
+
+def _path(outputs: Path, job: Mapping[str, Any]) -> Path:
+    return outputs / "failures" / f"{content_key(job)[:16]}.txt"

@@ -1,0 +1,136 @@
+"""What there is to measure for the tables of the paper, and what of it is there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+from pathlib import Path
+from typing import Any, cast
+
+from omegaconf import DictConfig, OmegaConf
+
+from bench.errors import SteerbenchError
+from bench.results import SCHEMA_VERSION, Store, content_key
+from reports.published import PaperTable, paper_tables
+from reports.runs import Run, load
+from reports.seeds import Repeated
+from sweeps import failures
+from sweeps.measurement import described
+from sweeps.names import unknown
+from sweeps.overrides import composed, swept
+
+REPEATED = "seed"
+"""The one setting that may take several values: a cell then has a mean and an interval."""
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A job: the line of a table that it fills, with which seed, and its whole configuration."""
+
+    table: str
+    line: str
+    config: DictConfig
+    command: Sequence[str]
+
+    @property
+    def name(self) -> str:
+        """What it is called while it runs."""
+        return f"{self.table}: {self.line}, seed {self.config.seed}"
+
+    @cached_property
+    def key(self) -> str:
+        """The same for jobs that are the same."""
+        return content_key(described(self.config))
+
+
+def chosen(name: str | None) -> list[PaperTable]:
+    """The table called `name`; all of them without one."""
+    tables = {table.name: table for table in paper_tables()}
+    if name is not None and name not in tables:
+        raise unknown("table", name, tables)
+    return [tables[name]] if name else list(tables.values())
+
+
+def plan(table: PaperTable, overrides: Sequence[str]) -> list[Planned]:
+    """The jobs of the experiment of `table` under `overrides`, once for each of their seeds.
+
+    What the experiment sweeps over and fills no line is left out: Instant-NGP has no 2D renderer to
+    compute in int8.
+
+    Raises:
+        SteerbenchError: an override cannot be read, names nothing, or is swept and no seed.
+    """
+    fixed, seeds = _seeds(overrides)
+    lines = {
+        frozenset(f"{name}={value}" for name, value in line.job.items()): line.label
+        for line in table.lines
+        if line.job
+    }
+    experiment = composed([f"+experiment={table.name}", *fixed], return_hydra_config=True)
+    params = experiment.hydra.sweeper.params
+    grid = swept([f"{name}={values}" for name, values in params.items()])
+    jobs = []
+    for values in product(*grid.values()):
+        settings = [f"{name}={value}" for name, value in zip(grid, values, strict=True)]
+        label = lines.get(frozenset(settings))
+        if label is not None:
+            together = [f"+experiment={table.name}", *fixed, *settings]
+            config = composed(together)
+            for seed in seeds:
+                command = ["steerbench", "run", *together, *seed, "hydra.mode=RUN"]
+                merged = OmegaConf.merge(config, OmegaConf.from_dotlist(seed))
+                jobs.append(Planned(table.name, label, cast(DictConfig, merged), command))
+    return jobs
+
+
+def _seeds(overrides: Sequence[str]) -> tuple[list[str], list[list[str]]]:
+    """Overrides that all jobs share, and those of each repetition."""
+    several = swept(overrides)
+    if others := sorted(several.keys() - {REPEATED}):
+        raise SteerbenchError(
+            f"{others[0]}: expected one value, got {', '.join(several[others[0]])}; only "
+            f"{REPEATED} may take several here"
+        )
+    fixed = [text for text in overrides if REPEATED not in swept([text])]
+    values = dict.fromkeys(several.get(REPEATED, ()))
+    return fixed, [[f"{REPEATED}={value}"] for value in values] or [[]]
+
+
+def newest(store: Store) -> dict[str, Run]:
+    """Every run of the store, by the key of its job; of several, that which was stored last."""
+    folders = [path for path in store.folder.glob("[!.]*") if store.find(path.name)]
+    folders.sort(key=lambda path: path.stat().st_mtime)
+    keys = {}
+    for folder in folders:
+        record: Any = store.record(folder.name)
+        if record.get("schema_version") == SCHEMA_VERSION and "config" in record["made_of"]:
+            keys[content_key(record["made_of"]["config"])] = folder.name
+    runs = {run.key: run for run in load(store, {key: key for key in keys.values()})}
+    return {job: runs[key] for job, key in keys.items()}
+
+
+def gather(
+    jobs: Sequence[Planned], runs: Mapping[str, Run], outputs: Path
+) -> dict[str, list[Repeated]]:
+    """What there is of every line, by table: its runs, and why others are missing.
+
+    Args:
+        runs: by the key of their job.
+    """
+    lines: dict[tuple[str, str], list[Planned]] = {}
+    for job in jobs:
+        lines.setdefault((job.table, job.line), []).append(job)
+    tables: dict[str, list[Repeated]] = {}
+    for (table, label), same in lines.items():
+        found, gaps = [], []
+        for job in same:
+            failure = failures.found(outputs, described(job.config))
+            if failure is None and job.key in runs:
+                found.append(replace(runs[job.key], label=label))
+            else:
+                why = "not measured yet" if failure is None else f"failed: {failure}"
+                gaps.append(f"seed {job.config.seed} {why}" if len(same) > 1 else why)
+        tables.setdefault(table, []).append(Repeated(label, found, gaps))
+    return tables

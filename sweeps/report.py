@@ -1,0 +1,44 @@
+"""`steerbench report`: the page about the tables of the paper, from the store alone."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from bench.results import Store
+from reports.doubts import doubts, table
+from reports.paper_page import write_paper_page
+from reports.published import PaperTable
+from sweeps.overrides import composed
+from sweeps.plan import Planned, chosen, gather, newest, plan
+from sweeps.terminal import console, rich_table
+
+
+def main(options: argparse.Namespace) -> int:
+    """Write the page, or with `--check` name the broken rows of the store: 1 if there are any."""
+    if options.check:
+        return _check(Store(Path(composed(options.overrides).outputs)))
+    tables = chosen(options.table)
+    jobs = [job for table in tables for job in plan(table, options.overrides)]
+    write(tables, jobs, options.report)
+    return 0
+
+
+def write(tables: Sequence[PaperTable], jobs: Sequence[Planned], folder: Path | None) -> None:
+    """Write what there is of `jobs` as a page about `tables`, and say where."""
+    outputs = Path(jobs[0].config.outputs)
+    runs = newest(Store(outputs))
+    lines, found = gather(jobs, runs, outputs), doubts(list(runs.values()))
+    page = write_paper_page(tables, lines, found, folder or outputs / "paper")
+    print(f"report: {page}", file=sys.stderr)
+
+
+def _check(store: Store) -> int:
+    runs = list(newest(store).values())
+    found = doubts(runs)
+    if found:
+        console().print(rich_table(table(found, runs)))
+    console().print(f"{len(found)} of {len(runs)} runs are to be doubted")
+    return int(len(found) > 0)

@@ -1,0 +1,125 @@
+"""Broken rows are found, each by the rule that is meant for it, and sound ones are left alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from reports.doubts import (
+    Doubt,
+    doubts,
+    far_from_other_scenes,
+    far_from_reference,
+    faster_with_more_pixels,
+    int8_far_from_fp32,
+    stages_do_not_add_up,
+    table,
+)
+from reports.runs import Run
+
+Make = Callable[..., Run]
+
+
+@pytest.fixture
+def make(rows: pd.DataFrame) -> Make:
+    """Makes a run of a scene, a seed, a size, a precision; figures by metric."""
+
+    def make_run(
+        key: str,
+        *,
+        scene: str = "totem",
+        seed: int = 0,
+        width: int = 100,
+        precision: str = "fp32",
+        cpu: str = "EPYC",
+        **figures: float,
+    ) -> Run:
+        facts = {"scene": scene, "seed": seed, "resolution": f"{width}x{width}"}
+        own = rows.assign(device="cpu", budget="small", precision=precision, **facts)
+        own["value"] = own["value"].where(~own["metric"].isin(figures), own["metric"].map(figures))
+        engine = {"name": "openvino" if precision == "int8" else "torch"}
+        config = {
+            "method": {"name": "ngp", "seed": seed, "engine": engine},
+            "scene": {"name": scene, "width": width},
+            "seed": seed,
+            "precision": precision,
+            "engine": engine,
+        }
+        record = {"machine": {"cpu": cpu, "gpus": []}, "made_of": {"config": config}}
+        return Run(key, key, own, pd.DataFrame(), record, Path())
+
+    return make_run
+
+
+def keys(found) -> list[str]:
+    return [doubt.key for doubt in found]
+
+
+def test_a_scene_far_below_a_methods_other_scenes_is_doubted(make: Make) -> None:
+    sound = [make(name, scene=name, psnr=db) for name, db in (("a", 33), ("b", 35), ("c", 26))]
+    assert keys(far_from_other_scenes(sound)) == []
+    broken = make("mic", scene="mic", psnr=13.0)
+    assert keys(far_from_other_scenes([*sound, broken])) == ["mic"]
+
+
+def test_two_scenes_do_not_tell_which_is_broken(make: Make) -> None:
+    assert (
+        keys(far_from_other_scenes([make("a", scene="a", psnr=33.0), make("b", psnr=13.0)])) == []
+    )
+
+
+def test_many_seeds_of_a_broken_scene_do_not_make_it_the_usual_one(make: Make) -> None:
+    sound = [make(name, scene=name, psnr=33.0) for name in "abc"]
+    broken = [make(f"mic {seed}", scene="mic", seed=seed, psnr=13.0) for seed in range(9)]
+    assert keys(far_from_other_scenes([*sound, *broken])) == keys(map(doubt, broken))
+
+
+def doubt(run: Run) -> Doubt:
+    return Doubt(run.key, "")
+
+
+def test_a_known_scene_is_held_against_what_is_known_of_it(make: Make) -> None:
+    runs = [
+        make("good", scene="mic", psnr=33.9),
+        make("bad", scene="mic", psnr=13.0),
+        make("other"),
+    ]
+    assert keys(far_from_reference(runs, {"mic": 35.59})) == ["bad"]
+
+
+def test_stages_that_leave_a_frame_unexplained_are_doubted(make: Make) -> None:
+    """Of 200 ms, 150 lie in the field, the rest in a second stage or in none."""
+    assert keys(stages_do_not_add_up([make("a", **{"stage_ms.field": 199.0})])) == []
+    assert keys(stages_do_not_add_up([make("b")])) == ["b"]
+    assert keys(stages_do_not_add_up([make("c", **{"stage_ms.field": 250.0})])) == ["c"]
+
+
+@pytest.mark.parametrize(("psnr", "doubted"), [(29.9, []), (28.0, ["int8"])])
+def test_int8_is_held_against_the_same_in_fp32(make: Make, psnr: float, doubted: list[str]) -> None:
+    runs = [make("fp32", psnr=30.0), make("int8", precision="int8", psnr=psnr)]
+    assert keys(int8_far_from_fp32(runs)) == doubted
+    apart = [make("fp32", seed=1, psnr=30.0), runs[1]]
+    assert keys(int8_far_from_fp32(apart)) == []
+
+
+def test_more_pixels_in_less_time_are_doubted_on_one_machine(make: Make) -> None:
+    small, large = make("small", frame_ms=50.0), make("large", width=200, frame_ms=40.0)
+    assert keys(faster_with_more_pixels([large, small])) == ["large"]
+    assert keys(faster_with_more_pixels([small, make("large", width=200, frame_ms=60.0)])) == []
+    elsewhere = make("elsewhere", width=200, frame_ms=40.0, cpu="Xeon")
+    assert keys(faster_with_more_pixels([small, elsewhere])) == []
+    a_little = make("a little", width=150, frame_ms=40.0)
+    assert keys(faster_with_more_pixels([small, a_little])) == []
+
+
+def test_all_rules_are_asked_and_their_answers_are_shown(make: Make) -> None:
+    runs = [make("here", psnr=13.0, scene="mic")]
+    found = doubts(runs)
+    assert {doubt.key for doubt in found} == {"here"}
+    assert len(found) == 2  # the reference, the stages
+    shown = table(found, runs)
+    assert shown.lines[0][:3] == ("here", "ngp", "mic")
+    assert table(found, []).lines == ()

@@ -1,0 +1,88 @@
+"""The page about the paper's tables: its pictures, its curves, what is to be doubted."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from reports import figures
+from reports.doubts import Doubt
+from reports.paper_page import ABLATION, METHODS, RANGE, write_paper_page
+from reports.published import paper_tables
+from reports.runs import Run, load
+from reports.seeds import Repeated
+
+
+@pytest.fixture
+def run(store, stored_run: str) -> Run:
+    """A run of six scored frames, three of them pictured."""
+    return load(store, {stored_run: "run"})[0]
+
+
+def of(run: Run, label: str) -> Repeated:
+    """`run` as that of a line."""
+    return Repeated(label, [replace(run, label=label)])
+
+
+def test_every_line_that_is_shown_in_a_figure_is_one_of_the_tables() -> None:
+    lines = {(table.name, line.label) for table in paper_tables() for line in table.lines}
+    assert {*METHODS, *ABLATION, *RANGE} <= lines
+
+
+def test_the_page_has_every_table_and_every_figure(run: Run, tmp_path: Path) -> None:
+    lines = {
+        table.name: [of(run, line.label) for line in table.lines if line.job]
+        for table in paper_tables()
+    }
+    page = write_paper_page(paper_tables(), lines, [], tmp_path)
+    text = page.read_text()
+    shown = re.findall(r"!\[[^]]*\]\((.+?)\)", text)
+    assert len(shown) == 6
+    assert {page.parent / name for name in shown} == set((tmp_path / "pictures").iterdir())
+    assert all(f"## Table {number}" in text for number in range(1, 7))
+    assert text.count(f"{run.key}  steerbench run method=offset") == 1
+    assert "to be doubted" not in text
+    assert (tmp_path / "report.html").read_text().count("data:image/png") == 6
+
+
+def test_a_page_of_nothing_still_says_what_is_missing(tmp_path: Path) -> None:
+    lines = {"table5": [Repeated("with joint training", [], ["not measured yet"])]}
+    text = write_paper_page(paper_tables(), lines, [], tmp_path).read_text()
+    assert "| with joint training: not measured yet | – / 33.05 |" in text
+    assert "![" not in text
+
+
+def test_what_is_to_be_doubted_is_said_of_the_runs_of_the_page(run: Run, tmp_path: Path) -> None:
+    lines = {"table5": [of(run, "with joint training")]}
+    found = [Doubt(run.key, "13 dB among 30s"), Doubt("another", "not of this page")]
+    text = write_paper_page(paper_tables(), lines, found, tmp_path).read_text()
+    assert "13 dB among 30s" in text
+    assert "not of this page" not in text
+
+
+def test_a_curve_has_a_point_for_every_scored_frame_and_hollow_ones_for_cold(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = []
+    monkeypatch.setattr(figures.Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    frames = run.frames.copy()
+    frames.loc[0, "phase"] = "cold"
+    frames.loc[3, "psnr"] = float("nan")
+    figures.quality_over_frames([replace(run, frames=frames)], tmp_path / "curve.png")
+    curve, cold = drawn[0].axes[0].lines
+    assert list(curve.get_xdata()) == [0, 1, 2, 4, 5]
+    assert list(cold.get_xdata()) == [0]
+
+
+def test_a_mark_stands_where_its_line_is_in_quality_and_cost(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = []
+    monkeypatch.setattr(figures.Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    lines = [of(run, "measured"), Repeated("missing", [])]
+    figures.quality_against(lines, "size_bytes.total", 1e6, "MB", tmp_path / "marks.png")
+    (mark,) = drawn[0].axes[0].lines
+    assert mark.get_xydata().tolist() == [[104e-6, run.values["psnr"]]]
