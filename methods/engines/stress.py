@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache, partial
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from methods.kernels.depthwise import neighbours_of
 from methods.space_to_depth import SpaceToDepth
 
 ENGINES: tuple[type[Engine], ...] = (TorchEngine, OpenVino, OnnxRuntime)
-CELLS = [(engine.name, precision) for engine in ENGINES for precision in engine.precisions]
+CELLS: list[Cell] = [(engine.name, precision) for engine in ENGINES for precision in engine.precisions]
 
 TOLERANCE = {"fp32": 1e-5, "bf16": 0.03, "fp16": 0.03, "int8": 0.1}
 SHARE = (
@@ -71,7 +71,7 @@ def _case(
     name: str,
     holds: str,
     derivation: str,
-    tolerances: dict[Cell, float],
+    tolerances: Mapping[Cell, float],
     worst: Callable[[str, str, str], float],
 ) -> StressCase:
     # Engines take seconds to build.
