@@ -21,7 +21,9 @@ from methods.kernels.depthwise import neighbours_of
 from methods.space_to_depth import SpaceToDepth
 
 ENGINES: tuple[type[Engine], ...] = (TorchEngine, OpenVino, OnnxRuntime)
-CELLS: list[Cell] = [(engine.name, precision) for engine in ENGINES for precision in engine.precisions]
+CELLS: list[Cell] = [
+    (engine.name, precision) for engine in ENGINES for precision in engine.precisions
+]
 
 TOLERANCE = {"fp32": 1e-5, "bf16": 0.03, "fp16": 0.03, "int8": 0.1}
 SHARE = (
