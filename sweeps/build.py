@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from hydra.errors import InstantiationException
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from bench.errors import SteerbenchError
 from sweeps.names import unknown
@@ -27,10 +28,13 @@ def build(config: DictConfig, group: str, *args: Any, **extra: Any) -> Any:
     Raises:
         SteerbenchError: a setting is missing, unknown to its target, or of another type.
     """
-    missing = sorted(OmegaConf.missing_keys(config[group]))  # full keys: "scene.path"
-    if missing:
-        raise SteerbenchError(f"{missing[0]} is not set: give {missing[0]}=...")
-    node: Any = OmegaConf.to_container(config[group], resolve=True)
+    try:
+        missing = sorted(OmegaConf.missing_keys(config[group]))  # full keys: "scene.path"
+        if missing:
+            raise SteerbenchError(f"{missing[0]} is not set: give {missing[0]}=...")
+        node: Any = OmegaConf.to_container(config[group], resolve=True)
+    except OmegaConfBaseException as error:  # of what was taken away (~backend), others stand on it
+        raise SteerbenchError(f"{group}: {str(error).splitlines()[0]}") from error
     target = get_object(node["_target_"])
     given = [*list(inspect.signature(target).parameters)[: len(args)], *extra]
     check_settings(target, node, f"{group}.", given)

@@ -127,7 +127,10 @@ def checked_settings(config: DictConfig) -> Settings:
     Raises:
         SteerbenchError: one of them is wrong.
     """
-    values = {field.name: config[field.name] for field in fields(Settings)}
+    names = [field.name for field in fields(Settings)]
+    if missing := [name for name in names if name not in config]:
+        raise SteerbenchError(f"{missing[0]} is not set: give {missing[0]}=...")
+    values = {name: config[name] for name in names}
     check_settings(Settings, values)
     settings = Settings(**values)
     if settings.seed < 0:

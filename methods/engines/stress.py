@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache, partial
 from pathlib import Path
 
@@ -73,7 +73,7 @@ def _case(
     name: str,
     holds: str,
     derivation: str,
-    tolerances: dict[Cell, float],
+    tolerances: Mapping[Cell, float],
     worst: Callable[[str, str, str], float],
 ) -> StressCase:
     # Engines take seconds to build.

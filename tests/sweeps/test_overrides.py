@@ -50,8 +50,10 @@ def test_deleting_what_is_not_there_is_an_error_without_traceback(run):
     assert "Traceback" not in outcome.err
 
 
-@pytest.mark.parametrize("argument", ["budget=0.0", "~budget=0.0", "scene=null"])
-def test_a_choice_that_is_no_name_is_an_error_without_traceback(run, argument):
+@pytest.mark.parametrize(
+    "argument", ["budget=0.0", "~budget=0.0", "scene=null", "~seed", "~method"]
+)
+def test_a_choice_that_is_no_name_or_none_is_an_error_without_traceback(run, argument):
     outcome = run(argument)
     assert outcome.status == 2
     assert outcome.err.startswith("steerbench: ")
