@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from omegaconf import DictConfig
 
 from bench.cameras import frame_camera
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
+from bench.frontier import observed_order
 from bench.results import COLD, Measurement, explained
 from bench.run import measure
 from bench.trajectories import Step
@@ -170,5 +170,5 @@ def growth(rows: Sequence[dict[str, Any]], figure: str) -> float:
     points = [(row["value"], row[figure]) for row in rows if row["value"] > 0 and row[figure] > 0]
     if len({value for value, _ in points}) < 2:
         return math.nan
-    value, of = np.log(np.array(points)).T
-    return float(np.polyfit(value, of, 1)[0])
+    value, of = zip(*points, strict=True)
+    return observed_order(value, of)
