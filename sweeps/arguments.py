@@ -93,6 +93,12 @@ def _scaling(scaling: Parser) -> None:
         "hardly, for what they have learned does not change what they cost."
     )
     _frames(scaling, 20, "steady frames of each")
+    scaling.add_argument(
+        "--axis",
+        action="append",
+        choices=["pixels", "threads", "L", "K", "T"],
+        help="only this one; may be given more than once",
+    )
     scaling.add_argument("--plot", type=Path, metavar="FILE.png", help="draw it, too")
     _overrides(scaling)
 

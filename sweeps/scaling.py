@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import statistics
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from omegaconf import DictConfig
 
@@ -17,10 +19,9 @@ from bench.cameras import frame_camera
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from bench.frontier import observed_order
-from bench.results import COLD, Measurement, explained
-from bench.run import measure
-from bench.trajectories import Step
-from bench.types import Log, Scene
+from bench.probes import FrameRecord, MemoryMeter, StageClock
+from bench.results import explained
+from bench.types import Camera, Log, Method, Scene
 from reports.growth import growth_panels
 from reports.tables import Table, megabytes, number
 from sweeps.build import build
@@ -79,11 +80,12 @@ def main(options: argparse.Namespace) -> int:
     settings = checked_settings(config)
     log = ConsoleLog(Path(settings.outputs))
     scene = build(config, "scene", log=log)
-    points, rows = list(_points()), []
+    points = [point for point in _points() if point.axis in (options.axis or [point.axis])]
+    rows = []
     with log.progress("scaling", len(points)) as progress:
         for point in points:
             made = composed([*overrides, *point.settings])
-            rows.append(_row(point, _measured(point, made, scene, options.frames, log)))
+            rows.append(_row(point, made, scene, options.frames, log))
             progress.advance(note=point.label)
     title = f"{config.method.name} on {scene.name}, {options.frames} frames"
     axes: dict[str, list[dict[str, Any]]] = {}
@@ -98,43 +100,50 @@ def main(options: argparse.Namespace) -> int:
     return 0
 
 
-def _measured(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) -> Measurement:
-    """The first steady `frames` of the trajectory, none scored, as large as `point` says."""
-    method = build(config, "method")
-    path = build(config, "trajectory", scene)
-    cameras = [step.camera for step in path.steps[: frames + method.memory]]
+def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) -> dict[str, Any]:
+    """Time, work and memory of the first steady `frames` of the trajectory, as `point` says."""
+    method: Method = build(config, "method")
+    method.fit(scene, build(config, "budget"), log)
+    cameras = [step.camera for step in build(config, "trajectory", scene).steps]
+    cameras = cameras[: method.memory + frames]
     if point.size:
         cameras = [frame_camera(camera, *point.size) for camera in cameras]
-    steps = tuple(Step(camera, None) for camera in cameras)
-    protocol = replace(build(config, "protocol"), name="unscored", lpips=())
     usual = torch.get_num_threads()
-    torch.set_num_threads(point.threads or usual)
+    torch.set_num_threads(point.threads or usual)  # trained with all of them, all the same
     try:
-        return measure(
-            method,
-            scene,
-            replace(path, steps=steps),
-            protocol,
-            build(config, "budget"),
-            log,
-            seed=config.seed,
-        )
+        records, peak_bytes = _render(method, cameras, log)
     finally:
         torch.set_num_threads(usual)
-
-
-def _row(point: Point, measured: Measurement) -> dict[str, Any]:
-    rows = measured.rows[measured.rows["phase"] != COLD].set_index("metric")["value"]
+    ms = [record.total_ns / 1e6 for record in records]
+    samples = [record.done["samples"] + record.done.get("surface_samples", 0) for record in records]
     return {
         "axis": point.axis,
         "label": point.label,
         "value": point.value,
-        "frame_ms": rows["frame_ms.p50"],
-        "p99_to_p50": rows["frame_ms.p99"] / rows["frame_ms.p50"],
-        "samples": rows["work.samples"] + rows.get("work.surface_samples", 0.0),
-        "peak_bytes": rows["peak_bytes"],
-        "size_bytes": rows["size_bytes.total"],
+        "frame_ms": statistics.median(ms),
+        "p99_to_p50": float(np.percentile(ms, 99)) / statistics.median(ms),
+        "samples": statistics.mean(samples),
+        "peak_bytes": peak_bytes,
+        "size_bytes": sum(method.sizes().values()),
     }
+
+
+@torch.no_grad()
+def _render(
+    method: Method, cameras: Sequence[Camera], log: Log
+) -> tuple[Sequence[FrameRecord], int]:
+    """The steady frames of a sequence through `cameras`, the second time round, and the peak of
+    memory in them."""
+    device = method.settings()["device"]
+    clock, meter = StageClock(device), MemoryMeter(device)
+    with log.progress("rendering", 2 * len(cameras)) as progress:
+        for _ in range(2):
+            method.reset()
+            for camera in cameras:
+                with meter, clock.frame():
+                    method.render(camera, clock)
+                progress.advance()
+    return clock.frames[len(cameras) + method.memory :], meter.peak_bytes
 
 
 def _lines(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
