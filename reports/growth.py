@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
 from reports.figures import COLOURS
 
@@ -23,7 +24,7 @@ def growth_panels(
     its own is not.
 
     Args:
-        axes: by name, rows with "value" and a value of every figure.
+        axes: by name, rows with "value", its "label" and a value of every figure.
         figures: key in a row, and label with unit.
         exponents: by axis and figure, shown where they are finite.
     """
@@ -36,10 +37,11 @@ def growth_panels(
             panel.plot(values, [row[key] for row in rows], "o-", color=COLOURS[0], markersize=4)
             panel.set_yscale("log")
             if min(values) > 0:
-                panel.set_xscale("log", base=2 if axis != "pixels" else 10)
+                panel.set_xscale("log")
+            panel.set_xticks(values, [row["label"] for row in rows], rotation=90, fontsize="small")
+            panel.xaxis.set_minor_locator(NullLocator())
             if (exponent := exponents[axis, key]) == exponent:
-                panel.set_title(f"~ {axis}^{exponent:.2f}", fontsize="small")
-            panel.set_xlabel(axis)
+                panel.set_title(f"~ {axis}^{exponent:.2f}", fontsize="medium")
             panel.grid(alpha=0.3, which="both")
             panel.spines[["top", "right"]].set_visible(False)
         line[0].set_ylabel(label)

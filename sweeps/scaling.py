@@ -62,7 +62,7 @@ def _points() -> Iterator[Point]:
     for width, height in SIZES:
         yield Point("pixels", width * height, f"{width} x {height}", size=(width, height))
     for threads in range(1, torch.get_num_threads() + 1):
-        yield Point("threads", threads, f"{threads}", threads=threads)
+        yield Point("threads", threads, f"{threads} thread{'s' * (threads > 1)}", threads=threads)
     for frames in (0, 1, 2, 3):
         yield Point("L", frames, f"L = {frames}", (f"method.pipeline.frames={frames}",))
     for channels in (3, 6, 9):
@@ -161,7 +161,7 @@ def _lines(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
         for row in rows
     ]
     exponents = [growth(rows, name) for name in ("frame_ms", "samples", "peak_bytes", "size_bytes")]
-    ms, samples, peak, size = (number(exponent, 2) for exponent in exponents)
+    ms, samples, peak, size = (number(round(exponent, 2) + 0.0, 2) for exponent in exponents)
     return [*lines, (f"exponent of {rows[0]['axis']}", ms, "", "", samples, peak, size)]
 
 
