@@ -35,7 +35,8 @@ def true_views(scene: Scene) -> list[TrueView]:
 
 @dataclass
 class Sequence:
-    """A view to be drawn and what precedes it; good for `uses` more patches.
+    """A view to be drawn and what precedes it; good for `uses` more patches, after which it begins
+    anew or, if it is `lasting`, goes on.
 
     Attributes:
         truth: the view and its picture.
@@ -50,6 +51,7 @@ class Sequence:
     buffer: RenderingBuffer
     cells: Tensor
     uses: int
+    lasting: bool
 
 
 @dataclass(frozen=True)
@@ -114,14 +116,14 @@ class SequencePool:
             self._pool.append(self._make())
             place = len(self._pool) - 1
         elif self._pool[place].uses <= 0:
-            longer = torch.rand((), generator=self._generator).item() < self._options.longer
-            self._pool[place] = self._go_on(self._pool[place]) if longer else self._make()
+            old = self._pool[place]
+            self._pool[place] = self._go_on(old) if old.lasting else self._make()
         sequence = self._pool[place]
         sequence.uses -= 1
         return sequence
 
     def _make(self) -> Sequence:
-        distilled = torch.rand((), generator=self._generator).item() < self._share
+        distilled = self._chance() < self._share
         views = self._distilled if distilled else self._real
         truth = views[self._random(len(views))]
         options = self._pipeline.options
@@ -149,7 +151,11 @@ class SequencePool:
             for camera in motion:
                 self._pipeline.render(camera, buffer, NullProbe())
         view = View.of(truth.camera, self._pipeline.options, buffer.turn)
-        return Sequence(truth, view, buffer, cells, self._options.uses)
+        lasting = self._chance() < self._options.longer
+        return Sequence(truth, view, buffer, cells, self._options.uses, lasting)
+
+    def _chance(self) -> float:
+        return torch.rand((), generator=self._generator).item()
 
     def _random(self, below: int) -> int:
         return int(torch.randint(below, (), generator=self._generator))
