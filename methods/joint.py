@@ -85,7 +85,8 @@ class JointOptions:
 
     def distilled(self, steps: int) -> int:
         """Distilled views of a training of so many steps: no more than it has a use for."""
-        sequences = self.motion.pool + steps * self.batch / self.motion.uses
+        anew = (1 - self.motion.longer) * steps * self.batch / self.motion.uses
+        sequences = self.motion.pool + anew
         return min(self.distilled_views, math.ceil(self.distilled_share * sequences))
 
 

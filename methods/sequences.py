@@ -151,7 +151,8 @@ class SequencePool:
             for camera in motion:
                 self._pipeline.render(camera, buffer, NullProbe())
         view = View.of(truth.camera, self._pipeline.options, buffer.turn)
-        lasting = self._chance() < self._options.longer
+        # Without frames before it, a view that goes on would be the same once more.
+        lasting = self._chance() < self._options.longer and self._pipeline.options.frames > 0
         return Sequence(truth, view, buffer, cells, self._options.uses, lasting)
 
     def _chance(self) -> float:

@@ -101,7 +101,8 @@ class SteerNerf:
         target = viewing_target(scene)
         distilled: list[TrueView] = []
         if views := self.joint.distilled(budget.renderer_steps):
-            folder = log.stage_dir("distilled", {**key, "views": views})
+            of_views = {**key, "views": views, "stage2": stage2_digest()}
+            folder = log.stage_dir("distilled", of_views)
             distilled = distilled_views(trained, scene, target, views, seed, folder, log)
         trained.field.widen(options.channels)
         self.pipeline, training = self._stage2(trained, scene, distilled, target, budget)
