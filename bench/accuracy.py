@@ -57,6 +57,7 @@ class Experiment:
     smooth: tuple[float, float] | None = None
 
 
+@torch.no_grad()
 def experiment_rows(
     experiments: Sequence[Experiment], repeats: int, log: Log
 ) -> list[dict[str, Any]]:

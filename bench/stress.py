@@ -9,7 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
+
+import torch
 
 from bench.types import Log, Unavailable
 
@@ -43,9 +46,9 @@ class StressCase:
     def check(self, cell: Cell, device: str) -> dict[str, Any]:
         """The row of one cell.
 
-        It holds subject, case, holds, derivation, backend, precision, tolerance, error (None where
-        it is not finite or there is none) and status: "ok", "failed", "failed: " with what was
-        raised, or "unavailable: " with the reason.
+        It holds subject, case, holds, derivation, device, backend, precision, tolerance, error
+        (None where it is not finite or there is none) and status: "ok", "failed", "failed: " with
+        what was raised, or "unavailable: " with the reason.
         """
         backend, precision = cell
         error, tolerance = math.inf, self.tolerances[cell]
@@ -54,6 +57,8 @@ class StressCase:
             status = "ok" if error <= tolerance else "failed"
         except Unavailable as reason:
             status = f"unavailable: {reason}"
+        except (MemoryError, torch.OutOfMemoryError):
+            status = "unavailable: more memory is needed than there is"
         except Exception as raised:  # a crash is what the case was looking for
             status = f"failed: {type(raised).__name__}: {raised}"
         return {
@@ -61,6 +66,7 @@ class StressCase:
             "case": self.name,
             "holds": self.holds,
             "derivation": self.derivation,
+            "device": device,
             "backend": backend,
             "precision": precision,
             "tolerance": tolerance,
@@ -69,10 +75,14 @@ class StressCase:
         }
 
 
-def run_cases(cases: Sequence[StressCase], device: str, log: Log) -> Iterator[dict[str, Any]]:
-    """The rows of all cells of `cases`, one case after the other; see `StressCase.check`."""
-    with log.progress("stress", sum(len(case.tolerances) for case in cases)) as progress:
-        for case in cases:
+def run_cases(
+    cases: Sequence[StressCase], devices: Sequence[str], log: Log
+) -> Iterator[dict[str, Any]]:
+    """The rows of all cells of `cases` on all `devices`, one case after the other; see
+    `StressCase.check`."""
+    cells = sum(len(case.tolerances) for case in cases)
+    with log.progress("stress", cells * len(devices)) as progress:
+        for case, device in product(cases, devices):
             for cell in case.tolerances:
                 progress.advance(0, note=f"{case.subject}, {case.name}: {' '.join(cell)}")
                 yield case.check(cell, device)

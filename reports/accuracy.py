@@ -12,6 +12,7 @@ import pandas as pd
 from bench.provenance import commit, machine
 from bench.results import explained
 from reports.frontier import frontier_plot
+from reports.publish import publish
 from reports.tables import Table, number
 
 Row = Mapping[str, Any]
@@ -76,7 +77,8 @@ def setting_table(rows: Sequence[Row]) -> Table:
 def write_accuracy(
     experiments: Sequence[Row], settings: Sequence[Row], folder: Path, command: str
 ) -> Path:
-    """Write `folder/report.md` with its plot and all rows as CSV beside it; return its path.
+    """Write `folder/report.md` and `report.html`, the plot and all rows as CSV beside them; return
+    the path of the first.
 
     `command` is what was typed.
 
@@ -95,9 +97,7 @@ def write_accuracy(
             parts.append("![Error of a frame against its time, one point a setting](frontier.png)")
             tables.insert(0, setting_table(settings))
         parts += [f"## {table.title}\n\n{table.markdown()}" for table in tables]
-        partial = folder / ".report.md.partial"
-        partial.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
-        return partial.replace(folder / "report.md")
+    return publish("\n\n".join(parts), folder)
 
 
 def _setting(value: float | str) -> str:

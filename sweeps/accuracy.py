@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from omegaconf import DictConfig
+
 from bench.accuracy import experiment_rows, render_in_turns
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
@@ -23,6 +25,7 @@ from sweeps.measurement import checked_settings
 from sweeps.overrides import composed
 from sweeps.skips import LEAN
 from sweeps.terminal import console, rich_table
+from sweeps.turns import turn
 from sweeps.variants import common_ground, finite, usable_method
 
 SETTINGS = ("method=steernerf", "scene=totem", "budget=demo", "trajectory=orbit")
@@ -41,14 +44,17 @@ def main(options: argparse.Namespace) -> int:
             "steerbench accuracy turns all knobs of SteerNeRF: expected a method with "
             "renderer=s2d, as method=steernerf"
         )
+    _check_taught(config, overrides)
     log = _Once(outputs)
     settings: list[dict[str, Any]] = []
     if not options.kernels:
-        settings = _setting_rows(overrides, options, log)
+        with turn(outputs, config.device, log):
+            settings = _setting_rows(overrides, options, log)
         console().print(rich_table(setting_table(settings)))
-    from methods.kernels.accuracy import all_experiments
+    from methods.accuracy import all_experiments
 
-    experiments = experiment_rows(all_experiments(), options.repeats, log)
+    with turn(outputs, "cpu", log):
+        experiments = experiment_rows(all_experiments(), options.repeats, log)
     console().print(rich_table(experiment_table(experiments)))
     command = shlex.join(["steerbench", *sys.argv[1:]])
     page = write_accuracy(experiments, settings, outputs / "accuracy", command)
@@ -57,6 +63,18 @@ def main(options: argparse.Namespace) -> int:
         print(_recommended(settings, limit))
     print(json.dumps({"kernels": experiments, "settings": [finite(row) for row in settings]}))
     return 0
+
+
+def _check_taught(config: DictConfig, overrides: Sequence[str]) -> None:
+    """Refuse a step or a stop that nothing was taught: all settings are to be of one training."""
+    untaught = composed(_last_words([*overrides, "method=steernerf_untaught"])).method.pipeline
+    for name in ("steps", "stop"):
+        got, taught = config.method.pipeline[name], untaught[f"taught_{name}"]
+        if got != taught:
+            raise SteerbenchError(
+                f"method.pipeline.{name}: steerbench accuracy turns it itself, from what the model "
+                f"was taught; expected {taught:g}, got {got:g}"
+            )
 
 
 def decibels(text: str) -> float:

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from rich.columns import Columns
 
 from bench.console import ConsoleLog
@@ -100,6 +101,8 @@ def _obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
         log.info(f"already measured; to measure again, remove {store.folder / run}")
         return Obtained(store, run, measured=False)
     with turn(root, method.settings()["device"], log):
+        if store.find(run) is not None:
+            return Obtained(store, run, measured=False)  # by the process that had the turn before
         measurement = measure(
             method,
             scene,
@@ -152,7 +155,10 @@ def described(config: DictConfig) -> dict[str, Any]:
     Where weights and scenes lie is not part of it, but for the last name of a scene's folder, which
     is what rows call it; nor an engine that the method has no use for.
     """
-    plain: Any = OmegaConf.to_container(config, resolve=True)
+    try:
+        plain: Any = OmegaConf.to_container(config, resolve=True)
+    except OmegaConfBaseException as error:  # what one setting takes from another was deleted
+        raise SteerbenchError(" ".join(str(error).split())) from error
     unused = () if "engine" in plain["method"] else ("engine", "precision")
     kept = {key: value for key, value in plain.items() if key not in (*PLACES, *unused)}
     kept["scene"] = {name: value for name, value in plain["scene"].items() if name != "root"}

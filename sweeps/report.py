@@ -40,5 +40,6 @@ def _check(store: Store) -> int:
     found = doubts(runs)
     if found:
         console().print(rich_table(table(found, runs)))
-    console().print(f"{len(found)} of {len(runs)} runs are to be doubted")
+    doubted = len({doubt.key for doubt in found})
+    console().print(f"{doubted} of {len(runs)} runs are to be doubted")
     return int(len(found) > 0)

@@ -28,9 +28,12 @@ from sweeps.build import build
 from sweeps.measurement import checked_settings
 from sweeps.overrides import composed
 from sweeps.terminal import console, rich_table
+from sweeps.turns import turn
 
 SETTINGS = ("method=steernerf", "trajectory=smooth", "budget.renderer_steps=8")
 """What a 2D renderer has learned does not change what it costs."""
+
+TORCH = "methods.engines.torch_engine.TorchEngine"
 
 SIZES = ((200, 200), (400, 400), (800, 800), (1920, 1080), (3840, 2160))
 
@@ -75,16 +78,23 @@ def main(options: argparse.Namespace) -> int:
     """Print a table with the fitted exponents and, as the last line, the rows as JSON."""
     if options.frames < 1:
         raise SteerbenchError(f"--frames: expected 1 or more, got {options.frames}")
+    if options.plot is not None and options.plot.suffix != ".png":
+        raise SteerbenchError(f"--plot: expected a name that ends in .png, got {options.plot}")
     overrides = [*SETTINGS, *options.overrides]
     config = composed(overrides)
-    settings = checked_settings(config)
-    log = ConsoleLog(Path(settings.outputs))
+    outputs = Path(checked_settings(config).outputs)
+    if "pipeline" not in config.method or config.engine._target_ != TORCH:
+        raise SteerbenchError(
+            "steerbench scaling varies L, K, T and threads: expected a method with a 2D renderer, "
+            "as method=steernerf, and engine=torch, whose threads can be chosen afterwards"
+        )
+    log = ConsoleLog(outputs)
     scene = build(config, "scene", log=log)
     points = [point for point in _points() if point.axis in (options.axis or [point.axis])]
+    configs = [composed([*overrides, *point.settings]) for point in points]
     rows = []
-    with log.progress("scaling", len(points)) as progress:
-        for point in points:
-            made = composed([*overrides, *point.settings])
+    with log.progress("scaling", len(points)) as progress, turn(outputs, config.device, log):
+        for point, made in zip(points, configs, strict=True):
             rows.append(_row(point, made, scene, options.frames, log))
             progress.advance(note=point.label)
     title = f"{config.method.name} on {scene.name}, {options.frames} frames"
@@ -93,19 +103,25 @@ def main(options: argparse.Namespace) -> int:
         axes.setdefault(row["axis"], []).append(row)
     lines = [line for of_axis in axes.values() for line in _lines(of_axis)]
     console().print(rich_table(Table(title, COLUMNS, tuple(lines))))
+    print(json.dumps(rows))
     if options.plot is not None:
         _plot(axes, options.plot)
         log.info(f"plot: {options.plot}")
-    print(json.dumps(rows))
     return 0
 
 
 def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) -> dict[str, Any]:
     """Time, work and memory of the first steady `frames` of the trajectory, as `point` says."""
+    torch.manual_seed(config.seed)
     method: Method = build(config, "method")
     method.fit(scene, build(config, "budget"), log)
     cameras = [step.camera for step in build(config, "trajectory", scene).steps]
     cameras = cameras[: method.memory + frames]
+    if len(cameras) <= method.memory:
+        raise SteerbenchError(
+            f"trajectory: expected more than the {method.memory} frames that {method.name} looks "
+            f"back on, got {len(cameras)}"
+        )
     if point.size:
         cameras = [frame_camera(camera, *point.size) for camera in cameras]
     usual = torch.get_num_threads()

@@ -16,7 +16,17 @@ from bench.stress import failed, run_cases
 from reports.tables import Table
 from sweeps.terminal import console, rich_table
 
-COLUMNS = ("subject", "case", "what must hold", "by", "precision", "worst", "at most", "status")
+COLUMNS = (
+    "subject",
+    "case",
+    "what must hold",
+    "by",
+    "on",
+    "precision",
+    "worst",
+    "at most",
+    "status",
+)
 CASE_COLUMNS = (
     "subject",
     "case",
@@ -40,8 +50,8 @@ def main(options: argparse.Namespace) -> int:
     cases = [c for c in all_cases() if options.filter in f"{c.subject}, {c.name}"]
     if not cases:
         raise SteerbenchError(f"--filter: no subject or case has {options.filter!r} in it")
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    rows = list(run_cases(cases, device, ConsoleLog(Path())))
+    devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+    rows = list(run_cases(cases, devices, ConsoleLog(Path())))
     wrong = sum(failed(row) for row in rows)
     title = f"Stress: {len(cases)} cases, {len(rows)} cells, {wrong} failed"
     if options.format == "markdown":
@@ -55,7 +65,7 @@ def main(options: argparse.Namespace) -> int:
 
 def _line(row: Mapping[str, Any]) -> tuple[str, ...]:
     return (
-        *(row[name] for name in ("subject", "case", "holds", "backend", "precision")),
+        *(row[name] for name in ("subject", "case", "holds", "backend", "device", "precision")),
         *_end(row),
     )
 

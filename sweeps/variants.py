@@ -23,6 +23,7 @@ from bench.types import Log, Method, Scene
 from sweeps.build import build
 from sweeps.measurement import checked_settings
 from sweeps.overrides import CONFIGS, composed
+from sweeps.turns import turn
 
 RENDERED = "-rendered"
 """How the names of renderings end; see `bench.scoring`."""
@@ -77,7 +78,10 @@ def render_variants(
     scene, path, protocol = common_ground(configs[0], frames, log)
     found: list[Rendered] = []
     standard: dict[str, np.ndarray] = {}
-    with log.progress(label, len(variants)) as progress:
+    with (
+        log.progress(label, len(variants)) as progress,
+        turn(Path(settings.outputs), settings.device, log),
+    ):
         for variant, config in zip(variants, configs, strict=True):
             method = usable_method(config, variant, log, required=not found)
             if method is not None:

@@ -17,7 +17,7 @@ MAY_IMPORT = {
     "sweeps": {"bench", "reports", "sweeps"},
 }
 REACHES = {
-    "sweeps/accuracy.py": "methods.kernels.",
+    "sweeps/accuracy.py": "methods.accuracy.",
     "sweeps/kernels.py": "methods.kernels.",
     "sweeps/catalogue.py": "methods.kernels.",
     "sweeps/stress.py": "methods.stress.",

@@ -60,7 +60,7 @@ def test_every_cell_of_every_case_gets_a_row(quiet_log: Log):
         asked.append((backend, device, precision))
         return 0.0
 
-    rows = list(run_cases([case(worst), case(worst)], "cuda", quiet_log))
+    rows = list(run_cases([case(worst), case(worst)], ["cuda"], quiet_log))
     assert asked == 2 * [("cpu", "cuda", "fp32"), ("reference", "cuda", "fp64")]
     assert [(row["backend"], row["precision"]) for row in rows] == 2 * list(CELLS)
     assert [row["tolerance"] for row in rows] == 2 * list(CELLS.values())

@@ -68,7 +68,7 @@ def test_the_page_shows_both_tables_and_the_plot(tmp_path):
 def test_without_settings_the_page_is_that_of_the_kernels(tmp_path):
     page = write_accuracy(EXPERIMENTS, [], tmp_path, "steerbench accuracy --kernels")
     assert "frontier" not in page.read_text()
-    assert {path.name for path in tmp_path.iterdir()} == {"report.md", "kernels.csv"}
+    assert {path.name for path in tmp_path.iterdir()} == {"report.md", "report.html", "kernels.csv"}
 
 
 @pytest.mark.parametrize("some", [SETTINGS, SETTINGS[:1]])

@@ -43,7 +43,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sweeps.accuracy.usable_method", lambda *arguments, **options: Fitted())
     monkeypatch.setattr("sweeps.accuracy.render_in_turns", lambda *arguments: rows)
     monkeypatch.setattr("sweeps.accuracy.experiment_rows", lambda *arguments: [ERROR])
-    monkeypatch.setattr("methods.kernels.accuracy.all_experiments", lambda: [])
+    monkeypatch.setattr("methods.accuracy.all_experiments", lambda: [])
     monkeypatch.setattr("reports.accuracy.frontier_plot", lambda rows, path: path.touch())
 
 
@@ -93,7 +93,7 @@ def test_where_nothing_faster_keeps_within_it_everything_off_is_recommended(stee
 def test_a_report_a_plot_and_the_rows_are_left_in_outputs(steerbench, measured, tmp_path):
     steerbench("accuracy", "outputs=here")
     names = {path.name for path in (tmp_path / "here" / "accuracy").iterdir()}
-    assert names == {"report.md", "frontier.png", "kernels.csv", "settings.csv"}
+    assert names == {"report.md", "report.html", "frontier.png", "kernels.csv", "settings.csv"}
 
 
 def test_the_kernels_alone_train_and_render_nothing(steerbench, measured, monkeypatch):

@@ -72,7 +72,6 @@ def test_nothing_but_outputs_is_left_behind(run, tmp_path):
     run("-m", "seed=0,1")
     assert [path.name for path in tmp_path.iterdir()] == ["outputs"]
     assert {path.name for path in (tmp_path / "outputs").iterdir()} == {
-        "locks",
         "runs",
         "stages",
         "sweeps",

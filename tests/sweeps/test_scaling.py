@@ -1,4 +1,4 @@
-"""`steerbench scaling`: the exponents it fits."""
+"""`steerbench scaling`: the exponents it fits, and what it refuses before anything is trained."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bench.errors import SteerbenchError
+from sweeps.cli import dispatch
 from sweeps.scaling import growth
 
 
@@ -24,3 +26,17 @@ def test_a_value_of_0_is_left_out() -> None:
 
 def test_a_single_value_has_no_exponent() -> None:
     assert math.isnan(growth([{"value": 2.0, "ms": 1.0}, {"value": 2.0, "ms": 2.0}], "ms"))
+
+
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ("method=ngp", "expected a method with a 2D renderer"),
+        ("engine=openvino", "engine=torch"),
+        ("--frames=0", "expected 1 or more, got 0"),
+        ("--plot=picture.jpg", "ends in .png"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused_at_once(argument: str, said: str) -> None:
+    with pytest.raises(SteerbenchError, match=said):
+        dispatch(["scaling", argument])

@@ -2,50 +2,80 @@
 
 from __future__ import annotations
 
-import fcntl
+import queue
+import tempfile
+import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 
 from bench.console import ConsoleLog
-from sweeps.turns import turn
+from sweeps.turns import lock_file, turn
+
+PATIENCE_S = 60.0
+"""A test that waits longer has failed."""
 
 
-def taken(lock: Path) -> bool:
-    """Whether anybody holds `lock`."""
-    with lock.open() as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-    return False
+class Told(ConsoleLog):
+    """A log that hands on what it is told."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(root, quiet=True)
+        self.messages: queue.Queue[str] = queue.Queue()
+
+    def info(self, message: str) -> None:
+        self.messages.put(message)
 
 
-def test_a_device_is_taken_as_long_as_the_turn_lasts(tmp_path: Path) -> None:
-    log = ConsoleLog(tmp_path, quiet=True)
-    with turn(tmp_path, "cpu", log), turn(tmp_path, "cuda:0", log):
-        first, second = sorted((tmp_path / "locks").iterdir())
-        assert taken(first)
-        assert taken(second)
-    assert not taken(first)
+@pytest.fixture(autouse=True)
+def locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
 
 
-def test_graphics_processors_that_share_a_number_are_told_apart(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    log = ConsoleLog(tmp_path, quiet=True)
-    for visible in ("0", "1"):
-        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-        with turn(tmp_path, "cuda:0", log):
-            pass
-    assert len(list((tmp_path / "locks").iterdir())) == 2
+def waiting(outputs: Path, device: str) -> tuple[threading.Thread, Told, threading.Event]:
+    """Somebody else who wants a turn: what they are told, and whether they had it."""
+    log, had = Told(outputs), threading.Event()
+
+    def other() -> None:
+        with turn(outputs, device, log):
+            had.set()
+
+    thread = threading.Thread(target=other, daemon=True)
+    thread.start()
+    return thread, log, had
+
+
+def test_who_wants_a_device_that_is_taken_waits_for_it(tmp_path: Path) -> None:
+    with turn(tmp_path, "cpu", Told(tmp_path)):
+        thread, log, had = waiting(tmp_path, "cpu")
+        assert "waiting: another process measures on cpu" in log.messages.get(timeout=PATIENCE_S)
+        assert not had.is_set()
+    thread.join(PATIENCE_S)
+    assert had.is_set()
 
 
 def test_a_failure_ends_the_turn(tmp_path: Path) -> None:
-    with pytest.raises(KeyError), turn(tmp_path, "cpu", ConsoleLog(tmp_path, quiet=True)):
+    with pytest.raises(KeyError), turn(tmp_path, "cpu", Told(tmp_path)):
         raise KeyError
-    (lock,) = (tmp_path / "locks").iterdir()
-    assert not taken(lock)
+    thread, _, had = waiting(tmp_path, "cpu")
+    thread.join(PATIENCE_S)
+    assert had.is_set()
+
+
+def test_graphics_processors_are_told_apart_by_what_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = {"cuda:0": "GPU-a", "cuda:1": "GPU-b"}
+    monkeypatch.setattr(
+        torch.cuda, "get_device_properties", lambda device: SimpleNamespace(uuid=names[device])
+    )
+    first, second = (lock_file(tmp_path, device) for device in names)
+    assert first != second
+    names["cuda:0"] = "GPU-b"  # as another job counts them
+    assert lock_file(tmp_path, "cuda:0") == second
+    assert lock_file(tmp_path / "elsewhere", "cuda:0") != second
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local", "ray"])

@@ -1,4 +1,4 @@
-"""Experiments on the kernels: knobs that trade time for error, where the exact answer is known."""
+"""Knobs of kernels and networks that trade time for error, where the exact answer is known."""
 
 from __future__ import annotations
 
