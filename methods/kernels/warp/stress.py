@@ -174,6 +174,8 @@ def _inside_error(backend: str, device: str, precision: str) -> float:
     picture = (pixels / 32).view(camera.height, camera.width, 2).to(dtype)
     z = torch.rand(len(pixels), generator=torch.Generator().manual_seed(0)).to(dtype)
     values, valid = _warped(source, camera, z, picture, backend, device)
+    if not valid.any():
+        return math.inf
     u = pixels[:, 0] - source.fx * source.c2w[0, 3].double() / z.double()
     u = u.clamp(0.5, camera.width - 0.5)  # the border is repeated
     want = torch.stack((u, pixels[:, 1]), dim=1).view(camera.height, camera.width, 2) / 32
@@ -207,6 +209,8 @@ def _walk_error(frames: int, backend: str, device: str, precision: str) -> float
         camera = replace(start, c2w=look_at(eye, middle, up))
         if before is not None:
             values, valid = _warped(before, camera, z, picture, backend, device)
+            if not valid.any():
+                return math.inf
             picture = torch.where(valid[..., None] > 0, values, first)
         before = camera
         drift = (picture[..., 0] - 0.7).abs().max().item()
