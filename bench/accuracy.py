@@ -6,7 +6,6 @@ times come from the same runs.
 
 from __future__ import annotations
 
-import math
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +16,7 @@ import torch
 from torch import Tensor
 
 from bench.frontier import observed_order
-from bench.metrics import psnr
+from bench.metrics import psnr, psnr_of_mse
 from bench.probes import StageClock
 from bench.protocol import EvaluationProtocol, composite
 from bench.trajectories import Trajectory
@@ -197,8 +196,7 @@ class _Scores:
 
     def of(self, name: str) -> dict[str, float]:
         """The scores of a method in a row."""
-        apart = statistics.fmean(self._apart[name])
         return {
             "psnr": statistics.fmean(self._psnr[name]),
-            "psnr_to_first": -10 * math.log10(apart) if apart else math.inf,
+            "psnr_to_first": psnr_of_mse(statistics.fmean(self._apart[name])),
         }

@@ -41,7 +41,11 @@ def quantise(image: Tensor) -> Tensor:
 def psnr(image: Tensor, reference: Tensor) -> float:
     """Peak signal-to-noise ratio in dB for a peak of 1; +inf where the pictures are equal."""
     _check_pair(image, reference)
-    mse = (image.double() - reference.double()).square().mean().item()
+    return psnr_of_mse((image.double() - reference.double()).square().mean().item())
+
+
+def psnr_of_mse(mse: float) -> float:
+    """The PSNR in dB that a mean squared error is, for a peak of 1; +inf for none."""
     return -10.0 * math.log10(mse) if mse > 0.0 else math.inf
 
 

@@ -23,10 +23,9 @@ from sweeps.build import build
 from sweeps.knobs import EVERYTHING_OFF, knobs
 from sweeps.measurement import checked_settings
 from sweeps.overrides import composed
-from sweeps.skips import LEAN
 from sweeps.terminal import console, rich_table
 from sweeps.turns import turn
-from sweeps.variants import common_ground, finite, usable_method
+from sweeps.variants import common_ground, finite, require_lean, usable_method
 
 SETTINGS = ("method=steernerf", "scene=totem", "budget=demo", "trajectory=orbit")
 
@@ -39,11 +38,7 @@ def main(options: argparse.Namespace) -> int:
     overrides = _last_words([*SETTINGS, *options.overrides])
     config = composed(overrides)
     outputs = Path(checked_settings(config).outputs)
-    if config.method.get("renderer", {}).get("_target_") != LEAN:
-        raise SteerbenchError(
-            "steerbench accuracy turns all knobs of SteerNeRF: expected a method with "
-            "renderer=s2d, as method=steernerf"
-        )
+    require_lean(config, "steerbench accuracy turns all knobs of SteerNeRF")
     _check_taught(config, overrides)
     log = _Once(outputs)
     settings: list[dict[str, Any]] = []

@@ -6,17 +6,14 @@ import argparse
 import json
 from typing import Any
 
-from bench.errors import SteerbenchError
 from reports.tables import Table, number, share
 from sweeps.overrides import composed
 from sweeps.terminal import console, rich_table
-from sweeps.variants import Rendered, Variant, apart_text, finite, render_variants
+from sweeps.variants import Rendered, Variant, apart_text, finite, render_variants, require_lean
 
 SETTINGS = ("method=steernerf", "trajectory=smooth", "method.pipeline.refined=0")
 """Without refinement, which takes a share of the cells that are drawn: of more where nothing is
 skipped."""
-
-LEAN = "methods.space_to_depth.SpaceToDepth"
 
 SWITCHES = {"empty space": "empty", "hidden samples": "hidden", "background cells": "background"}
 """The settings below `method.pipeline.skip`, in words."""
@@ -29,11 +26,7 @@ COLUMNS = ("skipped", "PSNR to nothing skipped, dB ↑", "PSNR, dB ↑", "lost, 
 def main(options: argparse.Namespace) -> int:
     """Print a table and, as the last line, the same rows as JSON."""
     overrides = [*SETTINGS, *options.overrides]
-    if composed(overrides).method.get("renderer", {}).get("_target_") != LEAN:
-        raise SteerbenchError(
-            "steerbench skips counts the work of a network on cells: expected a method with "
-            "renderer=s2d, as method=steernerf"
-        )
+    require_lean(composed(overrides), "steerbench skips counts the work of a network on cells")
     found = render_variants(overrides, _variants(), options.frames, "variants")
     rows = [_row(one, found[0]) for one in found]
     title = f"{found[0].method.name}, {options.frames} frames: mean work of a frame, and its share"

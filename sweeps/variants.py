@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
+from bench.metrics import psnr_of_mse
 from bench.protocol import EvaluationProtocol
 from bench.results import COLD, STEADY, Measurement
 from bench.run import measure
@@ -24,6 +25,8 @@ from sweeps.build import build
 from sweeps.measurement import checked_settings
 from sweeps.overrides import CONFIGS, composed
 from sweeps.turns import turn
+
+LEAN = "methods.space_to_depth.SpaceToDepth"
 
 RENDERED = "-rendered"
 """How the names of renderings end; see `bench.scoring`."""
@@ -96,6 +99,14 @@ def render_variants(
     return found
 
 
+def require_lean(config: DictConfig, purpose: str) -> None:
+    """Refuse a method without the lean 2D renderer, which the command needs for its `purpose`."""
+    if config.method.get("renderer", {}).get("_target_") != LEAN:
+        raise SteerbenchError(
+            f"{purpose}: expected a method with renderer=s2d, as method=steernerf"
+        )
+
+
 def common_ground(
     config: DictConfig, frames: int, log: Log
 ) -> tuple[Scene, Trajectory, EvaluationProtocol]:
@@ -160,12 +171,11 @@ def _compared(
     standard: Mapping[str, np.ndarray],
 ) -> Rendered:
     apart = np.stack([pictures[name] / 255.0 - standard[name] / 255.0 for name in standard])
-    error = float(np.square(apart).mean())
     rows = measured.rows[measured.rows["phase"] != COLD]
     return Rendered(
         variant,
         method,
-        -10 * math.log10(error) if error else math.inf,
+        psnr_of_mse(float(np.square(apart).mean())),
         float(np.abs(apart).max()),
         dict(zip(rows["metric"], rows["value"], strict=True)),
     )
