@@ -64,6 +64,9 @@ class PipelineOptions:
         history: the preceding picture is reprojected, too.
         surface: the field is looked at once a pixel at full resolution, too, where the
             low-resolution depth has the surface.
+        overlap: a preceding frame of which the present view shares less than this is not brought
+            into it, neither its features nor its depth or picture; see `Cloud.overlap`. It can be
+            chosen after the training.
         jitter: the samples of the low-resolution grid move from frame to frame, so that
             preceding frames carry samples of other places.
         feature_background: what the features beyond RGB are composited on. 1/2 is what an
@@ -83,6 +86,7 @@ class PipelineOptions:
     reprojection: Reprojection = Reprojection()
     history: bool = True
     surface: bool = True
+    overlap: float = 0.0
     jitter: bool = False
     feature_background: float = 0.5
     stop: float = STOP
@@ -96,13 +100,15 @@ class PipelineOptions:
                 f"expected channels (K) >= 3, frames (L) >= 0, scale (s) >= 1, steps > 0, "
                 f"got {self.channels}, {self.frames}, {self.scale}, {self.steps}"
             )
-        if not 0 <= self.refined <= 1:
-            raise ValueError(f"refined: expected a share of 0 to 1, got {self.refined}")
+        for name in ("overlap", "refined"):
+            if not 0 <= (share := getattr(self, name)) <= 1:
+                raise ValueError(f"{name}: expected a share of 0 to 1, got {share}")
 
     def taught(self, refined: float) -> PipelineOptions:
         """The options of a training. It looks everywhere, so that one serves all choices of where
         to look that are made afterwards."""
-        return replace(self, range=RangeReduction("off"), refined=refined, skip=Skips())
+        off = RangeReduction("off")
+        return replace(self, range=off, overlap=0.0, refined=refined, skip=Skips())
 
 
 class Pipeline:
@@ -142,10 +148,11 @@ class Pipeline:
     def render(self, camera: Camera, buffer: RenderingBuffer, probe: Probe) -> Frame:
         """Render one frame that follows those in `buffer`, and remember it there."""
         options, view = self.options, View.of(camera, self.options, buffer.turn)
-        newest = buffer.frames[0] if buffer.frames else None
+        frames = self.shared(buffer.frames, view, probe)
+        newest = frames[0] if frames else None
         features = self._features(view, newest, probe)
         with probe.stage("feature_reprojection"):
-            preceding = [self.reproject(frame.cloud, view) for frame in buffer.frames]
+            preceding = [self.reproject(frame.cloud, view) for frame in frames]
             observation = self.observe(features, preceding, newest, view, probe)
         with probe.stage("renderer2d"):
             drawing = self.renderer([observation], probe)
@@ -159,6 +166,16 @@ class Pipeline:
             cloud = Cloud.of(features, options.reprojection)
             buffer.push(Remembered(cloud, view.full, picture))
             return _finish(camera, picture, features, options.scale)
+
+    def shared(
+        self, frames: Sequence[Remembered], view: View, probe: Probe
+    ) -> Sequence[Remembered]:
+        """Those of the preceding `frames` that show enough of what is in `view`."""
+        if self.options.overlap:
+            least = self.options.overlap
+            frames = [frame for frame in frames if frame.cloud.overlap(view.full) >= least]
+        probe.count("preceding_frames", len(frames), self.options.frames)
+        return frames
 
     def reproject(self, cloud: Cloud, view: View) -> Points:
         """The features of a preceding frame where the present picture sees them."""

@@ -183,3 +183,43 @@ def test_a_near_surface_hides_a_far_one_when_the_camera_moves(backend: str) -> N
     index, _ = Cloud.of(frame_of(camera, depth), EXACT).land(moved, EXACT, backend)
     row = [-1, 0, 1, -1, 3, 4, 2, 6]
     assert index.tolist() == [[i + 8 * j if i >= 0 else -1 for i in row] for j in range(6)]
+
+
+def far_view(angle: float, aside: float = 0.0) -> Camera:
+    """64 x 64 pixels, 1.25 units a side, from 1000 units away, looking past the middle by `aside`."""
+    axis = torch.tensor((math.sin(angle), 0.0, math.cos(angle)))
+    down = torch.tensor((0.0, 1.0, 0.0))
+    right = torch.linalg.cross(down, -axis)
+    c2w = torch.stack((right, down, -axis, 1000 * axis + aside * right), dim=1)
+    focal = 64 / 1.25 * 1000
+    return Camera(c2w, focal, focal, 32.0, 32.0, 64, 64)
+
+
+def ball_cloud() -> Cloud:
+    """A ball of radius 0.5 around the origin, as `far_view(0)` sees it."""
+    camera = far_view(0.0)
+    pixels = (pixel_grid(64, 64) - 32) * 1.25 / 64
+    height = 0.25 - pixels.square().sum(dim=1)
+    depth = torch.where(height > 0, 1000 - height.clamp(min=0).sqrt(), math.inf).view(64, 64)
+    frame = FeatureFrame(camera, torch.zeros(64, 64, 4), depth, (depth < math.inf).float())
+    return Cloud.of(frame, EXACT)
+
+
+@pytest.mark.parametrize("degrees", [0, 30, 60, 90, 135, 180])
+def test_two_views_of_a_ball_overlap_by_what_faces_both(degrees: float) -> None:
+    cloud, other = ball_cloud(), far_view(math.radians(degrees))
+    faces_both = float((cloud.points @ other.c2w[:3, 2] < 0).float().mean())
+    # 2,000 pixels, of which the outline of what faces both crosses 100, and a sample of 256.
+    assert cloud.overlap(other) == pytest.approx(faces_both, abs=0.05 + 0.03)
+
+
+@pytest.mark.parametrize(("aside", "share"), [(0.0, 1.0), (0.625, 0.5), (1.2, 0.0), (-0.625, 0.5)])
+def test_two_views_overlap_by_what_lies_inside_both(aside: float, share: float) -> None:
+    assert ball_cloud().overlap(far_view(0.0, aside)) == pytest.approx(share, abs=0.05 + 0.03)
+
+
+def test_a_view_shares_nothing_with_what_is_behind_it_or_with_an_empty_frame() -> None:
+    behind = replace(far_view(0.0), c2w=far_view(0.0).c2w * torch.tensor((1.0, 1.0, 1.0, -1.0)))
+    assert ball_cloud().overlap(behind) == 0
+    nothing = frame_of(low_camera(1), alpha=0.0)
+    assert Cloud.of(nothing, EXACT).overlap(low_camera(1)) == 0

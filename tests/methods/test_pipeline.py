@@ -189,6 +189,22 @@ def test_the_cells_in_most_doubt_are_refined() -> None:
     assert changed.sum() > 0.5 * count
 
 
+def test_a_frame_that_shows_too_little_of_the_present_view_is_as_if_forgotten() -> None:
+    """After a jump to the other side, and back at once: what lay before it is used again."""
+    here, there = look_at_the_middle(0.1, 0.3), look_at_the_middle(0.6, -0.3)
+    path = [here, there, here]
+    used, pictures = {}, {}
+    for overlap in (0.0, 0.5):
+        options = replace(OPTIONS, overlap=overlap, range=RangeReduction("window"))
+        pipeline, buffer, probe = new_pipeline(options), RenderingBuffer(2), Work()
+        pictures[overlap] = [pipeline.render(camera, buffer, probe).rgb for camera in path]
+        used[overlap] = probe.done["preceding_frames"]
+    assert used == {0.0: 0 + 1 + 2, 0.5: 0 + 0 + 1}
+    cold = new_pipeline(options).render(there, RenderingBuffer(2), NullProbe()).rgb
+    assert torch.equal(pictures[0.5][1], cold)
+    assert not torch.equal(pictures[0.0][1], cold)
+
+
 def test_what_a_renderer_that_knows_no_doubt_drew_cannot_be_refined() -> None:
     pipeline = new_pipeline()
     with pytest.raises(ValueError, match=r"pipeline\.refined: UnetRelease .* expected 0, got 0\.1"):
@@ -210,6 +226,8 @@ def test_options_that_make_no_frame_are_refused(wrong: dict[str, int]) -> None:
 def test_a_share_of_cells_is_between_0_and_1() -> None:
     with pytest.raises(ValueError, match=r"refined: expected a share of 0 to 1, got 1\.5"):
         replace(OPTIONS, refined=1.5)
+    with pytest.raises(ValueError, match=r"overlap: expected a share of 0 to 1, got -0\.5"):
+        replace(OPTIONS, overlap=-0.5)
 
 
 class Work(NullProbe):

@@ -10,7 +10,7 @@ from sweeps.knobs import AS_IT_IS, EVERYTHING_OFF, knobs
 from sweeps.overrides import composed
 from sweeps.variants import Variant
 
-NOT_TRAINED_FOR = ("range", "refined", "skip")
+NOT_TRAINED_FOR = ("overlap", "range", "refined", "skip")
 
 
 def variants(trained: bool) -> list[Variant]:
