@@ -186,7 +186,7 @@ def test_a_near_surface_hides_a_far_one_when_the_camera_moves(backend: str) -> N
 
 
 def far_view(angle: float, aside: float = 0.0) -> Camera:
-    """64 x 64 pixels, 1.25 units a side, from 1000 units away, looking past the middle by `aside`."""
+    """64 x 64 pixels of 1.25 units, 1000 units away, looking past the middle by `aside`."""
     axis = torch.tensor((math.sin(angle), 0.0, math.cos(angle)))
     down = torch.tensor((0.0, 1.0, 0.0))
     right = torch.linalg.cross(down, -axis)
