@@ -67,6 +67,11 @@ def machine() -> dict[str, object]:
     }
 
 
+def decisive() -> dict[str, object]:
+    """What of the machine decides on figures: rows and trainings of others are other ones."""
+    return {name: value for name, value in machine().items() if name in ("cpu", "gpus", "versions")}
+
+
 def _git(*arguments: str) -> str:
     done = subprocess.run(
         ["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=True

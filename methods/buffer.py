@@ -21,8 +21,7 @@ SPLAT_ALPHA = 0.1
 """Least opacity of a pixel that becomes a point: the depth of a fainter one means little."""
 
 OVERLAP_POINTS = 256
-"""Points that tell how much of a frame another view shares: a half to within 3 %, the standard
-deviation of so many draws."""
+"""Points, evenly spread, that tell how much of a frame another view shares."""
 
 
 @dataclass(frozen=True)
@@ -97,9 +96,10 @@ class Cloud:
         (1 + cos t) / 2, half the disc and a half-ellipse; all that is seen is taken for such balls.
         What hides behind something else is not found out. 0 for a frame that shows nothing.
         """
-        points = self.points[:: math.ceil(len(self.points) / OVERLAP_POINTS) or 1]
+        points = self.points[self.alpha > SPLAT_ALPHA]
         if not len(points):
             return 0.0
+        points = points[:: math.ceil(len(points) / OVERLAP_POINTS)]
         pixels, depth = project(camera, points)
         size = torch.tensor((camera.width, camera.height), device=pixels.device)
         inside = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)

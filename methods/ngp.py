@@ -9,7 +9,7 @@ import torch
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.buffer import Cloud, Reprojection
 from methods.fields import Precision
-from methods.kernels.composite import STOP
+from methods.kernels.composite import STOP, check_stop
 from methods.kernels.encode import HashGrid
 from methods.pretrained import Setup, pretrain
 from methods.range_reduction import RangeReduction, evidence, render_guided
@@ -23,7 +23,7 @@ class InstantNgp:
         grid: shape of the hash table.
         training: how the field is trained.
         precision: "bf16" (packed table, bfloat16 networks) or "fp32".
-        stop: transmittance at which a ray ends when rendering.
+        stop: transmittance at which a ray ends when rendering, less than 1.
         range: where rays look, given the depth of the preceding frame; null: every frame stands
             alone.
         name: as it stands in result rows.
@@ -43,6 +43,7 @@ class InstantNgp:
         seed: int = 0,
     ) -> None:
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
+        check_stop(stop)
         self.stop, self.name = stop, name
         self.range = range if range is not None and range.mode != "off" else None
         self.memory = 0 if self.range is None else 1

@@ -23,7 +23,7 @@ from bench.types import Camera, Frame, Probe
 from methods.buffer import Cloud, Remembered, RenderingBuffer, Reprojection
 from methods.cells import centres, put_pixels
 from methods.fields import HashField
-from methods.kernels.composite import STOP
+from methods.kernels.composite import STOP, check_stop
 from methods.kernels.march import Occupancy
 from methods.kernels.warp import enlarge, warp
 from methods.occupancy import STEP
@@ -103,6 +103,7 @@ class PipelineOptions:
         for name in ("overlap", "refined"):
             if not 0 <= (share := getattr(self, name)) <= 1:
                 raise ValueError(f"{name}: expected a share of 0 to 1, got {share}")
+        check_stop(self.stop)
 
     def taught(self, refined: float) -> PipelineOptions:
         """The options of a training. It looks everywhere, so that one serves all choices of where

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 
 import torch
 
+from bench.provenance import decisive
 from bench.types import Budget, Log, Scene
 from methods.fields import HashField, Precision
 from methods.kernels import resolve
@@ -79,6 +80,7 @@ class Setup:
             "precision": self.precision,
             "backend": self.backend,
             "device": self.device.type,
+            "machine": decisive(),
             "threads": torch.get_num_threads(),
             "seed": self.seed,
             "code": training_digest(),

@@ -7,10 +7,10 @@ from torch import Tensor
 
 from bench.types import Probe, Rays
 from methods.fields import HashField
-from methods.kernels.composite import STOP, Pixels, composite
+from methods.kernels.composite import STOP, Pixels, composite, weights
 from methods.kernels.march import Occupancy, march
 from methods.occupancy import STEP
-from methods.volume import query
+from methods.volume import pad
 
 CHUNK_RAYS = 1 << 16
 """Rays rendered together: enough to keep all threads busy, few enough to stay in the cache."""
@@ -19,6 +19,10 @@ ROUND_SAMPLES = 6
 """Samples a ray may take in a round: more are evaluated in vain, fewer take more rounds. The few
 rays that are left in the end are not worth many rounds: they may take as many more as they are
 fewer than half of all."""
+
+FAINT = 0.1
+"""Samples of less weight than this share of the transmittance at which a ray ends have an opacity,
+but no features: black instead, they change a pixel by less than what lies behind its end."""
 
 
 @torch.no_grad()
@@ -86,8 +90,19 @@ def _render_round(
     probe.count("samples", len(samples))
     if len(samples) == 0:
         return alive[:0], start[:0]
+    carry = canvas.take(alive)
     with probe.stage("field"):
-        sigma, values = query(field, samples.positions, samples.ray, directions)
+        sigma, geometry = field.density(pad(samples.positions))
+        sigma = sigma[: len(samples)]
+        along = (sigma, samples.delta, samples.offsets)
+        weight = weights(*along, stop=stop, front=1 - carry.alpha, backend=field.backend)
+        seen = (weight > FAINT * stop).nonzero().squeeze(1)
+        encoded = field.encode_directions(directions)
+        index = pad(seen)
+        values = sigma.new_zeros(len(samples), field.channels)
+        shown = field.features(geometry[index], encoded[samples.ray[index]])
+        values[seen] = shown[: len(seen)]
+    probe.count("shaded_samples", len(seen), len(samples))
     with probe.stage("composite"):
         pixels = composite(
             sigma,
@@ -96,7 +111,7 @@ def _render_round(
             samples.delta,
             samples.offsets,
             stop=stop,
-            carry=canvas.take(alive),
+            carry=carry,
             backend=field.backend,
         )
         canvas.put(alive, pixels)

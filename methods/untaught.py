@@ -24,6 +24,10 @@ class UntaughtOptions(PipelineOptions):
     taught_stop: float = PipelineOptions.stop
     taught_steps: float = PipelineOptions.steps
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.taught_as()  # is checked, too
+
     def taught_as(self) -> PipelineOptions:
         """Those of the frames that it is trained for."""
         own = {field.name: getattr(self, field.name) for field in fields(PipelineOptions)}

@@ -82,7 +82,7 @@ def render_batch(
         rays.origins, rays.directions, occupancy, step, jitter=jitter, backend=field.backend
     )
     with torch.no_grad():
-        parts = _pad(samples.positions).split(CHUNK_SAMPLES)
+        parts = pad(samples.positions).split(CHUNK_SAMPLES)
         sigma = torch.cat([field.density(part)[0] for part in parts])[: len(samples)]
         counts = visible_counts(
             sigma, samples.delta, samples.offsets, stop=stop, backend=field.backend
@@ -108,16 +108,19 @@ def query(
     """Density [S] and features [S, K] at `positions` [S, 3] on rays `ray` [S] along `directions`
     [R, 3].
 
-    The field sees batches of a few round sizes only: the library behind the matrix products
-    prepares code for every new size, which takes longer than the product itself.
+    The field sees padded batches.
     """
-    sigma, geometry = field.density(_pad(positions))
-    values = field.features(geometry, field.encode_directions(directions)[_pad(ray)])
+    sigma, geometry = field.density(pad(positions))
+    values = field.features(geometry, field.encode_directions(directions)[pad(ray)])
     return sigma[: len(positions)], values[: len(positions)]
 
 
-def _pad(samples: Tensor) -> Tensor:
-    """Zeros at the end of [S, ...], up to a multiple of `BATCH_QUANTUM`."""
+def pad(samples: Tensor) -> Tensor:
+    """Zeros at the end of [S, ...], up to a multiple of `BATCH_QUANTUM`.
+
+    A field is to see batches of a few round sizes only: the library behind the matrix products
+    prepares code for every new size, which takes longer than the product itself.
+    """
     padding = -len(samples) % BATCH_QUANTUM
     return functional.pad(samples, (0, 0) * (samples.dim() - 1) + (0, padding))
 

@@ -18,7 +18,7 @@ from rich.columns import Columns
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
-from bench.provenance import code_digest, machine
+from bench.provenance import code_digest, decisive
 from bench.results import Store
 from bench.run import measure
 from bench.types import Method, Scene
@@ -175,7 +175,7 @@ def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any
         "scene": scene.digest,
         "resolved": method.settings(),
         "threads": torch.get_num_threads(),
-        "machine": {k: v for k, v in machine().items() if k in ("cpu", "gpus", "versions")},
+        "machine": decisive(),
     }
 
 

@@ -18,7 +18,7 @@ skipped."""
 SWITCHES = {"empty space": "empty", "hidden samples": "hidden", "background cells": "background"}
 """The settings below `method.pipeline.skip`, in words."""
 
-WORK = ("rays", "samples", "table reads, M", "cells", "products, G")
+WORK = ("rays", "samples", "shaded", "table reads, M", "cells", "products, G")
 
 COLUMNS = ("skipped", "PSNR to nothing skipped, dB ↑", "PSNR, dB ↑", "lost, dB ↓", "frame, ms ↓")
 
@@ -53,11 +53,17 @@ def _variants() -> list[Variant]:
 def _row(one: Rendered, standard: Rendered) -> dict[str, Any]:
     method: Any = one.method
     unit, done = method.unit_work(), one.values
-    samples = done["work.samples"] + done.get("work.surface_samples", 0)
-    products = samples * unit["products a sample"] + done["work.cells"] * unit["products a cell"]
+    surface = done.get("work.surface_samples", 0)
+    samples, shaded = done["work.samples"] + surface, done["work.shaded_samples"] + surface
+    products = (
+        samples * unit["products a sample"]
+        + shaded * unit["products a shaded sample"]
+        + done["work.cells"] * unit["products a cell"]
+    )
     work = (
         done["work.rays"] + done.get("work.refined_rays", 0),
         samples,
+        shaded,
         samples * unit["reads a sample"] / 1e6,
         done["work.cells"],
         products / 1e9,

@@ -108,3 +108,8 @@ def test_a_guided_frame_is_much_like_one_that_stands_alone() -> None:
 def test_a_packed_table_needs_two_features() -> None:
     with pytest.raises(ValueError, match=r"grid\.features is 4: use precision=fp32"):
         InstantNgp(grid=HashGrid(features=4), training=TrainingOptions(), device="cpu")
+
+
+def test_a_stop_that_ends_every_ray_at_once_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"stop: expected a transmittance of 0 or more and less"):
+        InstantNgp(grid=HashGrid(), training=TrainingOptions(), stop=1.0, device="cpu")

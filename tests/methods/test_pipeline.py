@@ -228,6 +228,8 @@ def test_a_share_of_cells_is_between_0_and_1() -> None:
         replace(OPTIONS, refined=1.5)
     with pytest.raises(ValueError, match=r"overlap: expected a share of 0 to 1, got -0\.5"):
         replace(OPTIONS, overlap=-0.5)
+    with pytest.raises(ValueError, match=r"stop: expected a transmittance .* got 1\.0"):
+        replace(OPTIONS, stop=1.0)
 
 
 class Work(NullProbe):

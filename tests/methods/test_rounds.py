@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from dataclasses import replace
 
 import torch
@@ -10,7 +12,8 @@ from bench.cameras import cast
 from bench.types import NullProbe
 from methods.fields import HashField
 from methods.kernels.march import Occupancy
-from methods.rounds import ROUND_SAMPLES, render_rays
+from methods.occupancy import STEP
+from methods.rounds import FAINT, ROUND_SAMPLES, render_rays
 from methods.volume import rays_at_matter, render_batch
 from tests.methods.conftest import GRID, look_at_the_middle
 
@@ -39,16 +42,42 @@ def test_samples_behind_the_early_stop_are_hardly_evaluated() -> None:
     occupancy = Occupancy(torch.ones(32, 32, 32, dtype=torch.bool))
     evaluated = 0
 
-    class Counter(NullProbe):
+    class Counting(NullProbe):
         def count(self, name: str, done: int, dense: int | None = None) -> None:
             nonlocal evaluated
             evaluated += done if name == "samples" else 0
 
     rays = cast(look_at_the_middle(0.0, 0.0))
-    pixels = render_rays(field, rays, occupancy, Counter())
+    pixels = render_rays(field, rays, occupancy, Counting())
     hit = int((pixels.alpha > 0).sum())
     assert hit > 0
     assert evaluated <= ROUND_SAMPLES * hit  # one round for each ray that hits
+
+
+def test_faint_samples_are_black_and_not_looked_at(cloud: tuple[HashField, Occupancy]) -> None:
+    field, occupancy = cloud
+    camera = look_at_the_middle(0.1, 0.4)
+    rays = cast(replace(camera, c2w=camera.c2w.to(field.table.device)))
+    counts: Counter[str] = Counter()
+
+    class Counting(NullProbe):
+        def count(self, name: str, done: int, dense: int | None = None) -> None:
+            counts[name] += done
+
+    stop = 0.01
+    rendered = render_rays(field, rays, occupancy, Counting(), stop=stop)
+    assert 0 < counts["shaded_samples"] < counts["samples"]
+    # Of a field whose features are 1 everywhere, what is shown is the sum of the weights seen.
+    field.features = lambda geometry, directions: torch.ones(  # type: ignore[method-assign]
+        len(geometry), field.channels, device=geometry.device
+    )
+    seen = render_rays(field, rays, occupancy, NullProbe(), stop=stop)
+    torch.testing.assert_close(seen.alpha, rendered.alpha, rtol=0, atol=0)
+    missing = seen.alpha - seen.values[:, 0]
+    longest = math.ceil(math.sqrt(3) / STEP)  # samples along the diagonal
+    assert missing.min() > -1e-5
+    assert missing.max() < longest * FAINT * stop
+    assert missing.max() > 0
 
 
 def test_an_empty_grid_renders_nothing() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+import pytest
 import torch
 
 from bench.console import ConsoleLog
@@ -50,3 +51,8 @@ def test_it_shares_its_training_and_renders_as_it_is_asked_to(
         method = fitted(UntaughtSteerNerf, options, ball_scene, tmp_path)
         assert torch.equal(method.render(camera, NullProbe()).rgb, want) == same
     assert len(list((tmp_path / "stages").glob("steernerf-*"))) == 1
+
+
+def test_what_is_taught_is_checked_too() -> None:
+    with pytest.raises(ValueError, match=r"stop: expected a transmittance .* got 1\.5"):
+        UntaughtOptions(taught_stop=1.5)

@@ -18,6 +18,12 @@ STOP = 1e-4
 """Transmittance below which a ray ends: what lies behind changes a pixel by less than this."""
 
 
+def check_stop(stop: float) -> None:
+    """Raise ValueError for a `stop` at which every ray would end before it begins."""
+    if not 0 <= stop < 1:
+        raise ValueError(f"stop: expected a transmittance of 0 or more and less than 1, got {stop}")
+
+
 @dataclass(frozen=True)
 class Pixels:
     """Composited rays: `values` [R, K], `depth_sum` [R] (sum w t, not divided), `alpha` [R]."""
@@ -87,6 +93,29 @@ def composite(
         return pixels
     shine = (1 - pixels.alpha)[:, None] * background
     return Pixels(pixels.values + shine, pixels.depth_sum, pixels.alpha)
+
+
+def weights(
+    sigma: Tensor,
+    delta: Tensor,
+    offsets: Tensor,
+    *,
+    stop: float = STOP,
+    front: Tensor | None = None,
+    backend: str = "auto",
+) -> Tensor:
+    """The weights [S] that `composite` gives to samples, without their values. No gradient.
+
+    Args:
+        front: [R] transmittance in front of each ray's first sample; None: 1.
+    """
+    _check_samples(sigma, delta, offsets)
+    if front is None:
+        front = sigma.new_ones(len(offsets) - 1)
+    check_shape("front", front, len(offsets) - 1)
+    return implementation("composite", backend, sigma.device).weights(
+        sigma.detach(), delta, offsets, stop, front
+    )
 
 
 def visible_counts(

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from methods.kernels.case import U32, Case, Prepared
-from methods.kernels.composite import Pixels, composite, visible_counts
+from methods.kernels.composite import Pixels, composite, visible_counts, weights
 
 DEPTH = 2.0
 """Largest t of the samples: the size of what is summed, values being at most 1."""
@@ -31,7 +31,12 @@ def cases() -> list[Case]:
     found = [
         Case(f"composite{direction}", name, "fp32", rays * most, partial(make, rays, most, options))
         for name, rays, most, options in kinds
-        for direction, make in (("", _forward), (" backward", _backward), (" visible", _visible))
+        for direction, make in (
+            ("", _forward),
+            (" backward", _backward),
+            (" weights", _weights),
+            (" visible", _visible),
+        )
     ]
     return [
         *found,
@@ -113,6 +118,17 @@ def _backward(rays: int, most: int, options: dict, device: str) -> Prepared:
     # The gain of a weight is a product with K + 2 gradients of at most 1; delta is at most 2 / n.
     channels = grad.shape[1]
     return Prepared(call, channels * _tolerance(most))
+
+
+def _weights(rays: int, most: int, options: dict, device: str) -> Prepared:
+    inputs, _ = _inputs(rays, most, options, device)
+    samples = (inputs["sigma"], inputs["delta"], inputs["offsets"])
+    front = 1 - inputs["carry"].alpha if "carry" in inputs else None
+
+    def call(backend: str) -> tuple[Tensor, ...]:
+        return (weights(*samples, stop=0.0, front=front, backend=backend),)
+
+    return Prepared(call, _tolerance(most))
 
 
 def _visible(rays: int, most: int, options: dict, device: str) -> Prepared:

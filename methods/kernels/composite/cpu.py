@@ -38,6 +38,14 @@ def composite(
     return Pixels(*_Composite.apply(sigma, values, t, delta, offsets, stop, carry))
 
 
+def weights(sigma: Tensor, delta: Tensor, offsets: Tensor, stop: float, front: Tensor) -> Tensor:
+    """See `methods.kernels.composite.weights`."""
+    weight = torch.empty_like(sigma, memory_format=torch.contiguous_format)
+    samples = (x.contiguous().numpy() for x in (sigma, delta, offsets))
+    _weights(*samples, f32(stop), front.contiguous().numpy(), weight.numpy())
+    return weight
+
+
 def visible_counts(sigma: Tensor, delta: Tensor, offsets: Tensor, stop: float) -> Tensor:
     """See `methods.kernels.composite.visible_counts`."""
     counts = torch.empty(len(offsets) - 1, dtype=torch.int64)
@@ -109,6 +117,20 @@ def _forward(sigma, values, t, delta, offsets, stop, front, out, depth_sum, alph
             out[ray] = sums
             depth_sum[ray] = depth
             alpha[ray] += f64(front[ray]) - transmittance
+
+
+@njit(cache=True, parallel=True)
+def _weights(sigma, delta, offsets, stop, front, weight):
+    rays = len(offsets) - 1
+    for chunk in prange((rays + CHUNK - 1) // CHUNK):
+        for ray in range(chunk * CHUNK, min(rays, (chunk + 1) * CHUNK)):
+            transmittance = f64(front[ray])
+            for i in range(offsets[ray], offsets[ray + 1]):
+                part = 0.0
+                if transmittance > stop:
+                    part = transmittance * _opacity(sigma[i], delta[i])
+                weight[i] = part
+                transmittance -= part
 
 
 @njit(cache=True, parallel=True)

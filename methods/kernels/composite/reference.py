@@ -18,20 +18,12 @@ def composite(
     carry: Pixels | None,
 ) -> Pixels:
     """See `methods.kernels.composite.composite`."""
-    present, index = _padded_rays(offsets)
-
-    def padded(samples: Tensor) -> Tensor:
-        mask = present.reshape(*present.shape, *(1,) * (samples.dim() - 1))
-        return torch.where(mask, samples[index], 0) if len(samples) else samples[index]
-
-    tau = padded(_thickness(sigma, delta))  # [R, N]
-    front = 1 if carry is None else (1 - carry.alpha)[:, None]
-    transmittance = front * _transmittance(tau)
-    weight = torch.where(transmittance > stop, transmittance * -torch.expm1(-tau), 0)
-
+    slots = _padded_rays(offsets)
+    front = sigma.new_ones(len(offsets) - 1) if carry is None else 1 - carry.alpha
+    weight = _padded_weights(sigma, delta, slots, stop, front)
     rays = Pixels(
-        (weight[..., None] * padded(values)).sum(dim=1),
-        (weight * padded(t)).sum(dim=1),
+        (weight[..., None] * _padded(values, slots)).sum(dim=1),
+        (weight * _padded(t, slots)).sum(dim=1),
         weight.sum(dim=1),
     )
     if carry is None:
@@ -39,6 +31,12 @@ def composite(
     return Pixels(
         carry.values + rays.values, carry.depth_sum + rays.depth_sum, carry.alpha + rays.alpha
     )
+
+
+def weights(sigma: Tensor, delta: Tensor, offsets: Tensor, stop: float, front: Tensor) -> Tensor:
+    """See `methods.kernels.composite.weights`."""
+    slots = _padded_rays(offsets)
+    return _padded_weights(sigma, delta, slots, stop, front)[slots[0]]
 
 
 def visible_counts(sigma: Tensor, delta: Tensor, offsets: Tensor, stop: float) -> Tensor:
@@ -56,6 +54,21 @@ def _padded_rays(offsets: Tensor) -> tuple[Tensor, Tensor]:
     slot = torch.arange(int(counts.max()) if len(counts) else 0, device=offsets.device)
     present = slot < counts[:, None]
     return present, torch.where(present, offsets[:-1, None] + slot, 0)
+
+
+def _padded(samples: Tensor, slots: tuple[Tensor, Tensor]) -> Tensor:
+    """[R, N, ...] of [S, ...], 0 where a slot holds none."""
+    present, index = slots
+    mask = present.reshape(*present.shape, *(1,) * (samples.dim() - 1))
+    return torch.where(mask, samples[index], 0) if len(samples) else samples[index]
+
+
+def _padded_weights(
+    sigma: Tensor, delta: Tensor, slots: tuple[Tensor, Tensor], stop: float, front: Tensor
+) -> Tensor:
+    tau = _padded(_thickness(sigma, delta), slots)  # [R, N]
+    transmittance = front[:, None] * _transmittance(tau)
+    return torch.where(transmittance > stop, transmittance * -torch.expm1(-tau), 0)
 
 
 def _thickness(sigma: Tensor, delta: Tensor) -> Tensor:

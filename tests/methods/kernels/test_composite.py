@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from methods.kernels.composite import Pixels, composite, visible_counts
+from methods.kernels.composite import Pixels, composite, visible_counts, weights
 
 BACKENDS = ["reference", "cpu"]
 
@@ -137,6 +137,26 @@ def test_visible_samples_are_those_with_a_gradient(backend: str) -> None:
         assert seen[begin : begin + count].all()
         assert not seen[begin + count : end].any()
     assert 0 < counts[0] < 40
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_weights_are_the_gradients_of_the_values(backend: str) -> None:
+    inputs, alpha = samples([40, 0, 1, 25], channels=1), torch.tensor([0.0, 0.5, 0.9, 0.2])
+    carry = Pixels(torch.zeros(4, 1), torch.zeros(4), alpha)
+    values = inputs["values"].requires_grad_()
+    pixels = composite(**inputs | {"values": values}, stop=0.05, carry=carry, backend=backend)
+    (gradient,) = torch.autograd.grad(pixels.values.sum(), values)
+    found = weights(
+        inputs["sigma"],
+        inputs["delta"],
+        inputs["offsets"],
+        stop=0.05,
+        front=1 - alpha,
+        backend=backend,
+    )
+    torch.testing.assert_close(found, gradient[:, 0], rtol=1e-5, atol=1e-7)
+    assert (found == 0).any()
+    assert (found > 0.05).any()
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
