@@ -6,6 +6,7 @@ import json
 import re
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from PIL import Image
 
@@ -134,7 +135,9 @@ def test_a_bar_per_run_is_as_long_as_its_stages_together(of, request, tmp_path, 
     monkeypatch.setattr(figures.Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
     rows = request.getfixturevalue(of)
     other = rows[rows["metric"] != "stage_ms.other"]
-    runs = [Run(str(i), f"run {i}", r, r, {}, tmp_path) for i, r in enumerate((rows, other))]
+    runs = [
+        Run(str(i), f"run {i}", r, pd.DataFrame, {}, tmp_path) for i, r in enumerate((rows, other))
+    ]
     figures.stage_bars(runs, tmp_path / "bars.png")
     (axes,) = drawn[0].axes
     field, rest = axes.containers

@@ -167,6 +167,18 @@ def test_a_check_names_the_broken_rows_of_the_store(
     assert key in found[1].out
 
 
+def test_the_frames_of_runs_that_are_not_on_a_page_are_not_read(
+    steerbench, store: Store, stored_run: str
+) -> None:
+    outputs = f"outputs={store.folder.parent}"
+    key = put(store, stored_run, plan(TABLES["table3"], [outputs])[0].config)
+    for run in (stored_run, key):
+        (store.folder / run / "frames.csv").unlink()
+    checked = steerbench("report", "--check", outputs)
+    assert "of 1 runs are to be doubted" in checked.out
+    assert steerbench("report", "--table", "table3", "seed=1", outputs).status == 0
+
+
 def test_the_page_goes_where_it_is_asked_for(
     steerbench, measured: list[DictConfig], store: Store, tmp_path: Path
 ) -> None:
