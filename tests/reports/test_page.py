@@ -101,6 +101,7 @@ def test_a_page_of_several_runs_has_all_of_them_beside_each_other(several, tmp_p
     text = page.read_text()
     assert text.startswith("# 6 runs on tiny\n")
     assert len(linked(page)) == 1 + 3 * 2  # the bars, then three frames, at most four runs in each
+    assert {path.stem[-1] for path in linked(page)[1:]} == {"0", "3"}  # and as many in either
     assert {path.resolve() for path in (page.parent / "pictures").iterdir()} == {
         path.resolve() for path in linked(page)
     }

@@ -59,6 +59,23 @@ def test_tables_share_the_run_that_they_have_in_common() -> None:
 
 
 @pytest.mark.parametrize(
+    ("method", "name", "line"),
+    [
+        ("ngp", "table1", "Instant-NGP"),
+        ("steernerf", "table4", "K = 6"),
+        ("steernerf_frozen", "table5", "without joint training"),
+        ("steernerf_k3", "table4", "K = 3"),
+    ],
+)
+def test_what_the_figures_show_is_what_the_tables_measure(
+    method: str, name: str, line: str
+) -> None:
+    shown = composed(["+experiment=figures", f"method={method}"])
+    (job,) = (job for job in plan(TABLES[name], []) if job.line == line)
+    assert described(shown) == described(job.config)
+
+
+@pytest.mark.parametrize(
     ("override", "said"),
     [("budgt=tiny", "budgt"), ("scene=totem,wires", "totem, wires"), ("a=b=,", "a=b=,")],
 )
