@@ -109,9 +109,10 @@ def faster_with_more_pixels(runs: Sequence[Run]) -> Iterator[Doubt]:
     """Many times the pixels of another run of the same, in less time."""
     size = ("scene.width", "scene.height", "scene.downscale", "seed", "method.seed")
     for same in _alike(runs, lambda run: (_settings(run, *size), run.computer)):
-        for one, other in combinations(sorted(same, key=_pixels), 2):
+        pixels = {run.key: _pixels(run) for run in same}
+        for one, other in combinations(sorted(same, key=lambda run: pixels[run.key]), 2):
             fewer, more = one.values["frame_ms"], other.values["frame_ms"]
-            if _pixels(other) >= MORE_PIXELS * _pixels(one) and more < fewer:
+            if pixels[other.key] >= MORE_PIXELS * pixels[one.key] and more < fewer:
                 at = f"{more:.1f} ms a frame at {other.facts['resolution']}"
                 yield Doubt(other.key, f"{at}, {fewer:.1f} ms at {one.facts['resolution']}")
 

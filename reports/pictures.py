@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from reports.runs import Run
 from reports.sheets import ZOOM, View, find_detail, write_sheet
 
 BESIDE = 4
-"""Renderings in one picture, beside the ground truth; more runs get further pictures."""
+"""Renderings in one picture, beside the ground truth, at most; more runs get further pictures."""
 
 
 def shown_frames(run: Run) -> list[str]:
@@ -30,9 +31,10 @@ def beside(runs: Sequence[Run], frame: str, stem: str, folder: Path) -> Iterator
     name = runs[0].frames.set_index("frame")["name"][int(frame)]
     place = f"frame {int(frame) + 1} of {len(runs[0].frames)}"
     yield f"### {runs[0].facts['scene']}, {name}, {place}"
-    for first in range(0, len(views), BESIDE):
+    width = math.ceil(len(views) / math.ceil(len(views) / BESIDE))  # no picture of a rest
+    for first in range(0, len(views), width):
         file = f"{stem}-{frame}-{first}.png"
-        group = views[first : first + BESIDE]
+        group = views[first : first + width]
         write_sheet(truth, group, detail, runs[0].record["error_map"], folder / file)
         shown = ", ".join(view.titles[0] for view in group)
         yield f"![Ground truth, {shown}; a detail of each; error maps]({folder.name}/{file})"

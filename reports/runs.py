@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ class Run:
         key: in the store.
         label: what it is called beside the others.
         rows: one metric per row.
-        frames: one frame per row.
+        read_frames: gives `frames`; few reports look at single frames, which are most of a run.
         record: what the figures mean, and where they come from.
         pictures: folder of ground truths, renderings and error maps.
     """
@@ -30,9 +30,14 @@ class Run:
     key: str
     label: str
     rows: pd.DataFrame
-    frames: pd.DataFrame
+    read_frames: Callable[[], pd.DataFrame]
     record: Mapping[str, Any]
     pictures: Path
+
+    @property
+    def frames(self) -> pd.DataFrame:
+        """One frame per row."""
+        return self.read_frames()
 
     @cached_property
     def headline(self) -> pd.DataFrame:
@@ -90,7 +95,7 @@ def load(store: Store, labels: Mapping[str, str]) -> list[Run]:
             key,
             label,
             by_run[key],
-            store.frames(key),
+            cache(partial(store.frames, key)),
             records[key],
             store.folder / key / "pictures",
         )

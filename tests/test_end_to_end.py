@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import random
 import shutil
+import signal
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import pandas as pd
@@ -146,6 +149,43 @@ def test_the_tables_of_the_paper_go_on_after_being_killed_and_end_with_the_same_
     assert [end.returncode for end in ends] == [0, 0], ends
     assert "already measured" in ends[0].stderr
     pd.testing.assert_frame_equal(*map(repeatable, (killed, undisturbed)), check_exact=True)
+
+
+SMALLEST = [
+    *("scene=totem", "scene.width=24", "scene.train=3", "scene.test=1"),
+    *("budget=tiny", "budget.steps=16", "budget.samples=512", "budget.renderer_steps=8"),
+    *("budget.frames=1", "protocol.name=quick", "protocol.lpips=[]", "protocol.warmup=0"),
+    *("method.grid.levels=4", "method.grid.log2_table=10", "method.pipeline.refined=0"),
+    *("method.joint.refined=0", "method.joint.patch=6", "method.joint.distilled_views=1"),
+    # Checkpoints of 2D renderers hold no preceding frames, so that without any they are exact.
+    *("method.pipeline.frames=0", "method.joint.motion.longer=0"),
+    *("method.joint.motion.pool=1", "method.joint.motion.uses=1"),
+]
+
+
+def mortal(folder: Path, last: int) -> subprocess.CompletedProcess[str]:
+    """Two trainings of a 2D renderer, killed at the change `last` of a file; see mortal.py."""
+    folder.mkdir(exist_ok=True)
+    program = [sys.executable, "-P", Path(__file__).with_name("mortal.py"), str(last)]
+    command = [*program, "paper", "--table", "table5", *SMALLEST]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
+def test_wherever_it_is_killed_again_and_again_a_sweep_ends_with_the_same_rows(
+    tmp_path: Path,
+) -> None:
+    """Killed once in every fifth of what the undisturbed sweep does, somewhere in it."""
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    undisturbed = mortal(whole, 0)
+    assert undisturbed.returncode == 0, undisturbed.stderr
+    fifth, chance = int(undisturbed.stdout) // 5, random.Random(0)
+    moments = [part * fifth + chance.randint(1, fifth) for part in range(5)]
+    for begun, end in pairwise([0, *moments]):
+        life = mortal(killed, end - begun)
+        assert life.returncode == -signal.SIGKILL, life.stderr
+    last = mortal(killed, 0)
+    assert last.returncode == 0, last.stderr
+    pd.testing.assert_frame_equal(*map(repeatable, (whole, killed)), check_exact=True)
 
 
 def test_parity_compares_every_engine_with_torch_in_fp32(first: tuple[Path, str]) -> None:

@@ -9,6 +9,7 @@ import subprocess
 import tomllib
 from collections.abc import Iterator
 from importlib import metadata
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from sweeps.cli import COMMANDS
+from sweeps.overrides import composed
 
 ROOT = Path(__file__).parent.parent
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -147,6 +149,14 @@ def test_every_choice_composes_to_something_that_exists(choice):
     group, _, _ = choice.partition("=")
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
         assert callable(get_object(compose("run", overrides=[choice])[group]._target_))
+
+
+@pytest.mark.parametrize("name", [path.stem for path in (CONFIGS / "experiment").glob("*.yaml")])
+def test_every_experiment_is_a_sweep_whose_jobs_compose(name):
+    experiment = f"+experiment={name}"
+    params = composed([experiment], return_hydra_config=True).hydra.sweeper.params
+    settings = [[f"{key}={value}" for value in values.split(",")] for key, values in params.items()]
+    assert all(composed([experiment, *job]).method for job in product(*settings))
 
 
 @pytest.mark.parametrize("choice", choices())

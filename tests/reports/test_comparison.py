@@ -24,7 +24,7 @@ def make(rows):
         kept = rows["value"].where(~rows["metric"].isin(list(changed)), rows["metric"].map(changed))
         own = rows.assign(value=kept, **FACTS)
         record = {"machine": {**MACHINE, "cpu": cpu}, "scene": {"digest": digest}}
-        return Run(label, label, own, pd.DataFrame({"frame": [0]}), record, Path())
+        return Run(label, label, own, pd.DataFrame, record, Path())
 
     return make_run
 

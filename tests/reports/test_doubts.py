@@ -49,7 +49,7 @@ def make(rows: pd.DataFrame) -> Make:
             "engine": engine,
         }
         record = {"machine": {"cpu": cpu, "gpus": []}, "made_of": {"config": config}}
-        return Run(key, key, own, pd.DataFrame(), record, Path())
+        return Run(key, key, own, pd.DataFrame, record, Path())
 
     return make_run
 

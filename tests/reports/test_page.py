@@ -6,6 +6,7 @@ import json
 import re
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from PIL import Image
 
@@ -100,6 +101,7 @@ def test_a_page_of_several_runs_has_all_of_them_beside_each_other(several, tmp_p
     text = page.read_text()
     assert text.startswith("# 6 runs on tiny\n")
     assert len(linked(page)) == 1 + 3 * 2  # the bars, then three frames, at most four runs in each
+    assert {path.stem[-1] for path in linked(page)[1:]} == {"0", "3"}  # and as many in either
     assert {path.resolve() for path in (page.parent / "pictures").iterdir()} == {
         path.resolve() for path in linked(page)
     }
@@ -134,7 +136,9 @@ def test_a_bar_per_run_is_as_long_as_its_stages_together(of, request, tmp_path, 
     monkeypatch.setattr(figures.Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
     rows = request.getfixturevalue(of)
     other = rows[rows["metric"] != "stage_ms.other"]
-    runs = [Run(str(i), f"run {i}", r, r, {}, tmp_path) for i, r in enumerate((rows, other))]
+    runs = [
+        Run(str(i), f"run {i}", r, pd.DataFrame, {}, tmp_path) for i, r in enumerate((rows, other))
+    ]
     figures.stage_bars(runs, tmp_path / "bars.png")
     (axes,) = drawn[0].axes
     field, rest = axes.containers

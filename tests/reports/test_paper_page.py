@@ -71,7 +71,7 @@ def test_a_curve_has_a_point_for_every_scored_frame_and_hollow_ones_for_cold(
     frames = run.frames.copy()
     frames.loc[0, "phase"] = "cold"
     frames.loc[3, "psnr"] = float("nan")
-    figures.quality_over_frames([replace(run, frames=frames)], tmp_path / "curve.png")
+    figures.quality_over_frames([replace(run, read_frames=lambda: frames)], tmp_path / "curve.png")
     curve, cold = drawn[0].axes[0].lines
     assert list(curve.get_xdata()) == [0, 1, 2, 4, 5]
     assert list(cold.get_xdata()) == [0]

@@ -25,7 +25,8 @@ def changed(run: Run, by: float | list[float], seed: int = 5) -> Run:
     """`run` with a PSNR larger by so much, of every frame and in the mean, with another seed."""
     rows = run.rows.assign(seed=seed)
     rows.loc[rows["metric"] == "psnr", "value"] += np.mean(by)
-    return replace(run, rows=rows, frames=run.frames.assign(psnr=run.frames["psnr"] + by))
+    frames = run.frames.assign(psnr=run.frames["psnr"] + by)
+    return replace(run, rows=rows, read_frames=lambda: frames)
 
 
 def only(one: list[Run], two: list[Run]):

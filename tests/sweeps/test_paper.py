@@ -59,6 +59,23 @@ def test_tables_share_the_run_that_they_have_in_common() -> None:
 
 
 @pytest.mark.parametrize(
+    ("method", "name", "line"),
+    [
+        ("ngp", "table1", "Instant-NGP"),
+        ("steernerf", "table4", "K = 6"),
+        ("steernerf_frozen", "table5", "without joint training"),
+        ("steernerf_k3", "table4", "K = 3"),
+    ],
+)
+def test_what_the_figures_show_is_what_the_tables_measure(
+    method: str, name: str, line: str
+) -> None:
+    shown = composed(["+experiment=figures", f"method={method}"])
+    (job,) = (job for job in plan(TABLES[name], []) if job.line == line)
+    assert described(shown) == described(job.config)
+
+
+@pytest.mark.parametrize(
     ("override", "said"),
     [("budgt=tiny", "budgt"), ("scene=totem,wires", "totem, wires"), ("a=b=,", "a=b=,")],
 )
@@ -165,6 +182,18 @@ def test_a_check_names_the_broken_rows_of_the_store(
         found.append(steerbench("report", "--check", outputs))
     assert [outcome.status for outcome in found] == [0, 1]
     assert key in found[1].out
+
+
+def test_the_frames_of_runs_that_are_not_on_a_page_are_not_read(
+    steerbench, store: Store, stored_run: str
+) -> None:
+    outputs = f"outputs={store.folder.parent}"
+    key = put(store, stored_run, plan(TABLES["table3"], [outputs])[0].config)
+    for run in (stored_run, key):
+        (store.folder / run / "frames.csv").unlink()
+    checked = steerbench("report", "--check", outputs)
+    assert "of 1 runs are to be doubted" in checked.out
+    assert steerbench("report", "--table", "table3", "seed=1", outputs).status == 0
 
 
 def test_the_page_goes_where_it_is_asked_for(
