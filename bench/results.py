@@ -16,7 +16,7 @@ import time
 import uuid
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -182,10 +182,14 @@ class Store:
         _sync(self.folder)
 
     def _sweep(self) -> None:
-        """Delete what killed processes left behind; a day is longer than any writing takes."""
-        for folder in self.folder.glob(f"{PARTIAL}*"):
-            if time.time() - folder.stat().st_mtime > STALE_S:
-                shutil.rmtree(folder, ignore_errors=True)
+        """Delete what killed processes left behind; a day is longer than any writing takes.
+
+        What others publish or delete meanwhile is gone, and that is no reason to lose a run.
+        """
+        with suppress(OSError):
+            for folder in self.folder.glob(f"{PARTIAL}*"):
+                if time.time() - folder.stat().st_mtime > STALE_S:
+                    shutil.rmtree(folder, ignore_errors=True)
 
     def _existing(self, run: str) -> Path:
         folder = self.find(run)

@@ -164,6 +164,13 @@ def test_what_a_killed_process_left_is_ignored_and_deleted_after_a_day(store):
     assert not stale.exists()
 
 
+def test_what_vanishes_while_the_store_is_cleaned_loses_no_run(store):
+    store.folder.mkdir(parents=True)
+    (store.folder / ".partial-abc-1").symlink_to("published")  # listed, and gone when looked at
+    key = store.save({}, measurement([1.0]))
+    assert store.find(key) is not None
+
+
 def test_a_run_of_another_schema_is_reported_and_left_out(store):
     kept, foreign, damaged = (store.save({"seed": i}, measurement([1.0])) for i in range(3))
     record = store.folder / foreign / "record.json"
