@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from bench.motion import novel_view
+from bench.sharing import missing
 from bench.types import Camera, Log, NullProbe, Scene
 from methods import checkpoint
 from methods.pretrained import Pretrained
@@ -35,18 +36,25 @@ def distilled_views(
         folder: where they are kept, and found again.
     """
     path = folder / "views.safetensors"
-    if not path.exists():
-        generator = torch.Generator().manual_seed(seed)
-        cameras = scene.splits["train"].cameras
-        views = [novel_view(cameras, target, generator) for _ in range(count)]
-        tensors: dict[str, Tensor] = {}
-        with log.progress("distilling", count) as progress:
-            for number, camera in enumerate(views):
-                tensors |= _packed(number, camera, _picture(trained, camera, scene.background))
-                progress.advance()
-        checkpoint.write(path, tensors, {"views": count})
+    with missing(path, log) as to_render:
+        if to_render:
+            generator = torch.Generator().manual_seed(seed)
+            cameras = scene.splits["train"].cameras
+            views = [novel_view(cameras, target, generator) for _ in range(count)]
+            checkpoint.write(path, _rendered(trained, scene, views, log), {"views": count})
     tensors, figures = checkpoint.read(path)
     return [_unpacked(tensors, number) for number in range(int(figures["views"]))]
+
+
+def _rendered(
+    trained: Pretrained, scene: Scene, views: Sequence[Camera], log: Log
+) -> dict[str, Tensor]:
+    tensors: dict[str, Tensor] = {}
+    with log.progress("distilling", len(views)) as progress:
+        for number, camera in enumerate(views):
+            tensors |= _packed(number, camera, _picture(trained, camera, scene.background))
+            progress.advance()
+    return tensors
 
 
 def _picture(trained: Pretrained, camera: Camera, background: Tensor) -> Tensor:

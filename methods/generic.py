@@ -78,12 +78,7 @@ def train_generic(
     training = RendererTraining(renderer, patches, joint, budget.renderer_steps, generator)
     for pipeline in pipelines:
         pipeline.renderer = training.mean
-    finished = folder / "generic.safetensors"
-    if finished.exists():
-        training.restore_result(checkpoint.read(finished)[0])
-        log.info(f"trained renderer found: {finished}")
-    else:
-        loop.train(training, finished, "training a generic renderer", log)
+    loop.train(training, folder / "generic.safetensors", "training a generic renderer", log)
     halves = {name: x.half() for name, x in training.mean.network.state_dict().items()}
     checkpoint.write(output, halves, {"scenes": len(scenes), "steps": training.steps})
     log.info(f"written: {output}")

@@ -10,6 +10,7 @@ from typing import Protocol
 
 from torch import Tensor
 
+from bench.sharing import missing
 from bench.types import Log, SteerbenchError
 from methods import checkpoint
 
@@ -41,6 +42,9 @@ class Training(Protocol):
     def result(self) -> dict[str, Tensor]:
         """What the training is for."""
 
+    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+        """Put back what `result` gave."""
+
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         """What, beside the result, a checkpoint must hold to go on as if never stopped."""
 
@@ -49,13 +53,25 @@ class Training(Protocol):
 
 
 def train(training: Training, finished: Path, label: str, log: Log) -> None:
-    """Drive `training` to its end and write its result to `finished`.
+    """Drive `training` to its end and write its result to `finished`, or load what is there.
 
-    A training that was killed goes on from the checkpoint beside it.
+    Another process that does the same is waited for. A training that was killed goes on from the
+    checkpoint beside it.
 
     Raises:
         SteerbenchError: something is not finite; the last good checkpoint is kept.
     """
+    with missing(finished, log) as to_train:
+        if to_train:
+            _drive(training, finished, label, log)
+        else:
+            tensors, figures = checkpoint.read(finished)
+            training.restore_result(tensors)
+            training.seconds = figures["seconds"]
+            log.info(f"{label}: found in {finished}")
+
+
+def _drive(training: Training, finished: Path, label: str, log: Log) -> None:
     unfinished = finished.with_name("checkpoint.safetensors")
     if unfinished.exists():
         resume(training, unfinished)

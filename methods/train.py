@@ -192,6 +192,10 @@ class FieldTraining:
         tensors = {f"field.{name}": value for name, value in self.field.state_dict().items()}
         return tensors | {"grid.density": self.grid.density}
 
+    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+        """Put back what `result` gave."""
+        restore_field(self.field, self.grid, tensors)
+
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         """Optimisers, random numbers, size of the batch."""
         generator = {"generator": self.generator.get_state()}
@@ -199,7 +203,7 @@ class FieldTraining:
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
         """See `loop.Training`."""
-        restore_field(self.field, self.grid, tensors)
+        self.restore_result(tensors)
         self.rays = int(figures["rays"])
         self.optimiser.restore(tensors)
         self.generator.set_state(tensors["generator"].cpu())

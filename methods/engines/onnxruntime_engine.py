@@ -14,6 +14,7 @@ from torch import Tensor
 
 from bench.provenance import digest
 from bench.results import explained
+from bench.sharing import missing
 from bench.types import Log
 from methods.engines import Built, Engine, Inputs, Precision, readable, required
 from methods.renderer2d import Network
@@ -56,10 +57,11 @@ class OnnxRuntime(Engine):
     ) -> Built:
         """See `Engine.build`."""
         path = folder() / "network.onnx"
-        if path.exists():
-            log.info(f"built network found: {path}")
-        else:
-            self._write(network, samples(), path)
+        with missing(path, log) as to_build:
+            if to_build:
+                self._write(network, samples(), path)
+            else:
+                log.info(f"built network found: {path}")
         options = self._runtime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
         session = self._runtime.InferenceSession(path, options, ["CPUExecutionProvider"])

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from bench.provenance import digest
 from bench.results import explained
+from bench.sharing import missing
 from bench.types import Log
 from methods.engines import CALIBRATION, Built, Engine, Inputs, Precision, readable, required
 from methods.renderer2d import Network
@@ -69,13 +70,14 @@ class OpenVino(Engine):
     ) -> Built:
         """See `Engine.build`."""
         path = folder() / "network.xml"
-        if path.exists():
-            log.info(f"built network found: {path}")
-        else:
-            seen = samples()
-            model = self._convert(network, seen)
-            model.set_rt_info(json.dumps(_sizes(seen, network.varying)), SIZES)
-            self._write(model, path)
+        with missing(path, log) as to_build:
+            if to_build:
+                seen = samples()
+                model = self._convert(network, seen)
+                model.set_rt_info(json.dumps(_sizes(seen, network.varying)), SIZES)
+                self._write(model, path)
+            else:
+                log.info(f"built network found: {path}")
         model = self._openvino.Core().read_model(path)
         compiled = _Compiled(self._openvino, model, network.varying, self.precision)
         sizes = json.loads(model.get_rt_info(SIZES).value)

@@ -319,7 +319,13 @@ def test_a_killed_training_goes_on_with_the_same_state(
 
     monkeypatch.setattr(RendererTraining, "advance", advance)
     loop.train(again, finished, "training", quiet_log)
-    assert [path.name for path in tmp_path.iterdir()] == ["steernerf.safetensors"]
+    assert {path.name for path in tmp_path.iterdir()} == {"steernerf.safetensors", "lock"}
+    found = new_training(ball_scene)
+    monkeypatch.delattr(RendererTraining, "advance")
+    loop.train(found, finished, "training", quiet_log)
+    assert found.seconds == again.seconds
+    for name, tensor in again.result().items():
+        assert torch.equal(tensor, found.result()[name])
 
 
 def test_without_preceding_frames_a_killed_training_ends_as_if_it_had_never_stopped(

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from bench.console import ConsoleLog
+from bench.sharing import locked
 from bench.types import Budget, Log, Scene, Split, SteerbenchError
-from methods import loop
+from methods import checkpoint, loop
 from methods.fields import HashField
 from methods.kernels.encode import HashGrid
 from methods.train import FieldTraining, PixelBatches, TrainingOptions, train_field
@@ -92,12 +95,12 @@ def test_a_killed_training_ends_as_if_it_had_never_stopped(
     folder = tmp_path / "killed"
     with pytest.raises(KeyboardInterrupt):
         trained(ball_scene, folder, quiet_log)
-    assert [path.name for path in folder.iterdir()] == ["checkpoint.safetensors"]
+    assert {path.name for path in folder.iterdir()} == {"checkpoint.safetensors", "lock"}
 
     monkeypatch.setattr(FieldTraining, "advance", advance)
     resumed = trained(ball_scene, folder, quiet_log)
     assert torch.equal(resumed.table, whole.table)
-    assert [path.name for path in folder.iterdir()] == ["field.safetensors"]
+    assert {path.name for path in folder.iterdir()} == {"field.safetensors", "lock"}
 
 
 def test_a_finished_training_is_loaded(ball_scene: Scene, tmp_path: Path, quiet_log: Log) -> None:
@@ -107,6 +110,32 @@ def test_a_finished_training_is_loaded(ball_scene: Scene, tmp_path: Path, quiet_
     assert torch.equal(first.table, second.table)
     assert torch.equal(first.packed, second.packed)
     assert (tmp_path / "field.safetensors").stat().st_mtime_ns == written
+
+
+def test_who_finds_the_same_training_under_way_waits_and_loads_its_result(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = trained(ball_scene, tmp_path / "first", quiet_log)
+    monkeypatch.delattr(FieldTraining, "advance")
+    folder = tmp_path / "shared"
+    folder.mkdir()
+
+    class Told(ConsoleLog):
+        """A log whose first line, that of waiting, lets the other one end."""
+
+        def info(self, message: str) -> None:
+            said.append(message)
+            if len(said) == 1:
+                (tmp_path / "first" / "field.safetensors").rename(folder / "field.safetensors")
+                other.close()
+
+    said: list[str] = []
+    other = ExitStack()
+    other.enter_context(locked(folder / "lock", "", quiet_log))
+    second = trained(ball_scene, folder, Told(tmp_path, quiet=True))
+    assert f"waits for another process that makes the same: {folder}" in said[0]
+    assert torch.equal(first.table, second.table)
+    assert torch.equal(first.packed, second.packed)
 
 
 def test_a_loss_that_is_no_number_stops_and_keeps_the_last_good_checkpoint(
@@ -144,7 +173,7 @@ def test_a_training_that_went_bad_in_its_last_step_is_not_finished(
     monkeypatch.setattr(FieldTraining, "_update", spoiled)
     with pytest.raises(SteerbenchError, match=r"step 40: not finite: table"):
         trained(ball_scene, tmp_path, quiet_log)
-    assert not list(tmp_path.iterdir())
+    assert [path.name for path in tmp_path.iterdir()] == ["lock"]
 
 
 def test_a_damaged_field_is_named_with_what_to_do(
@@ -184,10 +213,12 @@ def test_options_that_make_no_sense_are_refused(setting: dict) -> None:
 def test_a_checkpoint_that_cannot_be_written_says_so(
     ball_scene: Scene, tmp_path: Path, quiet_log: Log
 ) -> None:
-    with pytest.raises(SteerbenchError, match=r"gone.*cannot write the checkpoint"):
+    with pytest.raises(SteerbenchError, match=r"cannot write to .*gone"):  # before it is trained
         train_field(
             new_field(), ball_scene, BUDGET, TrainingOptions(), 0, tmp_path / "gone", quiet_log
         )
+    with pytest.raises(SteerbenchError, match=r"gone.*cannot write the checkpoint"):
+        checkpoint.write(tmp_path / "gone" / "field.safetensors", {}, {})
 
 
 def test_pictures_without_alpha_are_trained_on_as_they_are(ball_scene: Scene) -> None:

@@ -1,0 +1,70 @@
+"""Files that several processes share, also of other users and machines: one at a time makes them.
+
+A lock ends with the process that has it, however that ends.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from bench.results import explained
+from bench.types import Log
+
+
+@contextmanager
+def locked(path: Path, waiting: str, log: Log) -> Iterator[None]:
+    """Have the file `path`, made if missing and never removed, alone among all processes.
+
+    The log is told `waiting` when somebody else has it, and where the file system has no locks: the
+    work is then done all the same, at worst twice.
+
+    Raises:
+        SteerbenchError: `path` cannot be opened for writing.
+    """
+    with explained(path.parent):
+        handle = _opened(path)
+    try:
+        try:
+            _lock(handle, waiting, log)
+        except OSError as error:
+            log.info(f"not locked, others may do the same meanwhile: {path}: {error.strerror}")
+        yield
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def missing(path: Path, log: Log) -> Iterator[bool]:
+    """Whether `path` is still to be made: the body does so, and nobody else meanwhile.
+
+    Raises:
+        SteerbenchError: the folder of `path` cannot be written to.
+    """
+    if path.exists():
+        yield False
+        return
+    waiting = f"waits for another process that makes the same: {path}"
+    with locked(path.with_name("lock"), waiting, log):
+        yield not path.exists()
+
+
+def _opened(path: Path) -> int:
+    try:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL)
+    except FileExistsError:
+        # Without O_CREAT: in a folder for everybody, that is refused for the file of another user.
+        return os.open(path, os.O_RDWR)
+    os.fchmod(handle, 0o666)  # whatever the umask: other users take turns, too
+    return handle
+
+
+def _lock(handle: int, waiting: str, log: Log) -> None:
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        log.info(waiting)
+        fcntl.flock(handle, fcntl.LOCK_EX)
