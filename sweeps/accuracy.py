@@ -43,12 +43,12 @@ def main(options: argparse.Namespace) -> int:
     log = _Once(outputs)
     settings: list[dict[str, Any]] = []
     if not options.kernels:
-        with turn(outputs, config.device, log):
+        with turn(config.device, log):
             settings = _setting_rows(overrides, options, log)
         console().print(rich_table(setting_table(settings)))
     from methods.accuracy import all_experiments
 
-    with turn(outputs, "cpu", log):
+    with turn("cpu", log):
         experiments = experiment_rows(all_experiments(), options.repeats, log)
     console().print(rich_table(experiment_table(experiments)))
     command = shlex.join(["steerbench", *sys.argv[1:]])

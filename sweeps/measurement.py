@@ -100,7 +100,7 @@ def _obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
     if store.find(run) is not None:
         log.info(f"already measured; to measure again, remove {store.folder / run}")
         return Obtained(store, run, measured=False)
-    with turn(root, method.settings()["device"], log):
+    with turn(method.settings()["device"], log):
         if store.find(run) is not None:
             return Obtained(store, run, measured=False)  # by the process that had the turn before
         measurement = measure(

@@ -93,7 +93,7 @@ def main(options: argparse.Namespace) -> int:
     points = [point for point in _points() if point.axis in (options.axis or [point.axis])]
     configs = [composed([*overrides, *point.settings]) for point in points]
     rows = []
-    with log.progress("scaling", len(points)) as progress, turn(outputs, config.device, log):
+    with log.progress("scaling", len(points)) as progress, turn(config.device, log):
         for point, made in zip(points, configs, strict=True):
             rows.append(_row(point, made, scene, options.frames, log))
             progress.advance(note=point.label)

@@ -83,7 +83,7 @@ def render_variants(
     standard: dict[str, np.ndarray] = {}
     with (
         log.progress(label, len(variants)) as progress,
-        turn(Path(settings.outputs), settings.device, log),
+        turn(settings.device, log),
     ):
         for variant, config in zip(variants, configs, strict=True):
             method = usable_method(config, variant, log, required=not found)

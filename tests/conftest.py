@@ -46,6 +46,14 @@ def poisoned_empty() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def own_turns(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Tests wait for no measurement on this machine, and hold up none."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("STEERBENCH_LOCKS", str(tmp_path_factory.mktemp("locks")))
+        yield
+
+
 def _poisoning(allocate):
     def allocate_poisoned(*args, **kwargs):
         tensor = allocate(*args, **kwargs)

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from bench.console import ConsoleLog
+from sweeps import turns
 from sweeps.turns import lock_file, turn
 
 PATIENCE_S = 60.0
@@ -31,7 +32,7 @@ class Told(ConsoleLog):
 
 @pytest.fixture(autouse=True)
 def locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setenv(turns.FOLDER, str(tmp_path))
 
 
 def waiting(outputs: Path, device: str) -> tuple[threading.Thread, Told, threading.Event]:
@@ -39,7 +40,7 @@ def waiting(outputs: Path, device: str) -> tuple[threading.Thread, Told, threadi
     log, had = Told(outputs), threading.Event()
 
     def other() -> None:
-        with turn(outputs, device, log):
+        with turn(device, log):
             had.set()
 
     thread = threading.Thread(target=other, daemon=True)
@@ -48,8 +49,8 @@ def waiting(outputs: Path, device: str) -> tuple[threading.Thread, Told, threadi
 
 
 def test_who_wants_a_device_that_is_taken_waits_for_it(tmp_path: Path) -> None:
-    with turn(tmp_path, "cpu", Told(tmp_path)):
-        thread, log, had = waiting(tmp_path, "cpu")
+    with turn("cpu", Told(tmp_path)):
+        thread, log, had = waiting(tmp_path / "elsewhere", "cpu")
         assert "waiting: another process measures on cpu" in log.messages.get(timeout=PATIENCE_S)
         assert not had.is_set()
     thread.join(PATIENCE_S)
@@ -57,7 +58,7 @@ def test_who_wants_a_device_that_is_taken_waits_for_it(tmp_path: Path) -> None:
 
 
 def test_a_failure_ends_the_turn(tmp_path: Path) -> None:
-    with pytest.raises(KeyError), turn(tmp_path, "cpu", Told(tmp_path)):
+    with pytest.raises(KeyError), turn("cpu", Told(tmp_path)):
         raise KeyError
     thread, _, had = waiting(tmp_path, "cpu")
     thread.join(PATIENCE_S)
@@ -71,11 +72,18 @@ def test_graphics_processors_are_told_apart_by_what_they_are(
     monkeypatch.setattr(
         torch.cuda, "get_device_properties", lambda device: SimpleNamespace(uuid=names[device])
     )
-    first, second = (lock_file(tmp_path, device) for device in names)
+    first, second = map(lock_file, names)
     assert first != second
     names["cuda:0"] = "GPU-b"  # as another job counts them
-    assert lock_file(tmp_path, "cuda:0") == second
-    assert lock_file(tmp_path / "elsewhere", "cuda:0") != second
+    assert lock_file("cuda:0") == second
+
+
+def test_locks_lie_where_every_job_and_user_of_the_machine_sees_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(turns.FOLDER)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "of this job"))
+    assert lock_file("cpu").parent == Path("/var/tmp")
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local", "ray"])
