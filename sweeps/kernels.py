@@ -12,6 +12,7 @@ from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from reports.tables import Table
 from sweeps.terminal import console, rich_table
+from sweeps.turns import turn
 
 COLUMNS = ("kernel", "case", "backend", "dtype", "error", "tolerance", "ms", "M items/s", "ratio")
 """`ratio`: time of the reference backend over that of this one, same case, same run."""
@@ -23,7 +24,9 @@ def main(options: argparse.Namespace) -> int:
         raise SteerbenchError(f"--repeats: expected 1 or more, got {options.repeats}")
     from methods.kernels.benchmark import main_rows
 
-    rows = main_rows(options.filter, options.repeats, ConsoleLog(Path()))
+    log = ConsoleLog(Path())
+    with turn("auto", log):
+        rows = main_rows(options.filter, options.repeats, log)
     if not rows:
         raise SteerbenchError(f"--filter: no kernel has {options.filter!r} in its name")
     console().print(rich_table(Table("Kernels", COLUMNS, tuple(_line(row) for row in rows))))

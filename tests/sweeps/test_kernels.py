@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 
 import pytest
 
 from bench.types import Log
+from sweeps.turns import lock_file
 
 RIGHT = {
     "kernel": "encode", "case": "view", "backend": "cpu", "dtype": "float32", "error": 1e-7,
@@ -25,6 +27,8 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
 
     def main_rows(name_filter: str, repeats: int, log: Log) -> list[dict]:
         calls.append((name_filter, repeats))
+        with lock_file("auto").open() as file, pytest.raises(BlockingIOError):  # it is its turn
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return [row for row in (RIGHT, WRONG) if name_filter in row["kernel"]]
 
     monkeypatch.setattr("methods.kernels.benchmark.main_rows", main_rows)
