@@ -1,4 +1,4 @@
-"""Files that several processes share, also of other users and machines: one at a time makes them.
+"""Files that several processes share, also of other users and machines: whole, and made once.
 
 A lock ends with the process that has it, however that ends.
 """
@@ -7,12 +7,27 @@ from __future__ import annotations
 
 import fcntl
 import os
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from bench.results import explained
 from bench.types import Log
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A file beside `path` to write, which becomes `path` when the body ends without an exception.
+
+    Its name is nobody else's, and ends as `path` does.
+    """
+    new = path.with_name(f".{path.stem}-{uuid.uuid4().hex}{path.suffix}")
+    try:
+        yield new
+        new.replace(path)
+    finally:
+        new.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from bench.sharing import whole
 from bench.types import SteerbenchError
 
 
@@ -22,14 +23,12 @@ def write(path: Path, tensors: Mapping[str, Tensor], figures: Mapping[str, float
         SteerbenchError: the disk refuses.
     """
     packed = {name: tensor.contiguous() for name, tensor in tensors.items()}
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
     try:
-        save_file(packed, temporary, {"training": json.dumps(figures)})
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        with whole(path) as new:
+            save_file(packed, new, {"training": json.dumps(figures)})
+            with new.open("rb") as file:
+                os.fsync(file.fileno())
     except (OSError, SafetensorError) as error:
-        temporary.unlink(missing_ok=True)
         raise SteerbenchError(f"{path}: cannot write the checkpoint: {error}") from error
 
 

@@ -11,6 +11,7 @@ import pandas as pd
 
 from bench.provenance import commit, machine
 from bench.results import explained
+from bench.sharing import whole
 from reports.frontier import frontier_plot
 from reports.publish import publish
 from reports.tables import Table, number
@@ -88,12 +89,15 @@ def write_accuracy(
     tables = [experiment_table(experiments)]
     with explained(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        pd.DataFrame(experiments).to_csv(folder / "kernels.csv", index=False)
+        with whole(folder / "kernels.csv") as new:
+            pd.DataFrame(experiments).to_csv(new, index=False)
         made = f"```sh\n{command}\n```\n\nCommit {commit()}, {machine()['cpu']}."
         parts = ["# Run time against error", made]
         if settings:
-            pd.DataFrame(settings).to_csv(folder / "settings.csv", index=False)
-            frontier_plot(settings, folder / "frontier.png")
+            with whole(folder / "settings.csv") as new:
+                pd.DataFrame(settings).to_csv(new, index=False)
+            with whole(folder / "frontier.png") as new:
+                frontier_plot(settings, new)
             parts.append("![Error of a frame against its time, one point a setting](frontier.png)")
             tables.insert(0, setting_table(settings))
         parts += [f"## {table.title}\n\n{table.markdown()}" for table in tables]

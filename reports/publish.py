@@ -9,6 +9,7 @@ from pathlib import Path
 from markdown_it import MarkdownIt
 
 from bench.results import explained
+from bench.sharing import whole
 
 STYLE = """\
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 80rem; margin: 2rem auto;
@@ -32,9 +33,8 @@ def publish(text: str, folder: Path) -> Path:
     with explained(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in (("report.html", _page(text, folder)), ("report.md", f"{text}\n")):
-            partial = folder / f".{name}.partial"
-            partial.write_text(content, encoding="utf-8")
-            partial.replace(folder / name)
+            with whole(folder / name) as new:
+                new.write_text(content, encoding="utf-8")
     return folder / "report.md"
 
 

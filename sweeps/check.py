@@ -12,6 +12,7 @@ from typing import Any
 
 from bench.errors import SteerbenchError
 from bench.results import Store, explained
+from bench.sharing import whole
 from reports.regression import LIMITS, Figures, Limit, changes, table
 from reports.runs import Run, load
 from sweeps.measurement import PLACES
@@ -91,10 +92,8 @@ def _record(path: Path, found: Mapping[str, Run]) -> None:
     runs = {command: asdict(Figures.of(run).of_metrics(limits)) for command, run in found.items()}
     plain = {metric: asdict(limit) for metric, limit in limits.items()}
     text = json.dumps({"schema": SCHEMA, "limits": plain, "runs": runs}, indent=1)
-    new = path.with_name(f".{path.name}.new")
-    with explained(path.parent):
+    with explained(path.parent), whole(path) as new:
         new.write_text(text + "\n", encoding="utf-8")
-        new.replace(path)
     console().print(f"{path}: {len(runs)} runs", markup=False)
 
 

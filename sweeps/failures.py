@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.results import content_key, explained
+from bench.sharing import whole
 
 
 def reason(error: Exception) -> str:
@@ -19,9 +20,8 @@ def keep(outputs: Path, job: Mapping[str, Any], why: str) -> None:
     path = _path(outputs, job)
     with explained(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(".partial")
-        partial.write_text(f"{why}\n", encoding="utf-8")
-        partial.replace(path)
+        with whole(path) as new:
+            new.write_text(f"{why}\n", encoding="utf-8")
 
 
 def forget(outputs: Path, job: Mapping[str, Any]) -> None:

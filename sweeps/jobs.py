@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from bench.results import explained
+from bench.sharing import whole
 
 SUFFIX = ".job.json"
 
@@ -40,10 +41,8 @@ class Job:
 
     def write(self, folder: Path) -> None:
         """Leave it in `folder`; it appears there whole or not at all."""
-        with explained(folder):
-            partial = folder / f".{self.number}.partial"
-            partial.write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
-            partial.replace(folder / f"{self.number}{SUFFIX}")
+        with explained(folder), whole(folder / f"{self.number}{SUFFIX}") as new:
+            new.write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
 
     def label(self, names: Collection[str]) -> str:
         """What the job is called beside others: its method, and its settings of these `names`.

@@ -13,7 +13,7 @@ import pytest
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
-from bench.sharing import locked, missing
+from bench.sharing import locked, missing, whole
 
 MAKER = """
 import sys
@@ -51,6 +51,34 @@ def maker(tmp_path: Path) -> Callable[[], subprocess.Popen[str]]:
     return lambda: subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
+
+
+def test_a_file_that_two_write_at_a_time_is_whole_at_any_time(tmp_path):
+    path = tmp_path / "page.md"
+    with whole(path) as one, whole(path) as other:
+        assert one != other
+        assert one.suffix == other.suffix == ".md"
+        one.write_text("one")
+        other.write_text("other")
+        assert not path.exists()
+    assert path.read_text() == "one"  # which ended last
+    assert [path.name for path in tmp_path.iterdir()] == ["page.md"]
+
+
+@pytest.mark.parametrize("exception", [ValueError, KeyboardInterrupt])
+def test_a_file_that_is_not_ended_leaves_the_earlier_one_and_nothing_else(tmp_path, exception):
+    path = tmp_path / "page.md"
+    path.write_text("earlier")
+
+    def write() -> None:
+        with whole(path) as new:
+            new.write_text("half")
+            raise exception
+
+    with pytest.raises(exception):
+        write()
+    assert path.read_text() == "earlier"
+    assert [path.name for path in tmp_path.iterdir()] == ["page.md"]
 
 
 def test_of_two_processes_the_second_waits_and_finds_what_the_first_made(maker):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 from PIL import Image
@@ -63,6 +64,20 @@ def test_the_page_shows_both_tables_and_the_plot(tmp_path):
     assert setting_table(SETTINGS).markdown() in text
     assert experiment_table(EXPERIMENTS).markdown() in text
     assert not list(page.parent.glob(".*"))
+
+
+def test_a_plot_that_is_interrupted_leaves_the_earlier_one(tmp_path, monkeypatch):
+    write_accuracy(EXPERIMENTS, SETTINGS, tmp_path, "steerbench accuracy")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def half(rows: list[dict], path: Path) -> None:
+        path.write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("reports.accuracy.frontier_plot", half)
+    with pytest.raises(KeyboardInterrupt):
+        write_accuracy(EXPERIMENTS, SETTINGS, tmp_path, "steerbench accuracy")
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_without_settings_the_page_is_that_of_the_kernels(tmp_path):
