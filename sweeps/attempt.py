@@ -24,7 +24,8 @@ def attempt(config: DictConfig, command: Sequence[str], name: str) -> Obtained:
         return obtain(config, command)
     except Exception as error:
         print(f"steerbench: failed: {name}: {error}", file=sys.stderr)
-        failures.keep(Path(config.outputs), described(config), failures.reason(error))
+        with failures.told_only():
+            failures.keep(Path(config.outputs), described(config), failures.reason(error))
         raise
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,15 @@ from bench.sharing import whole
 def reason(error: Exception) -> str:
     """What `error` says, in one line."""
     return " ".join(str(error).split()) or type(error).__name__
+
+
+@contextmanager
+def told_only() -> Iterator[None]:
+    """Say what goes wrong in the body and go on: it must not hide the failure it is about."""
+    try:
+        yield
+    except Exception as error:
+        print(f"steerbench: {reason(error)}", file=sys.stderr)
 
 
 def keep(outputs: Path, job: Mapping[str, Any], why: str) -> None:

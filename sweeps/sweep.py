@@ -44,7 +44,8 @@ def run_job(config: DictConfig, command: Sequence[str]) -> None:
     try:
         obtained = attempt(config, command, " ".join(job.overrides))
     except Exception as error:
-        replace(job, failure=failures.reason(error)).write(folder)
+        with failures.told_only():
+            replace(job, failure=failures.reason(error)).write(folder)
         raise
     replace(job, run=obtained.run, measured=obtained.measured).write(folder)
     swept = [name for name in Announced.sizes if name != "method"]
