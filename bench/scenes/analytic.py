@@ -166,8 +166,11 @@ def write(folder: Path, settings: dict, log: Log) -> None:
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as temporary:
             scene = Path(temporary) / "scene"
             write_pictures(scene, settings, log)
-            if not folder.is_dir():  # else another process was faster
+            try:
                 scene.rename(folder)
+            except OSError:
+                if not folder.is_dir():  # else another process was faster
+                    raise
     except OSError as error:
         raise SteerbenchError(f"{folder}: the scene cannot be written: {error}") from error
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import pytest
@@ -45,6 +46,19 @@ def test_a_scene_is_written_once(tmp_path, log) -> None:
     second = analytic.load("void", **SMALL, root=tmp_path, log=log)
     assert log.done == written + 9
     assert second.digest == first.digest
+
+
+def test_who_finishes_second_accepts_the_scene_of_the_first(tmp_path, log, monkeypatch) -> None:
+    rename = Path.rename
+
+    def overtaken(scene: Path, folder: Path) -> Path:
+        shutil.copytree(scene, folder)
+        return rename(scene, folder)
+
+    monkeypatch.setattr(Path, "rename", overtaken)
+    analytic.load("void", **SMALL, root=tmp_path, log=log)
+    (folder,) = tmp_path.iterdir()
+    assert not (folder / "scene").exists()
 
 
 @pytest.mark.parametrize(
