@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from bench.results import Store, explained
 from reports import figures, tables
 from reports.comparison import comparison, setting
 from reports.pictures import BESIDE, beside, shown_frames
-from reports.publish import publish
+from reports.publish import add_picture, publish
 from reports.runs import Run, load
 
 
@@ -35,16 +36,12 @@ def write_page(
         SteerbenchError: a run is not in the store, or `folder` cannot be written to.
     """
     runs = load(store, labels)
-    pictures = folder / "pictures"
     with explained(folder):
-        pictures.mkdir(parents=True, exist_ok=True)
-        for stale in pictures.glob("frames-*.png"):  # of an earlier page
-            stale.unlink()
-        figures.stage_bars(runs, pictures / "stages.png")
+        stages = add_picture(folder, "stages", partial(figures.stage_bars, runs))
         parts = [
             _heading(runs, failures or {}),
-            TIME,
-            _pictures(runs, pictures),
+            TIME.format(stages=stages),
+            _pictures(runs, folder),
             *map(_figures, runs),
             _provenance(runs),
         ]
@@ -54,7 +51,7 @@ def write_page(
 TIME = """\
 ## Where the time goes
 
-![Mean time of a frame in ms, one bar per run, divided into stages](pictures/stages.png)
+![Mean time of a frame in ms, one bar per run, divided into stages]({stages})
 
 One bar per run: the mean time of a frame, divided into the stages of the method; a stage holds
 those inside it. What was spent between the stages is `other`."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from bench.results import explained
 from reports import doubts, figures
 from reports.doubts import Doubt
 from reports.pictures import beside, shown_frames
-from reports.publish import publish
+from reports.publish import add_picture, publish
 from reports.published import PaperTable, section
 from reports.runs import Run
 from reports.seeds import Repeated
@@ -49,19 +50,15 @@ def write_paper_page(
     Raises:
         SteerbenchError: `folder` cannot be written to.
     """
-    pictures = folder / "pictures"
     with explained(folder):
-        pictures.mkdir(parents=True, exist_ok=True)
-        for stale in pictures.glob("frames-*.png"):  # of an earlier page
-            stale.unlink()
         parts = [
             "# The tables of SteerNeRF, measured",
             READING,
             *_doubted(lines, found),
             *(section(table, lines.get(table.name, ())) for table in tables),
-            *_plots(lines, pictures),
-            *_compared("Methods", METHODS, lines, pictures),
-            *_compared("Ablations", ABLATION, lines, pictures),
+            *_plots(lines, folder),
+            *_compared("Methods", METHODS, lines, folder),
+            *_compared("Ablations", ABLATION, lines, folder),
             _sources(lines),
         ]
     return publish("\n\n".join(parts), folder)
@@ -95,46 +92,43 @@ def _runs(lines: Lines) -> list[Run]:
 def _plots(lines: Lines, folder: Path) -> Iterator[str]:
     first = [line for line in lines.get("table1", ()) if line.runs]
     if first:
-        figures.quality_against(first, "frame_ms", 1.0, "ms a frame", folder / "psnr-ms.png")
+        draw = partial(figures.quality_against, first, "frame_ms", 1.0, "ms a frame")
         yield _figure(
             "Quality against time",
-            "psnr-ms.png",
+            add_picture(folder, "psnr-ms", draw),
             "PSNR against the mean time of a frame, one mark a line of Table 1: further up is"
             " better, further left is faster. Time has a logarithmic scale.",
         )
     lengths = [line for line in lines.get("table6", ()) if line.runs]
     sized = [*first, *(replace(line, label=f"ours, {line.label}") for line in lengths)]
     if sized:
-        path = folder / "psnr-bytes.png"
-        figures.quality_against(sized, "size_bytes.total", 1e6, "MB of the model", path)
+        draw = partial(figures.quality_against, sized, "size_bytes.total", 1e6, "MB of the model")
         yield _figure(
             "Quality against memory",
-            path.name,
+            add_picture(folder, "psnr-bytes", draw),
             "PSNR against the size of the model, one mark a line of Tables 1 and 6, the latter with"
             " another length T of the hash table: further up is better, further left is smaller."
             " Size has a logarithmic scale.",
         )
     if divided := _named(METHODS | RANGE, lines):
-        figures.stage_bars(divided, folder / "stages.png")
         yield _figure(
             "Where the time goes",
-            "stages.png",
+            add_picture(folder, "stages", partial(figures.stage_bars, divided)),
             "The mean time of a frame, one bar for each run, divided into the stages of its method."
             " Rays, march, field, composite and finish of Instant-NGP are what SteerNeRF does in"
             " its stage `field`, at a lower resolution. What is in no stage is `other`.",
         )
     if followed := _named(METHODS, lines):
-        figures.quality_over_frames(followed, folder / "psnr-frames.png")
         yield _figure(
             "Quality along the path",
-            "psnr-frames.png",
+            add_picture(folder, "psnr-frames", partial(figures.quality_over_frames, followed)),
             "PSNR of every frame of the path with a ground truth. Hollow marks are cold frames, "
             "which had fewer preceding frames than the method looks back on.",
         )
 
 
 def _figure(title: str, file: str, caption: str) -> str:
-    return f"## {title}\n\n![{title}](pictures/{file})\n\n{caption}"
+    return f"## {title}\n\n![{title}]({file})\n\n{caption}"
 
 
 def _compared(

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from bench.results import COLD
+from reports.publish import add_picture
 from reports.runs import Run
 from reports.sheets import ZOOM, View, find_detail, write_sheet
 
@@ -23,8 +25,7 @@ def shown_frames(run: Run) -> list[str]:
 
 
 def beside(runs: Sequence[Run], frame: str, stem: str, folder: Path) -> Iterator[str]:
-    """Write the pictures of `frame` of `runs` into `folder`; yield what the page, beside which
-    that lies, has about it."""
+    """Write the pictures of `frame` of `runs`; yield what the page in `folder` has about it."""
     truth = _read(runs[0].pictures / f"{frame}-truth.png")
     views = [_view(run, frame) for run in runs]
     detail = find_detail(truth, [view.rendering for view in views])
@@ -33,11 +34,11 @@ def beside(runs: Sequence[Run], frame: str, stem: str, folder: Path) -> Iterator
     yield f"### {runs[0].facts['scene']}, {name}, {place}"
     width = math.ceil(len(views) / math.ceil(len(views) / BESIDE))  # no picture of a rest
     for first in range(0, len(views), width):
-        file = f"{stem}-{frame}-{first}.png"
         group = views[first : first + width]
-        write_sheet(truth, group, detail, runs[0].record["error_map"], folder / file)
+        draw = partial(write_sheet, truth, group, detail, runs[0].record["error_map"])
+        file = add_picture(folder, f"{stem}-{frame}-{first}", draw)
         shown = ", ".join(view.titles[0] for view in group)
-        yield f"![Ground truth, {shown}; a detail of each; error maps]({folder.name}/{file})"
+        yield f"![Ground truth, {shown}; a detail of each; error maps]({file})"
     yield (
         "PSNR and time above a picture are of this frame alone. The framed part, where"
         f" {detail.where}, is enlarged {ZOOM} times."

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import html
+import re
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from markdown_it import MarkdownIt
@@ -21,11 +26,31 @@ img { max-width: 100% }
 pre { background: #f4f4f4; padding: 8px; overflow-x: auto }"""
 
 
+PICTURE = re.compile(r".+-[0-9a-f]{12}\.png")
+"""What `add_picture` calls its files."""
+
+
+def add_picture(folder: Path, stem: str, draw: Callable[[Path], object]) -> str:
+    """Have `draw` write a PNG, and keep it for a page in `folder`; the name it has for the page.
+
+    It is one of its content, so that the pictures of an earlier page stay until that is replaced.
+    """
+    with tempfile.TemporaryDirectory() as place:
+        draw(drawn := Path(place) / f"{stem}.png")
+        content = drawn.read_bytes()
+    name = f"pictures/{stem}-{hashlib.sha256(content).hexdigest()[:12]}.png"
+    (folder / "pictures").mkdir(parents=True, exist_ok=True)
+    with whole(folder / name) as new:
+        new.write_bytes(content)
+    return name
+
+
 def publish(text: str, folder: Path) -> Path:
     """Write `text` as `report.md` and `report.html`, each of which appears whole or not at all;
     return the former.
 
-    Pictures that `text` shows lie below `folder`; the HTML page holds them itself.
+    Pictures that `text` shows lie below `folder`; the HTML page holds them itself. Those of an
+    earlier page are deleted last.
 
     Raises:
         SteerbenchError: `folder` cannot be written to.
@@ -35,6 +60,10 @@ def publish(text: str, folder: Path) -> Path:
         for name, content in (("report.html", _page(text, folder)), ("report.md", f"{text}\n")):
             with whole(folder / name) as new:
                 new.write_text(content, encoding="utf-8")
+    for picture in (folder / "pictures").glob("*.png"):
+        if PICTURE.fullmatch(picture.name) and f"(pictures/{picture.name})" not in text:
+            with suppress(OSError):  # the page is published
+                picture.unlink()
     return folder / "report.md"
 
 

@@ -77,10 +77,29 @@ def test_every_row_of_every_table_has_as_many_cells_as_its_heading(page):
 
 def test_a_page_is_written_over_an_earlier_one_and_leaves_nothing_else(page, store, stored_run):
     before = {path: path.read_bytes() for path in page.parent.rglob("*") if path.is_file()}
-    (page.parent / "pictures" / "frames-7-0042-0.png").write_bytes(b"of an earlier page")
+    (page.parent / "pictures" / "frames-7-0042-0-0123456789ab.png").write_bytes(
+        b"of an earlier page"
+    )
     write_page(store, {stored_run: "offset"}, page.parent)
     after = {path: path.read_bytes() for path in page.parent.rglob("*") if path.is_file()}
     assert after == before
+
+
+def test_a_page_that_is_interrupted_leaves_the_earlier_one_with_its_pictures(
+    page, several, monkeypatch
+):
+    before = {path: path.read_bytes() for path in linked(page)}
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("reports.page.publish", killed)
+        with pytest.raises(KeyboardInterrupt):
+            write_page(*several, page.parent)
+    assert {path: path.read_bytes() for path in linked(page)} == before
+    write_page(*several, page.parent)
+    assert set((page.parent / "pictures").iterdir()) == set(linked(page))
 
 
 def test_a_run_that_is_not_there_is_named(store, tmp_path):
@@ -101,7 +120,8 @@ def test_a_page_of_several_runs_has_all_of_them_beside_each_other(several, tmp_p
     text = page.read_text()
     assert text.startswith("# 6 runs on tiny\n")
     assert len(linked(page)) == 1 + 3 * 2  # the bars, then three frames, at most four runs in each
-    assert {path.stem[-1] for path in linked(page)[1:]} == {"0", "3"}  # and as many in either
+    firsts = {path.stem.split("-")[-2] for path in linked(page)[1:]}
+    assert firsts == {"0", "3"}  # and as many in either
     assert {path.resolve() for path in (page.parent / "pictures").iterdir()} == {
         path.resolve() for path in linked(page)
     }
