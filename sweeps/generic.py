@@ -8,6 +8,7 @@ from pathlib import Path
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from sweeps.build import build
+from sweeps.measurement import checked_settings
 from sweeps.overrides import composed
 
 SETTINGS = (
@@ -24,7 +25,7 @@ def main(options: argparse.Namespace) -> int:
     if options.scenes < 1:
         raise SteerbenchError(f"--scenes: expected 1 or more, got {options.scenes}")
     config = composed([*SETTINGS, *options.overrides])
-    log = ConsoleLog(Path(config.outputs))
+    log = ConsoleLog(Path(checked_settings(config).outputs))
     method, budget = build(config, "method"), build(config, "budget")
     scenes = []
     for config.scene.variant in range(options.scenes):

@@ -61,6 +61,13 @@ def test_one_renderer_is_trained_on_as_many_scenes_as_asked_for(steerbench, reco
     assert method["renderer"]["init"] == "scratch"
 
 
+def test_as_many_threads_are_used_as_asked_for(steerbench, recorder, monkeypatch):
+    asked = []
+    monkeypatch.setattr("torch.set_num_threads", asked.append)
+    assert steerbench("generic", "--scenes", "1", "--output", "w", "threads=1").status == 0
+    assert asked == [1]
+
+
 @pytest.mark.parametrize("scenes", ["0", "-2"])
 def test_no_scenes_at_all_are_refused(steerbench, recorder, scenes):
     outcome = steerbench("generic", "--scenes", scenes, "--output", "w.safetensors")
@@ -77,6 +84,9 @@ def test_no_scenes_at_all_are_refused(steerbench, recorder, scenes):
         (["--output", "w", "method.joint.rat=1"], "Did you mean method.joint.rate?"),
         (["--output", "w", "budget=genric"], "Did you mean generic?"),
         (["--output", "w", "seed"], "cannot read 'seed'"),
+        (["--output", "w", "seed=-1"], "seed: expected 0 or more"),
+        (["--output", "w", "threads=0"], "threads: expected 1 or more"),
+        (["--output", "w", "device=gpu"], "device: expected auto, cpu, cuda or cuda:N, got gpu"),
     ],
 )
 def test_a_wrong_word_is_answered_with_what_is_expected(steerbench, recorder, argv, message):
