@@ -9,7 +9,7 @@ import fcntl
 import os
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from bench.results import explained
@@ -73,7 +73,8 @@ def _opened(path: Path) -> int:
     except FileExistsError:
         # Without O_CREAT: in a folder for everybody, that is refused for the file of another user.
         return os.open(path, os.O_RDWR)
-    os.fchmod(handle, 0o666)  # whatever the umask: other users take turns, too
+    with suppress(OSError):  # some file systems have no modes
+        os.fchmod(handle, 0o666)  # whatever the umask: other users take turns, too
     return handle
 
 
