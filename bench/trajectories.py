@@ -15,6 +15,9 @@ import numpy as np
 from bench.motion import between, rotation_between
 from bench.types import Camera, Scene, SteerbenchError
 
+MIXED = "mixed"
+"""The resolution of a trajectory whose frames differ in size."""
+
 
 @dataclass(frozen=True)
 class Step:
@@ -48,9 +51,9 @@ class Trajectory:
 
     @property
     def resolution(self) -> str:
-        """`WIDTHxHEIGHT` of the frames, or "mixed"."""
+        """`WIDTHxHEIGHT` of the frames, or `MIXED`."""
         sizes = {f"{step.camera.width}x{step.camera.height}" for step in self.steps}
-        return sizes.pop() if len(sizes) == 1 else "mixed"
+        return sizes.pop() if len(sizes) == 1 else MIXED
 
 
 def spread(total: int, count: int) -> list[int]:
