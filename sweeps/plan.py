@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import SteerbenchError
-from bench.results import SCHEMA_VERSION, Store, content_key
+from bench.results import Store, content_key
 from reports.published import PaperTable, paper_tables
-from reports.runs import Run, load
+from reports.runs import Run, readable
 from reports.seeds import Repeated
 from sweeps import failures
 from sweeps.measurement import described
@@ -100,15 +100,8 @@ def _seeds(overrides: Sequence[str]) -> tuple[list[str], list[list[str]]]:
 
 def newest(store: Store) -> dict[str, Run]:
     """Every run of the store, by the key of its job; of several, that which was stored last."""
-    folders = [path for path in store.folder.glob("[!.]*") if store.find(path.name)]
-    folders.sort(key=lambda path: path.stat().st_mtime)
-    keys = {}
-    for folder in folders:
-        record: Any = store.record(folder.name)
-        if record.get("schema_version") == SCHEMA_VERSION and "config" in record["made_of"]:
-            keys[content_key(record["made_of"]["config"])] = folder.name
-    runs = {run.key: run for run in load(store, {key: key for key in keys.values()})}
-    return {job: runs[key] for job, key in keys.items()}
+    made_of = [(run, run.record["made_of"]) for run in readable(store)]
+    return {content_key(parts["config"]): run for run, parts in made_of if "config" in parts}
 
 
 def gather(
