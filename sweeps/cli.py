@@ -86,6 +86,9 @@ def dispatch(argv: Sequence[str]) -> int:
     if argv and not argv[0].startswith("-") and argv[0] not in COMMANDS:
         raise unknown("command", argv[0], COMMANDS)
     options, unread = parser.parse_known_args(argv)
+    if "overrides" in options:  # of which argparse takes those up to the next option alone
+        options.overrides += [word for word in unread if not word.startswith("-")]
+        unread = [word for word in unread if word.startswith("-")]
     if unread:
         known = re.findall(r"--[\w-]+", options.parser.format_help())
         raise unknown("argument", unread[0], set(known))
