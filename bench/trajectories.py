@@ -64,13 +64,17 @@ def spread(total: int, count: int) -> list[int]:
 def from_split(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:
     """The cameras of a split in their order; `limit` > 0 keeps that many, evenly spread.
 
+    A frame that is kept without the one before it comes after a cut.
+
     Raises:
         SteerbenchError: the scene has no such split, it is empty, or `limit` is negative.
     """
     cameras = _cameras(scene, split, limit)
     kept = spread(len(cameras), limit or len(cameras))
     name = split if len(kept) == len(cameras) else f"{split}-{len(kept)}of{len(cameras)}"
-    return Trajectory(name, split, tuple(Step(cameras[index], index) for index in kept))
+    cuts = [False, *(after != before + 1 for before, after in pairwise(kept))]
+    steps = (Step(cameras[index], index, cut) for index, cut in zip(kept, cuts, strict=True))
+    return Trajectory(name, split, tuple(steps))
 
 
 def orbit(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:
