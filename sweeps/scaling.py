@@ -130,17 +130,24 @@ def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) 
         records, peak_bytes = _render(method, cameras, log)
     finally:
         torch.set_num_threads(usual)
-    ms = [record.total_ns / 1e6 for record in records]
     samples = [record.done["samples"] + record.done.get("surface_samples", 0) for record in records]
     return {
         "axis": point.axis,
         "label": point.label,
         "value": point.value,
-        "frame_ms": statistics.median(ms),
-        "p99_to_p50": float(np.percentile(ms, 99)) / statistics.median(ms),
+        **_times(records),
         "samples": statistics.mean(samples),
         "peak_bytes": peak_bytes,
         "size_bytes": sum(method.sizes().values()),
+    }
+
+
+def _times(records: Sequence[FrameRecord]) -> dict[str, float]:
+    """Mean time of the frames, as everywhere, and how much longer than usual the longest take."""
+    ms = [record.total_ns / 1e6 for record in records]
+    return {
+        "frame_ms": statistics.mean(ms),
+        "p99_to_p50": float(np.percentile(ms, 99)) / statistics.median(ms),
     }
 
 
