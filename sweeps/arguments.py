@@ -14,7 +14,7 @@ def _run(run: Parser) -> None:
 
 
 def _tables(tables: Parser) -> None:
-    tables.add_argument("--table", metavar="NAME", help="only this one: table1 to table6")
+    tables.add_argument("--table", metavar="NAME", help="only this one, as table3")
     tables.add_argument(
         "--report", type=Path, metavar="DIR", help="where the page goes (default OUTPUTS/paper)"
     )

@@ -29,7 +29,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "20000")
 EXAMPLES = """\
 examples
   steerbench run +experiment=demo              three methods on an embedded scene, and a page
-  steerbench run scene=blender scene.path=DIR  the same on your copy of a NeRF-Synthetic scene
+  steerbench run scene=blender scene.path=DIR  Instant-NGP on your copy of a NeRF-Synthetic scene
   steerbench run --help                        all choices and settings
   steerbench list                              what there is, and what of it is usable here
   steerbench paper budget=tables               every table of the SteerNeRF paper, as a page
