@@ -76,8 +76,6 @@ def _points() -> Iterator[Point]:
 
 def main(options: argparse.Namespace) -> int:
     """Print a table with the fitted exponents and, as the last line, the rows as JSON."""
-    if options.frames < 1:
-        raise SteerbenchError(f"--frames: expected 1 or more, got {options.frames}")
     if options.plot is not None and options.plot.suffix != ".png":
         raise SteerbenchError(f"--plot: expected a name that ends in .png, got {options.plot}")
     overrides = [*SETTINGS, *options.overrides]

@@ -57,6 +57,8 @@ def test_list_says_how_to_get_an_engine_that_is_not_installed(steerbench, monkey
         (["results", "--fromat", "csv"], "unknown argument '--fromat'. Did you mean --format?"),
         (["results", "--format", "cvs"], "invalid choice: 'cvs'"),
         (["kernels", "--repeats", "0"], "--repeats: expected 1 or more, got 0"),
+        (["skips", "--frames", "0"], "--frames: expected 1 or more, got 0"),
+        (["parity", "--frames", "many"], "--frames: invalid number value: 'many'"),
         (["scenes", "verfy", "x"], "invalid choice: 'verfy'"),
     ],
 )
