@@ -55,6 +55,14 @@ class Trajectory:
         sizes = {f"{step.camera.width}x{step.camera.height}" for step in self.steps}
         return sizes.pop() if len(sizes) == 1 else MIXED
 
+    @property
+    def preceding(self) -> list[int]:
+        """Of each step, how many there were before it since the last cut."""
+        counts: list[int] = []
+        for step in self.steps:
+            counts.append(counts[-1] + 1 if counts and not step.cut else 0)
+        return counts
+
 
 def spread(total: int, count: int) -> list[int]:
     """At most `count` different indices of `total`, evenly spread, first and last among them."""
