@@ -133,21 +133,23 @@ def render_in_turns(
 
     Returns:
         One row for each method, of the frames that have a ground truth and as many frames before
-        them as any of the methods looks back on: setting (its name), ms (a round's mean time of a
-        frame; median over the rounds), ms_lo and ms_hi (its extremes), psnr (mean over the frames)
-        and psnr_to_first (against the pictures of the first method, all frames together, inf where
-        there is no difference), both of pictures as `protocol` rounds them.
+        them since the last cut as any of the methods looks back on: setting (its name), ms (a
+        round's mean time of a frame; median over the rounds), ms_lo and ms_hi (its extremes), psnr
+        (mean over the frames) and psnr_to_first (against the pictures of the first method, all
+        frames together, inf where there is no difference), both of pictures as `protocol` rounds
+        them.
 
     Raises:
         SteerbenchError: there is no such frame.
     """
     start = max(method.memory for method in methods.values())
     steps = trajectory.steps
-    scored = [n for n, step in enumerate(steps) if n >= start and step.truth is not None]
+    ready = [count >= start for count in trajectory.preceding]
+    scored = [n for n, step in enumerate(steps) if ready[n] and step.truth is not None]
     if not scored:
         raise SteerbenchError(
             f"{trajectory.name}: none of its {len(steps)} frames has a ground truth and {start} "
-            "frames before it to look back on; give more frames"
+            "frames before it to look back on, without a cut; give more frames"
         )
     clocks = {name: StageClock(method.settings()["device"]) for name, method in methods.items()}
     scores = _Scores(scene, trajectory, protocol)

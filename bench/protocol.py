@@ -14,9 +14,7 @@ from torch import Tensor
 from bench import metrics
 from bench.lpips_weights import locate
 from bench.trajectories import Trajectory
-from bench.types import Log, Scene, SteerbenchError, Unavailable
-
-BACKGROUNDS = {"white": 1.0, "black": 0.0}
+from bench.types import BACKGROUNDS, Log, Scene, SteerbenchError, Unavailable
 
 
 @dataclass(frozen=True)

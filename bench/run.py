@@ -6,7 +6,6 @@ Quality, time and memory of a run come from the same rendering of the same frame
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from bench.probes import FrameRecord, MemoryMeter, StageClock
 from bench.protocol import EvaluationProtocol
 from bench.results import COLD, STEADY, WHOLE, Measurement
 from bench.scoring import ERROR_RANGE, Scoring
-from bench.trajectories import Step, Trajectory, spread
+from bench.trajectories import Trajectory, spread
 from bench.types import Budget, Frame, Log, Method, Scene, SteerbenchError, check_shape
 
 CONFIDENCE = 0.95
@@ -107,7 +106,7 @@ def _render(
 ) -> pd.DataFrame:
     """Warm up, then render the sequence in its order; each frame is scored and let go."""
     steps = trajectory.steps
-    phases = _phases(steps, method.memory, protocol)
+    phases = _phases(trajectory, method.memory, protocol)
     clock = StageClock(method.settings()["device"])
     warmup = spread(len(steps), protocol.warmup)
     table: list[dict[str, Any]] = []
@@ -131,18 +130,13 @@ def _render(
     return _frame_table(table, protocol)
 
 
-def _phases(steps: Sequence[Step], memory: int, protocol: EvaluationProtocol) -> list[str]:
+def _phases(trajectory: Trajectory, memory: int, protocol: EvaluationProtocol) -> list[str]:
     """Of each frame: cold while fewer than `memory` were rendered since the last reset or cut.
 
     The method is not told of a cut: whoever steers a camera does not announce a jump either.
     """
-    phases, preceding = [], 0
-    for step in steps:
-        if step.cut or protocol.memory == "cold":
-            preceding = 0
-        phases.append(COLD if preceding < memory else STEADY)
-        preceding += 1
-    return phases
+    known = trajectory.preceding if protocol.memory == "steady" else [0] * len(trajectory.steps)
+    return [COLD if count < memory else STEADY for count in known]
 
 
 def _check_frame(frame: Frame, height: int, width: int, method: str, index: int) -> None:

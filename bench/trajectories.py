@@ -15,6 +15,9 @@ import numpy as np
 from bench.motion import between, rotation_between
 from bench.types import Camera, Scene, SteerbenchError
 
+MIXED = "mixed"
+"""The resolution of a trajectory whose frames differ in size."""
+
 
 @dataclass(frozen=True)
 class Step:
@@ -48,9 +51,17 @@ class Trajectory:
 
     @property
     def resolution(self) -> str:
-        """`WIDTHxHEIGHT` of the frames, or "mixed"."""
+        """`WIDTHxHEIGHT` of the frames, or `MIXED`."""
         sizes = {f"{step.camera.width}x{step.camera.height}" for step in self.steps}
-        return sizes.pop() if len(sizes) == 1 else "mixed"
+        return sizes.pop() if len(sizes) == 1 else MIXED
+
+    @property
+    def preceding(self) -> list[int]:
+        """Of each step, how many there were before it since the last cut."""
+        counts: list[int] = []
+        for step in self.steps:
+            counts.append(counts[-1] + 1 if counts and not step.cut else 0)
+        return counts
 
 
 def spread(total: int, count: int) -> list[int]:
@@ -61,13 +72,17 @@ def spread(total: int, count: int) -> list[int]:
 def from_split(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:
     """The cameras of a split in their order; `limit` > 0 keeps that many, evenly spread.
 
+    A frame that is kept without the one before it comes after a cut.
+
     Raises:
         SteerbenchError: the scene has no such split, it is empty, or `limit` is negative.
     """
     cameras = _cameras(scene, split, limit)
     kept = spread(len(cameras), limit or len(cameras))
     name = split if len(kept) == len(cameras) else f"{split}-{len(kept)}of{len(cameras)}"
-    return Trajectory(name, split, tuple(Step(cameras[index], index) for index in kept))
+    cuts = [False, *(after != before + 1 for before, after in pairwise(kept))]
+    steps = (Step(cameras[index], index, cut) for index, cut in zip(kept, cuts, strict=True))
+    return Trajectory(name, split, tuple(steps))
 
 
 def orbit(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:

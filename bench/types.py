@@ -37,6 +37,9 @@ from bench.errors import Unavailable as Unavailable
 EMPTY_ALPHA = 1e-3
 """Opacity below which a pixel is empty: its depth is +inf and it is never unprojected."""
 
+BACKGROUNDS = {"white": 1.0, "black": 0.0}
+"""What a scene may be composited on, by name: every channel of `Scene.background`."""
+
 
 def check_shape(name: str, value: Tensor, *shape: int | None) -> None:
     """Raise `ValueError` unless `value` has `shape`; None stands for any size along that axis."""

@@ -11,6 +11,7 @@ from pathlib import Path
 from statistics import median
 
 from bench.results import content_key
+from bench.trajectories import MIXED
 from reports.runs import Run
 from reports.tables import Table
 
@@ -106,9 +107,10 @@ def int8_far_from_fp32(runs: Sequence[Run]) -> Iterator[Doubt]:
 
 
 def faster_with_more_pixels(runs: Sequence[Run]) -> Iterator[Doubt]:
-    """Many times the pixels of another run of the same, in less time."""
+    """Many times the pixels of another run of the same, in less time; of frames of one size."""
     size = ("scene.width", "scene.height", "scene.downscale", "seed", "method.seed")
-    for same in _alike(runs, lambda run: (_settings(run, *size), run.computer)):
+    sized = [run for run in runs if run.facts["resolution"] != MIXED]
+    for same in _alike(sized, lambda run: (_settings(run, *size), run.computer)):
         pixels = {run.key: _pixels(run) for run in same}
         for one, other in combinations(sorted(same, key=lambda run: pixels[run.key]), 2):
             fewer, more = one.values["frame_ms"], other.values["frame_ms"]

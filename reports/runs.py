@@ -10,7 +10,8 @@ from typing import Any
 
 import pandas as pd
 
-from bench.results import WHOLE, Store
+from bench.errors import SteerbenchError
+from bench.results import SCHEMA_VERSION, WHOLE, Store
 from reports.tables import headline, phases, suffix
 
 
@@ -85,11 +86,16 @@ def load(store: Store, labels: Mapping[str, str]) -> list[Run]:
     """The runs whose keys `labels` has, in its order.
 
     Raises:
-        SteerbenchError: one of them is not in the store.
+        SteerbenchError: one of them is not in the store, or of a schema that cannot be read.
     """
     records = {key: store.record(key) for key in labels}
-    rows = store.rows(report=lambda unreadable: None)  # others, which are not asked for
-    by_run = dict(iter(rows.groupby("run")))
+    by_run = _rows_by_run(store)
+    for key in labels:
+        if key not in by_run:
+            raise SteerbenchError(
+                f"{store.folder / key}: its rows have schema {records[key].get('schema_version')}; "
+                f"this version reads schema {SCHEMA_VERSION}"
+            )
     return [
         Run(
             key,
@@ -101,3 +107,16 @@ def load(store: Store, labels: Mapping[str, str]) -> list[Run]:
         )
         for key, label in labels.items()
     ]
+
+
+def readable(store: Store) -> list[Run]:
+    """Every run that this version can read, under its key; the last that was stored comes last."""
+    folders = [folder for folder in map(store.find, _rows_by_run(store)) if folder]
+    folders.sort(key=lambda folder: folder.stat().st_mtime)
+    return load(store, {folder.name: folder.name for folder in folders})
+
+
+def _rows_by_run(store: Store) -> dict[str, pd.DataFrame]:
+    """The rows of every run that can be read, and no word on the others."""
+    rows = store.rows(report=lambda unreadable: None)
+    return {str(run): of_run for run, of_run in rows.groupby("run")}

@@ -33,8 +33,6 @@ SETTINGS = ("method=steernerf", "scene=totem", "budget=demo", "trajectory=orbit"
 def main(options: argparse.Namespace) -> int:
     """Print both tables and the setting that was asked for; as the last line, all rows as JSON."""
     limit = None if options.within is None else decibels(options.within)
-    if options.repeats < 1:
-        raise SteerbenchError(f"--repeats: expected 1 or more, got {options.repeats}")
     overrides = _last_words([*SETTINGS, *options.overrides])
     config = composed(overrides)
     outputs = Path(checked_settings(config).outputs)

@@ -14,7 +14,7 @@ def _run(run: Parser) -> None:
 
 
 def _tables(tables: Parser) -> None:
-    tables.add_argument("--table", metavar="NAME", help="only this one: table1 to table6")
+    tables.add_argument("--table", metavar="NAME", help="only this one, as table3")
     tables.add_argument(
         "--report", type=Path, metavar="DIR", help="where the page goes (default OUTPUTS/paper)"
     )
@@ -59,7 +59,7 @@ def _results(results: Parser) -> None:
 
 def _kernels(kernels: Parser) -> None:
     kernels.add_argument("--filter", default="", help="only kernels whose name contains this")
-    kernels.add_argument("--repeats", type=int, default=5, help="timed calls of each (default 5)")
+    _count(kernels, "--repeats", 5, "timed calls of each")
 
 
 VARIANTS = (
@@ -72,7 +72,7 @@ def _parity(parity: Parser) -> None:
         "with every engine and precision that can be used here, and compare them with torch in "
         "fp32."
     )
-    _frames(parity, 60, "first frames of the trajectory")
+    _count(parity, "--frames", 60, "first frames of the trajectory")
     _overrides(parity)
 
 
@@ -81,7 +81,7 @@ def _skips(skips: Parser) -> None:
         "with everything computed that could be left out, with each of it left out alone, and with "
         "all of it; without refinement."
     )
-    _frames(skips, 8, "first frames of the trajectory")
+    _count(skips, "--frames", 8, "first frames of the trajectory")
     _overrides(skips)
 
 
@@ -92,7 +92,7 @@ def _scaling(scaling: Parser) -> None:
         "fit a power of each to time and memory. A field is trained for each T; 2D renderers "
         "hardly, for what they have learned does not change what they cost."
     )
-    _frames(scaling, 20, "steady frames of each")
+    _count(scaling, "--frames", 20, "steady frames of each")
     scaling.add_argument(
         "--axis",
         action="append",
@@ -124,10 +124,8 @@ def _accuracy(accuracy: Parser) -> None:
         action="store_true",
         help="also what asks for trainings of its own: L, K, s, T, taught steps, a field in fp32",
     )
-    _frames(accuracy, 24, "first frames of the trajectory")
-    accuracy.add_argument(
-        "--repeats", type=int, default=5, help="timed rounds over all settings (default 5)"
-    )
+    _count(accuracy, "--frames", 24, "first frames of the trajectory")
+    _count(accuracy, "--repeats", 5, "timed rounds over all settings")
     _overrides(accuracy, " (default scene=totem budget=demo trajectory=orbit)")
 
 
@@ -177,7 +175,7 @@ def _generic(generic: Parser) -> None:
         "Fit a field to each of many random scenes, train one 2D renderer on all of them, write "
         "its weights: what renderer.init=generic starts from."
     )
-    generic.add_argument("--scenes", type=int, default=8, help="random scenes (default 8)")
+    _count(generic, "--scenes", 8, "random scenes")
     generic.add_argument(
         "--output", type=Path, required=True, metavar="FILE", help="the weights, safetensors"
     )
@@ -188,8 +186,17 @@ def _overrides(parser: Parser, usual: str = "") -> None:
     parser.add_argument("overrides", nargs="*", help=f"settings as of `steerbench run`{usual}")
 
 
-def _frames(parser: Parser, usual: int, which: str) -> None:
-    parser.add_argument("--frames", type=int, default=usual, help=f"{which} (default {usual})")
+def _count(parser: Parser, name: str, usual: int, of_what: str) -> None:
+    help_ = f"{of_what} (default {usual})"
+    parser.add_argument(name, type=number, default=usual, metavar="N", help=help_)
+
+
+def number(text: str) -> int:
+    """A number of things; argparse calls it by the name of this function where it is none."""
+    count = int(text)
+    if count < 1:
+        raise argparse.ArgumentTypeError(f"expected 1 or more, got {count}")
+    return count
 
 
 def _outputs(parser: Parser) -> None:

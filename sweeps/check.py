@@ -14,7 +14,7 @@ from bench.errors import SteerbenchError
 from bench.results import Store, explained
 from bench.sharing import whole
 from reports.regression import LIMITS, Figures, Limit, changes, table
-from reports.runs import Run, load
+from reports.runs import Run, load, readable
 from sweeps.measurement import PLACES
 from sweeps.terminal import console, rich_table
 
@@ -65,10 +65,7 @@ def _whole(store: Store, key: str) -> str:
 
 def _by_command(store: Store) -> dict[str, Run]:
     """Every run, by what was typed for it; of several, the last that was stored."""
-    folders = [path for path in store.folder.glob("[!.]*") if store.find(path.name)]
-    folders.sort(key=lambda path: path.stat().st_mtime)
-    runs = load(store, {path.name: path.name for path in folders})
-    return {_command(str(run.record["command"])): run for run in runs}
+    return {_command(str(run.record["command"])): run for run in readable(store)}
 
 
 def _command(typed: str) -> str:

@@ -29,7 +29,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "20000")
 EXAMPLES = """\
 examples
   steerbench run +experiment=demo              three methods on an embedded scene, and a page
-  steerbench run scene=blender scene.path=DIR  the same on your copy of a NeRF-Synthetic scene
+  steerbench run scene=blender scene.path=DIR  Instant-NGP on your copy of a NeRF-Synthetic scene
   steerbench run --help                        all choices and settings
   steerbench list                              what there is, and what of it is usable here
   steerbench paper budget=tables               every table of the SteerNeRF paper, as a page
@@ -86,6 +86,9 @@ def dispatch(argv: Sequence[str]) -> int:
     if argv and not argv[0].startswith("-") and argv[0] not in COMMANDS:
         raise unknown("command", argv[0], COMMANDS)
     options, unread = parser.parse_known_args(argv)
+    if "overrides" in options:  # of which argparse takes those up to the next option alone
+        options.overrides += [word for word in unread if not word.startswith("-")]
+        unread = [word for word in unread if word.startswith("-")]
     if unread:
         known = re.findall(r"--[\w-]+", options.parser.format_help())
         raise unknown("argument", unread[0], set(known))

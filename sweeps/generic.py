@@ -6,7 +6,6 @@ import argparse
 from pathlib import Path
 
 from bench.console import ConsoleLog
-from bench.errors import SteerbenchError
 from sweeps.build import build
 from sweeps.measurement import checked_settings
 from sweeps.overrides import composed
@@ -22,8 +21,6 @@ SETTINGS = (
 
 def main(options: argparse.Namespace) -> int:
     """Fit a field to each of many random scenes, train one renderer on all, write its weights."""
-    if options.scenes < 1:
-        raise SteerbenchError(f"--scenes: expected 1 or more, got {options.scenes}")
     config = composed([*SETTINGS, *options.overrides])
     log = ConsoleLog(Path(checked_settings(config).outputs))
     method, budget = build(config, "method"), build(config, "budget")

@@ -20,8 +20,6 @@ COLUMNS = ("kernel", "case", "backend", "dtype", "error", "tolerance", "ms", "M 
 
 def main(options: argparse.Namespace) -> int:
     """Print a table and, as the last line, the same rows as JSON; 1 if any kernel is wrong."""
-    if options.repeats < 1:
-        raise SteerbenchError(f"--repeats: expected 1 or more, got {options.repeats}")
     from methods.kernels.benchmark import main_rows
 
     log = ConsoleLog(Path())

@@ -114,6 +114,7 @@ def _obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
             weights_dir=weights,
         )
     record = {**measurement.record, "command": shlex.join(command)}
+    record["scene_path"] = _folder(config)
     store.save(parts, replace(measurement, record=record))
     return Obtained(store, run, measured=True)
 
@@ -165,6 +166,21 @@ def described(config: DictConfig) -> dict[str, Any]:
     if "path" in kept["scene"]:
         kept["scene"]["path"] = Path(kept["scene"]["path"]).name
     return kept
+
+
+def of_scene(run: Run, config: DictConfig) -> bool:
+    """Whether `run`, whose settings are those of `config`, shows the very scene, and not one whose
+    folder has the same last name. Of a folder that is not here nothing but its name is known."""
+    folder = _folder(config)
+    if folder is None or run.record.get("scene_path") == folder or not Path(folder).is_dir():
+        return True
+    scene = _scene(OmegaConf.to_yaml(config.scene, resolve=True), Path(config.outputs))
+    return run.record["scene"]["digest"] == scene.digest
+
+
+def _folder(config: DictConfig) -> str | None:
+    """Where the scene lies; None if it is embedded."""
+    return str(Path(config.scene.path).resolve()) if "path" in config.scene else None
 
 
 def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any]:

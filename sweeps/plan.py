@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import SteerbenchError
-from bench.results import SCHEMA_VERSION, Store, content_key
+from bench.results import Store, content_key
 from reports.published import PaperTable, paper_tables
-from reports.runs import Run, load
+from reports.runs import Run, readable
 from reports.seeds import Repeated
 from sweeps import failures
-from sweeps.measurement import described
+from sweeps.measurement import described, of_scene
 from sweeps.names import unknown
 from sweeps.overrides import composed, swept
 
@@ -98,26 +98,25 @@ def _seeds(overrides: Sequence[str]) -> tuple[list[str], list[list[str]]]:
     return fixed, [[f"{REPEATED}={value}"] for value in values] or [[]]
 
 
-def newest(store: Store) -> dict[str, Run]:
-    """Every run of the store, by the key of its job; of several, that which was stored last."""
-    folders = [path for path in store.folder.glob("[!.]*") if store.find(path.name)]
-    folders.sort(key=lambda path: path.stat().st_mtime)
-    keys = {}
-    for folder in folders:
-        record: Any = store.record(folder.name)
-        if record.get("schema_version") == SCHEMA_VERSION and "config" in record["made_of"]:
-            keys[content_key(record["made_of"]["config"])] = folder.name
-    runs = {run.key: run for run in load(store, {key: key for key in keys.values()})}
-    return {job: runs[key] for job, key in keys.items()}
+def newest(store: Store) -> dict[str, list[Run]]:
+    """The runs of the store by the key of their job, one for each scene that has its settings: that
+    which was stored last, and the last of these first."""
+    found: dict[str, dict[str, Run]] = {}
+    for run in reversed(readable(store)):
+        parts = run.record["made_of"]
+        if "config" in parts:
+            of_job = found.setdefault(content_key(parts["config"]), {})
+            of_job.setdefault(run.record["scene"]["digest"], run)
+    return {job: list(of_scenes.values()) for job, of_scenes in found.items()}
 
 
 def gather(
-    jobs: Sequence[Planned], runs: Mapping[str, Run], outputs: Path
+    jobs: Sequence[Planned], runs: Mapping[str, Sequence[Run]], outputs: Path
 ) -> dict[str, list[Repeated]]:
     """What there is of every line, by table: its runs, and why others are missing.
 
     Args:
-        runs: by the key of their job.
+        runs: as `newest` has them.
     """
     lines: dict[tuple[str, str], list[Planned]] = {}
     for job in jobs:
@@ -127,8 +126,9 @@ def gather(
         found, gaps = [], []
         for job in same:
             failure = failures.found(outputs, described(job.config))
-            if failure is None and job.key in runs:
-                found.append(replace(runs[job.key], label=label))
+            shown = (run for run in runs.get(job.key, ()) if of_scene(run, job.config))
+            if failure is None and (run := next(shown, None)):
+                found.append(replace(run, label=label))
             else:
                 why = "not measured yet" if failure is None else f"failed: {failure}"
                 gaps.append(f"seed {job.config.seed} {why}" if len(same) > 1 else why)

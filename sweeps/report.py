@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 
 from bench.results import Store
@@ -30,13 +31,13 @@ def write(tables: Sequence[PaperTable], jobs: Sequence[Planned], folder: Path | 
     """Write what there is of `jobs` as a page about `tables`, and say where."""
     outputs = Path(jobs[0].config.outputs)
     runs = newest(Store(outputs))
-    lines, found = gather(jobs, runs, outputs), doubts(list(runs.values()))
+    lines, found = gather(jobs, runs, outputs), doubts(list(chain(*runs.values())))
     page = write_paper_page(tables, lines, found, folder or outputs / "paper")
     print(f"report: {page}", file=sys.stderr)
 
 
 def _check(store: Store) -> int:
-    runs = list(newest(store).values())
+    runs = list(chain(*newest(store).values()))
     found = doubts(runs)
     if found:
         console().print(rich_table(table(found, runs)))

@@ -76,8 +76,6 @@ def _points() -> Iterator[Point]:
 
 def main(options: argparse.Namespace) -> int:
     """Print a table with the fitted exponents and, as the last line, the rows as JSON."""
-    if options.frames < 1:
-        raise SteerbenchError(f"--frames: expected 1 or more, got {options.frames}")
     if options.plot is not None and options.plot.suffix != ".png":
         raise SteerbenchError(f"--plot: expected a name that ends in .png, got {options.plot}")
     overrides = [*SETTINGS, *options.overrides]
@@ -130,17 +128,24 @@ def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) 
         records, peak_bytes = _render(method, cameras, log)
     finally:
         torch.set_num_threads(usual)
-    ms = [record.total_ns / 1e6 for record in records]
     samples = [record.done["samples"] + record.done.get("surface_samples", 0) for record in records]
     return {
         "axis": point.axis,
         "label": point.label,
         "value": point.value,
-        "frame_ms": statistics.median(ms),
-        "p99_to_p50": float(np.percentile(ms, 99)) / statistics.median(ms),
+        **_times(records),
         "samples": statistics.mean(samples),
         "peak_bytes": peak_bytes,
         "size_bytes": sum(method.sizes().values()),
+    }
+
+
+def _times(records: Sequence[FrameRecord]) -> dict[str, float]:
+    """Mean time of the frames, as everywhere, and how much longer than usual the longest take."""
+    ms = [record.total_ns / 1e6 for record in records]
+    return {
+        "frame_ms": statistics.mean(ms),
+        "p99_to_p50": float(np.percentile(ms, 99)) / statistics.median(ms),
     }
 
 

@@ -116,8 +116,6 @@ def common_ground(
     Raises:
         SteerbenchError: a setting is wrong.
     """
-    if frames < 1:
-        raise SteerbenchError(f"--frames: expected 1 or more, got {frames}")
     scene = build(config, "scene", log=log)
     path = build(config, "trajectory", scene)
     path = replace(path, name=f"{path.name}-first{frames}", steps=path.steps[:frames])

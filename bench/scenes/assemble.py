@@ -12,9 +12,7 @@ from bench.cameras import move_camera
 from bench.scenes.bounds import Box
 from bench.scenes.files import whole_number
 from bench.scenes.images import Picture, View, decode_all
-from bench.types import Log, Scene, Split, SteerbenchError
-
-BACKGROUNDS = {"white": 1.0, "black": 0.0}
+from bench.types import BACKGROUNDS, Log, Scene, Split, SteerbenchError
 
 SMALLEST, LARGEST = torch.finfo(torch.float32).tiny, torch.finfo(torch.float32).max
 """Lengths that float32 has at its full precision."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -106,6 +107,14 @@ def test_only_frames_that_every_method_has_enough_before_are_scored(in_turns, ti
     rows, _ = in_turns(0, memory=1, trajectory=path)
     alone, _ = in_turns(0, trajectory=warm)
     assert rows[0]["psnr"] == alone[0]["psnr"]
+
+
+def test_a_frame_soon_after_a_cut_is_not_scored(in_turns, tiny_scene):
+    path = from_split(tiny_scene)
+    cut = replace(path, steps=(*path.steps[:2], replace(path.steps[2], cut=True)))
+    rows, _ = in_turns(0, memory=1, trajectory=cut)
+    whole, _ = in_turns(0, memory=1, trajectory=replace(path, steps=path.steps[:2]))
+    assert rows[0]["psnr"] == whole[0]["psnr"]
 
 
 def test_without_a_frame_to_score_the_answer_is_to_give_more(in_turns, tiny_scene):

@@ -52,6 +52,18 @@ def test_a_limit_stands_in_the_name_unless_it_keeps_everything(tiny_scene):
     assert from_split(tiny_scene, limit=99).name == "test"
 
 
+def test_a_frame_that_is_kept_without_the_one_before_it_comes_after_a_cut(tiny_scene):
+    assert [step.cut for step in from_split(tiny_scene, limit=2).steps] == [False, True]
+    steps = from_split(tiny_scene, limit=5).steps
+    assert [step.truth for step in steps] == [0, 1, 2, 4, 5]
+    assert [step.cut for step in steps] == [False, False, False, True, False]
+
+
+def test_the_steps_before_a_step_are_counted_from_the_last_cut(tiny_scene):
+    assert from_split(tiny_scene, limit=5).preceding == [0, 1, 2, 0, 1]
+    assert from_split(tiny_scene, limit=2).preceding == [0, 0]
+
+
 def test_frames_of_different_size_are_called_mixed(tiny_scene):
     test = tiny_scene.splits["test"]
     cameras = [scale_camera(test.cameras[0], 20, 16), *test.cameras[1:]]

@@ -8,8 +8,10 @@ from typing import TypeVar
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from methods.renderer2d import Detail, Observation, Points, Renderer2d, cells_at_matter
+from methods.space_to_depth import SpaceToDepth
 from methods.volume import FeatureFrame
 from tests.methods.conftest import look_at_the_middle
 
@@ -18,6 +20,10 @@ BACKGROUND = torch.tensor([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.5, 0.5])
 ROUNDING = 1e-12
 """Error of a network in float64: activations of size 1 to 10, sums of up to 2,000 products in
 another order, a few tens of u = 1.1e-16 a layer, a few layers deep."""
+
+FLOAT32_ERROR = 1e-5
+"""Activations of size 1 to 10, sums of up to 400 products in another order: a few tens of u = 6e-8,
+a few layers deep."""
 
 POINTS = 20
 
@@ -157,3 +163,44 @@ def features_of(observation: Observation) -> Iterator[Tensor]:
     yield from (frame.values for frame in observation.preceding)
     if observation.surface is not None:
         yield observation.surface.values
+
+
+def new_renderer(
+    channels: int = 6, frames: int = 2, scale: int = 4, *, width: int = 16, blocks: int = 2, **rest
+) -> SpaceToDepth:
+    return SpaceToDepth(channels, frames, scale, width=width, blocks=blocks, init="scratch", **rest)
+
+
+def to_picture(blocks: Tensor, scale: int) -> Tensor:
+    """[h, w, s^2, C] to [h s, w s, C]."""
+    height, width, _, channels = blocks.shape
+    parts = blocks.view(height, width, scale, scale, channels).transpose(1, 2)
+    return parts.reshape(height * scale, width * scale, channels)
+
+
+def shown_by(points: Points) -> tuple[Tensor, Tensor]:
+    """[..., C] and [...]: what each pixel shows, and whether."""
+    return points.values[points.index.clamp(min=0).long()], (points.index >= 0).to(points.values)
+
+
+def at_surface(observation: Observation, scale: int) -> tuple[Tensor, Tensor]:
+    """[H, W, K + 1] and [H, W]: what each pixel shows of the surface, and whether."""
+    assert observation.surface is not None
+    parts = shown_by(observation.surface)
+    values, known = (everywhere(part, observation) for part in parts)
+    return to_picture(values, scale), to_picture(known[..., None], scale)[..., 0]
+
+
+def before(observation: Observation, scale: int) -> tuple[Tensor, Tensor]:
+    """[H, W, 3] and [H, W, 1]: the preceding picture, and where it is known."""
+    assert observation.history is not None
+    values = everywhere(observation.history.values, observation)
+    valid = everywhere(observation.history.valid[..., None], observation)
+    return to_picture(values, scale), to_picture(valid, scale)
+
+
+def enlarged(observation: Observation, scale: int) -> Tensor:
+    """[H, W, 3], at a phase of 0."""
+    rgb = observation.frame.values[..., :3].permute(2, 0, 1)[None]
+    large = functional.interpolate(rgb, scale_factor=scale, mode="bilinear", align_corners=False)
+    return large[0].permute(1, 2, 0)

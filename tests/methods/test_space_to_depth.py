@@ -1,4 +1,4 @@
-"""The lean 2D renderer: against a dense network, its base, what it reads, where it starts."""
+"""The lean 2D renderer: against a dense network, its base, how far it sees."""
 
 from __future__ import annotations
 
@@ -11,57 +11,24 @@ from torch.nn import functional
 
 from methods.cell_network import LEAK
 from methods.cells import REACH
-from methods.renderer2d import Detail, Observation, Points, cells_at_matter
+from methods.renderer2d import Detail, Observation, cells_at_matter
 from methods.space_to_depth import SpaceToDepth
 from tests.methods.observations import (
     BACKGROUND,
+    FLOAT32_ERROR,
     ROUNDING,
+    at_surface,
+    before,
     cut,
     doubled,
-    everywhere,
+    enlarged,
     features_of,
+    new_renderer,
     observe,
     shaken,
+    shown_by,
     spot,
 )
-
-FLOAT32_ERROR = 1e-5
-"""Activations of size 1 to 10, sums of up to 400 products in another order: a few tens of u = 6e-8,
-a few layers deep."""
-
-
-def new_renderer(
-    channels: int = 6, frames: int = 2, scale: int = 4, *, width: int = 16, blocks: int = 2, **rest
-) -> SpaceToDepth:
-    return SpaceToDepth(channels, frames, scale, width=width, blocks=blocks, init="scratch", **rest)
-
-
-def to_picture(blocks: Tensor, scale: int) -> Tensor:
-    """[h, w, s^2, C] to [h s, w s, C]."""
-    height, width, _, channels = blocks.shape
-    parts = blocks.view(height, width, scale, scale, channels).transpose(1, 2)
-    return parts.reshape(height * scale, width * scale, channels)
-
-
-def shown_by(points: Points) -> tuple[Tensor, Tensor]:
-    """[..., C] and [...]: what each pixel shows, and whether."""
-    return points.values[points.index.clamp(min=0).long()], (points.index >= 0).to(points.values)
-
-
-def at_surface(observation: Observation, scale: int) -> tuple[Tensor, Tensor]:
-    """[H, W, K + 1] and [H, W]: what each pixel shows of the surface, and whether."""
-    assert observation.surface is not None
-    parts = shown_by(observation.surface)
-    values, known = (everywhere(part, observation) for part in parts)
-    return to_picture(values, scale), to_picture(known[..., None], scale)[..., 0]
-
-
-def before(observation: Observation, scale: int) -> tuple[Tensor, Tensor]:
-    """[H, W, 3] and [H, W, 1]: the preceding picture, and where it is known."""
-    assert observation.history is not None
-    values = everywhere(observation.history.values, observation)
-    valid = everywhere(observation.history.valid[..., None], observation)
-    return to_picture(values, scale), to_picture(valid, scale)
 
 
 def reached(observation: Observation, scale: int) -> Tensor:
@@ -76,13 +43,6 @@ def reached(observation: Observation, scale: int) -> Tensor:
         above, left = max(row - REACH, 0), max(column - REACH, 0)
         active[above : row + REACH + 1, left : column + REACH + 1] = True
     return active
-
-
-def enlarged(observation: Observation, scale: int) -> Tensor:
-    """[H, W, 3], at a phase of 0."""
-    rgb = observation.frame.values[..., :3].permute(2, 0, 1)[None]
-    large = functional.interpolate(rgb, scale_factor=scale, mode="bilinear", align_corners=False)
-    return large[0].permute(1, 2, 0)
 
 
 def dense(renderer: SpaceToDepth, observation: Observation) -> Tensor:
@@ -344,82 +304,6 @@ def test_a_cell_sees_as_far_as_a_patch_has_to_reach() -> None:
         changed = replace(observation, frame=frame, cells=cells_at_matter(alpha, []))
         difference = (renderer([doubled(changed)]).pictures[middle] - without).abs().max()
         assert (difference > ROUNDING) == seen
-
-
-BLENDING = 6 * 2.0**-24
-"""Error of base + share (other - base), less the background and with it again, of size 1."""
-
-
-@pytest.mark.parametrize("share", [0.0, 1.0])
-def test_the_preceding_picture_is_blended_in_where_it_is_known(share: float) -> None:
-    scale = 4
-    renderer = new_renderer()
-    with torch.no_grad():
-        renderer.network.leave.bias.view(scale**2, 4)[:, 3] = 40.0 if share else -200.0
-    observation = observe()
-    picture, valid = before(observation, scale)
-    base = enlarged(observation, scale)
-    want = torch.where(valid > 0, share * picture + (1 - share) * base, base)
-    assert 0.5 < valid.mean() < 0.8
-    torch.testing.assert_close(renderer([observation]).pictures[0], want, rtol=0, atol=BLENDING)
-
-
-def test_the_surface_covers_the_base_as_far_as_it_is_opaque() -> None:
-    """Where the matrix of every cell is the identity on RGB and looks at nothing else."""
-    scale, channels = 4, 6
-    renderer = new_renderer(channels, history=False)
-    assert renderer.network.read is not None
-    with torch.no_grad():
-        renderer.network.read.bias.view(3, channels + 1)[:, :3] = torch.eye(3)
-    observation = observe(channels=channels)
-    values, known = at_surface(observation, scale)
-    base = enlarged(observation, scale)
-    covered = base + values[..., -1:] * (values[..., :3] - base)
-    want = torch.where(known[..., None] > 0, covered, base)
-    assert 0.5 < known.mean() < 0.8
-    torch.testing.assert_close(renderer([observation]).pictures[0], want, rtol=0, atol=BLENDING)
-
-
-@pytest.mark.parametrize("column", [3, 4, 6])
-def test_a_matrix_reads_opacity_and_other_features_less_the_background(column: int) -> None:
-    """Of K = 6: the opacity is behind the colours, then come the others."""
-    scale, channels = 4, 6
-    renderer = new_renderer(channels, history=False)
-    assert renderer.network.read is not None
-    with torch.no_grad():
-        renderer.network.read.bias.view(3, channels + 1)[1, column] = 1.0  # into green
-    observation = observe(channels=channels)
-    values, known = at_surface(observation, scale)
-    read = values[..., -1] if column == 3 else values[..., column - 1] - BACKGROUND[column - 1]
-    want = enlarged(observation, scale)
-    want[..., 1] += known * read
-    torch.testing.assert_close(renderer([observation]).pictures[0], want, rtol=0, atol=BLENDING)
-
-
-@pytest.mark.parametrize("part", ["history", "surface"])
-def test_a_renderer_without_a_part_ignores_what_is_known_of_it(part: str) -> None:
-    renderer = shaken(new_renderer(**{part: False}))
-    observation = observe()
-    without = replace(observation, **{part: None})
-    assert torch.equal(renderer([observation]).pictures, renderer([without]).pictures)
-    other = shaken(new_renderer())
-    assert not torch.equal(other([observation]).pictures, other([without]).pictures)
-
-
-def test_without_preceding_frames_there_is_no_preceding_picture() -> None:
-    assert not new_renderer(frames=0).layout.history
-    assert new_renderer(frames=0).layout.surface
-
-
-def test_a_point_that_looks_like_the_background_is_not_nothing() -> None:
-    observation = observe(frames=1)
-    renderer = shaken(new_renderer(frames=1))
-    like_background = replace(observation.preceding[0], values=BACKGROUND[:6].expand(20, 6))
-    none = replace(like_background, index=torch.full_like(like_background.index, -1))
-    shown, hidden = (
-        renderer([replace(observation, preceding=[p])]).pictures for p in (like_background, none)
-    )
-    assert (shown - hidden).abs().max() > FLOAT32_ERROR
 
 
 def test_a_doubt_belongs_to_each_cell_of_each_observation() -> None:

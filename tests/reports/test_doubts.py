@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -113,6 +114,12 @@ def test_more_pixels_in_less_time_are_doubted_on_one_machine(make: Make) -> None
     assert keys(faster_with_more_pixels([small, elsewhere])) == []
     a_little = make("a little", width=150, frame_ms=40.0)
     assert keys(faster_with_more_pixels([small, a_little])) == []
+
+
+def test_frames_of_several_sizes_are_held_against_no_others(make: Make) -> None:
+    small, mixed = make("small", frame_ms=50.0), make("mixed", frame_ms=40.0)
+    mixed = replace(mixed, rows=mixed.rows.assign(resolution="mixed"))
+    assert keys(faster_with_more_pixels([small, mixed])) == []
 
 
 def test_all_rules_are_asked_and_their_answers_are_shown(make: Make) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 
 from bench.errors import SteerbenchError
 from bench.results import Store
+from reports.runs import readable
 from sweeps.cli import dispatch
 
 
@@ -104,3 +106,26 @@ def test_two_runs_are_compared_by_the_beginning_of_their_keys(
     assert "psnr" in capsys.readouterr().out
     with pytest.raises(SteerbenchError, match="expected the beginning of one key, 0 runs"):
         dispatch(["compare", "nothing", stored_run, "--outputs", str(outputs)])
+
+
+@pytest.fixture
+def unread(outputs: Path, stored_run: str) -> str:
+    """The key of a second run beside the first, which an older version stored."""
+    key = f"0{stored_run[1:]}"
+    record = shutil.copytree(outputs / "runs" / stored_run, outputs / "runs" / key) / "record.json"
+    record.write_text(record.read_text().replace('"schema_version": 2', '"schema_version": 1'))
+    return key
+
+
+def test_a_run_of_another_schema_is_left_out(
+    baseline: Path, outputs: Path, stored_run: str, unread: str
+) -> None:
+    assert check(baseline, outputs) == 0
+    assert [run.key for run in readable(Store(outputs))] == [stored_run]
+
+
+def test_a_run_of_another_schema_cannot_be_compared(
+    outputs: Path, stored_run: str, unread: str
+) -> None:
+    with pytest.raises(SteerbenchError, match=f"{unread}: its rows have schema 1; this version"):
+        dispatch(["compare", unread, stored_run, "--outputs", str(outputs)])

@@ -57,6 +57,8 @@ def test_list_says_how_to_get_an_engine_that_is_not_installed(steerbench, monkey
         (["results", "--fromat", "csv"], "unknown argument '--fromat'. Did you mean --format?"),
         (["results", "--format", "cvs"], "invalid choice: 'cvs'"),
         (["kernels", "--repeats", "0"], "--repeats: expected 1 or more, got 0"),
+        (["skips", "--frames", "0"], "--frames: expected 1 or more, got 0"),
+        (["parity", "--frames", "many"], "--frames: invalid number value: 'many'"),
         (["scenes", "verfy", "x"], "invalid choice: 'verfy'"),
     ],
 )
@@ -64,6 +66,26 @@ def test_a_wrong_word_is_answered_with_what_there_is(steerbench, argv, message):
     outcome = steerbench(*argv)
     assert outcome.status == 2
     assert message in outcome.err
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["scaling", "scene=totem", "--frames", "0", "budget=demo"], "--frames: expected 1"),
+        (["report", "budget=tiny", "--table", "table3", "sed=1"], "unknown setting 'sed'"),
+        (["report", "seed=0", "--tabl3", "table3", "seed=1"], "Did you mean --table?"),
+    ],
+)
+def test_options_and_settings_are_read_in_any_order(steerbench, argv, message):
+    outcome = steerbench(*argv)
+    assert outcome.status == 2
+    assert message in outcome.err
+
+
+def test_of_settings_around_an_option_the_last_one_counts(steerbench):
+    assert steerbench("report", "outputs=a", "--table", "table3", "outputs=b").status == 0
+    assert Path("b", "paper").is_dir()
+    assert not Path("a").exists()
 
 
 def test_results_before_any_run_say_so(steerbench):

@@ -79,7 +79,7 @@ def test_no_scenes_at_all_are_refused(steerbench, recorder, scenes):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["--scenes", "two", "--output", "w"], "--scenes: invalid int value: 'two'"),
+        (["--scenes", "two", "--output", "w"], "--scenes: invalid number value: 'two'"),
         (["--scenes", "2"], "the following arguments are required: --output"),
         (["--output", "w", "method.joint.rat=1"], "Did you mean method.joint.rate?"),
         (["--output", "w", "budget=genric"], "Did you mean generic?"),
