@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -28,8 +29,9 @@ def distilled_views(
     seed: int,
     folder: Path,
     log: Log,
-) -> list[TrueView]:
-    """`count` views among the training cameras as `trained` shows them at full resolution.
+) -> tuple[list[TrueView], float]:
+    """`count` views among the training cameras as `trained` shows them at full resolution, and the
+    seconds that it took to render them.
 
     Args:
         target: [3] the point that the cameras look at, more or less.
@@ -39,11 +41,15 @@ def distilled_views(
     with missing(path, log) as to_render:
         if to_render:
             generator = torch.Generator().manual_seed(seed)
-            cameras = scene.splits["train"].cameras
-            views = [novel_view(cameras, target, generator) for _ in range(count)]
-            checkpoint.write(path, _rendered(trained, scene, views, log), {"views": count})
+            taken = scene.splits["train"].cameras
+            cameras = [novel_view(taken, target, generator) for _ in range(count)]
+            began = time.monotonic()
+            tensors = _rendered(trained, scene, cameras, log)
+            seconds = time.monotonic() - began
+            checkpoint.write(path, tensors, {"views": count, "seconds": seconds})
     tensors, figures = checkpoint.read(path)
-    return [_unpacked(tensors, number) for number in range(int(figures["views"]))]
+    views = [_unpacked(tensors, number) for number in range(int(figures["views"]))]
+    return views, figures["seconds"]
 
 
 def _rendered(

@@ -82,7 +82,7 @@ class PipelineOptions:
     channels: int = 6
     frames: int = 2
     scale: int = 4
-    range: RangeReduction = RangeReduction()
+    range: RangeReduction = RangeReduction("off")
     reprojection: Reprojection = Reprojection()
     history: bool = True
     surface: bool = True
@@ -104,6 +104,10 @@ class PipelineOptions:
             if not 0 <= (share := getattr(self, name)) <= 1:
                 raise ValueError(f"{name}: expected a share of 0 to 1, got {share}")
         check_stop(self.stop)
+        if not self.frames and self.range.mode != "off":
+            raise ValueError(
+                f"range.mode: expected off without preceding frames (L = 0), got {self.range.mode}"
+            )
 
     def taught(self, refined: float) -> PipelineOptions:
         """The options of a training. It looks everywhere, so that one serves all choices of where

@@ -13,7 +13,7 @@ from torch import Tensor
 from bench.motion import viewing_target
 from bench.provenance import ROOT, digest
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
-from methods import checkpoint, loop
+from methods import loop
 from methods.buffer import RenderingBuffer
 from methods.calibration import recorded_inputs
 from methods.distil import distilled_views
@@ -100,24 +100,21 @@ class SteerNerf:
         key = self.setup.key(scene, budget)
         target = viewing_target(scene)
         distilled: list[TrueView] = []
+        distilled_s = 0.0
         if views := self.joint.distilled(budget.renderer_steps):
             of_views = {**key, "views": views, "stage2": stage2_digest()}
             folder = log.stage_dir("distilled", of_views)
-            distilled = distilled_views(trained, scene, target, views, seed, folder, log)
+            distilled, distilled_s = distilled_views(
+                trained, scene, target, views, seed, folder, log
+            )
         trained.field.widen(options.channels)
         self.pipeline, training = self._stage2(trained, scene, distilled, target, budget)
         key |= self._key(budget)
         folder = log.stage_dir("steernerf", key)
-        finished = folder / "steernerf.safetensors"
-        if finished.exists():
-            tensors, figures = checkpoint.read(finished)
-            training.restore_result(tensors)
-            training.seconds = figures["seconds"]
-            log.info(f"trained renderer found: {finished}")
-        else:
-            loop.train(training, finished, f"training {self.name}", log)
+        loop.train(training, folder / "steernerf.safetensors", f"training {self.name}", log)
         trained.field.requires_grad_(False).grad_buffer = None
-        self.trained, self.train_s = trained, trained.train_s + training.seconds
+        self.trained = trained
+        self.train_s = trained.train_s + distilled_s + training.seconds
         self.pipeline.renderer.requires_grad_(False)
         self._hand_over(scene, target, key, log)
 

@@ -29,7 +29,7 @@ def views_of(
     trained: Pretrained, scene: Scene, folder: Path, log: Log, seed: int = 0
 ) -> list[TrueView]:
     folder.mkdir(exist_ok=True)
-    return distilled_views(trained, scene, TARGET, COUNT, seed, folder, log)
+    return distilled_views(trained, scene, TARGET, COUNT, seed, folder, log)[0]
 
 
 def same(first: list[TrueView], second: list[TrueView]) -> bool:

@@ -230,6 +230,8 @@ def test_a_share_of_cells_is_between_0_and_1() -> None:
         replace(OPTIONS, overlap=-0.5)
     with pytest.raises(ValueError, match=r"stop: expected a transmittance .* got 1\.0"):
         replace(OPTIONS, stop=1.0)
+    with pytest.raises(ValueError, match=r"range.mode: expected off without .* got window"):
+        replace(OPTIONS, frames=0, range=RangeReduction("window"))
 
 
 class Work(NullProbe):

@@ -59,7 +59,7 @@ def test_what_was_trained_is_found_again_and_renders_the_same(
     first.fit(ball_scene, BUDGET, log)
     capsys.readouterr()
     second.fit(ball_scene, BUDGET, log)
-    assert "trained renderer found" in capsys.readouterr().err
+    assert "training steernerf: found in" in capsys.readouterr().err
     assert stages(tmp_path) == ["distilled", "field", "steernerf"]
     assert second.train_s == first.train_s > 0
     for camera in ball_scene.splits["test"].cameras:
