@@ -103,6 +103,21 @@ def move_camera(camera: Camera, scale: float, offset: Tensor) -> Camera:
     return replace(camera, c2w=torch.cat((pose[:, :3], centre), dim=1).float())
 
 
+INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height")
+
+
+def pack_camera(camera: Camera) -> Tensor:
+    """All of `camera` as [18] float64 on the CPU: `c2w` row by row, then the intrinsics."""
+    inside = torch.tensor([getattr(camera, name) for name in INTRINSICS], dtype=torch.float64)
+    return torch.cat((camera.c2w.double().cpu().flatten(), inside))
+
+
+def unpack_camera(packed: Tensor) -> Camera:
+    """The camera that `pack_camera` packed, to the last bit, on the CPU."""
+    fx, fy, cx, cy, width, height = packed[12:].tolist()
+    return Camera(packed[:12].view(3, 4).float(), fx, fy, cx, cy, int(width), int(height))
+
+
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
     """Camera-to-world [3, 4] at `eye`, looking at `target`, with `up` upward in the picture."""
     forward = torch.nn.functional.normalize(target - eye, dim=0)

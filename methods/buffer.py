@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.cameras import pixel_grid, project, unproject
+from bench.cameras import pack_camera, pixel_grid, project, unpack_camera, unproject
 from bench.types import Camera
+from methods.checkpoint import part
 from methods.kernels.splat import splat
 from methods.volume import FeatureFrame
 
@@ -39,6 +40,10 @@ class Reprojection:
     rule: Literal["nearest", "last"] = "nearest"
     centres: Literal["exact", "paper"] = "exact"
     depth: Literal["expected", "sum"] = "expected"
+
+
+CLOUD = ("source", "points", "values", "alpha")
+"""The tensors of a cloud."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +148,48 @@ class RenderingBuffer:
         other._frames.extend(self._frames)
         return other
 
+    def state(self) -> dict[str, Tensor]:
+        """All that is remembered, to be kept in a file."""
+        tensors = {"turn": torch.tensor(self.turn)}
+        for age, frame in enumerate(self._frames):
+            tensors |= {f"{age}.{name}": x for name, x in _packed(frame).items()}
+        return tensors
+
+    def restore(self, tensors: Mapping[str, Tensor], device: torch.device) -> None:
+        """Remember on `device` what `state` gave of another buffer."""
+        self.turn = int(tensors["turn"])
+        ages = sum(name.endswith(".camera") for name in tensors)
+        frames = (_unpacked(part(tensors, f"{age}."), device) for age in range(ages))
+        self._frames = deque(frames, self._frames.maxlen)
+
     def reset(self) -> None:
         """Forget all: a new sequence starts."""
         self._frames.clear()
         self.turn = 0
+
+
+def _packed(frame: Remembered) -> dict[str, Tensor]:
+    """Of the picture only what differs from its first pixel: most of it is background."""
+    cloud, pixels = frame.cloud, frame.picture.flatten(0, 1)
+    places = (pixels != pixels[0]).any(dim=1).nonzero().squeeze(1)
+    parts = {name: getattr(cloud, name) for name in CLOUD}
+    return parts | {
+        "cloud_camera": pack_camera(cloud.camera),
+        "camera": pack_camera(frame.camera),
+        "background": pixels[0].clone(),
+        "places": places.int(),
+        "pixels": pixels[places],
+    }
+
+
+def _unpacked(tensors: Mapping[str, Tensor], device: torch.device) -> Remembered:
+    cloud_camera, camera = (_camera(tensors[name], device) for name in ("cloud_camera", "camera"))
+    cloud = Cloud(cloud_camera, **{name: tensors[name].to(device) for name in CLOUD})
+    picture = tensors["background"].repeat(camera.height * camera.width, 1)
+    picture[tensors["places"].long()] = tensors["pixels"]
+    return Remembered(cloud, camera, picture.view(camera.height, camera.width, 3).to(device))
+
+
+def _camera(packed: Tensor, device: torch.device) -> Camera:
+    camera = unpack_camera(packed)
+    return replace(camera, c2w=camera.c2w.to(device))

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from bench.cameras import pack_camera, unpack_camera
 from bench.motion import novel_view
 from bench.sharing import missing
 from bench.types import Camera, Log, NullProbe, Scene
@@ -17,8 +18,6 @@ from methods import checkpoint
 from methods.pretrained import Pretrained
 from methods.range_reduction import render_guided
 from methods.sequences import TrueView
-
-INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height")
 
 
 def distilled_views(
@@ -74,16 +73,8 @@ def _picture(trained: Pretrained, camera: Camera, background: Tensor) -> Tensor:
 
 
 def _packed(number: int, camera: Camera, picture: Tensor) -> dict[str, Tensor]:
-    inside = torch.tensor([getattr(camera, name) for name in INTRINSICS], dtype=torch.float64)
-    return {
-        f"{number}.picture": picture,
-        f"{number}.c2w": camera.c2w.contiguous(),
-        f"{number}.intrinsics": inside,
-    }
+    return {f"{number}.picture": picture, f"{number}.camera": pack_camera(camera)}
 
 
 def _unpacked(tensors: Mapping[str, Tensor], number: int) -> TrueView:
-    inside = dict(zip(INTRINSICS, tensors[f"{number}.intrinsics"].tolist(), strict=True))
-    inside |= {side: int(inside[side]) for side in ("width", "height")}
-    camera = Camera(tensors[f"{number}.c2w"], **inside)
-    return TrueView(camera, tensors[f"{number}.picture"])
+    return TrueView(unpack_camera(tensors[f"{number}.camera"]), tensors[f"{number}.picture"])

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from bench.motion import viewing_target
 from bench.results import explained
@@ -31,6 +32,16 @@ class AnyOf:
         """See `methods.patches.Patches`."""
         place = int(torch.randint(len(self.sources), (), generator=self.generator))
         return self.sources[place].draw(count)
+
+    def state(self) -> dict[str, Tensor]:
+        """See `methods.patches.Patches`."""
+        states = (source.state() for source in self.sources)
+        return {f"{n}.{name}": x for n, state in enumerate(states) for name, x in state.items()}
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """See `methods.patches.Patches`."""
+        for number, source in enumerate(self.sources):
+            source.restore(checkpoint.part(tensors, f"{number}."))
 
 
 def train_generic(

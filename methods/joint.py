@@ -183,10 +183,10 @@ class RendererTraining:
         self.mean.load_state_dict(checkpoint.part(tensors, "mean."))
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Renderer, optimiser, random numbers. The sequences are not in it: going on, they are
-        rendered anew."""
+        """Renderer, optimiser, random numbers, and what the next patches are cut out of."""
         tensors = {f"renderer.{name}": x for name, x in self.renderer.state_dict().items()}
         tensors |= checkpoint.optimiser_tensors(self.optimiser, "renderer_adam.")
+        tensors |= {f"patches.{name}": x for name, x in self.patches.state().items()}
         return tensors | {
             "generator": self.generator.get_state(),
             "averaged": self._averaged.n_averaged,
@@ -197,6 +197,7 @@ class RendererTraining:
         self.restore_result(tensors)
         self.renderer.load_state_dict(checkpoint.part(tensors, "renderer."))
         checkpoint.restore_optimiser(self.optimiser, tensors, "renderer_adam.")
+        self.patches.restore(checkpoint.part(tensors, "patches."))
         self.generator.set_state(tensors["generator"].cpu())
         self._averaged.n_averaged.copy_(tensors["averaged"])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
@@ -68,6 +69,12 @@ class Patches(Protocol):
     def draw(self, count: int) -> Batch:
         """`count` patches."""
 
+    def state(self) -> dict[str, Tensor]:
+        """What the next patches depend on, beside the pipeline and the random numbers."""
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Put back what `state` gave."""
+
 
 class PatchSource:
     """Batches of random patches of the sequences of a pool.
@@ -96,6 +103,14 @@ class PatchSource:
         observations, opacity = self.observe(patches)
         truth = torch.stack([patch.truth for patch in patches])
         return Batch(observations, [patch.view for patch in patches], truth, opacity)
+
+    def state(self) -> dict[str, Tensor]:
+        """See `Patches`."""
+        return self.pool.state()
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """See `Patches`."""
+        self.pool.restore(tensors)
 
     def cut(self, sequence: Sequence) -> Patch:
         """A random patch of `sequence` in which there is more than background."""

@@ -7,6 +7,7 @@ pipeline as it stands, and rendered anew, along another motion, when they have s
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from collections.abc import Sequence as Seq
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from torch import Tensor
 from bench.motion import preceding
 from bench.types import Camera, NullProbe, Scene
 from methods.buffer import RenderingBuffer
+from methods.checkpoint import part
 from methods.pipeline import Pipeline, View
 
 
@@ -39,6 +41,7 @@ class Sequence:
     anew or, if it is `lasting`, goes on.
 
     Attributes:
+        number: of the view, among those of its pool.
         truth: the view and its picture.
         view: the view as the pipeline sees it.
         buffer: the preceding frames.
@@ -46,6 +49,7 @@ class Sequence:
             background, or of all if it is.
     """
 
+    number: int
     truth: TrueView
     view: View
     buffer: RenderingBuffer
@@ -104,7 +108,7 @@ class SequencePool:
         generator: torch.Generator,
     ) -> None:
         self._pipeline, self._target, self._options = pipeline, target, options
-        self._real, self._distilled = real, distilled
+        self._views, self._real = [*real, *distilled], len(real)
         self._share = share if distilled else 0.0
         self._generator = generator
         self._pool: list[Sequence] = []
@@ -122,21 +126,42 @@ class SequencePool:
         sequence.uses -= 1
         return sequence
 
+    def state(self) -> dict[str, Tensor]:
+        """All sequences as they stand, to be kept in a file."""
+        tensors = {}
+        for place, sequence in enumerate(self._pool):
+            figures = (sequence.number, sequence.uses, sequence.lasting)
+            tensors[f"{place}.figures"] = torch.tensor(figures)
+            tensors |= {f"{place}.{name}": x for name, x in sequence.buffer.state().items()}
+        return tensors
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Go on with the sequences that `state` gave, of a pool of the same views and options."""
+        count = sum(name.endswith(".figures") for name in tensors)
+        self._pool = [self._restored(part(tensors, f"{place}.")) for place in range(count)]
+
+    def _restored(self, tensors: Mapping[str, Tensor]) -> Sequence:
+        number, uses, lasting = tensors["figures"].tolist()
+        buffer = RenderingBuffer(self._pipeline.options.frames)
+        buffer.restore(tensors, self._pipeline.background.device)
+        cells = _cells_with_content(self._views[number].picture, self._pipeline)
+        return self._sequence(number, buffer, cells, uses, bool(lasting))
+
     def _make(self) -> Sequence:
         distilled = self._chance() < self._share
-        views = self._distilled if distilled else self._real
-        truth = views[self._random(len(views))]
+        first, end = (self._real, len(self._views)) if distilled else (0, self._real)
+        number = first + self._random(end - first)
         options = self._pipeline.options
         buffer = RenderingBuffer(options.frames, turn=self._random(options.scale**2))
-        cells = _cells_with_content(truth.picture, self._pipeline)
-        return self._ended(truth, self._motion(truth), buffer, cells)
+        cells = _cells_with_content(self._views[number].picture, self._pipeline)
+        return self._ended(number, self._motion(self._views[number]), buffer, cells)
 
     def _go_on(self, old: Sequence) -> Sequence:
         """Go on from the view that `old` ends in, there and back."""
         back = self._motion(old.truth)
         back = back[len(back) // 2 :]
         path = [old.truth.camera, *reversed(back), *back[1:]]
-        return self._ended(old.truth, path, old.buffer.copy(), old.cells)
+        return self._ended(old.number, path, old.buffer.copy(), old.cells)
 
     def _motion(self, truth: TrueView) -> list[Camera]:
         options = self._options
@@ -144,16 +169,22 @@ class SequencePool:
         return preceding(truth.camera, self._target, count, options.degrees, self._generator)
 
     def _ended(
-        self, truth: TrueView, motion: Seq[Camera], buffer: RenderingBuffer, cells: Tensor
+        self, number: int, motion: Seq[Camera], buffer: RenderingBuffer, cells: Tensor
     ) -> Sequence:
-        """The sequence of `truth` whose `buffer` has seen the frames of a `motion` besides."""
+        """The sequence of a view whose `buffer` has seen the frames of a `motion` besides."""
         if self._pipeline.options.frames:
             for camera in motion:
                 self._pipeline.render(camera, buffer, NullProbe())
-        view = View.of(truth.camera, self._pipeline.options, buffer.turn)
         # Without frames before it, a view that goes on would be the same once more.
         lasting = self._chance() < self._options.longer and self._pipeline.options.frames > 0
-        return Sequence(truth, view, buffer, cells, self._options.uses, lasting)
+        return self._sequence(number, buffer, cells, self._options.uses, lasting)
+
+    def _sequence(
+        self, number: int, buffer: RenderingBuffer, cells: Tensor, uses: int, lasting: bool
+    ) -> Sequence:
+        truth = self._views[number]
+        view = View.of(truth.camera, self._pipeline.options, buffer.turn)
+        return Sequence(number, truth, view, buffer, cells, uses, lasting)
 
     def _chance(self) -> float:
         return torch.rand((), generator=self._generator).item()

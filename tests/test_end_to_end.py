@@ -157,9 +157,7 @@ SMALLEST = [
     *("budget.frames=1", "protocol.name=quick", "protocol.lpips=[]", "protocol.warmup=0"),
     *("method.grid.levels=4", "method.grid.log2_table=10", "method.pipeline.refined=0"),
     *("method.joint.refined=0", "method.joint.patch=6", "method.joint.distilled_views=1"),
-    # Checkpoints of 2D renderers hold no preceding frames, so that without any they are exact.
-    *("method.pipeline.frames=0", "method.joint.motion.longer=0"),
-    *("method.joint.motion.pool=1", "method.joint.motion.uses=1"),
+    *("method.joint.motion.pool=2", "method.joint.motion.uses=3"),
 ]
 
 

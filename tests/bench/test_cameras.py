@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -15,9 +16,11 @@ from bench.cameras import (
     frame_camera,
     look_at,
     move_camera,
+    pack_camera,
     pixel_grid,
     project,
     scale_camera,
+    unpack_camera,
     unproject,
 )
 from bench.types import Camera
@@ -135,3 +138,11 @@ def test_look_at_centres_the_target_with_up_upward() -> None:
     assert pixels[1, 1] < pixels[0, 1]
     rotation = camera.c2w[:, :3]
     assert torch.linalg.det(rotation).item() == pytest.approx(1, abs=1e-6)
+
+
+def test_a_packed_camera_comes_back_to_the_last_bit() -> None:
+    c2w = torch.randn(3, 4, generator=torch.Generator().manual_seed(0))
+    camera = Camera(c2w, 1 / 3, 700.1, -2.7, 1e-9, 4097, 3)
+    again = unpack_camera(pack_camera(camera))
+    assert torch.equal(again.c2w, c2w)
+    assert replace(again, c2w=c2w) == camera

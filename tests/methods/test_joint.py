@@ -328,24 +328,22 @@ def test_a_killed_training_goes_on_with_the_same_state(
         assert torch.equal(tensor, found.result()[name])
 
 
-def test_without_preceding_frames_a_killed_training_ends_as_if_it_had_never_stopped(
+def test_a_killed_training_ends_as_if_it_had_never_stopped(
     ball_scene: Scene, tmp_path: Path
 ) -> None:
-    """With a pool that is always drawn anew, the random numbers are all there is to go on from."""
-    pipeline = replace(PIPELINE, frames=0)
-    options = replace(OPTIONS, motion=MotionOptions(pool=1, uses=1, longer=0.0))
-    whole = new_training(ball_scene, options, pipeline)
-    for _ in range(3):
+    """The sequences go on, too: there and back, or to be made anew when they are used up."""
+    options = replace(OPTIONS, motion=MotionOptions(pool=2, uses=3, longer=0.5))
+    whole = new_training(ball_scene, options)
+    for _ in range(4):
         whole.advance()
     loop.save(whole, tmp_path / "checkpoint.safetensors")
-    for _ in range(3):
-        whole.advance()
-    again = new_training(ball_scene, options, pipeline)
+    again = new_training(ball_scene, options)
     loop.resume(again, tmp_path / "checkpoint.safetensors")
-    for _ in range(3):
-        again.advance()
-    for name, tensor in whole.result().items():
-        assert torch.equal(tensor, again.result()[name]), name
+    for training in (whole, again):
+        for _ in range(4):
+            training.advance()
+    for name, tensor in (whole.result() | whole.state()[0]).items():
+        assert torch.equal(tensor, (again.result() | again.state()[0])[name]), name
 
 
 def test_a_loss_that_is_no_number_stops_and_names_what_is_not_finite(ball_scene: Scene) -> None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 import torch
 
 from bench.types import Scene
+from methods import checkpoint
 from methods.sequences import MotionOptions, SequencePool, TrueView
 from tests.methods.test_pipeline import OPTIONS, new_pipeline
 
@@ -88,6 +90,28 @@ def test_going_on_leaves_what_was_drawn_before_as_it_was(ball_scene: Scene) -> N
     frames = first.buffer.frames
     pool.draw()
     assert first.buffer.frames == frames
+
+
+def test_a_pool_that_was_kept_in_a_file_goes_on_as_it_would_have(
+    ball_scene: Scene, tmp_path: Path
+) -> None:
+    motion = MotionOptions(pool=3, uses=2, longer=0.5)
+    pool, other = (new_pool(ball_scene, motion, share=0.5) for _ in range(2))
+    for _ in range(12):
+        pool.draw()
+    checkpoint.write(tmp_path / "pool.safetensors", pool.state(), {})
+    other.restore(checkpoint.read(tmp_path / "pool.safetensors")[0])
+    other._generator.set_state(pool._generator.get_state())
+    for _ in range(12):
+        one, same = pool.draw(), other.draw()
+        assert torch.equal(one.truth.picture, same.truth.picture)
+        assert torch.equal(one.cells, same.cells)
+        assert (one.uses, one.lasting) == (same.uses, same.lasting)
+        kept, found = one.buffer.state(), same.buffer.state()
+        assert kept.keys() == found.keys()
+        assert all(torch.equal(kept[name], found[name]) for name in kept)
+        for a, b in zip(one.buffer.frames, same.buffer.frames, strict=True):
+            assert torch.equal(a.picture, b.picture)
 
 
 def test_cells_are_those_in_which_something_is(ball_scene: Scene) -> None:
