@@ -74,7 +74,8 @@ paper does not give, or a method that does not exist here.
 
 Below each table stands what grows from line to line in the paper, and by how much it grows here. It
 `holds` where the whole 95 % interval is above zero. An interval over the frames of one seed does
-not hold the difference between one training and the next; give several seeds for that."""
+not hold the difference between one training and the next, nor how fast the machine was when a line
+was measured; give several seeds for that."""
 
 
 def _doubted(lines: Lines, found: Sequence[Doubt]) -> Iterator[str]:
