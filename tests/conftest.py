@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
+import signal
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
@@ -27,6 +28,9 @@ from bench.types import Budget, Camera, Frame, Log, Probe, Scene, Split
 hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True)
 hypothesis.settings.register_profile("fuzz", max_examples=10_000, deadline=5000)  # ms; no hang
 hypothesis.settings.load_profile("repeatable")
+
+# A shell has what it starts in the background ignore SIGINT, and so all that is started from there.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from bench.cameras import pack_camera
 from bench.types import Log, NullProbe, Scene
 from methods import distil
 from methods.distil import distilled_views
@@ -34,12 +35,9 @@ def views_of(
 
 def same(first: list[TrueView], second: list[TrueView]) -> bool:
     """Whether poses, intrinsics and pictures are equal to the last bit."""
-    inside = [
-        [[getattr(view.camera, name) for name in distil.INTRINSICS] for view in views]
-        for views in (first, second)
-    ]
-    return inside[0] == inside[1] and all(
-        torch.equal(a.camera.c2w, b.camera.c2w) and torch.equal(a.picture, b.picture)
+    return all(
+        torch.equal(pack_camera(a.camera), pack_camera(b.camera))
+        and torch.equal(a.picture, b.picture)
         for a, b in zip(first, second, strict=True)
     )
 
