@@ -96,24 +96,21 @@ def load(store: Store, labels: Mapping[str, str]) -> list[Run]:
                 f"{store.folder / key}: its rows have schema {records[key].get('schema_version')}; "
                 f"this version reads schema {SCHEMA_VERSION}"
             )
-    return [
-        Run(
-            key,
-            label,
-            by_run[key],
-            cache(partial(store.frames, key)),
-            records[key],
-            store.folder / key / "pictures",
-        )
-        for key, label in labels.items()
-    ]
+    return [_run(store, key, label, by_run[key], records[key]) for key, label in labels.items()]
 
 
 def readable(store: Store) -> list[Run]:
     """Every run that this version can read, under its key; the last that was stored comes last."""
-    folders = [folder for folder in map(store.find, _rows_by_run(store)) if folder]
+    by_run = _rows_by_run(store)
+    folders = [folder for folder in map(store.find, by_run) if folder]
     folders.sort(key=lambda folder: folder.stat().st_mtime)
-    return load(store, {folder.name: folder.name for folder in folders})
+    keys = [folder.name for folder in folders]
+    return [_run(store, key, key, by_run[key], store.record(key)) for key in keys]
+
+
+def _run(store: Store, key: str, label: str, rows: pd.DataFrame, record: Mapping[str, Any]) -> Run:
+    frames = cache(partial(store.frames, key))
+    return Run(key, label, rows, frames, record, store.folder / key / "pictures")
 
 
 def _rows_by_run(store: Store) -> dict[str, pd.DataFrame]:
