@@ -259,7 +259,7 @@ class JointTraining(RendererTraining):
             jitter=None,
             background=pipeline.background,
             stop=pipeline.options.stop,
-            step=pipeline.options.steps * STEP,
+            step=pipeline.options.refined_steps * STEP,
         )
         error = (pixels.values[:, :3] - wanted[some]).square().sum() / len(some)
         return error * len(wanted) / batch.truth.numel()

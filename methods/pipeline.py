@@ -72,10 +72,12 @@ class PipelineOptions:
         feature_background: what the features beyond RGB are composited on. 1/2 is what an
             untrained feature is everywhere.
         stop: transmittance at which a ray ends.
-        steps: length of a ray-marching step, in those of stage 1: stage 2 teaches the field to do
-            with longer ones.
+        steps: length of a ray-marching step at low resolution, in those of stage 1: stage 2 teaches
+            the field to do with longer ones.
         refined: share of the cells whose pixels are rendered by the field after all, those that
             the 2D renderer doubts most. It can be chosen after the training, too.
+        refined_steps: length of a ray-marching step there. It can be chosen after the training,
+            which takes steps as short as those of stage 1: at full resolution longer ones show.
         skip: what is not computed. Nor is it trained for.
     """
 
@@ -92,14 +94,18 @@ class PipelineOptions:
     stop: float = STOP
     steps: float = 1.0
     refined: float = 0.0
+    refined_steps: float = 1.0
     skip: Skips = Skips()
 
     def __post_init__(self) -> None:
-        if not (self.channels >= 3 and self.frames >= 0 and self.scale >= 1 and self.steps > 0):
+        if not (self.channels >= 3 and self.frames >= 0 and self.scale >= 1):
             raise ValueError(
-                f"expected channels (K) >= 3, frames (L) >= 0, scale (s) >= 1, steps > 0, "
-                f"got {self.channels}, {self.frames}, {self.scale}, {self.steps}"
+                f"expected channels (K) >= 3, frames (L) >= 0, scale (s) >= 1, "
+                f"got {self.channels}, {self.frames}, {self.scale}"
             )
+        for name in ("steps", "refined_steps"):
+            if not (length := getattr(self, name)) > 0:
+                raise ValueError(f"{name}: expected a length of more than 0, got {length}")
         for name in ("overlap", "refined"):
             if not 0 <= (share := getattr(self, name)) <= 1:
                 raise ValueError(f"{name}: expected a share of 0 to 1, got {share}")
@@ -113,7 +119,9 @@ class PipelineOptions:
         """The options of a training. It looks everywhere, so that one serves all choices of where
         to look that are made afterwards."""
         off = RangeReduction("off")
-        return replace(self, range=off, overlap=0.0, refined=refined, skip=Skips())
+        return replace(
+            self, range=off, overlap=0.0, refined=refined, refined_steps=1.0, skip=Skips()
+        )
 
 
 class Pipeline:
@@ -268,7 +276,7 @@ class Pipeline:
             self.occupancy,
             probe,
             stop=self.stop,
-            step=options.steps * STEP,
+            step=options.refined_steps * STEP,
             window=window,
         )
         colours = found.values[:, :3] + (1 - found.alpha)[:, None] * self.background[:3]

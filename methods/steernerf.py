@@ -52,7 +52,7 @@ SOURCES = (
 CALIBRATED_BY = ("calibration.py", "engines/__init__.py")
 """Files below this folder that decide on which frames an engine's network is built."""
 
-NOT_TRAINED_FOR = ("overlap", "range", "refined", "skip")
+NOT_TRAINED_FOR = ("overlap", "range", "refined", "refined_steps", "skip")
 """Options of a pipeline that stage 2 does not depend on; see `PipelineOptions.taught`."""
 
 

@@ -46,6 +46,7 @@ def knobs(trained: bool) -> Mapping[str, Sequence[Variant]]:
         "everything off": [EVERYTHING_OFF],
         "as it is": [AS_IT_IS],
         "step length": [_step(value) for value in (1, 1.5, 3, 4)],
+        "refined step length": [_refined_step(value) for value in (1.5, 2, 3)],
         "stop": [_stop(value) for value in ("1e-1", "3e-2", "1e-3", "1e-4")],
         "range reduction": [
             _range(mode, value) for mode in ("window", "paper") for value in (0.01, 0.03, 0.1)
@@ -59,7 +60,7 @@ def knobs(trained: bool) -> Mapping[str, Sequence[Variant]]:
         "two knobs": [
             _both(_refined(share), other)
             for share in (0, 0.06, 0.25, 0.5, 1)
-            for other in (_step(1), _step(3), _range("window", 0.03))
+            for other in (_step(1), _refined_step(2), _range("window", 0.03))
         ],
         **(_trainings() if trained else {}),
     }
@@ -68,6 +69,10 @@ def knobs(trained: bool) -> Mapping[str, Sequence[Variant]]:
 def _step(value: float) -> Variant:
     """In steps of stage 1, whatever the training was taught."""
     return Variant(f"step {value}", ("method=steernerf_untaught", f"method.pipeline.steps={value}"))
+
+
+def _refined_step(value: float) -> Variant:
+    return Variant(f"refined step {value}", (f"method.pipeline.refined_steps={value}",))
 
 
 def _stop(value: str) -> Variant:

@@ -149,7 +149,8 @@ def test_where_no_pixel_has_a_depth_there_is_no_surface() -> None:
 
 @pytest.mark.parametrize("mode", ["off", "window"])
 def test_where_every_cell_is_refined_the_picture_is_that_of_the_field(mode: Mode) -> None:
-    options = replace(OPTIONS, refined=1.0, range=RangeReduction(mode, epsilon=1.0))
+    range_ = RangeReduction(mode, epsilon=1.0)
+    options = replace(OPTIONS, refined=1.0, refined_steps=4.0, range=range_)
     pipeline, buffer = new_pipeline(options), RenderingBuffer(2)
     shown = pipeline.render(CAMERA, buffer, NullProbe()).rgb
     field = render_guided(
@@ -159,7 +160,7 @@ def test_where_every_cell_is_refined_the_picture_is_that_of_the_field(mode: Mode
         pipeline.background,
         NullProbe(),
         None,
-        step=OPTIONS.steps * STEP,
+        step=options.refined_steps * STEP,
     )
     drawn = cells_near(pipeline._features(View.of(CAMERA, options, 0), None, NullProbe()).alpha > 0)
     assert 10 < len(drawn) < 64
@@ -217,10 +218,16 @@ def test_what_a_renderer_that_knows_no_doubt_drew_cannot_be_refined() -> None:
         )
 
 
-@pytest.mark.parametrize("wrong", [{"channels": 2}, {"frames": -1}, {"scale": 0}, {"steps": 0.0}])
+@pytest.mark.parametrize("wrong", [{"channels": 2}, {"frames": -1}, {"scale": 0}])
 def test_options_that_make_no_frame_are_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="expected channels"):
         replace(OPTIONS, **wrong)
+
+
+@pytest.mark.parametrize("name", ["steps", "refined_steps"])
+def test_a_step_has_a_length(name: str) -> None:
+    with pytest.raises(ValueError, match=f"^{name}: expected a length of more than 0, got 0.0"):
+        replace(OPTIONS, **{name: 0.0})
 
 
 def test_a_share_of_cells_is_between_0_and_1() -> None:

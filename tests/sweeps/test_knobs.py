@@ -6,11 +6,10 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from methods.steernerf import NOT_TRAINED_FOR
 from sweeps.knobs import AS_IT_IS, EVERYTHING_OFF, knobs
 from sweeps.overrides import composed
 from sweeps.variants import Variant
-
-NOT_TRAINED_FOR = ("overlap", "range", "refined", "skip")
 
 
 def variants(trained: bool) -> list[Variant]:
