@@ -52,6 +52,10 @@ class CellNetwork(Network):
         heads = (self.leave, self.doubt, self.read)
         return tuple(head(hidden) for head in heads if head is not None)
 
+    def products(self, *inputs: Tensor) -> int:
+        """See `Network`: every matrix, and the taps of every channel, once a cell."""
+        return len(inputs[0]) * sum(x.numel() for x in self.parameters() if x.dim() > 1)
+
 
 class _Linear(nn.Linear):
     def forward(self, x: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Literal
 
@@ -9,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from bench.types import Probe
 from methods.kernels.encode import HashGrid, encode, pack
 from methods.kernels.spherical import CHANNELS as DIRECTION_CHANNELS
 from methods.kernels.spherical import spherical_harmonics
@@ -30,6 +32,9 @@ class HashField(nn.Module):
 
     With precision "bf16" the table is read as packed bfloat16 and the matrix products are bfloat16
     with float32 accumulation; parameters, gradients of the table and outputs stay float32.
+
+    Attributes:
+        levels: of the grid that are read, the coarsest first.
     """
 
     def __init__(
@@ -44,6 +49,7 @@ class HashField(nn.Module):
     ) -> None:
         super().__init__()
         self.grid, self.channels, self.precision, self.backend = grid, channels, precision, backend
+        self.levels = grid.levels
         table = torch.empty(grid.entries, grid.features).uniform_(-1e-4, 1e-4, generator=generator)
         self.table = nn.Parameter(table)
         sizes = {
@@ -76,6 +82,12 @@ class HashField(nn.Module):
             functional.pad(old, (0, 0, 0, channels - len(old)))
         )
 
+    def coarse(self, levels: int) -> HashField:
+        """This very field, of which only the coarsest `levels` are read."""
+        field = copy.copy(self)  # shares parameters and buffers
+        field.levels = levels
+        return field
+
     def encode_directions(self, directions: Tensor) -> Tensor:
         """Spherical harmonics [R, 16] of ray `directions` [R, 3] of any length."""
         unit = functional.normalize(directions, dim=-1)
@@ -87,19 +99,28 @@ class HashField(nn.Module):
             positions,
             self.table,
             self.grid,
+            levels=self.levels,
             packed=self.packed,
             grad_buffer=self.grad_buffer,
             backend=self.backend,
         )
-        hidden = self._linear(features, "density_in").relu_()
-        geometry = self._linear(hidden, "density_out")
+        hidden = self._linear(features, self._density_in).relu_()
+        geometry = self._linear(hidden, self.layers["density_out"])
         return _ClampedExp.apply(geometry[:, 0].to(self.table.dtype)), geometry
 
     def features(self, geometry: Tensor, directions: Tensor) -> Tensor:
         """Features [S, K] float32 of samples with encoded view `directions` [S, 16]."""
-        hidden = self._linear(torch.cat((directions, geometry), dim=-1), "feature_in").relu_()
-        hidden = self._linear(hidden, "feature_mid").relu_()
-        return self._linear(hidden, "feature_out").to(self.table.dtype).sigmoid()
+        layers = self.layers
+        hidden = self._linear(torch.cat((directions, geometry), dim=-1), layers["feature_in"])
+        hidden = self._linear(hidden.relu_(), layers["feature_mid"]).relu_()
+        return self._linear(hidden, layers["feature_out"]).to(self.table.dtype).sigmoid()
+
+    def count(self, probe: Probe, samples: int, shaded: int) -> None:
+        """Tell `probe` the work of the densities of `samples` and of the features of `shaded`."""
+        density = self._density_in.numel() + self.layers["density_out"].numel()
+        features = sum(self.layers[f"feature_{name}"].numel() for name in ("in", "mid", "out"))
+        probe.count("table_reads", 8 * self.levels * samples)
+        probe.count("products", density * samples + features * shaded)
 
     def sizes(self) -> dict[str, int]:
         """Bytes of table and networks at the precision in which they are read."""
@@ -111,8 +132,13 @@ class HashField(nn.Module):
     def _compute_dtype(self) -> torch.dtype:
         return torch.bfloat16 if self.precision == "bf16" else self.table.dtype
 
-    def _linear(self, inputs: Tensor, layer: str) -> Tensor:
-        return functional.linear(inputs, self.layers[layer].to(self._compute_dtype))
+    @property
+    def _density_in(self) -> Tensor:
+        """The weights of the levels that are read."""
+        return self.layers["density_in"][:, : self.levels * self.grid.features]
+
+    def _linear(self, inputs: Tensor, weights: Tensor) -> Tensor:
+        return functional.linear(inputs, weights.to(self._compute_dtype))
 
 
 def _xavier_uniform(outputs: int, inputs: int, generator: torch.Generator | None) -> nn.Parameter:

@@ -156,7 +156,7 @@ class PatchSource:
         pipeline = self.pipeline
         with torch.set_grad_enabled(self.learning):
             pixels, _ = render_batch(
-                pipeline.field,
+                pipeline.low_field,
                 together,
                 pipeline.occupancy,
                 jitter=None,

@@ -74,6 +74,8 @@ class PipelineOptions:
         stop: transmittance at which a ray ends.
         steps: length of a ray-marching step at low resolution, in those of stage 1: stage 2 teaches
             the field to do with longer ones.
+        levels: of the field's grid that low-resolution rays read, the coarsest first: cells of the
+            others may be far smaller than their pixels. None: all.
         refined: share of the cells whose pixels are rendered by the field after all, those that
             the 2D renderer doubts most. It can be chosen after the training, too.
         refined_steps: length of a ray-marching step there. It can be chosen after the training,
@@ -93,6 +95,7 @@ class PipelineOptions:
     feature_background: float = 0.5
     stop: float = STOP
     steps: float = 1.0
+    levels: int | None = None
     refined: float = 0.0
     refined_steps: float = 1.0
     skip: Skips = Skips()
@@ -132,7 +135,8 @@ class Pipeline:
         background: [3] of the scene.
 
     Raises:
-        ValueError: cells are to be refined, and the renderer does not say which.
+        ValueError: cells are to be refined, and the renderer does not say which; or the grid of the
+            field does not have as many levels.
     """
 
     def __init__(
@@ -148,6 +152,9 @@ class Pipeline:
                 f"pipeline.refined: {type(renderer).__name__} does not say where it may be wrong, "
                 f"expected 0, got {options.refined}"
             )
+        levels = field.grid.levels
+        if options.levels is not None and not 1 <= options.levels <= levels:
+            raise ValueError(f"pipeline.levels: expected 1 to {levels}, got {options.levels}")
         self.field, self.renderer = field, renderer
         self.options, self.backend = options, field.backend
         skip = options.skip
@@ -156,6 +163,12 @@ class Pipeline:
         self.background = functional.pad(
             background, (0, options.channels - 3), value=options.feature_background
         )  # [K]
+
+    @property
+    def low_field(self) -> HashField:
+        """The field as low-resolution rays read it."""
+        levels = self.options.levels
+        return self.field if levels is None else self.field.coarse(levels)
 
     @torch.no_grad()
     def render(self, camera: Camera, buffer: RenderingBuffer, probe: Probe) -> Frame:
@@ -247,6 +260,7 @@ class Pipeline:
             pixels = centres(cells, width, scale).flatten(0, 1)[known]
             points = unproject(view.full, pixels, depth.flatten()[known])
             probe.count("surface_samples", len(points), view.full.width * view.full.height)
+            self.field.count(probe, len(points), len(points))
             # The pixels of a cell share the view direction of its middle.
             middles = cast(view.low, centres(cells, width, 1)[:, 0]).directions
             sigma, values = query(self.field, points, known // scale**2, middles)
@@ -292,7 +306,7 @@ class Pipeline:
                 )
         with probe.stage("field"):
             return render_guided(
-                self.field,
+                self.low_field,
                 view.low,
                 self.occupancy,
                 self.background,

@@ -87,7 +87,7 @@ class Drawing:
 UNWATCHED = NullProbe()
 
 
-class Network(nn.Module):
+class Network(nn.Module, ABC):
     """What is learned of a 2D renderer: tensors to a tuple of tensors, as engines can run it.
 
     Attributes:
@@ -98,6 +98,10 @@ class Network(nn.Module):
 
     varying: tuple[tuple[int, ...], ...]
     backend = "auto"
+
+    @abstractmethod
+    def products(self, *inputs: Tensor) -> int:
+        """Multiplications by weights that `inputs` take."""
 
 
 class Renderer2d(nn.Module, ABC):
@@ -117,6 +121,7 @@ class Renderer2d(nn.Module, ABC):
 
     def run(self, probe: Probe, *inputs: Tensor) -> tuple[Tensor, ...]:
         """What the network makes of its inputs."""
+        probe.count("products", self.network.products(*inputs))
         with probe.stage("network"):
             return (self.engine or self.network)(*inputs)
 

@@ -103,6 +103,7 @@ def _render_round(
         shown = field.features(geometry[index], encoded[samples.ray[index]])
         values[seen] = shown[: len(seen)]
     probe.count("shaded_samples", len(seen), len(samples))
+    field.count(probe, len(samples), len(seen))
     with probe.stage("composite"):
         pixels = composite(
             sigma,

@@ -147,21 +147,6 @@ class SteerNerf:
         """Bytes of table, networks, occupancy bits and 2D renderer."""
         return self.trained.sizes() | {"renderer2d": self.renderer_bytes}
 
-    def unit_work(self) -> dict[str, int]:
-        """What one unit of work takes, with a network on cells: every weight of the field's density
-        network is multiplied once a sample, of its feature network once a sample that is shaded,
-        every matrix of the 2D renderer's once a cell."""
-        field, matrices = self.trained.field, self.pipeline.renderer.network.parameters()
-        size = {"density": 0, "feature": 0}
-        for name, layer in field.layers.items():
-            size[name.split("_")[0]] += layer.numel()
-        return {
-            "reads a sample": 8 * field.grid.levels,
-            "products a sample": size["density"],
-            "products a shaded sample": size["feature"],
-            "products a cell": sum(matrix.numel() for matrix in matrices if matrix.dim() > 1),
-        }
-
     def settings(self) -> dict[str, str]:
         """See `bench.types.Method.settings`; engine and precision are those of the 2D renderer."""
         return self.setup.settings() | {

@@ -94,6 +94,23 @@ class _Unet(Network):
         merged = self.merge_full(torch.cat((merged, full), dim=1)).relu()
         return (self.last(merged)[..., :height, :width],)
 
+    def products(self, *inputs: Tensor) -> int:
+        """See `Network`: every kernel once a pixel of the size at which it is used."""
+        batch, _, height, width = inputs[0].shape
+        full = batch * (-(-height // 4) * 4) * (-(-width // 4) * 4)
+        used = {
+            full: (self.first, self.enter, self.merge_full, self.last),
+            full // 4: (self.at_half, self.merge_half, self.half_again, self.widen_half),
+            full // 16: (self.narrow, self.at_quarter, self.widen_quarter),
+        }
+        return sum(
+            pixels * x.numel()
+            for pixels, layers in used.items()
+            for layer in layers
+            for x in layer.parameters()
+            if x.dim() > 1
+        )
+
 
 class _Residual(nn.Module):
     def __init__(self, width: int) -> None:

@@ -51,22 +51,15 @@ def _variants() -> list[Variant]:
 
 
 def _row(one: Rendered, standard: Rendered) -> dict[str, Any]:
-    method: Any = one.method
-    unit, done = method.unit_work(), one.values
+    done = one.values
     surface = done.get("work.surface_samples", 0)
-    samples, shaded = done["work.samples"] + surface, done["work.shaded_samples"] + surface
-    products = (
-        samples * unit["products a sample"]
-        + shaded * unit["products a shaded sample"]
-        + done["work.cells"] * unit["products a cell"]
-    )
     work = (
         done["work.rays"] + done.get("work.refined_rays", 0),
-        samples,
-        shaded,
-        samples * unit["reads a sample"] / 1e6,
+        done["work.samples"] + surface,
+        done["work.shaded_samples"] + surface,
+        done["work.table_reads"] / 1e6,
         done["work.cells"],
-        products / 1e9,
+        done["work.products"] / 1e9,
     )
     return {
         "skipped": one.variant.name,

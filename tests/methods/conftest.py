@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 
 import pytest
 import torch
 from torch import Tensor
 
 from bench.cameras import cast
-from bench.types import Camera, Scene, Split
+from bench.types import Camera, NullProbe, Scene, Split
 from methods.fields import HashField
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy
@@ -45,6 +46,16 @@ def look_at_the_middle(turn: float, lift: float) -> Camera:
     down = torch.linalg.cross(-away, right)
     c2w = torch.stack((right, down, -away, 0.5 + 1.6 * away), dim=1)
     return Camera(c2w, 40.0, 40.0, SIZE / 2, SIZE / 2, SIZE, SIZE)
+
+
+class Work(NullProbe):
+    """What was counted in all frames, by name."""
+
+    def __init__(self) -> None:
+        self.done: Counter[str] = Counter()
+
+    def count(self, name: str, done: int, dense: int | None = None) -> None:
+        self.done[name] += done
 
 
 @pytest.fixture(scope="session")

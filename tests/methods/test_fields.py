@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 from methods.fields import HashField
 from methods.kernels.encode import HashGrid
+from tests.methods.conftest import Work
 
 GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=32)
 
@@ -67,3 +70,37 @@ def test_the_gradient_of_a_huge_density_is_clamped() -> None:
     edge = torch.tensor(LOG_DENSITY_CLAMP).exp()
     assert log_density.grad is not None
     torch.testing.assert_close(log_density.grad, torch.stack((1 / edge, edge / edge, edge)))
+
+
+@pytest.mark.parametrize("levels", [1, 3, 4])
+def test_the_work_of_a_field_is_what_torch_counts(levels: int) -> None:
+    made, work = field("fp32", channels=6).coarse(levels), Work()
+    made.count(work, 200, 200)
+    with FlopCounterMode(display=False) as counter:
+        evaluate(made)
+    assert 2 * work.done["products"] == counter.get_total_flops()
+    assert work.done["table_reads"] == 200 * levels * 8
+
+
+@pytest.mark.parametrize("precision", ["bf16", "fp32"])
+def test_a_coarse_field_is_one_whose_finer_levels_hold_nothing(precision: str) -> None:
+    whole, emptied = field(precision), field(precision)
+    with torch.no_grad():
+        emptied.table[GRID.offsets[2] :] = 0
+    emptied.repack()
+    for got, want in zip(evaluate(whole.coarse(2)), evaluate(emptied), strict=True):
+        torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-6)
+
+
+def test_what_a_coarse_field_learns_the_field_has_learned() -> None:
+    whole = field("fp32")
+    coarse = whole.coarse(2)
+    sigma, features = evaluate(coarse)
+    (sigma.sum() + features.sum()).backward()
+    assert coarse.table is whole.table
+    gradient = whole.table.grad
+    assert gradient is not None
+    assert gradient[: GRID.offsets[2]].any()
+    assert not gradient[GRID.offsets[2] :].any()
+    whole.widen(6)
+    assert coarse.layers["feature_out"] is whole.layers["feature_out"]

@@ -13,8 +13,8 @@ from methods.ngp import InstantNgp
 from methods.pretrained import Pretrained
 from methods.range_reduction import KEPT_ALPHA, RangeReduction
 from methods.train import TrainingOptions
-from tests.methods.conftest import look_at_the_middle
-from tests.methods.solids import Counter, Solid, ball
+from tests.methods.conftest import Work, look_at_the_middle
+from tests.methods.solids import Solid, ball
 
 GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
 
@@ -87,9 +87,9 @@ def test_a_guided_frame_is_much_like_one_that_stands_alone() -> None:
     counts = []
     for method in (alone, guided):
         method.reset()
-        cold, warm = Counter(), Counter()
+        cold, warm = Work(), Work()
         frames = [method.render(first, cold), method.render(second, warm)]
-        counts.append((cold.samples, warm.samples, frames))
+        counts.append((cold.done["samples"], warm.done["samples"], frames))
     (cold_alone, all_samples, whole), (cold_guided, fewer, narrowed) = counts
     # The first frame of a sequence has nothing to be guided by.
     assert cold_guided == cold_alone

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from dataclasses import replace
 from typing import Literal
 
@@ -20,7 +19,7 @@ from methods.pipeline import LAYER, Pipeline, PipelineOptions, Skips, View, samp
 from methods.range_reduction import RangeReduction, render_guided
 from methods.space_to_depth import SpaceToDepth
 from methods.unet_release import UnetRelease
-from tests.methods.conftest import look_at_the_middle
+from tests.methods.conftest import GRID, Work, look_at_the_middle
 from tests.methods.observations import shaken, to_blocks
 from tests.methods.test_joint import misty_field, shell
 
@@ -218,6 +217,24 @@ def test_what_a_renderer_that_knows_no_doubt_drew_cannot_be_refined() -> None:
         )
 
 
+def test_a_grid_has_at_least_the_levels_that_are_read() -> None:
+    for levels in (0, GRID.levels + 1):
+        with pytest.raises(ValueError, match=rf"levels: expected 1 to {GRID.levels}, got {levels}"):
+            new_pipeline(replace(OPTIONS, levels=levels))
+
+
+def test_low_resolution_rays_read_the_coarsest_levels_alone() -> None:
+    frames, reads = [], []
+    for levels in (None, GRID.levels, 1):
+        work = Work()
+        options = replace(OPTIONS, levels=levels, surface=False)
+        frames.append(new_pipeline(options).render(CAMERA, RenderingBuffer(2), work))
+        reads.append(work.done["table_reads"] / work.done["samples"])
+    assert torch.equal(frames[0].rgb, frames[1].rgb)
+    assert not torch.equal(frames[0].rgb, frames[2].rgb)
+    assert reads == [8 * GRID.levels, 8 * GRID.levels, 8]
+
+
 @pytest.mark.parametrize("wrong", [{"channels": 2}, {"frames": -1}, {"scale": 0}])
 def test_options_that_make_no_frame_are_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="expected channels"):
@@ -239,16 +256,6 @@ def test_a_share_of_cells_is_between_0_and_1() -> None:
         replace(OPTIONS, stop=1.0)
     with pytest.raises(ValueError, match=r"range.mode: expected off without .* got window"):
         replace(OPTIONS, frames=0, range=RangeReduction("window"))
-
-
-class Work(NullProbe):
-    """What was counted, by name."""
-
-    def __init__(self) -> None:
-        self.done: Counter[str] = Counter()
-
-    def count(self, name: str, done: int, dense: int | None = None) -> None:
-        self.done[name] += done
 
 
 @pytest.mark.parametrize(

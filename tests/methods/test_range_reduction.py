@@ -17,8 +17,8 @@ from methods.range_reduction import EDGE, KEPT_ALPHA, Evidence, RangeReduction, 
 from methods.range_reduction import render_guided as render_guided_by
 from methods.rounds import ROUND_SAMPLES
 from methods.volume import FeatureFrame
-from tests.methods.conftest import look_at_the_middle
-from tests.methods.solids import Counter, Solid, ball, slab, wall
+from tests.methods.conftest import Work, look_at_the_middle
+from tests.methods.solids import Solid, ball, slab, wall
 
 EXACT = Reprojection()
 EVERYWHERE = Occupancy(torch.ones(32, 32, 32, dtype=torch.bool))
@@ -46,9 +46,9 @@ def render(
     field: Solid, camera: Camera, found: Evidence | None = None, occupancy: Occupancy = EVERYWHERE
 ) -> tuple[FeatureFrame, int]:
     """The frame, and how many samples it took."""
-    probe = Counter()
+    probe = Work()
     frame = render_guided_by(field, camera, occupancy, WHITE, probe, found, step=LONG)
-    return frame, probe.samples
+    return frame, probe.done["samples"]
 
 
 def seen_before(

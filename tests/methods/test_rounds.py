@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from dataclasses import replace
 
 import torch
@@ -15,7 +14,7 @@ from methods.kernels.march import Occupancy
 from methods.occupancy import STEP
 from methods.rounds import FAINT, ROUND_SAMPLES, render_rays
 from methods.volume import rays_at_matter, render_batch
-from tests.methods.conftest import GRID, look_at_the_middle
+from tests.methods.conftest import GRID, Work, look_at_the_middle
 
 
 def test_rounds_render_what_one_go_renders(cloud: tuple[HashField, Occupancy], device: str) -> None:
@@ -40,33 +39,20 @@ def test_samples_behind_the_early_stop_are_hardly_evaluated() -> None:
         torch.zeros(len(positions), 16),
     )
     occupancy = Occupancy(torch.ones(32, 32, 32, dtype=torch.bool))
-    evaluated = 0
-
-    class Counting(NullProbe):
-        def count(self, name: str, done: int, dense: int | None = None) -> None:
-            nonlocal evaluated
-            evaluated += done if name == "samples" else 0
-
-    rays = cast(look_at_the_middle(0.0, 0.0))
-    pixels = render_rays(field, rays, occupancy, Counting())
+    rays, work = cast(look_at_the_middle(0.0, 0.0)), Work()
+    pixels = render_rays(field, rays, occupancy, work)
     hit = int((pixels.alpha > 0).sum())
     assert hit > 0
-    assert evaluated <= ROUND_SAMPLES * hit  # one round for each ray that hits
+    assert work.done["samples"] <= ROUND_SAMPLES * hit  # one round for each ray that hits
 
 
 def test_faint_samples_are_black_and_not_looked_at(cloud: tuple[HashField, Occupancy]) -> None:
     field, occupancy = cloud
     camera = look_at_the_middle(0.1, 0.4)
     rays = cast(replace(camera, c2w=camera.c2w.to(field.table.device)))
-    counts: Counter[str] = Counter()
-
-    class Counting(NullProbe):
-        def count(self, name: str, done: int, dense: int | None = None) -> None:
-            counts[name] += done
-
-    stop = 0.01
-    rendered = render_rays(field, rays, occupancy, Counting(), stop=stop)
-    assert 0 < counts["shaded_samples"] < counts["samples"]
+    stop, work = 0.01, Work()
+    rendered = render_rays(field, rays, occupancy, work, stop=stop)
+    assert 0 < work.done["shaded_samples"] < work.done["samples"]
     # Of a field whose features are 1 everywhere, what is shown is the sum of the weights seen.
     field.features = lambda geometry, directions: torch.ones(  # type: ignore[method-assign]
         len(geometry), field.channels, device=geometry.device

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 from torch.nn import functional
+from torch.utils.flop_counter import FlopCounterMode
 
 from methods.cell_network import LEAK
 from methods.cells import REACH
@@ -328,6 +329,16 @@ def test_without_gradient_the_same_is_drawn(share: float) -> None:
         got = renderer([observation])
     torch.testing.assert_close(got.pictures, want.pictures, rtol=0, atol=FLOAT32_ERROR)
     torch.testing.assert_close(got.doubt, want.doubt, rtol=0, atol=FLOAT32_ERROR)
+
+
+def test_its_products_are_those_that_torch_counts_and_nine_for_each_channel_of_a_block() -> None:
+    width, blocks, cells = 16, 2, 5
+    network = SpaceToDepth(6, 2, 4, width=width, blocks=blocks, init="scratch").network
+    inputs = torch.zeros(cells, network.enter.in_features), torch.full((cells, 9), -1)
+    with FlopCounterMode(display=False) as counter:
+        network(*inputs)
+    taps = cells * blocks * 9 * width  # sums, which torch does not count
+    assert network.products(*inputs) == counter.get_total_flops() // 2 + taps
 
 
 def test_half_precision_changes_little() -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from torch.nn import functional
+from torch.utils.flop_counter import FlopCounterMode
 
 from methods.unet_release import UnetRelease
 from tests.methods.observations import ROUNDING, doubled, features_of, observe, shaken
@@ -35,6 +36,15 @@ def test_any_features_frames_and_sizes_are_taken(
         pictures, base = renderer(batch).pictures, renderer.base(batch)
         assert pictures.shape == base.shape == (len(batch), height * scale, width * scale, 3)
         assert pictures.isfinite().all()
+
+
+@pytest.mark.parametrize(("height", "width"), [(8, 12), (9, 6)])
+def test_its_products_are_those_that_torch_counts(height: int, width: int) -> None:
+    network = UnetRelease(6, 2, 4).network
+    inputs = torch.zeros(2, 18, height, width)
+    with FlopCounterMode(display=False) as counter:
+        network(inputs)
+    assert 2 * network.products(inputs) == counter.get_total_flops()
 
 
 def test_frames_that_are_missing_after_a_cold_start_show_nothing() -> None:

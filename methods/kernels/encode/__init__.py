@@ -93,6 +93,7 @@ def encode(
     table: Tensor,
     grid: HashGrid,
     *,
+    levels: int | None = None,
     packed: Tensor | None = None,
     grad_buffer: Tensor | None = None,
     backend: str = "auto",
@@ -104,6 +105,7 @@ def encode(
     backend="reference".
 
     Args:
+        levels: how many are read, the coarsest first; None: all.
         packed: `pack(table)`, read in place of `table` when given (half the memory traffic;
             F = 2 only). The output is then bfloat16; its gradient goes to `table`.
         grad_buffer: [entries, F]; when given, the gradient of `table` is added to it in place,
@@ -112,6 +114,9 @@ def encode(
     """
     check_shape("positions", positions, None, 3)
     check_shape("table", table, grid.entries, grid.features)
+    levels = grid.levels if levels is None else levels
+    if not 1 <= levels <= grid.levels:
+        raise ValueError(f"levels: expected 1 to {grid.levels}, got {levels}")
     if packed is not None:
         if grid.features != 2:
             raise ValueError(f"packed tables hold 2 features an entry, the grid has {grid}")
@@ -119,7 +124,7 @@ def encode(
     if grad_buffer is not None:
         check_shape("grad_buffer", grad_buffer, grid.entries, grid.features)
     features = implementation("encode", backend, positions.device).encode(
-        positions, table, grid, packed=packed, grad_buffer=grad_buffer
+        positions, table, grid, levels=levels, packed=packed, grad_buffer=grad_buffer
     )
     if positions.sum().isnan():  # hardly ever, and one sum tells
         features = torch.where(positions.isnan().any(dim=1, keepdim=True), torch.nan, features)

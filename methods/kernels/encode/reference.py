@@ -13,6 +13,7 @@ def encode(
     table: Tensor,
     grid: HashGrid,
     *,
+    levels: int,
     packed: Tensor | None = None,
     grad_buffer: Tensor | None = None,
 ) -> Tensor:
@@ -21,16 +22,16 @@ def encode(
         table = table.detach().requires_grad_()
         table.register_hook(grad_buffer.add_)
     inside = torch.where(positions > 0, positions, 0).clamp(max=1)
-    levels = []
-    for level in range(grid.levels):
+    found = []
+    for level in range(levels):
         entries, weights = corners(inside, grid, level)
         values = table[entries]  # [N, 8, F]
         if packed is not None:
             # The rounded values, with the gradient passed straight through to the table.
             rounded = packed[entries, None].view(torch.bfloat16).to(table.dtype)
             values = values + (rounded - values).detach()
-        levels.append((weights.to(table.dtype)[..., None] * values).sum(dim=1))
-    features = torch.cat(levels, dim=-1)
+        found.append((weights.to(table.dtype)[..., None] * values).sum(dim=1))
+    features = torch.cat(found, dim=-1)
     return features if packed is None else features.to(torch.bfloat16)
 
 
