@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict, dataclass
 
 import torch
@@ -47,7 +48,7 @@ class Setup:
         """With `auto` replaced by what it stands for here.
 
         Raises:
-            ValueError: the grid cannot be had at this precision.
+            ValueError: the grid cannot be had at this precision, or there is no such device.
             Unavailable: the backend cannot be used here.
         """
         if device == "auto":
@@ -57,6 +58,8 @@ class Setup:
                 f"precision bf16 packs 2 features an entry, grid.features is {grid.features}: "
                 "use precision=fp32"
             )
+        if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
+            raise ValueError(f"device: expected auto, cpu, cuda or cuda:N, got {device!r}")
         place = torch.device(device)
         return cls(grid, training, precision, resolve(backend, place), place, seed)
 

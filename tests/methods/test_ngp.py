@@ -113,3 +113,9 @@ def test_a_packed_table_needs_two_features() -> None:
 def test_a_stop_that_ends_every_ray_at_once_is_refused() -> None:
     with pytest.raises(ValueError, match=r"stop: expected a transmittance of 0 or more and less"):
         InstantNgp(grid=HashGrid(), training=TrainingOptions(), stop=1.0, device="cpu")
+
+
+@pytest.mark.parametrize("device", ["", "gpu", "cpu:0", "meta"])
+def test_a_device_that_does_not_exist_is_refused(device: str) -> None:
+    with pytest.raises(ValueError, match=rf"^device: expected auto, .* got '{device}'"):
+        InstantNgp(grid=GRID, training=TrainingOptions(), device=device)
