@@ -22,6 +22,7 @@ Scene units: every scene is normalised so that what is to be rendered lies in th
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
@@ -39,6 +40,10 @@ EMPTY_ALPHA = 1e-3
 
 BACKGROUNDS = {"white": 1.0, "black": 0.0}
 """What a scene may be composited on, by name: every channel of `Scene.background`."""
+
+
+DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?")
+"""How a device is named; auto: the GPU where there is one."""
 
 
 def check_shape(name: str, value: Tensor, *shape: int | None) -> None:

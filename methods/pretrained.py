@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import asdict, dataclass
 
 import torch
 
 from bench.provenance import decisive
-from bench.types import Budget, Log, Scene
+from bench.types import DEVICE, Budget, Log, Scene
 from methods.fields import HashField, Precision
 from methods.kernels import resolve
 from methods.kernels.encode import HashGrid
@@ -51,6 +50,8 @@ class Setup:
             ValueError: the grid cannot be had at this precision, or there is no such device.
             Unavailable: the backend cannot be used here.
         """
+        if not DEVICE.fullmatch(device):
+            raise ValueError(f"device: expected auto, cpu, cuda or cuda:N, got {device!r}")
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
         if precision == "bf16" and grid.features != 2:
@@ -58,8 +59,6 @@ class Setup:
                 f"precision bf16 packs 2 features an entry, grid.features is {grid.features}: "
                 "use precision=fp32"
             )
-        if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
-            raise ValueError(f"device: expected auto, cpu, cuda or cuda:N, got {device!r}")
         place = torch.device(device)
         return cls(grid, training, precision, resolve(backend, place), place, seed)
 

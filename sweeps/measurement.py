@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -21,7 +20,7 @@ from bench.errors import SteerbenchError, Unavailable
 from bench.provenance import code_digest, decisive
 from bench.results import Store
 from bench.run import measure
-from bench.types import Method, Scene
+from bench.types import DEVICE, Method, Scene
 from reports.page import write_page
 from reports.runs import Run, load
 from reports.tables import blocks
@@ -141,7 +140,7 @@ def checked_settings(config: DictConfig) -> Settings:
         raise SteerbenchError(f"seed: expected 0 or more, got {settings.seed}")
     if settings.threads is not None and settings.threads < 1:
         raise SteerbenchError(f"threads: expected 1 or more, or null, got {settings.threads}")
-    if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", settings.device):
+    if not DEVICE.fullmatch(settings.device):
         raise SteerbenchError(f"device: expected auto, cpu, cuda or cuda:N, got {settings.device}")
     if settings.device.startswith("cuda") and not torch.cuda.is_available():
         raise Unavailable(f"device={settings.device}: torch sees no GPU here; use device=cpu")
