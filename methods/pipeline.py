@@ -152,9 +152,8 @@ class Pipeline:
                 f"pipeline.refined: {type(renderer).__name__} does not say where it may be wrong, "
                 f"expected 0, got {options.refined}"
             )
-        levels = field.grid.levels
-        if options.levels is not None and not 1 <= options.levels <= levels:
-            raise ValueError(f"pipeline.levels: expected 1 to {levels}, got {options.levels}")
+        if options.levels is not None:
+            field.grid.check_levels(options.levels)
         self.field, self.renderer = field, renderer
         self.options, self.backend = options, field.backend
         skip = options.skip

@@ -86,6 +86,8 @@ class SteerNerf:
         device: str = "auto",
         seed: int = 0,
     ) -> None:
+        if pipeline.levels is not None:  # before anything is trained
+            grid.check_levels(pipeline.levels)
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         self.options, self.make_renderer, self.joint, self.name = pipeline, renderer, joint, name
         engine.check(self.setup.device)

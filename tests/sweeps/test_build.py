@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 
 from bench.errors import SteerbenchError
 from sweeps.build import build, check_settings
+from sweeps.overrides import composed
 
 
 @dataclass
@@ -115,3 +116,9 @@ def test_a_dataclass_may_have_fields_of_types_that_only_the_module_of_its_base_k
     check_settings(options, {"steps": 3.0, "taught_steps": 2.0})
     with pytest.raises(SteerbenchError, match="jitter: expected bool, got 'much'"):
         check_settings(options, {"jitter": "much"})
+
+
+def test_more_levels_than_the_grid_has_are_refused_before_anything_is_trained():
+    config = composed(["method=steernerf", "method.pipeline.levels=17"])
+    with pytest.raises(SteerbenchError, match=r"^method: levels: expected 1 to 16, got 17"):
+        build(config, "method")

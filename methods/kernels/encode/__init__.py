@@ -82,6 +82,11 @@ class HashGrid:
         """Entries of the whole table."""
         return self.offsets[-1]
 
+    def check_levels(self, levels: int) -> None:
+        """Raise `ValueError` unless the coarsest `levels` can be read."""
+        if not 1 <= levels <= self.levels:
+            raise ValueError(f"levels: expected 1 to {self.levels}, got {levels}")
+
     @property
     def channels(self) -> int:
         """Channels of an encoded position, level by level."""
@@ -115,8 +120,7 @@ def encode(
     check_shape("positions", positions, None, 3)
     check_shape("table", table, grid.entries, grid.features)
     levels = grid.levels if levels is None else levels
-    if not 1 <= levels <= grid.levels:
-        raise ValueError(f"levels: expected 1 to {grid.levels}, got {levels}")
+    grid.check_levels(levels)
     if packed is not None:
         if grid.features != 2:
             raise ValueError(f"packed tables hold 2 features an entry, the grid has {grid}")
