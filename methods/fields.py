@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from bench.types import Probe
+from methods.kernels import multiplies_bf16
 from methods.kernels.encode import HashGrid, encode, pack
 from methods.kernels.spherical import CHANNELS as DIRECTION_CHANNELS
 from methods.kernels.spherical import spherical_harmonics
@@ -30,8 +31,9 @@ class HashField(nn.Module):
     No biases, ReLU between layers, exp for density, sigmoid for features (Instant-NGP, Section 5.4;
     ngp_pl `networks.py`).
 
-    With precision "bf16" the table is read as packed bfloat16 and the matrix products are bfloat16
-    with float32 accumulation; parameters, gradients of the table and outputs stay float32.
+    With precision "bf16" the table is read as packed bfloat16, and the matrix products are those of
+    bfloat16 weights with float32 accumulation; parameters, gradients of the table and outputs stay
+    float32. So do the activations where the device has no products of bfloat16.
 
     Attributes:
         levels: of the grid that are read, the coarsest first.
@@ -103,7 +105,7 @@ class HashField(nn.Module):
             packed=self.packed,
             grad_buffer=self.grad_buffer,
             backend=self.backend,
-        )
+        ).to(self._compute_dtype)
         hidden = self._linear(features, self._density_in).relu_()
         geometry = self._linear(hidden, self.layers["density_out"])
         return _ClampedExp.apply(geometry[:, 0].to(self.table.dtype)), geometry
@@ -130,7 +132,8 @@ class HashField(nn.Module):
 
     @property
     def _compute_dtype(self) -> torch.dtype:
-        return torch.bfloat16 if self.precision == "bf16" else self.table.dtype
+        half = self.precision == "bf16" and multiplies_bf16(self.table.device.type)
+        return torch.bfloat16 if half else self.table.dtype
 
     @property
     def _density_in(self) -> Tensor:
@@ -138,6 +141,8 @@ class HashField(nn.Module):
         return self.layers["density_in"][:, : self.levels * self.grid.features]
 
     def _linear(self, inputs: Tensor, weights: Tensor) -> Tensor:
+        if self.precision == "bf16":
+            weights = weights.to(torch.bfloat16)
         return functional.linear(inputs, weights.to(self._compute_dtype))
 
 

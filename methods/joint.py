@@ -16,6 +16,7 @@ from bench.cameras import cast
 from bench.types import Rays
 from methods import checkpoint, loop
 from methods.cells import centres, pixels_of
+from methods.kernels import multiplies_bf16
 from methods.occupancy import STEP
 from methods.optimise import FieldOptimiser, step_at
 from methods.patches import Batch, Patches, Through
@@ -43,7 +44,8 @@ class JointOptions:
         final_rate: share of both left at the end of the cosine schedule.
         patch: side of a patch, low-resolution pixels.
         batch: patches of a step.
-        precision: of the 2D renderer's convolutions while it is trained.
+        precision: of the 2D renderer's convolutions while it is trained. Where the device has no
+            products of bfloat16, "bf16" is "fp32".
         opacity_entropy: weight of -o ln o of the rays.
         doubt: weight of the squared error of the doubt, in log.
         refined: share of the cells that are refined while it is trained.
@@ -127,8 +129,9 @@ class RendererTraining:
             SteerbenchError: the loss is not finite.
         """
         batch = self.patches.draw(self.options.batch)
-        half = self.options.precision == "bf16"
-        with torch.autocast(batch.truth.device.type, torch.bfloat16, enabled=half):
+        kind = batch.truth.device.type
+        half = self.options.precision == "bf16" and multiplies_bf16(kind)
+        with torch.autocast(kind, torch.bfloat16, enabled=half):
             drawing = self.renderer(batch.observations)
         loss = functional.mse_loss(drawing.pictures, batch.truth)
         (loss + self._doubt_loss(batch, drawing) + self._field_loss(batch, drawing)).backward()

@@ -5,6 +5,6 @@ version (any dtype, any device, differentiable: the oracle of all others), `cpu`
 All backends of a kernel have the same signature.
 """
 
-from methods.kernels.dispatch import BACKENDS, availability, resolve, sources
+from methods.kernels.dispatch import BACKENDS, availability, multiplies_bf16, resolve, sources
 
-__all__ = ["BACKENDS", "availability", "resolve", "sources"]
+__all__ = ["BACKENDS", "availability", "multiplies_bf16", "resolve", "sources"]

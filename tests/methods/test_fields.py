@@ -7,10 +7,13 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from methods.fields import HashField
-from methods.kernels.encode import HashGrid
+from methods.kernels.encode import HashGrid, encode
 from tests.methods.conftest import Work
 
 GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=32)
+GENERATOR = torch.Generator().manual_seed(1)
+POSITIONS = torch.rand(200, 3, generator=GENERATOR)
+DIRECTIONS = torch.randn(200, 3, generator=GENERATOR)
 
 
 def field(precision: str, **options) -> HashField:
@@ -24,10 +27,8 @@ def field(precision: str, **options) -> HashField:
 
 
 def evaluate(made: HashField) -> tuple[torch.Tensor, torch.Tensor]:
-    generator = torch.Generator().manual_seed(1)
-    positions = torch.rand(200, 3, generator=generator)
-    directions = made.encode_directions(torch.randn(200, 3, generator=generator))
-    sigma, geometry = made.density(positions)
+    directions = made.encode_directions(DIRECTIONS)
+    sigma, geometry = made.density(POSITIONS)
     return sigma, made.features(geometry, directions)
 
 
@@ -50,6 +51,24 @@ def test_fp32_agrees_between_backends() -> None:
     reference, fast = field("fp32", backend="reference"), field("fp32", backend="cpu")
     for got, want in zip(evaluate(fast), evaluate(reference), strict=True):
         torch.testing.assert_close(got, want, rtol=1e-4, atol=1e-4)
+
+
+def test_without_products_of_bfloat16_what_is_stored_in_it_is_multiplied_in_float32(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("methods.fields.multiplies_bf16", lambda kind: False)
+    rounded, stored = field("bf16"), field("fp32")
+    with torch.no_grad():
+        for parameter in stored.parameters():
+            parameter.copy_(parameter.bfloat16())
+    encoded = encode(POSITIONS, rounded.table, GRID, packed=rounded.packed).double()
+    layers = {name: weights.double() for name, weights in stored.layers.items()}
+    hidden = (encoded @ layers["density_in"].T).relu()
+    log_density = (hidden @ layers["density_out"].T)[:, 0]
+    # Sums of at most 64 products: 64 u = 4e-6 of the largest, which is some units.
+    torch.testing.assert_close(
+        rounded.density(POSITIONS)[0].log().double(), log_density, rtol=0, atol=2e-5
+    )
 
 
 def test_sizes_are_those_of_the_precision() -> None:
