@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bench.errors import Unavailable
 from bench.provenance import digest
 from bench.results import explained
 from bench.sharing import missing
@@ -39,7 +40,8 @@ class OpenVino(Engine):
     """OpenVINO on the CPU.
 
     Raises:
-        Unavailable: it, or for int8 NNCF, is not installed.
+        Unavailable: it, or for int8 NNCF, is not installed; or it has no bfloat16 on this CPU, for
+            which it would take float32 without a word.
     """
 
     name = "openvino"
@@ -49,6 +51,10 @@ class OpenVino(Engine):
         super().__init__(precision)
         self._openvino = required(self.name, "openvino", "openvino")
         self._nncf = required(self.name, "nncf", "openvino") if precision == "int8" else None
+        if precision == "bf16" and "BF16" not in _capabilities(self._openvino):
+            raise Unavailable(
+                "precision=bf16: engine=openvino has no bfloat16 on this CPU, use precision=fp32"
+            )
 
     def key(self) -> dict[str, object]:
         """See `Engine.key`."""
@@ -112,6 +118,10 @@ class OpenVino(Engine):
             self._openvino.save_model(model, new, compress_to_fp16=self.precision == "bf16")
             new.with_suffix(".bin").replace(path.with_suffix(".bin"))
             new.replace(path)
+
+
+def _capabilities(openvino: Any) -> list[str]:
+    return openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
 
 
 def _sizes(samples: Sequence[Inputs], varying: Varying) -> list[int]:
