@@ -13,6 +13,8 @@ from pathlib import Path
 
 import torch
 
+from bench.allocator import give_back
+
 OTHER = "other"
 """The stage that is charged while a frame is in no stage."""
 
@@ -109,6 +111,8 @@ class StageClock:
 class MemoryMeter:
     """Peak memory over all regions measured with it: `with meter: ...`, as often as needed.
 
+    What the process has freed before, say in a training, does not count.
+
     Attributes:
         peak_bytes: the highest peak so far.
         last_bytes: the peak of the last region.
@@ -120,6 +124,7 @@ class MemoryMeter:
     def __init__(self, device: str) -> None:
         self.peak_bytes = self.last_bytes = 0
         self._device = torch.device(device)
+        give_back()
         if self._device.type == "cuda":
             self.source = "peak allocated on the device while rendering"
         elif _reset_high_water_mark():

@@ -21,11 +21,6 @@ from bench.errors import SteerbenchError
 from sweeps.arguments import COMMANDS, add_commands
 from sweeps.names import unknown
 
-# Two thread pools take turns here, torch's and numba's. A pool that spins while it waits keeps the
-# other from its cores, one that sleeps at once is woken a thousand times a step: let it spin for
-# some ten microseconds.
-os.environ.setdefault("GOMP_SPINCOUNT", "20000")
-
 EXAMPLES = """\
 examples
   steerbench run +experiment=demo              three methods on an embedded scene, and a page
