@@ -58,9 +58,12 @@ def knobs(trained: bool) -> Mapping[str, Sequence[Variant]]:
         ],
         "engine": list(engines())[1:],  # the first is the default
         "two knobs": [
-            _both(_refined(share), other)
-            for share in (0, 0.06, 0.25, 0.5, 1)
-            for other in (_step(1), _refined_step(2), _range("window", 0.03))
+            *(
+                _both(_refined(share), other)
+                for share in (0, 0.06, 0.25, 0.5, 1)
+                for other in (_step(1), _range("window", 0.03))
+            ),
+            *(_both(_refined(share), _refined_step(2)) for share in (0.06, 0.25, 0.5, 1)),
         ],
         **(_trainings() if trained else {}),
     }
