@@ -98,6 +98,8 @@ def decode_bytes(content: bytes, path: Path) -> Tensor:
     with opened(io.BytesIO(content), path) as image:
         if image.mode.startswith(("I", "F")):
             raise unexpected(path, "8 bits a channel", f"mode {image.mode}")
+        if image.mode == "P" and image.palette is None:
+            raise unexpected(path, "a palette beside numbers of colours", "none")
         mode = "RGBA" if image.has_transparency_data else "RGB"
         return torch.from_numpy(np.array(image.convert(mode)))
 

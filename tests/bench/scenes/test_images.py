@@ -72,6 +72,16 @@ def test_every_8_bit_mode_becomes_rgb_or_rgba(mode, channels) -> None:
     assert image.shape == (4, 5, channels)
 
 
+def test_a_palette_that_is_missing_is_named() -> None:
+    buffer = io.BytesIO()
+    Image.new("P", (5, 4)).save(buffer, "png")
+    content = buffer.getvalue()
+    chunk = content.index(b"PLTE") - 4  # its length, its name, colours, a checksum
+    end = chunk + 12 + int.from_bytes(content[chunk : chunk + 4], "big")
+    with pytest.raises(SteerbenchError, match="expected a palette beside numbers of colours"):
+        decode_bytes(content[:chunk] + content[end:], HERE)
+
+
 def test_a_header_that_announces_more_than_memory_holds_is_refused(tmp_path: Path) -> None:
     buffer = io.BytesIO()
     Image.new("1", (1 << 14, (MOST_PIXELS >> 14) + 1)).save(buffer, "png")
