@@ -24,7 +24,6 @@ from methods.buffer import Cloud, Remembered, RenderingBuffer, Reprojection
 from methods.cells import centres, put_pixels
 from methods.fields import HashField
 from methods.kernels.composite import STOP, check_stop
-from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy
 from methods.kernels.warp import enlarge, warp
 from methods.occupancy import STEP
@@ -119,17 +118,6 @@ class PipelineOptions:
                 f"range.mode: expected off without preceding frames (L = 0), got {self.range.mode}"
             )
 
-    def check(self, grid: HashGrid, renderer: Renderer2d) -> None:
-        """Raise `ValueError` where cells are to be refined, and the renderer does not say which;
-        or where the grid does not have as many levels."""
-        if self.refined and not renderer.doubts:
-            raise ValueError(
-                f"pipeline.refined: {type(renderer).__name__} does not say where it may be wrong, "
-                f"expected 0, got {self.refined}"
-            )
-        if self.levels is not None:
-            grid.check_levels(self.levels)
-
     def taught(self, refined: float) -> PipelineOptions:
         """The options of a training. It looks everywhere, so that one serves all choices of where
         to look that are made afterwards."""
@@ -147,7 +135,8 @@ class Pipeline:
         background: [3] of the scene.
 
     Raises:
-        ValueError: see `PipelineOptions.check`.
+        ValueError: cells are to be refined, and the renderer does not say which; or the grid of the
+            field does not have as many levels.
     """
 
     def __init__(
@@ -158,7 +147,13 @@ class Pipeline:
         renderer: Renderer2d,
         options: PipelineOptions,
     ) -> None:
-        options.check(field.grid, renderer)
+        if options.refined and not renderer.doubts:
+            raise ValueError(
+                f"pipeline.refined: {type(renderer).__name__} does not say where it may be wrong, "
+                f"expected 0, got {options.refined}"
+            )
+        if options.levels is not None:
+            field.grid.check_levels(options.levels)
         self.field, self.renderer = field, renderer
         self.options, self.backend = options, field.backend
         skip = options.skip
