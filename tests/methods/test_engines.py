@@ -27,10 +27,12 @@ ENGINES: list[tuple[type[Engine], str]] = [
     *((OnnxRuntime, p) for p in ("fp32", "int8")),
 ]
 
-TOLERANCE = {"fp32": 1e-5, "bf16": 0.03, "int8": 0.1}
+TOLERANCE = {"fp32": 1e-5, "bf16": 0.03, "int8": 0.16}
 """Of the root mean square of what the network says. fp32: sums of a few hundred products in another
 order. Below, a number is rounded by half of 2^-8 (bf16), or by half of 1/255 of the range that it
-was seen in (int8), before each of half a dozen layers; single layers are kept higher."""
+was seen in (int8), before each of half a dozen layers; single layers are kept higher. int8: a range
+of 16 root mean squares is rounded by 16 / 255 / sqrt(12) of one; weights and inputs of ten layers add up
+to sqrt(20) times that, 0.08, and twice that is allowed."""
 
 
 def cells(count: int, seed: int = 0) -> Inputs:
@@ -44,6 +46,7 @@ def cells(count: int, seed: int = 0) -> Inputs:
 
 def lean() -> tuple[Network, list[Inputs]]:
     """The lean network, and inputs of three sizes."""
+    torch.manual_seed(1000)  # other numbers than those of the inputs
     renderer = shaken(SpaceToDepth(6, 2, 4, init="scratch")).requires_grad_(False)
     return renderer.network, [cells(count, seed) for seed, count in enumerate((64, 100, 64, 144))]
 
@@ -59,6 +62,7 @@ def test_a_view_of_nothing_has_no_cells(
 
 
 def unet() -> tuple[Network, list[Inputs]]:
+    torch.manual_seed(1000)
     renderer = shaken(UnetRelease(6, 1, 4)).requires_grad_(False)
     generator = torch.Generator().manual_seed(0)
     return renderer.network, [(torch.rand(1, 12, 36, 44, generator=generator),) for _ in range(3)]
