@@ -31,8 +31,8 @@ TOLERANCE = {"fp32": 1e-5, "bf16": 0.03, "int8": 0.16}
 """Of the root mean square of what the network says. fp32: sums of a few hundred products in another
 order. Below, a number is rounded by half of 2^-8 (bf16), or by half of 1/255 of the range that it
 was seen in (int8), before each of half a dozen layers; single layers are kept higher. int8: a range
-of 16 root mean squares is rounded by 16 / 255 / sqrt(12) of one; weights and inputs of ten layers add up
-to sqrt(20) times that, 0.08, and twice that is allowed."""
+of 16 root mean squares is rounded by 16 / 255 / sqrt(12) of one; weights and inputs of ten layers
+add up to sqrt(20) times that, 0.08, and twice that is allowed."""
 
 
 def cells(count: int, seed: int = 0) -> Inputs:
