@@ -111,7 +111,7 @@ class StageClock:
 class MemoryMeter:
     """Peak memory over all regions measured with it: `with meter: ...`, as often as needed.
 
-    What the process has freed before, say in a training, does not count.
+    What the process has freed before, say in a training, is given back first.
 
     Attributes:
         peak_bytes: the highest peak so far.

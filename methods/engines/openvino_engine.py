@@ -109,7 +109,12 @@ class OpenVino(Engine):
         logging.getLogger("nncf").setLevel(logging.ERROR)
         frames = self._nncf.Dataset(samples, lambda inputs: [x.numpy() for x in inputs])
         with contextlib.redirect_stdout(sys.stderr):  # its progress bars
-            return self._nncf.quantize(model, frames, subset_size=len(samples))
+            return self._nncf.quantize(
+                model,
+                frames,
+                preset=self._nncf.QuantizationPreset.MIXED,  # activations are not symmetric
+                subset_size=len(samples),
+            )
 
     def _write(self, model: Any, path: Path) -> None:
         """Leave the model at `path`, whole or not at all."""

@@ -13,7 +13,7 @@ from bench.console import ConsoleLog
 from bench.errors import Unavailable
 from methods.engines import Engine, Inputs, required
 from methods.engines.onnxruntime_engine import OnnxRuntime
-from methods.engines.openvino_engine import OpenVino
+from methods.engines.openvino_engine import OpenVino, _capabilities
 from methods.engines.torch_engine import TorchEngine
 from methods.kernels.depthwise import neighbours_of
 from methods.renderer2d import Network
@@ -21,18 +21,21 @@ from methods.space_to_depth import SpaceToDepth
 from methods.unet_release import UnetRelease
 from tests.methods.observations import shaken
 
-ENGINES: list[tuple[type[Engine], str]] = [
+NO_BF16 = "BF16" not in _capabilities(required("openvino", "openvino", "openvino"))
+
+ENGINES = [
     *((TorchEngine, p) for p in ("fp32", "bf16")),
-    *((OpenVino, p) for p in ("fp32", "bf16", "int8")),
+    *((OpenVino, p) for p in ("fp32", "int8")),
+    pytest.param(
+        OpenVino, "bf16", marks=pytest.mark.skipif(NO_BF16, reason="no bfloat16 on this CPU")
+    ),
     *((OnnxRuntime, p) for p in ("fp32", "int8")),
 ]
 
-TOLERANCE = {"fp32": 1e-5, "bf16": 0.03, "int8": 0.16}
+TOLERANCE = {"fp32": 1e-5, "bf16": 0.03, "int8": 0.1}
 """Of the root mean square of what the network says. fp32: sums of a few hundred products in another
 order. Below, a number is rounded by half of 2^-8 (bf16), or by half of 1/255 of the range that it
-was seen in (int8), before each of half a dozen layers; single layers are kept higher. int8: a range
-of 16 root mean squares is rounded by 16 / 255 / sqrt(12) of one; weights and inputs of ten layers
-add up to sqrt(20) times that, 0.08, and twice that is allowed."""
+was seen in (int8), before each of half a dozen layers; single layers are kept higher."""
 
 
 def cells(count: int, seed: int = 0) -> Inputs:
@@ -82,11 +85,7 @@ def test_an_engine_computes_what_the_network_does(
     folder: Callable[[], Path],
     quiet_log: ConsoleLog,
 ) -> None:
-    try:
-        engine = kind(precision)
-    except Unavailable as error:
-        pytest.skip(str(error))
-    module, inputs = network()
+    engine, (module, inputs) = kind(precision), network()
     built = engine.build(module, lambda: inputs, folder, quiet_log)
     with torch.no_grad():
         for some in inputs:
