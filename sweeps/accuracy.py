@@ -20,12 +20,12 @@ from bench.frontier import best_instead, cheapest_within
 from bench.types import Method
 from reports.accuracy import experiment_table, setting_table, write_accuracy
 from sweeps.build import build
-from sweeps.knobs import EVERYTHING_OFF, knobs
+from sweeps.knobs import ALWAYS, EVERYTHING_OFF, knobs
 from sweeps.measurement import checked_settings
 from sweeps.overrides import composed
 from sweeps.terminal import console, rich_table
 from sweeps.turns import turn
-from sweeps.variants import common_ground, finite, require_lean, usable_method
+from sweeps.variants import Variant, common_ground, finite, require_lean, usable_method
 
 SETTINGS = ("method=steernerf", "scene=totem", "budget=demo", "trajectory=orbit")
 
@@ -39,10 +39,11 @@ def main(options: argparse.Namespace) -> int:
     require_lean(config, "steerbench accuracy turns all knobs of SteerNeRF")
     _check_taught(config, overrides)
     log = _Once(outputs)
+    turned = _turned(options)
     settings: list[dict[str, Any]] = []
     if not options.kernels:
         with turn(config.device, log):
-            settings = _setting_rows(overrides, options, log)
+            settings = _setting_rows(overrides, turned, options, log)
         console().print(rich_table(setting_table(settings)))
     from methods.accuracy import all_experiments
 
@@ -96,12 +97,26 @@ def _last_words(overrides: Sequence[str]) -> list[str]:
     return list({line.partition("=")[0]: line for line in overrides}.values())
 
 
+def _turned(options: argparse.Namespace) -> list[tuple[str, Variant]]:
+    """The settings that were asked for, each with its knob."""
+    known = knobs(options.trained)
+    chosen = [knob for knob in known if options.filter in knob and knob not in ALWAYS]
+    if not chosen:
+        names = ", ".join(knob for knob in known if knob not in ALWAYS)
+        raise SteerbenchError(
+            f"--filter: no knob has {options.filter!r} in its name; expected part of one of {names}"
+        )
+    return [(knob, v) for knob, some in known.items() if knob in (*ALWAYS, *chosen) for v in some]
+
+
 def _setting_rows(
-    overrides: Sequence[str], options: argparse.Namespace, log: ConsoleLog
+    overrides: Sequence[str],
+    turned: Sequence[tuple[str, Variant]],
+    options: argparse.Namespace,
+    log: ConsoleLog,
 ) -> list[dict[str, Any]]:
     """Of every setting its knob, overrides, times and errors, what it loses against everything off
     and, in its place, the setting on the frontier; see `bench.accuracy.render_in_turns`."""
-    turned = [(knob, v) for knob, some in knobs(options.trained).items() for v in some]
     lines = {v.name: _last_words([*overrides, *v.settings]) for _, v in turned}
     configs = {name: composed(words) for name, words in lines.items()}
     scene, path, protocol = common_ground(configs[EVERYTHING_OFF.name], options.frames, log)

@@ -124,6 +124,11 @@ def _accuracy(accuracy: Parser) -> None:
         action="store_true",
         help="also what asks for trainings of its own: L, K, s, T, taught steps, a field in fp32",
     )
+    accuracy.add_argument(
+        "--filter",
+        default="",
+        help="only knobs whose name contains this: step, range, engine, refined, trained, ...",
+    )
     _count(accuracy, "--frames", 24, "first frames of the trajectory")
     _count(accuracy, "--repeats", 5, "timed rounds over all settings")
     _overrides(accuracy, " (default scene=totem budget=demo trajectory=orbit)")

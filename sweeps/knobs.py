@@ -25,6 +25,9 @@ field is empty belongs to the model: what it holds there was never held against 
 
 AS_IT_IS = Variant("as it is")
 
+ALWAYS = (EVERYTHING_OFF.name, AS_IT_IS.name)
+"""Not a knob: what all of them are compared with."""
+
 TRAININGS = (
     ("L", "method.pipeline.frames", (0, 1, 3), ()),
     ("K", "method.pipeline.channels", (3, 9), ()),
@@ -43,8 +46,8 @@ def knobs(trained: bool) -> Mapping[str, Sequence[Variant]]:
     All are rendered from one training, but for those that are added with `trained`.
     """
     return {
-        "everything off": [EVERYTHING_OFF],
-        "as it is": [AS_IT_IS],
+        EVERYTHING_OFF.name: [EVERYTHING_OFF],
+        AS_IT_IS.name: [AS_IT_IS],
         "step length": [_step(value) for value in (1, 1.5, 3, 4)],
         "refined step length": [_refined_step(value) for value in (1.5, 2, 3)],
         "stop": [_stop(value) for value in ("1e-1", "3e-2", "1e-3", "1e-4")],

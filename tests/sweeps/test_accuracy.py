@@ -36,12 +36,16 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> None:
          "psnr_to_first": 40.0 if index else math.inf}
         for index, (name, (ms, psnr)) in enumerate(FIGURES.items())
     ]  # fmt: skip
+
+    def rendered(methods: dict[str, Fitted], *arguments: object) -> list[dict[str, object]]:
+        return [row for row in rows if row["setting"] in methods]
+
     ground = SimpleNamespace(name="totem"), SimpleNamespace(name="orbit", resolution="8x8"), None
-    known = {"everything off": [EVERYTHING_OFF], "refined": variants}
+    known = {"everything off": [EVERYTHING_OFF], "share": variants[:2], "engine": variants[2:]}
     monkeypatch.setattr("sweeps.accuracy.knobs", lambda trained: known)
     monkeypatch.setattr("sweeps.accuracy.common_ground", lambda *arguments: ground)
     monkeypatch.setattr("sweeps.accuracy.usable_method", lambda *arguments, **options: Fitted())
-    monkeypatch.setattr("sweeps.accuracy.render_in_turns", lambda *arguments: rows)
+    monkeypatch.setattr("sweeps.accuracy.render_in_turns", rendered)
     monkeypatch.setattr("sweeps.accuracy.experiment_rows", lambda *arguments: [ERROR])
     monkeypatch.setattr("methods.accuracy.all_experiments", lambda: [])
     monkeypatch.setattr("reports.accuracy.frontier_plot", lambda rows, path: path.touch())
@@ -96,6 +100,14 @@ def test_a_report_a_plot_and_the_rows_are_left_in_outputs(steerbench, measured, 
     assert names == {"report.md", "report.html", "frontier.png", "kernels.csv", "settings.csv"}
 
 
+def test_a_filter_leaves_the_knobs_with_it_in_their_name_and_what_they_are_compared_with(
+    steerbench, measured
+):
+    outcome = steerbench("accuracy", "--filter", "gin")
+    settings = json.loads(outcome.out.splitlines()[-1])["settings"]
+    assert [row["setting"] for row in settings] == ["everything off", "poor"]
+
+
 def test_the_kernels_alone_train_and_render_nothing(steerbench, measured, monkeypatch):
     monkeypatch.setattr("sweeps.accuracy.common_ground", None)
     outcome = steerbench("accuracy", "--kernels")
@@ -107,6 +119,7 @@ def test_the_kernels_alone_train_and_render_nothing(steerbench, measured, monkey
     [
         (["--repeats", "0"], "--repeats: expected 1 or more, got 0"),
         (["--within", "much"], "--within: expected decibels, 0.1dB for example, got 'much'"),
+        (["--filter", "colour"], "no knob has 'colour' in its name; expected part of one of step"),
         (["method=ngp"], "expected a method with renderer=s2d, as method=steernerf"),
         (["budget=demmo"], "Did you mean demo?"),
     ],
