@@ -24,13 +24,24 @@ from methods.buffer import Cloud, Remembered, RenderingBuffer, Reprojection
 from methods.cells import centres, put_pixels
 from methods.fields import HashField
 from methods.kernels.composite import STOP, check_stop
+from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy
 from methods.kernels.warp import enlarge, warp
 from methods.occupancy import STEP
 from methods.range_reduction import RangeReduction, depths_around, evidence, render_guided
-from methods.renderer2d import Detail, Observation, Points, Renderer2d, cells_at_matter
+from methods.renderer2d import (
+    Detail,
+    Observation,
+    Points,
+    Renderer2d,
+    cells_at_matter,
+    check_size,
+)
 from methods.rounds import render_rays
 from methods.volume import FeatureFrame, query
+
+SIZES = {"channels": (3, 256), "frames": (0, 64), "scale": (1, 64)}
+"""K, L and s that a pipeline may have: from, to."""
 
 LAYER = 4 * STEP
 """Thickness, in scene units, of what a single sample of the surface stands for."""
@@ -101,11 +112,8 @@ class PipelineOptions:
     skip: Skips = Skips()
 
     def __post_init__(self) -> None:
-        if not (self.channels >= 3 and self.frames >= 0 and self.scale >= 1):
-            raise ValueError(
-                f"expected channels (K) >= 3, frames (L) >= 0, scale (s) >= 1, "
-                f"got {self.channels}, {self.frames}, {self.scale}"
-            )
+        for name, (least, most) in SIZES.items():
+            check_size(name, getattr(self, name), least, most)
         for name in ("steps", "refined_steps"):
             if not (length := getattr(self, name)) > 0:
                 raise ValueError(f"{name}: expected a length of more than 0, got {length}")
@@ -116,6 +124,16 @@ class PipelineOptions:
         if not self.frames and self.range.mode != "off":
             raise ValueError(
                 f"range.mode: expected off without preceding frames (L = 0), got {self.range.mode}"
+            )
+
+    def check(self, grid: HashGrid, renderer: Renderer2d) -> None:
+        """Refuse, with a ValueError, what a field of `grid` or the `renderer` cannot do."""
+        if self.levels is not None:
+            grid.check_levels(self.levels)
+        if self.refined and not renderer.doubts:
+            raise ValueError(
+                f"pipeline.refined: {type(renderer).__name__} does not say where it may be wrong, "
+                f"expected 0, got {self.refined}"
             )
 
     def taught(self, refined: float) -> PipelineOptions:
@@ -135,8 +153,7 @@ class Pipeline:
         background: [3] of the scene.
 
     Raises:
-        ValueError: cells are to be refined, and the renderer does not say which; or the grid of the
-            field does not have as many levels.
+        ValueError: see `PipelineOptions.check`.
     """
 
     def __init__(
@@ -147,13 +164,7 @@ class Pipeline:
         renderer: Renderer2d,
         options: PipelineOptions,
     ) -> None:
-        if options.refined and not renderer.doubts:
-            raise ValueError(
-                f"pipeline.refined: {type(renderer).__name__} does not say where it may be wrong, "
-                f"expected 0, got {options.refined}"
-            )
-        if options.levels is not None:
-            field.grid.check_levels(options.levels)
+        options.check(field.grid, renderer)
         self.field, self.renderer = field, renderer
         self.options, self.backend = options, field.backend
         skip = options.skip

@@ -104,6 +104,12 @@ class Network(nn.Module, ABC):
         """Multiplications by weights that `inputs` take."""
 
 
+def check_size(name: str, got: int, least: int, most: int) -> None:
+    """Refuse, with a ValueError, a size that is not of `least` to `most`."""
+    if not least <= got <= most:
+        raise ValueError(f"{name}: expected {least} to {most}, got {got}")
+
+
 class Renderer2d(nn.Module, ABC):
     """Turns observations into pictures, with the help of a network.
 

@@ -16,7 +16,7 @@ from methods.cell_network import CellNetwork
 from methods.cells import number, paint
 from methods.kernels.depthwise import neighbours_of
 from methods.kernels.lift import Layout, draw, lift
-from methods.renderer2d import UNWATCHED, Drawing, Observation, Renderer2d
+from methods.renderer2d import UNWATCHED, Drawing, Observation, Renderer2d, check_size
 
 QUANTUM = 512
 """The network is given cells in multiples of this."""
@@ -79,6 +79,8 @@ class SpaceToDepth(Renderer2d):
         surface: bool = True,
     ) -> None:
         super().__init__()
+        check_size("renderer.width", width, 1, 4096)
+        check_size("renderer.blocks", blocks, 0, 256)
         self.channels, self.frames, self.scale = channels, frames, scale
         layout = self.layout = Layout(channels, frames, scale, history and frames > 0, surface)
         self.network = CellNetwork(layout, width, blocks)

@@ -86,8 +86,8 @@ class SteerNerf:
         device: str = "auto",
         seed: int = 0,
     ) -> None:
-        if pipeline.levels is not None:  # before anything is trained
-            grid.check_levels(pipeline.levels)
+        with torch.device("meta"):  # shapes alone: refused, if at all, before anything is trained
+            pipeline.check(grid, renderer(pipeline.channels, pipeline.frames, pipeline.scale))
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         self.options, self.make_renderer, self.joint, self.name = pipeline, renderer, joint, name
         engine.check(self.setup.device)

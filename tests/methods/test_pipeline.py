@@ -15,7 +15,7 @@ from methods.buffer import RenderingBuffer
 from methods.cells import cells_near, pixels_of
 from methods.kernels.warp import enlarge
 from methods.occupancy import STEP
-from methods.pipeline import LAYER, Pipeline, PipelineOptions, Skips, View, sample_phase
+from methods.pipeline import LAYER, SIZES, Pipeline, PipelineOptions, Skips, View, sample_phase
 from methods.range_reduction import RangeReduction, render_guided
 from methods.space_to_depth import SpaceToDepth
 from methods.unet_release import UnetRelease
@@ -235,10 +235,12 @@ def test_low_resolution_rays_read_the_coarsest_levels_alone() -> None:
     assert reads == [8 * GRID.levels, 8 * GRID.levels, 8]
 
 
-@pytest.mark.parametrize("wrong", [{"channels": 2}, {"frames": -1}, {"scale": 0}])
-def test_options_that_make_no_frame_are_refused(wrong: dict[str, int]) -> None:
-    with pytest.raises(ValueError, match="expected channels"):
-        replace(OPTIONS, **wrong)
+@pytest.mark.parametrize("name", SIZES)
+def test_sizes_that_make_no_frame_are_refused(name: str) -> None:
+    least, most = SIZES[name]
+    for wrong in (least - 1, most + 1):
+        with pytest.raises(ValueError, match=f"{name}: expected {least} to {most}, got {wrong}"):
+            replace(OPTIONS, **{name: wrong})
 
 
 @pytest.mark.parametrize("name", ["steps", "refined_steps"])

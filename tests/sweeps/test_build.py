@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,7 +119,22 @@ def test_a_dataclass_may_have_fields_of_types_that_only_the_module_of_its_base_k
         check_settings(options, {"jitter": "much"})
 
 
-def test_more_levels_than_the_grid_has_are_refused_before_anything_is_trained():
-    config = composed(["method=steernerf", "method.pipeline.levels=17"])
-    with pytest.raises(SteerbenchError, match=r"^method: levels: expected 1 to 16, got 17"):
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["method.pipeline.levels=17"], "levels: expected 1 to 16, got 17"),
+        (["method.pipeline.scale=8"], "use renderer.init=scratch"),
+        (["method.renderer.width=0"], "renderer.width: expected 1 to 4096, got 0"),
+        (["method.renderer.blocks=-1"], "renderer.blocks: expected 0 to 256, got -1"),
+        (
+            ["method=steernerf_paper", "method.pipeline.refined=0.1"],
+            "pipeline.refined: UnetRelease does not say where it may be wrong, expected 0, got 0.1",
+        ),
+    ],
+)
+def test_what_field_and_renderer_cannot_do_is_refused_before_anything_is_trained(
+    overrides, message
+):
+    config = composed(["method=steernerf", *overrides])
+    with pytest.raises(SteerbenchError, match=rf"^method: .*{re.escape(message)}"):
         build(config, "method")
