@@ -19,6 +19,7 @@ from bench.frontier import observed_order
 from bench.metrics import psnr, psnr_of_mse
 from bench.probes import StageClock
 from bench.protocol import EvaluationProtocol, composite
+from bench.scoring import check_frame
 from bench.trajectories import Trajectory
 from bench.types import Log, Method, Scene, SteerbenchError
 
@@ -140,7 +141,7 @@ def render_in_turns(
         them.
 
     Raises:
-        SteerbenchError: there is no such frame.
+        SteerbenchError: there is no such frame, or a method rendered values that are not finite.
     """
     start = max(method.memory for method in methods.values())
     steps = trajectory.steps
@@ -160,6 +161,7 @@ def render_in_turns(
                 for number, step in enumerate(steps):
                     with clocks[name].frame():
                         frame = method.render(step.camera, clocks[name])
+                    check_frame(frame, step.camera, name, number)
                     if round_ == 0 and number in scored:
                         scores.add(name, number, frame.rgb)
                 progress.advance(note=f"round {round_} of {repeats}" if round_ else "warming up")

@@ -46,7 +46,7 @@ def psnr(image: Tensor, reference: Tensor) -> float:
 
 def psnr_of_mse(mse: float) -> float:
     """The PSNR in dB that a mean squared error is, for a peak of 1; +inf for none."""
-    return -10.0 * math.log10(mse) if mse > 0.0 else math.inf
+    return math.inf if mse == 0.0 else -10.0 * math.log10(mse)  # nan stays nan
 
 
 def flicker(

@@ -18,9 +18,9 @@ from scipy import stats
 from bench.probes import FrameRecord, MemoryMeter, StageClock
 from bench.protocol import EvaluationProtocol
 from bench.results import COLD, STEADY, WHOLE, Measurement
-from bench.scoring import ERROR_RANGE, Scoring
+from bench.scoring import ERROR_RANGE, Scoring, check_frame
 from bench.trajectories import Trajectory, spread
-from bench.types import Budget, Frame, Log, Method, Scene, SteerbenchError, check_shape
+from bench.types import Budget, Log, Method, Scene
 
 CONFIDENCE = 0.95
 QUANTILES = (50, 95, 99)
@@ -122,7 +122,7 @@ def _render(
                 method.reset()
             with meter, clock.frame():
                 frame = method.render(step.camera, clock)
-            _check_frame(frame, step.camera.height, step.camera.width, method.name, index)
+            check_frame(frame, step.camera, method.name, index)
             figures = {"frame": index, "phase": phase, "peak_bytes": meter.last_bytes}
             figures |= _times_and_work(clock.frames[-1])
             table.append(figures | scoring.score(index, step, frame.rgb))
@@ -137,18 +137,6 @@ def _phases(trajectory: Trajectory, memory: int, protocol: EvaluationProtocol) -
     """
     known = trajectory.preceding if protocol.memory == "steady" else [0] * len(trajectory.steps)
     return [COLD if count < memory else STEADY for count in known]
-
-
-def _check_frame(frame: Frame, height: int, width: int, method: str, index: int) -> None:
-    """A picture with a NaN in it has no score, and a table may not invent one."""
-    check_shape("rgb", frame.rgb, height, width, 3)
-    broken = int((~torch.isfinite(frame.rgb)).any(dim=-1).sum())
-    if broken:
-        raise SteerbenchError(
-            f"{method} rendered {broken} of {height * width} pixels of frame {index} as NaN or "
-            "infinite: the training is broken; train again with a lower learning rate or another "
-            "seed"
-        )
 
 
 def _times_and_work(record: FrameRecord) -> dict[str, Any]:

@@ -13,10 +13,27 @@ from torch import Tensor
 from bench.metrics import Lpips, flicker, quantise
 from bench.protocol import EvaluationProtocol, composite
 from bench.trajectories import Step, Trajectory, spread
-from bench.types import Scene
+from bench.types import Camera, Frame, Scene, SteerbenchError, check_shape
 
 ERROR_RANGE = 0.1
 """Absolute error, mean over the channels, that the brightest colour of an error map stands for."""
+
+
+def check_frame(frame: Frame, camera: Camera, method: str, index: int) -> None:
+    """Refuse a picture with a NaN in it: it has no score, and a table may not invent one.
+
+    Raises:
+        ValueError: the picture is not of the size of `camera`.
+        SteerbenchError: a pixel of it is not finite.
+    """
+    check_shape("rgb", frame.rgb, camera.height, camera.width, 3)
+    broken = int((~torch.isfinite(frame.rgb)).any(dim=-1).sum())
+    if broken:
+        raise SteerbenchError(
+            f"{method} rendered {broken} of {camera.height * camera.width} pixels of frame {index} "
+            "as NaN or infinite: the training is broken; train again with a lower learning rate or "
+            "another seed"
+        )
 
 
 class Scoring:

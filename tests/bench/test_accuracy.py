@@ -50,7 +50,7 @@ def test_settings_in_words_have_no_order(quiet_log):
 class Brighter:
     """Renders the ground truth brighter by some 8-bit levels, and notes its turn in `turns`."""
 
-    def __init__(self, scene, levels: int, turns: list, memory: int = 0) -> None:
+    def __init__(self, scene, levels: float, turns: list, memory: int = 0) -> None:
         self.name, self.levels, self.turns, self.memory = "brighter", levels, turns, memory
         self.split, self.background = scene.splits["test"], scene.background
 
@@ -120,3 +120,9 @@ def test_a_frame_soon_after_a_cut_is_not_scored(in_turns, tiny_scene):
 def test_without_a_frame_to_score_the_answer_is_to_give_more(in_turns, tiny_scene):
     with pytest.raises(SteerbenchError, match="give more frames"):
         in_turns(0, memory=len(tiny_scene.splits["test"]))
+
+
+def test_a_picture_with_a_nan_ends_it_and_is_no_setting(tiny_scene, quiet_log):
+    broken = Brighter(tiny_scene, math.nan, [])
+    with pytest.raises(SteerbenchError, match=r"broken rendered .* pixels of frame 0 as NaN"):
+        render_in_turns({"broken": broken}, tiny_scene, from_split(tiny_scene), QUICK, 1, quiet_log)

@@ -55,6 +55,11 @@ def test_psnr_is_symmetric_and_infinite_for_equal_pictures(device):
     assert psnr(a, a) == math.inf
 
 
+def test_a_picture_with_a_nan_is_not_a_perfect_one(device):
+    a = torch.ones(4, 5, 3, device=device)
+    assert math.isnan(psnr(a * torch.nan, a))
+
+
 def test_flicker_is_the_change_of_the_error_alone(device):
     before, after, wrong = (noise(9, 8, seed, device).double() for seed in range(3))
     assert flicker(after, after, before, before) == 0
