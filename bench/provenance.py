@@ -6,7 +6,6 @@ import functools
 import hashlib
 import os
 import platform
-import re
 import subprocess
 from collections.abc import Iterable
 from importlib import metadata
@@ -15,6 +14,11 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 MEASURING_PACKAGES = ("bench", "methods")
 VERSIONS_OF = ("torch", "numpy", "numba", "scikit-image", "lpips")
+VERSIONS_OF_ENGINES = ("openvino", "nncf", "onnx", "onnxruntime")
+"""Extras: they compute frames, and have no part in a training."""
+
+CPU_MARKS = ("cpu family", "model", "CPU implementer", "CPU part")
+"""Of /proc/cpuinfo: names alone are shared by processors that compute differently."""
 
 
 @functools.cache
@@ -54,6 +58,7 @@ def machine() -> dict[str, object]:
     """The machine and the versions of what it runs, for the record of a run."""
     import torch  # here, because reading the store needs no torch
 
+    capabilities = torch.cpu.get_capabilities()
     return {
         "cpu": _cpu_model(),
         "cores": os.cpu_count(),
@@ -63,13 +68,25 @@ def machine() -> dict[str, object]:
         "cuda": torch.version.cuda,
         "system": platform.platform(),
         "python": platform.python_version(),
+        "instructions": sorted(name for name, has in capabilities.items() if has is True),
         "versions": {name: metadata.version(name) for name in VERSIONS_OF},
+        "engines": {name: version for name in VERSIONS_OF_ENGINES if (version := _version(name))},
     }
 
 
-def decisive() -> dict[str, object]:
-    """What of the machine decides on figures: rows and trainings of others are other ones."""
-    return {name: value for name, value in machine().items() if name in ("cpu", "gpus", "versions")}
+def decisive(*, engines: bool) -> dict[str, object]:
+    """What of the machine decides on a training, and with `engines` on figures: those of others are
+    other ones."""
+    names = ("cpu", "instructions", "gpus", "versions", *(("engines",) if engines else ()))
+    found = machine()
+    return {name: found[name] for name in names}
+
+
+def _version(library: str) -> str | None:
+    try:
+        return metadata.version(library)
+    except metadata.PackageNotFoundError:
+        return None
 
 
 def _git(*arguments: str) -> str:
@@ -84,5 +101,8 @@ def _cpu_model() -> str:
         text = Path("/proc/cpuinfo").read_text()
     except OSError:
         return platform.processor()
-    model = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
-    return model[1] if model else platform.machine()
+    # Of the first processor; the others are taken to be like it.
+    known = {k.strip(): v.strip() for k, _, v in (x.partition(":") for x in text.splitlines()[:40])}
+    marks = [f"{mark.removeprefix('cpu ')} {known[mark]}" for mark in CPU_MARKS if mark in known]
+    name = known.get("model name", platform.machine())
+    return f"{name} ({', '.join(marks)})" if marks else name

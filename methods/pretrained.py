@@ -82,7 +82,7 @@ class Setup:
             "precision": self.precision,
             "backend": self.backend,
             "device": self.device.type,
-            "machine": decisive(),
+            "machine": decisive(engines=False),
             "threads": torch.get_num_threads(),
             "seed": self.seed,
             "code": training_digest(),

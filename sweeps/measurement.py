@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import shlex
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
@@ -11,13 +13,14 @@ from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.columns import Columns
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
-from bench.provenance import code_digest, decisive
+from bench.provenance import ROOT, code_digest, decisive
 from bench.results import Store
 from bench.run import measure
 from bench.types import DEVICE, Method, Scene
@@ -31,6 +34,9 @@ from sweeps.turns import turn
 
 PLACES = ("outputs", "report", "weights_dir")
 """Settings that say where things lie: they do not change a row."""
+
+USUAL_THREADS = torch.get_num_threads()
+"""What torch takes where nothing is said."""
 
 
 @dataclass(frozen=True)
@@ -142,10 +148,13 @@ def checked_settings(config: DictConfig) -> Settings:
         raise SteerbenchError(f"threads: expected 1 or more, or null, got {settings.threads}")
     if not DEVICE.fullmatch(settings.device):
         raise SteerbenchError(f"device: expected auto, cpu, cuda or cuda:N, got {settings.device}")
-    if settings.device.startswith("cuda") and not torch.cuda.is_available():
-        raise Unavailable(f"device={settings.device}: torch sees no GPU here; use device=cpu")
-    if settings.threads is not None:
-        torch.set_num_threads(settings.threads)
+    _, _, number = settings.device.partition(":")
+    if settings.device.startswith("cuda") and int(number or 0) >= torch.cuda.device_count():
+        raise Unavailable(
+            f"device={settings.device}: torch sees {torch.cuda.device_count() or 'no'} GPUs here, "
+            "numbered from 0; use another, or device=cpu"
+        )
+    torch.set_num_threads(settings.threads or USUAL_THREADS)
     return settings
 
 
@@ -186,12 +195,34 @@ def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any
     """Everything that can change the rows but for the weights at hand: what makes a run's key."""
     return {
         "code": code_digest(),
+        "other_code": _other_code(config),
         "config": described(config),
         "scene": scene.digest,
         "resolved": method.settings(),
         "threads": torch.get_num_threads(),
-        "machine": decisive(),
+        "machine": decisive(engines=True),
     }
+
+
+def _other_code(config: DictConfig) -> dict[str, str]:
+    """SHA-256 of the files outside of this project that define what `config` builds, by what is
+    built from them."""
+    found = {}
+    for target in _targets(OmegaConf.to_container(config, resolve=True)):
+        module = sys.modules[get_object(target).__module__]
+        path = Path(module.__file__ or ROOT).resolve()
+        if not path.is_relative_to(ROOT):
+            found[target] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return found
+
+
+def _targets(node: Any) -> Iterator[str]:
+    """What `node` and all below it are built by."""
+    if isinstance(node, Mapping):
+        if "_target_" in node:
+            yield node["_target_"]
+        for value in node.values():
+            yield from _targets(value)
 
 
 def _show(run: Run, explain: bool) -> None:

@@ -84,3 +84,23 @@ def test_the_machine_record_is_json_and_names_what_matters():
     assert record["memory_bytes"] > 1 << 28
     assert record["cpu"]
     assert len(record["gpus"]) == torch.cuda.device_count()
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("cpu family\t: 25\nmodel\t: 1\nmodel name\t: EPYC\n", "EPYC (family 25, model 1)"),
+        ("CPU implementer\t: 0x41\nCPU part\t: 0xd40\n", "(CPU implementer 0x41, CPU part 0xd40)"),
+    ],
+)
+def test_processors_of_one_name_are_told_apart(text, name, monkeypatch):
+    monkeypatch.setattr(Path, "read_text", lambda path, *more, **options: text)
+    assert provenance.machine()["cpu"].endswith(name)
+
+
+def test_an_engine_that_is_another_changes_figures_and_no_training(monkeypatch):
+    before = [provenance.decisive(engines=engines) for engines in (False, True)]
+    monkeypatch.setattr(provenance, "_version", lambda library: "another")
+    after = [provenance.decisive(engines=engines) for engines in (False, True)]
+    assert before[0] == after[0]
+    assert before[1] != after[1]

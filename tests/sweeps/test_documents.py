@@ -49,6 +49,10 @@ def test_the_method_and_the_scene_of_the_document_are_measured_from_outside_the_
     assert measured.status == 0, measured.err
     assert "19.83" in measured.out  # 20 log10(255 / 26)
     assert "paint" in measured.out
+    with (tmp_path / "mean_colour.py").open("a") as file:
+        file.write("# changed\n")
+    steerbench(*shlex.split(typed), *without_lpips)
+    assert len(list(tmp_path.glob("outputs/runs/*/record.json"))) == 2
     refused = steerbench(*shlex.split(typed), *without_lpips, "method.shade=2.0")
     assert refused.err.endswith("method: shade: expected 0 to 1, got 2.0\n")
 

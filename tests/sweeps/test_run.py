@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
 
 def stored(tmp_path: Path) -> list[Path]:
@@ -59,6 +60,17 @@ def test_the_record_holds_the_command_that_was_typed(run, tmp_path):
     command = json.loads((folder / "record.json").read_text())["command"]
     assert command.startswith("steerbench run ")
     assert command.endswith("seed=3 scene.path=.")
+    assert f"--config-dir={Path(__file__).parent / 'configs'} method=grey" in command
+
+
+def test_a_job_that_says_nothing_of_threads_has_the_usual_ones(run, tmp_path):
+    usual = torch.get_num_threads()
+    run("-m", "threads=1,null")
+    records = [json.loads((folder / "record.json").read_text()) for folder in stored(tmp_path)]
+    threads = {
+        json.dumps(r["made_of"]["config"]["threads"]): r["machine"]["threads"] for r in records
+    }
+    assert threads == {"1": 1, "null": usual}
 
 
 def test_a_report_is_written_where_it_is_asked_for(run, tmp_path):
