@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Protocol
 
+from bench.errors import SteerbenchError
+from bench.run import UNITS
 from reports.runs import Run
 from reports.tables import QUALITY, Table, megabytes, number
 
@@ -72,13 +74,25 @@ def _columns(runs: Sequence[Run]) -> list[tuple[str, str, Write]]:
 
 
 def written(metric: str) -> tuple[str, Write]:
-    """What the column of a metric is called, with an arrow to better, and how it is written."""
+    """What the column of a metric is called, with an arrow to better, and how it is written.
+
+    Raises:
+        SteerbenchError: there is no such metric.
+    """
     if metric in QUALITY:
         label, decimals = QUALITY[metric]
         return label, partial(number, decimals=decimals)
     if metric in COST:
         return COST[metric]
-    return f"{metric.removeprefix('stage_ms.')}, ms ↓", partial(number, decimals=2)
+    family, _, rest = metric.partition(".")
+    unit = UNITS.get(family)
+    if unit is None:
+        raise SteerbenchError(
+            f"{metric}: no such metric; expected one as `steerbench results` shows them"
+        )
+    if unit == "B":
+        return f"{rest or 'peak memory'}, MB ↓", megabytes
+    return f"{rest or family}, {unit} ↓", partial(number, decimals=0 if family == "work" else 2)
 
 
 def ranks(runs: Sequence[Comparable], metric: str) -> dict[int, int]:

@@ -61,7 +61,10 @@ class PaperTable:
 
 def paper_tables() -> list[PaperTable]:
     """All of them, in the paper's order."""
-    return [_table(path) for path in sorted(FOLDER.glob("table*.toml"))]
+    return [
+        _table(path)
+        for path in sorted(FOLDER.glob("table*.toml"), key=lambda path: (len(path.stem), path.stem))
+    ]
 
 
 def _table(path: Path) -> PaperTable:

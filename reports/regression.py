@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from bench.errors import SteerbenchError
 from bench.results import STEADY
 from bench.run import half_interval
 from reports.runs import Run
-from reports.tables import Table
+from reports.tables import QUALITY, Table
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,9 @@ LIMITS: Mapping[str, Limit] = {
 }
 """What is compared, unless a baseline says otherwise."""
 
+LARGEST = ("peak_bytes",)
+"""Metrics whose headline is the largest figure of a frame, not the mean of all."""
+
 
 @dataclass(frozen=True)
 class Figures:
@@ -52,8 +55,8 @@ class Figures:
 
     Attributes:
         values: of its headline, by metric.
-        frames: of its steady frames with ground truth, by metric and by number and name of the
-            frame.
+        frames: what the headline is the mean of, by metric and by number and name of the frame:
+            of qualities, the steady frames with ground truth, else all steady ones.
         machine: name of its processor and graphics processors.
         views: the same where the same frames of the same scene were rendered by one protocol.
     """
@@ -64,30 +67,26 @@ class Figures:
     views: str
 
     @classmethod
-    def of(cls, run: Run) -> Figures:
+    def of(cls, run: Run, limits: Mapping[str, Limit] = LIMITS) -> Figures:
         """The figures of `run` that have a limit."""
         values = {
             metric: run.values[metric]
-            for metric in LIMITS
+            for metric in limits
             if math.isfinite(run.values.get(metric, math.nan))
         }
         steady = run.frames[run.frames["phase"] == STEADY]
-        scored = (steady if len(steady) else run.frames).dropna(subset=["psnr"])
-        names = [f"{row.frame}: {row.name}" for row in scored[["frame", "name"]].itertuples(False)]
-        frames = {
-            metric: dict(zip(names, scored[metric].astype(float), strict=True))
-            for metric in LIMITS
-            if metric in scored and metric in values and scored[metric].notna().all()
-        }
+        steady = steady if len(steady) else run.frames
+        scored = steady.dropna(subset=["psnr"])
+        frames = {}
+        for metric in values:
+            if metric in run.frames and metric not in LARGEST:
+                averaged = scored if metric in QUALITY else steady
+                names = averaged["frame"].astype(str) + ": " + averaged["name"].fillna("")
+                if averaged[metric].notna().all():
+                    frames[metric] = dict(zip(names, averaged[metric].astype(float), strict=True))
         machine = run.record["machine"]
         views = ", ".join(map(str, (*run.views, run.facts["protocol"])))
         return cls(values, frames, ", ".join((machine["cpu"], *machine["gpus"])), views)
-
-    def of_metrics(self, metrics: Collection[str]) -> Figures:
-        """Only those of `metrics`."""
-        values = {metric: value for metric, value in self.values.items() if metric in metrics}
-        frames = {metric: value for metric, value in self.frames.items() if metric in metrics}
-        return replace(self, values=values, frames=frames)
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,10 @@ def changes(old: Figures, new: Figures, limits: Mapping[str, Limit] = LIMITS) ->
         SteerbenchError: the runs rendered other frames.
     """
     if old.views != new.views:
-        raise SteerbenchError(f"these are figures of other frames: {old.views}; {new.views}")
+        raise SteerbenchError(
+            "these are figures of other frames, expected those of one scene, size and protocol: "
+            f"{old.views}; {new.views}"
+        )
     for metric, limit in limits.items():
         if metric not in old.values or (limit.here and old.machine != new.machine):
             continue

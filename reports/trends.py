@@ -10,7 +10,7 @@ import numpy as np
 
 from bench.run import half_interval
 from reports.comparison import written
-from reports.regression import Figures
+from reports.regression import LIMITS, Figures
 from reports.seeds import Repeated
 from reports.tables import Table
 
@@ -73,6 +73,7 @@ def _apart(one: Repeated, other: Repeated, metric: str) -> tuple[np.ndarray, str
         if run.facts["seed"] == twin.facts["seed"]
         and metric in run.values
         and metric in twin.values
+        and (run.computer == twin.computer or not (metric in LIMITS and LIMITS[metric].here))
     ]
     if len(pairs) == 1:
         frames, others = (Figures.of(run).frames.get(metric, {}) for run in pairs[0])

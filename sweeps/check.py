@@ -35,7 +35,13 @@ def main(options: argparse.Namespace) -> int:
             console().print(f"{command}: no such run below {options.outputs}", markup=False)
             failed += 1
             continue
-        rows = list(changes(figures, Figures.of(found[command]), limits))
+        try:
+            rows = list(changes(figures, Figures.of(found[command], limits), limits))
+        except SteerbenchError as error:
+            text = f"{command}: {error}; `steerbench check --record` takes the new ones"
+            console().print(text, markup=False)
+            failed += 1
+            continue
         failed += sum(row.verdict != "" for row in rows)
         console().print(rich_table(table(command, rows)))
     console().print("as good as the baseline" if not failed else f"worse or missing: {failed}")
@@ -86,7 +92,7 @@ def _record(path: Path, found: Mapping[str, Run]) -> None:
         found = {command: found[command] for command in known}
     if not found:
         raise SteerbenchError("there are no runs to record: `steerbench run` makes one")
-    runs = {command: asdict(Figures.of(run).of_metrics(limits)) for command, run in found.items()}
+    runs = {command: asdict(Figures.of(run, limits)) for command, run in found.items()}
     plain = {metric: asdict(limit) for metric, limit in limits.items()}
     text = json.dumps({"schema": SCHEMA, "limits": plain, "runs": runs}, indent=1)
     with explained(path.parent), whole(path) as new:

@@ -60,7 +60,8 @@ def plan(table: PaperTable, overrides: Sequence[str]) -> list[Planned]:
     compute in int8.
 
     Raises:
-        SteerbenchError: an override cannot be read, names nothing, or is swept and no seed.
+        SteerbenchError: an override cannot be read, names nothing, or is swept and no seed; or a
+            line asks for a job that the experiment does not have.
     """
     fixed, seeds = _seeds(overrides)
     lines = {
@@ -82,6 +83,13 @@ def plan(table: PaperTable, overrides: Sequence[str]) -> list[Planned]:
                 command = ["steerbench", "run", *together, *seed, "hydra.mode=RUN"]
                 merged = OmegaConf.merge(config, OmegaConf.from_dotlist(seed))
                 jobs.append(Planned(table.name, label, cast(DictConfig, merged), command))
+    made = {job.line for job in jobs}
+    if lost := [label for label in lines.values() if label not in made]:
+        choices = "; ".join(f"{name}={','.join(some)}" for name, some in grid.items())
+        raise SteerbenchError(
+            f"{table.name}: no job of its experiment fills the line {lost[0]!r}; expected the "
+            f"settings of its job among {choices}"
+        )
     return jobs
 
 
@@ -127,10 +135,11 @@ def gather(
         for job in same:
             failure = failures.found(outputs, described(job.config))
             shown = (run for run in runs.get(job.key, ()) if of_scene(run, job.config))
-            if failure is None and (run := next(shown, None)):
+            why = "not measured yet" if failure is None else f"failed: {failure}"
+            if run := next(shown, None):
                 found.append(replace(run, label=label))
-            else:
-                why = "not measured yet" if failure is None else f"failed: {failure}"
+                why = why.replace("failed", "failed when it was tried again", 1) if failure else ""
+            if why:
                 gaps.append(f"seed {job.config.seed} {why}" if len(same) > 1 else why)
         tables.setdefault(table, []).append(Repeated(label, found, gaps))
     return tables

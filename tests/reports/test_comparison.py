@@ -9,7 +9,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from reports.comparison import comparison
+from bench.errors import SteerbenchError
+from reports.comparison import comparison, written
 from reports.runs import Run
 
 FACTS = dict.fromkeys(("split", "trajectory", "budget", "protocol", "device"), "same")
@@ -80,3 +81,22 @@ def test_cold_frames_have_a_line_of_their_own_and_compete_among_themselves(make,
     assert [line[1] for line in table.lines] == ["30.46", "30.46", "27.46", "30.46", "27.46"]
     assert table.lines[2][-4:] == ("400.0", "2.50", "25.20", "61")
     assert ("b, cold", "PSNR, dB ↑") in bold(table)
+
+
+@pytest.mark.parametrize(
+    ("metric", "label", "text"),
+    [
+        ("peak_bytes", "peak memory, MB ↓", "1.50"),
+        ("size_bytes.table", "table, MB ↓", "1.50"),
+        ("stage_ms.field", "field, ms ↓", "1500000.00"),
+        ("work.samples", "samples, 1/frame ↓", "1500000"),
+    ],
+)
+def test_a_figure_is_written_in_its_unit(metric, label, text):
+    got, write = written(metric)
+    assert (got, write(1.5e6).replace(",", "")) == (label, text)
+
+
+def test_a_metric_that_does_not_exist_is_refused():
+    with pytest.raises(SteerbenchError, match="pnsr: no such metric; expected one as"):
+        written("pnsr")

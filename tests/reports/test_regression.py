@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
 from scipy import stats
 
 from bench.errors import SteerbenchError
+from bench.results import Store
 from reports.regression import LIMITS, Change, Figures, Limit, changes
+from reports.runs import load
 
 OLD = Figures(
     {"psnr": 30.0, "frame_ms": 100.0, "size_bytes.total": 1000.0}, {}, "one machine", "views"
@@ -77,7 +80,7 @@ def test_a_metric_or_a_frame_that_is_gone_is_missing() -> None:
 
 
 def test_figures_of_other_frames_are_not_compared() -> None:
-    with pytest.raises(SteerbenchError, match="other frames: views; another scene"):
+    with pytest.raises(SteerbenchError, match=r"of other frames, .*: views; another scene"):
         list(changes(OLD, replace(OLD, views="another scene")))
 
 
@@ -86,3 +89,20 @@ def test_a_baseline_can_have_limits_of_its_own() -> None:
     (wide,) = changes(OLD, new, {"psnr": Limit(1, absolute=2.0)})
     assert wide.verdict == ""
     assert LIMITS["psnr"].absolute < 1
+
+
+def test_frames_are_those_that_the_headline_is_the_mean_of(store: Store, stored_run: str) -> None:
+    (run,) = load(store, {stored_run: "run"})
+    table = run.frames.assign(psnr=[30.0, *[math.nan] * (len(run.frames) - 1)])
+    figures = Figures.of(replace(run, read_frames=lambda: table))
+    assert len(figures.frames["psnr"]) == 1  # the others have no truth
+    assert list(figures.frames["frame_ms"].values()) == table["frame_ms"].tolist()
+    assert "peak_bytes" in figures.values
+    assert "peak_bytes" not in figures.frames  # its headline is the largest
+
+
+def test_a_metric_that_only_the_baseline_has_a_limit_for_is_kept(
+    store: Store, stored_run: str
+) -> None:
+    (run,) = load(store, {stored_run: "run"})
+    assert set(Figures.of(run, {"train_s": Limit(-1)}).values) == {"train_s"}

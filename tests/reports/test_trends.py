@@ -83,3 +83,11 @@ def test_bytes_are_computed_and_need_no_interval(run: Run) -> None:
 def test_a_line_that_was_not_measured_has_no_step(run: Run) -> None:
     lines = {"one": Repeated("one", [run]), "two": Repeated("two", [])}
     assert list(steps(TREND, lines)) == []
+
+
+def test_times_of_different_machines_tell_nothing(run: Run) -> None:
+    machine = {**run.record["machine"], "cpu": "another"}
+    elsewhere = replace(run, record={**run.record, "machine": machine})
+    lines = {"one": Repeated("one", [run]), "two": Repeated("two", [elsewhere])}
+    assert not list(steps(Trend("frame_ms", ["one", "two"]), lines))
+    assert list(steps(TREND, lines))

@@ -88,6 +88,19 @@ def test_a_run_that_is_missing_fails(
     assert "method=other: no such run" in capsys.readouterr().out
 
 
+def test_a_run_of_other_frames_fails_and_the_others_are_still_compared(
+    baseline: Path, outputs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    held = json.loads(baseline.read_text())
+    ((command, figures),) = held["runs"].items()
+    held["runs"] = {command: {**figures, "views": "others"}, "method=other": figures}
+    baseline.write_text(json.dumps(held))
+    assert check(baseline, outputs) == 1
+    out = capsys.readouterr().out
+    assert f"{command}: these are figures of other frames" in out
+    assert "method=other: no such run" in out
+
+
 @pytest.mark.parametrize("text", [None, "", "{}", '{"schema": 99}'])
 def test_what_is_no_baseline_is_refused_with_the_way_to_make_one(
     text: str | None, outputs: Path, tmp_path: Path

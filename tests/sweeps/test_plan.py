@@ -11,10 +11,11 @@ from pathlib import Path
 
 import pytest
 
+from bench.errors import SteerbenchError
 from bench.results import Store
 from bench.types import Scene
 from reports.published import paper_tables
-from sweeps import measurement
+from sweeps import failures, measurement
 from sweeps.measurement import described
 from sweeps.plan import Planned, gather, newest, plan
 
@@ -90,3 +91,19 @@ def test_of_a_scene_that_is_not_here_the_last_run_is_shown(
     measured: Store, tmp_path: Path, content: Callable[[str], None]
 ) -> None:
     assert shown(measured, tmp_path / "gone" / "mic") == ["b"]
+
+
+def test_a_failure_stands_beside_what_was_measured_before(measured: Store, tmp_path: Path) -> None:
+    asked = job(tmp_path / "b" / "mic")
+    outputs = measured.folder.parent
+    failures.keep(outputs, described(asked.config), "no such folder")
+    ((line,),) = gather([asked], newest(measured), outputs).values()
+    assert len(line.runs) == 1
+    assert line.gaps == ["failed when it was tried again: no such folder"]
+
+
+def test_a_line_that_no_job_fills_is_named() -> None:
+    first, *others = TABLE.lines
+    wrong = replace(first, job={"method.joint.field": "frosen"})
+    with pytest.raises(SteerbenchError, match=rf"no job .* fills the line '{first.label}'; expec"):
+        plan(replace(TABLE, lines=[wrong, *others]), [])
