@@ -37,7 +37,7 @@ def main(options: argparse.Namespace) -> int:
         )
     found = render_variants(overrides, list(engines()), options.frames, "engines")
     rows = [_row(one, found[0]) for one in found]
-    title = f"{found[0].method.name}, {options.frames} frames"
+    title = f"{found[0].method.name}, {found[0].frames} frames"
     console().print(rich_table(Table(title, COLUMNS, tuple(_line(row) for row in rows))))
     print(json.dumps([finite(row) for row in rows]))
     return 0

@@ -95,7 +95,7 @@ def main(options: argparse.Namespace) -> int:
         for point, made in zip(points, configs, strict=True):
             rows.append(_row(point, made, scene, options.frames, log))
             progress.advance(note=point.label)
-    title = f"{config.method.name} on {scene.name}, {options.frames} frames"
+    title = f"{config.method.name} on {scene.name}, {rows[0]['frames']} frames"
     axes: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
         axes.setdefault(row["axis"], []).append(row)
@@ -133,6 +133,7 @@ def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) 
         "axis": point.axis,
         "label": point.label,
         "value": point.value,
+        "frames": len(records),
         **_times(records),
         "samples": statistics.mean(samples),
         "peak_bytes": peak_bytes,

@@ -29,7 +29,7 @@ def main(options: argparse.Namespace) -> int:
     require_lean(composed(overrides), "steerbench skips counts the work of a network on cells")
     found = render_variants(overrides, _variants(), options.frames, "variants")
     rows = [_row(one, found[0]) for one in found]
-    title = f"{found[0].method.name}, {options.frames} frames: mean work of a frame, and its share"
+    title = f"{found[0].method.name}, {found[0].frames} frames: mean work of a frame, and its share"
     lines = tuple(_line(row, rows[0]) for row in rows)
     console().print(rich_table(Table(title, (*COLUMNS, *WORK), lines)))
     print(json.dumps([finite(row) for row in rows]))

@@ -46,6 +46,7 @@ class Rendered:
 
     Attributes:
         method: as it was used.
+        frames: that were rendered.
         apart: PSNR against the first variant, of all steady frames with ground truth together, as
             8-bit pictures, dB; inf where there is no difference.
         worst: largest difference of a channel from the first variant, of 1.
@@ -55,6 +56,7 @@ class Rendered:
 
     variant: Variant
     method: Method
+    frames: int
     apart: float
     worst: float
     values: Mapping[str, float]
@@ -118,7 +120,8 @@ def common_ground(
     """
     scene = build(config, "scene", log=log)
     path = build(config, "trajectory", scene)
-    path = replace(path, name=f"{path.name}-first{frames}", steps=path.steps[:frames])
+    steps = path.steps[:frames]
+    path = replace(path, name=f"{path.name}-first{len(steps)}", steps=steps)
     protocol = build(config, "protocol")
     return scene, path, replace(protocol, name=f"{protocol.name} without LPIPS", lpips=())
 
@@ -173,6 +176,7 @@ def _compared(
     return Rendered(
         variant,
         method,
+        len(measured.frames),
         psnr_of_mse(float(np.square(apart).mean())),
         float(np.abs(apart).max()),
         dict(zip(rows["metric"], rows["value"], strict=True)),
