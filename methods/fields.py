@@ -18,6 +18,9 @@ from methods.kernels.spherical import spherical_harmonics
 
 Precision = Literal["bf16", "fp32"]
 
+HIDDEN_CHANNELS = 64
+"""Of every layer between input and output."""
+
 GEOMETRY_CHANNELS = 16
 """Outputs of the density network; the first is log density, all feed the feature network."""
 
@@ -44,7 +47,6 @@ class HashField(nn.Module):
         grid: HashGrid,
         channels: int = 3,
         *,
-        hidden: int = 64,
         precision: Precision = "bf16",
         backend: str = "auto",
         generator: torch.Generator | None = None,
@@ -55,11 +57,11 @@ class HashField(nn.Module):
         table = torch.empty(grid.entries, grid.features).uniform_(-1e-4, 1e-4, generator=generator)
         self.table = nn.Parameter(table)
         sizes = {
-            "density_in": (hidden, grid.channels),
-            "density_out": (GEOMETRY_CHANNELS, hidden),
-            "feature_in": (hidden, DIRECTION_CHANNELS + GEOMETRY_CHANNELS),
-            "feature_mid": (hidden, hidden),
-            "feature_out": (channels, hidden),
+            "density_in": (HIDDEN_CHANNELS, grid.channels),
+            "density_out": (GEOMETRY_CHANNELS, HIDDEN_CHANNELS),
+            "feature_in": (HIDDEN_CHANNELS, DIRECTION_CHANNELS + GEOMETRY_CHANNELS),
+            "feature_mid": (HIDDEN_CHANNELS, HIDDEN_CHANNELS),
+            "feature_out": (channels, HIDDEN_CHANNELS),
         }
         self.layers = nn.ParameterDict(
             {name: _xavier_uniform(*size, generator) for name, size in sizes.items()}

@@ -22,7 +22,8 @@ fewer than half of all."""
 
 FAINT = 0.1
 """Samples of less weight than this share of the transmittance at which a ray ends have an opacity,
-but no features: black instead, they change a pixel by less than what lies behind its end."""
+but no features: black instead, each changes a pixel by less than its weight, and so less than a
+tenth of what may lie behind its end. A ray through haze has many of them."""
 
 
 @torch.no_grad()

@@ -44,19 +44,23 @@ def main_rows(name_filter: str, repeats: int, log: Log) -> list[dict[str, Any]]:
     device = "cuda" if torch.cuda.is_available() else "cpu"
     others = [name for name in BACKENDS if name != "reference" and _serves(name, device)]
     cases = [case for case in all_cases() if name_filter in case.kernel]
+    timed = [case for case in cases if case.timed]
     wrong: dict[tuple[str, str], list[str]] = {}
+    errors: list[dict[str, float]] = []
     rows = []
-    with log.progress("kernels", len(cases)) as progress:
-        for case in sorted(cases, key=lambda case: case.timed):  # what is small comes first
+    with log.progress("kernels", len(cases) + len(timed)) as progress:
+        for case in cases:  # all of them before any is timed: what is wrong has no speed
             prepared = case.prepare(device)
-            errors = _errors(prepared, others)
-            for backend, error in errors.items():
+            errors.append(_errors(prepared, others))
+            for backend, error in errors[-1].items():
                 if not error <= prepared.tolerance:
                     wrong.setdefault((case.kernel, backend), []).append(case.name)
-            if case.timed:
-                statuses = {name: _status(wrong.get((case.kernel, name))) for name in errors}
-                rows += _timed_rows(case, prepared, errors, statuses, repeats, device)
             progress.advance(note=f"{case.kernel}, {case.name}")
+        for case, of_case in zip(cases, errors, strict=True):
+            if case.timed:
+                statuses = {name: _status(wrong.get((case.kernel, name))) for name in of_case}
+                rows += _timed_rows(case, of_case, statuses, repeats, device)
+                progress.advance(note=f"timed: {case.kernel}, {case.name}")
     return rows
 
 
@@ -74,12 +78,12 @@ def _status(wrong_cases: list[str] | None) -> str:
 
 def _timed_rows(
     case: Case,
-    prepared: Prepared,
     errors: dict[str, float],
     statuses: dict[str, str],
     repeats: int,
     device: str,
 ) -> list[dict[str, Any]]:
+    prepared = case.prepare(device)
     correct = [name for name, status in statuses.items() if status == "ok"]
     times = _times_ms(prepared, correct, repeats, device)
     rows = []

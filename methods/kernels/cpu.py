@@ -1,7 +1,8 @@
 """What the numba backends share.
 
 numba caches compiled code by the file of the calling function alone: after a change of
-`pack_bf16`, remove the `__pycache__` of its callers.
+`pack_bf16`, or of a constant that such a file imports from another (`PRIMES`, `TAPS`, `PARALLEL`),
+remove the `__pycache__` of its callers.
 """
 
 from __future__ import annotations

@@ -76,11 +76,6 @@ class Occupancy:
                 lower[axis], upper[axis] = filled[0] / size, (filled[-1] + 1) / size
         return torch.stack((lower, upper))
 
-    @property
-    def fraction(self) -> float:
-        """Share of cells that are occupied."""
-        return self.cells.float().mean().item()
-
 
 def _pack_bricks(bits: Tensor) -> Tensor:
     """64 bits a word: bit x + 4 y + 16 z of a word is the cell (x, y, z) of its 4^3 brick."""

@@ -49,8 +49,9 @@ def test_a_nan_is_an_infinite_error() -> None:
     assert largest_error((torch.tensor([torch.nan]),), (torch.ones(1),)) == torch.inf
 
 
-def test_a_kernel_that_is_wrong_on_a_small_case_gets_no_time(
-    monkeypatch: pytest.MonkeyPatch, quiet_log: Log
+@pytest.mark.parametrize("timed", [False, True])
+def test_a_kernel_that_is_wrong_on_any_case_gets_no_time(
+    timed: bool, monkeypatch: pytest.MonkeyPatch, quiet_log: Log
 ) -> None:
     def wrong_at_zero(device: str) -> Prepared:
         return Prepared(lambda backend: (torch.tensor([float(backend == "cpu")]),), 0.5)
@@ -60,10 +61,11 @@ def test_a_kernel_that_is_wrong_on_a_small_case_gets_no_time(
 
     cases = [
         Case("fake", "large", "fp32", 1000, right, timed=True),
-        Case("fake", "no sample", "fp32", 0, wrong_at_zero),
+        Case("fake", "no sample", "fp32", 0, wrong_at_zero, timed=timed),
     ]
     monkeypatch.setattr(benchmark, "all_cases", lambda: cases)
-    rows = {row["backend"]: row for row in benchmark.main_rows("fake", 2, quiet_log)}
+    found = benchmark.main_rows("fake", 2, quiet_log)
+    rows = {row["backend"]: row for row in found if row["case"] == "large"}
     assert rows["reference"]["status"] == "ok"
     assert rows["reference"]["ratio"] == 1
     assert rows["cpu"]["status"] == "wrong: no sample"

@@ -200,7 +200,6 @@ def test_words_bounds_and_share_describe_the_cells() -> None:
     assert torch.equal(
         grid.bounds, torch.tensor([[3 / 32, 17 / 32, 30 / 32], [6 / 32, 21 / 32, 1.0]])
     )
-    assert grid.fraction == 2 / 32**3
 
 
 def test_clearance_is_the_distance_to_the_nearest_brick_along_the_farthest_axis() -> None:
