@@ -9,7 +9,16 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from bench.cameras import cast, look_at, move_camera, pixel_grid, project, scale_camera, unproject
+from bench.cameras import (
+    cast,
+    look_at,
+    move_camera,
+    pixel_grid,
+    place_camera,
+    project,
+    scale_camera,
+    unproject,
+)
 from bench.stress import StressCase
 from bench.types import Camera
 
@@ -115,7 +124,7 @@ def _apart(got: Tensor, want: Tensor) -> float:
 
 
 def _round_trip(camera: Camera, depth: float, backend: str, device: str, precision: str) -> float:
-    camera = replace(camera, c2w=camera.c2w.to(device))
+    camera = place_camera(camera, device)
     pixels = pixel_grid(camera.width, camera.height, device)
     points = unproject(camera, pixels, torch.full_like(pixels[:, 0], depth))
     got, got_depth = project(camera, points)
@@ -128,7 +137,7 @@ def _not_in_front(depths: tuple[float, ...], backend: str, device: str, precisio
     camera = CAMERAS["at the origin"]
     sides = torch.cartesian_prod(torch.tensor([-1e20, -1.0, 0.0, 1.0]), torch.tensor(depths))
     points = torch.stack((sides[:, 0], sides[:, 0], sides[:, 1]), dim=1).to(device)
-    pixels, depth = project(replace(camera, c2w=camera.c2w.to(device)), points)
+    pixels, depth = project(place_camera(camera, device), points)
     fine = bool((depth <= 0).all()) and bool(pixels.isfinite().all())
     return 0.0 if fine else math.inf
 
@@ -140,7 +149,7 @@ def _normalisation_error(side: float, backend: str, device: str, precision: str)
     given = camera.c2w.double()
     given = torch.cat((given[:, :3], (origin + side * given[:, 3])[:, None]), dim=1)
     moved = move_camera(replace(camera, c2w=given), 1 / side, -origin / side)
-    rays = cast(replace(moved, c2w=moved.c2w.to(device)))
+    rays = cast(place_camera(moved, device))
     points = (rays.origins + 2 * rays.directions).cpu().double()
     local = (origin + side * points - given[:, 3]) @ given[:, :3]
     u = camera.fx * local[:, 0] / local[:, 2] + camera.cx
@@ -174,7 +183,7 @@ def motion_error(seed: int, device: str) -> float:
     """By how many pixels points of the unit cube move when they and the camera do together."""
     rotation, translation = random_motion(seed)
     camera = CAMERAS["looking at the cube"]
-    camera = replace(camera, c2w=camera.c2w.to(device))
+    camera = place_camera(camera, device)
     points = torch.rand(200, 3, generator=torch.Generator().manual_seed(seed))
     there = (points.double() @ rotation.T + translation).float()
     pixels, _ = project(camera, points.to(device))

@@ -103,6 +103,11 @@ def move_camera(camera: Camera, scale: float, offset: Tensor) -> Camera:
     return replace(camera, c2w=torch.cat((pose[:, :3], centre), dim=1).float())
 
 
+def place_camera(camera: Camera, device: torch.device | str) -> Camera:
+    """The same camera with its pose on `device`, where what is cast and projected then lies."""
+    return replace(camera, c2w=camera.c2w.to(device))
+
+
 INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height")
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.cameras import pack_camera, pixel_grid, project, unpack_camera, unproject
+from bench.cameras import pack_camera, pixel_grid, place_camera, project, unpack_camera, unproject
 from bench.types import Camera
 from methods.checkpoint import part
 from methods.kernels.splat import splat
@@ -183,13 +183,10 @@ def _packed(frame: Remembered) -> dict[str, Tensor]:
 
 
 def _unpacked(tensors: Mapping[str, Tensor], device: torch.device) -> Remembered:
-    cloud_camera, camera = (_camera(tensors[name], device) for name in ("cloud_camera", "camera"))
+    cloud_camera, camera = (
+        place_camera(unpack_camera(tensors[name]), device) for name in ("cloud_camera", "camera")
+    )
     cloud = Cloud(cloud_camera, **{name: tensors[name].to(device) for name in CLOUD})
     picture = tensors["background"].repeat(camera.height * camera.width, 1)
     picture[tensors["places"].long()] = tensors["pixels"]
     return Remembered(cloud, camera, picture.view(camera.height, camera.width, 3).to(device))
-
-
-def _camera(packed: Tensor, device: torch.device) -> Camera:
-    camera = unpack_camera(packed)
-    return replace(camera, c2w=camera.c2w.to(device))

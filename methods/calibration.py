@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
@@ -48,7 +46,6 @@ def recorded_inputs(
         with log.progress("frames to build the network on", count) as progress:
             for place in range(count):
                 camera = cameras[place * len(cameras) // count]
-                camera = replace(camera, c2w=camera.c2w.to(pipeline.background.device))
                 buffer = RenderingBuffer(pipeline.options.frames)
                 before = pipeline.options.frames + 1
                 for earlier in preceding(camera, target, before, motion.degrees, generator):

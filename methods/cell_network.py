@@ -24,6 +24,7 @@ class CellNetwork(Network):
     """
 
     varying = ((0,), (0,))  # cells
+    quantum = 512
 
     def __init__(self, layout: Layout, width: int, blocks: int) -> None:
         super().__init__()

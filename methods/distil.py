@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from bench.cameras import pack_camera, unpack_camera
+from bench.cameras import pack_camera, place_camera, unpack_camera
 from bench.motion import novel_view
 from bench.sharing import missing
 from bench.types import Camera, Log, NullProbe, Scene
@@ -65,7 +64,7 @@ def _rendered(
 def _picture(trained: Pretrained, camera: Camera, background: Tensor) -> Tensor:
     """uint8 [H, W, 3]."""
     device = trained.field.table.device
-    camera = replace(camera, c2w=camera.c2w.to(device))
+    camera = place_camera(camera, device)
     rgb = render_guided(
         trained.field, camera, trained.occupancy, background.to(device), NullProbe(), None
     ).values

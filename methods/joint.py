@@ -76,18 +76,32 @@ class JointOptions:
     motion: MotionOptions = MotionOptions()
 
     def __post_init__(self) -> None:
-        if not (self.rate > 0 and self.field_rate > 0 and 0 < self.final_rate <= 1):
-            raise ValueError(f"expected rates > 0, final_rate in (0, 1]: {self}")
-        if not (self.patch >= 1 and self.batch >= 1 and self.clip > 0 and 0 <= self.average < 1):
-            raise ValueError(f"expected patch, batch >= 1, clip > 0, average in [0, 1): {self}")
-        if not (self.distilled_views >= 0 and 0 <= self.distilled_share <= 1):
-            raise ValueError(f"expected distilled_views >= 0 and distilled_share in [0, 1]: {self}")
-        if not (self.doubt >= 0 and 0 <= self.refined <= 1 and self.refined_rays >= 1):
-            raise ValueError(f"expected doubt >= 0, refined in [0, 1], refined_rays >= 1: {self}")
+        fits = {
+            "rate": (self.rate > 0, "more than 0"),
+            "field_rate": (self.field_rate > 0, "more than 0"),
+            "final_rate": (0 < self.final_rate <= 1, "a share, more than 0"),
+            "patch": (self.patch >= 1, "1 or more"),
+            "batch": (self.batch >= 1, "1 or more"),
+            "opacity_entropy": (self.opacity_entropy >= 0, "0 or more"),
+            "doubt": (self.doubt >= 0, "0 or more"),
+            "refined": (0 <= self.refined <= 1, "a share of 0 to 1"),
+            "refined_rays": (self.refined_rays >= 1, "1 or more"),
+            "clip": (self.clip > 0, "more than 0"),
+            "average": (0 <= self.average < 1, "a share of less than 1"),
+            "distilled_views": (self.distilled_views >= 0, "0 or more"),
+            "distilled_share": (0 <= self.distilled_share <= 1, "a share of 0 to 1"),
+        }
+        for name, (fit, wanted) in fits.items():
+            if not fit:
+                raise ValueError(f"joint.{name}: expected {wanted}, got {getattr(self, name)}")
 
-    def distilled(self, steps: int) -> int:
-        """Distilled views of a training of so many steps: no more than it has a use for."""
-        anew = (1 - self.motion.longer) * steps * self.batch / self.motion.uses
+    def distilled(self, steps: int, frames: int) -> int:
+        """Distilled views of a training of so many steps: no more than it has a use for.
+
+        Without preceding `frames` every sequence begins anew.
+        """
+        longer = self.motion.longer if frames else 0.0
+        anew = (1 - longer) * steps * self.batch / self.motion.uses
         sequences = self.motion.pool + anew
         return min(self.distilled_views, math.ceil(self.distilled_share * sequences))
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 
+from bench.cameras import place_camera
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.buffer import Cloud, Reprojection
 from methods.fields import Precision
@@ -65,7 +64,7 @@ class InstantNgp:
     def render(self, camera: Camera, probe: Probe) -> Frame:
         """One frame at the camera's full resolution."""
         field, occupancy = self.trained.field, self.trained.occupancy
-        camera = replace(camera, c2w=camera.c2w.to(self.setup.device))
+        camera = place_camera(camera, self.setup.device)
         found = None
         if self.range is not None and self.preceding is not None:
             with probe.stage("depth_reprojection"):

@@ -11,12 +11,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from bench.cameras import project
+from bench.cameras import place_camera, project
 from bench.types import Camera
 from methods.fields import LOG_DENSITY_CLAMP, HashField
 from methods.kernels.march import BRICK, MAX_SAMPLES, Occupancy
@@ -64,7 +63,7 @@ def learnable_cells(bounds: Tensor, cameras: Sequence[Camera]) -> Tensor:
     views = torch.zeros(len(centres), dtype=torch.int32, device=device)
     free = torch.ones(len(centres), dtype=torch.bool, device=device)
     for camera in cameras:
-        camera = replace(camera, c2w=camera.c2w.to(device))
+        camera = place_camera(camera, device)
         pixels, depth = project(camera, centres)
         size = pixels.new_tensor((camera.width, camera.height))
         views += (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.cameras import cast, scale_camera, unproject
+from bench.cameras import cast, place_camera, scale_camera, unproject
 from bench.types import Camera, Frame, Probe
 from methods.buffer import Cloud, Remembered, RenderingBuffer, Reprojection
 from methods.cells import centres, put_pixels
@@ -35,6 +35,7 @@ from methods.renderer2d import (
     Points,
     Renderer2d,
     cells_at_matter,
+    check_refined,
     check_size,
 )
 from methods.rounds import render_rays
@@ -130,11 +131,7 @@ class PipelineOptions:
         """Refuse, with a ValueError, what a field of `grid` or the `renderer` cannot do."""
         if self.levels is not None:
             grid.check_levels(self.levels)
-        if self.refined and not renderer.doubts:
-            raise ValueError(
-                f"pipeline.refined: {type(renderer).__name__} does not say where it may be wrong, "
-                f"expected 0, got {self.refined}"
-            )
+        check_refined("pipeline.refined", self.refined, renderer)
 
     def taught(self, refined: float) -> PipelineOptions:
         """The options of a training. It looks everywhere, so that one serves all choices of where
@@ -180,10 +177,14 @@ class Pipeline:
         levels = self.options.levels
         return self.field if levels is None else self.field.coarse(levels)
 
+    def view(self, camera: Camera, turn: int) -> View:
+        """The view of the `turn`-th frame of a sequence, where the field is."""
+        return View.of(place_camera(camera, self.background.device), self.options, turn)
+
     @torch.no_grad()
     def render(self, camera: Camera, buffer: RenderingBuffer, probe: Probe) -> Frame:
         """Render one frame that follows those in `buffer`, and remember it there."""
-        options, view = self.options, View.of(camera, self.options, buffer.turn)
+        options, view = self.options, self.view(camera, buffer.turn)
         frames = self.shared(buffer.frames, view, probe)
         newest = frames[0] if frames else None
         features = self._features(view, newest, probe)

@@ -93,21 +93,17 @@ class Network(nn.Module, ABC):
     Attributes:
         varying: of each input, the axes whose size, the same for all of them, differs from frame to
             frame.
+        quantum: that size is a multiple of this while frames are rendered.
         backend: of its kernels; engines read "reference", which is plain torch.
     """
 
     varying: tuple[tuple[int, ...], ...]
+    quantum = 1
     backend = "auto"
 
     @abstractmethod
     def products(self, *inputs: Tensor) -> int:
         """Multiplications by weights that `inputs` take."""
-
-
-def check_size(name: str, got: int, least: int, most: int) -> None:
-    """Refuse, with a ValueError, a size that is not of `least` to `most`."""
-    if not least <= got <= most:
-        raise ValueError(f"{name}: expected {least} to {most}, got {got}")
 
 
 class Renderer2d(nn.Module, ABC):
@@ -138,3 +134,18 @@ class Renderer2d(nn.Module, ABC):
     @abstractmethod
     def base(self, observations: Sequence[Observation]) -> Tensor:
         """The pictures [B, H, W, 3] that the network corrects: RGB, enlarged."""
+
+
+def check_size(name: str, got: int, least: int, most: int) -> None:
+    """Refuse, with a ValueError, a size that is not of `least` to `most`."""
+    if not least <= got <= most:
+        raise ValueError(f"{name}: expected {least} to {most}, got {got}")
+
+
+def check_refined(name: str, share: float, renderer: Renderer2d) -> None:
+    """Refuse, with a ValueError, a `share` of cells to be refined that `renderer` cannot choose."""
+    if share and not renderer.doubts:
+        raise ValueError(
+            f"{name}: {type(renderer).__name__} does not say where it may be wrong, expected 0, "
+            f"got {share}"
+        )

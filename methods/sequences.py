@@ -183,7 +183,7 @@ class SequencePool:
         self, number: int, buffer: RenderingBuffer, cells: Tensor, uses: int, lasting: bool
     ) -> Sequence:
         truth = self._views[number]
-        view = View.of(truth.camera, self._pipeline.options, buffer.turn)
+        view = self._pipeline.view(truth.camera, buffer.turn)
         return Sequence(number, truth, view, buffer, cells, uses, lasting)
 
     def _chance(self) -> float:

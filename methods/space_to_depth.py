@@ -18,9 +18,6 @@ from methods.kernels.depthwise import neighbours_of
 from methods.kernels.lift import Layout, draw, lift
 from methods.renderer2d import UNWATCHED, Drawing, Observation, Renderer2d, check_size
 
-QUANTUM = 512
-"""The network is given cells in multiples of this."""
-
 GENERIC = Path(__file__).parent / "weights" / "generic.safetensors"
 """Weights trained on other scenes, by `steerbench generic`."""
 
@@ -123,11 +120,12 @@ class SpaceToDepth(Renderer2d):
         the product itself: it sees few sizes.
         """
         alone = len(observations) == 1
-        parts = [self._lift_one(o, QUANTUM if alone else 1) for o in observations]
+        quantum = self.network.quantum
+        parts = [self._lift_one(o, quantum if alone else 1) for o in observations]
         if alone:
             return parts[0]
         base, rows = (torch.cat(some) for some in zip(*parts, strict=True))
-        return base, functional.pad(rows, (0, 0, 0, -len(rows) % QUANTUM))
+        return base, functional.pad(rows, (0, 0, 0, -len(rows) % quantum))
 
     def _lift_one(self, observation: Observation, multiple: int) -> tuple[Tensor, Tensor]:
         o, layout = observation, self.layout

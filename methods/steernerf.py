@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
 
@@ -26,7 +26,7 @@ from methods.kernels.encode import HashGrid
 from methods.patches import PatchSource
 from methods.pipeline import Pipeline, PipelineOptions
 from methods.pretrained import Pretrained, Setup, pretrain
-from methods.renderer2d import Renderer2d
+from methods.renderer2d import Renderer2d, check_refined
 from methods.sequences import SequencePool, TrueView, true_views
 from methods.space_to_depth import GENERIC
 from methods.train import TrainingOptions
@@ -87,7 +87,9 @@ class SteerNerf:
         seed: int = 0,
     ) -> None:
         with torch.device("meta"):  # shapes alone: refused, if at all, before anything is trained
-            pipeline.check(grid, renderer(pipeline.channels, pipeline.frames, pipeline.scale))
+            made = renderer(pipeline.channels, pipeline.frames, pipeline.scale)
+        pipeline.check(grid, made)
+        check_refined("joint.refined", joint.refined, made)
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         self.options, self.make_renderer, self.joint, self.name = pipeline, renderer, joint, name
         engine.check(self.setup.device)
@@ -103,7 +105,7 @@ class SteerNerf:
         target = viewing_target(scene)
         distilled: list[TrueView] = []
         distilled_s = 0.0
-        if views := self.joint.distilled(budget.renderer_steps):
+        if views := self.joint.distilled(budget.renderer_steps, options.frames):
             of_views = {**key, "views": views, "stage2": stage2_digest()}
             folder = log.stage_dir("distilled", of_views)
             distilled, distilled_s = distilled_views(
@@ -123,7 +125,9 @@ class SteerNerf:
     def fit_generic(self, scenes: Sequence[Scene], budget: Budget, output: Path, log: Log) -> None:
         """Train a 2D renderer on many scenes, for others to start from; see `methods.generic`."""
         fields = [self.setup.key(scene, budget) for scene in scenes]
-        folder = log.stage_dir("generic", {"fields": fields, **self._key(budget)})
+        code = digest([ROOT / "methods" / "generic.py"])
+        key = {"fields": fields, "generic": code, **self._key(budget)}
+        folder = log.stage_dir("generic", key)
         train_generic(
             self.setup,
             self.options,
@@ -142,7 +146,6 @@ class SteerNerf:
 
     def render(self, camera: Camera, probe: Probe) -> Frame:
         """The next frame of the sequence."""
-        camera = replace(camera, c2w=camera.c2w.to(self.setup.device))
         return self.pipeline.render(camera, self.buffer, probe)
 
     def sizes(self) -> dict[str, int]:
@@ -229,4 +232,5 @@ def stage2_digest() -> str:
     stage 1."""
     modules = [ROOT / "methods" / f"{name}.py" for name in SOURCES]
     kernels = sources("depthwise", "lift", "splat", "warp")
-    return digest([*modules, *kernels, GENERIC, ROOT / "bench" / "motion.py"])
+    truth = [ROOT / "bench" / "motion.py", ROOT / "bench" / "protocol.py"]
+    return digest([*modules, *kernels, *truth, GENERIC])

@@ -24,7 +24,16 @@ from methods.volume import render_batch
 KERNELS = ("adam", "composite", "encode", "march", "spherical")
 """Kernels that a training of a field runs through."""
 
-SOURCES = ("checkpoint", "fields", "loop", "occupancy", "optimise", "train", "volume")
+SOURCES = (
+    "checkpoint",
+    "fields",
+    "loop",
+    "occupancy",
+    "optimise",
+    "pretrained",
+    "train",
+    "volume",
+)
 """Modules beside this one that decide what a training of a field results in."""
 
 MIN_RAYS = 64
@@ -216,7 +225,7 @@ def training_digest() -> str:
     used = [methods / f"{name}.py" for name in SOURCES]
     used += [methods / "kernels" / "dispatch.py", methods / "kernels" / "cpu.py"]
     used += sources(*KERNELS)
-    used += [bench / "cameras.py", *(bench / "scenes").glob("*.py")]  # pixels and rays
+    used += [bench / "cameras.py", bench / "types.py", *(bench / "scenes").glob("*.py")]
     return digest(used)
 
 

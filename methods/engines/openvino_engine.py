@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import math
 import sys
 import tempfile
 import warnings
@@ -42,6 +41,8 @@ class OpenVino(Engine):
     Raises:
         Unavailable: it, or for int8 NNCF, is not installed; or it has no bfloat16 on this CPU, for
             which it would take float32 without a word.
+
+    With int8, what is not quantised is computed in bfloat16 where the CPU has it, else in float32.
     """
 
     name = "openvino"
@@ -80,7 +81,7 @@ class OpenVino(Engine):
             if to_build:
                 seen = samples()
                 model = self._convert(network, seen)
-                model.set_rt_info(json.dumps(_sizes(seen, network.varying)), SIZES)
+                model.set_rt_info(json.dumps(_sizes(seen, network)), SIZES)
                 self._write(model, path)
             else:
                 log.info(f"built network found: {path}")
@@ -129,18 +130,19 @@ def _capabilities(openvino: Any) -> list[str]:
     return openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
 
 
-def _sizes(samples: Sequence[Inputs], varying: Varying) -> list[int]:
+def _sizes(samples: Sequence[Inputs], network: Network) -> list[int]:
     """The sizes of varying axes that were seen, those between, and one beyond on either side."""
     seen = {
         x.shape[axis]
         for inputs in samples
-        for x, axes in zip(inputs, varying, strict=True)
+        for x, axes in zip(inputs, network.varying, strict=True)
         for axis in axes
     }
-    if len(seen) < 2:
-        return sorted(seen)
-    step = math.gcd(*seen)
-    return list(range(max(min(seen) - step, step), max(seen) + step + 1, step))
+    if not seen:
+        return []
+    step = network.quantum
+    least, most = max(min(seen) // step - 1, 1), -(-max(seen) // step) + 1
+    return sorted({*seen, *range(least * step, most * step + 1, step)})
 
 
 class _Compiled:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,7 @@ from bench.console import ConsoleLog
 from bench.errors import Unavailable
 from methods.engines import Engine, Inputs, required
 from methods.engines.onnxruntime_engine import OnnxRuntime
-from methods.engines.openvino_engine import OpenVino, _capabilities
+from methods.engines.openvino_engine import SIZES, OpenVino, _capabilities
 from methods.engines.torch_engine import TorchEngine
 from methods.kernels.depthwise import neighbours_of
 from methods.renderer2d import Network
@@ -152,3 +153,16 @@ def test_half_precision_without_a_gpu_is_refused() -> None:
 def test_a_library_that_is_missing_is_named_with_the_command_that_installs_it() -> None:
     with pytest.raises(Unavailable, match=r'engine=ours .*pip install .*"\.\[extra\]"'):
         required("ours", "nowhere", "extra")
+
+
+def test_sizes_that_may_come_are_compiled_before_a_frame_is_timed(
+    folder: Callable[[], Path], quiet_log: ConsoleLog
+) -> None:
+    module, _ = lean()
+    quantum = module.quantum
+    rows, neighbours = cells(0)
+    some = rows.new_zeros(2 * quantum, rows.shape[1]), neighbours.new_zeros(2 * quantum, 9)
+    OpenVino("fp32").build(module, lambda: [some], folder, quiet_log)
+    model = required("openvino", "openvino", "openvino").Core().read_model(folder() / "network.xml")
+    sizes = json.loads(model.get_rt_info(SIZES).value)
+    assert sizes == [quantum, 2 * quantum, 3 * quantum]

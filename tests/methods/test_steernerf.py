@@ -26,7 +26,11 @@ BUDGET = Budget("test", steps=40, samples=4096, renderer_steps=4)
 
 
 def new_method(
-    frames: int = 2, rate: float = 1e-3, engine: Engine | None = None, refined: float = 0.0
+    frames: int = 2,
+    rate: float = 1e-3,
+    engine: Engine | None = None,
+    refined: float = 0.0,
+    device: str = "cpu",
 ) -> SteerNerf:
     return SteerNerf(
         grid=HashGrid(levels=8, log2_table=12, n_min=8, n_max=64),
@@ -40,6 +44,7 @@ def new_method(
             motion=MotionOptions(pool=2, length=2),
         ),
         engine=engine or TorchEngine(),
+        device=device,
     )
 
 
@@ -53,9 +58,13 @@ def stages(folder: Path) -> list[str]:
 
 
 def test_what_was_trained_is_found_again_and_renders_the_same(
-    ball_scene: Scene, log: ConsoleLog, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ball_scene: Scene,
+    log: ConsoleLog,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    device: str,
 ) -> None:
-    first, second = new_method(), new_method()
+    first, second = (new_method(device=device) for _ in range(2))
     first.fit(ball_scene, BUDGET, log)
     capsys.readouterr()
     second.fit(ball_scene, BUDGET, log)
@@ -114,3 +123,10 @@ def test_a_network_is_built_once_for_each_training_and_for_no_other(
 def test_an_engine_that_does_not_compute_on_the_device_is_refused() -> None:
     with pytest.raises(Unavailable, match="engine=openvino computes on the CPU"):
         OpenVino("fp32").check(torch.device("cuda"))
+
+
+def test_what_begins_anew_more_often_has_a_use_for_more_distilled_views() -> None:
+    options = JointOptions(distilled_share=1.0, motion=MotionOptions(pool=2, uses=4, longer=0.75))
+    # 2 sequences at the beginning, and 100 steps of 2 patches, 4 of a sequence.
+    assert options.distilled(100, frames=2) == 2 + 50 / 4 // 1 + 1
+    assert options.distilled(100, frames=0) == 2 + 50

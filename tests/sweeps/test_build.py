@@ -130,6 +130,8 @@ def test_a_dataclass_may_have_fields_of_types_that_only_the_module_of_its_base_k
             ["method=steernerf_paper", "method.pipeline.refined=0.1"],
             "pipeline.refined: UnetRelease does not say where it may be wrong, expected 0, got 0.1",
         ),
+        (["method=steernerf_paper", "method.joint.refined=0.2"], "joint.refined: UnetRelease does"),
+        (["method.joint.opacity_entropy=-1"], "joint.opacity_entropy: expected 0 or more, got -1"),
     ],
 )
 def test_what_field_and_renderer_cannot_do_is_refused_before_anything_is_trained(
