@@ -38,11 +38,11 @@ Varying = tuple[tuple[int, ...], ...]
 class OpenVino(Engine):
     """OpenVINO on the CPU.
 
+    With int8, what is not quantised is computed in bfloat16 where the CPU has it, else in float32.
+
     Raises:
         Unavailable: it, or for int8 NNCF, is not installed; or it has no bfloat16 on this CPU, for
             which it would take float32 without a word.
-
-    With int8, what is not quantised is computed in bfloat16 where the CPU has it, else in float32.
     """
 
     name = "openvino"
