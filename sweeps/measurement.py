@@ -20,7 +20,7 @@ from rich.columns import Columns
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
-from bench.provenance import ROOT, code_digest, decisive
+from bench.provenance import MEASURING_PACKAGES, ROOT, code_digest, decisive
 from bench.results import Store
 from bench.run import measure
 from bench.types import DEVICE, Method, Scene
@@ -205,13 +205,14 @@ def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any
 
 
 def _other_code(config: DictConfig) -> dict[str, str]:
-    """SHA-256 of the files outside of this project that define what `config` builds, by what is
-    built from them."""
+    """SHA-256 of the files that define what `config` builds and that `code_digest` does not cover, by
+    what is built from them."""
+    covered = [ROOT / name for name in MEASURING_PACKAGES]
     found = {}
     for target in _targets(OmegaConf.to_container(config, resolve=True)):
         module = sys.modules[get_object(target).__module__]
-        path = Path(module.__file__ or ROOT).resolve()
-        if not path.is_relative_to(ROOT):
+        path = Path(module.__file__ or covered[0]).resolve()
+        if not any(path.is_relative_to(folder) for folder in covered):
             found[target] = hashlib.sha256(path.read_bytes()).hexdigest()
     return found
 
