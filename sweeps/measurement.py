@@ -205,8 +205,8 @@ def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any
 
 
 def _other_code(config: DictConfig) -> dict[str, str]:
-    """SHA-256 of the files that define what `config` builds and that `code_digest` does not cover, by
-    what is built from them."""
+    """SHA-256 of the files that `code_digest` does not cover and `config` builds something from, by
+    what it builds."""
     covered = [ROOT / name for name in MEASURING_PACKAGES]
     found = {}
     for target in _targets(OmegaConf.to_container(config, resolve=True)):
