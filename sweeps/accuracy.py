@@ -100,13 +100,16 @@ def _last_words(overrides: Sequence[str]) -> list[str]:
 def _turned(options: argparse.Namespace) -> list[tuple[str, Variant]]:
     """The settings that were asked for, each with its knob."""
     known = knobs(options.trained)
-    chosen = [knob for knob in known if options.filter in knob and knob not in ALWAYS]
-    if not chosen:
-        names = ", ".join(knob for knob in known if knob not in ALWAYS)
-        raise SteerbenchError(
-            f"--filter: no knob has {options.filter!r} in its name; expected part of one of {names}"
-        )
-    return [(knob, v) for knob, some in known.items() if knob in (*ALWAYS, *chosen) for v in some]
+    turned = [knob for knob in known if knob not in ALWAYS]
+    chosen = set(ALWAYS)
+    for part in options.filter or [""]:
+        if not (found := {knob for knob in turned if part in knob}):
+            raise SteerbenchError(
+                f"--filter: no knob has {part!r} in its name; expected part of one of "
+                f"{', '.join(turned)}"
+            )
+        chosen |= found
+    return [(knob, v) for knob, some in known.items() if knob in chosen for v in some]
 
 
 def _setting_rows(

@@ -126,8 +126,9 @@ def _accuracy(accuracy: Parser) -> None:
     )
     accuracy.add_argument(
         "--filter",
-        default="",
-        help="only knobs whose name contains this: step, range, engine, refined, trained, ...",
+        action="append",
+        help="only knobs whose name contains this: step, range, engine, refined, trained, ...; may "
+        "be given more than once",
     )
     _count(accuracy, "--frames", 24, "first frames of the trajectory")
     _count(accuracy, "--repeats", 5, "timed rounds over all settings")

@@ -106,6 +106,8 @@ def test_a_filter_leaves_the_knobs_with_it_in_their_name_and_what_they_are_compa
     outcome = steerbench("accuracy", "--filter", "gin")
     settings = json.loads(outcome.out.splitlines()[-1])["settings"]
     assert [row["setting"] for row in settings] == ["everything off", "poor"]
+    both = steerbench("accuracy", "--filter", "gin", "--filter", "share")
+    assert len(json.loads(both.out.splitlines()[-1])["settings"]) == len(FIGURES)
 
 
 def test_the_kernels_alone_train_and_render_nothing(steerbench, measured, monkeypatch):
