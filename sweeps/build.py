@@ -66,6 +66,10 @@ def check_settings(
     hints = get_type_hints(target.__init__ if plain else target)
     parameters = inspect.signature(target).parameters
     names = [name for name in parameters if name not in given]
+    if not settings.get("_partial_"):
+        for name in names:  # ~name takes away what the configurations give
+            if _required(parameters[name]) and name not in settings:
+                raise SteerbenchError(f"{prefix}{name} is not set: give {prefix}{name}=...")
     for name, value in settings.items():
         if name.startswith("_"):  # of Hydra: _target_, _convert_
             continue
@@ -76,6 +80,11 @@ def check_settings(
         elif not _fits(value, hints.get(name, Any)):
             wanted = " or ".join(map(str, _choices(hints[name]))) or parameters[name].annotation
             raise SteerbenchError(f"{prefix}{name}: expected {wanted}, got {value!r}")
+
+
+def _required(parameter: inspect.Parameter) -> bool:
+    several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    return parameter.default is inspect.Parameter.empty and parameter.kind not in several
 
 
 def _choices(hint: Any) -> tuple[object, ...]:
