@@ -24,16 +24,7 @@ from methods.volume import render_batch
 KERNELS = ("adam", "composite", "encode", "march", "spherical")
 """Kernels that a training of a field runs through."""
 
-SOURCES = (
-    "checkpoint",
-    "fields",
-    "loop",
-    "occupancy",
-    "optimise",
-    "pretrained",
-    "train",
-    "volume",
-)
+SOURCES = ("checkpoint", "fields", "loop", "occupancy", "optimise", "pretrained", "train", "volume")
 """Modules beside this one that decide what a training of a field results in."""
 
 MIN_RAYS = 64

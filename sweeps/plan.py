@@ -135,10 +135,11 @@ def gather(
         for job in same:
             failure = failures.found(outputs, described(job.config))
             shown = (run for run in runs.get(job.key, ()) if of_scene(run, job.config))
-            why = "not measured yet" if failure is None else f"failed: {failure}"
             if run := next(shown, None):
                 found.append(replace(run, label=label))
-                why = why.replace("failed", "failed when it was tried again", 1) if failure else ""
+                why = failure and f"failed when it was tried again: {failure}"
+            else:
+                why = f"failed: {failure}" if failure else "not measured yet"
             if why:
                 gaps.append(f"seed {job.config.seed} {why}" if len(same) > 1 else why)
         tables.setdefault(table, []).append(Repeated(label, found, gaps))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 from collections.abc import Sequence
@@ -49,7 +48,7 @@ def _launch(argv: Sequence[str]) -> Exception | None:
         from sweeps.measurement import execute
         from sweeps.sweep import run_job
 
-        command = ["steerbench", "run", *_config_dir(argv), *HydraConfig.get().overrides.task]
+        command = ["steerbench", "run", *_config_dir(), *HydraConfig.get().overrides.task]
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             run_job(config, command)
             return
@@ -69,13 +68,11 @@ def _launch(argv: Sequence[str]) -> Exception | None:
     return failures[0] if failures else None
 
 
-def _config_dir(argv: Sequence[str]) -> list[str]:
+def _config_dir() -> list[str]:
     """The folder of further settings that was typed, as one word: without it others cannot run the
     command."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--config-dir", "-cd")
-    folder = parser.parse_known_args(argv)[0].config_dir
-    return [f"--config-dir={folder}"] if folder else []
+    sources = HydraConfig.get().runtime.config_sources
+    return [f"--config-dir={x.path}" for x in sources if x.provider == "command-line"]
 
 
 def _is_override(argument: str) -> bool:
