@@ -4,7 +4,7 @@
 #   VENV=.venv             where the environment lives
 #   PIP_ARGS="..."         further arguments for pip, e.g. an index of CPU-only wheels of torch
 #   DEMO_ARGS="..."        overrides for the demo, e.g. DEMO_ARGS="seed=1 scene=wires"
-#   PAPER_ARGS="..."       overrides for the paper's tables, e.g. PAPER_ARGS="budget=tables seed=0,1,2"
+#   PAPER_ARGS="..."       overrides for the paper's tables, e.g. PAPER_ARGS="budget=demo seed=0,1,2"
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
@@ -15,7 +15,7 @@ BIN := $(VENV)/bin
 PYTHON ?=
 PIP_ARGS ?=
 DEMO_ARGS ?=
-PAPER_ARGS ?= budget=tables scene=totem
+PAPER_ARGS ?= budget=demo scene=totem
 
 # A complete interpreter is one that is new enough and can make environments with pip in them.
 SUITS := import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))

@@ -27,7 +27,7 @@ examples
   steerbench run scene=blender scene.path=DIR  Instant-NGP on your copy of a NeRF-Synthetic scene
   steerbench run --help                        all choices and settings
   steerbench list                              what there is, and what of it is usable here
-  steerbench paper budget=tables               every table of the SteerNeRF paper, as a page
+  steerbench paper budget=demo                 every table of the SteerNeRF paper, as a page
   steerbench parity scene=totem budget=demo    what int8 costs, in decibels, and saves, in time
   steerbench accuracy --within 0.1dB           the fastest setting that loses no more than that
   steerbench check BASELINE.json               is everything as good as it was
