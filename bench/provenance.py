@@ -7,13 +7,15 @@ import hashlib
 import os
 import platform
 import subprocess
+import sys
 from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 MEASURING_PACKAGES = ("bench", "methods")
-VERSIONS_OF = ("torch", "numpy", "numba", "scikit-image", "lpips")
+VERSIONS_OF = ("torch", "numpy", "numba", "kornia", "scikit-image", "lpips")
 VERSIONS_OF_ENGINES = ("openvino", "nncf", "onnx", "onnxruntime")
 """Extras: they compute frames, and have no part in a training."""
 
@@ -41,6 +43,14 @@ def digest(sources: Iterable[Path]) -> str:
         total.update(f"{path.relative_to(ROOT).as_posix()} {len(content)}\n".encode())
         total.update(content)
     return total.hexdigest()
+
+
+def foreign_digest(thing: Any) -> str | None:
+    """SHA-256 of the file that `thing` is defined in; None if `code_digest` covers it."""
+    path = Path(sys.modules[thing.__module__].__file__ or __file__).resolve()
+    if any(path.is_relative_to(ROOT / name) for name in MEASURING_PACKAGES):
+        return None
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @functools.cache

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -46,6 +47,22 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, float]]:
         raise SteerbenchError(
             f"{path}: expected the file of a training, could not read one ({error}); "
             "remove it to train again"
+        ) from error
+
+
+@contextmanager
+def restoring(path: Path) -> Iterator[None]:
+    """Whatever is put back in here comes from `path`.
+
+    Raises:
+        SteerbenchError: it does not fit, and so is of another training.
+    """
+    try:
+        yield
+    except (KeyError, RuntimeError) as error:
+        raise SteerbenchError(
+            f"{path}: expected the file of this training, its content does not fit "
+            f"({' '.join(str(error).split())}); remove it to train again"
         ) from error
 
 

@@ -46,8 +46,9 @@ def distilled_views(
             seconds = time.monotonic() - began
             checkpoint.write(path, tensors, {"views": count, "seconds": seconds})
     tensors, figures = checkpoint.read(path)
-    views = [_unpacked(tensors, number) for number in range(int(figures["views"]))]
-    return views, figures["seconds"]
+    with checkpoint.restoring(path):
+        views = [_unpacked(tensors, number) for number in range(int(figures["views"]))]
+        return views, figures["seconds"]
 
 
 def _rendered(

@@ -18,12 +18,12 @@ from methods import checkpoint, loop
 from methods.cells import centres, pixels_of
 from methods.kernels import multiplies_bf16
 from methods.occupancy import STEP
-from methods.optimise import FieldOptimiser, step_at
+from methods.optimise import FieldOptimiser, cosine, step_at
 from methods.patches import Batch, Patches, Through
 from methods.pipeline import Pipeline, most_doubted
 from methods.renderer2d import Drawing, Renderer2d
 from methods.sequences import MotionOptions
-from methods.volume import render_batch
+from methods.volume import opacity_entropy, render_batch
 
 LEAST_ERROR = 1e-6
 """Mean squared error of a cell below which one is as good as another."""
@@ -153,8 +153,7 @@ class RendererTraining:
         if not math.isfinite(value):
             loop.check_finite(self, {"loss": loss, "picture": drawing.pictures})
         nn.utils.clip_grad_norm_(self.renderer.parameters(), self.options.clip)
-        low = self.options.final_rate
-        self._update(low + (1 - low) * 0.5 * (1 + math.cos(math.pi * self.step / self.steps)))
+        self._update(cosine(self.step / self.steps, self.options.final_rate))
         self.step += 1
         with torch.no_grad():
             base = functional.mse_loss(self.renderer.base(batch.observations), batch.truth).item()
@@ -243,10 +242,7 @@ class JointTraining(RendererTraining):
         return self._opacity_loss(batch.opacity) + self._refinement_loss(batch, drawing)
 
     def _opacity_loss(self, opacity: Tensor) -> Tensor | float:
-        if not len(opacity):
-            return 0.0
-        opacity = opacity.clamp(1e-5, 1 - 1e-5)
-        return -self.options.opacity_entropy * (opacity * opacity.log()).mean()
+        return self.options.opacity_entropy * opacity_entropy(opacity) if len(opacity) else 0.0
 
     def _refinement_loss(self, batch: Batch, drawing: Drawing) -> Tensor | float:
         """Mean squared error that the pixels to be refined add to the pictures, estimated from

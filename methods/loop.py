@@ -66,8 +66,9 @@ def train(training: Training, finished: Path, label: str, log: Log) -> None:
             _drive(training, finished, label, log)
         else:
             tensors, figures = checkpoint.read(finished)
-            training.restore_result(tensors)
-            training.seconds = figures["seconds"]
+            with checkpoint.restoring(finished):
+                training.restore_result(tensors)
+                training.seconds = figures["seconds"]
             log.info(f"{label}: found in {finished}")
 
 
@@ -107,8 +108,9 @@ def resume(training: Training, path: Path) -> None:
         SteerbenchError: the file is damaged, or of another training.
     """
     tensors, figures = checkpoint.read(path)
-    training.restore(tensors, figures)
-    training.step, training.seconds = int(figures["step"]), figures["seconds"]
+    with checkpoint.restoring(path):
+        training.restore(tensors, figures)
+        training.step, training.seconds = int(figures["step"]), figures["seconds"]
 
 
 def check_finite(training: Training, more: Mapping[str, Tensor] | None = None) -> None:

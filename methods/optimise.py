@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import torch
@@ -10,6 +11,11 @@ from torch import Tensor
 from methods import checkpoint
 from methods.fields import HashField
 from methods.kernels.adam import AdamState, sparse_adam_
+
+
+def cosine(done: float, final: float) -> float:
+    """Share of the learning rate after a share `done` of the steps: monotone, 1 to `final`."""
+    return final + (1 - final) * 0.5 * (1 + math.cos(math.pi * done))
 
 
 def step_at(optimiser: torch.optim.Optimizer, rate: float) -> None:

@@ -132,6 +132,11 @@ class PipelineOptions:
         if self.levels is not None:
             grid.check_levels(self.levels)
         check_refined("pipeline.refined", self.refined, renderer)
+        if self.jitter and not renderer.shifts:
+            raise ValueError(
+                f"pipeline.jitter: {type(renderer).__name__} takes every sample for the middle of "
+                "its cell, expected false, got true"
+            )
 
     def taught(self, refined: float) -> PipelineOptions:
         """The options of a training. It looks everywhere, so that one serves all choices of where

@@ -47,7 +47,7 @@ class Setup:
         """With `auto` replaced by what it stands for here.
 
         Raises:
-            ValueError: the grid cannot be had at this precision, or there is no such device.
+            ValueError: the grid cannot be had at this precision, or `device` is no name of one.
             Unavailable: the backend cannot be used here.
         """
         if not DEVICE.fullmatch(device):

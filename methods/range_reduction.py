@@ -17,7 +17,7 @@ from methods.fields import HashField
 from methods.kernels.composite import STOP, Pixels
 from methods.kernels.march import Occupancy
 from methods.occupancy import STEP
-from methods.rounds import render_rays
+from methods.rounds import FAINT, render_rays
 from methods.volume import FeatureFrame, rays_at_matter
 
 KEPT_ALPHA = 0.95
@@ -149,7 +149,8 @@ def _march_within(
     inside = narrow.nonzero().squeeze(1)
     expected = alpha[inside]
     loose = max(stop, 1 - KEPT_ALPHA)
-    first = march(rays.take(inside), stop=loose, window=window[inside])
+    # Most of them end here, but those that go on are not to lack what is faint in front.
+    first = march(rays.take(inside), stop=loose, window=window[inside], faint=FAINT * stop)
     enough = first.alpha >= KEPT_ALPHA * expected
     # What is left of the opacity looks like what was found.
     more = torch.where(enough & (first.alpha < expected), expected / first.alpha, 1)

@@ -112,12 +112,14 @@ class Renderer2d(nn.Module, ABC):
     Attributes:
         scale: s.
         doubts: it says where its pictures may be wrong.
+        shifts: it draws frames whose samples lie beside the centres of their pixels.
         network: what is learned.
         engine: computes what the network does, in its place; see `methods.engines`.
     """
 
     scale: int
     doubts = False
+    shifts = False
     network: Network
     engine: Callable[..., tuple[Tensor, ...]] | None = None
 

@@ -21,9 +21,9 @@ rays that are left in the end are not worth many rounds: they may take as many m
 fewer than half of all."""
 
 FAINT = 0.1
-"""Samples of less weight than this share of the transmittance at which a ray ends have an opacity,
-but no features: black instead, each changes a pixel by less than its weight, and so less than a
-tenth of what may lie behind its end. A ray through haze has many of them."""
+"""Samples of less weight than this share of the transmittance at which a ray may end have an
+opacity, but no features: black instead, each changes a pixel by less than its weight, and so less
+than a tenth of what may lie behind its end. A ray through haze has many of them."""
 
 
 @torch.no_grad()
@@ -37,6 +37,7 @@ def render_rays(
     step: float = STEP,
     window: Tensor | None = None,
     carry: Pixels | None = None,
+    faint: float | None = None,
 ) -> Pixels:
     """Render `rays` in rounds, so that samples behind the early stop are hardly ever evaluated.
 
@@ -46,8 +47,10 @@ def render_rays(
     Args:
         window: [R, 2] nearest and farthest t of each ray; None: all.
         carry: what lies in front of the windows; taken over and changed in place.
+        faint: samples of less weight have no features; None: `FAINT * stop`.
     """
     device = rays.origins.device
+    faint = FAINT * stop if faint is None else faint
     canvas = carry or Pixels.blank(len(rays.origins), field.channels, device)
     for first in range(0, len(rays.origins), CHUNK_RAYS):
         alive = torch.arange(first, min(first + CHUNK_RAYS, len(rays.origins)), device=device)
@@ -56,7 +59,18 @@ def render_rays(
         while len(alive):
             limit = ROUND_SAMPLES * max(count // (2 * len(alive)), 1)
             alive, start = _render_round(
-                field, rays, window, occupancy, probe, canvas, alive, start, limit, stop, step
+                field,
+                rays,
+                window,
+                occupancy,
+                probe,
+                canvas,
+                alive,
+                start,
+                limit,
+                stop,
+                step,
+                faint,
             )
     return canvas
 
@@ -73,6 +87,7 @@ def _render_round(
     limit: int,
     stop: float,
     step: float,
+    faint: float,
 ) -> tuple[Tensor, Tensor]:
     """One round of at most `limit` samples of the rays `alive` from their steps `start`; those left
     and where they go on."""
@@ -97,7 +112,7 @@ def _render_round(
         sigma = sigma[: len(samples)]
         along = (sigma, samples.delta, samples.offsets)
         weight = weights(*along, stop=stop, front=1 - carry.alpha, backend=field.backend)
-        seen = (weight > FAINT * stop).nonzero().squeeze(1)
+        seen = (weight > faint).nonzero().squeeze(1)
         encoded = field.encode_directions(directions)
         index = pad(seen)
         values = sigma.new_zeros(len(samples), field.channels)

@@ -61,6 +61,7 @@ class SpaceToDepth(Renderer2d):
     """
 
     doubts = True
+    shifts = True
     network: CellNetwork
 
     def __init__(

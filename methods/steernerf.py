@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from bench.motion import viewing_target
-from bench.provenance import ROOT, digest
+from bench.provenance import ROOT, digest, foreign_digest
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods import loop
 from methods.buffer import RenderingBuffer
@@ -220,7 +220,11 @@ class SteerNerf:
         return {
             "renderer_steps": budget.renderer_steps,
             "pipeline": trained_for,
-            "renderer": {"kind": kind.__qualname__, **settings},
+            "renderer": {
+                "kind": f"{kind.__module__}.{kind.__qualname__}",
+                "code": foreign_digest(kind),
+                **settings,
+            },
             "joint": asdict(self.joint),
             "stage2": stage2_digest(),
         }

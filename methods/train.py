@@ -18,8 +18,8 @@ from methods import checkpoint, loop
 from methods.fields import HashField
 from methods.kernels import sources
 from methods.occupancy import EVERY, MIN_VIEWS, DensityGrid, learnable_cells
-from methods.optimise import FieldOptimiser
-from methods.volume import render_batch
+from methods.optimise import FieldOptimiser, cosine
+from methods.volume import opacity_entropy, render_batch
 
 KERNELS = ("adam", "composite", "encode", "march", "spherical")
 """Kernels that a training of a field runs through."""
@@ -125,16 +125,14 @@ class FieldTraining:
         self.batches = PixelBatches(scene.splits["train"], device)
         self.background = scene.background.to(device)
         self.step, self.steps = 0, budget.steps
-        self.rays = 1024
+        self.rays = min(1024, options.max_rays)
         self.seconds = 0.0
         self.generator = torch.Generator(device).manual_seed(seed)
         self.optimiser = FieldOptimiser(field)
 
     def learning_rate(self) -> float:
-        """Cosine from `rate` to `rate * final_rate`: monotone."""
-        low = self.options.final_rate
-        done = self.step / self.steps
-        return self.options.rate * (low + (1 - low) * 0.5 * (1 + math.cos(math.pi * done)))
+        """Of the next step."""
+        return self.options.rate * cosine(self.step / self.steps, self.options.final_rate)
 
     def advance(self) -> dict[str, float]:
         """One step; its mean squared error.
@@ -151,8 +149,7 @@ class FieldTraining:
         jitter = torch.rand(len(target), generator=self.generator, device=target.device)
         pixels, samples = render_batch(self.field, rays, self.grid.occupancy, jitter, background)
         loss = functional.mse_loss(pixels.values, target)
-        opacity = pixels.alpha.clamp(1e-5, 1 - 1e-5)
-        entropy = -(opacity * opacity.log()).mean()
+        entropy = opacity_entropy(pixels.alpha)
         (loss + self.options.opacity_entropy * entropy).backward()
         value = loss.item()
         if not math.isfinite(value):
@@ -238,9 +235,11 @@ def train_field(
     if finished.exists():
         tensors, figures = checkpoint.read(finished)
         grid = new_grid(scene, field.table.device)
-        restore_field(field, grid, tensors)
+        with checkpoint.restoring(finished):
+            restore_field(field, grid, tensors)
+            seconds = figures["seconds"]
         log.info(f"trained field found: {finished}")
-        return grid, figures["seconds"]
+        return grid, seconds
     training = FieldTraining(field, scene, budget, options, seed)
     loop.train(training, finished, "training", log)
     field.grad_buffer = None

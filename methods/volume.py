@@ -102,6 +102,12 @@ def render_batch(
     return pixels, len(samples)
 
 
+def opacity_entropy(opacity: Tensor) -> Tensor:
+    """Mean of -o ln o of `opacity` [R]: least where every ray meets all or nothing."""
+    opacity = opacity.clamp(1e-5, 1 - 1e-5)
+    return -(opacity * opacity.log()).mean()
+
+
 def query(
     field: HashField, positions: Tensor, ray: Tensor, directions: Tensor
 ) -> tuple[Tensor, Tensor]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import shlex
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
@@ -20,7 +18,7 @@ from rich.columns import Columns
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
-from bench.provenance import MEASURING_PACKAGES, ROOT, code_digest, decisive
+from bench.provenance import code_digest, decisive, foreign_digest
 from bench.results import Store
 from bench.run import measure
 from bench.types import DEVICE, Method, Scene
@@ -207,14 +205,9 @@ def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any
 def _other_code(config: DictConfig) -> dict[str, str]:
     """SHA-256 of the files that `code_digest` does not cover and `config` builds something from, by
     what it builds."""
-    covered = [ROOT / name for name in MEASURING_PACKAGES]
-    found = {}
-    for target in _targets(OmegaConf.to_container(config, resolve=True)):
-        module = sys.modules[get_object(target).__module__]
-        path = Path(module.__file__ or covered[0]).resolve()
-        if not any(path.is_relative_to(folder) for folder in covered):
-            found[target] = hashlib.sha256(path.read_bytes()).hexdigest()
-    return found
+    targets = set(_targets(OmegaConf.to_container(config, resolve=True)))
+    digests = {target: foreign_digest(get_object(target)) for target in targets}
+    return {target: found for target, found in digests.items() if found is not None}
 
 
 def _targets(node: Any) -> Iterator[str]:

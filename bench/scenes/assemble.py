@@ -41,7 +41,7 @@ def assemble(
     """The scene in units in which `box` fills the unit cube.
 
     The digest covers the bytes of `camera_files` and of all picture files, the background, the
-    resolution and the place of the box.
+    resolution and the box.
     Raises SteerbenchError where the box, or a camera in its units, is beyond float32.
     """
     if background not in BACKGROUNDS:
@@ -63,7 +63,8 @@ def assemble(
         for view, camera in zip(part.names, part.cameras, strict=True):
             others = [camera.cx, camera.cy, *camera.c2w.flatten().tolist()]
             _check_float32(view, [camera.fx, camera.fy], others)
-    digest = hashlib.sha256(repr((background, box.origin.tolist(), box.side)).encode())
+    corners = box.lower.tolist(), box.upper.tolist()
+    digest = hashlib.sha256(repr((background, corners)).encode())
     for path in camera_files:
         digest.update(hashlib.sha256(path.read_bytes()).digest())
     for split in pictures:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from functools import cache, partial
 from pathlib import Path
 
@@ -28,7 +29,7 @@ CELLS: list[Cell] = [
 TOLERANCE = {"fp32": 1e-5, "bf16": 0.03, "fp16": 0.03, "int8": 0.1}
 SHARE = (
     "of the root mean square: fp32 adds hundreds of products in another order; below, numbers are "
-    "rounded by 2^-9, or 1/510 of the range seen, before each of some ten layers"
+    "rounded by 2^-8, or 1/510 of the range seen, before each of some ten layers"
 )
 
 SIDE, BLOCKS = 16, 6
@@ -86,8 +87,10 @@ def _renderer() -> SpaceToDepth:
     return SpaceToDepth(3, 2, 4).requires_grad_(False)
 
 
-def _inputs(rows: Tensor) -> Inputs:
-    return rows, neighbours_of(torch.ones(1, SIDE, SIDE, dtype=torch.bool))
+def _placed(rows: Tensor, device: str) -> Inputs:
+    """The network's inputs: `rows` and who is beside whom."""
+    neighbours = neighbours_of(torch.ones(1, SIDE, SIDE, dtype=torch.bool))
+    return rows.to(device), neighbours.to(device)
 
 
 def _random_rows(seed: int) -> Tensor:
@@ -105,17 +108,18 @@ def _built(engine: str, device: str, precision: Precision) -> Callable[..., Inpu
     """
     chosen = next(kind for kind in ENGINES if kind.name == engine)(precision)
     chosen.check(torch.device(device))
-    views = [_inputs(_random_rows(seed)) for seed in range(4)]
+    network = deepcopy(_renderer().network).to(device)
+    views = [_placed(_random_rows(seed), device) for seed in range(4)]
     with tempfile.TemporaryDirectory() as folder:
         log = ConsoleLog(Path(folder), quiet=True)
-        return chosen.build(_renderer().network, lambda: views, lambda: Path(folder), log).run
+        return chosen.build(network, lambda: views, lambda: Path(folder), log).run
 
 
 def _said(engine: str, device: str, precision: str, rows: Tensor) -> list[Tensor]:
     """All that the engine says of `rows`, in float64."""
     run = _built(engine, device, precision)
     with torch.no_grad():
-        return [x.cpu().double().clone() for x in run(*(x.to(device) for x in _inputs(rows)))]
+        return [x.cpu().double().clone() for x in run(*_placed(rows, device))]
 
 
 def _apart(got: list[Tensor], want: list[Tensor]) -> float:
@@ -130,7 +134,7 @@ def _apart(got: list[Tensor], want: list[Tensor]) -> float:
 def _error(value: float, engine: str, device: str, precision: str) -> float:
     rows = torch.full_like(_random_rows(0), value)
     with torch.no_grad():
-        want = [x.double() for x in _renderer().network(*_inputs(rows))]
+        want = [x.double() for x in _renderer().network(*_placed(rows, "cpu"))]
     return _apart(_said(engine, device, precision, rows), want)
 
 

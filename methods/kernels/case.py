@@ -25,7 +25,8 @@ U32 = 2.0**-24
 """Unit roundoff of float32."""
 
 U16 = 2.0**-8
-"""Unit roundoff of bfloat16, doubled: two nearly equal numbers may round to neighbours."""
+"""Unit roundoff of bfloat16, and its ulp from 1/2 to 1: two nearly equal numbers below 1 may round
+to neighbours."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import subprocess
 from importlib import metadata
@@ -11,6 +12,7 @@ import pytest
 import torch
 
 from bench import provenance
+from bench.types import Camera
 
 code_digest, commit = provenance.code_digest.__wrapped__, provenance.commit.__wrapped__
 
@@ -24,6 +26,16 @@ def sources(monkeypatch, tmp_path) -> Path:
     monkeypatch.setattr(provenance, "ROOT", tmp_path)
     monkeypatch.setattr(provenance, "__file__", str(tmp_path / "bench" / "a.py"))
     return tmp_path
+
+
+def test_code_from_elsewhere_is_known_by_its_file(tmp_path, monkeypatch):
+    (tmp_path / "from_elsewhere.py").write_text("class Renderer:\n    A = 1\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    kind = importlib.import_module("from_elsewhere").Renderer
+    before = provenance.foreign_digest(kind)
+    (tmp_path / "from_elsewhere.py").write_text("class Renderer:\n    A = 2\n")
+    assert None is not before != provenance.foreign_digest(kind)
+    assert provenance.foreign_digest(Camera) is None
 
 
 def test_the_digest_changes_with_every_source_that_can_change_a_row(sources):

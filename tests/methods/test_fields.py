@@ -42,7 +42,7 @@ def test_density_is_positive_and_features_are_in_the_unit_interval() -> None:
 
 def test_bfloat16_is_close_to_float32() -> None:
     exact, rounded = evaluate(field("fp32")), evaluate(field("bf16"))
-    # Five layers and the table, each rounded to a relative 2^-9 of values that cancel in sums.
+    # Five layers and the table, each rounded to a relative 2^-8 of values that cancel in sums.
     torch.testing.assert_close(rounded[1], exact[1], rtol=0, atol=0.03)
     torch.testing.assert_close(rounded[0].log(), exact[0].log(), rtol=0, atol=0.1)
 

@@ -21,7 +21,7 @@ from methods.patches import Batch, PatchSource, Through
 from methods.pipeline import Pipeline, PipelineOptions, View
 from methods.range_reduction import RangeReduction
 from methods.renderer2d import Points, Renderer2d
-from methods.sequences import MotionOptions, SequencePool, TrueView
+from methods.sequences import MotionOptions, SequencePool, true_views
 from methods.space_to_depth import SpaceToDepth
 from methods.unet_release import UnetRelease
 from tests.methods.observations import shaken
@@ -71,8 +71,7 @@ def new_training(
         history=pipeline.history,
         surface=pipeline.surface,
     )
-    split = scene.splits["train"]
-    views = [TrueView(c, p) for c, p in zip(split.cameras, split.images, strict=True)]
+    views = true_views(scene)
     generator = torch.Generator().manual_seed(1)
     whole = Pipeline(field, shell(), scene.background, renderer, pipeline)
     pool = SequencePool(whole, views, [], 0.0, TARGET, options.motion, generator)

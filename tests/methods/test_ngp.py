@@ -116,6 +116,6 @@ def test_a_stop_that_ends_every_ray_at_once_is_refused() -> None:
 
 
 @pytest.mark.parametrize("device", ["", "gpu", "cpu:0", "meta"])
-def test_a_device_that_does_not_exist_is_refused(device: str) -> None:
+def test_what_is_no_name_of_a_device_is_refused(device: str) -> None:
     with pytest.raises(ValueError, match=rf"^device: expected auto, .* got '{device}'"):
         InstantNgp(grid=GRID, training=TrainingOptions(), device=device)

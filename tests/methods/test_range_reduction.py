@@ -217,6 +217,18 @@ def test_a_thin_surface_that_was_thin_before_ends_its_rays() -> None:
     assert samples < 0.5 * all_samples
 
 
+def test_a_faint_surface_that_was_faint_before_keeps_its_colour() -> None:
+    camera = along_x()
+    veil = Solid(slab(0.3, 0.36), density=2.0)  # 11 % opaque, a third of a percent a sample
+    found = seen_before(veil, camera, camera)
+    assert is_known(found).all()
+    frame = render_guided_by(
+        veil, camera, EVERYWHERE, torch.zeros(4), Work(), found, stop=1e-2, step=STEP
+    )
+    assert frame.alpha.min() > 0.1
+    torch.testing.assert_close(frame.values[..., 3], 0.25 * frame.alpha, rtol=0, atol=1e-6)
+
+
 def test_the_evidence_of_an_empty_frame_is_unknown_everywhere() -> None:
     camera = along_x()
     found = seen_before(Solid(lambda x: -x[:, 0] - 1), camera, camera)

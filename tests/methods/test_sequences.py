@@ -12,19 +12,14 @@ import torch
 
 from bench.types import Scene
 from methods import checkpoint
-from methods.sequences import MotionOptions, SequencePool, TrueView
+from methods.sequences import MotionOptions, SequencePool, true_views
 from tests.methods.test_pipeline import OPTIONS, new_pipeline
 
 TARGET = torch.full((3,), 0.5)
 
 
-def views(scene: Scene) -> list[TrueView]:
-    split = scene.splits["train"]
-    return [TrueView(c, p) for c, p in zip(split.cameras, split.images, strict=True)]
-
-
 def new_pool(scene: Scene, motion: MotionOptions, share: float = 0.0, frames: int = 2):
-    real = views(scene)
+    real = true_views(scene)
     pipeline = new_pipeline(replace(OPTIONS, frames=frames))
     generator = torch.Generator().manual_seed(0)
     return SequencePool(pipeline, real[:12], real[12:], share, TARGET, motion, generator)
@@ -48,7 +43,7 @@ def test_the_share_of_distilled_views_is_kept(
     ball_scene: Scene, share: float, distilled: int
 ) -> None:
     pool = new_pool(ball_scene, MotionOptions(pool=1, uses=1, length=0), share)
-    of_field = {id(view.camera) for view in views(ball_scene)[12:]}
+    of_field = {id(view.camera) for view in true_views(ball_scene)[12:]}
     drawn = [pool.draw() for _ in range(20)]
     assert sum(id(sequence.truth.camera) in of_field for sequence in drawn) == distilled
 

@@ -15,7 +15,13 @@ from bench.types import Budget, Log, Scene, Split, SteerbenchError
 from methods import checkpoint, loop
 from methods.fields import HashField
 from methods.kernels.encode import HashGrid
-from methods.train import FieldTraining, PixelBatches, TrainingOptions, train_field
+from methods.train import (
+    MIN_RAYS,
+    FieldTraining,
+    PixelBatches,
+    TrainingOptions,
+    train_field,
+)
 
 GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
 BUDGET = Budget("test", steps=40, samples=4096)
@@ -182,6 +188,26 @@ def test_a_damaged_field_is_named_with_what_to_do(
     (tmp_path / "field.safetensors").write_bytes(b"half a file")
     with pytest.raises(SteerbenchError, match=r"field\.safetensors.*remove it to train again"):
         trained(ball_scene, tmp_path, quiet_log)
+
+
+@pytest.mark.parametrize("name", ["field", "checkpoint"])
+def test_a_file_of_another_training_is_named_with_what_to_do(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, name: str
+) -> None:
+    checkpoint.write(tmp_path / f"{name}.safetensors", {"mean.weight": torch.zeros(3)}, {})
+    message = rf"{name}\.safetensors: expected the file of this .*; remove it to train again"
+    with pytest.raises(SteerbenchError, match=message):
+        trained(ball_scene, tmp_path, quiet_log)
+
+
+def test_no_step_has_more_rays_than_it_may(ball_scene: Scene) -> None:
+    options = TrainingOptions(max_rays=MIN_RAYS)
+    training = FieldTraining(new_field(), ball_scene, BUDGET, options, seed=0)
+    rays = []
+    for _ in range(2):
+        rays.append(training.rays)
+        training.advance()
+    assert max(rays) <= MIN_RAYS
 
 
 def test_an_opaque_picture_among_transparent_ones_is_opaque(ball_scene: Scene) -> None:

@@ -132,6 +132,10 @@ def test_a_dataclass_may_have_fields_of_types_that_only_the_module_of_its_base_k
             "pipeline.refined: UnetRelease does not say where it may be wrong, expected 0, got 0.1",
         ),
         (["method=steernerf_paper", "method.joint.refined=0.2"], "joint.refined: UnetRelease does"),
+        (
+            ["method=steernerf_paper", "method.pipeline.jitter=true"],
+            "pipeline.jitter: UnetRelease takes every sample for the middle of its cell",
+        ),
         (["method.joint.opacity_entropy=-1"], "joint.opacity_entropy: expected 0 or more, got -1"),
     ],
 )

@@ -141,5 +141,6 @@ def _visible(rays: int, most: int, options: dict, device: str) -> Prepared:
             ),
         )
 
-    # A transmittance within rounding of the threshold may end a ray one sample earlier.
-    return Prepared(call, 1.0)
+    # Only a transmittance within rounding of the threshold, 1e-6 of those there may be, could end a
+    # ray one sample earlier.
+    return Prepared(call, 0.0)

@@ -9,6 +9,7 @@ leaves samples out but moves none.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,7 +21,7 @@ from bench.types import check_shape
 from methods.kernels.dispatch import implementation
 
 MAX_SAMPLES = 1024
-"""Most samples of a ray; a step of sqrt(3) / 1024 crosses the unit cube with as many."""
+"""Samples with which a ray crosses the unit cube at the usual step, sqrt(3) / 1024."""
 
 PARALLEL = 2.0**-127
 """A direction below this lies in the planes of its axis: its reciprocal is no float32."""
@@ -134,7 +135,7 @@ def march(
     window: Tensor | None = None,
     jitter: Tensor | None = None,
     start: Tensor | None = None,
-    limit: int = MAX_SAMPLES,
+    limit: int | None = None,
     backend: str = "auto",
 ) -> Samples:
     """Sample rays `origins` + t `directions` ([R, 3] each) inside the unit cube.
@@ -148,7 +149,7 @@ def march(
         jitter: [R] phase of a ray's samples in [0, 1); None: 1/2.
         start: [R] int32 step to begin with, `Samples.resume` of an earlier call with the same rays;
             a negative one ends the ray; None: 0.
-        limit: at most so many samples a ray.
+        limit: at most so many samples a ray; None: all.
     """
     rays = len(origins)
     check_shape("origins", origins, None, 3)
@@ -164,6 +165,8 @@ def march(
     check_shape("start", start, rays)
     if not step > 0:
         raise ValueError(f"step: expected a positive length, got {step}")
+    if limit is None:
+        limit = math.ceil(math.sqrt(3) / step) + 1  # the cube's diagonal, and what rounding adds
     if limit < 1:
         raise ValueError(f"limit: expected 1 or more, got {limit}")
     return implementation("march", backend, origins.device).march(

@@ -127,7 +127,9 @@ def _way_error(
     counts = torch.zeros(len(origins), dtype=torch.int64, device=device)
     outside = 0.0
     for _ in range(math.ceil(math.sqrt(3) / step / MAX_SAMPLES) + 1):
-        samples = march(origins, directions, occupancy, step, start=start, backend=backend)
+        samples = march(
+            origins, directions, occupancy, step, start=start, limit=MAX_SAMPLES, backend=backend
+        )
         counts += samples.offsets.diff()
         start = samples.resume
         if len(samples):

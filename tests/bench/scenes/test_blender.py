@@ -110,6 +110,12 @@ def test_digest_depends_on_the_options(blender_folder, log, options) -> None:
     assert blender.load(blender_folder, **options, log=log).digest != plain
 
 
+def test_digest_depends_on_the_short_sides_of_the_box(blender_folder, log) -> None:
+    flat = [[-1.5, -1.5, -0.5], [1.5, 1.5, 0.5]]  # centre and longest side are those of "full"
+    digests = [blender.load(blender_folder, bounds=b, log=log).digest for b in ("full", flat)]
+    assert digests[0] != digests[1]
+
+
 def test_digest_depends_on_pictures_and_cameras(blender_folder, picture, edit_json, log) -> None:
     digests = {blender.load(blender_folder, bounds="full", log=log).digest}
     edit_json(blender_folder / "transforms_test.json", lambda r: r.update(camera_angle_x=0.71))

@@ -62,10 +62,11 @@ def test_samples_are_the_steps_in_occupied_cells(backend: str) -> None:
     assert differing <= 2
 
 
+@pytest.mark.parametrize("step", [STEP, STEP / 4])
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_full_grid_is_sampled_along_the_whole_chord(backend: str) -> None:
+def test_a_full_grid_is_sampled_along_the_whole_chord(backend: str, step: float) -> None:
     origins, directions = rays_through_the_cube(200)
-    samples = march(origins, directions, full(), STEP, backend=backend)
+    samples = march(origins, directions, full(), step, backend=backend)
     inverse = 1 / directions
     first, second = -origins * inverse, (1 - origins) * inverse
     near = torch.minimum(first, second).amax(dim=1).clamp(min=0)
@@ -73,7 +74,7 @@ def test_a_full_grid_is_sampled_along_the_whole_chord(backend: str) -> None:
     chord = (far - near).clamp(min=0) * directions.norm(dim=1)
     lengths = torch.zeros(200).index_add(0, samples.ray.long(), samples.delta)
     # A midpoint rule covers the chord up to half a step, a sample more or less at its far end.
-    assert ((lengths - chord).abs() <= 0.5 * STEP + 1e-5).all()
+    assert ((lengths - chord).abs() <= 0.5 * step + 1e-5).all()
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -189,7 +190,7 @@ def test_the_front_of_a_ray_is_its_first_samples() -> None:
             assert torch.equal(getattr(front, name)[kept], getattr(samples, name)[whole])
 
 
-def test_words_bounds_and_share_describe_the_cells() -> None:
+def test_words_and_bounds_describe_the_cells() -> None:
     cells = torch.zeros(32, 32, 32, dtype=torch.bool)
     cells[3, 17, 30] = cells[5, 20, 31] = True
     grid = Occupancy(cells)
