@@ -72,7 +72,7 @@ def test_a_full_grid_is_sampled_along_the_whole_chord(backend: str, step: float)
     near = torch.minimum(first, second).amax(dim=1).clamp(min=0)
     far = torch.maximum(first, second).amin(dim=1)
     chord = (far - near).clamp(min=0) * directions.norm(dim=1)
-    lengths = torch.zeros(200).index_add(0, samples.ray.long(), samples.delta)
+    lengths = torch.zeros(200).double().index_add(0, samples.ray.long(), samples.delta.double())
     # A midpoint rule covers the chord up to half a step, a sample more or less at its far end.
     assert ((lengths - chord).abs() <= 0.5 * step + 1e-5).all()
 
