@@ -47,7 +47,8 @@ def digest(sources: Iterable[Path]) -> str:
 
 def foreign_digest(thing: Any) -> str | None:
     """SHA-256 of the file that `thing` is defined in; None if `code_digest` covers it."""
-    path = Path(sys.modules[thing.__module__].__file__ or __file__).resolve()
+    module = sys.modules[thing.__module__]
+    path = Path(getattr(module, "__file__", None) or __file__).resolve()  # none: built in
     if any(path.is_relative_to(ROOT / name) for name in MEASURING_PACKAGES):
         return None
     return hashlib.sha256(path.read_bytes()).hexdigest()
