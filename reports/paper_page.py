@@ -21,7 +21,7 @@ Lines = Mapping[str, Sequence[Repeated]]
 
 METHODS = {
     ("table1", "Instant-NGP"): "Instant-NGP",
-    ("table1", "SteerNeRF as published, fp32"): "SteerNeRF as published",
+    ("table1", "SteerNeRF, the paper's, fp32"): "SteerNeRF, the paper's",
     ("table1", "SteerNeRF, ours, fp32"): "SteerNeRF, ours",
 }
 """Table and line of what is shown in pictures, and what it is called there."""
@@ -35,7 +35,7 @@ ABLATION = {
 
 RANGE = {
     ("table2", "without range reduction"): "ours, without range reduction",
-    ("table2", "with range reduction"): "ours, with range reduction",
+    ("table2", "with range reduction, by window"): "ours, with range reduction",
 }
 
 
@@ -69,13 +69,18 @@ A cell is what was measured / what the paper has / the difference. The two were 
 different scenes, machines and trainings, which stand above each table: what can be compared is how
 the lines differ. With several seeds a measured figure is their mean ± half of its 95 % interval.
 The best figure of a column is **bold**, the second of three or more *italic*, among those of the
-same frames, protocol and machine; LPIPS columns name their network. A `–` is a figure that the
-paper does not give, or a method that does not exist here.
+same frames, protocol and machine; LPIPS columns name the network of the measured figure. A `–` is
+a figure that the paper does not give, or a method that does not exist here. Figures are means over
+steady frames; cold ones, before which too few were rendered, are left out.
 
-Below each table stands what grows from line to line in the paper, and by how much it grows here. It
-`holds` where the whole 95 % interval is above zero. An interval over the frames of one seed does
-not hold the difference between one training and the next, nor how fast the machine was when a line
-was measured; give several seeds for that."""
+The method `steernerf_paper` follows the paper's pipeline; `steernerf` is our own, which Tables 2
+to 6 vary.
+
+Below each table stands what grows from line to line in the paper, and by how much it grows here,
+over the frames that both lines have. With several seeds it `holds` where the whole 95 % interval
+is above zero. The interval of a single seed is one over frames: it knows nothing of the difference
+between one training and the next, nor of how fast the machine was when a line was measured, and so
+proves nothing."""
 
 
 def _doubted(lines: Lines, found: Sequence[Doubt]) -> Iterator[str]:
@@ -97,8 +102,8 @@ def _plots(lines: Lines, folder: Path) -> Iterator[str]:
         yield _figure(
             "Quality against time",
             add_picture(folder, "psnr-ms", draw),
-            "PSNR against the mean time of a frame, one mark a line of Table 1: further up is"
-            " better, further left is faster. Time has a logarithmic scale.",
+            "PSNR against the mean time of a frame, one mark a measured line of Table 1: further"
+            " up is better, further left is faster. Time has a logarithmic scale.",
         )
     lengths = [line for line in lines.get("table6", ()) if line.runs]
     sized = [*first, *(replace(line, label=f"ours, {line.label}") for line in lengths)]
@@ -107,17 +112,19 @@ def _plots(lines: Lines, folder: Path) -> Iterator[str]:
         yield _figure(
             "Quality against memory",
             add_picture(folder, "psnr-bytes", draw),
-            "PSNR against the size of the model, one mark a line of Tables 1 and 6, the latter with"
-            " another length T of the hash table: further up is better, further left is smaller."
-            " Size has a logarithmic scale.",
+            "PSNR against the size of the model, one mark a measured line of Tables 1 and 6, the"
+            " latter with another length T of the hash table: further up is better, further left is"
+            " smaller. Size has a logarithmic scale.",
         )
     if divided := _named(METHODS | RANGE, lines):
         yield _figure(
             "Where the time goes",
             add_picture(folder, "stages", partial(figures.stage_bars, divided)),
             "The mean time of a frame, one bar for each run, divided into the stages of its method."
-            " Rays, march, field, composite and finish of Instant-NGP are what SteerNeRF does in"
-            " its stage `field`, at a lower resolution. What is in no stage is `other`.",
+            " Rays, march, field and composite of Instant-NGP are what SteerNeRF does at low"
+            " resolution in `field`, at full resolution in `refinement` and, one sample a pixel, in"
+            " `feature_reprojection`. OpenVINO computes the 2D renderers of Table 1, torch those of"
+            " Table 2. What is in no stage is `other`.",
         )
     if followed := _named(METHODS, lines):
         yield _figure(

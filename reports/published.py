@@ -119,9 +119,10 @@ def section(table: PaperTable, lines: Sequence[Repeated]) -> str:
 
 
 def _origin(runs: Sequence[Run]) -> str:
-    """Seeds, commits and processors of `runs`."""
+    """Methods, seeds, commits and processors of `runs`."""
     machines = [run.record["machine"] for run in runs]
     told = {
+        "method": [run.facts["method"] for run in runs],
         "seed": [str(run.facts["seed"]) for run in runs],
         "commit": [run.facts["commit"] for run in runs],
         "on": [f"{each['cpu']} with {each['threads']} threads" for each in machines],

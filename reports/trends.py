@@ -15,6 +15,9 @@ from reports.seeds import Repeated
 from reports.tables import Table
 
 HOLDS, FAILS, OPEN = "holds", "does not hold", "cannot be told"
+SEEN, REVERSED = "so, by one seed", "the reverse, by one seed"
+"""What frames of one seed can say: another training may turn it around."""
+
 COMPUTED = "computed, not sampled"
 
 
@@ -34,6 +37,7 @@ class Step:
         by: what the metric grows by.
         half: half of the 95 % interval of that; nan where it is not known.
         over: of what the interval is.
+        proves: whether the interval holds the difference between one training and the next.
     """
 
     metric: str
@@ -42,13 +46,16 @@ class Step:
     by: float
     half: float
     over: str
+    proves: bool
 
     @property
     def verdict(self) -> str:
-        """Whether it grows for sure, surely does not, or neither."""
+        """Whether it grows, does not, or neither can be told."""
         if self.by - self.half > 0:
-            return HOLDS
-        return FAILS if self.by + self.half <= 0 else OPEN
+            return HOLDS if self.proves else SEEN
+        if self.by + self.half <= 0:
+            return FAILS if self.proves else REVERSED
+        return OPEN
 
 
 def steps(trend: Trend, lines: Mapping[str, Repeated]) -> Iterator[Step]:
@@ -56,16 +63,18 @@ def steps(trend: Trend, lines: Mapping[str, Repeated]) -> Iterator[Step]:
     for smaller, larger in pairwise(trend.rising):
         one, other = lines.get(smaller), lines.get(larger)
         if one is not None and other is not None:
-            apart, over = _apart(one, other, trend.metric)
+            apart, over, proves = _apart(one, other, trend.metric)
             if len(apart):
                 half = half_interval(apart)
                 if trend.metric.startswith("size_bytes"):
-                    half, over = 0.0, COMPUTED
-                yield Step(trend.metric, smaller, larger, float(apart.mean()), half, over)
+                    half, over, proves = 0.0, COMPUTED, True
+                by = float(apart.mean())
+                yield Step(trend.metric, smaller, larger, by, half, over, proves)
 
 
-def _apart(one: Repeated, other: Repeated, metric: str) -> tuple[np.ndarray, str]:
-    """Differences of pairs: of the same seed where there are several, else of the same frame."""
+def _apart(one: Repeated, other: Repeated, metric: str) -> tuple[np.ndarray, str, bool]:
+    """Differences of pairs, of the same seed where there are several, else of the same frame; of
+    what; and whether of several trainings."""
     pairs = [
         (run, twin)
         for run in one.runs
@@ -79,9 +88,10 @@ def _apart(one: Repeated, other: Repeated, metric: str) -> tuple[np.ndarray, str
         frames, others = (Figures.of(run).frames.get(metric, {}) for run in pairs[0])
         apart = [others[name] - frames[name] for name in frames if name in others]
         if len(apart) > 1:
-            return np.array(apart), f"{len(apart)} frames of one seed"
+            return np.array(apart), f"{len(apart)} frames of one seed", False
     differences = [twin.values[metric] - run.values[metric] for run, twin in pairs]
-    return np.array(differences), f"{len(pairs)} seeds" if len(pairs) > 1 else "one figure each"
+    several = len(pairs) > 1
+    return np.array(differences), f"{len(pairs)} seeds" if several else "one figure each", several
 
 
 def table(found: Sequence[Step]) -> Table:

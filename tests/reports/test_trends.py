@@ -10,7 +10,7 @@ import pytest
 from bench.run import half_interval
 from reports.runs import Run, load
 from reports.seeds import Repeated
-from reports.trends import FAILS, HOLDS, OPEN, Trend, steps
+from reports.trends import FAILS, HOLDS, OPEN, REVERSED, SEEN, Trend, steps
 
 TREND = Trend("psnr", ["one", "two"])
 
@@ -37,8 +37,8 @@ def only(one: list[Run], two: list[Run]):
 @pytest.mark.parametrize(
     ("apart", "verdict"),
     [
-        ([0.9, 1.0, 1.1, 0.9, 1.0, 1.1], HOLDS),
-        ([-0.9, -1.0, -1.1, -0.9, -1.0, -1.1], FAILS),
+        ([0.9, 1.0, 1.1, 0.9, 1.0, 1.1], SEEN),
+        ([-0.9, -1.0, -1.1, -0.9, -1.0, -1.1], REVERSED),
         ([1.0, -1.0, 1.0, -1.0, 1.0, -0.9], OPEN),
     ],
 )
@@ -50,14 +50,15 @@ def test_one_seed_is_compared_frame_by_frame(run: Run, apart: list[float], verdi
     assert step.verdict == verdict
 
 
-def test_several_seeds_are_compared_seed_by_seed(run: Run) -> None:
+@pytest.mark.parametrize(("by", "verdict"), [(0.1, HOLDS), (-0.1, FAILS)])
+def test_several_seeds_are_compared_seed_by_seed(run: Run, by: float, verdict: str) -> None:
     """Seeds differ by a decibel, the lines by a tenth with each of them."""
     one = [changed(run, seed, seed) for seed in (0, 1, 2)]
-    two = [changed(run, seed + 0.1, seed) for seed in (2, 0, 1)]
+    two = [changed(run, seed + by, seed) for seed in (2, 0, 1)]
     step = only(one, two)
     assert step.over == "3 seeds"
-    assert step.by == pytest.approx(0.1)
-    assert step.verdict == HOLDS
+    assert step.by == pytest.approx(by)
+    assert step.verdict == verdict
 
 
 def test_seeds_that_only_one_line_has_are_left_out(run: Run) -> None:
