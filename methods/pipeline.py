@@ -213,9 +213,9 @@ class Pipeline:
         self, frames: Sequence[Remembered], view: View, probe: Probe
     ) -> Sequence[Remembered]:
         """Those of the preceding `frames` that show enough of what is in `view`."""
-        if self.options.overlap:
-            least = self.options.overlap
-            frames = [frame for frame in frames if frame.cloud.overlap(view.full) >= least]
+        if least := self.options.overlap:
+            with probe.stage("feature_reprojection"):
+                frames = [frame for frame in frames if frame.cloud.overlap(view.full) >= least]
         probe.count("preceding_frames", len(frames), self.options.frames)
         return frames
 

@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from bench.cameras import cast, pixel_grid, project, unproject
-from bench.types import NullProbe
-from methods.buffer import RenderingBuffer
+from bench.probes import StageClock
+from bench.types import Camera, NullProbe
+from methods.buffer import Cloud, RenderingBuffer
 from methods.cells import cells_near, pixels_of
 from methods.kernels.warp import enlarge
 from methods.occupancy import STEP
@@ -203,6 +204,24 @@ def test_a_frame_that_shows_too_little_of_the_present_view_is_as_if_forgotten() 
     cold = new_pipeline(options).render(there, RenderingBuffer(2), NullProbe()).rgb
     assert torch.equal(pictures[0.5][1], cold)
     assert not torch.equal(pictures[0.0][1], cold)
+
+
+def test_the_time_to_see_what_frames_share_is_that_of_a_stage(monkeypatch) -> None:
+    """On a clock that stands still but for this."""
+    now = [0]
+
+    def overlap(cloud: Cloud, camera: Camera) -> float:
+        now[0] += 1
+        return 1.0
+
+    monkeypatch.setattr(Cloud, "overlap", overlap)
+    clock, buffer = StageClock("cpu", lambda: now[0]), RenderingBuffer(2)
+    pipeline = new_pipeline(replace(OPTIONS, overlap=0.5))
+    for angle in (0.1, 0.2, 0.3):
+        with clock.frame():
+            pipeline.render(look_at_the_middle(angle, 0.3), buffer, clock)
+    assert [frame.total_ns for frame in clock.frames] == [0, 1, 2]
+    assert [frame.stages_ns["other"] for frame in clock.frames] == [0, 0, 0]
 
 
 def test_what_a_renderer_that_knows_no_doubt_drew_cannot_be_refined() -> None:
