@@ -13,6 +13,7 @@ EVERYTHING_OFF = Variant(
         "method=steernerf_untaught",
         "engine=torch",
         "precision=fp32",
+        "method.pipeline.overlap=0",
         "method.pipeline.range.mode=off",
         "method.pipeline.steps=1",
         "method.pipeline.refined=1",
