@@ -85,6 +85,16 @@ def _skips(skips: Parser) -> None:
     _overrides(skips)
 
 
+def _breakdown(breakdown: Parser) -> None:
+    breakdown.description = VARIANTS + (
+        "at every precision of an engine, with and without skipping, and tell the time of a frame "
+        "by its parts; beside Instant-NGP, which renders the same field at full resolution, and "
+        "the paper's pipeline, whose U-Net is trained for its time alone."
+    )
+    _count(breakdown, "--frames", 10, "first frames of the trajectory")
+    _overrides(breakdown, " (default engine=openvino)")
+
+
 def _scaling(scaling: Parser) -> None:
     scaling.description = (
         "Render the first steady frames of a trajectory at several sizes, with several numbers of "
@@ -218,6 +228,10 @@ COMMANDS: dict[str, tuple[str, Callable[[Parser], None]]] = {
     "kernels": ("throughput and error of every kernel", _kernels),
     "parity": ("every engine and precision of the 2D renderer on the same frames", _parity),
     "skips": ("what is not computed, what that saves and what it costs", _skips),
+    "breakdown": (
+        "where the time of a frame goes, by precision, with and without skips",
+        _breakdown,
+    ),
     "scaling": ("how a frame's time and memory grow with its size, L, K, T and threads", _scaling),
     "accuracy": ("run time against error of every knob, and which setting to take", _accuracy),
     "stress": ("what must hold where numbers are extreme", _stress),

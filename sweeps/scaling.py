@@ -81,14 +81,19 @@ def main(options: argparse.Namespace) -> int:
     overrides = [*SETTINGS, *options.overrides]
     config = composed(overrides)
     outputs = Path(checked_settings(config).outputs)
-    if "pipeline" not in config.method or config.engine._target_ != TORCH:
+    points = [point for point in _points() if point.axis in (options.axis or [point.axis])]
+    if "pipeline" not in config.method:
         raise SteerbenchError(
-            "steerbench scaling varies L, K, T and threads: expected a method with a 2D renderer, "
-            "as method=steernerf, and engine=torch, whose threads can be chosen afterwards"
+            "steerbench scaling varies L and K: expected a method with a 2D renderer, as "
+            "method=steernerf"
+        )
+    if config.engine._target_ != TORCH and any(point.threads for point in points):
+        raise SteerbenchError(
+            "--axis threads: expected engine=torch, whose threads can be chosen afterwards; for "
+            "another engine give --axis pixels, L, K or T"
         )
     log = ConsoleLog(outputs)
     scene = build(config, "scene", log=log)
-    points = [point for point in _points() if point.axis in (options.axis or [point.axis])]
     configs = [composed([*overrides, *point.settings]) for point in points]
     rows = []
     with log.progress("scaling", len(points)) as progress, turn(config.device, log):

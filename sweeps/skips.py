@@ -18,6 +18,8 @@ skipped."""
 SWITCHES = {"empty space": "empty", "hidden samples": "hidden", "background cells": "background"}
 """The settings below `method.pipeline.skip`, in words."""
 
+NOTHING_SKIPPED = tuple(f"method.pipeline.skip.{switch}=false" for switch in SWITCHES.values())
+
 WORK = ("rays", "samples", "shaded", "table reads, M", "cells", "products, G")
 
 COLUMNS = ("skipped", "PSNR to nothing skipped, dB ↑", "PSNR, dB ↑", "lost, dB ↓", "frame, ms ↓")
@@ -38,12 +40,12 @@ def main(options: argparse.Namespace) -> int:
 
 def _variants() -> list[Variant]:
     """Nothing skipped, each alone, all of them, and range reduction on top."""
-    off = {name: f"method.pipeline.skip.{switch}=false" for name, switch in SWITCHES.items()}
+    off = dict(zip(SWITCHES, NOTHING_SKIPPED, strict=True))
     alone = [
         Variant(name, tuple(line for other, line in off.items() if other != name)) for name in off
     ]
     return [
-        Variant("nothing", tuple(off.values())),
+        Variant("nothing", NOTHING_SKIPPED),
         *alone,
         Variant("all of these"),
         Variant("and a window of depths", ("method.pipeline.range.mode=window",)),

@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 
 from bench.results import Store
+from sweeps import breakdown
 
 SMALL = ["scene.width=64", "scene.train=6", "scene.test=3", "budget=tiny", "budget.frames=0"]
 METHODS = ("ngp", "steernerf", "steernerf_paper")
@@ -218,3 +219,19 @@ def test_skips_lists_the_work_of_a_frame_with_and_without_each_switch(
     assert dense["cells"] == 16 * 16
     assert found["empty space"]["samples"] < dense["samples"]
     assert found["all of these"]["samples"] <= found["empty space"]["samples"]
+
+
+def test_breakdown_divides_the_frame_and_names_every_line(first: tuple[Path, str]) -> None:
+    steerbench = Path(sys.executable).with_name("steerbench")
+    command = [steerbench, "breakdown", "--frames", "3", "engine=torch", "scene=totem", *SMALL]
+    done = subprocess.run(command, cwd=first[0], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "torch, fp16: " in done.stderr  # and why it cannot be had
+    found = {row["line"]: row for row in json.loads(done.stdout.splitlines()[-1])}
+    endings = ("", ", nothing skipped", ", the paper's U-Net")
+    lines = [f"torch, {precision}{ending}" for ending in endings for precision in ("fp32", "bf16")]
+    assert list(found) == [*lines, "Instant-NGP"]
+    for row in found.values():
+        assert sum(row[part] for part in breakdown.COLUMNS) == pytest.approx(row["frame_ms"])
+    assert found["torch, fp32, the paper's U-Net"]["psnr"] is None  # it has hardly been trained
+    assert found["Instant-NGP"]["network"] == 0

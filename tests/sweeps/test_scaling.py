@@ -40,7 +40,7 @@ def test_the_time_of_a_frame_is_the_mean_beside_a_ratio_to_the_median() -> None:
     ("argument", "said"),
     [
         ("method=ngp", "expected a method with a 2D renderer"),
-        ("engine=openvino", "engine=torch"),
+        ("engine=openvino", "--axis threads: expected engine=torch"),
         ("--frames=0", "expected 1 or more, got 0"),
         ("--plot=picture.jpg", "ends in .png"),
     ],
