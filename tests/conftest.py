@@ -32,6 +32,10 @@ hypothesis.settings.load_profile("repeatable")
 # A shell has what it starts in the background ignore SIGINT, and so all that is started from there.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# Before anything imports Triton, which looks at it once.
+if not torch.cuda.is_available():
+    os.environ["TRITON_INTERPRET"] = "1"
+
 DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
 
 

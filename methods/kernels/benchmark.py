@@ -12,7 +12,7 @@ import torch
 
 from bench.types import Log, Unavailable
 from methods.kernels.case import Case, Prepared, largest_error
-from methods.kernels.dispatch import BACKENDS, resolve
+from methods.kernels.dispatch import BACKENDS, has, resolve
 
 CASE_MODULES = (
     "methods.kernels.encode.cases",
@@ -42,7 +42,7 @@ def main_rows(name_filter: str, repeats: int, log: Log) -> list[dict[str, Any]]:
     second) and ratio (time of the reference over that of this backend, the two timed in turn).
     """
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    others = [name for name in BACKENDS if name != "reference" and _serves(name, device)]
+    others = [name for name in BACKENDS if name != "reference" and _usable(name, device)]
     cases = [case for case in all_cases() if name_filter in case.kernel]
     timed = [case for case in cases if case.timed]
     wrong: dict[tuple[str, str], list[str]] = {}
@@ -51,7 +51,7 @@ def main_rows(name_filter: str, repeats: int, log: Log) -> list[dict[str, Any]]:
     with log.progress("kernels", len(cases) + len(timed)) as progress:
         for case in cases:  # all of them before any is timed: what is wrong has no speed
             prepared = case.prepare(device)
-            errors.append(_errors(prepared, others))
+            errors.append(_errors(prepared, [name for name in others if _serves(name, case)]))
             for backend, error in errors[-1].items():
                 if not error <= prepared.tolerance:
                     wrong.setdefault((case.kernel, backend), []).append(case.name)
@@ -105,11 +105,19 @@ def _timed_rows(
     return rows
 
 
-def _serves(backend: str, device: str) -> bool:
+def _usable(backend: str, device: str) -> bool:
+    """Whether it is for this device; what an interpreter takes says nothing of a kernel."""
     try:
-        return resolve(backend, device) == backend
+        return resolve(backend, device) == backend and (backend == "gpu") == (device == "cuda")
     except Unavailable:
         return False
+
+
+def _serves(backend: str, case: Case) -> bool:
+    """Whether `backend` computes the kernel of `case` itself; what is made of several kernels is
+    not that of any folder."""
+    folder = case.kernel.partition(" ")[0]
+    return has(folder, backend) or not has(folder, "reference")
 
 
 def _times_ms(

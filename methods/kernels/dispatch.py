@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import importlib.util
+import os
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -22,14 +23,24 @@ def availability() -> dict[str, str]:
     reasons = dict.fromkeys(BACKENDS, "")
     if importlib.util.find_spec("numba") is None:
         reasons["cpu"] = "numba is not installed: pip install numba"
-    reasons["gpu"] = "no GPU kernels yet: CUDA tensors are served by the reference backend"
+    if importlib.util.find_spec("triton") is None:
+        reasons["gpu"] = "Triton is not installed; it comes with torch for CUDA"
+    elif not (torch.cuda.is_available() or interpreted()):
+        reasons["gpu"] = "torch sees no GPU"
     return reasons
+
+
+def interpreted() -> bool:
+    """Whether Triton's interpreter, in place of its compiler, runs the kernels of `gpu`: on CPU
+    tensors, and slowly. For tests where there is no GPU."""
+    return os.environ.get("TRITON_INTERPRET") == "1"
 
 
 def resolve(backend: str, device: torch.device | str) -> str:
     """The name of the backend that will serve tensors on `device`.
 
-    `auto` goes by the device alone: CPU tensors to `cpu`, all others to `reference`.
+    `auto` goes by the device alone: CPU tensors to `cpu`, all others to `reference`. The kernels of
+    `gpu` were never run on one: they serve who asks for them by name.
 
     Raises:
         Unavailable: the backend asked for by name is unknown, cannot be used here, or does not
@@ -51,6 +62,11 @@ def resolve(backend: str, device: torch.device | str) -> str:
             f"backend='cpu' serves CPU tensors, these are on {kind!r}: "
             "use backend=auto or device=cpu"
         )
+    if backend == "gpu" and kind != "cuda" and not interpreted():
+        raise Unavailable(
+            f"backend='gpu' serves CUDA tensors, these are on {kind!r}: "
+            "use backend=auto or device=cuda"
+        )
     return backend
 
 
@@ -67,11 +83,21 @@ def multiplies_bf16(kind: str) -> bool:
 
 
 def implementation(kernel: str, backend: str, device: torch.device) -> ModuleType:
-    """The module that implements `kernel` (a folder beside this file) for tensors on `device`."""
+    """The module that implements `kernel` (a folder beside this file) for tensors on `device`.
+
+    With backend="gpu" torch computes, on the device, what has no kernel in Triton.
+    """
     name = resolve(backend, device)
+    if name == "gpu" and not has(kernel, name):
+        name = "reference"
     if name == "cpu":
         _load("methods.kernels.cpu").follow_torch_threads()
     return _load(f"methods.kernels.{kernel}.{name}")
+
+
+def has(kernel: str, backend: str) -> bool:
+    """Whether `backend` has an implementation of its own of `kernel`."""
+    return (Path(__file__).parent / kernel / f"{backend}.py").exists()
 
 
 def sources(*kernels: str) -> list[Path]:

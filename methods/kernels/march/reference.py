@@ -52,14 +52,8 @@ def _march_block(
     limit: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """t [S] and positions [S, 3] of the samples, how many a ray has [R], where to resume [R]."""
-    entry, leave = _cross_unit_cube(origins, directions)
-    near, far = entry.clamp(min=0), torch.minimum(leave, window[:, 1])
-    # In float64, where every backend rounds to the same float32.
-    length = directions.double().norm(dim=-1).to(directions.dtype)
-    # A true division: `step / length` would multiply by the reciprocal, an ulp away.
-    step_t = torch.full_like(length, step) / length
-    alive = (near < far) & far.isfinite() & step_t.isfinite() & (start >= 0)
-
+    near, far, step_t, alive = clip(origins, directions, step, window[:, 1])
+    alive &= start >= 0
     count = torch.where(alive, (far - near) / step_t, 0).ceil().clamp(min=0)
     k = torch.arange(int(count.max()) if len(count) else 0, device=origins.device)
     t = near[:, None] + (k + jitter[:, None]) * step_t[:, None]  # [R, K]
@@ -73,6 +67,20 @@ def _march_block(
     full = (per_ray == limit) & (per_ray > 0)
     last = (kept * (k + 1)).amax(dim=1) if len(k) else per_ray
     return t[kept], positions[kept], per_ray, torch.where(full, last, -1).int()
+
+
+def clip(
+    origins: Tensor, directions: Tensor, step: float, farthest: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The t between which rays are inside the cube and nearer than `farthest`, their step in t, and
+    whether there is anything to march, each [R]."""
+    entry, leave = _cross_unit_cube(origins, directions)
+    near, far = entry.clamp(min=0), torch.minimum(leave, farthest)
+    # In float64, where every backend rounds to the same float32.
+    length = directions.double().norm(dim=-1).to(directions.dtype)
+    # A true division: `step / length` would multiply by the reciprocal, an ulp away.
+    step_t = torch.full_like(length, step) / length
+    return near, far, step_t, (near < far) & far.isfinite() & step_t.isfinite()
 
 
 def _cross_unit_cube(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:

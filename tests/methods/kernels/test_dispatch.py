@@ -6,9 +6,10 @@ import subprocess
 import sys
 
 import pytest
+import torch
 
 from bench.errors import Unavailable
-from methods.kernels import resolve
+from methods.kernels import availability, dispatch, resolve
 
 
 def test_auto_goes_by_the_device() -> None:
@@ -21,9 +22,21 @@ def test_unknown_backend_names_the_nearest() -> None:
         resolve("refrence", "cpu")
 
 
-def test_backend_that_cannot_be_used_says_why() -> None:
-    with pytest.raises(Unavailable, match="no GPU kernels yet"):
+@pytest.mark.skipif(torch.cuda.is_available(), reason="here it can be used")
+def test_backend_that_cannot_be_used_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    availability.cache_clear()
+    with pytest.raises(Unavailable, match=r"sees no GPU|not installed"):
         resolve("gpu", "cuda")
+    availability.cache_clear()
+
+
+def test_what_has_no_kernel_for_the_gpu_is_computed_by_torch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(dispatch, "resolve", lambda backend, device: backend)
+    chosen = dispatch.implementation("spherical", "gpu", torch.device("cpu"))
+    assert chosen.__name__ == "methods.kernels.spherical.reference"
 
 
 def test_cpu_backend_refuses_tensors_of_another_device() -> None:

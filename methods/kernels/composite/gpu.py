@@ -1,0 +1,259 @@
+"""Compositing with Triton: a program takes a ray, a block of its samples at a time.
+
+Within a block transmittance is the exponential of a cumulative sum; a ray ends with the first block
+behind which nothing shines through.
+"""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from methods.kernels.composite import Pixels
+from methods.kernels.gpu import check_types, launch
+
+BLOCK = 64  # samples
+OPAQUE = tl.constexpr(128.0)
+"""Optical thickness behind which float32 has no light: thicker is the same, and stays finite."""
+
+
+def composite(
+    sigma: Tensor,
+    values: Tensor,
+    t: Tensor,
+    delta: Tensor,
+    offsets: Tensor,
+    stop: float,
+    carry: Pixels | None,
+) -> Pixels:
+    """See `methods.kernels.composite.composite`."""
+    check_types("sigma", sigma, torch.float32)
+    check_types("values", values, torch.float32)
+    return Pixels(*_Composite.apply(sigma, values, t, delta, offsets, stop, carry))
+
+
+def weights(sigma: Tensor, delta: Tensor, offsets: Tensor, stop: float, front: Tensor) -> Tensor:
+    """See `methods.kernels.composite.weights`."""
+    weight = torch.zeros_like(sigma, memory_format=torch.contiguous_format)
+    samples = (x.contiguous() for x in (sigma, delta, offsets, front))
+    launch(_weights, (len(front),), *samples, stop, weight, BLOCK=BLOCK)
+    return weight
+
+
+def visible_counts(sigma: Tensor, delta: Tensor, offsets: Tensor, stop: float) -> Tensor:
+    """See `methods.kernels.composite.visible_counts`."""
+    counts = offsets.new_zeros(len(offsets) - 1)
+    samples = (x.contiguous() for x in (sigma, delta, offsets))
+    launch(_visible, (len(counts),), *samples, stop, counts, BLOCK=BLOCK)
+    return counts
+
+
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, sigma, values, t, delta, offsets, stop, carry):
+        rays, channels = len(offsets) - 1, values.shape[1]
+        if carry is None:
+            pixels = Pixels.blank(rays, channels, sigma.device)
+        else:
+            pixels = Pixels(carry.values.clone(), carry.depth_sum.clone(), carry.alpha.clone())
+        front = 1 - pixels.alpha
+        samples = [x.contiguous() for x in (sigma, values, t, delta, offsets)]
+        launch(
+            _forward,
+            (rays,),
+            *samples,
+            front,
+            stop,
+            pixels.values,
+            pixels.depth_sum,
+            pixels.alpha,
+            channels,
+            CHANNELS=triton.next_power_of_2(max(channels, 1)),
+            BLOCK=BLOCK,
+        )
+        ctx.save_for_backward(*samples, front)
+        ctx.stop = stop
+        return pixels.values, pixels.depth_sum, pixels.alpha
+
+    @staticmethod
+    def backward(ctx, grad_values, grad_depth, grad_alpha):
+        *samples, front = ctx.saved_tensors
+        grad_sigma, grad_samples = torch.zeros_like(samples[0]), torch.zeros_like(samples[1])
+        channels = samples[1].shape[1]
+        launch(
+            _backward,
+            (len(front),),
+            *samples,
+            front,
+            ctx.stop,
+            grad_values.contiguous(),
+            grad_depth.contiguous(),
+            grad_alpha.contiguous(),
+            grad_sigma,
+            grad_samples,
+            channels,
+            CHANNELS=triton.next_power_of_2(max(channels, 1)),
+            BLOCK=BLOCK,
+        )
+        return grad_sigma, grad_samples, None, None, None, None, None
+
+
+@triton.jit
+def _opacity(tau):
+    """1 - exp(-tau), by its series where the difference would cancel."""
+    series = tau * (1 - tau / 2 * (1 - tau / 3 * (1 - tau / 4 * (1 - tau / 5))))
+    return tl.where(tau < 0.06, series, 1 - tl.exp(-tau))
+
+
+@triton.jit
+def _thickness(sigma, delta, i, there):
+    """Optical thickness of samples, at most `OPAQUE`; a NaN stays one.
+
+    A sample without length is without matter, however dense: 0, not inf * 0.
+    """
+    length = tl.load(delta + i, mask=there, other=0.0)
+    tau = tl.load(sigma + i, mask=there, other=0.0) * length
+    tau = tl.where(tau > OPAQUE, OPAQUE, tau)
+    return tl.where(length > 0, tau, 0.0)
+
+
+@triton.jit
+def _block(sigma, delta, first, i, inside, light, stop):
+    """Weights of the samples `i`, which begin with `first`; which of them still get light, and how
+    much of it goes on behind each."""
+    in_front = _thickness(sigma, delta, i - 1, inside & (i > first))
+    tau = _thickness(sigma, delta, i, inside)
+    before = light * tl.exp(-tl.cumsum(in_front, 0))
+    lit = inside & (before > stop)
+    return tl.where(lit, before * _opacity(tau), 0.0), lit, before * tl.exp(-tau)
+
+
+@triton.jit
+def _forward(
+    sigma,
+    values,
+    t,
+    delta,
+    offsets,
+    front,
+    stop,
+    out,
+    depth_sum,
+    alpha,
+    channels,
+    CHANNELS: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    ray = tl.program_id(0).to(tl.int64)
+    first, end = tl.load(offsets + ray), tl.load(offsets + ray + 1)
+    light = tl.load(front + ray)
+    channel = tl.arange(0, CHANNELS)
+    there = channel < channels
+    sums = tl.load(out + ray * channels + channel, mask=there, other=0.0)
+    depth, covered = tl.load(depth_sum + ray), tl.load(alpha + ray)
+    while (first < end) & (light > stop):
+        i = first + tl.arange(0, BLOCK)
+        weight, lit, behind = _block(sigma, delta, first, i, i < end, light, stop)
+        rows = values + i[:, None] * channels + channel[None, :]
+        shown = tl.load(rows, mask=lit[:, None] & there[None, :], other=0.0)
+        sums += tl.sum(weight[:, None] * shown, 0)
+        depth += tl.sum(weight * tl.load(t + i, mask=lit, other=0.0), 0)
+        covered += tl.sum(weight, 0)
+        light = tl.min(behind, 0)
+        first += BLOCK
+    tl.store(out + ray * channels + channel, sums, mask=there)
+    tl.store(depth_sum + ray, depth)
+    tl.store(alpha + ray, covered)
+
+
+@triton.jit
+def _weights(sigma, delta, offsets, front, stop, weight, BLOCK: tl.constexpr):
+    ray = tl.program_id(0).to(tl.int64)
+    first, end = tl.load(offsets + ray), tl.load(offsets + ray + 1)
+    light = tl.load(front + ray)
+    while (first < end) & (light > stop):
+        i = first + tl.arange(0, BLOCK)
+        inside = i < end
+        found, _, behind = _block(sigma, delta, first, i, inside, light, stop)
+        tl.store(weight + i, found, mask=inside)
+        light = tl.min(behind, 0)
+        first += BLOCK
+
+
+@triton.jit
+def _visible(sigma, delta, offsets, stop, counts, BLOCK: tl.constexpr):
+    ray = tl.program_id(0).to(tl.int64)
+    first, end = tl.load(offsets + ray), tl.load(offsets + ray + 1)
+    light, count = 1.0, tl.zeros([], tl.int64)
+    while (first < end) & (light > stop):
+        i = first + tl.arange(0, BLOCK)
+        _, lit, behind = _block(sigma, delta, first, i, i < end, light, stop)
+        count += tl.sum(lit.to(tl.int64), 0)
+        light = tl.min(behind, 0)
+        first += BLOCK
+    tl.store(counts + ray, count)
+
+
+@triton.jit
+def _gain(values, t, i, lit, shine, of_depth, of_alpha, channel, there, channels):
+    """g_i = dL/dw_i of samples that get light, 0 of others."""
+    rows = values + i[:, None] * channels + channel[None, :]
+    shown = tl.load(rows, mask=lit[:, None] & there[None, :], other=0.0)
+    where = tl.load(t + i, mask=lit, other=0.0)
+    gain = of_depth * where + of_alpha + tl.sum(shown * shine[None, :], 1)
+    return tl.where(lit, gain, 0.0)
+
+
+@triton.jit
+def _backward(
+    sigma,
+    values,
+    t,
+    delta,
+    offsets,
+    front,
+    stop,
+    grad_out,
+    grad_depth,
+    grad_alpha,
+    grad_sigma,
+    grad_values,
+    channels,
+    CHANNELS: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """With g_i = dL/dw_i and T_{i+1} = T_i (1 - alpha_i):
+
+    dL/dsigma_i = delta_i (T_{i+1} g_i - sum_{j > i} w_j g_j).
+    """
+    ray = tl.program_id(0).to(tl.int64)
+    begin, end = tl.load(offsets + ray), tl.load(offsets + ray + 1)
+    channel = tl.arange(0, CHANNELS)
+    there = channel < channels
+    shine = tl.load(grad_out + ray * channels + channel, mask=there, other=0.0)
+    of_depth, of_alpha = tl.load(grad_depth + ray), tl.load(grad_alpha + ray)
+
+    first, light, rest = begin, tl.load(front + ray), 0.0
+    while (first < end) & (light > stop):
+        i = first + tl.arange(0, BLOCK)
+        weight, lit, behind = _block(sigma, delta, first, i, i < end, light, stop)
+        gain = _gain(values, t, i, lit, shine, of_depth, of_alpha, channel, there, channels)
+        rest += tl.sum(weight * gain, 0)
+        rows = grad_values + i[:, None] * channels + channel[None, :]
+        tl.store(rows, weight[:, None] * shine[None, :], mask=lit[:, None] & there[None, :])
+        light = tl.min(behind, 0)
+        first += BLOCK
+
+    # `rest` is now the sum over all samples; less what was passed, it is what lies behind.
+    first, light = begin, tl.load(front + ray)
+    while (first < end) & (light > stop):
+        i = first + tl.arange(0, BLOCK)
+        weight, lit, behind = _block(sigma, delta, first, i, i < end, light, stop)
+        gain = _gain(values, t, i, lit, shine, of_depth, of_alpha, channel, there, channels)
+        slope = behind * gain - (rest - tl.cumsum(weight * gain, 0))
+        tl.store(grad_sigma + i, tl.load(delta + i, mask=lit, other=0.0) * slope, mask=lit)
+        rest -= tl.sum(weight * gain, 0)
+        light = tl.min(behind, 0)
+        first += BLOCK

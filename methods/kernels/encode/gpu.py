@@ -1,0 +1,213 @@
+"""Hash-grid encoding with Triton: a program encodes a block of samples at one level.
+
+Programs of one level follow each other, so that the entries they read are those of one level, which
+stay in the second-level cache. The scatter of the backward pass adds with atomics, in no order that
+repeats; where torch is told to use deterministic algorithms, torch's sorted scatter does it.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from methods.kernels.encode import PRIMES, HashGrid
+from methods.kernels.encode.reference import corners
+from methods.kernels.gpu import check_types, launch
+
+BLOCK = 256  # samples
+PRIME_Y, PRIME_Z = tl.constexpr(PRIMES[1]), tl.constexpr(PRIMES[2])
+
+
+def encode(
+    positions: Tensor,
+    table: Tensor,
+    grid: HashGrid,
+    *,
+    levels: int,
+    packed: Tensor | None = None,
+    grad_buffer: Tensor | None = None,
+) -> Tensor:
+    """See `methods.kernels.encode.encode`. Not differentiable in `positions`; a table of float16 or
+    bfloat16 gives features of its type, its products and sums are float32."""
+    if positions.requires_grad:
+        raise ValueError("backend 'gpu' gives no gradient for positions: use backend='reference'")
+    check_types("positions", positions, torch.float32)
+    check_types("table", table, torch.float32, torch.float16, torch.bfloat16)
+    return _Encode.apply(positions.contiguous(), table, grid, levels, packed, grad_buffer)
+
+
+class _Encode(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, positions, table, grid, levels, packed, grad_buffer):
+        ctx.save_for_backward(positions)
+        ctx.grid, ctx.levels, ctx.grad_buffer, ctx.dtype = grid, levels, grad_buffer, table.dtype
+        read = table.detach() if packed is None else packed.view(torch.bfloat16).view(-1, 2)
+        features = read.new_empty(len(positions), levels * grid.features)
+        _launch(_forward, positions, read.contiguous(), grid, levels, features)
+        return features
+
+    @staticmethod
+    def backward(ctx, grad):
+        (positions,) = ctx.saved_tensors
+        grid, levels, buffer = ctx.grid, ctx.levels, ctx.grad_buffer
+        target = buffer
+        if buffer is None or buffer.dtype != torch.float32:
+            target = grad.new_zeros(grid.entries, grid.features, dtype=torch.float32)
+        if torch.are_deterministic_algorithms_enabled():
+            _scatter_sorted(positions, grad.float(), grid, levels, target)
+        else:
+            _launch(_scatter, positions, target, grid, levels, grad.contiguous())
+        if buffer is None:
+            return None, target.to(ctx.dtype), None, None, None, None
+        if target is not buffer:
+            buffer += target
+        return None, None, None, None, None, None
+
+
+def _launch(
+    kernel: triton.JITFunction,
+    positions: Tensor,
+    table: Tensor,
+    grid: HashGrid,
+    levels: int,
+    features: Tensor,
+) -> None:
+    """Run `kernel`, which reads or adds to one of `table` and `features`, for the other."""
+    launch(
+        kernel,
+        (triton.cdiv(len(positions), BLOCK), levels),
+        positions,
+        table,
+        *_level_arrays(grid, levels, positions.device),
+        features,
+        len(positions),
+        features.shape[1],
+        FEATURES=grid.features,
+        BLOCK=BLOCK,
+    )
+
+
+@cache
+def _level_arrays(grid: HashGrid, levels: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Scale [levels] of each level; its vertices along an axis (0: hashed), first entry and number
+    of entries [levels, 3]. To copy them to the device again would wait for it."""
+    strides = [res if dense else 0 for res, dense in zip(grid.resolutions, grid.dense, strict=True)]
+    shapes = list(zip(strides, grid.offsets, grid.sizes, strict=False))[:levels]
+    return (
+        torch.tensor(grid.scales[:levels], dtype=torch.float32, device=device),
+        torch.tensor(shapes, dtype=torch.int32, device=device),
+    )
+
+
+def _scatter_sorted(
+    positions: Tensor, grad: Tensor, grid: HashGrid, levels: int, target: Tensor
+) -> None:
+    """Add to `target` in the same order every time."""
+    inside = torch.where(positions > 0, positions, 0).clamp(max=1)
+    for level in range(levels):
+        entries, weights = corners(inside, grid, level)
+        of_level = grad[:, level * grid.features : (level + 1) * grid.features]
+        shares = weights[..., None] * of_level[:, None]  # [N, 8, F]
+        target.index_put_((entries,), shares, accumulate=True)
+
+
+@triton.jit
+def _axis(positions, i, inside, axis, scale):
+    """Cell and fraction along an axis; a NaN is at 0."""
+    x = tl.load(positions + 3 * i + axis, mask=inside, other=0.0)
+    x = tl.minimum(tl.where(x > 0, x, 0.0), 1.0)
+    p = x * scale + 0.5
+    cell = p.to(tl.int32)
+    return cell.to(tl.uint32), p - cell.to(tl.float32)
+
+
+@triton.jit
+def _entry(x, y, z, stride, size):
+    """Table entry, within its level, of a vertex; `stride` is 0 where they are hashed."""
+    stored = x + stride * (y + stride * z)
+    stored = tl.where(stored >= size, stored - size, stored)
+    hashed = (x ^ (y * PRIME_Y) ^ (z * PRIME_Z)) & (size - 1)
+    return tl.where(stride > 0, stored, hashed)
+
+
+@triton.jit
+def _level(scales, shapes, level):
+    """Scale, vertices along an axis (0: hashed), first entry and entries of a level."""
+    return (
+        tl.load(scales + level),
+        tl.load(shapes + 3 * level).to(tl.uint32),
+        tl.load(shapes + 3 * level + 1).to(tl.int64),
+        tl.load(shapes + 3 * level + 2).to(tl.uint32),
+    )
+
+
+@triton.jit
+def _forward(
+    positions,
+    table,
+    scales,
+    shapes,
+    features,
+    total,
+    channels,
+    FEATURES: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    level = tl.program_id(1)
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    inside = i < total
+    scale, stride, first, size = _level(scales, shapes, level)
+    ix, fx = _axis(positions, i, inside, 0, scale)
+    iy, fy = _axis(positions, i, inside, 1, scale)
+    iz, fz = _axis(positions, i, inside, 2, scale)
+    for feature in tl.static_range(FEATURES):
+        blended = tl.zeros([BLOCK], tl.float32)
+        for corner in tl.static_range(8):
+            bx, by, bz = corner & 1, corner >> 1 & 1, corner >> 2
+            entry = first + _entry(ix + bx, iy + by, iz + bz, stride, size)
+            value = tl.load(table + entry * FEATURES + feature, mask=inside, other=0.0)
+            wx, wy = fx if bx else 1 - fx, fy if by else 1 - fy
+            wz = fz if bz else 1 - fz
+            blended += wx * wy * wz * value.to(tl.float32)
+        out = features + i * channels + level * FEATURES + feature
+        tl.store(out, blended.to(features.dtype.element_ty), mask=inside)
+
+
+@triton.jit
+def _scatter(
+    positions,
+    target,
+    scales,
+    shapes,
+    grad,
+    total,
+    channels,
+    FEATURES: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Adjoint of `_forward`: target[corner] += weight * grad."""
+    level = tl.program_id(1)
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    inside = i < total
+    scale, stride, first, size = _level(scales, shapes, level)
+    ix, fx = _axis(positions, i, inside, 0, scale)
+    iy, fy = _axis(positions, i, inside, 1, scale)
+    iz, fz = _axis(positions, i, inside, 2, scale)
+    for feature in tl.static_range(FEATURES):
+        of_feature = grad + i * channels + level * FEATURES + feature
+        share = tl.load(of_feature, mask=inside, other=0.0).to(tl.float32)
+        for corner in tl.static_range(8):
+            bx, by, bz = corner & 1, corner >> 1 & 1, corner >> 2
+            entry = first + _entry(ix + bx, iy + by, iz + bz, stride, size)
+            wx, wy = fx if bx else 1 - fx, fy if by else 1 - fy
+            wz = fz if bz else 1 - fz
+            tl.atomic_add(
+                target + entry * FEATURES + feature,
+                wx * wy * wz * share,
+                mask=inside,
+                sem="relaxed",
+            )

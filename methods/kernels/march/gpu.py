@@ -1,0 +1,162 @@
+"""Ray marching with Triton: a lane a ray, which crosses all that is empty around it in one step.
+
+The rays are marched twice: once to count their samples, once, when it is known where these go, to
+write them.
+"""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from methods.kernels.gpu import check_types, launch
+from methods.kernels.march import BRICK, PARALLEL, Occupancy, Samples
+from methods.kernels.march.reference import clip
+
+BLOCK = 32  # rays: those of a warp, which waits for the longest of them
+
+
+def march(
+    origins: Tensor,
+    directions: Tensor,
+    occupancy: Occupancy,
+    step: float,
+    window: Tensor,
+    jitter: Tensor,
+    start: Tensor,
+    limit: int,
+) -> Samples:
+    """See `methods.kernels.march.march`."""
+    check_types("origins", origins, torch.float32)
+    rays, device = len(origins), origins.device
+    near, far, step_t, alive = clip(origins, directions, step, window[:, 1])
+    parallel = directions.abs() < PARALLEL
+    slopes = torch.where(parallel, 0, 1 / torch.where(parallel, 1, directions))
+    counts = torch.zeros(rays, dtype=torch.int64, device=device)
+    resume = torch.full((rays,), -1, dtype=torch.int32, device=device)
+    given = (origins, directions, slopes, near, far, step_t, window[:, 0], jitter)
+    arguments = [
+        *(x.contiguous() for x in given),
+        torch.where(alive, start, -1).int(),
+        occupancy.words,
+        occupancy.clearance,
+        occupancy.resolution // BRICK,
+        limit,
+        rays,
+    ]
+    grid, options = (triton.cdiv(rays, BLOCK),), {"BLOCK": BLOCK, "num_warps": 1}
+    launch(_march, grid, *arguments, counts, resume, None, None, None, None, **options)
+    offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
+    total = int(offsets[-1])
+    ray = torch.empty(total, dtype=torch.int32, device=device)
+    t, positions = (torch.empty(*shape, device=device) for shape in ((total,), (total, 3)))
+    launch(_march, grid, *arguments, counts, resume, offsets, ray, t, positions, **options)
+    return Samples(offsets, ray, t, torch.full_like(t, step), positions, resume)
+
+
+@triton.jit
+def _vector(vectors, ray, there):
+    return (
+        tl.load(vectors + 3 * ray, mask=there, other=0.0),
+        tl.load(vectors + 3 * ray + 1, mask=there, other=0.0),
+        tl.load(vectors + 3 * ray + 2, mask=there, other=0.0),
+    )
+
+
+@triton.jit
+def _leave_slab(origin, slope, cell, free, width):
+    """t at which a ray leaves, along one axis, the cells that are empty with `cell`: itself, or, if
+    `free` is not 0, those of as many bricks around."""
+    brick = cell >> 2
+    first = tl.where(free == 0, cell, (brick - free + 1) << 2)
+    end = tl.where(free == 0, cell + 1, (brick + free) << 2)
+    bound = tl.where(slope > 0, end, first).to(tl.float32)
+    return tl.where(slope != 0, (bound * width - origin) * slope, float("inf"))
+
+
+@triton.jit
+def _cell(origin, direction, t, size):
+    cell = ((origin + t * direction) * size.to(tl.float32)).to(tl.int32)
+    return tl.minimum(tl.maximum(cell, 0), size - 1)
+
+
+@triton.jit
+def _march(
+    origins,
+    directions,
+    slopes,
+    nearest,
+    farthest,
+    steps,
+    lowest,
+    phases,
+    starts,
+    words,
+    clearance,
+    side,
+    limit,
+    rays,
+    counts,
+    resume,
+    offsets,
+    ray_of,
+    out_t,
+    out_positions,
+    BLOCK: tl.constexpr,
+):
+    """Count the samples and find where to resume; with `offsets`, write the samples there."""
+    ray = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = ray < rays
+    k = tl.load(starts + ray, mask=inside, other=-1)
+    going = k >= 0
+    ox, oy, oz = _vector(origins, ray, going)
+    dx, dy, dz = _vector(directions, ray, going)
+    sx, sy, sz = _vector(slopes, ray, going)
+    near = tl.load(nearest + ray, mask=going, other=0.0)
+    far = tl.load(farthest + ray, mask=going, other=0.0)
+    step = tl.load(steps + ray, mask=going, other=1.0)
+    low = tl.load(lowest + ray, mask=going, other=0.0)
+    phase = tl.load(phases + ray, mask=going, other=0.0)
+    size = side * 4
+    width = 1.0 / size.to(tl.float32)
+    count = tl.zeros([BLOCK], tl.int64)
+    begin = count if offsets is None else tl.load(offsets + ray, mask=inside, other=0)
+    again = tl.full([BLOCK], -1, tl.int32)
+    # Less one, for what rounding may take from the step before.
+    k = tl.where(going, tl.maximum(k, ((low - near) / step - phase).to(tl.int32) - 1), k)
+    while tl.max(going.to(tl.int32), 0) > 0:
+        t = near + (k.to(tl.float32) + phase) * step
+        going = going & (t < far)
+        t = tl.where(going, t, near)
+        x, y, z = _cell(ox, dx, t, size), _cell(oy, dy, t, size), _cell(oz, dz, t, size)
+        brick = ((x >> 2) * side + (y >> 2)) * side + (z >> 2)
+        free = tl.load(clearance + brick, mask=going, other=0).to(tl.int32)
+        word = tl.load(words + brick, mask=going & (free == 0), other=0)
+        bit = ((x & 3) + ((y & 3) << 2) + ((z & 3) << 4)).to(tl.int64)
+        passed = t >= low
+        hit = going & passed & ((word >> bit & 1) == 1)
+        if offsets is not None:
+            place = begin + count
+            tl.store(ray_of + place, ray, mask=hit)
+            tl.store(out_t + place, t, mask=hit)
+            tl.store(out_positions + 3 * place, ox + t * dx, mask=hit)
+            tl.store(out_positions + 3 * place + 1, oy + t * dy, mask=hit)
+            tl.store(out_positions + 3 * place + 2, oz + t * dz, mask=hit)
+        count += hit.to(tl.int64)
+        full = hit & (count == limit)
+        again = tl.where(full, k + 1, again)
+        skips = going & passed & (hit == 0)
+        k += 1
+        if tl.max(skips.to(tl.int32), 0) > 0:
+            leave = _leave_slab(ox, sx, x, free, width)
+            leave = tl.minimum(leave, _leave_slab(oy, sy, y, free, width))
+            leave = tl.minimum(leave, _leave_slab(oz, sz, z, free, width))
+            # Rounded down, so that the first step outside what is empty is never passed over.
+            ahead = tl.where(skips, (leave - near) / step, 0.0) - phase
+            k = tl.maximum(k, ahead.to(tl.int32))
+        going = going & (full == 0)
+    if offsets is None:
+        tl.store(counts + ray, count, mask=inside)
+        tl.store(resume + ray, again, mask=inside)

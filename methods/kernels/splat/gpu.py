@@ -1,0 +1,140 @@
+"""Splatting with Triton: a lane a point, which competes for its pixel with atomics.
+
+One key after the other: the least depth of every pixel, among the points that have it the least u,
+then v, then the first. What is the least does not depend on the order of the atomics, so the
+picture is the same every time.
+"""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from methods.kernels.gpu import check_types, launch
+from methods.kernels.splat import Rule
+
+BLOCK = 256
+NOTHING = torch.iinfo(torch.int32).max
+
+
+def splat(pixels: Tensor, depth: Tensor, width: int, height: int, rule: Rule) -> Tensor:
+    """See `methods.kernels.splat.splat`."""
+    check_types("pixels", pixels, torch.float32)
+    check_types("depth", depth, torch.float32)
+    index = torch.full((height, width), -1, dtype=torch.int32, device=depth.device)
+    given = (pixels.contiguous(), depth.contiguous(), len(depth), width, height)
+    grid, options = (triton.cdiv(len(depth), BLOCK),), {"BLOCK": BLOCK}
+    if rule == "last":
+        launch(_splat_last, grid, *given, index, **options)
+        return index
+    least = torch.full((4, height, width), NOTHING, dtype=torch.int32, device=depth.device)
+    for key in range(4):
+        launch(_compete, grid, *given, least, KEY=key, **options)
+    return torch.where(least[3] < NOTHING, least[3], index)
+
+
+def gather(values: Tensor, index: Tensor) -> Tensor:
+    """See `methods.kernels.splat.gather`."""
+    check_types("values", values, torch.float32)
+    rows = _Gather.apply(values.contiguous(), index.contiguous().view(-1))
+    return rows.view(*index.shape, values.shape[1])
+
+
+class _Gather(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, values, index):
+        ctx.save_for_backward(index)
+        ctx.points = len(values)
+        rows = values.new_zeros(len(index), values.shape[1])
+        _move(_gather, values.detach(), index, rows)
+        return rows
+
+    @staticmethod
+    def backward(ctx, grad):
+        (index,) = ctx.saved_tensors
+        grad_values = grad.new_zeros(ctx.points, grad.shape[1])
+        if torch.are_deterministic_algorithms_enabled():
+            shown = index >= 0
+            grad_values.index_put_((index[shown].long(),), grad[shown], accumulate=True)
+        else:
+            _move(_scatter, grad_values, index, grad.contiguous())
+        return grad_values, None
+
+
+def _move(kernel: triton.JITFunction, values: Tensor, index: Tensor, rows: Tensor) -> None:
+    """Between `values` [N, C] and the `rows` [P, C] that show those at `index` [P]."""
+    grid = (triton.cdiv(rows.numel(), BLOCK),)
+    launch(kernel, grid, values, index, rows, rows.numel(), rows.shape[1], BLOCK=BLOCK)
+
+
+@triton.jit
+def _pixel(pixels, depth, points, width, height, i):
+    """u, v and depth of points, the pixel they lie in, and whether they take part.
+
+    Compared as floats, where every comparison with nan is false: as integers, what is huge or not
+    finite has no defined value. A zero without sign is added: -0 and 0 are the same place.
+    """
+    inside = i < points
+    u = tl.load(pixels + 2 * i, mask=inside, other=-1.0) + 0.0
+    v = tl.load(pixels + 2 * i + 1, mask=inside, other=-1.0) + 0.0
+    z = tl.load(depth + i, mask=inside, other=-1.0)
+    shown = inside & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    shown = shown & (z > 0) & (z < float("inf"))
+    row = tl.where(shown, v, 0.0).to(tl.int64)
+    return u, v, z, row * width + tl.where(shown, u, 0.0).to(tl.int64), shown
+
+
+@triton.jit
+def _compete(pixels, depth, points, width, height, least, KEY: tl.constexpr, BLOCK: tl.constexpr):
+    """Lower `least` [4, H, W] of depth, u, v or index, by `KEY`, for points that are the least by
+    all keys before.
+
+    Floats that are not negative are in the order of their bits as integers.
+    """
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    u, v, z, pixel, shown = _pixel(pixels, depth, points, width, height, i)
+    size = width.to(tl.int64) * height
+    z_bits = z.to(tl.int32, bitcast=True)
+    u_bits, v_bits = u.to(tl.int32, bitcast=True), v.to(tl.int32, bitcast=True)
+    if KEY > 0:
+        shown = shown & (tl.load(least + pixel, mask=shown, other=0) == z_bits)
+    if KEY > 1:
+        shown = shown & (tl.load(least + size + pixel, mask=shown, other=0) == u_bits)
+    if KEY > 2:
+        shown = shown & (tl.load(least + 2 * size + pixel, mask=shown, other=0) == v_bits)
+    if KEY == 0:
+        key = z_bits
+    elif KEY == 1:
+        key = u_bits
+    elif KEY == 2:
+        key = v_bits
+    else:
+        key = i
+    tl.atomic_min(least + KEY * size + pixel, key, mask=shown, sem="relaxed")
+
+
+@triton.jit
+def _splat_last(pixels, depth, points, width, height, index, BLOCK: tl.constexpr):
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    _, _, _, pixel, shown = _pixel(pixels, depth, points, width, height, i)
+    tl.atomic_max(index + pixel, i, mask=shown, sem="relaxed")
+
+
+@triton.jit
+def _gather(values, index, rows, total, channels, BLOCK: tl.constexpr):
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    point = tl.load(index + i // channels, mask=i < total, other=-1).to(tl.int64)
+    shown = point >= 0
+    tl.store(rows + i, tl.load(values + point * channels + i % channels, mask=shown), mask=shown)
+
+
+@triton.jit
+def _scatter(values, index, rows, total, channels, BLOCK: tl.constexpr):
+    """Adjoint of `_gather`."""
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    point = tl.load(index + i // channels, mask=i < total, other=-1).to(tl.int64)
+    shown = point >= 0
+    share = tl.load(rows + i, mask=shown, other=0.0)
+    tl.atomic_add(values + point * channels + i % channels, share, mask=shown, sem="relaxed")

@@ -1,0 +1,68 @@
+"""Compile every kernel of the GPU for a Hopper chip, which needs none: with the arguments that the
+cases of the kernels give, one line each. Run by test_gpu.py as a program of its own, in which
+nothing is interpreted.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+from typing import Any
+
+import triton
+from torch import Tensor
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+
+import methods.kernels.gpu
+from methods.kernels.benchmark import all_cases
+from methods.kernels.dispatch import has
+
+HOPPER = GPUTarget("cuda", 90, 32)
+TYPES = {
+    "float32": "fp32",
+    "float16": "fp16",
+    "bfloat16": "bf16",
+    "int64": "i64",
+    "int32": "i32",
+    "uint8": "u8",
+}
+
+
+def signature(value: Any) -> str:
+    """The type of an argument, as Triton writes it."""
+    if isinstance(value, Tensor):
+        return "*" + TYPES[str(value.dtype).removeprefix("torch.")]
+    return {float: "fp32", int: "i32"}.get(type(value), "constexpr")
+
+
+def compile_for_hopper(
+    kernel: triton.JITFunction, grid: tuple[int, ...], *arguments: Any, **options: Any
+) -> None:
+    """In place of `methods.kernels.gpu.launch`."""
+    given = dict(zip(kernel.arg_names, arguments, strict=False))
+    constants = {name: value for name, value in options.items() if name in kernel.arg_names}
+    constants |= {name: value for name, value in given.items() if signature(value) == "constexpr"}
+    types = {
+        name: "constexpr" if name in constants else signature(given[name])
+        for name in kernel.arg_names
+    }
+    line = f"{kernel.fn.__module__}.{kernel.fn.__name__} {types} {constants}"
+    if line not in seen:
+        seen.add(line)
+        rest = {name: value for name, value in options.items() if name not in constants}
+        source = ASTSource(kernel, types, constants)
+        triton.compile(source, target=HOPPER, options={"enable_fp_fusion": False, **rest})
+        print(kernel.fn.__module__, kernel.fn.__name__)
+
+
+seen: set[str] = set()
+methods.kernels.gpu.launch = compile_for_hopper
+folders = {case.kernel.partition(" ")[0] for case in all_cases()}
+served = {folder for folder in folders if has(folder, "gpu")}
+for folder in served:
+    importlib.import_module(f"methods.kernels.{folder}.gpu")
+os.environ["TRITON_INTERPRET"] = "1"  # so that CPU tensors are taken; too late for a kernel
+for case in all_cases():
+    if case.kernel.partition(" ")[0] in served and not case.timed:
+        case.prepare("cpu").call("gpu")

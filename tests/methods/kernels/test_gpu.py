@@ -1,0 +1,143 @@
+"""The kernels of the GPU against the reference: on a GPU, else in Triton's interpreter."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+import methods.kernels
+from methods.kernels import availability
+from methods.kernels.benchmark import all_cases
+from methods.kernels.case import U32, Case, largest_error
+from methods.kernels.composite import composite, weights
+from methods.kernels.dispatch import has
+from methods.kernels.encode import HashGrid, encode
+from methods.kernels.splat import gather
+
+pytestmark = pytest.mark.skipif(
+    bool(availability()["gpu"]), reason="Triton has no build for this platform"
+)
+CASES = [
+    case for case in all_cases() if not case.timed and has(case.kernel.partition(" ")[0], "gpu")
+]
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+
+
+@pytest.fixture(autouse=True)
+def wide_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is interpreted costs the same for a block of any size."""
+    monkeypatch.setattr("methods.kernels.march.gpu.BLOCK", 256)
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.kernel}: {case.name}")
+def test_the_gpu_agrees_with_the_reference(case: Case) -> None:
+    prepared = case.prepare(DEVICE)
+    got = tuple(result.cpu() for result in prepared.call("gpu"))
+    assert largest_error(got, case.prepare("cpu").call("reference")) <= prepared.tolerance
+
+
+def test_a_table_of_half_precision_gives_features_of_its_type() -> None:
+    grid = HashGrid(levels=4, log2_table=10, n_min=4, n_max=40)
+    positions = torch.rand(57, 3, device=DEVICE)
+    for dtype in (torch.float16, torch.bfloat16):
+        table = torch.randn(grid.entries, 2, device=DEVICE).to(dtype).requires_grad_()
+        exact = table.detach().double().requires_grad_()
+        features = encode(positions, table, grid, backend="gpu")
+        right = encode(positions.double(), exact, grid, backend="reference")
+        # Fractions as in the cases of `encode`, at sizes up to that of the table, and one rounding.
+        size = table.detach().abs().max().item()
+        unit = torch.finfo(dtype).eps
+        tolerance = size * (3 * 2 * 2 * U32 * grid.n_max + 11 * U32 + unit)
+        assert features.dtype == dtype
+        assert (features - right).abs().max() <= tolerance
+        features.sum().backward()
+        right.sum().backward()
+        assert table.grad is not None
+        assert exact.grad is not None
+        most = exact.grad.abs().max().item()  # an entry's gradient is a sum of weights
+        assert (table.grad - exact.grad).abs().max() <= most * unit + 57 * 6 * U32 * grid.n_max
+
+
+def test_told_to_be_deterministic_it_adds_up_in_an_order_that_repeats() -> None:
+    """In another order than the atomics', so that only the last bits may differ from theirs."""
+    grid = HashGrid(levels=2, log2_table=6, n_min=4, n_max=20)
+    positions = torch.rand(4000, 3, device=DEVICE)
+    table = torch.zeros(grid.entries, 2, device=DEVICE, requires_grad=True)
+    weights_of_rows = torch.rand(4000, grid.channels, device=DEVICE)
+    values = torch.rand(3, 5, device=DEVICE, requires_grad=True)
+    index = torch.randint(-1, 3, (4000,), dtype=torch.int32, device=DEVICE)
+    rows = torch.rand(4000, 5, device=DEVICE)
+
+    def gradients() -> tuple[Tensor, ...]:
+        loss = (encode(positions, table, grid, backend="gpu") * weights_of_rows).sum()
+        loss = loss + (gather(values, index, backend="gpu") * rows).sum()
+        return torch.autograd.grad(loss, (table, values))
+
+    free = gradients()
+    torch.use_deterministic_algorithms(True)
+    try:
+        first, second = gradients(), gradients()
+    finally:
+        torch.use_deterministic_algorithms(False)
+    assert largest_error(first, second) == 0
+    # At most 4,000 terms below 1: 2 n roundings of a sum of n, as independent errors.
+    assert 0 < largest_error(first, free) <= 6 * 4000**0.5 * 4000 * U32
+
+
+@pytest.mark.filterwarnings("ignore:All-NaN")  # of the interpreter's least of nothing but NaN
+def test_what_is_not_a_number_shows_and_spoils_nothing_else() -> None:
+    sigma = torch.tensor([1.0, torch.nan, 1.0, torch.inf, 1.0], device=DEVICE)
+    delta = torch.full_like(sigma, 0.5)
+    offsets = torch.tensor([0, 1, 3, 5], device=DEVICE)
+    ones = torch.ones(5, 1, device=DEVICE)
+    pixels = composite(sigma, ones, ones[:, 0], delta, offsets, backend="gpu")
+    thin = -torch.expm1(torch.tensor(-0.5)).item()
+    assert pixels.alpha[0].item() == pytest.approx(thin, abs=4 * U32)
+    assert pixels.alpha[1].isnan()
+    assert pixels.alpha[2] == 1  # opaque: what is behind has no weight
+
+
+def test_a_thin_haze_keeps_its_light_to_the_last_digits() -> None:
+    """1 - exp(-tau) of a tau far below 1, which a difference of float32 numbers does not have."""
+    sigma = torch.logspace(-30, 0, 61, device=DEVICE)
+    offsets = torch.arange(62, device=DEVICE)
+    found = weights(sigma, torch.full_like(sigma, 0.25), offsets, backend="gpu").double().cpu()
+    exact = -torch.expm1(-(0.25 * sigma.double())).cpu()
+    # Five products and sums of the series, or exp and a difference of numbers above 0.06.
+    assert ((found - exact).abs() / exact).max() <= (6 + 2 / 0.06) * U32
+
+
+@pytest.mark.skipif(platform.system() != "Linux", reason="Triton brings its assembler for Linux")
+def test_every_kernel_compiles_for_a_gpu_that_is_not_here(tmp_path: Path) -> None:
+    environment = {name: text for name, text in os.environ.items() if name != "TRITON_INTERPRET"}
+    done = subprocess.run(
+        [sys.executable, "-P", Path(__file__).with_name("compiled.py")],
+        env=environment | {"TRITON_CACHE_DIR": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    compiled = set(done.stdout.splitlines())
+    folder = Path(methods.kernels.__file__).parent
+    written = {
+        f"methods.kernels.{path.parent.name}.gpu {name}"
+        for path in folder.glob("*/gpu.py")
+        for name in re.findall(r"(?:launch|_move)\(\s*(_\w+)", path.read_text())
+    }
+    assert written <= compiled
+
+
+def test_types_that_it_does_not_serve_are_refused() -> None:
+    grid = HashGrid(levels=1, log2_table=3, n_min=2, n_max=2)
+    positions = torch.rand(2, 3, dtype=torch.float64, device=DEVICE)
+    with pytest.raises(ValueError, match="expects positions of float32"):
+        encode(positions, torch.rand(grid.entries, 2, device=DEVICE), grid, backend="gpu")
