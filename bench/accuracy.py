@@ -10,14 +10,16 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from bench.frontier import observed_order
 from bench.metrics import psnr, psnr_of_mse
-from bench.probes import StageClock
+from bench.probes import FrameRecord, StageClock
 from bench.protocol import EvaluationProtocol, composite
 from bench.scoring import check_frame
 from bench.trajectories import Trajectory
@@ -133,12 +135,14 @@ def render_in_turns(
     not a frame, which would find the caches full of another model.
 
     Returns:
-        One row for each method, of the frames that have a ground truth and as many frames before
-        them since the last cut as any of the methods looks back on: setting (its name), ms (a
-        round's mean time of a frame; median over the rounds), ms_lo and ms_hi (its extremes), psnr
-        (mean over the frames) and psnr_to_first (against the pictures of the first method, all
-        frames together, inf where there is no difference), both of pictures as `protocol` rounds
-        them.
+        One row for each method, of the frames that have as many frames before them since the last
+        cut as any of the methods looks back on: setting (its name), ms (a round's mean time of a
+        frame, of the median round), ms_lo and ms_hi (its extremes), p99_to_p50 (of all times of a
+        frame), and of the median round, as in the rows of `bench.run.measure`, stage_ms.* and
+        work.*. Of those with a ground truth: psnr (mean over the frames), psnr_to_first (against
+        the pictures of the first method, all frames together, inf where there is no difference)
+        and worst (the largest difference of a channel from these, of 1), all of pictures as
+        `protocol` rounds them.
 
     Raises:
         SteerbenchError: there is no such frame, or a method rendered values that are not finite.
@@ -166,16 +170,39 @@ def render_in_turns(
                         scores.add(name, number, frame.rgb)
                 progress.advance(note=f"round {round_} of {repeats}" if round_ else "warming up")
     return [
-        {"setting": name, **_spread(_round_means(clock, len(steps), scored)), **scores.of(name)}
+        {"setting": name, **_costs(clock.frames, ready), **scores.of(name)}
         for name, clock in clocks.items()
     ]
 
 
-def _round_means(clock: StageClock, frames: int, scored: Sequence[int]) -> list[float]:
-    """Mean ms of the `scored` frames of each round of `frames` but the first."""
-    ms = [record.total_ns / 1e6 for record in clock.frames]
-    rounds = [ms[first : first + frames] for first in range(frames, len(ms), frames)]
-    return [statistics.fmean(of_round[number] for number in scored) for of_round in rounds]
+def _costs(records: Sequence[FrameRecord], ready: Sequence[bool]) -> dict[str, float]:
+    """What the `ready` frames of a round took, in all rounds but the first; see
+    `render_in_turns`."""
+    count = len(ready)
+    rounds = [
+        list(compress(records[first : first + count], ready))
+        for first in range(count, len(records), count)
+    ]
+    means = [statistics.fmean(record.total_ns / 1e6 for record in of_round) for of_round in rounds]
+    usual = rounds[means.index(statistics.median_low(means))]
+    every = [record.total_ns for of_round in rounds for record in of_round]
+    return {
+        "ms": statistics.median_low(means),
+        "ms_lo": min(means),
+        "ms_hi": max(means),
+        "p99_to_p50": float(np.percentile(every, 99)) / statistics.median(every),
+        **_means("stage_ms", [record.stages_ns for record in usual], 1e-6),
+        **_means("work", [record.done for record in usual]),
+    }
+
+
+def _means(kind: str, of_frames: Sequence[Mapping[str, int]], unit: float = 1) -> dict[str, float]:
+    """The mean over frames of everything that any of them has; 0 where one has it not."""
+    names = dict.fromkeys(name for figures in of_frames for name in figures)
+    return {
+        f"{kind}.{name}": unit * statistics.fmean(figures.get(name, 0) for figures in of_frames)
+        for name in names
+    }
 
 
 class _Scores:
@@ -187,6 +214,7 @@ class _Scores:
         self._first: dict[int, Tensor] = {}
         self._psnr: dict[str, list[float]] = {}
         self._apart: dict[str, list[float]] = {}
+        self._worst: dict[str, float] = {}
 
     def add(self, name: str, number: int, rgb: Tensor) -> None:
         """The frame `number` of the trajectory, as the method `name` rendered it."""
@@ -197,10 +225,12 @@ class _Scores:
         apart = picture.double() - self._first.setdefault(number, picture).double()
         self._psnr.setdefault(name, []).append(psnr(picture, exact))
         self._apart.setdefault(name, []).append(apart.square().mean().item())
+        self._worst[name] = max(self._worst.get(name, 0.0), apart.abs().max().item())
 
     def of(self, name: str) -> dict[str, float]:
         """The scores of a method in a row."""
         return {
             "psnr": statistics.fmean(self._psnr[name]),
             "psnr_to_first": psnr_of_mse(statistics.fmean(self._apart[name])),
+            "worst": self._worst[name],
         }

@@ -17,15 +17,13 @@ from bench.accuracy import experiment_rows, render_in_turns
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from bench.frontier import best_instead, cheapest_within
-from bench.types import Method
 from reports.accuracy import experiment_table, setting_table, write_accuracy
-from sweeps.build import build
 from sweeps.knobs import ALWAYS, EVERYTHING_OFF, knobs
 from sweeps.measurement import checked_settings
 from sweeps.overrides import composed
 from sweeps.terminal import console, rich_table
 from sweeps.turns import turn
-from sweeps.variants import Variant, common_ground, finite, require_lean, usable_method
+from sweeps.variants import OnceLog, Variant, common_ground, finite, fit_each, require_lean
 
 SETTINGS = ("method=steernerf", "scene=totem", "budget=demo", "trajectory=orbit")
 
@@ -38,7 +36,7 @@ def main(options: argparse.Namespace) -> int:
     outputs = Path(checked_settings(config).outputs)
     require_lean(config, "steerbench accuracy turns all knobs of SteerNeRF")
     _check_taught(config, overrides)
-    log = _Once(outputs)
+    log = OnceLog(outputs)
     turned = _turned(options)
     settings: list[dict[str, Any]] = []
     if not options.kernels:
@@ -79,19 +77,6 @@ def decibels(text: str) -> float:
     return float(number[1])
 
 
-class _Once(ConsoleLog):
-    """A log that says nothing twice: most settings find the same training."""
-
-    def __init__(self, root: Path) -> None:
-        super().__init__(root)
-        self._said: set[str] = set()
-
-    def info(self, message: str) -> None:
-        if message not in self._said:
-            self._said.add(message)
-            super().info(message)
-
-
 def _last_words(overrides: Sequence[str]) -> list[str]:
     """`overrides` without those that a later one of the same name replaces."""
     return list({line.partition("=")[0]: line for line in overrides}.values())
@@ -123,15 +108,7 @@ def _setting_rows(
     lines = {v.name: _last_words([*overrides, *v.settings]) for _, v in turned}
     configs = {name: composed(words) for name, words in lines.items()}
     scene, path, protocol = common_ground(configs[EVERYTHING_OFF.name], options.frames, log)
-    methods: dict[str, Method] = {}
-    with log.progress("settings", len(turned)) as progress:
-        for _, variant in turned:
-            config = configs[variant.name]
-            method = usable_method(config, variant, log, required=not methods)
-            if method is not None:
-                method.fit(scene, build(config, "budget"), log)
-                methods[variant.name] = method
-            progress.advance(note=variant.name)
+    methods = fit_each(configs, scene, log)
     rendered = render_in_turns(methods, scene, path, protocol, options.repeats, log)
     knob_of = {variant.name: knob for knob, variant in turned}
     best = best_instead([row["ms"] for row in rendered], [-row["psnr"] for row in rendered])

@@ -63,8 +63,14 @@ def _kernels(kernels: Parser) -> None:
 
 
 VARIANTS = (
-    "Train SteerNeRF, or take what the same training left behind; then render the same frames "
+    "Train SteerNeRF, or take what the same training left behind; then render the same frames, in "
+    "turn, again and again, "
 )
+
+
+def _rounds(parser: Parser, frames: int) -> None:
+    _count(parser, "--frames", frames, "first frames of the trajectory")
+    _count(parser, "--repeats", 3, "timed rounds over all lines, of which the median counts")
 
 
 def _parity(parity: Parser) -> None:
@@ -72,7 +78,7 @@ def _parity(parity: Parser) -> None:
         "with every engine and precision that can be used here, and compare them with torch in "
         "fp32."
     )
-    _count(parity, "--frames", 60, "first frames of the trajectory")
+    _rounds(parity, 40)
     _overrides(parity)
 
 
@@ -81,7 +87,7 @@ def _skips(skips: Parser) -> None:
         "with everything computed that could be left out, with each of it left out alone, and with "
         "all of it; without refinement."
     )
-    _count(skips, "--frames", 8, "first frames of the trajectory")
+    _rounds(skips, 10)
     _overrides(skips)
 
 
@@ -91,7 +97,7 @@ def _breakdown(breakdown: Parser) -> None:
         "by its parts; beside Instant-NGP, which renders the same field at full resolution, and "
         "the paper's pipeline, whose U-Net is trained for its time alone."
     )
-    _count(breakdown, "--frames", 10, "first frames of the trajectory")
+    _rounds(breakdown, 10)
     _overrides(breakdown, " (default engine=openvino)")
 
 

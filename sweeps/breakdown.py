@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
-from itertools import chain
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hydra.utils import get_class
@@ -15,9 +14,21 @@ from reports.tables import Table, number, share
 from sweeps.overrides import composed
 from sweeps.skips import NOTHING_SKIPPED
 from sweeps.terminal import console, rich_table
-from sweeps.variants import Rendered, Variant, engines, finite, render_variants, require_lean
+from sweeps.variants import (
+    Rendered,
+    Variant,
+    engines,
+    finite,
+    render_variants,
+    require_lean,
+    settings_of,
+)
 
 Row = dict[str, Any]
+
+DENSE, UNET, NGP = ", nothing skipped", ", the paper's U-Net", "Instant-NGP"
+"""How the names of lines end that are not of one engine at one precision as it is; the last is
+whole."""
 
 SETTINGS = ("method=steernerf", "trajectory=smooth", "engine=openvino")
 
@@ -32,14 +43,14 @@ PARTS = {
     "composite": "field",
     "feature_reprojection": "reprojection",
     "feature_reprojection/surface": "surface",
-    "renderer2d": "around it",
+    "renderer2d": "renderer2d",
     "renderer2d/network": "network",
     "refinement": "refinement",
 }
 """The column of a stage, and of all within it that has none of its own."""
 
 REST = "rest"
-COLUMNS = ("field", "reprojection", "surface", "network", "around it", "refinement", REST)
+COLUMNS = ("field", "reprojection", "surface", "renderer2d", "network", "refinement", REST)
 HEADS = ("", *COLUMNS, "frame ↓", "p99 / p50 ↓", "FPS ↑", "PSNR, dB ↑")
 
 RATIOS = (
@@ -60,30 +71,22 @@ def main(options: argparse.Namespace) -> int:
     require_lean(config, "steerbench breakdown switches off what a network on cells can skip")
     kind: Any = get_class(config.engine._target_)
     engine = f"engine={kind.name}"
-    everywhere = of_the_field(overrides)
-
-    def rendered(label: str, own: Sequence[str], variants: Sequence[Variant]) -> list[Rendered]:
-        return render_variants(own, variants, options.frames, label)
-
-    precisions = [variant for variant in engines() if engine in variant.settings]
-    lean = rendered("precisions", overrides, precisions)
-    usable = [one.variant for one in lean]
-    dense = rendered("nothing skipped", [*overrides, *NOTHING_SKIPPED], usable)
-    unet = rendered("the paper's U-Net", [*everywhere, *PAPER], usable)
-    ngp = rendered("Instant-NGP", [*everywhere, "method=ngp"], [Variant("Instant-NGP")])
-
-    lines = [
-        [_row(one, "") for one in lean],
-        [_row(one, ", nothing skipped") for one in dense],
-        [_row(one, ", the paper's U-Net") | {"psnr": None} for one in unet],
-    ]
-    alone = _row(ngp[0], "")
-    compared = [_ratios(alone, lines[0][0], *three) for three in zip(*lines, strict=True)]
-    rows = [*chain(*lines), alone]
-    title = f"ms of a frame, mean of the steady ones of {alone['frames']}"
-    console().print(rich_table(Table(title, HEADS, tuple(map(_line, rows)))))
+    shared = of_the_field(overrides)
+    usual = [variant for variant in engines() if engine in variant.settings]
+    lines = {
+        **settings_of(overrides, usual),
+        **settings_of([*overrides, *NOTHING_SKIPPED], _called(usual, DENSE)),
+        **settings_of([*shared, *PAPER], _called(usual, UNET)),
+        NGP: [*shared, "method=ngp"],
+    }
+    found = render_variants(lines, options.frames, options.repeats)
+    rows = {one.name: _row(one) for one in found}
+    names = [variant.name for variant in usual if variant.name in rows]
+    compared = [_ratios(rows, name, names[0]) for name in names]
+    title = f"ms of a frame, part by part, mean of the steady ones of {found[0].frames}"
+    console().print(rich_table(Table(title, HEADS, tuple(map(_line, rows.values())))))
     console().print(rich_table(Table("Compared", RATIOS, tuple(compared))))
-    print(json.dumps([finite(row) for row in rows]))
+    print(json.dumps([finite(row) for row in rows.values()]))
     return 0
 
 
@@ -107,19 +110,21 @@ def part_of(stage: str) -> str:
     return REST
 
 
-def _row(one: Rendered, label: str) -> Row:
+def _called(variants: Sequence[Variant], ending: str) -> list[Variant]:
+    return [Variant(variant.name + ending, variant.settings) for variant in variants]
+
+
+def _row(one: Rendered) -> Row:
     parts = dict.fromkeys(COLUMNS, 0.0)
     for metric, value in one.values.items():
         if metric.startswith("stage_ms."):
             parts[part_of(metric.removeprefix("stage_ms."))] += value
-    ms = one.values["frame_ms"]
     return {
-        "line": one.variant.name + label,
+        "line": one.name,
         **parts,
-        "frame_ms": ms,
-        "p99_to_p50": one.values["frame_ms.p99"] / one.values["frame_ms.p50"],
-        "psnr": one.values["psnr"],
-        "frames": one.frames,
+        "frame_ms": one.values["ms"],
+        "p99_to_p50": one.values["p99_to_p50"],
+        "psnr": None if one.name.endswith(UNET) else one.values["psnr"],
     }
 
 
@@ -134,14 +139,15 @@ def _line(row: Row) -> tuple[str, ...]:
     )
 
 
-def _ratios(ngp: Row, standard: Row, lean: Row, dense: Row, unet: Row) -> tuple[str, ...]:
-    """What skipping and a lean network bring at one precision; `standard` is fp32."""
+def _ratios(rows: Mapping[str, Row], name: str, standard: str) -> tuple[str, ...]:
+    """What skipping and a lean network bring the line `name`; `standard` is that of fp32."""
+    lean, dense, unet = (rows[name + ending] for ending in ("", DENSE, UNET))
     return (
-        lean["line"],
-        number(ngp["frame_ms"] / lean["frame_ms"], 1),
+        name,
+        number(rows[NGP]["frame_ms"] / lean["frame_ms"], 1),
         number(unet["network"] / lean["frame_ms"], 1),
         number(unet["network"] / lean["network"], 1),
-        number(standard["psnr"] - lean["psnr"], 3),
+        number(rows[standard]["psnr"] - lean["psnr"], 3),
         number(dense["psnr"] - lean["psnr"], 3),
         share(lean["frame_ms"], dense["frame_ms"]),
     )

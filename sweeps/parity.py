@@ -10,7 +10,7 @@ from bench.errors import SteerbenchError
 from reports.tables import Table, megabytes, number
 from sweeps.overrides import composed
 from sweeps.terminal import console, rich_table
-from sweeps.variants import Rendered, apart_text, engines, finite, render_variants
+from sweeps.variants import Rendered, apart_text, engines, finite, render_variants, settings_of
 
 SETTINGS = ("method=steernerf", "trajectory=smooth")
 
@@ -35,7 +35,8 @@ def main(options: argparse.Namespace) -> int:
             "steerbench parity compares engines of a 2D renderer: expected method=steernerf or "
             "steernerf_paper"
         )
-    found = render_variants(overrides, list(engines()), options.frames, "engines")
+    lines = settings_of(overrides, engines())
+    found = render_variants(lines, options.frames, options.repeats)
     rows = [_row(one, found[0]) for one in found]
     title = f"{found[0].method.name}, {found[0].frames} frames"
     console().print(rich_table(Table(title, COLUMNS, tuple(_line(row) for row in rows))))
@@ -45,14 +46,14 @@ def main(options: argparse.Namespace) -> int:
 
 def _row(one: Rendered, standard: Rendered) -> dict[str, Any]:
     return {
-        "engine": one.variant.name,
-        "apart": one.apart,
-        "worst": one.worst,
+        "engine": one.name,
+        "apart": one.values["psnr_to_first"],
+        "worst": one.values["worst"],
         "psnr": one.values["psnr"],
         "lost": standard.values["psnr"] - one.values["psnr"],
         "network_ms": one.values["stage_ms.renderer2d/network"],
-        "frame_ms": one.values["frame_ms"],
-        "p99_to_p50": one.values["frame_ms.p99"] / one.values["frame_ms.p50"],
+        "frame_ms": one.values["ms"],
+        "p99_to_p50": one.values["p99_to_p50"],
         "bytes": one.method.sizes()["renderer2d"],
     }
 

@@ -9,7 +9,15 @@ from typing import Any
 from reports.tables import Table, number, share
 from sweeps.overrides import composed
 from sweeps.terminal import console, rich_table
-from sweeps.variants import Rendered, Variant, apart_text, finite, render_variants, require_lean
+from sweeps.variants import (
+    Rendered,
+    Variant,
+    apart_text,
+    finite,
+    render_variants,
+    require_lean,
+    settings_of,
+)
 
 SETTINGS = ("method=steernerf", "trajectory=smooth", "method.pipeline.refined=0")
 """Without refinement, which takes a share of the cells that are drawn: of more where nothing is
@@ -29,7 +37,8 @@ def main(options: argparse.Namespace) -> int:
     """Print a table and, as the last line, the same rows as JSON."""
     overrides = [*SETTINGS, *options.overrides]
     require_lean(composed(overrides), "steerbench skips counts the work of a network on cells")
-    found = render_variants(overrides, _variants(), options.frames, "variants")
+    variants = settings_of(overrides, _variants())
+    found = render_variants(variants, options.frames, options.repeats)
     rows = [_row(one, found[0]) for one in found]
     title = f"{found[0].method.name}, {found[0].frames} frames: mean work of a frame, and its share"
     lines = tuple(_line(row, rows[0]) for row in rows)
@@ -64,11 +73,11 @@ def _row(one: Rendered, standard: Rendered) -> dict[str, Any]:
         done["work.products"] / 1e9,
     )
     return {
-        "skipped": one.variant.name,
-        "apart": one.apart,
+        "skipped": one.name,
+        "apart": done["psnr_to_first"],
         "psnr": done["psnr"],
         "lost": standard.values["psnr"] - done["psnr"],
-        "frame_ms": done["frame_ms"],
+        "frame_ms": done["ms"],
         **dict(zip(WORK, work, strict=True)),
     }
 

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 
+from bench.accuracy import render_in_turns
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
-from bench.metrics import psnr_of_mse
 from bench.protocol import EvaluationProtocol
-from bench.results import COLD, STEADY, Measurement
-from bench.run import measure
 from bench.trajectories import Trajectory
 from bench.types import Log, Method, Scene
 from sweeps.build import build
@@ -27,9 +24,6 @@ from sweeps.overrides import CONFIGS, composed
 from sweeps.turns import turn
 
 LEAN = "methods.space_to_depth.SpaceToDepth"
-
-RENDERED = "-rendered"
-"""How the names of renderings end; see `bench.scoring`."""
 
 
 @dataclass(frozen=True)
@@ -46,59 +40,79 @@ class Rendered:
 
     Attributes:
         method: as it was used.
-        frames: that were rendered.
-        apart: PSNR against the first variant, of all steady frames with ground truth together, as
-            8-bit pictures, dB; inf where there is no difference.
-        worst: largest difference of a channel from the first variant, of 1.
-        values: of the steady frames and of the whole run, by metric, as `bench.run.measure` has
-            them.
+        frames: of the path.
+        values: see `bench.accuracy.render_in_turns`.
     """
 
-    variant: Variant
+    name: str
     method: Method
     frames: int
-    apart: float
-    worst: float
-    values: Mapping[str, float]
+    values: Mapping[str, Any]
 
 
 def render_variants(
-    overrides: Sequence[str], variants: Sequence[Variant], frames: int, label: str
+    lines: Mapping[str, Sequence[str]], frames: int, repeats: int
 ) -> list[Rendered]:
-    """Measure the first `frames` of the trajectory, without LPIPS, with every variant that can be
-    used here.
+    """Render the first `frames` of the trajectory with all variants that can be used here, in turn;
+    see `bench.accuracy.render_in_turns`.
 
     What a variant is trained from is trained if need be, or found.
 
     Args:
-        overrides: settings of all variants, as of `steerbench run`.
+        lines: by the name of a variant its settings, as of `steerbench run`. Scene and trajectory
+            are those of the first.
 
     Raises:
         SteerbenchError: a setting is wrong, the first variant cannot be used here, or there is no
             steady frame with ground truth among the first ones.
     """
-    configs = [composed([*overrides, *variant.settings]) for variant in variants]
-    settings = checked_settings(configs[0])
-    log = ConsoleLog(Path(settings.outputs))
-    scene, path, protocol = common_ground(configs[0], frames, log)
-    found: list[Rendered] = []
-    standard: dict[str, np.ndarray] = {}
-    with (
-        log.progress(label, len(variants)) as progress,
-        turn(settings.device, log),
-    ):
-        for variant, config in zip(variants, configs, strict=True):
-            method = usable_method(config, variant, log, required=not found)
-            if method is not None:
-                budget = build(config, "budget")
-                measured = measure(
-                    method, scene, path, protocol, budget, log, seed=settings.seed, pictures=frames
-                )
-                pictures = _steady_pictures(measured, frames)
-                standard = standard or pictures
-                found.append(_compared(variant, method, measured, pictures, standard))
-            progress.advance()
-    return found
+    configs = {name: composed(overrides) for name, overrides in lines.items()}
+    first = next(iter(configs.values()))
+    settings = checked_settings(first)
+    log = OnceLog(Path(settings.outputs))
+    scene, path, protocol = common_ground(first, frames, log)
+    with turn(settings.device, log):
+        methods = fit_each(configs, scene, log)
+        rows = render_in_turns(methods, scene, path, protocol, repeats, log)
+    return [Rendered(row["setting"], methods[row["setting"]], len(path.steps), row) for row in rows]
+
+
+def settings_of(overrides: Sequence[str], variants: Iterable[Variant]) -> dict[str, list[str]]:
+    """By the name of each variant its settings after those of all."""
+    return {variant.name: [*overrides, *variant.settings] for variant in variants}
+
+
+def fit_each(configs: Mapping[str, DictConfig], scene: Scene, log: Log) -> dict[str, Method]:
+    """The methods that can be used here, fitted. Of others the log is told why; Unavailable if the
+    first is one of them."""
+    methods: dict[str, Method] = {}
+    with log.progress("variants", len(configs)) as progress:
+        for name, config in configs.items():
+            torch.manual_seed(config.seed)
+            try:
+                method: Method = build(config, "method")
+            except Unavailable as error:
+                if not methods:
+                    raise
+                log.info(f"{name}: {error}")
+            else:
+                method.fit(scene, build(config, "budget"), log)
+                methods[name] = method
+            progress.advance(note=name)
+    return methods
+
+
+class OnceLog(ConsoleLog):
+    """A log that says nothing twice: most variants find the same training."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        self._said: set[str] = set()
+
+    def info(self, message: str) -> None:
+        if message not in self._said:
+            self._said.add(message)
+            super().info(message)
 
 
 def require_lean(config: DictConfig, purpose: str) -> None:
@@ -123,22 +137,8 @@ def common_ground(
     steps = path.steps[:frames]
     path = replace(path, name=f"{path.name}-first{len(steps)}", steps=steps)
     protocol = build(config, "protocol")
+    protocol.check(scene, path)
     return scene, path, replace(protocol, name=f"{protocol.name} without LPIPS", lpips=())
-
-
-def usable_method(
-    config: DictConfig, variant: Variant, log: Log, *, required: bool
-) -> Method | None:
-    """The method of `variant`, not yet trained. Where it cannot be used here: None, and the log is
-    told; Unavailable if it is `required`."""
-    torch.manual_seed(config.seed)
-    try:
-        return build(config, "method")
-    except Unavailable as error:
-        if required:
-            raise
-        log.info(f"{variant.name}: {error}")
-        return None
 
 
 def engines() -> Iterator[Variant]:
@@ -150,37 +150,6 @@ def engines() -> Iterator[Variant]:
         for precision in kind.precisions:
             settings = (f"engine={name}", f"precision={precision}")
             yield Variant(f"{name}, {precision}", settings)
-
-
-def _steady_pictures(measured: Measurement, frames: int) -> dict[str, np.ndarray]:
-    steady = measured.frames.loc[measured.frames["phase"] == STEADY, "frame"]
-    names = {f"{frame:04d}{RENDERED}" for frame in steady}
-    pictures = {name: pixels for name, pixels in measured.pictures.items() if name in names}
-    if not pictures:
-        raise SteerbenchError(
-            f"--frames={frames}: none of these frames has a ground truth and as many frames before "
-            "it as the method looks back on; give more"
-        )
-    return pictures
-
-
-def _compared(
-    variant: Variant,
-    method: Method,
-    measured: Measurement,
-    pictures: Mapping[str, np.ndarray],
-    standard: Mapping[str, np.ndarray],
-) -> Rendered:
-    apart = np.stack([pictures[name] / 255.0 - standard[name] / 255.0 for name in standard])
-    rows = measured.rows[measured.rows["phase"] != COLD]
-    return Rendered(
-        variant,
-        method,
-        len(measured.frames),
-        psnr_of_mse(float(np.square(apart).mean())),
-        float(np.abs(apart).max()),
-        dict(zip(rows["metric"], rows["value"], strict=True)),
-    )
 
 
 def apart_text(psnr: float) -> str:

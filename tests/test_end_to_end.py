@@ -189,7 +189,7 @@ def test_wherever_it_is_killed_again_and_again_a_sweep_ends_with_the_same_rows(
 
 def test_parity_compares_every_engine_with_torch_in_fp32(first: tuple[Path, str]) -> None:
     steerbench = Path(sys.executable).with_name("steerbench")
-    command = [steerbench, "parity", "--frames", "4", "scene=totem", *SMALL]
+    command = [steerbench, "parity", "--repeats", "1", "--frames", "4", "scene=totem", *SMALL]
     done = subprocess.run(command, cwd=first[0], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert ": found in" in done.stderr
@@ -211,7 +211,7 @@ def test_skips_lists_the_work_of_a_frame_with_and_without_each_switch(
     first: tuple[Path, str],
 ) -> None:
     steerbench = Path(sys.executable).with_name("steerbench")
-    command = [steerbench, "skips", "--frames", "3", "scene=totem", *SMALL]
+    command = [steerbench, "skips", "--repeats", "1", "--frames", "3", "scene=totem", *SMALL]
     done = subprocess.run(command, cwd=first[0], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     found = {row["skipped"]: row for row in json.loads(done.stdout.splitlines()[-1])}
@@ -223,7 +223,17 @@ def test_skips_lists_the_work_of_a_frame_with_and_without_each_switch(
 
 def test_breakdown_divides_the_frame_and_names_every_line(first: tuple[Path, str]) -> None:
     steerbench = Path(sys.executable).with_name("steerbench")
-    command = [steerbench, "breakdown", "--frames", "3", "engine=torch", "scene=totem", *SMALL]
+    command = [
+        steerbench,
+        "breakdown",
+        "--repeats",
+        "1",
+        "--frames",
+        "3",
+        "engine=torch",
+        "scene=totem",
+        *SMALL,
+    ]
     done = subprocess.run(command, cwd=first[0], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "torch, fp16: " in done.stderr  # and why it cannot be had

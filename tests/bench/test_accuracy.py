@@ -8,8 +8,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bench.accuracy import Experiment, Trial, experiment_rows, render_in_turns
+from bench.accuracy import Experiment, Trial, _costs, experiment_rows, render_in_turns
 from bench.errors import SteerbenchError
+from bench.probes import FrameRecord
 from bench.protocol import EvaluationProtocol, composite
 from bench.trajectories import Step, Trajectory, from_split
 from bench.types import Frame
@@ -95,8 +96,31 @@ def test_pictures_are_held_against_those_of_the_first_and_against_the_truth(in_t
     # Halves of odd levels round to even ones: by up to one level more or less than 8.
     assert -20 * math.log10(9 / 255) <= rows[1]["psnr_to_first"] <= -20 * math.log10(7 / 255)
     assert rows[1]["psnr"] > rows[0]["psnr"]  # half the truth is too dark
+    assert rows[0]["worst"] == 0
+    assert 7 / 255 - 1e-6 <= rows[1]["worst"] <= 9 / 255 + 1e-6
     for row in rows:
         assert 0 < row["ms_lo"] <= row["ms"] <= row["ms_hi"]
+
+
+def frame(field: float, network: float | None = None, rays: int = 0) -> FrameRecord:
+    """A frame of so many ms in two stages; without the second where it is None."""
+    stages = {"field": field} if network is None else {"field": field, "network": network}
+    return FrameRecord({name: int(ms * 1e6) for name, ms in stages.items()}, {"rays": rays}, {})
+
+
+def test_the_costs_are_those_of_the_median_round_without_the_first_and_what_is_not_ready():
+    cold, warming = frame(1000.0), [frame(500.0)] * 3
+    slow = [cold, frame(40.0), frame(60.0)]
+    usual = [cold, frame(10.0, 4.0, rays=6), frame(14.0, rays=8)]
+    fast = [cold, frame(8.0), frame(8.0)]
+    costs = _costs([*warming, *slow, *usual, *fast], [False, True, True])
+    assert costs["ms"] == 14.0  # of (10 + 4 + 14) / 2
+    assert (costs["ms_lo"], costs["ms_hi"]) == (8.0, 50.0)
+    assert costs["stage_ms.field"] == 12.0
+    assert costs["stage_ms.network"] == 2.0  # one of the two frames has none
+    assert costs["work.rays"] == 7.0
+    # Sorted 8, 8, 14, 14, 40, 60: the 99th percentile is 95 % of the way from 40 to 60.
+    assert costs["p99_to_p50"] == pytest.approx(59.0 / 14.0)
 
 
 def test_only_frames_that_every_method_has_enough_before_are_scored(in_turns, tiny_scene):

@@ -19,13 +19,6 @@ FIGURES = {"everything off": (100.0, 30.0), "fast": (10.0, 29.9), "faster": (5.0
            "poor": (20.0, 20.0)}  # fmt: skip
 
 
-class Fitted:
-    """In place of a method."""
-
-    def fit(self, *arguments: object) -> None:
-        """Nothing to be done."""
-
-
 @pytest.fixture
 def measured(monkeypatch: pytest.MonkeyPatch) -> None:
     """`FIGURES`, in place of what the settings take and lose."""
@@ -37,14 +30,14 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> None:
         for index, (name, (ms, psnr)) in enumerate(FIGURES.items())
     ]  # fmt: skip
 
-    def rendered(methods: dict[str, Fitted], *arguments: object) -> list[dict[str, object]]:
+    def rendered(methods: dict[str, object], *arguments: object) -> list[dict[str, object]]:
         return [row for row in rows if row["setting"] in methods]
 
     ground = SimpleNamespace(name="totem"), SimpleNamespace(name="orbit", resolution="8x8"), None
     known = {"everything off": [EVERYTHING_OFF], "share": variants[:2], "engine": variants[2:]}
     monkeypatch.setattr("sweeps.accuracy.knobs", lambda trained: known)
     monkeypatch.setattr("sweeps.accuracy.common_ground", lambda *arguments: ground)
-    monkeypatch.setattr("sweeps.accuracy.usable_method", lambda *arguments, **options: Fitted())
+    monkeypatch.setattr("sweeps.accuracy.fit_each", lambda configs, *arguments: configs)
     monkeypatch.setattr("sweeps.accuracy.render_in_turns", rendered)
     monkeypatch.setattr("sweeps.accuracy.experiment_rows", lambda *arguments: [ERROR])
     monkeypatch.setattr("methods.accuracy.all_experiments", lambda: [])

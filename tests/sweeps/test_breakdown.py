@@ -18,7 +18,7 @@ from sweeps.cli import dispatch
         ("feature_reprojection", "reprojection"),
         ("feature_reprojection/surface", "surface"),
         ("feature_reprojection/surface/anything", "surface"),
-        ("renderer2d", "around it"),
+        ("renderer2d", "renderer2d"),
         ("renderer2d/network", "network"),
         ("refinement/field", "refinement"),
         ("finish", "rest"),
