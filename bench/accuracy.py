@@ -1,25 +1,24 @@
 """Run time against error, for computations whose exact answer is known and for whole methods.
 
-What is compared takes turns, so that a drifting clock hits all of it alike; its errors and its
-times come from the same runs.
+What is compared takes turns, so that a drifting clock hits all of it alike; the times come from
+further rounds of what made the errors.
 """
 
 from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from bench.frontier import observed_order
 from bench.metrics import psnr, psnr_of_mse
-from bench.probes import FrameRecord, StageClock
+from bench.probes import FrameRecord, StageClock, p99_to_p50
 from bench.protocol import EvaluationProtocol, composite
 from bench.scoring import check_frame
 from bench.trajectories import Trajectory
@@ -137,9 +136,9 @@ def render_in_turns(
     Returns:
         One row for each method, of the frames that have as many frames before them since the last
         cut as any of the methods looks back on: setting (its name), ms (a round's mean time of a
-        frame, of the median round), ms_lo and ms_hi (its extremes), p99_to_p50 (of all times of a
-        frame), and of the median round, as in the rows of `bench.run.measure`, stage_ms.* and
-        work.*. Of those with a ground truth: psnr (mean over the frames), psnr_to_first (against
+        frame, of the median round, the lower of two), ms_lo and ms_hi (its extremes), and of the
+        same round p99_to_p50 and, as in the rows of `bench.run.measure`, stage_ms.* and work.*. Of
+        those with a ground truth: psnr (mean over the frames), psnr_to_first (against
         the pictures of the first method, all frames together, inf where there is no difference)
         and worst (the largest difference of a channel from these, of 1), all of pictures as
         `protocol` rounds them.
@@ -147,15 +146,8 @@ def render_in_turns(
     Raises:
         SteerbenchError: there is no such frame, or a method rendered values that are not finite.
     """
-    start = max(method.memory for method in methods.values())
     steps = trajectory.steps
-    ready = [count >= start for count in trajectory.preceding]
-    scored = [n for n, step in enumerate(steps) if ready[n] and step.truth is not None]
-    if not scored:
-        raise SteerbenchError(
-            f"{trajectory.name}: none of its {len(steps)} frames has a ground truth and {start} "
-            "frames before it to look back on, without a cut; give more frames"
-        )
+    ready, scored = steady_frames(methods.values(), trajectory)
     clocks = {name: StageClock(method.settings()["device"]) for name, method in methods.items()}
     scores = _Scores(scene, trajectory, protocol)
     with torch.no_grad(), log.progress("rendering", (repeats + 1) * len(methods)) as progress:
@@ -175,6 +167,26 @@ def render_in_turns(
     ]
 
 
+def steady_frames(
+    methods: Iterable[Method], trajectory: Trajectory
+) -> tuple[list[bool], list[int]]:
+    """Which frames have as many before them as any of the `methods` looks back on, and the numbers
+    of those that have a ground truth, too.
+
+    Raises:
+        SteerbenchError: there is none with a ground truth.
+    """
+    start = max(method.memory for method in methods)
+    ready = [count >= start for count in trajectory.preceding]
+    scored = [n for n, step in enumerate(trajectory.steps) if ready[n] and step.truth is not None]
+    if not scored:
+        raise SteerbenchError(
+            f"{trajectory.name}: none of its {len(trajectory.steps)} frames has a ground truth and "
+            f"{start} frames before it to look back on, without a cut; give more frames"
+        )
+    return ready, scored
+
+
 def _costs(records: Sequence[FrameRecord], ready: Sequence[bool]) -> dict[str, float]:
     """What the `ready` frames of a round took, in all rounds but the first; see
     `render_in_turns`."""
@@ -185,22 +197,23 @@ def _costs(records: Sequence[FrameRecord], ready: Sequence[bool]) -> dict[str, f
     ]
     means = [statistics.fmean(record.total_ns / 1e6 for record in of_round) for of_round in rounds]
     usual = rounds[means.index(statistics.median_low(means))]
-    every = [record.total_ns for of_round in rounds for record in of_round]
     return {
         "ms": statistics.median_low(means),
         "ms_lo": min(means),
         "ms_hi": max(means),
-        "p99_to_p50": float(np.percentile(every, 99)) / statistics.median(every),
+        "p99_to_p50": p99_to_p50(usual),
         **_means("stage_ms", [record.stages_ns for record in usual], 1e-6),
         **_means("work", [record.done for record in usual]),
     }
 
 
-def _means(kind: str, of_frames: Sequence[Mapping[str, int]], unit: float = 1) -> dict[str, float]:
+def _means(
+    kind: str, of_frames: Sequence[Mapping[str, int]], factor: float = 1
+) -> dict[str, float]:
     """The mean over frames of everything that any of them has; 0 where one has it not."""
     names = dict.fromkeys(name for figures in of_frames for name in figures)
     return {
-        f"{kind}.{name}": unit * statistics.fmean(figures.get(name, 0) for figures in of_frames)
+        f"{kind}.{name}": factor * statistics.fmean(figures.get(name, 0) for figures in of_frames)
         for name in names
     }
 

@@ -6,11 +6,12 @@ import resource
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from bench.allocator import give_back
@@ -38,6 +39,13 @@ class FrameRecord:
     def total_ns(self) -> int:
         """Time from the beginning to the end of the frame: every nanosecond has its stage."""
         return sum(self.stages_ns.values())
+
+
+def p99_to_p50(frames: Sequence[FrameRecord]) -> float:
+    """The 99th percentile of the times of `frames`, of their median: how much longer than usual the
+    longest take."""
+    middle, last = np.percentile([frame.total_ns for frame in frames], (50, 99))
+    return float(last / middle)
 
 
 class StageClock:

@@ -103,12 +103,12 @@ def _setting_rows(
     options: argparse.Namespace,
     log: ConsoleLog,
 ) -> list[dict[str, Any]]:
-    """Of every setting its knob, overrides, times and errors, what it loses against everything off
+    """Of every setting its knob, overrides, costs and errors, what it loses against everything off
     and, in its place, the setting on the frontier; see `bench.accuracy.render_in_turns`."""
     lines = {v.name: _last_words([*overrides, *v.settings]) for _, v in turned}
     configs = {name: composed(words) for name, words in lines.items()}
     scene, path, protocol = common_ground(configs[EVERYTHING_OFF.name], options.frames, log)
-    methods = fit_each(configs, scene, log)
+    methods = fit_each(configs, scene, path, log)
     rendered = render_in_turns(methods, scene, path, protocol, options.repeats, log)
     knob_of = {variant.name: knob for knob, variant in turned}
     best = best_instead([row["ms"] for row in rendered], [-row["psnr"] for row in rendered])

@@ -68,9 +68,9 @@ VARIANTS = (
 )
 
 
-def _rounds(parser: Parser, frames: int) -> None:
+def _rounds(parser: Parser, frames: int, repeats: int = 3) -> None:
     _count(parser, "--frames", frames, "first frames of the trajectory")
-    _count(parser, "--repeats", 3, "timed rounds over all lines, of which the median counts")
+    _count(parser, "--repeats", repeats, "timed rounds over all of them; the median counts")
 
 
 def _parity(parity: Parser) -> None:
@@ -94,8 +94,9 @@ def _skips(skips: Parser) -> None:
 def _breakdown(breakdown: Parser) -> None:
     breakdown.description = VARIANTS + (
         "at every precision of an engine, with and without skipping, and tell the time of a frame "
-        "by its parts; beside Instant-NGP, which renders the same field at full resolution, and "
-        "the paper's pipeline, whose U-Net is trained for its time alone."
+        "by its parts; beside Instant-NGP, which renders the field of stage 1 at full resolution, "
+        "and the paper's pipeline, whose U-Net is trained for its time alone. Where nothing is "
+        "skipped, refinement takes its share of all cells: method.pipeline.refined=0 leaves it out."
     )
     _rounds(breakdown, 10)
     _overrides(breakdown, " (default engine=openvino)")
@@ -146,8 +147,7 @@ def _accuracy(accuracy: Parser) -> None:
         help="only knobs whose name contains this: step, range, engine, refined, trained, ...; may "
         "be given more than once",
     )
-    _count(accuracy, "--frames", 24, "first frames of the trajectory")
-    _count(accuracy, "--repeats", 5, "timed rounds over all settings")
+    _rounds(accuracy, 24, 5)
     _overrides(accuracy, " (default scene=totem budget=demo trajectory=orbit)")
 
 

@@ -7,9 +7,9 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from hydra.utils import get_class
 from omegaconf import OmegaConf
 
+from bench.probes import OTHER
 from reports.tables import Table, number, share
 from sweeps.overrides import composed
 from sweeps.skips import NOTHING_SKIPPED
@@ -19,6 +19,7 @@ from sweeps.variants import (
     Variant,
     engines,
     finite,
+    range_text,
     render_variants,
     require_lean,
     settings_of,
@@ -26,18 +27,17 @@ from sweeps.variants import (
 
 Row = dict[str, Any]
 
-DENSE, UNET, NGP = ", nothing skipped", ", the paper's U-Net", "Instant-NGP"
-"""How the names of lines end that are not of one engine at one precision as it is; the last is
-whole."""
+DENSE, UNET, NGP = ", nothing skipped", ", the paper's", "Instant-NGP"
+"""How the names of the other variants of an engine at a precision end; the last is whole."""
 
 SETTINGS = ("method=steernerf", "trajectory=smooth", "engine=openvino")
 
 PAPER = ("method=steernerf_paper", "budget.renderer_steps=8")
 """The U-Net of the release. What it has learned does not change what it costs."""
 
-PARTS = {
-    "depth_reprojection": "reprojection",
+PART_OF = {
     "field": "field",
+    "depth_reprojection": "reprojection",
     "rays": "field",
     "march": "field",
     "composite": "field",
@@ -46,18 +46,19 @@ PARTS = {
     "renderer2d": "renderer2d",
     "renderer2d/network": "network",
     "refinement": "refinement",
+    "finish": "finish",
 }
-"""The column of a stage, and of all within it that has none of its own."""
+"""The part that a stage is, with all within it that is no part of its own."""
 
-REST = "rest"
-COLUMNS = ("field", "reprojection", "surface", "renderer2d", "network", "refinement", REST)
-HEADS = ("", *COLUMNS, "frame ↓", "p99 / p50 ↓", "FPS ↑", "PSNR, dB ↑")
+PARTS = (*dict.fromkeys(PART_OF.values()), OTHER)
 
-RATIOS = (
+COLUMNS = ("", *PARTS, "frame ↓", "of rounds", "p99 / p50 ↓", "FPS ↑", "PSNR, dB ↑")
+
+COMPARED = (
     "",
-    "Instant-NGP / frame ↑",
-    "the paper's U-Net / frame ↑",
-    "the paper's U-Net / network ↑",
+    "frame of Instant-NGP / frame ↑",
+    "the paper's network / frame ↑",
+    "the paper's network / network ↑",
     "lost to fp32, dB ↓",
     "lost by skipping, dB ↓",
     "time, of nothing skipped ↓",
@@ -69,45 +70,45 @@ def main(options: argparse.Namespace) -> int:
     overrides = [*SETTINGS, *options.overrides]
     config = composed(overrides)
     require_lean(config, "steerbench breakdown switches off what a network on cells can skip")
-    kind: Any = get_class(config.engine._target_)
-    engine = f"engine={kind.name}"
-    shared = of_the_field(overrides)
-    usual = [variant for variant in engines() if engine in variant.settings]
-    lines = {
+    choice = composed(overrides, return_hydra_config=True).hydra.runtime.choices.engine
+    usual = [variant for variant in engines() if f"engine={choice}" in variant.settings]
+    shared = of_stage_1(overrides)
+    variants = {
         **settings_of(overrides, usual),
         **settings_of([*overrides, *NOTHING_SKIPPED], _called(usual, DENSE)),
         **settings_of([*shared, *PAPER], _called(usual, UNET)),
         NGP: [*shared, "method=ngp"],
     }
-    found = render_variants(lines, options.frames, options.repeats)
+    found = render_variants(variants, options.frames, options.repeats)
     rows = {one.name: _row(one) for one in found}
     names = [variant.name for variant in usual if variant.name in rows]
-    compared = [_ratios(rows, name, names[0]) for name in names]
-    title = f"ms of a frame, part by part, mean of the steady ones of {found[0].frames}"
-    console().print(rich_table(Table(title, HEADS, tuple(map(_line, rows.values())))))
-    console().print(rich_table(Table("Compared", RATIOS, tuple(compared))))
+    compared = [_compared(rows, name, names[0]) for name in names]
+    title = f"ms of a frame, and what of it each part takes itself; {found[0].frames} frames"
+    console().print(rich_table(Table(title, COLUMNS, tuple(map(_line, rows.values())))))
+    console().print(rich_table(Table("Compared", COMPARED, tuple(compared))))
     print(json.dumps([finite(row) for row in rows.values()]))
     return 0
 
 
-def of_the_field(overrides: Sequence[str]) -> list[str]:
-    """Those of `overrides` that Instant-NGP has, too: the same field for all."""
-    ngp = composed(["method=ngp"])
+def of_stage_1(overrides: Sequence[str]) -> list[str]:
+    """Those of `overrides` that decide what the field of stage 1 is, and all that are not of the
+    method: what Instant-NGP has, too."""
+    ngp, missing = composed(["method=ngp"]), object()
     return [
         override
         for override in overrides
         if not (name := override.partition("=")[0].lstrip("+~")).startswith("method")
-        or ("." in name and OmegaConf.select(ngp, name, default=REST) != REST)
+        or ("." in name and OmegaConf.select(ngp, name, default=missing) is not missing)
     ]
 
 
 def part_of(stage: str) -> str:
-    """The column of a `stage`."""
+    """The part of a frame that a `stage` is counted in."""
     while stage:
-        if stage in PARTS:
-            return PARTS[stage]
+        if stage in PART_OF:
+            return PART_OF[stage]
         stage, _, _ = stage.rpartition("/")
-    return REST
+    return OTHER
 
 
 def _called(variants: Sequence[Variant], ending: str) -> list[Variant]:
@@ -115,7 +116,7 @@ def _called(variants: Sequence[Variant], ending: str) -> list[Variant]:
 
 
 def _row(one: Rendered) -> Row:
-    parts = dict.fromkeys(COLUMNS, 0.0)
+    parts = dict.fromkeys(PARTS, 0.0)
     for metric, value in one.values.items():
         if metric.startswith("stage_ms."):
             parts[part_of(metric.removeprefix("stage_ms."))] += value
@@ -123,6 +124,8 @@ def _row(one: Rendered) -> Row:
         "line": one.name,
         **parts,
         "frame_ms": one.values["ms"],
+        "ms_lo": one.values["ms_lo"],
+        "ms_hi": one.values["ms_hi"],
         "p99_to_p50": one.values["p99_to_p50"],
         "psnr": None if one.name.endswith(UNET) else one.values["psnr"],
     }
@@ -131,15 +134,16 @@ def _row(one: Rendered) -> Row:
 def _line(row: Row) -> tuple[str, ...]:
     return (
         row["line"],
-        *(number(row[part], 1) for part in COLUMNS),
+        *(number(row[part], 1) for part in PARTS),
         number(row["frame_ms"], 1),
+        range_text(row),
         number(row["p99_to_p50"], 2),
         number(1e3 / row["frame_ms"], 2),
         number(row["psnr"], 2),
     )
 
 
-def _ratios(rows: Mapping[str, Row], name: str, standard: str) -> tuple[str, ...]:
+def _compared(rows: Mapping[str, Row], name: str, standard: str) -> tuple[str, ...]:
     """What skipping and a lean network bring the line `name`; `standard` is that of fp32."""
     lean, dense, unet = (rows[name + ending] for ending in ("", DENSE, UNET))
     return (

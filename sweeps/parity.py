@@ -10,7 +10,15 @@ from bench.errors import SteerbenchError
 from reports.tables import Table, megabytes, number
 from sweeps.overrides import composed
 from sweeps.terminal import console, rich_table
-from sweeps.variants import Rendered, apart_text, engines, finite, render_variants, settings_of
+from sweeps.variants import (
+    Rendered,
+    apart_text,
+    engines,
+    finite,
+    range_text,
+    render_variants,
+    settings_of,
+)
 
 SETTINGS = ("method=steernerf", "trajectory=smooth")
 
@@ -22,6 +30,7 @@ COLUMNS = (
     "lost, dB ↓",
     "network, ms ↓",
     "frame, ms ↓",
+    "of rounds",
     "p99 / p50",
     "network, MB ↓",
 )
@@ -35,8 +44,8 @@ def main(options: argparse.Namespace) -> int:
             "steerbench parity compares engines of a 2D renderer: expected method=steernerf or "
             "steernerf_paper"
         )
-    lines = settings_of(overrides, engines())
-    found = render_variants(lines, options.frames, options.repeats)
+    variants = settings_of(overrides, engines())
+    found = render_variants(variants, options.frames, options.repeats)
     rows = [_row(one, found[0]) for one in found]
     title = f"{found[0].method.name}, {found[0].frames} frames"
     console().print(rich_table(Table(title, COLUMNS, tuple(_line(row) for row in rows))))
@@ -53,6 +62,8 @@ def _row(one: Rendered, standard: Rendered) -> dict[str, Any]:
         "lost": standard.values["psnr"] - one.values["psnr"],
         "network_ms": one.values["stage_ms.renderer2d/network"],
         "frame_ms": one.values["ms"],
+        "ms_lo": one.values["ms_lo"],
+        "ms_hi": one.values["ms_hi"],
         "p99_to_p50": one.values["p99_to_p50"],
         "bytes": one.method.sizes()["renderer2d"],
     }
@@ -67,6 +78,7 @@ def _line(row: dict[str, Any]) -> tuple[str, ...]:
         number(row["lost"], 3),
         number(row["network_ms"], 2),
         number(row["frame_ms"], 1),
+        range_text(row),
         number(row["p99_to_p50"], 2),
         megabytes(row["bytes"]),
     )

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from omegaconf import DictConfig
 
@@ -19,7 +18,7 @@ from bench.cameras import frame_camera
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from bench.frontier import observed_order
-from bench.probes import FrameRecord, MemoryMeter, StageClock
+from bench.probes import FrameRecord, MemoryMeter, StageClock, p99_to_p50
 from bench.results import explained
 from bench.types import Camera, Log, Method, Scene
 from reports.growth import growth_panels
@@ -139,19 +138,11 @@ def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) 
         "label": point.label,
         "value": point.value,
         "frames": len(records),
-        **_times(records),
+        "frame_ms": statistics.mean(record.total_ns for record in records) / 1e6,
+        "p99_to_p50": p99_to_p50(records),
         "samples": statistics.mean(samples),
         "peak_bytes": peak_bytes,
         "size_bytes": sum(method.sizes().values()),
-    }
-
-
-def _times(records: Sequence[FrameRecord]) -> dict[str, float]:
-    """Mean time of the frames, as everywhere, and how much longer than usual the longest take."""
-    ms = [record.total_ns / 1e6 for record in records]
-    return {
-        "frame_ms": statistics.mean(ms),
-        "p99_to_p50": float(np.percentile(ms, 99)) / statistics.median(ms),
     }
 
 

@@ -14,6 +14,7 @@ from sweeps.variants import (
     Variant,
     apart_text,
     finite,
+    range_text,
     render_variants,
     require_lean,
     settings_of,
@@ -30,7 +31,14 @@ NOTHING_SKIPPED = tuple(f"method.pipeline.skip.{switch}=false" for switch in SWI
 
 WORK = ("rays", "samples", "shaded", "table reads, M", "cells", "products, G")
 
-COLUMNS = ("skipped", "PSNR to nothing skipped, dB ↑", "PSNR, dB ↑", "lost, dB ↓", "frame, ms ↓")
+COLUMNS = (
+    "skipped",
+    "PSNR to nothing skipped, dB ↑",
+    "PSNR, dB ↑",
+    "lost, dB ↓",
+    "frame, ms ↓",
+    "of rounds",
+)
 
 
 def main(options: argparse.Namespace) -> int:
@@ -78,6 +86,8 @@ def _row(one: Rendered, standard: Rendered) -> dict[str, Any]:
         "psnr": done["psnr"],
         "lost": standard.values["psnr"] - done["psnr"],
         "frame_ms": done["ms"],
+        "ms_lo": done["ms_lo"],
+        "ms_hi": done["ms_hi"],
         **dict(zip(WORK, work, strict=True)),
     }
 
@@ -93,5 +103,6 @@ def _line(row: dict[str, Any], dense: dict[str, Any]) -> tuple[str, ...]:
         number(row["psnr"], 2),
         number(row["lost"], 3),
         number(row["frame_ms"], 1),
+        range_text(row),
         *figures,
     )

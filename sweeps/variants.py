@@ -12,12 +12,13 @@ import torch
 from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 
-from bench.accuracy import render_in_turns
+from bench.accuracy import render_in_turns, steady_frames
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
 from bench.protocol import EvaluationProtocol
 from bench.trajectories import Trajectory
 from bench.types import Log, Method, Scene
+from reports.tables import number
 from sweeps.build import build
 from sweeps.measurement import checked_settings
 from sweeps.overrides import CONFIGS, composed
@@ -51,7 +52,7 @@ class Rendered:
 
 
 def render_variants(
-    lines: Mapping[str, Sequence[str]], frames: int, repeats: int
+    variants: Mapping[str, Sequence[str]], frames: int, repeats: int
 ) -> list[Rendered]:
     """Render the first `frames` of the trajectory with all variants that can be used here, in turn;
     see `bench.accuracy.render_in_turns`.
@@ -59,20 +60,20 @@ def render_variants(
     What a variant is trained from is trained if need be, or found.
 
     Args:
-        lines: by the name of a variant its settings, as of `steerbench run`. Scene and trajectory
-            are those of the first.
+        variants: by name the settings of each, as of `steerbench run`. Scene, trajectory and
+            protocol are those of the first.
 
     Raises:
         SteerbenchError: a setting is wrong, the first variant cannot be used here, or there is no
             steady frame with ground truth among the first ones.
     """
-    configs = {name: composed(overrides) for name, overrides in lines.items()}
+    configs = {name: composed(overrides) for name, overrides in variants.items()}
     first = next(iter(configs.values()))
     settings = checked_settings(first)
     log = OnceLog(Path(settings.outputs))
     scene, path, protocol = common_ground(first, frames, log)
     with turn(settings.device, log):
-        methods = fit_each(configs, scene, log)
+        methods = fit_each(configs, scene, path, log)
         rows = render_in_turns(methods, scene, path, protocol, repeats, log)
     return [Rendered(row["setting"], methods[row["setting"]], len(path.steps), row) for row in rows]
 
@@ -82,22 +83,29 @@ def settings_of(overrides: Sequence[str], variants: Iterable[Variant]) -> dict[s
     return {variant.name: [*overrides, *variant.settings] for variant in variants}
 
 
-def fit_each(configs: Mapping[str, DictConfig], scene: Scene, log: Log) -> dict[str, Method]:
-    """The methods that can be used here, fitted. Of others the log is told why; Unavailable if the
-    first is one of them."""
+def fit_each(
+    configs: Mapping[str, DictConfig], scene: Scene, path: Trajectory, log: Log
+) -> dict[str, Method]:
+    """The methods that can be used here, fitted. Of others the log is told why.
+
+    Raises, before anything is trained:
+        Unavailable: the first of them cannot be used.
+        SteerbenchError: no frame of `path` is good for all.
+    """
     methods: dict[str, Method] = {}
-    with log.progress("variants", len(configs)) as progress:
-        for name, config in configs.items():
-            torch.manual_seed(config.seed)
-            try:
-                method: Method = build(config, "method")
-            except Unavailable as error:
-                if not methods:
-                    raise
-                log.info(f"{name}: {error}")
-            else:
-                method.fit(scene, build(config, "budget"), log)
-                methods[name] = method
+    for name, config in configs.items():
+        torch.manual_seed(config.seed)
+        try:
+            methods[name] = build(config, "method")
+        except Unavailable as error:
+            if not methods:
+                raise
+            log.info(f"{name}: {error}")
+    steady_frames(methods.values(), path)
+    with log.progress("variants", len(methods)) as progress:
+        for name, method in methods.items():
+            torch.manual_seed(configs[name].seed)
+            method.fit(scene, build(configs[name], "budget"), log)
             progress.advance(note=name)
     return methods
 
@@ -130,15 +138,21 @@ def common_ground(
     protocol without LPIPS.
 
     Raises:
-        SteerbenchError: a setting is wrong.
+        SteerbenchError: a setting is wrong, or the scene does not suit the protocol.
     """
     scene = build(config, "scene", log=log)
     path = build(config, "trajectory", scene)
     steps = path.steps[:frames]
     path = replace(path, name=f"{path.name}-first{len(steps)}", steps=steps)
     protocol = build(config, "protocol")
+    protocol = replace(protocol, name=f"{protocol.name} without LPIPS", lpips=())
+    if protocol.memory != "steady":
+        raise SteerbenchError(
+            "protocol.memory: expected steady, where frames follow each other in turns, got "
+            f"{protocol.memory}"
+        )
     protocol.check(scene, path)
-    return scene, path, replace(protocol, name=f"{protocol.name} without LPIPS", lpips=())
+    return scene, path, protocol
 
 
 def engines() -> Iterator[Variant]:
@@ -163,3 +177,8 @@ def finite(row: Mapping[str, Any]) -> dict[str, Any]:
         key: None if isinstance(value, float) and not math.isfinite(value) else value
         for key, value in row.items()
     }
+
+
+def range_text(values: Mapping[str, Any]) -> str:
+    """The mean times of a frame of the fastest and of the slowest round, for a table."""
+    return f"{number(values['ms_lo'], 1)} – {number(values['ms_hi'], 1)}"

@@ -223,25 +223,16 @@ def test_skips_lists_the_work_of_a_frame_with_and_without_each_switch(
 
 def test_breakdown_divides_the_frame_and_names_every_line(first: tuple[Path, str]) -> None:
     steerbench = Path(sys.executable).with_name("steerbench")
-    command = [
-        steerbench,
-        "breakdown",
-        "--repeats",
-        "1",
-        "--frames",
-        "3",
-        "engine=torch",
-        "scene=totem",
-        *SMALL,
-    ]
+    command = [steerbench, "breakdown", "--repeats", "1", "--frames", "3", "engine=torch"]
+    command += ["device=cpu", "scene=totem", *SMALL]
     done = subprocess.run(command, cwd=first[0], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "torch, fp16: " in done.stderr  # and why it cannot be had
     found = {row["line"]: row for row in json.loads(done.stdout.splitlines()[-1])}
-    endings = ("", ", nothing skipped", ", the paper's U-Net")
+    endings = ("", breakdown.DENSE, breakdown.UNET)
     lines = [f"torch, {precision}{ending}" for ending in endings for precision in ("fp32", "bf16")]
     assert list(found) == [*lines, "Instant-NGP"]
     for row in found.values():
-        assert sum(row[part] for part in breakdown.COLUMNS) == pytest.approx(row["frame_ms"])
-    assert found["torch, fp32, the paper's U-Net"]["psnr"] is None  # it has hardly been trained
+        assert sum(row[part] for part in breakdown.PARTS) == pytest.approx(row["frame_ms"])
+    assert found["torch, fp32" + breakdown.UNET]["psnr"] is None  # it has hardly been trained
     assert found["Instant-NGP"]["network"] == 0

@@ -8,7 +8,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bench.accuracy import Experiment, Trial, _costs, experiment_rows, render_in_turns
+from bench.accuracy import (
+    Experiment,
+    Trial,
+    _costs,
+    experiment_rows,
+    render_in_turns,
+    steady_frames,
+)
 from bench.errors import SteerbenchError
 from bench.probes import FrameRecord
 from bench.protocol import EvaluationProtocol, composite
@@ -119,8 +126,26 @@ def test_the_costs_are_those_of_the_median_round_without_the_first_and_what_is_n
     assert costs["stage_ms.field"] == 12.0
     assert costs["stage_ms.network"] == 2.0  # one of the two frames has none
     assert costs["work.rays"] == 7.0
-    # Sorted 8, 8, 14, 14, 40, 60: the 99th percentile is 95 % of the way from 40 to 60.
-    assert costs["p99_to_p50"] == pytest.approx(59.0 / 14.0)
+    assert costs["p99_to_p50"] == 1.0  # both took 14
+
+
+def test_of_two_rounds_the_lower_counts():
+    assert _costs([frame(9.0), frame(3.0), frame(5.0)], [True])["ms"] == 3.0
+
+
+def test_frames_without_a_ground_truth_are_not_scored(in_turns, tiny_scene):
+    cameras = tiny_scene.splits["test"].cameras
+    between = Trajectory("between", "test", (Step(cameras[0], 0), Step(cameras[1], None)))
+    alone = Trajectory("alone", "test", (Step(cameras[0], 0),))
+    (row,), _ = in_turns(0, trajectory=between)
+    (known,), _ = in_turns(0, trajectory=alone)
+    assert row["psnr"] == known["psnr"]
+
+
+def test_frames_without_a_ground_truth_are_timed(tiny_scene):
+    cameras = tiny_scene.splits["test"].cameras
+    between = Trajectory("between", "test", (Step(cameras[0], 0), Step(cameras[1], None)))
+    assert steady_frames([Brighter(tiny_scene, 0, [])], between) == ([True, True], [0])
 
 
 def test_only_frames_that_every_method_has_enough_before_are_scored(in_turns, tiny_scene):

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bench import probes
-from bench.probes import MemoryMeter, StageClock
+from bench.probes import FrameRecord, MemoryMeter, StageClock, p99_to_p50
 
 
 def clock_reading(times: Iterable[int]) -> StageClock:
@@ -122,6 +122,11 @@ def test_the_real_clock_measures_on_the_device(device):
     with clock.frame(), clock.stage("product"):
         torch.ones(64, 64, device=device) @ torch.ones(64, 64, device=device)
     assert clock.frames[0].stages_ns["product"] > 0
+
+
+def test_the_longest_frames_are_held_against_the_median():
+    records = [FrameRecord({"field": ms * 1_000_000}, {}, {}) for ms in (10, 10, 40)]
+    assert p99_to_p50(records) == pytest.approx(3.94)  # 10 + 0.98 x 30, of 10
 
 
 SIZE = 64 << 20

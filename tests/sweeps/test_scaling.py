@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bench.errors import SteerbenchError
-from bench.probes import FrameRecord
 from sweeps.cli import dispatch
-from sweeps.scaling import _times, growth
+from sweeps.scaling import growth
 
 
 @given(power=st.floats(-3, 3), factor=st.floats(1e-3, 1e3))
@@ -27,13 +26,6 @@ def test_a_value_of_0_is_left_out() -> None:
 
 def test_a_single_value_has_no_exponent() -> None:
     assert math.isnan(growth([{"value": 2.0, "ms": 1.0}, {"value": 2.0, "ms": 2.0}], "ms"))
-
-
-def test_the_time_of_a_frame_is_the_mean_beside_a_ratio_to_the_median() -> None:
-    records = [FrameRecord({"field": ms * 1_000_000}, {}, {}) for ms in (10, 10, 40)]
-    times = _times(records)
-    assert times["frame_ms"] == 20
-    assert times["p99_to_p50"] == pytest.approx(3.94)  # 10 + 0.98 x 30, of 10
 
 
 @pytest.mark.parametrize(
