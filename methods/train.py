@@ -211,7 +211,6 @@ def training_digest() -> str:
     """SHA-256 of the sources that decide what a training results in."""
     methods, bench = ROOT / "methods", ROOT / "bench"
     used = [methods / f"{name}.py" for name in SOURCES]
-    used += [methods / "kernels" / "dispatch.py", methods / "kernels" / "cpu.py"]
     used += sources(*KERNELS)
     used += [bench / "cameras.py", bench / "types.py", *(bench / "scenes").glob("*.py")]
     return digest(used)

@@ -12,7 +12,7 @@ import torch
 
 from bench.types import Log, Unavailable
 from methods.kernels.case import Case, Prepared, largest_error
-from methods.kernels.dispatch import BACKENDS, has, resolve
+from methods.kernels.dispatch import BACKENDS, has, interpreted, resolve
 
 CASE_MODULES = (
     "methods.kernels.encode.cases",
@@ -108,9 +108,10 @@ def _timed_rows(
 def _usable(backend: str, device: str) -> bool:
     """Whether it is for this device; what an interpreter takes says nothing of a kernel."""
     try:
-        return resolve(backend, device) == backend and (backend == "gpu") == (device == "cuda")
+        resolve(backend, device)
     except Unavailable:
         return False
+    return not (backend == "gpu" and interpreted())
 
 
 def _serves(backend: str, case: Case) -> bool:

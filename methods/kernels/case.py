@@ -62,8 +62,9 @@ class Case:
 
 
 def on_backends(units: float, *precisions: str) -> dict[tuple[str, str], float]:
-    """Cells of a `bench.stress.StressCase` that is right to within `units` u: in fp32 by every
-    backend, in further `precisions` by the reference, which alone has them."""
+    """Cells of a `bench.stress.StressCase` that is right to within `units` u: in fp32 by the
+    reference and by the backend of the CPU, in further `precisions` by the reference, which alone
+    has them."""
     cells = [("reference", "fp32"), ("cpu", "fp32"), *(("reference", p) for p in precisions)]
     return {cell: units * torch.finfo(DTYPES[cell[1]]).eps / 2 for cell in cells}
 

@@ -1,4 +1,5 @@
-"""Which backend serves a call: by name or by the device of the tensors, never a silent fallback."""
+"""Which backend serves a call: by name or by the device of the tensors, never a silent fallback but
+for what `gpu` has no kernel for, which torch computes on the device."""
 
 from __future__ import annotations
 
@@ -15,6 +16,9 @@ import torch
 from bench.errors import Unavailable
 
 BACKENDS = ("reference", "cpu", "gpu")
+
+SHARED = ("cpu.py", "gpu.py")
+"""What all kernels of a backend share, beside this file."""
 
 
 @cache
@@ -104,7 +108,8 @@ def sources(*kernels: str) -> list[Path]:
     """The files that decide what `kernels` compute, on any backend."""
     folders = [Path(__file__).parent / kernel for kernel in kernels]
     names = [f"{name}.py" for name in ("__init__", *BACKENDS)]
-    return [path for folder in folders for name in names if (path := folder / name).exists()]
+    files = [path for folder in folders for name in names if (path := folder / name).exists()]
+    return [*files, *(Path(__file__).with_name(name) for name in ("dispatch.py", *SHARED))]
 
 
 # Imported when first used: numba and Triton are heavy, and not every machine has both.

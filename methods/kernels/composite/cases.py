@@ -27,6 +27,7 @@ def cases() -> list[Case]:
         ("opaque at once", 9, 12, {"density": 1e30}),
         ("continued", 33, 20, {"carry": True}),
         ("a background a ray", 33, 20, {"background": True}),
+        ("stopped after many samples", 20, 200, {"stop": 0.3}),
     ]
     found = [
         Case(f"composite{direction}", name, "fp32", rays * most, partial(make, rays, most, options))
@@ -76,6 +77,7 @@ def _inputs(rays: int, most: int, options: dict, device: str) -> tuple[dict, Ten
     inputs = {name: tensor.to(device) for name, tensor in inputs.items()}
     inputs["sigma"].requires_grad_()
     inputs["values"].requires_grad_()
+    # Only a transmittance within rounding of `stop` could end a ray one sample earlier.
     if options.get("background"):
         inputs["background"] = torch.rand(rays, channels, generator=generator).to(device)
     if options.get("carry"):
@@ -99,7 +101,7 @@ def _forward(rays: int, most: int, options: dict, device: str) -> Prepared:
 
     def call(backend: str) -> tuple[Tensor, ...]:
         with torch.no_grad():
-            pixels = composite(**inputs, stop=0.0, backend=backend)
+            pixels = composite(**inputs, stop=options.get("stop", 0.0), backend=backend)
         return pixels.values, pixels.depth_sum, pixels.alpha
 
     return Prepared(call, _tolerance(most))
@@ -109,7 +111,7 @@ def _backward(rays: int, most: int, options: dict, device: str) -> Prepared:
     inputs, grad = _inputs(rays, most, options, device)
 
     def call(backend: str) -> tuple[Tensor, ...]:
-        pixels = composite(**inputs, stop=0.0, backend=backend)
+        pixels = composite(**inputs, stop=options.get("stop", 0.0), backend=backend)
         outputs = torch.cat(
             (pixels.values, pixels.depth_sum[:, None], pixels.alpha[:, None]), dim=1
         )
@@ -126,7 +128,8 @@ def _weights(rays: int, most: int, options: dict, device: str) -> Prepared:
     front = 1 - inputs["carry"].alpha if "carry" in inputs else None
 
     def call(backend: str) -> tuple[Tensor, ...]:
-        return (weights(*samples, stop=0.0, front=front, backend=backend),)
+        stop = options.get("stop", 0.0)
+        return (weights(*samples, stop=stop, front=front, backend=backend),)
 
     return Prepared(call, _tolerance(most))
 

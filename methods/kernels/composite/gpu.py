@@ -29,24 +29,25 @@ def composite(
     carry: Pixels | None,
 ) -> Pixels:
     """See `methods.kernels.composite.composite`."""
-    check_types("sigma", sigma, torch.float32)
-    check_types("values", values, torch.float32)
+    check_types(torch.float32, sigma=sigma, values=values, t=t, delta=delta)
     return Pixels(*_Composite.apply(sigma, values, t, delta, offsets, stop, carry))
 
 
 def weights(sigma: Tensor, delta: Tensor, offsets: Tensor, stop: float, front: Tensor) -> Tensor:
     """See `methods.kernels.composite.weights`."""
+    check_types(torch.float32, sigma=sigma, delta=delta, front=front)
     weight = torch.zeros_like(sigma, memory_format=torch.contiguous_format)
     samples = (x.contiguous() for x in (sigma, delta, offsets, front))
-    launch(_weights, (len(front),), *samples, stop, weight, BLOCK=BLOCK)
+    launch(_weights, (len(front),), *samples, stop, weight, BLOCK=BLOCK, num_warps=1)
     return weight
 
 
 def visible_counts(sigma: Tensor, delta: Tensor, offsets: Tensor, stop: float) -> Tensor:
     """See `methods.kernels.composite.visible_counts`."""
+    check_types(torch.float32, sigma=sigma, delta=delta)
     counts = offsets.new_zeros(len(offsets) - 1)
     samples = (x.contiguous() for x in (sigma, delta, offsets))
-    launch(_visible, (len(counts),), *samples, stop, counts, BLOCK=BLOCK)
+    launch(_visible, (len(counts),), *samples, stop, counts, BLOCK=BLOCK, num_warps=1)
     return counts
 
 
@@ -57,7 +58,8 @@ class _Composite(torch.autograd.Function):
         if carry is None:
             pixels = Pixels.blank(rays, channels, sigma.device)
         else:
-            pixels = Pixels(carry.values.clone(), carry.depth_sum.clone(), carry.alpha.clone())
+            parts = (carry.values, carry.depth_sum, carry.alpha)
+            pixels = Pixels(*(x.clone(memory_format=torch.contiguous_format) for x in parts))
         front = 1 - pixels.alpha
         samples = [x.contiguous() for x in (sigma, values, t, delta, offsets)]
         launch(
@@ -72,6 +74,7 @@ class _Composite(torch.autograd.Function):
             channels,
             CHANNELS=triton.next_power_of_2(max(channels, 1)),
             BLOCK=BLOCK,
+            num_warps=1,
         )
         ctx.save_for_backward(*samples, front)
         ctx.stop = stop
@@ -96,6 +99,7 @@ class _Composite(torch.autograd.Function):
             channels,
             CHANNELS=triton.next_power_of_2(max(channels, 1)),
             BLOCK=BLOCK,
+            num_warps=1,
         )
         return grad_sigma, grad_samples, None, None, None, None, None
 
@@ -121,13 +125,14 @@ def _thickness(sigma, delta, i, there):
 
 @triton.jit
 def _block(sigma, delta, first, i, inside, light, stop):
-    """Weights of the samples `i`, which begin with `first`; which of them still get light, and how
-    much of it goes on behind each."""
+    """Weights of the samples `i`, which begin with `first`; which of them still get light, how much
+    of it goes on behind each, and behind all. Where one is NaN, nothing goes on."""
     in_front = _thickness(sigma, delta, i - 1, inside & (i > first))
     tau = _thickness(sigma, delta, i, inside)
     before = light * tl.exp(-tl.cumsum(in_front, 0))
     lit = inside & (before > stop)
-    return tl.where(lit, before * _opacity(tau), 0.0), lit, before * tl.exp(-tau)
+    weight = tl.where(lit, before * _opacity(tau), 0.0)
+    return weight, lit, before * tl.exp(-tau), light * tl.exp(-tl.sum(tau, 0))
 
 
 @triton.jit
@@ -155,13 +160,12 @@ def _forward(
     depth, covered = tl.load(depth_sum + ray), tl.load(alpha + ray)
     while (first < end) & (light > stop):
         i = first + tl.arange(0, BLOCK)
-        weight, lit, behind = _block(sigma, delta, first, i, i < end, light, stop)
+        weight, lit, _, light = _block(sigma, delta, first, i, i < end, light, stop)
         rows = values + i[:, None] * channels + channel[None, :]
         shown = tl.load(rows, mask=lit[:, None] & there[None, :], other=0.0)
         sums += tl.sum(weight[:, None] * shown, 0)
         depth += tl.sum(weight * tl.load(t + i, mask=lit, other=0.0), 0)
         covered += tl.sum(weight, 0)
-        light = tl.min(behind, 0)
         first += BLOCK
     tl.store(out + ray * channels + channel, sums, mask=there)
     tl.store(depth_sum + ray, depth)
@@ -176,9 +180,8 @@ def _weights(sigma, delta, offsets, front, stop, weight, BLOCK: tl.constexpr):
     while (first < end) & (light > stop):
         i = first + tl.arange(0, BLOCK)
         inside = i < end
-        found, _, behind = _block(sigma, delta, first, i, inside, light, stop)
+        found, _, _, light = _block(sigma, delta, first, i, inside, light, stop)
         tl.store(weight + i, found, mask=inside)
-        light = tl.min(behind, 0)
         first += BLOCK
 
 
@@ -189,9 +192,8 @@ def _visible(sigma, delta, offsets, stop, counts, BLOCK: tl.constexpr):
     light, count = 1.0, tl.zeros([], tl.int64)
     while (first < end) & (light > stop):
         i = first + tl.arange(0, BLOCK)
-        _, lit, behind = _block(sigma, delta, first, i, i < end, light, stop)
+        _, lit, _, light = _block(sigma, delta, first, i, i < end, light, stop)
         count += tl.sum(lit.to(tl.int64), 0)
-        light = tl.min(behind, 0)
         first += BLOCK
     tl.store(counts + ray, count)
 
@@ -238,22 +240,20 @@ def _backward(
     first, light, rest = begin, tl.load(front + ray), 0.0
     while (first < end) & (light > stop):
         i = first + tl.arange(0, BLOCK)
-        weight, lit, behind = _block(sigma, delta, first, i, i < end, light, stop)
+        weight, lit, _, light = _block(sigma, delta, first, i, i < end, light, stop)
         gain = _gain(values, t, i, lit, shine, of_depth, of_alpha, channel, there, channels)
         rest += tl.sum(weight * gain, 0)
         rows = grad_values + i[:, None] * channels + channel[None, :]
         tl.store(rows, weight[:, None] * shine[None, :], mask=lit[:, None] & there[None, :])
-        light = tl.min(behind, 0)
         first += BLOCK
 
     # `rest` is now the sum over all samples; less what was passed, it is what lies behind.
     first, light = begin, tl.load(front + ray)
     while (first < end) & (light > stop):
         i = first + tl.arange(0, BLOCK)
-        weight, lit, behind = _block(sigma, delta, first, i, i < end, light, stop)
+        weight, lit, behind, light = _block(sigma, delta, first, i, i < end, light, stop)
         gain = _gain(values, t, i, lit, shine, of_depth, of_alpha, channel, there, channels)
         slope = behind * gain - (rest - tl.cumsum(weight * gain, 0))
         tl.store(grad_sigma + i, tl.load(delta + i, mask=lit, other=0.0) * slope, mask=lit)
         rest -= tl.sum(weight * gain, 0)
-        light = tl.min(behind, 0)
         first += BLOCK

@@ -31,6 +31,10 @@ def cases() -> list[Case]:
         found.append(Case("encode backward", name, "fp32", count, partial(_backward, count, grid)))
     found.append(Case("encode", "corners", "fp32", 27, partial(_forward, -1, SMALL)))
     found.append(Case("encode", "257 samples", "bf16", 257, partial(_packed, 257, SMALL)))
+    coarse = partial(_forward, 257, SMALL, levels=2)
+    found.append(Case("encode", "the two coarsest levels", "fp32", 257, coarse))
+    learned = partial(_backward, 257, SMALL, packed=True)
+    found.append(Case("encode backward", "257 samples", "bf16", 257, learned))
     for name, view in (("view", True), ("random", False)):
         found += [
             Case("encode", name, "fp32", VIEW, partial(_forward, VIEW, LARGE, view=view), True),
@@ -77,11 +81,15 @@ def _fraction_error(grid: HashGrid) -> float:
     return 2 * U32 * grid.n_max
 
 
-def _forward(count: int, grid: HashGrid, device: str, view: bool = False) -> Prepared:
+def _forward(
+    count: int, grid: HashGrid, device: str, view: bool = False, levels: int | None = None
+) -> Prepared:
     positions, table = _inputs(count, grid, view, device)
     # Values of at most 1 differ by at most 2 along each of 3 axes; 11 roundings in the blend.
     tolerance = 3 * 2 * _fraction_error(grid) + 11 * U32
-    return Prepared(lambda backend: (encode(positions, table, grid, backend=backend),), tolerance)
+    return Prepared(
+        lambda backend: (encode(positions, table, grid, levels=levels, backend=backend),), tolerance
+    )
 
 
 def _packed(count: int, grid: HashGrid, device: str, view: bool = False) -> Prepared:
@@ -94,15 +102,19 @@ def _packed(count: int, grid: HashGrid, device: str, view: bool = False) -> Prep
     )
 
 
-def _backward(count: int, grid: HashGrid, device: str, view: bool = False) -> Prepared:
+def _backward(
+    count: int, grid: HashGrid, device: str, view: bool = False, packed: bool = False
+) -> Prepared:
     positions, table = _inputs(count, grid, view, device)
     table.requires_grad_()
     generator = torch.Generator().manual_seed(1)
     grad = (torch.rand(count, grid.channels, generator=generator) * 2 - 1).to(device)
+    words = pack(table) if packed else None
+    grad = grad.bfloat16() if packed else grad
 
     def call(backend: str) -> tuple[Tensor, ...]:
         buffer = torch.zeros_like(table)
-        features = encode(positions, table, grid, grad_buffer=buffer, backend=backend)
+        features = encode(positions, table, grid, packed=words, grad_buffer=buffer, backend=backend)
         features.backward(grad)
         return (buffer,)
 

@@ -1,8 +1,9 @@
 """Hash-grid encoding with Triton: a program encodes a block of samples at one level.
 
-Programs of one level follow each other, so that the entries they read are those of one level, which
-stay in the second-level cache. The scatter of the backward pass adds with atomics, in no order that
-repeats; where torch is told to use deterministic algorithms, torch's sorted scatter does it.
+Programs of one level are numbered one after the other: those that run at a time mostly read one
+level, which stays in the second-level cache. The scatter of the backward pass adds with atomics, in
+no order that repeats; where torch is told to use deterministic algorithms, torch's sorted scatter
+does it.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ def encode(
     bfloat16 gives features of its type, its products and sums are float32."""
     if positions.requires_grad:
         raise ValueError("backend 'gpu' gives no gradient for positions: use backend='reference'")
-    check_types("positions", positions, torch.float32)
-    check_types("table", table, torch.float32, torch.float16, torch.bfloat16)
+    check_types(torch.float32, positions=positions)
+    check_types(torch.float32, torch.float16, torch.bfloat16, table=table)
     return _Encode.apply(positions.contiguous(), table, grid, levels, packed, grad_buffer)
 
 
@@ -55,7 +56,7 @@ class _Encode(torch.autograd.Function):
         (positions,) = ctx.saved_tensors
         grid, levels, buffer = ctx.grid, ctx.levels, ctx.grad_buffer
         target = buffer
-        if buffer is None or buffer.dtype != torch.float32:
+        if buffer is None or buffer.dtype != torch.float32 or not buffer.is_contiguous():
             target = grad.new_zeros(grid.entries, grid.features, dtype=torch.float32)
         if torch.are_deterministic_algorithms_enabled():
             _scatter_sorted(positions, grad.float(), grid, levels, target)
@@ -99,7 +100,7 @@ def _level_arrays(grid: HashGrid, levels: int, device: torch.device) -> tuple[Te
     shapes = list(zip(strides, grid.offsets, grid.sizes, strict=False))[:levels]
     return (
         torch.tensor(grid.scales[:levels], dtype=torch.float32, device=device),
-        torch.tensor(shapes, dtype=torch.int32, device=device),
+        torch.tensor(shapes, dtype=torch.int64, device=device),
     )
 
 
@@ -140,7 +141,7 @@ def _level(scales, shapes, level):
     return (
         tl.load(scales + level),
         tl.load(shapes + 3 * level).to(tl.uint32),
-        tl.load(shapes + 3 * level + 1).to(tl.int64),
+        tl.load(shapes + 3 * level + 1),
         tl.load(shapes + 3 * level + 2).to(tl.uint32),
     )
 

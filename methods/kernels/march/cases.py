@@ -23,6 +23,8 @@ def cases() -> list[Case]:
         ("inside and outside", 129, {}),
         ("jitter", 129, {"jitter": True}),
         ("window", 129, {"window": True}),
+        ("window without bounds", 129, {"unbounded": True}),
+        ("resumed", 129, {"resumed": True}),
         ("limit 1", 129, {"limit": 1}),
         ("limit 7", 129, {"limit": 7}),
         ("empty grid", 65, {"grid": "empty"}),
@@ -85,6 +87,10 @@ def _prepare(count: int, options: dict, device: str) -> Prepared:
     if options.get("window"):
         near = torch.rand(rays, generator=generator)
         arguments["window"] = torch.stack((near, near + 0.5), dim=1).to(device)
+    if options.get("unbounded"):
+        arguments["window"] = torch.tensor([-torch.inf, torch.inf]).expand(rays, 2).to(device)
+    if options.get("resumed"):
+        arguments["start"] = torch.randint(-1, 400, (rays,), generator=generator).int().to(device)
     if "limit" in options:
         arguments["limit"] = options["limit"]
     grid = _grid(options.get("grid", "dust"), device)

@@ -29,14 +29,16 @@ def march(
     limit: int,
 ) -> Samples:
     """See `methods.kernels.march.march`."""
-    check_types("origins", origins, torch.float32)
+    check_types(torch.float32, origins=origins, directions=directions, window=window, jitter=jitter)
     rays, device = len(origins), origins.device
     near, far, step_t, alive = clip(origins, directions, step, window[:, 1])
     parallel = directions.abs() < PARALLEL
     slopes = torch.where(parallel, 0, 1 / torch.where(parallel, 1, directions))
     counts = torch.zeros(rays, dtype=torch.int64, device=device)
     resume = torch.full((rays,), -1, dtype=torch.int32, device=device)
-    given = (origins, directions, slopes, near, far, step_t, window[:, 0], jitter)
+    # Where a ray is not in the cube a window changes nothing, and may be far beyond any integer.
+    lowest = torch.minimum(torch.maximum(window[:, 0], near), far)
+    given = (origins, directions, slopes, near, far, step_t, lowest, jitter)
     arguments = [
         *(x.contiguous() for x in given),
         torch.where(alive, start, -1).int(),
@@ -107,7 +109,7 @@ def _march(
     BLOCK: tl.constexpr,
 ):
     """Count the samples and find where to resume; with `offsets`, write the samples there."""
-    ray = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    ray = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = ray < rays
     k = tl.load(starts + ray, mask=inside, other=-1)
     going = k >= 0
@@ -139,7 +141,7 @@ def _march(
         hit = going & passed & ((word >> bit & 1) == 1)
         if offsets is not None:
             place = begin + count
-            tl.store(ray_of + place, ray, mask=hit)
+            tl.store(ray_of + place, ray.to(tl.int32), mask=hit)
             tl.store(out_t + place, t, mask=hit)
             tl.store(out_positions + 3 * place, ox + t * dx, mask=hit)
             tl.store(out_positions + 3 * place + 1, oy + t * dy, mask=hit)

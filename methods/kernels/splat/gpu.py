@@ -21,8 +21,7 @@ NOTHING = torch.iinfo(torch.int32).max
 
 def splat(pixels: Tensor, depth: Tensor, width: int, height: int, rule: Rule) -> Tensor:
     """See `methods.kernels.splat.splat`."""
-    check_types("pixels", pixels, torch.float32)
-    check_types("depth", depth, torch.float32)
+    check_types(torch.float32, pixels=pixels, depth=depth)
     index = torch.full((height, width), -1, dtype=torch.int32, device=depth.device)
     given = (pixels.contiguous(), depth.contiguous(), len(depth), width, height)
     grid, options = (triton.cdiv(len(depth), BLOCK),), {"BLOCK": BLOCK}
@@ -31,13 +30,13 @@ def splat(pixels: Tensor, depth: Tensor, width: int, height: int, rule: Rule) ->
         return index
     least = torch.full((4, height, width), NOTHING, dtype=torch.int32, device=depth.device)
     for key in range(4):
-        launch(_compete, grid, *given, least, KEY=key, **options)
+        launch(_compete, grid, *given, width * height, least, KEY=key, **options)
     return torch.where(least[3] < NOTHING, least[3], index)
 
 
 def gather(values: Tensor, index: Tensor) -> Tensor:
     """See `methods.kernels.splat.gather`."""
-    check_types("values", values, torch.float32)
+    check_types(torch.float32, values=values)
     rows = _Gather.apply(values.contiguous(), index.contiguous().view(-1))
     return rows.view(*index.shape, values.shape[1])
 
@@ -87,15 +86,24 @@ def _pixel(pixels, depth, points, width, height, i):
 
 
 @triton.jit
-def _compete(pixels, depth, points, width, height, least, KEY: tl.constexpr, BLOCK: tl.constexpr):
-    """Lower `least` [4, H, W] of depth, u, v or index, by `KEY`, for points that are the least by
-    all keys before.
+def _compete(
+    pixels,
+    depth,
+    points,
+    width,
+    height,
+    size,
+    least,
+    KEY: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Lower `least` [4, H, W], of depth, u, v or index, by `KEY`, for points that are the least by
+    all keys before; `size` is H W.
 
     Floats that are not negative are in the order of their bits as integers.
     """
-    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     u, v, z, pixel, shown = _pixel(pixels, depth, points, width, height, i)
-    size = width.to(tl.int64) * height
     z_bits = z.to(tl.int32, bitcast=True)
     u_bits, v_bits = u.to(tl.int32, bitcast=True), v.to(tl.int32, bitcast=True)
     if KEY > 0:
@@ -111,15 +119,15 @@ def _compete(pixels, depth, points, width, height, least, KEY: tl.constexpr, BLO
     elif KEY == 2:
         key = v_bits
     else:
-        key = i
+        key = i.to(tl.int32)
     tl.atomic_min(least + KEY * size + pixel, key, mask=shown, sem="relaxed")
 
 
 @triton.jit
 def _splat_last(pixels, depth, points, width, height, index, BLOCK: tl.constexpr):
-    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     _, _, _, pixel, shown = _pixel(pixels, depth, points, width, height, i)
-    tl.atomic_max(index + pixel, i, mask=shown, sem="relaxed")
+    tl.atomic_max(index + pixel, i.to(tl.int32), mask=shown, sem="relaxed")
 
 
 @triton.jit

@@ -30,10 +30,17 @@ TYPES = {
 
 
 def signature(value: Any) -> str:
-    """The type of an argument, as Triton writes it."""
+    """The type of an argument, as Triton writes it, which takes a 1 for a constant."""
     if isinstance(value, Tensor):
         return "*" + TYPES[str(value.dtype).removeprefix("torch.")]
+    if value == 1:
+        return "constexpr"
     return {float: "fp32", int: "i32"}.get(type(value), "constexpr")
+
+
+def aligned(value: Any) -> bool:
+    """Whether Triton compiles for a multiple of 16: of bytes, or the number itself."""
+    return isinstance(value, Tensor) or (isinstance(value, int) and value % 16 == 0)
 
 
 def compile_for_hopper(
@@ -47,11 +54,16 @@ def compile_for_hopper(
         name: "constexpr" if name in constants else signature(given[name])
         for name in kernel.arg_names
     }
-    line = f"{kernel.fn.__module__}.{kernel.fn.__name__} {types} {constants}"
+    multiples = {
+        (index,): [["tt.divisibility", 16]]
+        for index, name in enumerate(kernel.arg_names)
+        if name not in constants and aligned(given[name])
+    }
+    line = f"{kernel.fn.__module__}.{kernel.fn.__name__} {types} {constants} {multiples}"
     if line not in seen:
         seen.add(line)
         rest = {name: value for name, value in options.items() if name not in constants}
-        source = ASTSource(kernel, types, constants)
+        source = ASTSource(kernel, types, constants, multiples)
         triton.compile(source, target=HOPPER, options={"enable_fp_fusion": False, **rest})
         print(kernel.fn.__module__, kernel.fn.__name__)
 
