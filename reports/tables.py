@@ -130,10 +130,10 @@ def _memory(rows: pd.DataFrame) -> Table:
 
 
 def number(value: float | None, decimals: int) -> str:
-    """A figure with `decimals`, or `n/a` where there is none."""
+    """A figure with `decimals`, or `n/a` where there is none; what rounds to 0 has no sign."""
     if value is None or math.isnan(value):
         return NOT_AVAILABLE
-    return f"{value:,.{decimals}f}"
+    return f"{round(value, decimals) + 0.0:,.{decimals}f}"
 
 
 def megabytes(size: float | None) -> str:

@@ -179,7 +179,7 @@ def _lines(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
         for row in rows
     ]
     exponents = [growth(rows, name) for name in ("frame_ms", "samples", "peak_bytes", "size_bytes")]
-    ms, samples, peak, size = (number(round(exponent, 2) + 0.0, 2) for exponent in exponents)
+    ms, samples, peak, size = (number(exponent, 2) for exponent in exponents)
     return [*lines, (f"exponent of {rows[0]['axis']}", ms, "", "", samples, peak, size)]
 
 

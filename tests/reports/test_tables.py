@@ -95,3 +95,8 @@ def test_markdown_sets_what_stands_out_in_bold_and_keeps_bars_in_their_cells():
 )
 def test_a_figure_that_could_not_be_had_is_never_a_number(value, text):
     assert tables.number(value, 2) == text
+
+
+def test_what_rounds_to_zero_has_no_sign():
+    assert tables.number(-0.0004, 3) == "0.000"
+    assert tables.number(-0.0006, 3) == "-0.001"
