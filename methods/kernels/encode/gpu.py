@@ -136,6 +136,15 @@ def _entry(x, y, z, stride, size):
 
 
 @triton.jit
+def _corner(ix, iy, iz, fx, fy, fz, stride, size, corner: tl.constexpr):
+    """Table entry, within its level, and weight of one of the eight corners of a cell."""
+    bx, by, bz = corner & 1, corner >> 1 & 1, corner >> 2
+    wx, wy = fx if bx else 1 - fx, fy if by else 1 - fy
+    wz = fz if bz else 1 - fz
+    return _entry(ix + bx, iy + by, iz + bz, stride, size), wx * wy * wz
+
+
+@triton.jit
 def _level(scales, shapes, level):
     """Scale, vertices along an axis (0: hashed), first entry and entries of a level."""
     return (
@@ -168,12 +177,9 @@ def _forward(
     for feature in tl.static_range(FEATURES):
         blended = tl.zeros([BLOCK], tl.float32)
         for corner in tl.static_range(8):
-            bx, by, bz = corner & 1, corner >> 1 & 1, corner >> 2
-            entry = first + _entry(ix + bx, iy + by, iz + bz, stride, size)
-            value = tl.load(table + entry * FEATURES + feature, mask=inside, other=0.0)
-            wx, wy = fx if bx else 1 - fx, fy if by else 1 - fy
-            wz = fz if bz else 1 - fz
-            blended += wx * wy * wz * value.to(tl.float32)
+            entry, weight = _corner(ix, iy, iz, fx, fy, fz, stride, size, corner)
+            value = tl.load(table + (first + entry) * FEATURES + feature, mask=inside, other=0.0)
+            blended += weight * value.to(tl.float32)
         out = features + i * channels + level * FEATURES + feature
         tl.store(out, blended.to(features.dtype.element_ty), mask=inside)
 
@@ -202,13 +208,6 @@ def _scatter(
         of_feature = grad + i * channels + level * FEATURES + feature
         share = tl.load(of_feature, mask=inside, other=0.0).to(tl.float32)
         for corner in tl.static_range(8):
-            bx, by, bz = corner & 1, corner >> 1 & 1, corner >> 2
-            entry = first + _entry(ix + bx, iy + by, iz + bz, stride, size)
-            wx, wy = fx if bx else 1 - fx, fy if by else 1 - fy
-            wz = fz if bz else 1 - fz
-            tl.atomic_add(
-                target + entry * FEATURES + feature,
-                wx * wy * wz * share,
-                mask=inside,
-                sem="relaxed",
-            )
+            entry, weight = _corner(ix, iy, iz, fx, fy, fz, stride, size, corner)
+            place = target + (first + entry) * FEATURES + feature
+            tl.atomic_add(place, weight * share, mask=inside, sem="relaxed")
