@@ -76,7 +76,8 @@ def test_a_kernel_that_is_wrong_on_any_case_gets_no_time(
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_backends_have_the_same_signature(kernel: str) -> None:
     folder = Path(methods.kernels.__file__).parent / kernel
-    names = [path.stem for path in folder.glob("*.py") if path.stem in BACKENDS]
+    usable = [name for name in BACKENDS if not availability()[name]]
+    names = [path.stem for path in folder.glob("*.py") if path.stem in usable]
     assert {"reference", "cpu"} <= set(names)
     public = {"adam": "sparse_adam_", "spherical": "spherical_harmonics"}.get(kernel, kernel)
     signatures = {
