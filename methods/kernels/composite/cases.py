@@ -27,6 +27,7 @@ def cases() -> list[Case]:
         ("opaque at once", 9, 12, {"density": 1e30}),
         ("continued", 33, 20, {"carry": True}),
         ("a background a ray", 33, 20, {"background": True}),
+        # Only a transmittance within rounding of `stop` could end a ray one sample earlier.
         ("stopped after many samples", 20, 200, {"stop": 0.3}),
     ]
     found = [
@@ -77,7 +78,6 @@ def _inputs(rays: int, most: int, options: dict, device: str) -> tuple[dict, Ten
     inputs = {name: tensor.to(device) for name, tensor in inputs.items()}
     inputs["sigma"].requires_grad_()
     inputs["values"].requires_grad_()
-    # Only a transmittance within rounding of `stop` could end a ray one sample earlier.
     if options.get("background"):
         inputs["background"] = torch.rand(rays, channels, generator=generator).to(device)
     if options.get("carry"):

@@ -145,14 +145,17 @@ def _corner(ix, iy, iz, fx, fy, fz, stride, size, corner: tl.constexpr):
 
 
 @triton.jit
-def _level(scales, shapes, level):
-    """Scale, vertices along an axis (0: hashed), first entry and entries of a level."""
-    return (
-        tl.load(scales + level),
-        tl.load(shapes + 3 * level).to(tl.uint32),
-        tl.load(shapes + 3 * level + 1),
-        tl.load(shapes + 3 * level + 2).to(tl.uint32),
-    )
+def _locate(positions, scales, shapes, level, i, inside):
+    """Cell and fraction of samples along each axis of a level; the level's vertices along an axis
+    (0: hashed), first entry and number of entries."""
+    scale = tl.load(scales + level)
+    ix, fx = _axis(positions, i, inside, 0, scale)
+    iy, fy = _axis(positions, i, inside, 1, scale)
+    iz, fz = _axis(positions, i, inside, 2, scale)
+    stride = tl.load(shapes + 3 * level).to(tl.uint32)
+    first = tl.load(shapes + 3 * level + 1)
+    size = tl.load(shapes + 3 * level + 2).to(tl.uint32)
+    return ix, iy, iz, fx, fy, fz, stride, first, size
 
 
 @triton.jit
@@ -170,10 +173,9 @@ def _forward(
     level = tl.program_id(1)
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = i < total
-    scale, stride, first, size = _level(scales, shapes, level)
-    ix, fx = _axis(positions, i, inside, 0, scale)
-    iy, fy = _axis(positions, i, inside, 1, scale)
-    iz, fz = _axis(positions, i, inside, 2, scale)
+    ix, iy, iz, fx, fy, fz, stride, first, size = _locate(
+        positions, scales, shapes, level, i, inside
+    )
     for feature in tl.static_range(FEATURES):
         blended = tl.zeros([BLOCK], tl.float32)
         for corner in tl.static_range(8):
@@ -200,10 +202,9 @@ def _scatter(
     level = tl.program_id(1)
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = i < total
-    scale, stride, first, size = _level(scales, shapes, level)
-    ix, fx = _axis(positions, i, inside, 0, scale)
-    iy, fy = _axis(positions, i, inside, 1, scale)
-    iz, fz = _axis(positions, i, inside, 2, scale)
+    ix, iy, iz, fx, fy, fz, stride, first, size = _locate(
+        positions, scales, shapes, level, i, inside
+    )
     for feature in tl.static_range(FEATURES):
         of_feature = grad + i * channels + level * FEATURES + feature
         share = tl.load(of_feature, mask=inside, other=0.0).to(tl.float32)
