@@ -196,11 +196,11 @@ def _costs(records: Sequence[FrameRecord], ready: Sequence[bool]) -> dict[str, f
         for first in range(count, len(records), count)
     ]
     means = [statistics.fmean(record.total_ns / 1e6 for record in of_round) for of_round in rounds]
-    usual = rounds[means.index(statistics.median_low(means))]
+    ms = statistics.median_low(means)
+    usual = rounds[means.index(ms)]
     return {
-        "ms": statistics.median_low(means),
-        "ms_lo": min(means),
-        "ms_hi": max(means),
+        **_spread(means),
+        "ms": ms,  # of a round that there was, whose parts follow
         "p99_to_p50": p99_to_p50(usual),
         **_means("stage_ms", [record.stages_ns for record in usual], 1e-6),
         **_means("work", [record.done for record in usual]),

@@ -13,17 +13,17 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from bench.accuracy import experiment_rows, render_in_turns
+from bench.accuracy import experiment_rows
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from bench.frontier import best_instead, cheapest_within
 from reports.accuracy import experiment_table, setting_table, write_accuracy
-from sweeps.knobs import ALWAYS, EVERYTHING_OFF, knobs
+from sweeps.knobs import ALWAYS, knobs
 from sweeps.measurement import checked_settings
 from sweeps.overrides import composed
 from sweeps.terminal import console, rich_table
 from sweeps.turns import turn
-from sweeps.variants import OnceLog, Variant, common_ground, finite, fit_each, require_lean
+from sweeps.variants import Variant, finite, render_variants, require_lean
 
 SETTINGS = ("method=steernerf", "scene=totem", "budget=demo", "trajectory=orbit")
 
@@ -36,12 +36,11 @@ def main(options: argparse.Namespace) -> int:
     outputs = Path(checked_settings(config).outputs)
     require_lean(config, "steerbench accuracy turns all knobs of SteerNeRF")
     _check_taught(config, overrides)
-    log = OnceLog(outputs)
+    log = ConsoleLog(outputs)
     turned = _turned(options)
     settings: list[dict[str, Any]] = []
     if not options.kernels:
-        with turn(config.device, log):
-            settings = _setting_rows(overrides, turned, options, log)
+        settings = _setting_rows(overrides, turned, options)
         console().print(rich_table(setting_table(settings)))
     from methods.accuracy import all_experiments
 
@@ -101,15 +100,12 @@ def _setting_rows(
     overrides: Sequence[str],
     turned: Sequence[tuple[str, Variant]],
     options: argparse.Namespace,
-    log: ConsoleLog,
 ) -> list[dict[str, Any]]:
     """Of every setting its knob, overrides, costs and errors, what it loses against everything off
     and, in its place, the setting on the frontier; see `bench.accuracy.render_in_turns`."""
     lines = {v.name: _last_words([*overrides, *v.settings]) for _, v in turned}
-    configs = {name: composed(words) for name, words in lines.items()}
-    scene, path, protocol = common_ground(configs[EVERYTHING_OFF.name], options.frames, log)
-    methods = fit_each(configs, scene, path, log)
-    rendered = render_in_turns(methods, scene, path, protocol, options.repeats, log)
+    found = render_variants(lines, options.frames, options.repeats)
+    scene, path, rendered = found[0].scene, found[0].path, [one.values for one in found]
     knob_of = {variant.name: knob for knob, variant in turned}
     best = best_instead([row["ms"] for row in rendered], [-row["psnr"] for row in rendered])
     return [

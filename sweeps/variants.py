@@ -41,14 +41,20 @@ class Rendered:
 
     Attributes:
         method: as it was used.
-        frames: of the path.
+        scene, path: what all variants rendered.
         values: see `bench.accuracy.render_in_turns`.
     """
 
     name: str
     method: Method
-    frames: int
+    scene: Scene
+    path: Trajectory
     values: Mapping[str, Any]
+
+    @property
+    def frames(self) -> int:
+        """Frames of the path."""
+        return len(self.path.steps)
 
 
 def render_variants(
@@ -75,7 +81,7 @@ def render_variants(
     with turn(settings.device, log):
         methods = fit_each(configs, scene, path, log)
         rows = render_in_turns(methods, scene, path, protocol, repeats, log)
-    return [Rendered(row["setting"], methods[row["setting"]], len(path.steps), row) for row in rows]
+    return [Rendered(row["setting"], methods[row["setting"]], scene, path, row) for row in rows]
 
 
 def settings_of(overrides: Sequence[str], variants: Iterable[Variant]) -> dict[str, list[str]]:

@@ -36,9 +36,9 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> None:
     ground = SimpleNamespace(name="totem"), SimpleNamespace(name="orbit", resolution="8x8"), None
     known = {"everything off": [EVERYTHING_OFF], "share": variants[:2], "engine": variants[2:]}
     monkeypatch.setattr("sweeps.accuracy.knobs", lambda trained: known)
-    monkeypatch.setattr("sweeps.accuracy.common_ground", lambda *arguments: ground)
-    monkeypatch.setattr("sweeps.accuracy.fit_each", lambda configs, *arguments: configs)
-    monkeypatch.setattr("sweeps.accuracy.render_in_turns", rendered)
+    monkeypatch.setattr("sweeps.variants.common_ground", lambda *arguments: ground)
+    monkeypatch.setattr("sweeps.variants.fit_each", lambda configs, *arguments: configs)
+    monkeypatch.setattr("sweeps.variants.render_in_turns", rendered)
     monkeypatch.setattr("sweeps.accuracy.experiment_rows", lambda *arguments: [ERROR])
     monkeypatch.setattr("methods.accuracy.all_experiments", lambda: [])
     monkeypatch.setattr("reports.accuracy.frontier_plot", lambda rows, path: path.touch())
@@ -104,7 +104,7 @@ def test_a_filter_leaves_the_knobs_with_it_in_their_name_and_what_they_are_compa
 
 
 def test_the_kernels_alone_train_and_render_nothing(steerbench, measured, monkeypatch):
-    monkeypatch.setattr("sweeps.accuracy.common_ground", None)
+    monkeypatch.setattr("sweeps.variants.common_ground", None)
     outcome = steerbench("accuracy", "--kernels")
     assert json.loads(outcome.out.splitlines()[-1]) == {"kernels": [ERROR], "settings": []}
 
