@@ -42,7 +42,7 @@ class Reprojection:
     depth: Literal["expected", "sum"] = "expected"
 
 
-CLOUD = ("source", "points", "values", "alpha")
+CLOUD = ("source", "points", "values", "alpha", "age")
 """The tensors of a cloud."""
 
 
@@ -56,6 +56,7 @@ class Cloud:
         points: [N, 3].
         values: [N, K] features.
         alpha: [N] opacity.
+        age: [N] uint8, frames since the oldest of what a pixel is made of was rendered.
     """
 
     camera: Camera
@@ -63,10 +64,11 @@ class Cloud:
     points: Tensor
     values: Tensor
     alpha: Tensor
+    age: Tensor
 
     @classmethod
-    def of(cls, frame: FeatureFrame, options: Reprojection) -> Cloud:
-        """Unproject `frame` (Eq. 6)."""
+    def of(cls, frame: FeatureFrame, options: Reprojection, age: Tensor | None = None) -> Cloud:
+        """Unproject `frame` (Eq. 6), whose pixels are of `age` [h * w]; None: of 0."""
         alpha, depth = frame.alpha.flatten(), frame.depth.flatten()
         if options.depth == "sum":
             source = torch.arange(len(alpha), device=alpha.device)
@@ -79,7 +81,9 @@ class Cloud:
         if options.centres == "paper":
             centres = centres - 0.5
         values = frame.values.reshape(len(alpha), -1)[source]
-        return cls(camera, source, unproject(camera, centres, depth), values, alpha[source])
+        age = torch.zeros_like(alpha, dtype=torch.uint8) if age is None else age
+        points = unproject(camera, centres, depth)
+        return cls(camera, source, points, values, alpha[source], age[source])
 
     def land(self, camera: Camera, options: Reprojection, backend: str) -> tuple[Tensor, Tensor]:
         """Which point each pixel of `camera` shows (Eq. 9, 10).

@@ -15,9 +15,10 @@ from bench.types import Camera, NullProbe, Rays
 from methods.buffer import Cloud
 from methods.kernels.composite import Pixels
 from methods.occupancy import STEP
-from methods.pipeline import Pipeline, View
+from methods.pipeline import Pipeline
 from methods.renderer2d import Observation, Points
 from methods.sequences import Sequence, SequencePool
+from methods.view import View
 from methods.volume import FeatureFrame, rays_at_matter, render_batch
 
 Through = Literal["all", "present"]

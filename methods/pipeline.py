@@ -12,13 +12,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.cameras import cast, place_camera, scale_camera, unproject
+from bench.cameras import cast, place_camera, unproject
 from bench.types import Camera, Frame, Probe
 from methods.buffer import Cloud, Remembered, RenderingBuffer, Reprojection
 from methods.cells import centres, put_pixels
@@ -29,6 +28,7 @@ from methods.kernels.march import Occupancy
 from methods.kernels.warp import enlarge, warp
 from methods.occupancy import STEP
 from methods.range_reduction import RangeReduction, depths_around, evidence, render_guided
+from methods.refresh import Refresh, first_ages, known_pixels
 from methods.renderer2d import (
     Detail,
     Observation,
@@ -39,6 +39,7 @@ from methods.renderer2d import (
     check_size,
 )
 from methods.rounds import render_rays
+from methods.view import View
 from methods.volume import FeatureFrame, query
 
 SIZES = {"channels": (3, 256), "frames": (0, 64), "scale": (1, 64)}
@@ -72,6 +73,7 @@ class PipelineOptions:
         frames: L, preceding frames.
         scale: s, the field is rendered at 1/s of the resolution.
         range: where rays look for a surface. It is not trained for, and can be chosen afterwards.
+        refresh: which low-resolution rays are not rendered anew. It is not trained for, either.
         reprojection: how preceding frames are brought into the present view.
         history: the preceding picture is reprojected, too.
         surface: the field is looked at once a pixel at full resolution, too, where the
@@ -99,6 +101,7 @@ class PipelineOptions:
     frames: int = 2
     scale: int = 4
     range: RangeReduction = RangeReduction("off")
+    refresh: Refresh = Refresh()
     reprojection: Reprojection = Reprojection()
     history: bool = True
     surface: bool = True
@@ -126,6 +129,11 @@ class PipelineOptions:
             raise ValueError(
                 f"range.mode: expected off without preceding frames (L = 0), got {self.range.mode}"
             )
+        if self.refresh.age and (not self.frames or self.reprojection != Reprojection()):
+            raise ValueError(
+                "refresh.age: expected 0 without preceding frames (L = 0) or with an inexact "
+                f"reprojection, got {self.refresh.age}"
+            )
 
     def check(self, grid: HashGrid, renderer: Renderer2d) -> None:
         """Refuse, with a ValueError, what a field of `grid` or the `renderer` cannot do."""
@@ -143,7 +151,13 @@ class PipelineOptions:
         to look that are made afterwards."""
         off = RangeReduction("off")
         return replace(
-            self, range=off, overlap=0.0, refined=refined, refined_steps=1.0, skip=Skips()
+            self,
+            range=off,
+            refresh=Refresh(),
+            overlap=0.0,
+            refined=refined,
+            refined_steps=1.0,
+            skip=Skips(),
         )
 
 
@@ -184,7 +198,8 @@ class Pipeline:
 
     def view(self, camera: Camera, turn: int) -> View:
         """The view of the `turn`-th frame of a sequence, where the field is."""
-        return View.of(place_camera(camera, self.background.device), self.options, turn)
+        camera = place_camera(camera, self.background.device)
+        return View.of(camera, self.options.scale, turn, jitter=self.options.jitter)
 
     @torch.no_grad()
     def render(self, camera: Camera, buffer: RenderingBuffer, probe: Probe) -> Frame:
@@ -192,7 +207,7 @@ class Pipeline:
         options, view = self.options, self.view(camera, buffer.turn)
         frames = self.shared(buffer.frames, view, probe)
         newest = frames[0] if frames else None
-        features = self._features(view, newest, probe)
+        features, age = self._features(view, newest, probe)
         with probe.stage("feature_reprojection"):
             preceding = [self.reproject(frame.cloud, view) for frame in frames]
             observation = self.observe(features, preceding, newest, view, probe)
@@ -205,7 +220,7 @@ class Pipeline:
                 colours = self.refine(worst, features, view, probe).clamp_(0, 1)
                 put_pixels(picture, worst, options.scale, colours)
         with probe.stage("finish"):
-            cloud = Cloud.of(features, options.reprojection)
+            cloud = Cloud.of(features, options.reprojection, age)
             buffer.push(Remembered(cloud, view.full, picture))
             return _finish(camera, picture, features, options.scale)
 
@@ -312,16 +327,21 @@ class Pipeline:
         colours = found.values[:, :3] + (1 - found.alpha)[:, None] * self.background[:3]
         return colours.view(*pixels.shape[:2], 3)
 
-    def _features(self, view: View, newest: Remembered | None, probe: Probe) -> FeatureFrame:
-        """The field at low resolution, looked at where the newest preceding frame says."""
-        options, found = self.options, None
-        if newest is not None and options.range.mode != "off":
+    def _features(
+        self, view: View, newest: Remembered | None, probe: Probe
+    ) -> tuple[FeatureFrame, Tensor | None]:
+        """The field at low resolution, looked at where the newest preceding frame says and what it
+        shows does not suffice; and the ages of the pixels."""
+        options, found, known = self.options, None, None
+        how = options.reprojection, self.backend
+        if newest is not None:
             with probe.stage("depth_reprojection"):
-                found = evidence(
-                    newest.cloud, view.low, options.range, options.reprojection, self.backend
-                )
+                if options.range.mode != "off":
+                    found = evidence(newest.cloud, view.low, options.range, *how)
+                if options.refresh.age:
+                    known = known_pixels(newest.cloud, view.low, options.refresh, *how)
         with probe.stage("field"):
-            return render_guided(
+            features = render_guided(
                 self.low_field,
                 view.low,
                 self.occupancy,
@@ -330,54 +350,18 @@ class Pipeline:
                 found,
                 stop=self.stop,
                 step=options.steps * STEP,
+                known=None if known is None else known.pixels,
             )
+        if known is not None:
+            probe.count("known_pixels", len(known.pixels), features.alpha.numel())
+            return known.put(features), known.ages(view.low)
+        ages = first_ages(view.low, options.refresh, self.background.device)
+        return features, ages if options.refresh.age else None
 
 
 def most_doubted(doubt: Tensor, share: float) -> Tensor:
     """Which of N cells, `share` of them, have the largest `doubt` [N]."""
     return doubt.topk(math.ceil(share * len(doubt)), sorted=False).indices
-
-
-@dataclass(frozen=True)
-class View:
-    """A camera as the pipeline sees it.
-
-    Attributes:
-        full: the camera, its picture enlarged to the right and below to multiples of s.
-        low: its low-resolution camera, whose pixel centres lie `phase` beside those of s x s
-            pixels.
-        phase: (u, v) in full-resolution pixels.
-    """
-
-    full: Camera
-    low: Camera
-    phase: tuple[float, float]
-
-    @classmethod
-    def of(cls, camera: Camera, options: PipelineOptions, turn: int) -> View:
-        """The view of the `turn`-th frame of a sequence."""
-        scale = options.scale
-        width, height = -(-camera.width // scale), -(-camera.height // scale)
-        full = replace(camera, width=width * scale, height=height * scale)
-        low = scale_camera(full, width, height)
-        phase = sample_phase(turn, scale) if options.jitter else (0.0, 0.0)
-        low = replace(low, cx=low.cx - phase[0] / scale, cy=low.cy - phase[1] / scale)
-        return cls(full, low, phase)
-
-
-def sample_phase(turn: int, scale: int) -> tuple[float, float]:
-    """Where the low-resolution samples of the `turn`-th frame lie beside the middle of their cell.
-
-    On the centre of one of its s x s pixels; s^2 frames visit all of them where s is a power of 2,
-    and any few that follow each other lie apart.
-    """
-    u, v = (_phases(scale)[turn % scale**2] * scale).floor().tolist()
-    return u - (scale - 1) / 2, v - (scale - 1) / 2
-
-
-@cache
-def _phases(scale: int) -> Tensor:
-    return torch.quasirandom.SobolEngine(2).draw(scale**2)
 
 
 def _finish(camera: Camera, picture: Tensor, features: FeatureFrame, scale: int) -> Frame:

@@ -68,10 +68,10 @@ def evidence(
     """What `cloud` tells of the depths that `camera`, a low-resolution one, will see."""
     index, depth = cloud.land(camera, reprojection, backend)
     known = index >= 0
-    near, far = _at(depth, index, torch.inf), _at(depth, index, -torch.inf)
-    alpha = _at(cloud.alpha, index, 0.0)
+    near, far = landed(depth, index, torch.inf), landed(depth, index, -torch.inf)
+    alpha = landed(cloud.alpha, index, 0.0)
     if options.mode == "window":
-        near, far, alpha = -_highest(-near), _highest(far), _highest(alpha)
+        near, far, alpha = -highest_around(-near), highest_around(far), highest_around(alpha)
         known = (alpha > 0) & (far - near < EDGE * options.epsilon)
     window = torch.stack(
         (
@@ -86,18 +86,18 @@ def evidence(
 def depths_around(depth: Tensor, epsilon: float) -> Tensor:
     """[h, w, 2] nearest and farthest z-depth within `epsilon` of those of the 3 x 3 neighbourhood
     in `depth` [h, w]; [0, inf) where none of them is finite."""
-    near = -_highest(-depth)
-    far = _highest(torch.where(depth.isfinite(), depth, -torch.inf))
+    near = -highest_around(-depth)
+    far = highest_around(torch.where(depth.isfinite(), depth, -torch.inf))
     window = torch.stack((near - epsilon, far + epsilon), dim=-1)
     return torch.where(near.isfinite()[..., None], window, window.new_tensor((0.0, torch.inf)))
 
 
-def _at(values: Tensor, index: Tensor, otherwise: float) -> Tensor:
+def landed(values: Tensor, index: Tensor, otherwise: float) -> Tensor:
     """`values` [N] at `index` [h, w], `otherwise` where that is -1."""
     return functional.pad(values, (0, 1), value=otherwise)[index.long()]  # -1 is the last one
 
 
-def _highest(image: Tensor) -> Tensor:
+def highest_around(image: Tensor) -> Tensor:
     """Largest value of each pixel's 3 x 3 neighbourhood."""
     return functional.max_pool2d(image[None], 3, stride=1, padding=1)[0]
 
@@ -113,6 +113,7 @@ def render_guided(
     *,
     stop: float = STOP,
     step: float = STEP,
+    known: Tensor | None = None,
 ) -> FeatureFrame:
     """Render a frame, looking only where `found` says that something is; None: everywhere.
 
@@ -120,11 +121,17 @@ def render_guided(
         background: [K].
         stop: transmittance at which a ray ends.
         step: world length of a ray-marching step.
+        known: [P] pixels that are not rendered, row by row.
     """
     march = partial(render_rays, field, occupancy=occupancy, probe=probe, step=step)
     device, size = field.table.device, camera.height * camera.width
     with probe.stage("rays"):
         seen, rays = rays_at_matter(camera, occupancy)
+        if known is not None:
+            left = torch.ones(size, dtype=torch.bool, device=device)
+            left[known] = False
+            left = left[seen]
+            seen, rays = seen[left], rays.take(left)
         canvas = Pixels.blank(size, field.channels, device)
     probe.count("rays", len(seen), size)
     if found is None:

@@ -18,7 +18,8 @@ from bench.motion import preceding
 from bench.types import Camera, NullProbe, Scene
 from methods.buffer import RenderingBuffer
 from methods.checkpoint import part
-from methods.pipeline import Pipeline, View
+from methods.pipeline import Pipeline
+from methods.view import View
 
 
 @dataclass(frozen=True)

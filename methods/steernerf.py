@@ -40,19 +40,21 @@ SOURCES = (
     "patches",
     "pipeline",
     "range_reduction",
+    "refresh",
     "renderer2d",
     "rounds",
     "sequences",
     "space_to_depth",
     "steernerf",
     "unet_release",
+    "view",
 )
 """Modules beside this one that decide what stage 2 results in, with those of stage 1."""
 
 CALIBRATED_BY = ("calibration.py", "engines/__init__.py")
 """Files below this folder that decide on which frames an engine's network is built."""
 
-NOT_TRAINED_FOR = ("overlap", "range", "refined", "refined_steps", "skip")
+NOT_TRAINED_FOR = ("overlap", "range", "refresh", "refined", "refined_steps", "skip")
 """Options of a pipeline that stage 2 does not depend on; see `PipelineOptions.taught`."""
 
 

@@ -15,6 +15,7 @@ EVERYTHING_OFF = Variant(
         "precision=fp32",
         "method.pipeline.overlap=0",
         "method.pipeline.range.mode=off",
+        "method.pipeline.refresh.age=0",
         "method.pipeline.steps=1",
         "method.pipeline.refined=1",
         "method.pipeline.skip.hidden=false",
@@ -55,6 +56,7 @@ def knobs(trained: bool) -> Mapping[str, Sequence[Variant]]:
         "range reduction": [
             _range(mode, value) for mode in ("window", "paper") for value in (0.01, 0.03, 0.1)
         ],
+        "rays taken over": [_refresh(age) for age in (1, 3, 7)],
         "refined share": [_refined(value) for value in (0, 0.03, 0.06, 0.25, 0.5, 1)],
         "skips": [
             Variant(f"{name} not skipped", (f"method.pipeline.skip.{switch}=false",))
@@ -90,6 +92,10 @@ def _stop(value: str) -> Variant:
 def _range(mode: str, epsilon: float) -> Variant:
     chosen = (f"method.pipeline.range.mode={mode}", f"method.pipeline.range.epsilon={epsilon}")
     return Variant(f"range {mode} {epsilon}", chosen)
+
+
+def _refresh(age: int) -> Variant:
+    return Variant(f"refresh age {age}", (f"method.pipeline.refresh.age={age}",))
 
 
 def _refined(share: float) -> Variant:

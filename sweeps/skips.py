@@ -56,7 +56,7 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _variants() -> list[Variant]:
-    """Nothing skipped, each alone, all of them, and range reduction on top."""
+    """Nothing skipped, each alone, all of them, and on top what the preceding frame knows."""
     off = dict(zip(SWITCHES, NOTHING_SKIPPED, strict=True))
     alone = [
         Variant(name, tuple(line for other, line in off.items() if other != name)) for name in off
@@ -66,6 +66,7 @@ def _variants() -> list[Variant]:
         *alone,
         Variant("all of these"),
         Variant("and a window of depths", ("method.pipeline.range.mode=window",)),
+        Variant("and rays taken over", ("method.pipeline.refresh.age=3",)),
     ]
 
 

@@ -18,12 +18,13 @@ from methods.joint import LEAST_ERROR, JointOptions, JointTraining, RendererTrai
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy
 from methods.patches import Batch, PatchSource, Through
-from methods.pipeline import Pipeline, PipelineOptions, View
+from methods.pipeline import Pipeline, PipelineOptions
 from methods.range_reduction import RangeReduction
 from methods.renderer2d import Points, Renderer2d
 from methods.sequences import MotionOptions, SequencePool, true_views
 from methods.space_to_depth import SpaceToDepth
 from methods.unet_release import UnetRelease
+from methods.view import View
 from tests.methods.observations import shaken
 
 GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)

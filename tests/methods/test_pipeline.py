@@ -16,10 +16,11 @@ from methods.buffer import Cloud, RenderingBuffer
 from methods.cells import cells_near, pixels_of
 from methods.kernels.warp import enlarge
 from methods.occupancy import STEP
-from methods.pipeline import LAYER, SIZES, Pipeline, PipelineOptions, Skips, View, sample_phase
+from methods.pipeline import LAYER, SIZES, Pipeline, PipelineOptions, Skips
 from methods.range_reduction import RangeReduction, render_guided
 from methods.space_to_depth import SpaceToDepth
 from methods.unet_release import UnetRelease
+from methods.view import View, sample_phase
 from tests.methods.conftest import GRID, Work, look_at_the_middle
 from tests.methods.observations import shaken, to_blocks
 from tests.methods.test_joint import misty_field, shell
@@ -61,7 +62,7 @@ def test_a_ray_of_the_low_resolution_goes_through_the_middle_of_its_cell_and_the
 ) -> None:
     camera = replace(CAMERA, width=size[0], height=size[1])
     for turn in range(16):
-        view = View.of(camera, replace(OPTIONS, jitter=True), turn)
+        view = View.of(camera, 4, turn, jitter=True)
         assert (view.full.width, view.full.height) == (4 * view.low.width, 4 * view.low.height)
         rays = cast(view.low)
         pixels, _ = project(view.full, rays.origins + 2 * rays.directions)
@@ -102,7 +103,7 @@ def test_the_preceding_picture_of_a_still_camera_is_where_it_was() -> None:
     pipeline = new_pipeline()
     buffer = RenderingBuffer(2)
     frame = pipeline.render(CAMERA, buffer, NullProbe())
-    view = View.of(CAMERA, OPTIONS, 1)
+    view = View.of(CAMERA, 4, 1)
     low_depth = frame.depth[::4, ::4]
     fine = enlarge(low_depth, ALL_CELLS, 4)
     history = pipeline.history(buffer.frames[0], fine, ALL_CELLS, view)
@@ -116,7 +117,7 @@ def test_the_preceding_picture_of_a_still_camera_is_where_it_was() -> None:
 
 def test_the_opacity_at_the_surface_is_that_of_a_layer_of_the_field() -> None:
     """At a pixel's own point, z in front of it; pixels without a depth have no point."""
-    pipeline, view, z = new_pipeline(), View.of(CAMERA, OPTIONS, 0), 1.5
+    pipeline, view, z = new_pipeline(), View.of(CAMERA, 4), 1.5
     pipeline.field = misty_field("fp32")
     near = torch.zeros(32, 32, dtype=torch.bool)
     near[10:22, 6:22] = True
@@ -137,7 +138,7 @@ def test_the_opacity_at_the_surface_is_that_of_a_layer_of_the_field() -> None:
 
 
 def test_where_no_pixel_has_a_depth_there_is_no_surface() -> None:
-    view = View.of(CAMERA, OPTIONS, 0)
+    view = View.of(CAMERA, 4)
     nowhere = torch.full((64, 16), torch.inf)
     surface = new_pipeline().surface(nowhere, ALL_CELLS, view, NullProbe())
     assert surface is not None
@@ -162,7 +163,7 @@ def test_where_every_cell_is_refined_the_picture_is_that_of_the_field(mode: Mode
         None,
         step=options.refined_steps * STEP,
     )
-    drawn = cells_near(pipeline._features(View.of(CAMERA, options, 0), None, NullProbe()).alpha > 0)
+    drawn = cells_near(pipeline._features(View.of(CAMERA, 4), None, NullProbe())[0].alpha > 0)
     assert 10 < len(drawn) < 64
     want = pixels_of(field.values[..., :3], drawn, 4)
     assert want.std() > 0.01
@@ -177,8 +178,8 @@ def test_the_cells_in_most_doubt_are_refined() -> None:
     drawn, refined = (new_pipeline(replace(OPTIONS, refined=part)) for part in (0.0, share))
     refined.renderer = shaken(drawn.renderer)
     pictures = [p.render(CAMERA, RenderingBuffer(2), NullProbe()).rgb for p in (drawn, refined)]
-    view = View.of(CAMERA, OPTIONS, 0)
-    frame = drawn._features(view, None, NullProbe())
+    view = View.of(CAMERA, 4)
+    frame = drawn._features(view, None, NullProbe())[0]
     observation = drawn.observe(frame, [], None, view, NullProbe())
     doubt = drawn.renderer([observation]).doubt
     assert doubt is not None
