@@ -68,9 +68,7 @@ def test_between_samples_even_shading_is_interpolated_exactly(aside: float) -> N
     camera = facing_a_wall(aside)
     known = known_at(at_the_wall(shading(slope)), camera, Refresh(age=1, tolerance=slope))
     assert len(known.pixels) >= (SIZE - 4) ** 2
-    want = shading(slope).flatten(0, 1)[known.pixels] + slope * aside * torch.tensor(
-        [1, -1, 0.5, 1]
-    )
+    want = shading(slope).flatten(0, 1)[known.pixels] + slope * aside * shift
     # Places and depths are off by some ulps of 16 pixels.
     torch.testing.assert_close(known.values, want, rtol=0, atol=1e-5)
     torch.testing.assert_close(known.depth, torch.full_like(known.depth, DISTANCE))
