@@ -164,7 +164,14 @@ def test_the_nearer_of_two_points_hides_the_other(backend: str) -> None:
     pixels = torch.tensor([[4.5, 3.5], [4.6, 3.4], [1.5, 1.5], [1.5, 1.5]])
     depth = torch.tensor([2.0, 1.0, 1.0, 2.0])
     points = unproject(target, pixels, depth)
-    cloud = Cloud(target, torch.arange(4), points, torch.zeros(4, 3), torch.ones(4))
+    cloud = Cloud(
+        target,
+        torch.arange(4),
+        points,
+        torch.zeros(4, 3),
+        torch.ones(4),
+        torch.zeros(4, dtype=torch.uint8),
+    )
     index, seen = cloud.land(target, EXACT, backend)
     assert (index[3, 4].item(), index[1, 1].item()) == (1, 2)
     assert (index >= 0).sum() == 2
