@@ -141,6 +141,11 @@ class RenderingBuffer:
         """Newest first; fewer than `length` after a cold start."""
         return tuple(self._frames)
 
+    @property
+    def clouds(self) -> Sequence[Cloud]:
+        """Those of `frames`."""
+        return tuple(frame.cloud for frame in self._frames)
+
     def push(self, frame: Remembered) -> None:
         """Remember `frame`, forget the oldest one if there are too many."""
         self._frames.appendleft(frame)

@@ -15,7 +15,8 @@ from bench.types import Budget, Log, Scene, SteerbenchError
 from methods import checkpoint, loop
 from methods.joint import JointOptions, RendererTraining
 from methods.patches import Batch, Patches, PatchSource
-from methods.pipeline import Pipeline, PipelineOptions
+from methods.pipeline import Pipeline
+from methods.pipeline_options import PipelineOptions
 from methods.pretrained import Setup, pretrain
 from methods.renderer2d import Renderer2d
 from methods.sequences import SequencePool, true_views

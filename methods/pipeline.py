@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -19,146 +19,28 @@ from torch.nn import functional
 
 from bench.cameras import cast, place_camera, unproject
 from bench.types import Camera, Frame, Probe
-from methods.buffer import Cloud, Remembered, RenderingBuffer, Reprojection
+from methods.buffer import Cloud, Remembered, RenderingBuffer
 from methods.cells import centres, put_pixels
 from methods.fields import HashField
-from methods.kernels.composite import STOP, check_stop
-from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy
 from methods.kernels.warp import enlarge, warp
 from methods.occupancy import STEP
-from methods.range_reduction import RangeReduction, depths_around, evidence, render_guided
-from methods.refresh import Refresh, first_ages, known_pixels
+from methods.pipeline_options import PipelineOptions
+from methods.range_reduction import depths_around, evidence, render_guided
+from methods.refresh import first_ages, known_pixels
 from methods.renderer2d import (
     Detail,
     Observation,
     Points,
     Renderer2d,
     cells_at_matter,
-    check_refined,
-    check_size,
 )
 from methods.rounds import render_rays
 from methods.view import View
 from methods.volume import FeatureFrame, query
 
-SIZES = {"channels": (3, 256), "frames": (0, 64), "scale": (1, 64)}
-"""K, L and s that a pipeline may have: from, to."""
-
 LAYER = 4 * STEP
 """Thickness, in scene units, of what a single sample of the surface stands for."""
-
-
-@dataclass(frozen=True)
-class Skips:
-    """What is not computed because no picture shows it; switched off, to see what that saves.
-
-    Attributes:
-        empty: samples where the field holds nothing, and rays that meet nothing else.
-        hidden: samples behind a transmittance of `PipelineOptions.stop`.
-        background: cells near which nothing is seen.
-    """
-
-    empty: bool = True
-    hidden: bool = True
-    background: bool = True
-
-
-@dataclass(frozen=True)
-class PipelineOptions:
-    """What a frame is made of.
-
-    Attributes:
-        channels: K, features of the field; the first three are RGB.
-        frames: L, preceding frames.
-        scale: s, the field is rendered at 1/s of the resolution.
-        range: where rays look for a surface. It is not trained for, and can be chosen afterwards.
-        refresh: which low-resolution rays are not rendered anew. It is not trained for, either.
-        reprojection: how preceding frames are brought into the present view.
-        history: the preceding picture is reprojected, too.
-        surface: the field is looked at once a pixel at full resolution, too, where the
-            low-resolution depth has the surface.
-        overlap: a preceding frame of which the present view shares less than this is not brought
-            into it, neither its features nor its depth or picture; see `Cloud.overlap`. It can be
-            chosen after the training.
-        jitter: the samples of the low-resolution grid move from frame to frame, so that
-            preceding frames carry samples of other places.
-        feature_background: what the features beyond RGB are composited on. 1/2 is what an
-            untrained feature is everywhere.
-        stop: transmittance at which a ray ends.
-        steps: length of a ray-marching step at low resolution, in those of stage 1: stage 2 teaches
-            the field to do with longer ones.
-        levels: of the field's grid that low-resolution rays read, the coarsest first: cells of the
-            others may be far smaller than their pixels. None: all.
-        refined: share of the cells whose pixels are rendered by the field after all, those that
-            the 2D renderer doubts most. It can be chosen after the training, too.
-        refined_steps: length of a ray-marching step there. It can be chosen after the training,
-            which takes steps as short as those of stage 1: at full resolution longer ones show.
-        skip: what is not computed. Nor is it trained for.
-    """
-
-    channels: int = 6
-    frames: int = 2
-    scale: int = 4
-    range: RangeReduction = RangeReduction("off")
-    refresh: Refresh = Refresh()
-    reprojection: Reprojection = Reprojection()
-    history: bool = True
-    surface: bool = True
-    overlap: float = 0.0
-    jitter: bool = False
-    feature_background: float = 0.5
-    stop: float = STOP
-    steps: float = 1.0
-    levels: int | None = None
-    refined: float = 0.0
-    refined_steps: float = 1.0
-    skip: Skips = Skips()
-
-    def __post_init__(self) -> None:
-        for name, (least, most) in SIZES.items():
-            check_size(name, getattr(self, name), least, most)
-        for name in ("steps", "refined_steps"):
-            if not (length := getattr(self, name)) > 0:
-                raise ValueError(f"{name}: expected a length of more than 0, got {length}")
-        for name in ("overlap", "refined"):
-            if not 0 <= (share := getattr(self, name)) <= 1:
-                raise ValueError(f"{name}: expected a share of 0 to 1, got {share}")
-        check_stop(self.stop)
-        if not self.frames and self.range.mode != "off":
-            raise ValueError(
-                f"range.mode: expected off without preceding frames (L = 0), got {self.range.mode}"
-            )
-        if self.refresh.age and (not self.frames or self.reprojection != Reprojection()):
-            raise ValueError(
-                "refresh.age: expected 0 without preceding frames (L = 0) or with an inexact "
-                f"reprojection, got {self.refresh.age}"
-            )
-
-    def check(self, grid: HashGrid, renderer: Renderer2d) -> None:
-        """Refuse, with a ValueError, what a field of `grid` or the `renderer` cannot do."""
-        if self.levels is not None:
-            grid.check_levels(self.levels)
-        check_refined("pipeline.refined", self.refined, renderer)
-        if self.jitter and not renderer.shifts:
-            raise ValueError(
-                f"pipeline.jitter: {type(renderer).__name__} takes every sample for the middle of "
-                "its cell, expected false, got true"
-            )
-
-    def taught(self, refined: float) -> PipelineOptions:
-        """The options of a training. It looks everywhere, so that one serves all choices of where
-        to look that are made afterwards."""
-        off = RangeReduction("off")
-        return replace(
-            self,
-            range=off,
-            refresh=Refresh(),
-            overlap=0.0,
-            refined=refined,
-            refined_steps=1.0,
-            skip=Skips(),
-        )
 
 
 class Pipeline:
@@ -201,16 +83,31 @@ class Pipeline:
         camera = place_camera(camera, self.background.device)
         return View.of(camera, self.options.scale, turn, jitter=self.options.jitter)
 
-    @torch.no_grad()
     def render(self, camera: Camera, buffer: RenderingBuffer, probe: Probe) -> Frame:
         """Render one frame that follows those in `buffer`, and remember it there."""
-        options, view = self.options, self.view(camera, buffer.turn)
-        frames = self.shared(buffer.frames, view, probe)
-        newest = frames[0] if frames else None
-        features, age = self._features(view, newest, probe)
+        glance = self.glance(camera, buffer.clouds, buffer.turn, probe)
+        return self.draw(camera, glance, buffer, probe)
+
+    @torch.no_grad()
+    def glance(self, camera: Camera, clouds: Sequence[Cloud], turn: int, probe: Probe) -> Glance:
+        """The `turn`-th frame of a sequence, as far as it needs no pictures of those before it: it
+        has all to do with their `clouds`, newest first."""
+        options, view = self.options, self.view(camera, turn)
+        used = self.shared(clouds, view, probe)
+        features, ages = self._features(view, clouds[used[0]] if used else None, probe)
         with probe.stage("feature_reprojection"):
-            preceding = [self.reproject(frame.cloud, view) for frame in frames]
-            observation = self.observe(features, preceding, newest, view, probe)
+            preceding = [self.reproject(clouds[number], view) for number in used]
+        with probe.stage("finish"):
+            cloud = Cloud.of(features, options.reprojection, ages)
+        return Glance(view, features, cloud, used, preceding)
+
+    @torch.no_grad()
+    def draw(self, camera: Camera, glance: Glance, buffer: RenderingBuffer, probe: Probe) -> Frame:
+        """The rest of the frame that follows those in `buffer`; it is remembered there."""
+        options, view, features = self.options, glance.view, glance.features
+        newest = buffer.frames[glance.used[0]] if glance.used else None
+        with probe.stage("feature_reprojection"):
+            observation = self.observe(features, glance.preceding, newest, view, probe)
         with probe.stage("renderer2d"):
             drawing = self.renderer([observation], probe)
             picture = drawing.pictures[0].clamp_(0, 1)
@@ -220,19 +117,17 @@ class Pipeline:
                 colours = self.refine(worst, features, view, probe).clamp_(0, 1)
                 put_pixels(picture, worst, options.scale, colours)
         with probe.stage("finish"):
-            cloud = Cloud.of(features, options.reprojection, age)
-            buffer.push(Remembered(cloud, view.full, picture))
+            buffer.push(Remembered(glance.cloud, view.full, picture))
             return _finish(camera, picture, features, options.scale)
 
-    def shared(
-        self, frames: Sequence[Remembered], view: View, probe: Probe
-    ) -> Sequence[Remembered]:
-        """Those of the preceding `frames` that show enough of what is in `view`."""
+    def shared(self, clouds: Sequence[Cloud], view: View, probe: Probe) -> Sequence[int]:
+        """Which of the preceding frames show enough of what is in `view`."""
+        used: Sequence[int] = range(len(clouds))
         if least := self.options.overlap:
             with probe.stage("feature_reprojection"):
-                frames = [frame for frame in frames if frame.cloud.overlap(view.full) >= least]
-        probe.count("preceding_frames", len(frames), self.options.frames)
-        return frames
+                used = [number for number in used if clouds[number].overlap(view.full) >= least]
+        probe.count("preceding_frames", len(used), self.options.frames)
+        return used
 
     def reproject(self, cloud: Cloud, view: View) -> Points:
         """The features of a preceding frame where the present picture sees them."""
@@ -328,7 +223,7 @@ class Pipeline:
         return colours.view(*pixels.shape[:2], 3)
 
     def _features(
-        self, view: View, newest: Remembered | None, probe: Probe
+        self, view: View, newest: Cloud | None, probe: Probe
     ) -> tuple[FeatureFrame, Tensor | None]:
         """The field at low resolution, looked at where the newest preceding frame says and what it
         shows does not suffice; and the ages of the pixels."""
@@ -337,9 +232,9 @@ class Pipeline:
         if newest is not None:
             with probe.stage("depth_reprojection"):
                 if options.range.mode != "off":
-                    found = evidence(newest.cloud, view.low, options.range, *how)
+                    found = evidence(newest, view.low, options.range, *how)
                 if options.refresh.age:
-                    known = known_pixels(newest.cloud, view.low, options.refresh, *how)
+                    known = known_pixels(newest, view.low, options.refresh, *how)
         with probe.stage("field"):
             features = render_guided(
                 self.low_field,
@@ -357,6 +252,25 @@ class Pipeline:
             return known.put(features), known.ages(view.low)
         ages = first_ages(view.low, options.refresh, self.background.device)
         return features, ages if options.refresh.age else None
+
+
+@dataclass(frozen=True)
+class Glance:
+    """What is known of a frame before the pictures of the preceding ones are.
+
+    Attributes:
+        view: of its camera.
+        features: the field at low resolution.
+        cloud: the same as points, to be remembered.
+        used: which of the preceding frames show enough of the view, 0 for the newest.
+        preceding: their features in it.
+    """
+
+    view: View
+    features: FeatureFrame
+    cloud: Cloud
+    used: Sequence[int]
+    preceding: Sequence[Points]
 
 
 def most_doubted(doubt: Tensor, share: float) -> Tensor:

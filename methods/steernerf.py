@@ -23,8 +23,10 @@ from methods.generic import train_generic
 from methods.joint import JointOptions, JointTraining, RendererTraining
 from methods.kernels import sources
 from methods.kernels.encode import HashGrid
+from methods.lookahead import Lookahead
 from methods.patches import PatchSource
-from methods.pipeline import Pipeline, PipelineOptions
+from methods.pipeline import Pipeline
+from methods.pipeline_options import PipelineOptions
 from methods.pretrained import Pretrained, Setup, pretrain
 from methods.renderer2d import Renderer2d, check_refined
 from methods.sequences import SequencePool, TrueView, true_views
@@ -39,6 +41,7 @@ SOURCES = (
     "joint",
     "patches",
     "pipeline",
+    "pipeline_options",
     "range_reduction",
     "refresh",
     "renderer2d",
@@ -96,7 +99,7 @@ class SteerNerf:
         self.options, self.make_renderer, self.joint, self.name = pipeline, renderer, joint, name
         engine.check(self.setup.device)
         self.engine, self.memory = engine, pipeline.frames
-        self.buffer = RenderingBuffer(pipeline.frames)
+        self.buffer, self.lookahead = RenderingBuffer(pipeline.frames), Lookahead()
         self.train_s = 0.0
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
@@ -145,10 +148,18 @@ class SteerNerf:
     def reset(self) -> None:
         """Forget preceding frames."""
         self.buffer.reset()
+        self.lookahead.forget()
+
+    def foresee(self, camera: Camera) -> bool:
+        """See `bench.lookahead.Foreseeing`. On a GPU the next frame would need a stream of its own,
+        which it has not: it is not begun before."""
+        if on_cpu := self.setup.device.type == "cpu":
+            self.lookahead.foresee(camera)
+        return on_cpu
 
     def render(self, camera: Camera, probe: Probe) -> Frame:
         """The next frame of the sequence."""
-        return self.pipeline.render(camera, self.buffer, probe)
+        return self.lookahead.render(self.pipeline, camera, self.buffer, probe)
 
     def sizes(self) -> dict[str, int]:
         """Bytes of table, networks, occupancy bits and 2D renderer."""

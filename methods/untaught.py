@@ -9,7 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 from bench.types import Budget, Log, Scene
-from methods.pipeline import Pipeline, PipelineOptions
+from methods.pipeline import Pipeline
+from methods.pipeline_options import PipelineOptions
 from methods.steernerf import SteerNerf
 
 

@@ -116,6 +116,8 @@ def _time(rows: pd.DataFrame, suffix: str) -> Table:
         (f"frame, {quantile}", number(value[f"frame_ms.{quantile}"], 2), "")
         for quantile in ("p50", "p95", "p99")
     ]
+    if "latency_ms" in value:
+        lines.append(("latency", number(value["latency_ms"], 2), ""))
     lines.append(("FPS", number(value["fps"], 2), ""))
     return Table(f"Time of a frame{suffix}", ("stage", "mean ms", "share"), tuple(lines))
 

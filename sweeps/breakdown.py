@@ -27,7 +27,12 @@ from sweeps.variants import (
 
 Row = dict[str, Any]
 
-DENSE, UNET, NGP = ", nothing skipped", ", the paper's", "Instant-NGP"
+AHEAD, DENSE, UNET, NGP = (
+    ", next camera known",
+    ", nothing skipped",
+    ", the paper's",
+    "Instant-NGP",
+)
 """How the names of the other variants of an engine at a precision end; the last is whole."""
 
 SETTINGS = ("method=steernerf", "trajectory=smooth", "engine=openvino")
@@ -47,12 +52,13 @@ PART_OF = {
     "renderer2d/network": "network",
     "refinement": "refinement",
     "finish": "finish",
+    "lookahead": "lookahead",
 }
 """The part that a stage is, with all within it that is no part of its own."""
 
 PARTS = (*dict.fromkeys(PART_OF.values()), OTHER)
 
-COLUMNS = ("", *PARTS, "frame ↓", "of rounds", "p99 / p50 ↓", "FPS ↑", "PSNR, dB ↑")
+COLUMNS = ("", *PARTS, "frame ↓", "of rounds", "latency ↓", "p99 / p50 ↓", "FPS ↑", "PSNR, dB ↑")
 
 COMPARED = (
     "",
@@ -75,6 +81,7 @@ def main(options: argparse.Namespace) -> int:
     shared = of_stage_1(overrides)
     variants = {
         **settings_of(overrides, usual),
+        **settings_of([*overrides, "protocol.lookahead=true"], _called(usual, AHEAD)),
         **settings_of([*overrides, *NOTHING_SKIPPED], _called(usual, DENSE)),
         **settings_of([*shared, *PAPER], _called(usual, UNET)),
         NGP: [*shared, "method=ngp"],
@@ -126,6 +133,7 @@ def _row(one: Rendered) -> Row:
         "frame_ms": one.values["ms"],
         "ms_lo": one.values["ms_lo"],
         "ms_hi": one.values["ms_hi"],
+        "latency_ms": one.values["latency_ms"],
         "p99_to_p50": one.values["p99_to_p50"],
         "psnr": None if one.name.endswith(UNET) else one.values["psnr"],
     }
@@ -137,6 +145,7 @@ def _line(row: Row) -> tuple[str, ...]:
         *(number(row[part], 1) for part in PARTS),
         number(row["frame_ms"], 1),
         range_text(row),
+        number(row["latency_ms"], 1),
         number(row["p99_to_p50"], 2),
         number(1e3 / row["frame_ms"], 2),
         number(row["psnr"], 2),

@@ -67,7 +67,7 @@ def render_variants(
 
     Args:
         variants: by name the settings of each, as of `steerbench run`. Scene, trajectory and
-            protocol are those of the first.
+            protocol, but for its lookahead, are those of the first.
 
     Raises:
         SteerbenchError: a setting is wrong, the first variant cannot be used here, or there is no
@@ -80,7 +80,8 @@ def render_variants(
     scene, path, protocol = common_ground(first, frames, log)
     with turn(settings.device, log):
         methods = fit_each(configs, scene, path, log)
-        rows = render_in_turns(methods, scene, path, protocol, repeats, log)
+        told = [name for name in methods if configs[name].protocol.lookahead]
+        rows = render_in_turns(methods, scene, path, protocol, repeats, log, told)
     return [Rendered(row["setting"], methods[row["setting"]], scene, path, row) for row in rows]
 
 

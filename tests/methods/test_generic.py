@@ -17,7 +17,7 @@ from methods.generic import AnyOf, train_generic
 from methods.joint import JointOptions
 from methods.kernels.encode import HashGrid
 from methods.patches import Batch
-from methods.pipeline import PipelineOptions
+from methods.pipeline_options import PipelineOptions
 from methods.pretrained import Setup
 from methods.sequences import MotionOptions
 from methods.space_to_depth import SpaceToDepth

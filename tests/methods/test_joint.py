@@ -18,7 +18,8 @@ from methods.joint import LEAST_ERROR, JointOptions, JointTraining, RendererTrai
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy
 from methods.patches import Batch, PatchSource, Through
-from methods.pipeline import Pipeline, PipelineOptions
+from methods.pipeline import Pipeline
+from methods.pipeline_options import PipelineOptions
 from methods.range_reduction import RangeReduction
 from methods.renderer2d import Points, Renderer2d
 from methods.sequences import MotionOptions, SequencePool, true_views

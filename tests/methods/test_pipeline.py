@@ -16,7 +16,8 @@ from methods.buffer import Cloud, RenderingBuffer
 from methods.cells import cells_near, pixels_of
 from methods.kernels.warp import enlarge
 from methods.occupancy import STEP
-from methods.pipeline import LAYER, SIZES, Pipeline, PipelineOptions, Skips
+from methods.pipeline import LAYER, Pipeline
+from methods.pipeline_options import SIZES, PipelineOptions, Skips
 from methods.range_reduction import RangeReduction, render_guided
 from methods.space_to_depth import SpaceToDepth
 from methods.unet_release import UnetRelease

@@ -13,7 +13,7 @@ from bench.types import Budget, NullProbe, Scene
 from methods.engines.torch_engine import TorchEngine
 from methods.joint import JointOptions
 from methods.kernels.encode import HashGrid
-from methods.pipeline import PipelineOptions
+from methods.pipeline_options import PipelineOptions
 from methods.sequences import MotionOptions
 from methods.space_to_depth import SpaceToDepth
 from methods.steernerf import SteerNerf

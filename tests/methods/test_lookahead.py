@@ -1,0 +1,161 @@
+"""A glance at the next frame beside this one: the same pictures and work, at the same time."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from bench.probes import StageClock
+from bench.types import Camera, NullProbe
+from methods.buffer import RenderingBuffer
+from methods.lookahead import Lookahead
+from methods.pipeline import Pipeline
+from methods.pipeline_options import PipelineOptions
+from methods.range_reduction import RangeReduction
+from methods.refresh import Refresh
+from tests.methods.conftest import Work, look_at_the_middle
+from tests.methods.test_pipeline import OPTIONS, new_pipeline
+
+PATH = [look_at_the_middle(0.1 + 0.004 * i, 0.3) for i in range(4)]
+PATH += [look_at_the_middle(0.6, -0.3), *PATH[:2]]  # there, and back at once
+PATIENCE = 60.0
+"""Seconds after which one that waits for another gives up."""
+
+
+def rendered(
+    pipeline: Pipeline, path: Sequence[Camera], upcoming: Sequence[Camera | None]
+) -> tuple[list[Tensor], Work]:
+    """The pictures of `path`, told before each of those in `upcoming`, and all the work."""
+    lookahead, buffer, work = Lookahead(), RenderingBuffer(pipeline.options.frames), Work()
+    pictures = []
+    for camera, following in zip(path, upcoming, strict=True):
+        if following is not None:
+            lookahead.foresee(following)
+        pictures.append(lookahead.render(pipeline, camera, buffer, work).rgb)
+    return pictures, work
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        OPTIONS,
+        replace(OPTIONS, frames=0),
+        replace(OPTIONS, jitter=True, overlap=0.5, refined=0.2),
+        replace(OPTIONS, range=RangeReduction("window"), refresh=Refresh(age=2, tolerance=1.0)),
+    ],
+)
+def test_what_is_foreseen_has_the_same_pictures_and_takes_the_same_work(
+    options: PipelineOptions,
+) -> None:
+    pipeline = new_pipeline(options)
+    buffer, alone = RenderingBuffer(options.frames), Work()
+    want = [pipeline.render(camera, buffer, alone).rgb for camera in PATH]
+    got, work = rendered(pipeline, PATH, [*PATH[1:], None])
+    assert all(torch.equal(a, b) for a, b in zip(got, want, strict=True))
+    assert work.done == alone.done
+
+
+def test_what_was_foreseen_and_does_not_come_does_not_matter() -> None:
+    pipeline = new_pipeline()
+    want, _ = rendered(pipeline, PATH, [None] * len(PATH))
+    got, _ = rendered(pipeline, PATH, PATH)  # each frame stands still, they said
+    assert all(torch.equal(a, b) for a, b in zip(got, want, strict=True))
+
+
+def test_a_new_sequence_knows_nothing_of_the_last_one() -> None:
+    pipeline, lookahead, buffer = new_pipeline(), Lookahead(), RenderingBuffer(2)
+    first = lookahead.render(pipeline, PATH[1], buffer, NullProbe()).rgb
+    lookahead.foresee(PATH[1])
+    lookahead.render(pipeline, PATH[0], buffer, NullProbe())
+    lookahead.foresee(PATH[2])
+    buffer.reset()
+    lookahead.forget()
+    assert torch.equal(lookahead.render(pipeline, PATH[1], buffer, NullProbe()).rgb, first)
+    assert lookahead._prospect is None
+
+
+class Watched(Pipeline):
+    """Runs `in_glance` and `in_draw` before a glance, but the first one, and before a drawing."""
+
+    in_glance = in_draw = staticmethod(lambda: None)
+    glances = 0
+
+    def glance(self, *arguments: Any) -> Any:
+        self.glances += 1
+        if self.glances > 1:
+            self.in_glance()
+        return super().glance(*arguments)
+
+    def draw(self, *arguments: Any) -> Any:
+        self.in_draw()
+        return super().draw(*arguments)
+
+
+@pytest.fixture
+def watched() -> Watched:
+    pipeline = new_pipeline()
+    pipeline.__class__ = Watched
+    assert isinstance(pipeline, Watched)
+    return pipeline
+
+
+def test_the_next_frame_is_glanced_at_while_this_one_is_drawn(watched: Watched) -> None:
+    meeting = threading.Barrier(2)
+    watched.in_glance = watched.in_draw = lambda: meeting.wait(PATIENCE)
+    lookahead = Lookahead()
+    lookahead.foresee(PATH[1])
+    lookahead.render(watched, PATH[0], RenderingBuffer(2), NullProbe())
+    assert watched.glances == 2
+
+
+@pytest.mark.parametrize(("threads", "halves"), [(1, (1, 1)), (2, (1, 1)), (3, (2, 1))])
+def test_both_have_half_of_the_threads_and_later_all_are_back(
+    watched: Watched, threads: int, halves: tuple[int, int]
+) -> None:
+    seen: dict[str, int] = {}
+    watched.in_draw = lambda: seen.update(draw=torch.get_num_threads())
+    watched.in_glance = lambda: seen.update(glance=torch.get_num_threads())
+    lookahead, before = Lookahead(), torch.get_num_threads()
+    lookahead.foresee(PATH[1])
+    try:
+        torch.set_num_threads(threads)
+        lookahead.render(watched, PATH[0], RenderingBuffer(2), NullProbe())
+        assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    assert (seen["draw"], seen["glance"]) == halves
+
+
+@pytest.mark.parametrize("part", ["in_glance", "in_draw"])
+def test_what_goes_wrong_in_either_part_is_told_when_both_have_ended(
+    watched: Watched, part: str
+) -> None:
+    def fail() -> None:
+        raise ArithmeticError(part)
+
+    setattr(watched, part, fail)
+    lookahead, threads = Lookahead(), torch.get_num_threads()
+    lookahead.foresee(PATH[1])
+    with pytest.raises(ArithmeticError, match=part):
+        lookahead.render(watched, PATH[0], RenderingBuffer(2), NullProbe())
+    assert watched.glances == 2
+    assert torch.get_num_threads() == threads
+
+
+def test_the_wait_for_the_glance_is_a_stage_and_there_is_none_without() -> None:
+    pipeline, lookahead, buffer = new_pipeline(), Lookahead(), RenderingBuffer(2)
+    clock = StageClock("cpu")
+    for camera, following in ((PATH[0], PATH[1]), (PATH[1], None)):
+        if following is not None:
+            lookahead.foresee(following)
+        with clock.frame():
+            lookahead.render(pipeline, camera, buffer, clock)
+    told, foreseen = (frame.stages_ns for frame in clock.frames)
+    assert "lookahead" in told
+    assert not {"lookahead", "field", "depth_reprojection"} & set(foreseen)
