@@ -18,6 +18,7 @@ from bench.cameras import frame_camera
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from bench.frontier import observed_order
+from bench.lookahead import announce_next
 from bench.probes import FrameRecord, MemoryMeter, StageClock, p99_to_p50
 from bench.results import explained
 from bench.types import Camera, Log, Method, Scene
@@ -36,7 +37,16 @@ TORCH = "methods.engines.torch_engine.TorchEngine"
 
 SIZES = ((200, 200), (400, 400), (800, 800), (1920, 1080), (3840, 2160))
 
-COLUMNS = ("", "ms / frame ↓", "p99 / p50 ↓", "FPS ↑", "field samples", "peak, MB ↓", "model, MB ↓")
+COLUMNS = (
+    "",
+    "ms / frame ↓",
+    "latency, ms ↓",
+    "p99 / p50 ↓",
+    "FPS ↑",
+    "field samples",
+    "peak, MB ↓",
+    "model, MB ↓",
+)
 
 
 @dataclass(frozen=True)
@@ -129,7 +139,7 @@ def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) 
     usual = torch.get_num_threads()
     torch.set_num_threads(point.threads or usual)  # trained with all of them, all the same
     try:
-        records, peak_bytes = _render(method, cameras, log)
+        records, peak_bytes = _render(method, cameras, config.protocol.lookahead, log)
     finally:
         torch.set_num_threads(usual)
     samples = [record.done["samples"] + record.done.get("surface_samples", 0) for record in records]
@@ -139,6 +149,7 @@ def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) 
         "value": point.value,
         "frames": len(records),
         "frame_ms": statistics.mean(record.total_ns for record in records) / 1e6,
+        "latency_ms": statistics.mean(record.latency_ns for record in records) / 1e6,
         "p99_to_p50": p99_to_p50(records),
         "samples": statistics.mean(samples),
         "peak_bytes": peak_bytes,
@@ -148,17 +159,18 @@ def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) 
 
 @torch.no_grad()
 def _render(
-    method: Method, cameras: Sequence[Camera], log: Log
+    method: Method, cameras: Sequence[Camera], lookahead: bool, log: Log
 ) -> tuple[Sequence[FrameRecord], int]:
     """The steady frames of a sequence through `cameras`, the second time round, and the peak of
-    memory in them."""
+    memory in them; with `lookahead` the camera of the next frame is known."""
     device = method.settings()["device"]
     clock, meter = StageClock(device), MemoryMeter(device)
     with log.progress("rendering", 2 * len(cameras)) as progress:
         for _ in range(2):
             method.reset()
-            for camera in cameras:
-                with meter, clock.frame():
+            for index, camera in enumerate(cameras):
+                next_known = lookahead and announce_next(method, cameras, index)
+                with meter, clock.frame(next_known):
                     method.render(camera, clock)
                 progress.advance()
     return clock.frames[len(cameras) + method.memory :], meter.peak_bytes
@@ -170,6 +182,7 @@ def _lines(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
         (
             row["label"],
             number(row["frame_ms"], 1),
+            number(row["latency_ms"], 1),
             number(row["p99_to_p50"], 2),
             number(1e3 / row["frame_ms"], 2),
             number(row["samples"], 0),
@@ -180,7 +193,7 @@ def _lines(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
     ]
     exponents = [growth(rows, name) for name in ("frame_ms", "samples", "peak_bytes", "size_bytes")]
     ms, samples, peak, size = (number(exponent, 2) for exponent in exponents)
-    return [*lines, (f"exponent of {rows[0]['axis']}", ms, "", "", samples, peak, size)]
+    return [*lines, (f"exponent of {rows[0]['axis']}", ms, "", "", "", samples, peak, size)]
 
 
 def _plot(axes: Mapping[str, Sequence[dict[str, Any]]], path: Path) -> None:
