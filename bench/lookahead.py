@@ -19,9 +19,12 @@ class Foreseeing(Protocol):
 
 def announce_next(method: Method, cameras: Sequence[Camera], index: int) -> bool:
     """Tell `method` of the camera after that of the `index`-th frame, which it is about to render;
-    whether there is one and the method has a use for it."""
-    return (
-        index + 1 < len(cameras)
-        and isinstance(method, Foreseeing)
-        and method.foresee(cameras[index + 1])
-    )
+    whether there is one and the method has a use for it.
+
+    After the last frame it is told of that camera once more. What it begins is thrown away, but so
+    each of any number of frames in a row is charged with what was begun beside it, and as many are
+    begun beside them as they are.
+    """
+    following = min(index + 1, len(cameras) - 1)
+    useful = isinstance(method, Foreseeing) and method.foresee(cameras[following])
+    return useful and following > index

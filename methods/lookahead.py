@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -16,19 +16,26 @@ from methods.pipeline import Glance, Pipeline
 
 @dataclass(frozen=True)
 class Prospect:
-    """A `glance` at a frame that is not asked for yet, from `camera`, and the work it took."""
+    """What is computed ahead of a frame that nobody has asked for yet.
+
+    Attributes:
+        camera: of the frame.
+        glance: at it, once it has ended.
+        work: that it takes.
+    """
 
     camera: Camera
-    glance: Glance
+    glance: Future[Glance]
     work: Ledger
 
 
 class Lookahead:
     """Renders the frames of a sequence, of each its glance beside the rest of the one before it.
 
-    While both are at work each has half of the CPU's threads. A stage seldom takes half the time on
-    twice as many, for they wait for each other at the end of each of its loops; so two frames at a
-    time take less than two frames one after the other.
+    While both are at work each has half of torch's threads, of which there must be two. A stage
+    seldom takes half the time on twice as many, for they wait for each other at the end of each of
+    its loops; so two frames at a time take less than two frames one after the other. The threads of
+    another engine's network are its own: it keeps them all.
     """
 
     def __init__(self) -> None:
@@ -49,8 +56,8 @@ class Lookahead:
     ) -> Frame:
         """The frame of `Pipeline.render`, and a glance at the one that was foreseen, if any.
 
-        The glance has ended when this returns, the time that it is waited for is the stage
-        `lookahead`, and its work is counted with the frame that it is of.
+        The glance has ended when this returns. The time that it is waited for is the stage
+        `lookahead`; its work, and what may go wrong in it, is that of the frame that it is of.
         """
         glance = self._found(camera, probe)
         if glance is None:
@@ -59,16 +66,16 @@ class Lookahead:
         if upcoming is None:
             return pipeline.draw(camera, glance, buffer, probe)
         clouds = (glance.cloud, *buffer.clouds)[: pipeline.options.frames]
+        work = Ledger()
         with _half_of_the_threads() as others:
-            ahead = self._thread.submit(
-                _prospect, pipeline, upcoming, clouds, buffer.turn + 1, others
-            )
+            arguments = pipeline, upcoming, clouds, buffer.turn + 1, work, others
+            ahead = self._thread.submit(_glance, *arguments)
             try:
                 frame = pipeline.draw(camera, glance, buffer, probe)
             finally:
                 with probe.stage("lookahead"):
                     wait([ahead])
-        self._prospect = ahead.result()
+        self._prospect = Prospect(upcoming, ahead, work)
         return frame
 
     def _found(self, camera: Camera, probe: Probe) -> Glance | None:
@@ -77,7 +84,7 @@ class Lookahead:
         if prospect is None or prospect.camera is not camera:
             return None
         prospect.work.tell(probe)
-        return prospect.glance
+        return prospect.glance.result()
 
 
 class Ledger(NullProbe):
@@ -96,20 +103,24 @@ class Ledger(NullProbe):
             probe.count(*count)
 
 
-def _prospect(
-    pipeline: Pipeline, camera: Camera, clouds: Sequence[Cloud], turn: int, threads: int
-) -> Prospect:
+def _glance(
+    pipeline: Pipeline,
+    camera: Camera,
+    clouds: Sequence[Cloud],
+    turn: int,
+    probe: Probe,
+    threads: int,
+) -> Glance:
     torch.set_num_threads(threads)  # of this thread
-    work = Ledger()
-    return Prospect(camera, pipeline.glance(camera, clouds, turn, work), work)
+    return pipeline.glance(camera, clouds, turn, probe)
 
 
 @contextmanager
 def _half_of_the_threads() -> Iterator[int]:
-    """Leave as many threads as are yielded to another thread, but keep one."""
+    """Leave as many of two threads or more as are yielded to another one."""
     threads = torch.get_num_threads()
-    others = max(threads // 2, 1)
-    torch.set_num_threads(max(threads - others, 1))
+    others = threads // 2
+    torch.set_num_threads(threads - others)
     try:
         yield others
     finally:

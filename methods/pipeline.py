@@ -94,7 +94,7 @@ class Pipeline:
         has all to do with their `clouds`, newest first."""
         options, view = self.options, self.view(camera, turn)
         used = self.shared(clouds, view, probe)
-        features, ages = self._features(view, clouds[used[0]] if used else None, probe)
+        features, ages = self._features(view, clouds, used, probe)
         with probe.stage("feature_reprojection"):
             preceding = [self.reproject(clouds[number], view) for number in used]
         with probe.stage("finish"):
@@ -223,18 +223,18 @@ class Pipeline:
         return colours.view(*pixels.shape[:2], 3)
 
     def _features(
-        self, view: View, newest: Cloud | None, probe: Probe
+        self, view: View, clouds: Sequence[Cloud], used: Sequence[int], probe: Probe
     ) -> tuple[FeatureFrame, Tensor | None]:
-        """The field at low resolution, looked at where the newest preceding frame says and what it
-        shows does not suffice; and the ages of the pixels."""
-        options, found, known = self.options, None, None
+        """The field at low resolution, looked at where the newest of the `used` frames says and
+        what the frame just before shows does not suffice; and the ages of the pixels."""
+        options, found, known, ages = self.options, None, None, None
         how = options.reprojection, self.backend
-        if newest is not None:
+        if used and options.range.mode != "off":
             with probe.stage("depth_reprojection"):
-                if options.range.mode != "off":
-                    found = evidence(newest, view.low, options.range, *how)
-                if options.refresh.age:
-                    known = known_pixels(newest, view.low, options.refresh, *how)
+                found = evidence(clouds[used[0]], view.low, options.range, *how)
+        if 0 in used and options.refresh.age:
+            with probe.stage("depth_reprojection"):
+                known = known_pixels(clouds[0], view.low, options.refresh, *how)
         with probe.stage("field"):
             features = render_guided(
                 self.low_field,
@@ -247,11 +247,12 @@ class Pipeline:
                 step=options.steps * STEP,
                 known=None if known is None else known.pixels,
             )
-        if known is not None:
-            probe.count("known_pixels", len(known.pixels), features.alpha.numel())
-            return known.put(features), known.ages(view.low)
-        ages = first_ages(view.low, options.refresh, self.background.device)
-        return features, ages if options.refresh.age else None
+            if known is not None:
+                probe.count("known_pixels", len(known.pixels), features.alpha.numel())
+                features, ages = known.put(features), known.ages(view.low)
+            elif options.refresh.age:
+                ages = first_ages(view.low, options.refresh, self.background.device)
+        return features, ages
 
 
 @dataclass(frozen=True)

@@ -97,8 +97,8 @@ class PipelineOptions:
             )
         if self.refresh.age and (not self.frames or self.reprojection != Reprojection()):
             raise ValueError(
-                "refresh.age: expected 0 without preceding frames (L = 0) or with an inexact "
-                f"reprojection, got {self.refresh.age}"
+                "refresh.age: expected 0 without preceding frames (L = 0) or where reprojection is "
+                f"not nearest, exact and expected, got {self.refresh.age}"
             )
 
     def check(self, grid: HashGrid, renderer: Renderer2d) -> None:

@@ -1,4 +1,4 @@
-"""Adaptive refresh: low-resolution rays that are not rendered anew where the newest frame knows."""
+"""Adaptive refresh: low-resolution rays that are not rendered anew where the frame before knows."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from methods.volume import FeatureFrame
 OPAQUE = 0.95
 """Least opacity of the pixels around: behind a fainter one something else moves."""
 
-EDGE = 0.06
+DEPTH_EDGE = 0.06
 """Depths of a neighbourhood, in scene units, that differ by more than this are those of an edge."""
 
-MOST = 0.7
+LANDED = 0.7
 """Share of a neighbourhood on which points must land. On a pixel here and there of a surface none
 does; of the neighbourhood of a pixel at its outline a third is empty."""
 
-NEIGHBOUR = 0.01
+DEPTH_TOLERANCE = 0.01
 """Depths around, in scene units, may differ by this much more from the nearest one."""
 
 BLOCK = 8
 """Side, in pixels, of the blocks that grow old together after a cold start: were it the whole
 picture, every frame would take another time."""
 
-MOST_AGE = 255
+OLDEST = 255
 """Ages are kept in a byte."""
 
 
 @dataclass(frozen=True)
 class Refresh:
-    """When a pixel of the low-resolution frame is taken over from the newest preceding one.
+    """When a pixel of the low-resolution frame is taken over from the one just before it.
 
     Attributes:
         age: frames in a row that it may be; 0: every ray is rendered in every frame.
@@ -49,15 +49,15 @@ class Refresh:
     tolerance: float = 0.01
 
     def __post_init__(self) -> None:
-        if not 0 <= self.age <= MOST_AGE:
-            raise ValueError(f"refresh.age: expected 0 to {MOST_AGE} frames, got {self.age}")
+        if not 0 <= self.age <= OLDEST:
+            raise ValueError(f"refresh.age: expected 0 to {OLDEST} frames, got {self.age}")
         if not 0 <= self.tolerance <= 1:
             raise ValueError(f"refresh.tolerance: expected 0 to 1, got {self.tolerance}")
 
 
 @dataclass(frozen=True)
 class Known:
-    """Pixels of a view that the newest preceding frame shows.
+    """Pixels of a view that the frame before shows.
 
     Attributes:
         pixels: [P] indices, row by row.
@@ -96,8 +96,8 @@ def known_pixels(
 
     Where a point of `cloud` lands and no depth edge is near, its frame is looked at where it shows
     the middle of the pixel. The four samples around that place are interpolated if they are opaque,
-    young enough, and the nearest of them says the same. A standing camera meets the samples
-    themselves: it loses nothing.
+    young enough, and the nearest of them says the same. A camera that stands still, without jitter,
+    meets the samples themselves: it loses nothing.
     """
     index, z = cloud.land(camera, reprojection, backend)
     pixels = inside_surface(landed(z, index, torch.inf)).flatten().nonzero().squeeze(1)
@@ -115,7 +115,7 @@ def known_pixels(
         for samples in (cloud.values, z, cloud.alpha)
     )
     same = ((values - cloud.values[nearest]).abs() <= options.tolerance).all(dim=1)
-    same &= (depth - z[nearest]).abs() <= NEIGHBOUR
+    same &= (depth - z[nearest]).abs() <= DEPTH_TOLERANCE
     age = cloud.age[around].amax(dim=1) + 1
     return Known(pixels[same], values[same], depth[same], alpha[same], age[same])
 
@@ -127,7 +127,7 @@ def inside_surface(depth: Tensor) -> Tensor:
     around = functional.avg_pool2d(finite[None].float(), 3, 1, 1, count_include_pad=False)[0]
     near = -highest_around(-depth)
     far = highest_around(torch.where(finite, depth, -torch.inf))
-    return finite & (around > MOST) & (far - near <= EDGE)
+    return finite & (around > LANDED) & (far - near <= DEPTH_EDGE)
 
 
 def _samples_around(cloud: Cloud, places: Tensor) -> tuple[Tensor, Tensor]:

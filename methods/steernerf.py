@@ -21,7 +21,7 @@ from methods.engines import Engine
 from methods.fields import Precision
 from methods.generic import train_generic
 from methods.joint import JointOptions, JointTraining, RendererTraining
-from methods.kernels import sources
+from methods.kernels import serves_many_threads, sources
 from methods.kernels.encode import HashGrid
 from methods.lookahead import Lookahead
 from methods.patches import PatchSource
@@ -151,11 +151,13 @@ class SteerNerf:
         self.lookahead.forget()
 
     def foresee(self, camera: Camera) -> bool:
-        """See `bench.lookahead.Foreseeing`. On a GPU the next frame would need a stream of its own,
-        which it has not: it is not begun before."""
-        if on_cpu := self.setup.device.type == "cpu":
+        """See `bench.lookahead.Foreseeing`: of use with two threads of a CPU or more. On a GPU the
+        next frame would need a stream of its own, which it has not."""
+        device = self.setup.device
+        shared = torch.get_num_threads() > 1 and serves_many_threads(self.setup.backend, device)
+        if useful := device.type == "cpu" and shared:
             self.lookahead.foresee(camera)
-        return on_cpu
+        return useful
 
     def render(self, camera: Camera, probe: Probe) -> Frame:
         """The next frame of the sequence."""

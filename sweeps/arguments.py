@@ -94,9 +94,10 @@ def _skips(skips: Parser) -> None:
 def _breakdown(breakdown: Parser) -> None:
     breakdown.description = VARIANTS + (
         "at every precision of an engine, with and without skipping, and where the camera of the "
-        "next frame is known, and tell the time of a frame by its parts; beside Instant-NGP, which renders the field of stage 1 at full resolution, "
-        "and the paper's pipeline, whose U-Net is trained for its time alone. Where nothing is "
-        "skipped, refinement takes its share of all cells: method.pipeline.refined=0 leaves it out."
+        "next frame is known, and tell the time of a frame by its parts; beside Instant-NGP, which "
+        "renders the field of stage 1 at full resolution, and the paper's pipeline, whose U-Net is "
+        "trained for its time alone. Where nothing is skipped, refinement takes its share of all "
+        "cells: method.pipeline.refined=0 leaves it out."
     )
     _rounds(breakdown, 10)
     _overrides(breakdown, " (default engine=openvino)")

@@ -73,7 +73,7 @@ COMPARED = (
 
 def main(options: argparse.Namespace) -> int:
     """Print two tables and, as the last line, the rows of the first as JSON."""
-    overrides = [*SETTINGS, *options.overrides]
+    overrides = [*SETTINGS, *options.overrides, "protocol.lookahead=false"]
     config = composed(overrides)
     require_lean(config, "steerbench breakdown switches off what a network on cells can skip")
     choice = composed(overrides, return_hydra_config=True).hydra.runtime.choices.engine

@@ -16,6 +16,7 @@ from sweeps.variants import (
     finite,
     range_text,
     render_variants,
+    reprojects_exactly,
     require_lean,
     settings_of,
 )
@@ -44,8 +45,9 @@ COLUMNS = (
 def main(options: argparse.Namespace) -> int:
     """Print a table and, as the last line, the same rows as JSON."""
     overrides = [*SETTINGS, *options.overrides]
-    require_lean(composed(overrides), "steerbench skips counts the work of a network on cells")
-    variants = settings_of(overrides, _variants())
+    config = composed(overrides)
+    require_lean(config, "steerbench skips counts the work of a network on cells")
+    variants = settings_of(overrides, _variants(reprojects_exactly(config)))
     found = render_variants(variants, options.frames, options.repeats)
     rows = [_row(one, found[0]) for one in found]
     title = f"{found[0].method.name}, {found[0].frames} frames: mean work of a frame, and its share"
@@ -55,8 +57,9 @@ def main(options: argparse.Namespace) -> int:
     return 0
 
 
-def _variants() -> list[Variant]:
+def _variants(refresh: bool) -> list[Variant]:
     """Nothing skipped, each alone, all of them, and on top what the preceding frame knows."""
+    taken_over = Variant("and rays taken over", ("method.pipeline.refresh.age=3",))
     off = dict(zip(SWITCHES, NOTHING_SKIPPED, strict=True))
     alone = [
         Variant(name, tuple(line for other, line in off.items() if other != name)) for name in off
@@ -66,7 +69,7 @@ def _variants() -> list[Variant]:
         *alone,
         Variant("all of these"),
         Variant("and a window of depths", ("method.pipeline.range.mode=window",)),
-        Variant("and rays taken over", ("method.pipeline.refresh.age=3",)),
+        *([taken_over] if refresh else []),
     ]
 
 

@@ -138,6 +138,12 @@ def require_lean(config: DictConfig, purpose: str) -> None:
         )
 
 
+def reprojects_exactly(config: DictConfig) -> bool:
+    """Whether frames are reprojected as `method=steernerf` does it, which the refresh needs."""
+    exact = composed(["method=steernerf"]).method.pipeline.reprojection
+    return bool(config.method.pipeline.reprojection == exact)
+
+
 def common_ground(
     config: DictConfig, frames: int, log: Log
 ) -> tuple[Scene, Trajectory, EvaluationProtocol]:

@@ -6,6 +6,20 @@ version (any dtype, any device, differentiable: the oracle of all others), `cpu`
 All backends of a kernel have the same signature.
 """
 
-from methods.kernels.dispatch import BACKENDS, availability, multiplies_bf16, resolve, sources
+from methods.kernels.dispatch import (
+    BACKENDS,
+    availability,
+    multiplies_bf16,
+    resolve,
+    serves_many_threads,
+    sources,
+)
 
-__all__ = ["BACKENDS", "availability", "multiplies_bf16", "resolve", "sources"]
+__all__ = [
+    "BACKENDS",
+    "availability",
+    "multiplies_bf16",
+    "resolve",
+    "serves_many_threads",
+    "sources",
+]

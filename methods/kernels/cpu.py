@@ -23,6 +23,13 @@ def follow_torch_threads() -> None:
         torch.set_num_threads(threads)
 
 
+def serves_many_threads() -> bool:
+    """Whether several threads may call kernels at once. Without OpenMP and TBB numba has threads of
+    its own (`workqueue`), and ends the process that does so."""
+    numba.get_num_threads()  # starts them, if none are yet
+    return numba.threading_layer() != "workqueue"
+
+
 @njit(cache=True)
 def pack_bf16(low, high):
     """Two float32 rounded to nearest even bfloat16, in the low and high half of a word."""

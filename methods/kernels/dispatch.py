@@ -99,6 +99,13 @@ def implementation(kernel: str, backend: str, device: torch.device) -> ModuleTyp
     return _load(f"methods.kernels.{kernel}.{name}")
 
 
+def serves_many_threads(backend: str, device: torch.device) -> bool:
+    """Whether several threads may call kernels of `backend` at once."""
+    if resolve(backend, device) != "cpu":
+        return True
+    return bool(_load("methods.kernels.cpu").serves_many_threads())
+
+
 def has(kernel: str, backend: str) -> bool:
     """Whether `backend` has an implementation of its own of `kernel`."""
     return (Path(__file__).parent / kernel / f"{backend}.py").exists()

@@ -164,7 +164,7 @@ def test_where_every_cell_is_refined_the_picture_is_that_of_the_field(mode: Mode
         None,
         step=options.refined_steps * STEP,
     )
-    drawn = cells_near(pipeline._features(View.of(CAMERA, 4), None, NullProbe())[0].alpha > 0)
+    drawn = cells_near(pipeline.glance(CAMERA, (), 0, NullProbe()).features.alpha > 0)
     assert 10 < len(drawn) < 64
     want = pixels_of(field.values[..., :3], drawn, 4)
     assert want.std() > 0.01
@@ -180,7 +180,7 @@ def test_the_cells_in_most_doubt_are_refined() -> None:
     refined.renderer = shaken(drawn.renderer)
     pictures = [p.render(CAMERA, RenderingBuffer(2), NullProbe()).rgb for p in (drawn, refined)]
     view = View.of(CAMERA, 4)
-    frame = drawn._features(view, None, NullProbe())[0]
+    frame = drawn.glance(CAMERA, (), 0, NullProbe()).features
     observation = drawn.observe(frame, [], None, view, NullProbe())
     doubt = drawn.renderer([observation]).doubt
     assert doubt is not None

@@ -15,7 +15,7 @@ from methods.kernels.march import Occupancy
 from methods.range_reduction import RangeReduction
 from methods.refresh import (
     BLOCK,
-    NEIGHBOUR,
+    DEPTH_TOLERANCE,
     OPAQUE,
     Known,
     Refresh,
@@ -94,7 +94,7 @@ def test_taken_over_pixels_differ_from_the_nearest_sample_by_the_tolerance_at_mo
 
 
 def test_depths_that_differ_more_than_neighbours_may_are_not_interpolated() -> None:
-    step, camera = 3 * NEIGHBOUR, facing_a_wall()  # less than an edge
+    step, camera = 3 * DEPTH_TOLERANCE, facing_a_wall()  # less than an edge
     depth = torch.full((SIZE, SIZE), DISTANCE)
     depth[:, SIZE // 2 :] += step
     frame = replace(at_the_wall(shading(0.0)), depth=depth)
@@ -180,6 +180,23 @@ def test_a_camera_that_stands_still_comes_to_see_what_is_rendered_anew(age: int,
     # Interpolated once, and by weights some ulps of 16 pixels off 0 and 1 of features in [0, 1].
     assert max(apart[1:4]) > 1e-3
     assert max(apart[-options.frames :]) < age * 1e-4
+
+
+def test_a_frame_that_was_left_out_between_is_not_skipped_over() -> None:
+    """After a glance to the other side, what lies before it is two frames old."""
+    options = replace(OPTIONS, steps=1, overlap=0.5, refresh=Refresh(age=3, tolerance=1.0))
+    pipeline, buffer = new_pipeline(options), RenderingBuffer(2)
+    pipeline.field, pipeline.occupancy = Solid(ball()), EVERYWHERE
+    here, there = (
+        replace(look_at_the_middle(turn, lift), width=128, height=128, cx=64, cy=64, fx=240, fy=240)
+        for turn, lift in ((0.1, 0.3), (0.6, -0.3))
+    )
+    known = []
+    for camera in (here, here, there, here, here):
+        work = Work()
+        pipeline.render(camera, buffer, work)
+        known.append(work.done["known_pixels"] > 0)
+    assert known == [False, True, False, False, True]
 
 
 def test_what_cannot_be_refreshed_adaptively_is_refused() -> None:
