@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import torch
 
 from bench.results import Store
 from sweeps import breakdown
@@ -219,6 +220,7 @@ def test_skips_lists_the_work_of_a_frame_with_and_without_each_switch(
     assert dense["cells"] == 16 * 16
     assert found["empty space"]["samples"] < dense["samples"]
     assert found["all of these"]["samples"] <= found["empty space"]["samples"]
+    assert found["and rays taken over"]["rays"] <= found["all of these"]["rays"]
 
 
 def test_breakdown_divides_the_frame_and_names_every_line(first: tuple[Path, str]) -> None:
@@ -229,10 +231,18 @@ def test_breakdown_divides_the_frame_and_names_every_line(first: tuple[Path, str
     assert done.returncode == 0, done.stderr
     assert "torch, fp16: " in done.stderr  # and why it cannot be had
     found = {row["line"]: row for row in json.loads(done.stdout.splitlines()[-1])}
-    endings = ("", breakdown.DENSE, breakdown.UNET)
+    endings = ("", breakdown.AHEAD, breakdown.DENSE, breakdown.UNET)
     lines = [f"torch, {precision}{ending}" for ending in endings for precision in ("fp32", "bf16")]
     assert list(found) == [*lines, "Instant-NGP"]
     for row in found.values():
         assert sum(row[part] for part in breakdown.PARTS) == pytest.approx(row["frame_ms"])
+        if not row["line"].endswith(breakdown.AHEAD):
+            assert row["latency_ms"] == pytest.approx(row["frame_ms"])
+            assert row["lookahead"] == 0
+    usual, ahead = (found["torch, fp32" + ending] for ending in ("", breakdown.AHEAD))
+    assert ahead["psnr"] == usual["psnr"]
+    if torch.get_num_threads() > 1:
+        assert ahead["latency_ms"] > ahead["frame_ms"]
+        assert ahead["lookahead"] > 0
     assert found["torch, fp32" + breakdown.UNET]["psnr"] is None  # it has hardly been trained
     assert found["Instant-NGP"]["network"] == 0

@@ -10,6 +10,7 @@ import torch
 
 from bench.console import ConsoleLog
 from bench.errors import Unavailable
+from bench.probes import StageClock
 from bench.types import Budget, NullProbe, Scene
 from methods.engines import Engine
 from methods.engines.openvino_engine import OpenVino
@@ -21,6 +22,7 @@ from methods.sequences import MotionOptions
 from methods.space_to_depth import SpaceToDepth
 from methods.steernerf import SteerNerf
 from methods.train import TrainingOptions
+from tests.methods.conftest import look_at_the_middle
 
 BUDGET = Budget("test", steps=40, samples=4096, renderer_steps=4)
 
@@ -94,6 +96,42 @@ def test_reset_forgets(ball_scene: Scene, log: ConsoleLog) -> None:
     assert torch.equal(method.render(camera, NullProbe()).rgb, cold)
     assert not torch.equal(steady, cold)
     assert method.memory == 2
+
+
+def test_a_foreseen_frame_is_begun_before_unless_a_sequence_begins(
+    ball_scene: Scene, log: ConsoleLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    method = new_method()
+    method.fit(ball_scene, BUDGET, log)
+    first, second = ball_scene.splits["test"].cameras[:2]
+    clock, threads = StageClock("cpu"), torch.get_num_threads()
+    pictures = []
+    try:
+        torch.set_num_threads(2)
+        for foreseen, reset in ((False, False), (True, False), (True, True)):
+            method.reset()
+            assert not foreseen or method.foresee(second)
+            method.render(first, NullProbe())
+            if reset:
+                method.reset()
+            with clock.frame():
+                pictures.append(method.render(second, clock).rgb)
+    finally:
+        torch.set_num_threads(threads)
+    assert ["field" in frame.stages_ns for frame in clock.frames] == [True, False, True]
+    assert torch.equal(pictures[0], pictures[1])
+    assert not torch.equal(pictures[0], pictures[2])  # which no frame precedes
+
+
+@pytest.mark.parametrize(("threads", "safe"), [(1, True), (2, False)])
+def test_where_two_threads_cannot_be_at_work_nothing_is_begun_before(
+    monkeypatch: pytest.MonkeyPatch, threads: int, safe: bool
+) -> None:
+    monkeypatch.setattr("torch.get_num_threads", lambda: threads)
+    monkeypatch.setattr("methods.steernerf.serves_many_threads", lambda backend, device: safe)
+    method = new_method()
+    assert not method.foresee(look_at_the_middle(0.1, 0.3))
+    assert method.lookahead._upcoming is None
 
 
 def test_sizes_are_those_of_all_that_a_frame_needs(ball_scene: Scene, log: ConsoleLog) -> None:

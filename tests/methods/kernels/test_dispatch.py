@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -42,6 +43,22 @@ def test_what_has_no_kernel_for_the_gpu_is_computed_by_torch(
 def test_cpu_backend_refuses_tensors_of_another_device() -> None:
     with pytest.raises(Unavailable, match="serves CPU tensors, these are on 'cuda'"):
         resolve("cpu", "cuda")
+
+
+def test_threads_of_numbas_own_serve_one_thread_at_a_time() -> None:
+    program = """
+import torch
+from methods.kernels import serves_many_threads
+
+print([serves_many_threads(backend, torch.device("cpu")) for backend in ("reference", "cpu")])
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env={**os.environ, "NUMBA_THREADING_LAYER": "workqueue"},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout) == (0, "[True, False]\n"), done.stderr
 
 
 def test_torch_keeps_its_threads_when_the_first_kernel_starts_its_own() -> None:
