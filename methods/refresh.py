@@ -25,7 +25,7 @@ LANDED = 0.7
 does; of the neighbourhood of a pixel at its outline a third is empty."""
 
 DEPTH_TOLERANCE = 0.01
-"""Depths around, in scene units, may differ by this much more from the nearest one."""
+"""What is between depths, in scene units, may differ by this much from the nearest one."""
 
 BLOCK = 8
 """Side, in pixels, of the blocks that grow old together after a cold start: were it the whole
