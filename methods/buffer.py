@@ -81,9 +81,9 @@ class Cloud:
         if options.centres == "paper":
             centres = centres - 0.5
         values = frame.values.reshape(len(alpha), -1)[source]
-        age = torch.zeros_like(alpha, dtype=torch.uint8) if age is None else age
         points = unproject(camera, centres, depth)
-        return cls(camera, source, points, values, alpha[source], age[source])
+        ages = torch.zeros_like(source, dtype=torch.uint8) if age is None else age[source]
+        return cls(camera, source, points, values, alpha[source], ages)
 
     def land(self, camera: Camera, options: Reprojection, backend: str) -> tuple[Tensor, Tensor]:
         """Which point each pixel of `camera` shows (Eq. 9, 10).

@@ -71,7 +71,7 @@ def evidence(
     near, far = landed(depth, index, torch.inf), landed(depth, index, -torch.inf)
     alpha = landed(cloud.alpha, index, 0.0)
     if options.mode == "window":
-        near, far, alpha = -highest_around(-near), highest_around(far), highest_around(alpha)
+        near, far, alpha = -_highest(-near), _highest(far), _highest(alpha)
         known = (alpha > 0) & (far - near < EDGE * options.epsilon)
     window = torch.stack(
         (
@@ -86,8 +86,8 @@ def evidence(
 def depths_around(depth: Tensor, epsilon: float) -> Tensor:
     """[h, w, 2] nearest and farthest z-depth within `epsilon` of those of the 3 x 3 neighbourhood
     in `depth` [h, w]; [0, inf) where none of them is finite."""
-    near = -highest_around(-depth)
-    far = highest_around(torch.where(depth.isfinite(), depth, -torch.inf))
+    near = -_highest(-depth)
+    far = _highest(torch.where(depth.isfinite(), depth, -torch.inf))
     window = torch.stack((near - epsilon, far + epsilon), dim=-1)
     return torch.where(near.isfinite()[..., None], window, window.new_tensor((0.0, torch.inf)))
 
@@ -97,7 +97,7 @@ def landed(values: Tensor, index: Tensor, otherwise: float) -> Tensor:
     return functional.pad(values, (0, 1), value=otherwise)[index.long()]  # -1 is the last one
 
 
-def highest_around(image: Tensor) -> Tensor:
+def _highest(image: Tensor) -> Tensor:
     """Largest value of each pixel's 3 x 3 neighbourhood."""
     return functional.max_pool2d(image[None], 3, stride=1, padding=1)[0]
 

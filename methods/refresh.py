@@ -11,7 +11,7 @@ from torch.nn import functional
 from bench.cameras import pixel_grid, project, unproject
 from bench.types import Camera
 from methods.buffer import Cloud, Reprojection
-from methods.range_reduction import highest_around, landed
+from methods.range_reduction import depths_around, landed
 from methods.volume import FeatureFrame
 
 OPAQUE = 0.95
@@ -125,8 +125,7 @@ def inside_surface(depth: Tensor) -> Tensor:
     edge is between those."""
     finite = depth.isfinite()
     around = functional.avg_pool2d(finite[None].float(), 3, 1, 1, count_include_pad=False)[0]
-    near = -highest_around(-depth)
-    far = highest_around(torch.where(finite, depth, -torch.inf))
+    near, far = depths_around(depth, 0.0).unbind(dim=-1)
     return finite & (around > LANDED) & (far - near <= DEPTH_EDGE)
 
 

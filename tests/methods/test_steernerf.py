@@ -99,7 +99,7 @@ def test_reset_forgets(ball_scene: Scene, log: ConsoleLog) -> None:
 
 
 def test_a_foreseen_frame_is_begun_before_unless_a_sequence_begins(
-    ball_scene: Scene, log: ConsoleLog, monkeypatch: pytest.MonkeyPatch
+    ball_scene: Scene, log: ConsoleLog
 ) -> None:
     method = new_method()
     method.fit(ball_scene, BUDGET, log)
