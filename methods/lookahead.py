@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
 
+from bench.threads import torch_threads
 from bench.types import Camera, Frame, NullProbe, Probe
 from methods.buffer import Cloud, RenderingBuffer
 from methods.pipeline import Glance, Pipeline
@@ -67,7 +67,9 @@ class Lookahead:
             return pipeline.draw(camera, glance, buffer, probe)
         clouds = (glance.cloud, *buffer.clouds)[: pipeline.options.frames]
         work = Ledger()
-        with _half_of_the_threads() as others:
+        threads = torch.get_num_threads()
+        others = threads // 2
+        with torch_threads(threads - others):
             arguments = pipeline, upcoming, clouds, buffer.turn + 1, work, others
             ahead = self._thread.submit(_glance, *arguments)
             try:
@@ -113,15 +115,3 @@ def _glance(
 ) -> Glance:
     torch.set_num_threads(threads)  # of this thread
     return pipeline.glance(camera, clouds, turn, probe)
-
-
-@contextmanager
-def _half_of_the_threads() -> Iterator[int]:
-    """Leave as many of two threads or more as are yielded to another one."""
-    threads = torch.get_num_threads()
-    others = threads // 2
-    torch.set_num_threads(threads - others)
-    try:
-        yield others
-    finally:
-        torch.set_num_threads(threads)

@@ -21,6 +21,7 @@ from bench.frontier import observed_order
 from bench.lookahead import announce_next
 from bench.probes import FrameRecord, MemoryMeter, StageClock, p99_to_p50
 from bench.results import explained
+from bench.threads import torch_threads
 from bench.types import Camera, Log, Method, Scene
 from reports.growth import growth_panels
 from reports.tables import Table, megabytes, number
@@ -136,12 +137,8 @@ def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) 
         )
     if point.size:
         cameras = [frame_camera(camera, *point.size) for camera in cameras]
-    usual = torch.get_num_threads()
-    torch.set_num_threads(point.threads or usual)  # trained with all of them, all the same
-    try:
+    with torch_threads(point.threads or torch.get_num_threads()):  # trained with all, all the same
         records, peak_bytes = _render(method, cameras, config.protocol.lookahead, log)
-    finally:
-        torch.set_num_threads(usual)
     samples = [record.done["samples"] + record.done.get("surface_samples", 0) for record in records]
     return {
         "axis": point.axis,

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bench.cameras import project
-from bench.scenes.parallel import one_thread_each
+from bench.threads import torch_threads
 from bench.types import Camera, SteerbenchError
 
 MARGIN = 0.05
@@ -66,7 +66,7 @@ def parse_box(value: object) -> Box:
     return Box(corners[0], corners[1])
 
 
-@one_thread_each()
+@torch_threads(1)
 def hull_box(cameras: Sequence[Camera], images: Sequence[Tensor], space: Box) -> Box | None:
     """The box of the visual hull of the pictures' masks (alpha > 0) inside `space`.
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from typing import TypeVar
 
-import torch
-
+from bench.threads import torch_threads
 from bench.types import Log
 
 Item = TypeVar("Item")
@@ -24,7 +22,7 @@ def in_parallel(
 ) -> list[Result]:
     """[work(item) for item in items] under a progress bar; the first fault ends it."""
     with (
-        one_thread_each(),
+        torch_threads(1),
         log.progress(label, len(items)) as bar,
         ThreadPoolExecutor(WORKERS) as pool,
     ):
@@ -37,18 +35,3 @@ def in_parallel(
         finally:  # after a fault, what still waits is not begun
             pool.shutdown(wait=False, cancel_futures=True)
     return results
-
-
-@contextmanager
-def one_thread_each() -> Iterator[None]:
-    """Keep each of torch's operations on the thread that calls it.
-
-    For many small operations: pools inside a pool fight for the cores, and on a busy machine even
-    a single pool spends most of its time waiting for its slowest thread.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
