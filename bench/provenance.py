@@ -16,7 +16,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 MEASURING_PACKAGES = ("bench", "methods")
 VERSIONS_OF = ("torch", "numpy", "numba", "kornia", "scikit-image", "lpips")
-VERSIONS_OF_ENGINES = ("openvino", "nncf", "onnx", "onnxruntime")
+VERSIONS_OF_ENGINES = ("openvino", "nncf", "onnx", "onnxruntime", "tensorrt")
 """Extras: they compute frames, and have no part in a training."""
 
 CPU_MARKS = ("cpu family", "model", "CPU implementer", "CPU part")

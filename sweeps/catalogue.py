@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 from importlib import metadata
+from typing import Any
 
-import torch
-
+from bench.errors import Unavailable
 from reports.tables import Table
 from sweeps.overrides import CONFIGS
 from sweeps.terminal import console, rich_table
+from sweeps.variants import engine_kinds
 
 GROUPS = ("method", "engine", "scene", "trajectory", "protocol", "budget", "experiment")
-
-EXTRAS = {"openvino": "openvino", "onnxruntime": "onnx"}
-"""Engines that run the network of a 2D renderer beside torch, and the extra that installs each."""
 
 
 def main(options: argparse.Namespace) -> int:
@@ -42,15 +39,16 @@ def choices() -> tuple[tuple[str, str], ...]:
 
 
 def engines() -> tuple[tuple[str, str], ...]:
-    """Every engine, and whether it can be used here or how to get it."""
-    rows = [("torch", f"usable (version {torch.__version__})")]
-    for name, extra in EXTRAS.items():
-        if importlib.util.find_spec(name) is None:
-            rows.append((name, f'not installed: pip install -c constraints.txt -e ".[{extra}]"'))
-        else:
-            rows.append((name, f"usable (version {metadata.version(name)})"))
-    rows.append(("tensorrt", "not yet: on a GPU, engine=torch precision=fp16"))
-    return tuple(rows)
+    """Every engine, and whether it can be used here, or why not."""
+    return tuple((name, _state(name, kind)) for name, kind in engine_kinds().items())
+
+
+def _state(name: str, kind: Any) -> str:
+    try:
+        kind(kind.precisions[0])
+    except Unavailable as reason:
+        return str(reason)
+    return f"usable (version {metadata.version(name)})"
 
 
 def _comment(text: str) -> str:

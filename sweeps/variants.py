@@ -77,9 +77,10 @@ def render_variants(
     first = next(iter(configs.values()))
     settings = checked_settings(first)
     log = OnceLog(Path(settings.outputs))
+    methods = usable(configs, log)
     scene, path, protocol = common_ground(first, frames, log)
     with turn(settings.device, log):
-        methods = fit_each(configs, scene, path, log)
+        fit_each(methods, configs, scene, path, log)
         told = [name for name in methods if configs[name].protocol.lookahead]
         rows = render_in_turns(methods, scene, path, protocol, repeats, log, told)
     return [Rendered(row["setting"], methods[row["setting"]], scene, path, row) for row in rows]
@@ -90,14 +91,11 @@ def settings_of(overrides: Sequence[str], variants: Iterable[Variant]) -> dict[s
     return {variant.name: [*overrides, *variant.settings] for variant in variants}
 
 
-def fit_each(
-    configs: Mapping[str, DictConfig], scene: Scene, path: Trajectory, log: Log
-) -> dict[str, Method]:
-    """The methods that can be used here, fitted. Of others the log is told why.
+def usable(configs: Mapping[str, DictConfig], log: Log) -> dict[str, Method]:
+    """The methods that can be used here. Of others the log is told why.
 
-    Raises, before anything is trained:
+    Raises:
         Unavailable: the first of them cannot be used.
-        SteerbenchError: no frame of `path` is good for all.
     """
     methods: dict[str, Method] = {}
     for name, config in configs.items():
@@ -108,13 +106,27 @@ def fit_each(
             if not methods:
                 raise
             log.info(f"{name}: {error}")
+    return methods
+
+
+def fit_each(
+    methods: Mapping[str, Method],
+    configs: Mapping[str, DictConfig],
+    scene: Scene,
+    path: Trajectory,
+    log: Log,
+) -> None:
+    """Fit all `methods`, each with the budget of its config.
+
+    Raises, before anything is trained:
+        SteerbenchError: no frame of `path` is good for all.
+    """
     steady_frames(methods.values(), path)
     with log.progress("variants", len(methods)) as progress:
         for name, method in methods.items():
             torch.manual_seed(configs[name].seed)
             method.fit(scene, build(configs[name], "budget"), log)
             progress.advance(note=name)
-    return methods
 
 
 class OnceLog(ConsoleLog):
@@ -170,13 +182,20 @@ def common_ground(
 
 def engines() -> Iterator[Variant]:
     """All engines at all precisions; torch in fp32, the standard, first."""
-    names = sorted(path.stem for path in (CONFIGS / "engine").glob("*.yaml"))
-    for name in sorted(names, key=lambda name: name != "torch"):
-        node: Any = OmegaConf.load(CONFIGS / "engine" / f"{name}.yaml")
-        kind: Any = get_class(node["_target_"])
+    for name, kind in engine_kinds().items():
         for precision in kind.precisions:
             settings = (f"engine={name}", f"precision={precision}")
             yield Variant(f"{name}, {precision}", settings)
+
+
+def engine_kinds() -> dict[str, Any]:
+    """The class of each engine by its name; torch, the standard, first."""
+    names = sorted(path.stem for path in (CONFIGS / "engine").glob("*.yaml"))
+    nodes: dict[str, Any] = {
+        name: OmegaConf.load(CONFIGS / "engine" / f"{name}.yaml")
+        for name in sorted(names, key=lambda name: name != "torch")
+    }
+    return {name: get_class(node["_target_"]) for name, node in nodes.items()}
 
 
 def apart_text(psnr: float) -> str:

@@ -29,6 +29,9 @@ Inputs = tuple[Tensor, ...]
 CALIBRATION = 16
 """Frames whose inputs tell the range of every number that is rounded to 8 bits."""
 
+SIZES = "steerbench_sizes"
+"""Where a stored model says for which sizes of varying axes it is made ready beforehand."""
+
 
 @dataclass(frozen=True)
 class Built:
@@ -98,6 +101,30 @@ def readable(network: Network) -> Network:
     copy = deepcopy(network)
     copy.backend = "reference"
     return copy
+
+
+def sizes_to_expect(samples: Sequence[Inputs], network: Network) -> list[int]:
+    """The sizes of varying axes that were seen, those between, and one beyond on either side."""
+    seen = {
+        x.shape[axis]
+        for inputs in samples
+        for x, axes in zip(inputs, network.varying, strict=True)
+        for axis in axes
+    }
+    if not seen:
+        return []
+    step = network.quantum
+    least, most = max(min(seen) // step - 1, 1), -(-max(seen) // step) + 1
+    return sorted({*seen, *range(least * step, most * step + 1, step)})
+
+
+def resized(sample: Inputs, network: Network, size: int) -> Inputs:
+    """Zeros like `sample`, whose varying axes are of `size`."""
+    shapes = (
+        [size if axis in axes else length for axis, length in enumerate(x.shape)]
+        for x, axes in zip(sample, network.varying, strict=True)
+    )
+    return tuple(x.new_zeros(shape) for x, shape in zip(sample, shapes, strict=True))
 
 
 def required(engine: str, library: str, extra: str) -> ModuleType:

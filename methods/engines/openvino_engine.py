@@ -22,15 +22,21 @@ from bench.provenance import digest
 from bench.results import explained
 from bench.sharing import missing
 from bench.types import Log
-from methods.engines import CALIBRATION, Built, Engine, Inputs, Precision, readable, required
+from methods.engines import (
+    CALIBRATION,
+    SIZES,
+    Built,
+    Engine,
+    Inputs,
+    Precision,
+    readable,
+    required,
+    sizes_to_expect,
+)
 from methods.renderer2d import Network
 
 # Neither OpenVINO nor NNCF is to tell anybody that it is used: both do without this package.
 sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
-
-
-SIZES = "steerbench_sizes"
-"""Where a stored model says for which sizes it is compiled beforehand."""
 
 Varying = tuple[tuple[int, ...], ...]
 
@@ -81,7 +87,7 @@ class OpenVino(Engine):
             if to_build:
                 seen = samples()
                 model = self._convert(network, seen)
-                model.set_rt_info(json.dumps(_sizes(seen, network)), SIZES)
+                model.set_rt_info(json.dumps(sizes_to_expect(seen, network)), SIZES)
                 self._write(model, path)
             else:
                 log.info(f"built network found: {path}")
@@ -128,21 +134,6 @@ class OpenVino(Engine):
 
 def _capabilities(openvino: Any) -> list[str]:
     return openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
-
-
-def _sizes(samples: Sequence[Inputs], network: Network) -> list[int]:
-    """The sizes of varying axes that were seen, those between, and one beyond on either side."""
-    seen = {
-        x.shape[axis]
-        for inputs in samples
-        for x, axes in zip(inputs, network.varying, strict=True)
-        for axis in axes
-    }
-    if not seen:
-        return []
-    step = network.quantum
-    least, most = max(min(seen) // step - 1, 1), -(-max(seen) // step) + 1
-    return sorted({*seen, *range(least * step, most * step + 1, step)})
 
 
 class _Compiled:

@@ -17,11 +17,12 @@ from bench.stress import Cell, StressCase
 from methods.engines import Engine, Inputs, Precision
 from methods.engines.onnxruntime_engine import OnnxRuntime
 from methods.engines.openvino_engine import OpenVino
+from methods.engines.tensorrt_engine import TensorRt
 from methods.engines.torch_engine import TorchEngine
 from methods.kernels.depthwise import neighbours_of
 from methods.space_to_depth import SpaceToDepth
 
-ENGINES: tuple[type[Engine], ...] = (TorchEngine, OpenVino, OnnxRuntime)
+ENGINES: tuple[type[Engine], ...] = (TorchEngine, OpenVino, OnnxRuntime, TensorRt)
 CELLS: list[Cell] = [
     (engine.name, precision) for engine in ENGINES for precision in engine.precisions
 ]

@@ -1,4 +1,4 @@
-"""torch as an engine: the network as it was trained, or in half precision."""
+"""torch as an engine: the network as trained, or in half precision; on a GPU as CUDA graphs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from torch import Tensor
 
 from bench.errors import Unavailable
 from bench.types import Log
-from methods.engines import Built, Engine, Inputs
+from methods.engines import CALIBRATION, Built, Engine, Inputs, resized, sizes_to_expect
+from methods.engines.cuda_graphs import Replayed
 from methods.renderer2d import Network
 
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
@@ -28,8 +29,8 @@ class TorchEngine(Engine):
             raise Unavailable("precision=fp16: engine=torch has it on a GPU, on a CPU use bf16")
 
     def samples(self, network: Network) -> int:
-        """None: nothing is prepared."""
-        return 0
+        """See `Engine.samples`: on a GPU, enough to know the sizes that come; on a CPU none."""
+        return CALIBRATION if _device(network).type == "cuda" else 0
 
     def key(self) -> dict[str, object]:
         """See `Engine.key`."""
@@ -50,4 +51,22 @@ class TorchEngine(Engine):
             with torch.autocast(inputs[0].device.type, dtype, enabled=half):
                 return network(*inputs)
 
-        return Built(run, sum(weight.numel() for weight in network.parameters()) * dtype.itemsize)
+        ready = run if _device(network).type == "cpu" else _recorded(run, network, samples(), log)
+        return Built(ready, sum(weight.numel() for weight in network.parameters()) * dtype.itemsize)
+
+
+def _recorded(
+    run: Callable[..., Inputs], network: Network, samples: Sequence[Inputs], log: Log
+) -> Replayed:
+    """`run` as CUDA graphs, recorded for the sizes to expect."""
+    replayed = Replayed(run)
+    sizes = sizes_to_expect(samples, network) or [1]  # or the one size that it has
+    with torch.no_grad(), log.progress("recording CUDA graphs", len(sizes)) as progress:
+        for size in sizes:
+            replayed(*resized(samples[0], network, size))
+            progress.advance()
+    return replayed
+
+
+def _device(network: Network) -> torch.device:
+    return next(network.parameters()).device

@@ -37,7 +37,8 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> None:
     known = {"everything off": [EVERYTHING_OFF], "share": variants[:2], "engine": variants[2:]}
     monkeypatch.setattr("sweeps.accuracy.knobs", lambda trained: known)
     monkeypatch.setattr("sweeps.variants.common_ground", lambda *arguments: ground)
-    monkeypatch.setattr("sweeps.variants.fit_each", lambda configs, *arguments: configs)
+    monkeypatch.setattr("sweeps.variants.usable", lambda configs, log: configs)
+    monkeypatch.setattr("sweeps.variants.fit_each", lambda *arguments: None)
     monkeypatch.setattr("sweeps.variants.render_in_turns", rendered)
     monkeypatch.setattr("sweeps.accuracy.experiment_rows", lambda *arguments: [ERROR])
     monkeypatch.setattr("methods.accuracy.all_experiments", lambda: [])

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import torch
 
 from bench.results import COLUMNS
 from sweeps.cli import COMMANDS
@@ -41,12 +42,18 @@ def test_list_shows_every_choice_with_what_it_is(steerbench):
     assert "scene=blender" in out
     assert "NeRF-Synthetic" in out
     assert "+experiment=demo" in out
-    for name in ("reference", "cpu", "gpu", "torch", "openvino", "onnxruntime", "tensorrt"):
+    for name in ("reference", "cpu", "gpu", "torch", "openvino", "onnxruntime", "engine=tensorrt"):
         assert name in out
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="for a machine without a GPU")
+def test_list_says_why_an_engine_cannot_be_used(steerbench):
+    out = " ".join(steerbench("list").out.split())
+    assert "engine=tensorrt computes on a CUDA GPU, and torch sees none here" in out
+
+
 def test_list_says_how_to_get_an_engine_that_is_not_installed(steerbench, monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
     assert 'pip install -c constraints.txt -e ".[onnx]"' in steerbench("list").out
 
 

@@ -9,7 +9,7 @@ import pytest
 from bench.errors import SteerbenchError, Unavailable
 from bench.trajectories import Step, Trajectory
 from sweeps.overrides import composed
-from sweeps.variants import common_ground, fit_each
+from sweeps.variants import common_ground, fit_each, usable
 
 SMALL = ("scene=totem", "scene.width=16", "scene.train=2", "scene.test=2", "trajectory=test")
 
@@ -37,20 +37,23 @@ def path(truth: int | None) -> Trajectory:
 
 
 def test_what_cannot_be_used_is_left_out(fitted, quiet_log):
-    methods = fit_each(configs("one", "absent", "other"), None, path(0), quiet_log)
+    found = configs("one", "absent", "other")
+    methods = usable(found, quiet_log)
     assert list(methods) == ["0", "2"]
+    fit_each(methods, found, None, path(0), quiet_log)
     assert fitted == ["one", "other"]
 
 
 def test_without_the_first_there_is_nothing_to_compare_with(fitted, quiet_log):
     with pytest.raises(Unavailable):
-        fit_each(configs("absent", "other"), None, path(0), quiet_log)
-    assert fitted == []
+        usable(configs("absent", "other"), quiet_log)
 
 
 def test_a_path_without_truth_is_refused_before_anything_is_trained(fitted, quiet_log):
+    found = configs("one")
+    methods = usable(found, quiet_log)
     with pytest.raises(SteerbenchError, match="give more frames"):
-        fit_each(configs("one"), None, path(None), quiet_log)
+        fit_each(methods, found, None, path(None), quiet_log)
     assert fitted == []
 
 

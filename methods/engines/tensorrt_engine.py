@@ -1,0 +1,209 @@
+"""TensorRT as an engine: fp32, fp16, and 8-bit integers quantised by ONNX Runtime.
+
+TensorRT 11 computes in the types that a model has (strong typing), so that these are written into
+the ONNX model: halves by casting the network, integers as pairs of QuantizeLinear and
+DequantizeLinear that are symmetric, and without a quantised bias, as TensorRT asks for
+(https://docs.nvidia.com/deeplearning/tensorrt, "Explicit Quantization").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bench.errors import SteerbenchError, Unavailable
+from bench.provenance import digest
+from bench.results import explained
+from bench.sharing import missing, whole
+from bench.types import Log
+from methods.engines import (
+    CALIBRATION,
+    Built,
+    Engine,
+    Inputs,
+    Precision,
+    onnx_model,
+    required,
+)
+from methods.renderer2d import Network
+
+QUANTISED = {"ActivationSymmetric": True, "QuantizeBias": False}
+
+
+class TensorRt(Engine):
+    """TensorRT on a CUDA GPU.
+
+    What is built, a plan, is good for one GPU and one version, and for up to so many cells: a power
+    of two. The plans for the sizes to expect are made beforehand, others when such a view comes.
+
+    Raises:
+        Unavailable: there is no CUDA GPU, or TensorRT, onnx or ONNX Runtime is not installed.
+    """
+
+    name = "tensorrt"
+    precisions = ("fp32", "fp16", "int8")
+
+    def __init__(self, precision: Precision = "fp32") -> None:
+        super().__init__(precision)
+        if not torch.cuda.is_available():
+            raise Unavailable(
+                "engine=tensorrt computes on a CUDA GPU, and torch sees none here: use "
+                "engine=openvino or engine=onnxruntime"
+            )
+        for library in ("onnx", "onnxruntime"):
+            required(self.name, library, "tensorrt")
+        self._tensorrt = required(self.name, "tensorrt", "tensorrt")
+
+    def check(self, device: torch.device) -> None:
+        """See `Engine.check`."""
+        if device.type != "cuda":
+            raise Unavailable(
+                f"engine=tensorrt computes on a CUDA GPU, this is device={device}: use device=cuda"
+            )
+
+    def samples(self, network: Network) -> int:
+        """See `Engine.samples`: enough to know the sizes that come."""
+        return CALIBRATION if any(network.varying) else super().samples(network)
+
+    def key(self) -> dict[str, object]:
+        """See `Engine.key`."""
+        versions = {library: metadata.version(library) for library in ("onnx", "onnxruntime")}
+        return {
+            "engine": self.name,
+            "precision": self.precision,
+            "code": digest([Path(__file__), Path(onnx_model.__file__)]),
+            "tensorrt": self._tensorrt.__version__,
+            "gpu": torch.cuda.get_device_name(),
+            **versions,
+        }
+
+    def build(
+        self,
+        network: Network,
+        samples: Callable[[], Sequence[Inputs]],
+        folder: Callable[[], Path],
+        log: Log,
+    ) -> Built:
+        """See `Engine.build`."""
+        path = folder() / "network.onnx"
+        with missing(path, log) as to_build:
+            if to_build:
+                onnx_model.write(network, samples(), path, self.precision, QUANTISED)
+            else:
+                log.info(f"exported network found: {path}")
+        plans = _Plans(self._tensorrt, path, network, exact=self.precision == "fp32", log=log)
+        plans.prepare(onnx_model.sizes(path))
+        return Built(plans, onnx_model.weight_bytes(path))
+
+
+class _Plans:
+    """A model, built for up to 2^n cells, for every n that comes."""
+
+    def __init__(
+        self, tensorrt: Any, model: Path, network: Network, *, exact: bool, log: Log
+    ) -> None:
+        self._tensorrt, self._model, self._network = tensorrt, model, network
+        self._exact, self._log = exact, log
+        self._logger = tensorrt.Logger(tensorrt.Logger.ERROR)
+        self._executions: dict[int, _Execution] = {}
+
+    def prepare(self, sizes: Sequence[int]) -> None:
+        """Have a plan for each of these numbers of cells; for a network of fixed size, its plan."""
+        ceilings = sorted({_ceiling(size) for size in sizes or [1]})
+        with self._log.progress("building for TensorRT", len(ceilings)) as progress:
+            for ceiling in ceilings:
+                self._execution(ceiling)
+                progress.advance(note=f"up to {ceiling} cells" if sizes else "")
+
+    def __call__(self, *inputs: Tensor) -> Inputs:
+        if not all(x.numel() for x in inputs):
+            return self._network(*inputs)
+        sizes = {
+            x.shape[axis]
+            for x, axes in zip(inputs, self._network.varying, strict=True)
+            for axis in axes
+        }
+        return self._execution(_ceiling(max(sizes, default=1)))(*inputs)
+
+    def _execution(self, ceiling: int) -> _Execution:
+        if ceiling not in self._executions:
+            path = self._model.with_name(f"upto-{ceiling}.plan")
+            with missing(path, self._log) as to_build:
+                if to_build:
+                    built = self._built(ceiling)
+                    with explained(path.parent), whole(path) as new:
+                        new.write_bytes(built)
+            self._executions[ceiling] = _Execution(self._tensorrt, path, self._logger)
+        return self._executions[ceiling]
+
+    def _built(self, ceiling: int) -> Any:
+        """The plan for 1 to `ceiling` cells, fastest at most of them."""
+        trt = self._tensorrt
+        builder = trt.Builder(self._logger)
+        typed = 1 << int(trt.NetworkDefinitionCreationFlag.STRONGLY_TYPED)
+        network, config = builder.create_network(typed), builder.create_builder_config()
+        parser = trt.OnnxParser(network, self._logger)
+        if not parser.parse_from_file(str(self._model)):
+            found = "; ".join(parser.get_error(at).desc() for at in range(parser.num_errors))
+            raise SteerbenchError(f"TensorRT {trt.__version__} cannot read {self._model}: {found}")
+        if self._exact:
+            config.clear_flag(trt.BuilderFlag.TF32)
+        profile = builder.create_optimization_profile()
+        for told in map(network.get_input, range(network.num_inputs)):
+            shapes = (
+                [size if axis == -1 else axis for axis in told.shape]
+                for size in (1, ceiling, ceiling)  # the least, the usual, the most
+            )
+            profile.set_shape(told.name, *shapes)
+        config.add_optimization_profile(profile)
+        plan = builder.build_serialized_network(network, config)
+        if plan is None:
+            raise SteerbenchError(
+                f"TensorRT {trt.__version__} cannot build {self._model} for up to {ceiling} cells; "
+                "it says why above"
+            )
+        return plan
+
+
+class _Execution:
+    """A plan, ready to run on a stream of its own: on torch's, TensorRT waits for the device."""
+
+    def __init__(self, tensorrt: Any, path: Path, logger: Any) -> None:
+        engine = tensorrt.Runtime(logger).deserialize_cuda_engine(path.read_bytes())
+        if engine is None:
+            raise SteerbenchError(f"TensorRT cannot load its plan: remove {path} and run again")
+        self._context = engine.create_execution_context()
+        names = [engine.get_tensor_name(at) for at in range(engine.num_io_tensors)]
+        told = {name: engine.get_tensor_mode(name) == tensorrt.TensorIOMode.INPUT for name in names}
+        self._told = [name for name in names if told[name]]
+        self._said = [name for name in names if not told[name]]
+        self._stream = torch.cuda.Stream()
+
+    def __call__(self, *inputs: Tensor) -> Inputs:
+        inputs = tuple(x.contiguous() for x in inputs)
+        context = self._context
+        for name, x in zip(self._told, inputs, strict=True):
+            context.set_input_shape(name, tuple(x.shape))
+            context.set_tensor_address(name, x.data_ptr())
+        said = [
+            torch.empty(tuple(context.get_tensor_shape(name)), device=inputs[0].device)
+            for name in self._said
+        ]
+        for name, x in zip(self._said, said, strict=True):
+            context.set_tensor_address(name, x.data_ptr())
+        current = torch.cuda.current_stream()
+        self._stream.wait_stream(current)
+        if not context.execute_async_v3(self._stream.cuda_stream):
+            raise SteerbenchError("TensorRT could not run a network; it says why above")
+        current.wait_stream(self._stream)
+        return tuple(said)
+
+
+def _ceiling(size: int) -> int:
+    """The least power of two that is not less than `size`, 1 or more."""
+    return 1 << (size - 1).bit_length()

@@ -1,0 +1,202 @@
+"""TensorRT as `methods.engines.tensorrt_engine` uses it, on the CPU by ONNX Runtime.
+
+Names and arguments are those of the Python bindings of TensorRT 11.4. A plan is the ONNX model with
+the sizes that it is good for in front; memory is read and written at the addresses that are told.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+from collections.abc import Sequence
+from enum import Enum
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import onnx
+import onnxruntime
+
+__version__ = "11.4.0"
+
+ONNX_TYPES = {"tensor(float)": np.float32, "tensor(int32)": np.int32}
+
+
+class Logger:
+    ERROR = 1
+
+    def __init__(self, min_severity: int) -> None: ...
+
+
+class NetworkDefinitionCreationFlag(Enum):
+    STRONGLY_TYPED = 1
+
+    def __int__(self) -> int:
+        return self.value
+
+
+class BuilderFlag(Enum):
+    TF32 = 3
+
+
+class TensorIOMode(Enum):
+    INPUT = 1
+    OUTPUT = 2
+
+
+class Network:
+    """What a parser reads into."""
+
+    model: bytes
+
+    @property
+    def _inputs(self) -> list[onnx.ValueInfoProto]:
+        return list(onnx.load_from_string(self.model).graph.input)
+
+    @property
+    def num_inputs(self) -> int:
+        return len(self._inputs)
+
+    def get_input(self, index: int) -> SimpleNamespace:
+        told = self._inputs[index]
+        axes = told.type.tensor_type.shape.dim
+        return SimpleNamespace(
+            name=told.name, shape=tuple(-1 if axis.dim_param else axis.dim_value for axis in axes)
+        )
+
+
+class Profile:
+    def __init__(self) -> None:
+        self.shapes: dict[str, list[list[int]]] = {}
+
+    def set_shape(
+        self, input: str, min: Sequence[int], opt: Sequence[int], max: Sequence[int]
+    ) -> None:
+        assert all(a <= b <= c for a, b, c in zip(min, opt, max, strict=True))
+        self.shapes[input] = [list(min), list(max)]
+
+
+class Config:
+    def __init__(self) -> None:
+        self.profile: Profile | None = None
+        self.cleared: list[BuilderFlag] = []
+
+    def add_optimization_profile(self, profile: Profile) -> int:
+        self.profile = profile
+        return 0
+
+    def clear_flag(self, flag: BuilderFlag) -> None:
+        self.cleared.append(flag)
+
+
+class Builder:
+    built = 0
+
+    def __init__(self, logger: Logger) -> None: ...
+
+    def create_network(self, flags: int) -> Network:
+        assert flags == 1 << NetworkDefinitionCreationFlag.STRONGLY_TYPED.value
+        return Network()
+
+    def create_builder_config(self) -> Config:
+        return Config()
+
+    def create_optimization_profile(self) -> Profile:
+        return Profile()
+
+    def build_serialized_network(self, network: Network, config: Config) -> bytes | None:
+        assert config.profile is not None
+        Builder.built += 1
+        return json.dumps(config.profile.shapes).encode() + b"\n" + network.model
+
+
+class OnnxParser:
+    num_errors = 1
+
+    def __init__(self, network: Network, logger: Logger) -> None:
+        self._network = network
+
+    def parse_from_file(self, model: str) -> bool:
+        self._network.model = Path(model).read_bytes()
+        return True
+
+    def get_error(self, index: int) -> SimpleNamespace:
+        return SimpleNamespace(desc=lambda: "no such operator")
+
+
+class Runtime:
+    def __init__(self, logger: Logger) -> None: ...
+
+    def deserialize_cuda_engine(self, serialized_engine: bytes) -> CudaEngine | None:
+        shapes, found, model = serialized_engine.partition(b"\n")
+        return CudaEngine(json.loads(shapes), model) if found else None
+
+
+class CudaEngine:
+    def __init__(self, shapes: dict[str, list[list[int]]], model: bytes) -> None:
+        self.shapes, self.session = shapes, onnxruntime.InferenceSession(model)
+        self._inputs = [x.name for x in self.session.get_inputs()]
+        self._names = [*self._inputs, *(x.name for x in self.session.get_outputs())]
+
+    @property
+    def num_io_tensors(self) -> int:
+        return len(self._names)
+
+    def get_tensor_name(self, index: int) -> str:
+        return self._names[index]
+
+    def get_tensor_mode(self, name: str) -> TensorIOMode:
+        return TensorIOMode.INPUT if name in self._inputs else TensorIOMode.OUTPUT
+
+    def create_execution_context(self) -> ExecutionContext:
+        return ExecutionContext(self)
+
+
+class ExecutionContext:
+    def __init__(self, engine: CudaEngine) -> None:
+        self._engine = engine
+        self._shapes: dict[str, tuple[int, ...]] = {}
+        self._addresses: dict[str, int] = {}
+
+    def set_input_shape(self, name: str, shape: tuple[int, ...]) -> bool:
+        least, most = self._engine.shapes[name]
+        assert all(a <= b <= c for a, b, c in zip(least, shape, most, strict=True))
+        self._shapes[name] = shape
+        return True
+
+    def set_tensor_address(self, name: str, memory: int) -> bool:
+        self._addresses[name] = memory
+        return True
+
+    def get_tensor_shape(self, name: str) -> tuple[int, ...]:
+        told = {
+            x.name: np.zeros(self._shapes[x.name], ONNX_TYPES[x.type])
+            for x in self._engine.session.get_inputs()
+        }
+        return self._engine.session.run([name], told)[0].shape
+
+    def execute_async_v3(self, stream_handle: int) -> bool:
+        session = self._engine.session
+        told = {
+            x.name: self._memory(x.name, self._shapes[x.name], ONNX_TYPES[x.type])
+            for x in session.get_inputs()
+        }
+        names = [x.name for x in session.get_outputs()]
+        for name, value in zip(names, session.run(names, told), strict=True):
+            self._memory(name, value.shape, value.dtype)[...] = value
+        return True
+
+    def _memory(
+        self, name: str, shape: tuple[int, ...], dtype: type[np.generic] | np.dtype
+    ) -> np.ndarray:
+        size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+        raw = (ctypes.c_char * size).from_address(self._addresses[name])
+        return np.frombuffer(raw, dtype).reshape(shape)
+
+
+class Stream:
+    """One of CUDA's, for `torch.cuda`."""
+
+    cuda_stream = 7
+
+    def wait_stream(self, stream: Stream) -> None: ...
