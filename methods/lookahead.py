@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import torch
@@ -34,8 +36,9 @@ class Lookahead:
 
     While both are at work each has half of torch's threads, of which there must be two. A stage
     seldom takes half the time on twice as many, for they wait for each other at the end of each of
-    its loops; so two frames at a time take less than two frames one after the other. The threads of
-    another engine's network are its own: it keeps them all.
+    its loops; so two frames at a time take less than two frames one after the other. Which of them
+    is left when the other has ended has all threads from its next stage on. The threads of another
+    engine's network are its own: it keeps them all.
     """
 
     def __init__(self) -> None:
@@ -66,15 +69,17 @@ class Lookahead:
         if upcoming is None:
             return pipeline.draw(camera, glance, buffer, probe)
         clouds = (glance.cloud, *buffer.clouds)[: pipeline.options.frames]
-        work = Ledger()
+        work, drawn = Ledger(), threading.Event()
         threads = torch.get_num_threads()
         others = threads // 2
         with torch_threads(threads - others):
-            arguments = pipeline, upcoming, clouds, buffer.turn + 1, work, others
+            beside = _Beside(work, drawn.is_set, threads)
+            arguments = pipeline, upcoming, clouds, buffer.turn + 1, beside, others
             ahead = self._thread.submit(_glance, *arguments)
             try:
-                frame = pipeline.draw(camera, glance, buffer, probe)
+                frame = pipeline.draw(camera, glance, buffer, _Beside(probe, ahead.done, threads))
             finally:
+                drawn.set()
                 with probe.stage("lookahead"):
                     wait([ahead])
         self._prospect = Prospect(upcoming, ahead, work)
@@ -103,6 +108,21 @@ class Ledger(NullProbe):
         """Count all of it there."""
         for count in self._counts:
             probe.count(*count)
+
+
+class _Beside:
+    """A probe that has all `threads` of torch serve the calling thread from the first stage on that
+    it enters `alone`."""
+
+    def __init__(self, probe: Probe, alone: Callable[[], bool], threads: int) -> None:
+        self._probe, self._alone, self._threads = probe, alone, threads
+        self.count = probe.count
+
+    def stage(self, name: str) -> AbstractContextManager[None]:
+        """See `bench.types.Probe`."""
+        if self._alone():
+            torch.set_num_threads(self._threads)
+        return self._probe.stage(name)
 
 
 def _glance(

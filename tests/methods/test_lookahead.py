@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor
 
 from bench.probes import StageClock
+from bench.threads import torch_threads
 from bench.types import Camera, NullProbe
 from methods.buffer import RenderingBuffer
 from methods.lookahead import Lookahead
@@ -97,20 +99,26 @@ def test_a_new_sequence_knows_nothing_of_the_last_one() -> None:
 
 
 class Watched(Pipeline):
-    """Runs `in_glance` and `in_draw` before a glance, but the first one, and before a drawing."""
+    """Runs `in_glance` and `in_draw` before a glance, but the first one, and before a drawing; and
+    tells on how many of torch's threads they ended."""
 
     in_glance = in_draw = staticmethod(lambda: None)
     glances = 0
+    ended: dict[str, int]
 
     def glance(self, *arguments: Any) -> Any:
         self.glances += 1
         if self.glances > 1:
             self.in_glance()
-        return super().glance(*arguments)
+        result = super().glance(*arguments)
+        self.ended["glance"] = torch.get_num_threads()
+        return result
 
     def draw(self, *arguments: Any) -> Any:
         self.in_draw()
-        return super().draw(*arguments)
+        result = super().draw(*arguments)
+        self.ended["draw"] = torch.get_num_threads()
+        return result
 
 
 @pytest.fixture
@@ -118,6 +126,7 @@ def watched() -> Watched:
     pipeline = new_pipeline()
     pipeline.__class__ = Watched
     assert isinstance(pipeline, Watched)
+    pipeline.ended = {}
     return pipeline
 
 
@@ -146,6 +155,38 @@ def test_both_have_half_of_the_threads_and_later_all_are_back(
     finally:
         torch.set_num_threads(before)
     assert (seen["draw"], seen["glance"]) == halves
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    with torch_threads(2):
+        yield
+
+
+def test_a_drawing_that_is_left_has_all_threads(watched: Watched, two_threads: None) -> None:
+    lookahead = Lookahead()
+    # The thread does one thing after the other: when it has done this, the glance has ended.
+    watched.in_draw = lambda: lookahead._thread.submit(int).result(PATIENCE)
+    lookahead.foresee(PATH[1])
+    lookahead.render(watched, PATH[0], RenderingBuffer(2), NullProbe())
+    assert watched.ended == {"draw": 2, "glance": 1}
+
+
+def test_a_glance_that_is_left_has_all_threads(watched: Watched, two_threads: None) -> None:
+    waited_for = threading.Event()
+
+    class Telling(NullProbe):
+        def stage(self, name: str) -> AbstractContextManager[None]:
+            if name == "lookahead":
+                waited_for.set()
+            return super().stage(name)
+
+    watched.in_glance = lambda: waited_for.wait(PATIENCE)
+    lookahead = Lookahead()
+    lookahead.foresee(PATH[1])
+    lookahead.render(watched, PATH[0], RenderingBuffer(2), Telling())
+    assert watched.glances == 2
+    assert watched.ended == {"draw": 1, "glance": 2}
 
 
 def fail() -> None:
