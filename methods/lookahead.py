@@ -74,7 +74,7 @@ class Lookahead:
         others = threads // 2
         with torch_threads(threads - others):
             beside = _Beside(work, drawn.is_set, threads)
-            arguments = pipeline, upcoming, clouds, buffer.turn + 1, beside, others
+            arguments = pipeline, upcoming, clouds, buffer.turn + 1, beside, others, drawn.is_set
             ahead = self._thread.submit(_glance, *arguments)
             try:
                 frame = pipeline.draw(camera, glance, buffer, _Beside(probe, ahead.done, threads))
@@ -125,6 +125,7 @@ class _Beside:
         return self._probe.stage(name)
 
 
+@torch.no_grad()
 def _glance(
     pipeline: Pipeline,
     camera: Camera,
@@ -132,6 +133,11 @@ def _glance(
     turn: int,
     probe: Probe,
     threads: int,
+    enough: Callable[[], bool],
 ) -> Glance:
+    """A glance, and as much of the surface in it as there is time for."""
     torch.set_num_threads(threads)  # of this thread
-    return pipeline.glance(camera, clouds, turn, probe)
+    glance = pipeline.glance(camera, clouds, turn, probe)
+    if glance.sight.surface:
+        glance.sight.surface.look(probe, enough)
+    return glance

@@ -179,7 +179,8 @@ class PatchSource:
             values[age] = values[age].index_copy(0, patch.shown[age], pixels.values + shine)
         points = [Points(v, i) for v, i in zip(values, patch.indices, strict=True)]
         newest = frames[0] if frames else None
-        return self.pipeline.observe(frame, points, newest, patch.view, NullProbe())
+        sight = self.pipeline.sight(frame, points, patch.view, NullProbe())
+        return self.pipeline.observe(frame, points, newest, patch.view, sight, NullProbe())
 
     def _spread(self, patch: Patch, pixels: Pixels) -> FeatureFrame:
         """All pixels of the patch, from those that were rendered."""

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.cameras import cast, place_camera, unproject
+from bench.cameras import cast, place_camera
 from bench.types import Camera, Frame, Probe
 from methods.buffer import Cloud, Remembered, RenderingBuffer
 from methods.cells import centres, put_pixels
@@ -36,11 +36,9 @@ from methods.renderer2d import (
     cells_at_matter,
 )
 from methods.rounds import render_rays
+from methods.surface import Surface
 from methods.view import View
-from methods.volume import FeatureFrame, query
-
-LAYER = 4 * STEP
-"""Thickness, in scene units, of what a single sample of the surface stands for."""
+from methods.volume import FeatureFrame
 
 
 class Pipeline:
@@ -97,9 +95,10 @@ class Pipeline:
         features, ages = self._features(view, clouds, used, probe)
         with probe.stage("feature_reprojection"):
             preceding = [self.reproject(clouds[number], view) for number in used]
+            sight = self.sight(features, preceding, view, probe)
         with probe.stage("finish"):
             cloud = Cloud.of(features, options.reprojection, ages)
-        return Glance(view, features, cloud, used, preceding)
+        return Glance(view, features, cloud, used, preceding, sight)
 
     @torch.no_grad()
     def draw(self, camera: Camera, glance: Glance, buffer: RenderingBuffer, probe: Probe) -> Frame:
@@ -107,7 +106,9 @@ class Pipeline:
         options, view, features = self.options, glance.view, glance.features
         newest = buffer.frames[glance.used[0]] if glance.used else None
         with probe.stage("feature_reprojection"):
-            observation = self.observe(features, glance.preceding, newest, view, probe)
+            observation = self.observe(
+                features, glance.preceding, newest, view, glance.sight, probe
+            )
         with probe.stage("renderer2d"):
             drawing = self.renderer([observation], probe)
             picture = drawing.pictures[0].clamp_(0, 1)
@@ -134,67 +135,60 @@ class Pipeline:
         index, _ = cloud.land(view.full, self.options.reprojection, self.backend)
         return Points(cloud.values, index)
 
-    def observe(
-        self,
-        frame: FeatureFrame,
-        preceding: Sequence[Points],
-        newest: Remembered | None,
-        view: View,
-        probe: Probe,
-    ) -> Observation:
-        """All that is known of the picture of `view` from its `frame` and the `preceding` ones."""
+    def sight(
+        self, frame: FeatureFrame, preceding: Sequence[Points], view: View, probe: Probe
+    ) -> Sight:
+        """Where matter is seen in `view`, by its `frame` and the `preceding` ones."""
         options = self.options
         if options.skip.background:
             cells = cells_at_matter(frame.alpha, preceding)
         else:
             cells = torch.arange(frame.alpha.numel(), device=frame.alpha.device)
         probe.count("cells", len(cells), frame.alpha.numel())
-        history = surface = None
-        if options.history or options.surface:
-            depth = enlarge(
-                frame.depth.detach(), cells, options.scale, view.phase, backend=self.backend
-            )
-            history = self.history(newest, depth, cells, view)
-            surface = self.surface(depth, cells, view, probe)
+        if not (options.history or options.surface):
+            return Sight(cells)
+        depth = frame.depth.detach()
+        depth = enlarge(depth, cells, options.scale, view.phase, backend=self.backend)
+        if not options.surface:
+            return Sight(cells, depth)
+        with probe.stage("surface"):
+            surface = Surface(self.field, depth, cells, view, options.scale)
+        probe.count("surface_samples", len(surface), view.full.width * view.full.height)
+        return Sight(cells, depth, surface)
+
+    def observe(
+        self,
+        frame: FeatureFrame,
+        preceding: Sequence[Points],
+        newest: Remembered | None,
+        view: View,
+        sight: Sight,
+        probe: Probe,
+    ) -> Observation:
+        """All that is known of the picture of `view` from its `frame`, the `preceding` ones, and
+        its `sight`."""
+        history = None
+        if newest is not None and self.options.history:
+            history = self.history(newest, sight, view)
+        surface = sight.surface.points(probe) if sight.surface else None
+        cells, phase = sight.cells, view.phase
         return Observation(
-            frame, self.background, preceding, cells, history, surface, view.phase, self.backend
+            frame, self.background, preceding, cells, history, surface, phase, self.backend
         )
 
-    def history(
-        self, newest: Remembered | None, depth: Tensor, cells: Tensor, view: View
-    ) -> Detail | None:
-        """The preceding picture where the present one, of `depth` [N, s^2] in `cells`, sees it."""
-        if newest is None or not self.options.history:
-            return None
-        scale, backend = self.options.scale, self.backend
+    def history(self, newest: Remembered, sight: Sight, view: View) -> Detail:
+        """The preceding picture where the present one sees what it shows."""
+        assert sight.depth is not None
         values, valid = warp(
-            newest.picture, newest.camera, depth, cells, view.full, scale, backend=backend
+            newest.picture,
+            newest.camera,
+            sight.depth,
+            sight.cells,
+            view.full,
+            self.options.scale,
+            backend=self.backend,
         )
         return Detail(values, valid)
-
-    def surface(self, depth: Tensor, cells: Tensor, view: View, probe: Probe) -> Points | None:
-        """Features and, as the last of [P, K + 1], opacity of a sample at every pixel of `cells`
-        whose `depth` [N, s^2] is finite, standing for a layer of `LAYER`.
-
-        Differentiable in the field, not in its depth.
-        """
-        if not self.options.surface:
-            return None
-        with probe.stage("surface"):
-            scale, width = self.options.scale, view.low.width
-            known = depth.isfinite().flatten().nonzero().squeeze(1)
-            pixels = centres(cells, width, scale).flatten(0, 1)[known]
-            points = unproject(view.full, pixels, depth.flatten()[known])
-            probe.count("surface_samples", len(points), view.full.width * view.full.height)
-            self.field.count(probe, len(points), len(points))
-            # The pixels of a cell share the view direction of its middle.
-            middles = cast(view.low, centres(cells, width, 1)[:, 0]).directions
-            sigma, values = query(self.field, points, known // scale**2, middles)
-            alpha = -torch.expm1(-LAYER * sigma)
-            index = torch.full(depth.shape, -1, dtype=torch.int32, device=depth.device)
-            number = torch.arange(len(points), dtype=torch.int32, device=depth.device)
-            index.view(-1)[known] = number
-        return Points(torch.cat((values, alpha[:, None]), dim=1), index)
 
     def refine(self, cells: Tensor, frame: FeatureFrame, view: View, probe: Probe) -> Tensor:
         """Colours [n, s^2, 3] of `cells` [n], by a ray of the field through each of their pixels.
@@ -256,6 +250,21 @@ class Pipeline:
 
 
 @dataclass(frozen=True)
+class Sight:
+    """Where matter is seen in a picture.
+
+    Attributes:
+        cells: [N] that have any.
+        depth: [N, s^2] of their pixels, +inf where there is none; None: of no use.
+        surface: what the field has there; None: of no use.
+    """
+
+    cells: Tensor
+    depth: Tensor | None = None
+    surface: Surface | None = None
+
+
+@dataclass(frozen=True)
 class Glance:
     """What is known of a frame before the pictures of the preceding ones are.
 
@@ -265,6 +274,7 @@ class Glance:
         cloud: the same as points, to be remembered.
         used: which of the preceding frames show enough of the view, 0 for the newest.
         preceding: their features in it.
+        sight: where matter is seen.
     """
 
     view: View
@@ -272,6 +282,7 @@ class Glance:
     cloud: Cloud
     used: Sequence[int]
     preceding: Sequence[Points]
+    sight: Sight
 
 
 def most_doubted(doubt: Tensor, share: float) -> Tensor:

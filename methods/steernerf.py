@@ -49,6 +49,7 @@ SOURCES = (
     "sequences",
     "space_to_depth",
     "steernerf",
+    "surface",
     "unet_release",
     "view",
 )

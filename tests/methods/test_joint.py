@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.types import Camera, Log, NullProbe, Probe, Scene, SteerbenchError
+from bench.types import Camera, Log, NullProbe, Scene, SteerbenchError
 from methods import loop
 from methods.cells import pixels_of
 from methods.fields import HashField
@@ -21,9 +21,10 @@ from methods.patches import Batch, PatchSource, Through
 from methods.pipeline import Pipeline
 from methods.pipeline_options import PipelineOptions
 from methods.range_reduction import RangeReduction
-from methods.renderer2d import Points, Renderer2d
+from methods.renderer2d import Renderer2d
 from methods.sequences import MotionOptions, SequencePool, true_views
 from methods.space_to_depth import SpaceToDepth
+from methods.surface import Surface
 from methods.unet_release import UnetRelease
 from methods.view import View
 from tests.methods.observations import shaken
@@ -119,14 +120,14 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
     frozen = [cloud.values.double() for cloud in clouds]
     for cloud, values in zip(clouds, frozen, strict=True):
         object.__setattr__(cloud, "values", values)
-    look, depths = training.patches.pipeline.surface, {}
+    depths: dict[int, Tensor] = {}
 
-    def look_at_first_depth(
-        depth: Tensor, cells: Tensor, view: View, probe: Probe
-    ) -> Points | None:
-        return look(depths.setdefault(id(view), depth.detach()), cells, view, probe)
+    def at_first_depth(
+        field: HashField, depth: Tensor, cells: Tensor, view: View, scale: int
+    ) -> Surface:
+        return Surface(field, depths.setdefault(id(view), depth), cells, view, scale)
 
-    monkeypatch.setattr(training.patches.pipeline, "surface", look_at_first_depth)
+    monkeypatch.setattr("methods.pipeline.Surface", at_first_depth)
 
     def loss() -> Tensor:
         observations, opacity = training.patches.observe(patches)

@@ -9,21 +9,21 @@ from typing import Literal
 import pytest
 import torch
 
-from bench.cameras import cast, pixel_grid, project, unproject
+from bench.cameras import cast, project
 from bench.probes import StageClock
 from bench.types import Camera, NullProbe
 from methods.buffer import Cloud, RenderingBuffer
 from methods.cells import cells_near, pixels_of
 from methods.kernels.warp import enlarge
 from methods.occupancy import STEP
-from methods.pipeline import LAYER, Pipeline
+from methods.pipeline import Pipeline, Sight
 from methods.pipeline_options import SIZES, PipelineOptions, Skips
 from methods.range_reduction import RangeReduction, render_guided
 from methods.space_to_depth import SpaceToDepth
 from methods.unet_release import UnetRelease
 from methods.view import View, sample_phase
 from tests.methods.conftest import GRID, Work, look_at_the_middle
-from tests.methods.observations import shaken, to_blocks
+from tests.methods.observations import shaken
 from tests.methods.test_joint import misty_field, shell
 
 OPTIONS = PipelineOptions(channels=4, frames=2, steps=8)
@@ -107,46 +107,12 @@ def test_the_preceding_picture_of_a_still_camera_is_where_it_was() -> None:
     view = View.of(CAMERA, 4, 1)
     low_depth = frame.depth[::4, ::4]
     fine = enlarge(low_depth, ALL_CELLS, 4)
-    history = pipeline.history(buffer.frames[0], fine, ALL_CELLS, view)
-    assert history is not None
+    history = pipeline.history(buffer.frames[0], Sight(ALL_CELLS, fine), view)
     blocks = frame.rgb.view(8, 4, 8, 4, 3).transpose(1, 2).reshape(64, 16, 3)
     known = history.valid > 0
     assert known.float().mean() > 0.2
     # Positions are off by some ulps of 32 pixels, and neighbours differ by at most 1.
     assert (history.values - blocks)[known].abs().max() < 1e-4
-
-
-def test_the_opacity_at_the_surface_is_that_of_a_layer_of_the_field() -> None:
-    """At a pixel's own point, z in front of it; pixels without a depth have no point."""
-    pipeline, view, z = new_pipeline(), View.of(CAMERA, 4), 1.5
-    pipeline.field = misty_field("fp32")
-    near = torch.zeros(32, 32, dtype=torch.bool)
-    near[10:22, 6:22] = True
-    cells = torch.arange(8, 64)  # not the first row
-    blocks = to_blocks(near[..., None], 4).flatten(0, 1)[cells, :, 0]
-    surface = pipeline.surface(torch.where(blocks, z, torch.inf), cells, view, NullProbe())
-    assert surface is not None
-    assert torch.equal(surface.index >= 0, blocks)
-    whole = torch.full((64, 16), -1).index_copy(0, cells, surface.index.long())
-    index = whole.view(8, 8, 4, 4).transpose(1, 2).reshape(32, 32)[near]
-    assert torch.equal(index.sort().values, torch.arange(int(near.sum())))
-    pixels = pixel_grid(32, 32, near.device)[near.flatten()]
-    points = unproject(view.full, pixels, torch.full((len(pixels),), z))
-    opacity = 1 - torch.exp(-LAYER * pipeline.field.density(points)[0])
-    assert opacity.std() > 1e-3  # not the same everywhere
-    assert surface.values.shape == (len(pixels), OPTIONS.channels + 1)
-    torch.testing.assert_close(surface.values[index, -1], opacity, rtol=1e-5, atol=1e-6)
-
-
-def test_where_no_pixel_has_a_depth_there_is_no_surface() -> None:
-    view = View.of(CAMERA, 4)
-    nowhere = torch.full((64, 16), torch.inf)
-    surface = new_pipeline().surface(nowhere, ALL_CELLS, view, NullProbe())
-    assert surface is not None
-    assert surface.values.shape == (0, OPTIONS.channels + 1)
-    assert (surface.index == -1).all()
-    unused = new_pipeline(replace(OPTIONS, surface=False))
-    assert unused.surface(torch.ones(64, 16), ALL_CELLS, view, NullProbe()) is None
 
 
 @pytest.mark.parametrize("mode", ["off", "window"])
@@ -181,7 +147,8 @@ def test_the_cells_in_most_doubt_are_refined() -> None:
     pictures = [p.render(CAMERA, RenderingBuffer(2), NullProbe()).rgb for p in (drawn, refined)]
     view = View.of(CAMERA, 4)
     frame = drawn.glance(CAMERA, (), 0, NullProbe()).features
-    observation = drawn.observe(frame, [], None, view, NullProbe())
+    sight = drawn.sight(frame, [], view, NullProbe())
+    observation = drawn.observe(frame, [], None, view, sight, NullProbe())
     doubt = drawn.renderer([observation]).doubt
     assert doubt is not None
     order = doubt.sort(descending=True).indices

@@ -1,0 +1,77 @@
+"""The field looked at once a pixel, where the low-resolution depth has the surface."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from bench.cameras import cast, unproject
+from bench.types import Probe
+from methods.cells import centres
+from methods.fields import HashField
+from methods.occupancy import STEP
+from methods.renderer2d import Points
+from methods.view import View
+from methods.volume import pad
+
+LAYER = 4 * STEP
+"""Thickness, in scene units, of what a single sample of the surface stands for."""
+
+PIECE = 1 << 16
+"""Pixels that a CPU looks at together: few enough to stay in the cache, and for two threads to
+share those of a large picture."""
+
+
+class Surface:
+    """Features and opacity of a sample at every pixel of `cells` [N] whose `depth` [N, s^2] is
+    finite, a piece at a time: several threads may look at pieces, and none is looked at twice.
+
+    Differentiable in the field, not in the depth.
+    """
+
+    def __init__(
+        self, field: HashField, depth: Tensor, cells: Tensor, view: View, scale: int
+    ) -> None:
+        self._field, self._shape, device = field, depth.shape, depth.device
+        self._known = depth.isfinite().flatten().nonzero().squeeze(1)
+        pixels = centres(cells, view.low.width, scale).flatten(0, 1)[self._known]
+        self._points = unproject(view.full, pixels, depth.flatten()[self._known])
+        # The pixels of a cell share the view direction of its middle.
+        self._cell = self._known // scale**2
+        middles = cast(view.low, centres(cells, view.low.width, 1)[:, 0])
+        self._directions = field.encode_directions(middles.directions)
+        size = PIECE if device.type == "cpu" else len(self._points)
+        starts = range(0, len(self._points), size) if len(self._points) else (0,)
+        self._pieces = [slice(start, start + size) for start in starts]
+        self._turn = itertools.count()  # whoever counts on has that piece
+        self._found: list[Tensor | None] = [None] * len(self._pieces)
+
+    def __len__(self) -> int:
+        return len(self._points)
+
+    def look(self, probe: Probe, enough: Callable[[], bool] = lambda: False) -> None:
+        """Look at pieces that nobody has taken, until there are none or it is `enough`."""
+        while not enough() and (turn := next(self._turn)) < len(self._pieces):
+            with probe.stage("surface"):
+                self._found[turn] = self._looked_at(self._pieces[turn], probe)
+
+    def points(self, probe: Probe) -> Points:
+        """All of it, opacity the last of [P, K + 1]. No other thread is looking any more."""
+        self.look(probe)
+        found = [part for part in self._found if part is not None]
+        with probe.stage("surface"):
+            index = torch.full(self._shape, -1, dtype=torch.int32, device=self._points.device)
+            number = torch.arange(len(self._points), dtype=torch.int32, device=index.device)
+            index.view(-1)[self._known] = number
+            return Points(torch.cat(found), index)
+
+    def _looked_at(self, piece: slice, probe: Probe) -> Tensor:
+        points, cell = self._points[piece], self._cell[piece]
+        self._field.count(probe, len(points), len(points))
+        sigma, geometry = self._field.density(pad(points))
+        values = self._field.features(geometry, self._directions[pad(cell)])
+        alpha = -torch.expm1(-LAYER * sigma)  # of a layer of that thickness
+        return torch.cat((values, alpha[:, None]), dim=1)[: len(points)]
