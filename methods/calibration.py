@@ -2,15 +2,46 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from itertools import groupby
+from pathlib import Path
+
 import torch
 from torch import Tensor
 
 from bench.motion import preceding
+from bench.sharing import missing
 from bench.types import Log, NullProbe, Scene
+from methods import checkpoint
 from methods.buffer import RenderingBuffer
 from methods.engines import Inputs
 from methods.pipeline import Pipeline
 from methods.sequences import MotionOptions
+
+
+def kept_inputs(
+    folder: Callable[[], Path], record: Callable[[], Sequence[Inputs]], log: Log
+) -> list[Inputs]:
+    """What `record` finds: done once, and kept in `folder` for every engine that is to see it.
+
+    Raises:
+        SteerbenchError: the file there cannot be written or read.
+    """
+    path = folder() / "inputs.safetensors"
+    with missing(path, log) as to_record:
+        if to_record:
+            frames = record()
+            tensors = {
+                f"{frame:03} {place}": x
+                for frame, inputs in enumerate(frames)
+                for place, x in enumerate(inputs)
+            }
+            checkpoint.write(path, tensors, {})
+            return list(frames)
+    log.info(f"frames to build the network on: found in {path}")
+    tensors, _ = checkpoint.read(path)
+    by_frame = groupby(sorted(tensors), lambda name: name.partition(" ")[0])
+    return [tuple(tensors[name] for name in names) for _, names in by_frame]
 
 
 def recorded_inputs(

@@ -15,7 +15,7 @@ from bench.provenance import ROOT, digest, foreign_digest
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods import loop
 from methods.buffer import RenderingBuffer
-from methods.calibration import recorded_inputs
+from methods.calibration import kept_inputs, recorded_inputs
 from methods.distil import distilled_views
 from methods.engines import Engine
 from methods.fields import Precision
@@ -182,9 +182,12 @@ class SteerNerf:
         usual = self.options.taught(self.joint.refined)
         trained, background = self.trained, self.pipeline.background[:3]
         pipeline = Pipeline(trained.field, trained.occupancy, background, renderer, usual)
-        options = (engine.samples(renderer.network), self.joint.motion, self.setup.seed, log)
-        seen = partial(recorded_inputs, pipeline, scene, target, *options)
+        count = engine.samples(renderer.network)
+        options = (count, self.joint.motion, self.setup.seed, log)
+        record = partial(recorded_inputs, pipeline, scene, target, *options)
         code = digest([ROOT / "methods" / path for path in CALIBRATED_BY])
+        shown = {"trained": key, "frames": count, "calibration": code}
+        seen = partial(kept_inputs, partial(log.stage_dir, "inputs", shown), record, log)
         parts = {"trained": key, "engine": engine.key(), "calibration": code}
         built = engine.build(renderer.network, seen, partial(log.stage_dir, "network", parts), log)
         renderer.engine, self.renderer_bytes = built.run, built.size

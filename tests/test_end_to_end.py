@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import random
-import shutil
 import signal
 import subprocess
 import sys
@@ -132,27 +131,6 @@ def test_the_methods_are_as_good_as_the_recorded_baseline(first: tuple[Path, str
     assert done.returncode == 0, done.stdout
 
 
-def test_the_tables_of_the_paper_go_on_after_being_killed_and_end_with_the_same_rows(
-    first: tuple[Path, str], tmp_path: Path, lpips_weights: Path
-) -> None:
-    steerbench = Path(sys.executable).with_name("steerbench")
-    command = [steerbench, "paper", "--table", "table5", "scene=totem", *SMALL]
-    command.append(f"weights_dir={lpips_weights}")
-    killed, undisturbed = tmp_path / "killed", tmp_path / "undisturbed"
-    for folder in (killed, undisturbed):  # one of two trainings is still to be done
-        shutil.copytree(first[0] / "outputs" / "stages", folder / "outputs" / "stages")
-    with subprocess.Popen(command, cwd=killed, stderr=subprocess.PIPE, text=True) as process:
-        assert any(line.startswith("2 of 2") for line in process.stderr)
-        process.kill()
-    ends = [
-        subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-        for folder in (killed, undisturbed)
-    ]
-    assert [end.returncode for end in ends] == [0, 0], ends
-    assert "already measured" in ends[0].stderr
-    pd.testing.assert_frame_equal(*map(repeatable, (killed, undisturbed)), check_exact=True)
-
-
 SMALLEST = [
     *("scene=totem", "scene.width=24", "scene.train=3", "scene.test=1"),
     *("budget=tiny", "budget.steps=16", "budget.samples=512", "budget.renderer_steps=8"),
@@ -185,23 +163,24 @@ def test_wherever_it_is_killed_again_and_again_a_sweep_ends_with_the_same_rows(
         assert life.returncode == -signal.SIGKILL, life.stderr
     last = mortal(killed, 0)
     assert last.returncode == 0, last.stderr
+    assert "already measured" in last.stderr
     pd.testing.assert_frame_equal(*map(repeatable, (whole, killed)), check_exact=True)
 
 
-def test_parity_compares_every_engine_with_torch_in_fp32(first: tuple[Path, str]) -> None:
+def test_parity_compares_every_engine_with_torch_in_fp32(tmp_path: Path) -> None:
     steerbench = Path(sys.executable).with_name("steerbench")
-    command = [steerbench, "parity", "--repeats", "1", "--frames", "4", "scene=totem", *SMALL]
-    done = subprocess.run(command, cwd=first[0], capture_output=True, text=True, check=False)
+    command = [steerbench, "parity", "--repeats", "1", "--frames", "4", *SMALLEST]
+    command += ["scene.test=3", "budget.frames=0"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert ": found in" in done.stderr
+    assert "frames to build the network on: found in" in done.stderr  # made for another engine
     found = {row["engine"]: row for row in json.loads(done.stdout.splitlines()[-1])}
     standard = found["torch, fp32"]
     assert standard["lost"] == 0
     assert standard["apart"] is None  # there is no difference
     for engine in ("openvino", "onnxruntime"):
-        # The same in 8 bits, but that refinement may choose another one of cells doubted alike.
         apart = found[f"{engine}, fp32"]["apart"]
-        assert apart is None or apart > 60
+        assert apart is None or apart > 60  # the same in 8 bits, but for one here and there
         assert abs(found[f"{engine}, int8"]["lost"]) < 1
         assert found[f"{engine}, int8"]["bytes"] < 0.5 * standard["bytes"]
     for row in found.values():
