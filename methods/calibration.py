@@ -20,9 +20,13 @@ from methods.sequences import MotionOptions
 
 
 def kept_inputs(
-    folder: Callable[[], Path], record: Callable[[], Sequence[Inputs]], log: Log
+    folder: Callable[[], Path],
+    record: Callable[[], Sequence[Inputs]],
+    device: torch.device,
+    log: Log,
 ) -> list[Inputs]:
-    """What `record` finds: done once, and kept in `folder` for every engine that is to see it.
+    """What `record` finds on `device`: done once, and kept in `folder` for every engine that is to
+    see it.
 
     Raises:
         SteerbenchError: the file there cannot be written or read.
@@ -41,7 +45,7 @@ def kept_inputs(
     log.info(f"frames to build the network on: found in {path}")
     tensors, _ = checkpoint.read(path)
     by_frame = groupby(sorted(tensors), lambda name: name.partition(" ")[0])
-    return [tuple(tensors[name] for name in names) for _, names in by_frame]
+    return [tuple(tensors[name].to(device) for name in names) for _, names in by_frame]
 
 
 def recorded_inputs(

@@ -46,7 +46,7 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, float]]:
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         raise SteerbenchError(
             f"{path}: expected the file of a training, could not read one ({error}); "
-            "remove it to train again"
+            "remove it, and it is made again"
         ) from error
 
 

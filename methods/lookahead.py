@@ -120,7 +120,7 @@ class _Beside:
 
     def stage(self, name: str) -> AbstractContextManager[None]:
         """See `bench.types.Probe`."""
-        if self._alone():
+        if self._alone() and torch.get_num_threads() != self._threads:
             torch.set_num_threads(self._threads)
         return self._probe.stage(name)
 

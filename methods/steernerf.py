@@ -187,7 +187,8 @@ class SteerNerf:
         record = partial(recorded_inputs, pipeline, scene, target, *options)
         code = digest([ROOT / "methods" / path for path in CALIBRATED_BY])
         shown = {"trained": key, "frames": count, "calibration": code}
-        seen = partial(kept_inputs, partial(log.stage_dir, "inputs", shown), record, log)
+        kept = partial(log.stage_dir, "inputs", shown)
+        seen = partial(kept_inputs, kept, record, self.setup.device, log)
         parts = {"trained": key, "engine": engine.key(), "calibration": code}
         built = engine.build(renderer.network, seen, partial(log.stage_dir, "network", parts), log)
         renderer.engine, self.renderer_bytes = built.run, built.size

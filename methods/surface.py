@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 
 import torch
@@ -21,13 +20,13 @@ LAYER = 4 * STEP
 """Thickness, in scene units, of what a single sample of the surface stands for."""
 
 PIECE = 1 << 16
-"""Pixels that a CPU looks at together: few enough to stay in the cache, and for two threads to
-share those of a large picture."""
+"""Pixels that a CPU looks at together: few enough to stay in the cache, and for who has enough to
+stop soon."""
 
 
 class Surface:
     """Features and opacity of a sample at every pixel of `cells` [N] whose `depth` [N, s^2] is
-    finite, a piece at a time: several threads may look at pieces, and none is looked at twice.
+    finite, a piece at a time: one thread may look at some of them, and later another at the rest.
 
     Differentiable in the field, not in the depth.
     """
@@ -46,27 +45,25 @@ class Surface:
         size = PIECE if device.type == "cpu" else len(self._points)
         starts = range(0, len(self._points), size) if len(self._points) else (0,)
         self._pieces = [slice(start, start + size) for start in starts]
-        self._turn = itertools.count()  # whoever counts on has that piece
-        self._found: list[Tensor | None] = [None] * len(self._pieces)
+        self._found: list[Tensor] = []
 
     def __len__(self) -> int:
         return len(self._points)
 
     def look(self, probe: Probe, enough: Callable[[], bool] = lambda: False) -> None:
-        """Look at pieces that nobody has taken, until there are none or it is `enough`."""
-        while not enough() and (turn := next(self._turn)) < len(self._pieces):
+        """Look at one piece after the other, until there are none left or it is `enough`."""
+        while len(self._found) < len(self._pieces) and not enough():
             with probe.stage("surface"):
-                self._found[turn] = self._looked_at(self._pieces[turn], probe)
+                self._found.append(self._looked_at(self._pieces[len(self._found)], probe))
 
     def points(self, probe: Probe) -> Points:
-        """All of it, opacity the last of [P, K + 1]. No other thread is looking any more."""
+        """All of it, opacity the last of [P, K + 1]."""
         self.look(probe)
-        found = [part for part in self._found if part is not None]
         with probe.stage("surface"):
             index = torch.full(self._shape, -1, dtype=torch.int32, device=self._points.device)
             number = torch.arange(len(self._points), dtype=torch.int32, device=index.device)
             index.view(-1)[self._known] = number
-            return Points(torch.cat(found), index)
+            return Points(torch.cat(self._found), index)
 
     def _looked_at(self, piece: slice, probe: Probe) -> Tensor:
         points, cell = self._points[piece], self._cell[piece]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
 from importlib import metadata
 from typing import Any
 
@@ -48,7 +49,9 @@ def _state(name: str, kind: Any) -> str:
         kind(kind.precisions[0])
     except Unavailable as reason:
         return str(reason)
-    return f"usable (version {metadata.version(name)})"
+    with suppress(metadata.PackageNotFoundError):  # an engine need not be called as its library
+        return f"usable (version {metadata.version(name)})"
+    return "usable"
 
 
 def _comment(text: str) -> str:

@@ -27,7 +27,8 @@ Precision = Literal["fp32", "bf16", "fp16", "int8"]
 Inputs = tuple[Tensor, ...]
 
 CALIBRATION = 16
-"""Frames whose inputs tell the range of every number that is rounded to 8 bits."""
+"""Frames whose inputs tell the range of every number that is rounded to 8 bits, and the sizes of
+varying axes that are to be expected."""
 
 SIZES = "steerbench_sizes"
 """Where a stored model says for which sizes of varying axes it is made ready beforehand."""

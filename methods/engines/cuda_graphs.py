@@ -21,7 +21,7 @@ WARM_UP = 3
 class Replayed:
     """`run`, recorded for every size of its inputs that comes.
 
-    What it returns is overwritten by the next call with inputs of the same size.
+    What it returns is overwritten by the next call, of whatever size: all recordings share memory.
 
     Args:
         run: computes on a CUDA GPU, without asking it anything.
@@ -40,15 +40,19 @@ class Replayed:
     def __call__(self, *inputs: Tensor) -> Inputs:
         if not all(x.numel() for x in inputs):
             return self._run(*inputs)  # nothing would be launched, and nothing is not recorded
+        with torch.cuda.device_of(inputs[0]):
+            recording = self._recording(inputs)
+            for held, x in zip(recording.told, inputs, strict=True):
+                held.copy_(x)
+            recording.replay()
+        return recording.said
+
+    def _recording(self, inputs: Inputs) -> _Recording:
         sizes = tuple(x.shape for x in inputs)
         if sizes not in self._recordings:
             told = [x.clone() for x in inputs]
             self._recordings[sizes] = _Recording(told, *self._record(lambda: self._run(*told)))
-        recording = self._recordings[sizes]
-        for held, x in zip(recording.told, inputs, strict=True):
-            held.copy_(x)
-        recording.replay()
-        return recording.said
+        return self._recordings[sizes]
 
 
 class _Recording(NamedTuple):
@@ -61,15 +65,17 @@ class _Recorder:
     """Records graphs, all with one pool of memory: no two of them are played at a time."""
 
     def __init__(self) -> None:
-        self._stream, self._pool = torch.cuda.Stream(), torch.cuda.graph_pool_handle()
+        self._stream: torch.cuda.Stream | None = None
+        self._pool = torch.cuda.graph_pool_handle()
 
     def __call__(self, run: Callable[[], Inputs]) -> tuple[Callable[[], Any], Inputs]:
-        self._stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(self._stream):
+        stream = self._stream = self._stream or torch.cuda.Stream()  # of the device of the first
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
             for _ in range(WARM_UP):
                 run()
-        torch.cuda.current_stream().wait_stream(self._stream)
+        torch.cuda.current_stream().wait_stream(stream)
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, pool=self._pool, stream=self._stream):
+        with torch.cuda.graph(graph, pool=self._pool, stream=stream):
             said = run()
         return graph.replay, said

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,16 +43,22 @@ def write(
         exported, ready = Path(place) / "exported.onnx", Path(place) / "ready.onnx"
         _export(_Halved(plain) if precision == "fp16" else plain, network, samples[0], exported)
         if precision == "int8":
-            _quantise(exported, samples, ready, options or {})
+            frames = _Reader(samples, input_names(network))
+            _quantise(exported, frames, ready, options or {})
         else:
             ready = exported
-        _note(ready, json.dumps(sizes_to_expect(samples, network)))
+        _note_sizes(ready, sizes_to_expect(samples, network))
         ready.replace(path)
 
 
 def input_names(network: Network) -> list[str]:
     """What the inputs of an exported `network` are called, in order."""
     return [f"input{place}" for place in range(len(network.varying))]
+
+
+def output_names(count: int) -> list[str]:
+    """What `count` outputs of an exported network are called, in order."""
+    return [f"output{place}" for place in range(count)]
 
 
 def sizes(path: Path) -> list[int]:
@@ -71,11 +77,11 @@ def weight_bytes(path: Path) -> int:
     return sum(onnx.numpy_helper.to_array(weight).nbytes for weight in weights)
 
 
-def _note(path: Path, sizes: str) -> None:
+def _note_sizes(path: Path, expected: list[int]) -> None:
     import onnx
 
     model = onnx.load(path)
-    onnx.helper.set_model_props(model, {SIZES: sizes})
+    onnx.helper.set_model_props(model, {SIZES: json.dumps(expected)})
     onnx.save(model, path)
 
 
@@ -95,21 +101,21 @@ def _export(module: nn.Module, network: Network, sample: Inputs, path: Path) -> 
     names = input_names(network)
     varying = dict(zip(names, map(list, network.varying), strict=True))
     with torch.no_grad(), warnings.catch_warnings():
+        outputs = len(module(*sample))
         warnings.simplefilter("ignore")  # of the exporter, on itself
         torch.onnx.export(
             module,
             sample,
             path,
             input_names=names,
+            output_names=output_names(outputs),
             dynamic_axes=varying,
             opset_version=OPSET,
             dynamo=False,
         )
 
 
-def _quantise(
-    exported: Path, samples: Sequence[Inputs], path: Path, options: Mapping[str, bool]
-) -> None:
+def _quantise(exported: Path, frames: _Reader, path: Path, options: Mapping[str, bool]) -> None:
     from onnxruntime import quantization
     from onnxruntime.quantization import shape_inference
 
@@ -118,7 +124,7 @@ def _quantise(
     quantization.quantize_static(
         prepared,
         path,
-        _Reader(samples),
+        frames,
         quant_format=quantization.QuantFormat.QDQ,
         per_channel=True,
         op_types_to_quantize=list(PRODUCTS),
@@ -129,12 +135,12 @@ def _quantise(
 class _Reader:
     """Inputs, one frame after the other, as ONNX Runtime asks for them."""
 
-    def __init__(self, samples: Sequence[Inputs]) -> None:
-        self._frames: Iterator[Inputs] = iter(samples)
+    def __init__(self, samples: Sequence[Inputs], names: Sequence[str]) -> None:
+        self._frames, self._names = iter(samples), names
 
     def get_next(self) -> dict[str, Any] | None:
         """The next frame; None after the last."""
         frame = next(self._frames, None)
         if frame is None:
             return None
-        return {f"input{place}": x.numpy() for place, x in enumerate(frame)}
+        return {name: x.numpy() for name, x in zip(self._names, frame, strict=True)}

@@ -61,9 +61,10 @@ class TensorRt(Engine):
 
     def check(self, device: torch.device) -> None:
         """See `Engine.check`."""
-        if device.type != "cuda":
+        if device.type != "cuda" or device.index:
             raise Unavailable(
-                f"engine=tensorrt computes on a CUDA GPU, this is device={device}: use device=cuda"
+                f"engine=tensorrt computes on the first CUDA GPU, this is device={device}: use "
+                "device=cuda, and CUDA_VISIBLE_DEVICES to choose among several"
             )
 
     def samples(self, network: Network) -> int:
@@ -138,7 +139,8 @@ class _Plans:
                     built = self._built(ceiling)
                     with explained(path.parent), whole(path) as new:
                         new.write_bytes(built)
-            self._executions[ceiling] = _Execution(self._tensorrt, path, self._logger)
+            names = onnx_model.input_names(self._network)
+            self._executions[ceiling] = _Execution(self._tensorrt, path, self._logger, names)
         return self._executions[ceiling]
 
     def _built(self, ceiling: int) -> Any:
@@ -173,35 +175,40 @@ class _Plans:
 class _Execution:
     """A plan, ready to run on a stream of its own: on torch's, TensorRT waits for the device."""
 
-    def __init__(self, tensorrt: Any, path: Path, logger: Any) -> None:
+    def __init__(self, tensorrt: Any, path: Path, logger: Any, told: Sequence[str]) -> None:
         engine = tensorrt.Runtime(logger).deserialize_cuda_engine(path.read_bytes())
         if engine is None:
             raise SteerbenchError(f"TensorRT cannot load its plan: remove {path} and run again")
         self._context = engine.create_execution_context()
-        names = [engine.get_tensor_name(at) for at in range(engine.num_io_tensors)]
-        told = {name: engine.get_tensor_mode(name) == tensorrt.TensorIOMode.INPUT for name in names}
-        self._told = [name for name in names if told[name]]
-        self._said = [name for name in names if not told[name]]
+        self._told = told
+        self._said = onnx_model.output_names(engine.num_io_tensors - len(told))
         self._stream = torch.cuda.Stream()
 
     def __call__(self, *inputs: Tensor) -> Inputs:
-        inputs = tuple(x.contiguous() for x in inputs)
-        context = self._context
-        for name, x in zip(self._told, inputs, strict=True):
+        inputs, context = tuple(x.contiguous() for x in inputs), self._context
+        taken = [
             context.set_input_shape(name, tuple(x.shape))
-            context.set_tensor_address(name, x.data_ptr())
+            for name, x in zip(self._told, inputs, strict=True)
+        ]
+        if not all(taken):
+            raise _refused(inputs)
         said = [
             torch.empty(tuple(context.get_tensor_shape(name)), device=inputs[0].device)
             for name in self._said
         ]
-        for name, x in zip(self._said, said, strict=True):
-            context.set_tensor_address(name, x.data_ptr())
+        for name, x in zip((*self._told, *self._said), (*inputs, *said), strict=True):
+            taken.append(context.set_tensor_address(name, x.data_ptr()))
         current = torch.cuda.current_stream()
         self._stream.wait_stream(current)
-        if not context.execute_async_v3(self._stream.cuda_stream):
-            raise SteerbenchError("TensorRT could not run a network; it says why above")
+        if not all(taken) or not context.execute_async_v3(self._stream.cuda_stream):
+            raise _refused(inputs)
         current.wait_stream(self._stream)
         return tuple(said)
+
+
+def _refused(inputs: Inputs) -> SteerbenchError:
+    shapes = ", ".join(str(list(x.shape)) for x in inputs)
+    return SteerbenchError(f"TensorRT cannot run a network on {shapes}; it says why above")
 
 
 def _ceiling(size: int) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import torch
@@ -30,7 +31,9 @@ class TorchEngine(Engine):
 
     def samples(self, network: Network) -> int:
         """See `Engine.samples`: on a GPU, enough to know the sizes that come; on a CPU none."""
-        return CALIBRATION if _device(network).type == "cuda" else 0
+        if _on_cpu(network):
+            return 0
+        return CALIBRATION if any(network.varying) else 1
 
     def key(self) -> dict[str, object]:
         """See `Engine.key`."""
@@ -47,11 +50,10 @@ class TorchEngine(Engine):
         dtype = DTYPES[self.precision]
 
         def run(*inputs: Tensor) -> Inputs:
-            half = dtype != torch.float32
-            with torch.autocast(inputs[0].device.type, dtype, enabled=half):
+            with _arithmetic(inputs[0].device, dtype):
                 return network(*inputs)
 
-        ready = run if _device(network).type == "cpu" else _recorded(run, network, samples(), log)
+        ready = run if _on_cpu(network) else _recorded(run, network, samples(), log)
         return Built(ready, sum(weight.numel() for weight in network.parameters()) * dtype.itemsize)
 
 
@@ -68,5 +70,14 @@ def _recorded(
     return replayed
 
 
-def _device(network: Network) -> torch.device:
-    return next(network.parameters()).device
+def _arithmetic(device: torch.device, dtype: torch.dtype) -> AbstractContextManager[object]:
+    """Products in `dtype`; on a GPU convolutions in float32 would else be computed in TF32."""
+    if dtype != torch.float32:
+        return torch.autocast(device.type, dtype)
+    if device.type == "cuda":
+        return torch.backends.cudnn.flags(enabled=True, allow_tf32=False)
+    return nullcontext()
+
+
+def _on_cpu(network: Network) -> bool:
+    return next(network.parameters()).device.type == "cpu"

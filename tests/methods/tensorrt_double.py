@@ -29,7 +29,7 @@ class Logger:
 
 
 class NetworkDefinitionCreationFlag(Enum):
-    STRONGLY_TYPED = 1
+    STRONGLY_TYPED = 0
 
     def __int__(self) -> int:
         return self.value
@@ -37,11 +37,6 @@ class NetworkDefinitionCreationFlag(Enum):
 
 class BuilderFlag(Enum):
     TF32 = 3
-
-
-class TensorIOMode(Enum):
-    INPUT = 1
-    OUTPUT = 2
 
 
 class Network:
@@ -135,18 +130,10 @@ class Runtime:
 class CudaEngine:
     def __init__(self, shapes: dict[str, list[list[int]]], model: bytes) -> None:
         self.shapes, self.session = shapes, onnxruntime.InferenceSession(model)
-        self._inputs = [x.name for x in self.session.get_inputs()]
-        self._names = [*self._inputs, *(x.name for x in self.session.get_outputs())]
 
     @property
     def num_io_tensors(self) -> int:
-        return len(self._names)
-
-    def get_tensor_name(self, index: int) -> str:
-        return self._names[index]
-
-    def get_tensor_mode(self, name: str) -> TensorIOMode:
-        return TensorIOMode.INPUT if name in self._inputs else TensorIOMode.OUTPUT
+        return len(self.session.get_inputs()) + len(self.session.get_outputs())
 
     def create_execution_context(self) -> ExecutionContext:
         return ExecutionContext(self)
@@ -160,9 +147,8 @@ class ExecutionContext:
 
     def set_input_shape(self, name: str, shape: tuple[int, ...]) -> bool:
         least, most = self._engine.shapes[name]
-        assert all(a <= b <= c for a, b, c in zip(least, shape, most, strict=True))
         self._shapes[name] = shape
-        return True
+        return all(a <= b <= c for a, b, c in zip(least, shape, most, strict=True))
 
     def set_tensor_address(self, name: str, memory: int) -> bool:
         self._addresses[name] = memory

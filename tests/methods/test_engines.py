@@ -12,9 +12,9 @@ import torch
 
 from bench.console import ConsoleLog
 from bench.errors import Unavailable
-from methods.engines import Engine, Inputs, required
+from methods.engines import SIZES, Engine, Inputs, required
 from methods.engines.onnxruntime_engine import OnnxRuntime
-from methods.engines.openvino_engine import SIZES, OpenVino, _capabilities
+from methods.engines.openvino_engine import OpenVino, _capabilities
 from methods.engines.torch_engine import TorchEngine
 from methods.kernels.depthwise import neighbours_of
 from methods.renderer2d import Network

@@ -17,7 +17,7 @@ from bench.threads import torch_threads
 from bench.types import Camera, NullProbe
 from methods.buffer import RenderingBuffer
 from methods.lookahead import Lookahead
-from methods.pipeline import Pipeline
+from methods.pipeline import Glance, Pipeline
 from methods.pipeline_options import PipelineOptions
 from methods.range_reduction import RangeReduction
 from methods.refresh import Refresh
@@ -100,18 +100,19 @@ def test_a_new_sequence_knows_nothing_of_the_last_one() -> None:
 
 class Watched(Pipeline):
     """Runs `in_glance` and `in_draw` before a glance, but the first one, and before a drawing; and
-    tells on how many of torch's threads they ended."""
+    tells on how many of torch's threads they ended, and what the last glance was."""
 
     in_glance = in_draw = staticmethod(lambda: None)
     glances = 0
     ended: dict[str, int]
+    last: Glance
 
     def glance(self, *arguments: Any) -> Any:
         self.glances += 1
         if self.glances > 1:
             self.in_glance()
         result = super().glance(*arguments)
-        self.ended["glance"] = torch.get_num_threads()
+        self.ended["glance"], self.last = torch.get_num_threads(), result
         return result
 
     def draw(self, *arguments: Any) -> Any:
@@ -170,6 +171,8 @@ def test_a_drawing_that_is_left_has_all_threads(watched: Watched, two_threads: N
     lookahead.foresee(PATH[1])
     lookahead.render(watched, PATH[0], RenderingBuffer(2), NullProbe())
     assert watched.ended == {"draw": 2, "glance": 1}
+    assert watched.last.sight.surface
+    assert len(watched.last.sight.surface._found) == 1  # there was time for its only piece
 
 
 def test_a_glance_that_is_left_has_all_threads(watched: Watched, two_threads: None) -> None:
@@ -187,6 +190,8 @@ def test_a_glance_that_is_left_has_all_threads(watched: Watched, two_threads: No
     lookahead.render(watched, PATH[0], RenderingBuffer(2), Telling())
     assert watched.glances == 2
     assert watched.ended == {"draw": 1, "glance": 2}
+    assert watched.last.sight.surface
+    assert watched.last.sight.surface._found == []  # that is left to the next drawing
 
 
 def fail() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import replace
 
 import pytest
@@ -74,24 +73,6 @@ def test_in_pieces_it_is_the_same_and_the_same_work(
     # Sums of float32 in another order.
     torch.testing.assert_close(pieces.values, whole.values, rtol=1e-5, atol=1e-6)
     assert work.done["table_reads"] == 192 * 8 * misty_field("fp32").levels
-
-
-def test_no_piece_is_looked_at_twice(small_pieces: None) -> None:
-    whole, work = new_surface().points(NullProbe()), [Work(), Work(), Work()]
-    surface, together = new_surface(), threading.Barrier(2)
-
-    def look(probe: Work) -> None:
-        together.wait()
-        surface.look(probe)
-
-    others = [threading.Thread(target=look, args=(probe,)) for probe in work[:2]]
-    for other in others:
-        other.start()
-    for other in others:
-        other.join()
-    assert torch.equal(surface.points(work[2]).values, whole.values)
-    reads = sum(probe.done.get("table_reads", 0) for probe in work)
-    assert reads == 192 * 8 * misty_field("fp32").levels
 
 
 def test_who_has_enough_stops_and_the_rest_is_looked_at_later(small_pieces: None) -> None:

@@ -136,9 +136,17 @@ def test_a_build_belongs_to_its_gpu_and_version(double, monkeypatch):
     assert len({str(key) for key in (first, second, TensorRt("fp16").key())}) == 3
 
 
-def test_a_cpu_is_refused(double):
-    with pytest.raises(Unavailable, match="this is device=cpu: use device=cuda"):
-        TensorRt("fp16").check(torch.device("cpu"))
+@pytest.mark.parametrize("device", ["cpu", "cuda:1"])
+def test_what_is_not_the_first_gpu_is_refused(device, double):
+    with pytest.raises(Unavailable, match=f"this is device={device}: use device=cuda"):
+        TensorRt("fp16").check(torch.device(device))
+
+
+def test_inputs_that_a_plan_is_not_for_are_refused(double, tmp_path, quiet_log):
+    module, inputs = unet()  # of one size
+    built = TensorRt("fp32").build(module, lambda: inputs, lambda: tmp_path, quiet_log)
+    with pytest.raises(SteerbenchError, match=r"on \[1, 12, 40, 44\]; it says why above"):
+        built.run(torch.zeros(1, 12, 40, 44))
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="for a machine without a GPU")
