@@ -195,7 +195,7 @@ def test_a_file_of_another_training_is_named_with_what_to_do(
     ball_scene: Scene, tmp_path: Path, quiet_log: Log, name: str
 ) -> None:
     checkpoint.write(tmp_path / f"{name}.safetensors", {"mean.weight": torch.zeros(3)}, {})
-    message = rf"{name}\.safetensors: expected the file of this .*; remove it, and it is made again"
+    message = rf"{name}\.safetensors: expected the file of this .*; remove it to train again"
     with pytest.raises(SteerbenchError, match=message):
         trained(ball_scene, tmp_path, quiet_log)
 
