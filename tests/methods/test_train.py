@@ -186,7 +186,7 @@ def test_a_damaged_field_is_named_with_what_to_do(
     ball_scene: Scene, tmp_path: Path, quiet_log: Log
 ) -> None:
     (tmp_path / "field.safetensors").write_bytes(b"half a file")
-    with pytest.raises(SteerbenchError, match=r"field\.safetensors.*remove it, and it is made again"):
+    with pytest.raises(SteerbenchError, match=r"field\.safetensors.*remove it, and it is made"):
         trained(ball_scene, tmp_path, quiet_log)
 
 
