@@ -18,6 +18,9 @@ from bench.results import COLD, STEADY
 
 NOT_AVAILABLE = "n/a"
 
+DENSE = ".dense"
+"""How the name of a counter ends that says what skipping nothing would have taken."""
+
 QUALITY = {
     "psnr": ("PSNR, dB ↑", 2),
     "ssim": ("SSIM ↑", 4),
@@ -64,13 +67,14 @@ def headline(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def blocks(rows: pd.DataFrame) -> list[Table]:
-    """The tables of one run: quality and time by stage of each phase, memory."""
+    """The tables of one run: quality, time by stage and, where it counted any, work of each phase;
+    memory."""
     tables = [
         table(of_phase, suffix(phase))
         for phase, of_phase in phases(rows)
-        for table in (_quality, _time)
+        for table in (_quality, _time, _work)
     ]
-    return [*tables, _memory(rows)]
+    return [*(table for table in tables if table.lines), _memory(rows)]
 
 
 def phases(rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
@@ -120,6 +124,19 @@ def _time(rows: pd.DataFrame, suffix: str) -> Table:
         lines.append(("latency", number(value["latency_ms"], 2), ""))
     lines.append(("FPS", number(value["fps"], 2), ""))
     return Table(f"Time of a frame{suffix}", ("stage", "mean ms", "share"), tuple(lines))
+
+
+def _work(rows: pd.DataFrame, suffix: str) -> Table:
+    """The ledger: what was done, beside what a method that skips nothing would have done."""
+    value = _values(rows, "work.")
+    lines = []
+    for name in value:
+        done, dense = value[name], value.get(f"{name}{DENSE}")
+        if not name.endswith(DENSE):
+            saved = "" if dense is None else share(dense - done, dense)
+            figures = ("" if x is None else number(x, 0 if x >= 100 else 1) for x in (done, dense))
+            lines.append((name.replace("_", " "), *figures, saved))
+    return Table(f"Work of a frame{suffix}", ("work", "done", "dense", "saved"), tuple(lines))
 
 
 def _memory(rows: pd.DataFrame) -> Table:

@@ -70,7 +70,7 @@ def test_a_picture_of_a_cold_frame_says_so(store, stored_run, tmp_path, monkeypa
 
 def test_every_row_of_every_table_has_as_many_cells_as_its_heading(page):
     tables = re.findall(r"(?:^\|.*\|\n)+", page.read_text(), re.MULTILINE)
-    assert len(tables) == 5
+    assert len(tables) == 6
     for table in tables:
         assert len({line.count("|") for line in table.splitlines()}) == 1
 

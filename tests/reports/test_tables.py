@@ -52,6 +52,20 @@ def test_memory_is_in_decimal_megabytes(rows):
     }
 
 
+def test_work_stands_beside_what_skipping_nothing_takes(rows):
+    counted = {"samples": 57_461.4, "rays": 10_000.0, "rays.dense": 40_000.0, "frames": 1.5}
+    more = [rows.iloc[0].copy() for _ in counted]
+    for line, (name, value) in zip(more, counted.items(), strict=True):
+        line["metric"], line["value"] = f"work.{name}", value
+    _, _, work, _ = tables.blocks(pd.concat([rows, pd.DataFrame(more)]))
+    assert work.title == "Work of a frame"
+    assert cells(work) == {
+        "samples": ("57,461", "", ""),
+        "rays": ("10,000", "40,000", "75.0 %"),
+        "frames": ("1.5", "", ""),
+    }
+
+
 def test_cold_frames_stand_apart_and_are_called_so(rows, rows_with_cold):
     quality, time, cold_quality, cold_time, memory = tables.blocks(rows_with_cold)
     assert [quality, time, memory] == tables.blocks(rows)
