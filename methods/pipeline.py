@@ -167,26 +167,19 @@ class Pipeline:
     ) -> Observation:
         """All that is known of the picture of `view` from its `frame`, the `preceding` ones, and
         its `sight`."""
-        history = None
-        if newest is not None and self.options.history:
-            history = self.history(newest, sight, view)
+        cells, history = sight.cells, None
+        if newest is not None and sight.depth is not None and self.options.history:
+            history = self.history(newest, sight.depth, cells, view)
         surface = sight.surface.points(probe) if sight.surface else None
-        cells, phase = sight.cells, view.phase
         return Observation(
-            frame, self.background, preceding, cells, history, surface, phase, self.backend
+            frame, self.background, preceding, cells, history, surface, view.phase, self.backend
         )
 
-    def history(self, newest: Remembered, sight: Sight, view: View) -> Detail:
-        """The preceding picture where the present one sees what it shows."""
-        assert sight.depth is not None
+    def history(self, newest: Remembered, depth: Tensor, cells: Tensor, view: View) -> Detail:
+        """The preceding picture where the present one, of `depth` [N, s^2] in `cells`, sees it."""
+        scale, backend = self.options.scale, self.backend
         values, valid = warp(
-            newest.picture,
-            newest.camera,
-            sight.depth,
-            sight.cells,
-            view.full,
-            self.options.scale,
-            backend=self.backend,
+            newest.picture, newest.camera, depth, cells, view.full, scale, backend=backend
         )
         return Detail(values, valid)
 

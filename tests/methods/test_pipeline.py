@@ -16,7 +16,7 @@ from methods.buffer import Cloud, RenderingBuffer
 from methods.cells import cells_near, pixels_of
 from methods.kernels.warp import enlarge
 from methods.occupancy import STEP
-from methods.pipeline import Pipeline, Sight
+from methods.pipeline import Pipeline
 from methods.pipeline_options import SIZES, PipelineOptions, Skips
 from methods.range_reduction import RangeReduction, render_guided
 from methods.space_to_depth import SpaceToDepth
@@ -107,7 +107,7 @@ def test_the_preceding_picture_of_a_still_camera_is_where_it_was() -> None:
     view = View.of(CAMERA, 4, 1)
     low_depth = frame.depth[::4, ::4]
     fine = enlarge(low_depth, ALL_CELLS, 4)
-    history = pipeline.history(buffer.frames[0], Sight(ALL_CELLS, fine), view)
+    history = pipeline.history(buffer.frames[0], fine, ALL_CELLS, view)
     blocks = frame.rgb.view(8, 4, 8, 4, 3).transpose(1, 2).reshape(64, 16, 3)
     known = history.valid > 0
     assert known.float().mean() > 0.2
