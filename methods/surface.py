@@ -14,7 +14,7 @@ from methods.fields import HashField
 from methods.occupancy import STEP
 from methods.renderer2d import Points
 from methods.view import View
-from methods.volume import pad
+from methods.volume import query
 
 LAYER = 4 * STEP
 """Thickness, in scene units, of what a single sample of the surface stands for."""
@@ -68,7 +68,6 @@ class Surface:
     def _looked_at(self, piece: slice, probe: Probe) -> Tensor:
         points, cell = self._points[piece], self._cell[piece]
         self._field.count(probe, len(points), len(points))
-        sigma, geometry = self._field.density(pad(points))
-        values = self._field.features(geometry, self._directions[pad(cell)])
+        sigma, values = query(self._field, points, cell, self._directions)
         alpha = -torch.expm1(-LAYER * sigma)  # of a layer of that thickness
-        return torch.cat((values, alpha[:, None]), dim=1)[: len(points)]
+        return torch.cat((values, alpha[:, None]), dim=1)

@@ -88,7 +88,9 @@ def render_batch(
             sigma, samples.delta, samples.offsets, stop=stop, backend=field.backend
         )
     samples = samples.front(counts)
-    sigma, values = query(field, samples.positions, samples.ray, rays.directions)
+    sigma, values = query(
+        field, samples.positions, samples.ray, field.encode_directions(rays.directions)
+    )
     pixels = composite(
         sigma,
         values,
@@ -109,15 +111,15 @@ def opacity_entropy(opacity: Tensor) -> Tensor:
 
 
 def query(
-    field: HashField, positions: Tensor, ray: Tensor, directions: Tensor
+    field: HashField, positions: Tensor, ray: Tensor, encoded: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Density [S] and features [S, K] at `positions` [S, 3] on rays `ray` [S] along `directions`
-    [R, 3].
+    """Density [S] and features [S, K] at `positions` [S, 3] on rays `ray` [S] whose directions are
+    `encoded` [R, 16].
 
     The field sees padded batches.
     """
     sigma, geometry = field.density(pad(positions))
-    values = field.features(geometry, field.encode_directions(directions)[pad(ray)])
+    values = field.features(geometry, encoded[pad(ray)])
     return sigma[: len(positions)], values[: len(positions)]
 
 

@@ -5,15 +5,19 @@ from __future__ import annotations
 import json
 import tempfile
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from bench.provenance import digest
 from bench.results import explained
-from methods.engines import SIZES, Inputs, Precision, readable, sizes_to_expect
+from bench.sharing import missing
+from bench.types import Log
+from methods.engines import SIZES, Engine, Inputs, Precision, readable, sizes_to_expect
 from methods.renderer2d import Network
 
 OPSET = 17
@@ -22,21 +26,46 @@ PRODUCTS = ("Conv", "Gemm", "MatMul")
 """What is quantised. Sums and activations between them gain nothing from 8 bits, and lose."""
 
 
-def write(
+def key(engine: Engine, source: str) -> dict[str, object]:
+    """See `Engine.key`: of an engine that reads such a model, whose code stands in `source`."""
+    versions = {library: metadata.version(library) for library in ("onnx", "onnxruntime")}
+    code = digest([Path(source), Path(__file__)])
+    return {"engine": engine.name, "precision": engine.precision, "code": code, **versions}
+
+
+def kept(
     network: Network,
-    samples: Sequence[Inputs],
-    path: Path,
+    samples: Callable[[], Sequence[Inputs]],
+    folder: Callable[[], Path],
     precision: Precision,
+    log: Log,
     options: Mapping[str, bool] | None = None,
-) -> None:
-    """Leave `network` as a model at `path`, whole or not at all.
+) -> Path:
+    """Where `network` lies in `folder` as a model, which is made there if it is missing.
 
     Args:
-        samples: inputs of one frame, or of those to calibrate on.
+        samples: called if they are needed: inputs of one frame, or of those to calibrate on.
         precision: fp32; fp16, with inputs and outputs in float32; or int8, with what is not
             quantised in float32.
         options: further ones of ONNX Runtime's quantiser.
     """
+    path = folder() / "network.onnx"
+    with missing(path, log) as to_build:
+        if to_build:
+            _write(network, samples(), path, precision, options or {})
+        else:
+            log.info(f"built network found: {path}")
+    return path
+
+
+def _write(
+    network: Network,
+    samples: Sequence[Inputs],
+    path: Path,
+    precision: Precision,
+    options: Mapping[str, bool],
+) -> None:
+    """Leave the model at `path`, whole or not at all."""
     samples = [tuple(x.cpu() for x in inputs) for inputs in samples]
     plain = readable(network).cpu()
     with explained(path.parent), tempfile.TemporaryDirectory(dir=path.parent) as place:
@@ -44,7 +73,7 @@ def write(
         _export(_Halved(plain) if precision == "fp16" else plain, network, samples[0], exported)
         if precision == "int8":
             frames = _Reader(samples, input_names(network))
-            _quantise(exported, frames, ready, options or {})
+            _quantise(exported, frames, ready, options)
         else:
             ready = exported
         _note_sizes(ready, sizes_to_expect(samples, network))

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from importlib import metadata
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from bench.provenance import digest
-from bench.sharing import missing
 from bench.types import Log
 from methods.engines import Built, Engine, Inputs, Precision, onnx_model, required
 from methods.renderer2d import Network
@@ -34,13 +31,7 @@ class OnnxRuntime(Engine):
 
     def key(self) -> dict[str, object]:
         """See `Engine.key`."""
-        versions = {library: metadata.version(library) for library in ("onnx", "onnxruntime")}
-        return {
-            "engine": self.name,
-            "precision": self.precision,
-            "code": digest([Path(__file__), Path(onnx_model.__file__)]),
-            **versions,
-        }
+        return onnx_model.key(self, __file__)
 
     def build(
         self,
@@ -50,12 +41,7 @@ class OnnxRuntime(Engine):
         log: Log,
     ) -> Built:
         """See `Engine.build`."""
-        path = folder() / "network.onnx"
-        with missing(path, log) as to_build:
-            if to_build:
-                onnx_model.write(network, samples(), path, self.precision)
-            else:
-                log.info(f"built network found: {path}")
+        path = onnx_model.kept(network, samples, folder, self.precision, log)
         options = self._runtime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
         session = self._runtime.InferenceSession(path, options, ["CPUExecutionProvider"])

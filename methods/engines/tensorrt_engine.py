@@ -9,7 +9,6 @@ DequantizeLinear that are symmetric, and without a quantised bias, as TensorRT a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ import torch
 from torch import Tensor
 
 from bench.errors import SteerbenchError, Unavailable
-from bench.provenance import digest
 from bench.results import explained
 from bench.sharing import missing, whole
 from bench.types import Log
@@ -73,14 +71,9 @@ class TensorRt(Engine):
 
     def key(self) -> dict[str, object]:
         """See `Engine.key`."""
-        versions = {library: metadata.version(library) for library in ("onnx", "onnxruntime")}
-        return {
-            "engine": self.name,
-            "precision": self.precision,
-            "code": digest([Path(__file__), Path(onnx_model.__file__)]),
+        return onnx_model.key(self, __file__) | {
             "tensorrt": self._tensorrt.__version__,
             "gpu": torch.cuda.get_device_name(),
-            **versions,
         }
 
     def build(
@@ -91,12 +84,7 @@ class TensorRt(Engine):
         log: Log,
     ) -> Built:
         """See `Engine.build`."""
-        path = folder() / "network.onnx"
-        with missing(path, log) as to_build:
-            if to_build:
-                onnx_model.write(network, samples(), path, self.precision, QUANTISED)
-            else:
-                log.info(f"exported network found: {path}")
+        path = onnx_model.kept(network, samples, folder, self.precision, log, QUANTISED)
         plans = _Plans(self._tensorrt, path, network, exact=self.precision == "fp32", log=log)
         plans.prepare(onnx_model.sizes(path))
         return Built(plans, onnx_model.weight_bytes(path))
