@@ -7,9 +7,9 @@ import importlib
 from bench.accuracy import Experiment
 
 EXPERIMENT_MODULES = (
-    "methods.kernels.quadrature",
-    "methods.kernels.reprojection",
-    "methods.rounding",
+    "methods.kernels.composite.experiments",
+    "methods.kernels.splat.experiments",
+    "methods.instant_ngp.experiments",
 )
 
 

@@ -13,7 +13,7 @@ CASE_MODULES = (
     "methods.kernels.march.stress",
     "methods.kernels.splat.stress",
     "methods.kernels.warp.stress",
-    "methods.training_stress",
+    "methods.instant_ngp.stress",
     "methods.engines.stress",
 )
 

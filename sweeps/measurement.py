@@ -18,9 +18,10 @@ from rich.columns import Columns
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
-from bench.provenance import code_digest, decisive, foreign_digest
+from bench.provenance import decisive
 from bench.results import Store
 from bench.run import measure
+from bench.sources import digest, libraries
 from bench.types import DEVICE, Method, Scene
 from reports.page import write_page
 from reports.runs import Run, load
@@ -191,23 +192,17 @@ def _folder(config: DictConfig) -> str | None:
 
 def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any]:
     """Everything that can change the rows but for the weights at hand: what makes a run's key."""
+    targets = set(_targets(OmegaConf.to_container(config, resolve=True)))
+    things = [measure, *map(get_object, sorted(targets))]
     return {
-        "code": code_digest(),
-        "other_code": _other_code(config),
+        "code": digest(*things),
+        "libraries": libraries(*things),
         "config": described(config),
         "scene": scene.digest,
         "resolved": method.settings(),
         "threads": torch.get_num_threads(),
-        "machine": decisive(engines=True),
+        "machine": decisive(),
     }
-
-
-def _other_code(config: DictConfig) -> dict[str, str]:
-    """SHA-256 of the files that `code_digest` does not cover and `config` builds something from, by
-    what it builds."""
-    targets = set(_targets(OmegaConf.to_container(config, resolve=True)))
-    digests = {target: foreign_digest(get_object(target)) for target in targets}
-    return {target: found for target, found in digests.items() if found is not None}
 
 
 def _targets(node: Any) -> Iterator[str]:

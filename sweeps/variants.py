@@ -24,7 +24,7 @@ from sweeps.measurement import checked_settings
 from sweeps.overrides import CONFIGS, composed
 from sweeps.turns import turn
 
-LEAN = "methods.space_to_depth.SpaceToDepth"
+LEAN = "methods.steernerf.beyond.lean_renderer.SpaceToDepth"
 
 
 @dataclass(frozen=True)

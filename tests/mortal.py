@@ -13,7 +13,7 @@ import sys
 from itertools import count
 from pathlib import Path
 
-from methods import loop
+from methods.training import loop
 from sweeps import cli
 
 CHANGES = ("os.mkdir", "os.rename", "os.remove", "os.rmdir")

@@ -16,11 +16,11 @@ from types import ModuleType
 from typing import ClassVar, Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from bench.errors import Unavailable
+from bench.sources import digest, libraries
 from bench.types import Log
-from methods.renderer2d import Network
 
 Precision = Literal["fp32", "bf16", "fp16", "int8"]
 
@@ -32,6 +32,25 @@ varying axes that are to be expected."""
 
 SIZES = "steerbench_sizes"
 """Where a stored model says for which sizes of varying axes it is made ready beforehand."""
+
+
+class Network(nn.Module, ABC):
+    """A network as engines can run it: tensors to a tuple of tensors.
+
+    Attributes:
+        varying: of each input, the axes whose size, the same for all of them, differs from frame to
+            frame.
+        quantum: that size is a multiple of this while frames are rendered.
+        backend: of its kernels; engines read "reference", which is plain torch.
+    """
+
+    varying: tuple[tuple[int, ...], ...]
+    quantum = 1
+    backend = "auto"
+
+    @abstractmethod
+    def products(self, *inputs: Tensor) -> int:
+        """Multiplications by weights that `inputs` take."""
 
 
 @dataclass(frozen=True)
@@ -50,12 +69,18 @@ class Built:
 class Engine(ABC):
     """Builds networks at one `precision`.
 
+    Attributes:
+        name: as it stands in rows.
+        precisions: that it has.
+        libraries: distributions that it loads when it is made.
+
     Raises:
         Unavailable: the engine does not have this precision, or cannot be used here.
     """
 
     name: ClassVar[str]
     precisions: ClassVar[tuple[Precision, ...]]
+    libraries: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, precision: Precision = "fp32") -> None:
         if precision not in self.precisions:
@@ -77,9 +102,15 @@ class Engine(ABC):
         """Frames whose inputs `build` wants to see."""
         return CALIBRATION if self.precision == "int8" else 1
 
-    @abstractmethod
     def key(self) -> dict[str, object]:
         """Everything that what is built depends on, beside the network and its inputs."""
+        kind = type(self)
+        return {
+            "engine": self.name,
+            "precision": self.precision,
+            "code": digest(kind),
+            "libraries": libraries(kind),
+        }
 
     @abstractmethod
     def build(

@@ -6,31 +6,21 @@ import json
 import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from bench.provenance import digest
 from bench.results import explained
 from bench.sharing import missing
 from bench.types import Log
-from methods.engines import SIZES, Engine, Inputs, Precision, readable, sizes_to_expect
-from methods.renderer2d import Network
+from methods.engines import SIZES, Inputs, Network, Precision, readable, sizes_to_expect
 
 OPSET = 17
 
 PRODUCTS = ("Conv", "Gemm", "MatMul")
 """What is quantised. Sums and activations between them gain nothing from 8 bits, and lose."""
-
-
-def key(engine: Engine, source: str) -> dict[str, object]:
-    """See `Engine.key`: of an engine that reads such a model, whose code stands in `source`."""
-    versions = {library: metadata.version(library) for library in ("onnx", "onnxruntime")}
-    code = digest([Path(source), Path(__file__)])
-    return {"engine": engine.name, "precision": engine.precision, "code": code, **versions}
 
 
 def kept(

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from bench.types import Log
-from methods.engines import Built, Engine, Inputs, Precision, onnx_model, required
-from methods.renderer2d import Network
+from methods.engines import Built, Engine, Inputs, Network, Precision, onnx_model, required
 
 
 class OnnxRuntime(Engine):
@@ -22,16 +21,12 @@ class OnnxRuntime(Engine):
 
     name = "onnxruntime"
     precisions = ("fp32", "int8")
+    libraries = ("onnx", "onnxruntime")
 
     def __init__(self, precision: Precision = "fp32") -> None:
         super().__init__(precision)
-        required(self.name, "onnx", "onnx")
-        self._runtime = required(self.name, "onnxruntime", "onnx")
+        _, self._runtime = (required(self.name, library, "onnx") for library in self.libraries)
         self._runtime.disable_telemetry_events()
-
-    def key(self) -> dict[str, object]:
-        """See `Engine.key`."""
-        return onnx_model.key(self, __file__)
 
     def build(
         self,

@@ -9,7 +9,6 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ import torch
 from torch import Tensor
 
 from bench.errors import Unavailable
-from bench.provenance import digest
 from bench.results import explained
 from bench.sharing import missing
 from bench.types import Log
@@ -28,12 +26,12 @@ from methods.engines import (
     Built,
     Engine,
     Inputs,
+    Network,
     Precision,
     readable,
     required,
     sizes_to_expect,
 )
-from methods.renderer2d import Network
 
 # Neither OpenVINO nor NNCF is to tell anybody that it is used: both do without this package.
 sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
@@ -53,6 +51,7 @@ class OpenVino(Engine):
 
     name = "openvino"
     precisions = ("fp32", "bf16", "int8")
+    libraries = ("openvino", "nncf")
 
     def __init__(self, precision: Precision = "fp32") -> None:
         super().__init__(precision)
@@ -62,13 +61,6 @@ class OpenVino(Engine):
             raise Unavailable(
                 "precision=bf16: engine=openvino has no bfloat16 on this CPU, use precision=fp32"
             )
-
-    def key(self) -> dict[str, object]:
-        """See `Engine.key`."""
-        libraries = ("openvino", "nncf") if self._nncf else ("openvino",)
-        versions = {library: metadata.version(library) for library in libraries}
-        code = digest([Path(__file__)])
-        return {"engine": self.name, "precision": self.precision, "code": code, **versions}
 
     def samples(self, network: Network) -> int:
         """See `Engine.samples`: enough to know the sizes that come."""

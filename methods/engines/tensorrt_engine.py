@@ -24,11 +24,11 @@ from methods.engines import (
     Built,
     Engine,
     Inputs,
+    Network,
     Precision,
     onnx_model,
     required,
 )
-from methods.renderer2d import Network
 
 QUANTISED = {"ActivationSymmetric": True, "QuantizeBias": False}
 
@@ -45,6 +45,7 @@ class TensorRt(Engine):
 
     name = "tensorrt"
     precisions = ("fp32", "fp16", "int8")
+    libraries = ("onnx", "onnxruntime", "tensorrt")
 
     def __init__(self, precision: Precision = "fp32") -> None:
         super().__init__(precision)
@@ -53,9 +54,8 @@ class TensorRt(Engine):
                 "engine=tensorrt computes on a CUDA GPU, and torch sees none here: use "
                 "engine=openvino or engine=onnxruntime"
             )
-        for library in ("onnx", "onnxruntime"):
-            required(self.name, library, "tensorrt")
-        self._tensorrt = required(self.name, "tensorrt", "tensorrt")
+        loaded = [required(self.name, library, "tensorrt") for library in self.libraries]
+        self._tensorrt = loaded[-1]
 
     def check(self, device: torch.device) -> None:
         """See `Engine.check`."""
@@ -71,10 +71,7 @@ class TensorRt(Engine):
 
     def key(self) -> dict[str, object]:
         """See `Engine.key`."""
-        return onnx_model.key(self, __file__) | {
-            "tensorrt": self._tensorrt.__version__,
-            "gpu": torch.cuda.get_device_name(),
-        }
+        return super().key() | {"gpu": torch.cuda.get_device_name()}
 
     def build(
         self,

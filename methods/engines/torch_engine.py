@@ -11,9 +11,8 @@ from torch import Tensor
 
 from bench.errors import Unavailable
 from bench.types import Log
-from methods.engines import CALIBRATION, Built, Engine, Inputs, resized, sizes_to_expect
+from methods.engines import CALIBRATION, Built, Engine, Inputs, Network, resized, sizes_to_expect
 from methods.engines.cuda_graphs import Replayed
-from methods.renderer2d import Network
 
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
@@ -34,10 +33,6 @@ class TorchEngine(Engine):
         if _on_cpu(network):
             return 0
         return CALIBRATION if any(network.varying) else 1
-
-    def key(self) -> dict[str, object]:
-        """See `Engine.key`."""
-        return {"engine": self.name, "precision": self.precision}
 
     def build(
         self,

@@ -12,7 +12,6 @@ from methods.kernels.dispatch import (
     multiplies_bf16,
     resolve,
     serves_many_threads,
-    sources,
 )
 
 __all__ = [
@@ -21,5 +20,4 @@ __all__ = [
     "multiplies_bf16",
     "resolve",
     "serves_many_threads",
-    "sources",
 ]

@@ -23,8 +23,8 @@ CASE_MODULES = (
     "methods.kernels.splat.cases",
     "methods.kernels.warp.cases",
     "methods.kernels.depthwise.cases",
-    "methods.kernels.lift.cases",
-    "methods.step_cases",
+    "methods.kernels.space_to_depth.cases",
+    "methods.instant_ngp.cases",
 )
 
 

@@ -17,9 +17,6 @@ from bench.errors import Unavailable
 
 BACKENDS = ("reference", "cpu", "gpu")
 
-SHARED = ("cpu.py", "gpu.py")
-"""What all kernels of a backend share, beside this file."""
-
 
 @cache
 def availability() -> dict[str, str]:
@@ -109,14 +106,6 @@ def serves_many_threads(backend: str, device: torch.device) -> bool:
 def has(kernel: str, backend: str) -> bool:
     """Whether `backend` has an implementation of its own of `kernel`."""
     return (Path(__file__).parent / kernel / f"{backend}.py").exists()
-
-
-def sources(*kernels: str) -> list[Path]:
-    """The files that decide what `kernels` compute, on any backend."""
-    folders = [Path(__file__).parent / kernel for kernel in kernels]
-    names = [f"{name}.py" for name in ("__init__", *BACKENDS)]
-    files = [path for folder in folders for name in names if (path := folder / name).exists()]
-    return [*files, *(Path(__file__).with_name(name) for name in ("dispatch.py", *SHARED))]
 
 
 # Imported when first used: numba and Triton are heavy, and not every machine has both.

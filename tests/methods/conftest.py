@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bench.cameras import cast
 from bench.types import Camera, NullProbe, Scene, Split
-from methods.fields import HashField
+from methods.instant_ngp.field import HashField
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy
 

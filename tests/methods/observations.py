@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from methods.renderer2d import Detail, Observation, Points, Renderer2d, cells_at_matter
-from methods.space_to_depth import SpaceToDepth
-from methods.volume import FeatureFrame
+from methods.rendering.batch import FeatureFrame
+from methods.steernerf.beyond.lean_renderer import SpaceToDepth
+from methods.steernerf.renderer import Detail, Observation, Points, Renderer2d, cells_at_matter
 from tests.methods.conftest import look_at_the_middle
 
 CAMERA = look_at_the_middle(0.0, 0.0)  # no renderer looks at it

@@ -113,7 +113,9 @@ def test_a_setting_that_does_not_fit_is_named_in_full(override, message):
 
 
 def test_a_dataclass_may_have_fields_of_types_that_only_the_module_of_its_base_knows():
-    options = get_object("methods.untaught.UntaughtOptions")  # does not import RangeReduction
+    options = get_object(
+        "methods.steernerf.untaught.UntaughtOptions"
+    )  # does not import RangeReduction
     check_settings(options, {"steps": 3.0, "taught_steps": 2.0})
     with pytest.raises(SteerbenchError, match="jitter: expected bool, got 'much'"):
         check_settings(options, {"jitter": "much"})

@@ -6,7 +6,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from methods.steernerf import NOT_TRAINED_FOR
+from methods.steernerf.method import NOT_TRAINED_FOR
 from sweeps.knobs import AS_IT_IS, EVERYTHING_OFF, knobs
 from sweeps.overrides import composed
 from sweeps.variants import Variant

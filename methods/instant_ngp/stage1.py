@@ -1,0 +1,115 @@
+"""Stage 1: the field that every method on a hash grid starts from, trained once and shared."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import torch
+
+from bench.provenance import decisive
+from bench.sources import digest, libraries
+from bench.types import DEVICE, Budget, Log, Scene
+from methods.instant_ngp.field import HashField, Precision
+from methods.instant_ngp.training import TrainingOptions, train_field
+from methods.kernels import resolve
+from methods.kernels.encode import HashGrid
+from methods.kernels.march import Occupancy
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a field is and where it runs.
+
+    Attributes:
+        grid: shape of the hash table.
+        training: how the field is trained.
+        precision: "bf16" (packed table, bfloat16 networks) or "fp32".
+        backend, device: resolved names.
+        seed: of everything random in the training.
+    """
+
+    grid: HashGrid
+    training: TrainingOptions
+    precision: Precision
+    backend: str
+    device: torch.device
+    seed: int
+
+    @classmethod
+    def resolved(
+        cls,
+        grid: HashGrid,
+        training: TrainingOptions,
+        precision: Precision,
+        backend: str,
+        device: str,
+        seed: int,
+    ) -> Setup:
+        """With `auto` replaced by what it stands for here.
+
+        Raises:
+            ValueError: the grid cannot be had at this precision, or `device` is no name of one.
+            Unavailable: the backend cannot be used here.
+        """
+        if not DEVICE.fullmatch(device):
+            raise ValueError(f"device: expected auto, cpu, cuda or cuda:N, got {device!r}")
+        if device == "auto":
+            device = "cuda" if torch.cuda.is_available() else "cpu"
+        if precision == "bf16" and grid.features != 2:
+            raise ValueError(
+                f"precision bf16 packs 2 features an entry, grid.features is {grid.features}: "
+                "use precision=fp32"
+            )
+        place = torch.device(device)
+        return cls(grid, training, precision, resolve(backend, place), place, seed)
+
+    def settings(self) -> dict[str, str]:
+        """See `bench.types.Method.settings`."""
+        return {
+            "device": str(self.device),
+            "backend": self.backend,
+            "engine": "torch",
+            "precision": self.precision,
+        }
+
+    def key(self, scene: Scene, budget: Budget) -> dict[str, object]:
+        """Everything the trained field depends on."""
+        return {
+            "scene": scene.digest,
+            "steps": budget.steps,
+            "samples": budget.samples,
+            "grid": asdict(self.grid),
+            "training": asdict(self.training),
+            "precision": self.precision,
+            "backend": self.backend,
+            "device": self.device.type,
+            "machine": decisive(),
+            "libraries": libraries(train_field),
+            "threads": torch.get_num_threads(),
+            "seed": self.seed,
+            "code": digest(train_field),
+        }
+
+
+@dataclass(frozen=True)
+class Pretrained:
+    """A trained `field`, where it may hold matter, and the seconds its training took."""
+
+    field: HashField
+    occupancy: Occupancy
+    train_s: float
+
+    def sizes(self) -> dict[str, int]:
+        """Bytes of table, networks and occupancy bits."""
+        return self.field.sizes() | {"occupancy": self.occupancy.cells.numel() // 8}
+
+
+def pretrain(setup: Setup, scene: Scene, budget: Budget, log: Log) -> Pretrained:
+    """Train a field on the pictures of `scene`, or load the one the same training left behind."""
+    generator = torch.Generator().manual_seed(setup.seed)
+    field = HashField(
+        setup.grid, precision=setup.precision, backend=setup.backend, generator=generator
+    ).to(setup.device)
+    folder = log.stage_dir("field", setup.key(scene, budget))
+    density, train_s = train_field(field, scene, budget, setup.training, setup.seed, folder, log)
+    return Pretrained(field, density.occupancy, train_s)

@@ -1,0 +1,233 @@
+"""Training a field on the pictures of a scene: the loop, its checkpoints and its guards."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from bench.types import Budget, Log, Rays, Scene, Split, SteerbenchError
+from methods.instant_ngp.field import HashField
+from methods.rendering.batch import opacity_entropy, render_batch
+from methods.rendering.occupancy import EVERY, MIN_VIEWS, DensityGrid, learnable_cells
+from methods.training import checkpoint, loop
+from methods.training.optimiser import FieldOptimiser, cosine
+
+MIN_RAYS = 64
+"""Fewest rays of a step."""
+
+GRID_YOUTH_STEPS = 256
+"""Until this step the density grid is visited four times as much: most of it is still unknown."""
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """How a field is trained; the defaults follow ngp_pl where facts are known.
+
+    Attributes:
+        rate: learning rate at the beginning, of table and networks.
+        final_rate: share of `rate` left at the end of the cosine schedule.
+        opacity_entropy: weight of -o ln o, which drives the opacity of a ray to 0 or 1.
+        random_background: train RGBA pictures on a random colour a ray instead of the scene's
+            background, so that no density can pass for background.
+        grid_samples: visits of an update of the density grid.
+        max_rays: most rays of a step.
+    """
+
+    rate: float = 1e-2
+    final_rate: float = 1 / 30
+    opacity_entropy: float = 1e-3
+    random_background: bool = True
+    grid_samples: int = 1 << 17
+    max_rays: int = 1 << 15
+
+    def __post_init__(self) -> None:
+        if not (self.rate > 0 and 0 < self.final_rate <= 1 and self.opacity_entropy >= 0):
+            raise ValueError(
+                f"expected rate > 0, final_rate in (0, 1], opacity_entropy >= 0: {self}"
+            )
+        if not (self.grid_samples >= 2 and self.max_rays >= MIN_RAYS):
+            raise ValueError(f"expected grid_samples >= 2, max_rays >= {MIN_RAYS}: {self}")
+
+
+class PixelBatches:
+    """Random pixels of the pictures of a split, with their rays."""
+
+    def __init__(self, split: Split, device: torch.device) -> None:
+        self._device = device
+        channels = max(picture.shape[-1] for picture in split.images)
+        pictures = [
+            # An opaque picture among transparent ones gets an alpha of 255.
+            functional.pad(picture, (0, channels - picture.shape[-1]), value=255).flatten(0, 1)
+            for picture in split.images
+        ]
+        sizes = torch.tensor([len(picture) for picture in pictures])
+        self._ends = sizes.cumsum(0).to(device)  # of each picture in `_pixels`
+        self._pixels = torch.cat([p.to(device) for p in pictures])  # [P, 3 or 4] uint8
+        cameras = split.cameras
+        self._widths = torch.tensor([c.width for c in cameras], device=device)
+        self._poses = torch.stack([c.c2w for c in cameras]).to(device)  # [N, 3, 4]
+        self._intrinsics = torch.tensor(
+            [(c.fx, c.fy, c.cx, c.cy) for c in cameras], device=device
+        )  # [N, 4]
+
+    def draw(self, count: int, generator: torch.Generator) -> tuple[Rays, Tensor]:
+        """`count` rays through pixel centres, and their colours [count, 3 or 4] in [0, 1]."""
+        total = len(self._pixels)
+        pixel = torch.randint(total, (count,), generator=generator, device=self._device)
+        view = torch.searchsorted(self._ends, pixel, right=True)
+        within = pixel - torch.where(view > 0, self._ends[view - 1], 0)
+        width = self._widths[view]
+        u, v = within % width + 0.5, within // width + 0.5
+        fx, fy, cx, cy = self._intrinsics[view].unbind(dim=-1)
+        local = torch.stack(((u - cx) / fx, (v - cy) / fy, torch.ones_like(fx)), dim=-1)
+        pose = self._poses[view]
+        directions = (pose[:, :, :3] * local[:, None]).sum(dim=-1)
+        return Rays(pose[:, :, 3].contiguous(), directions), self._pixels[pixel].float() / 255
+
+
+def new_grid(scene: Scene, device: torch.device) -> DensityGrid:
+    """The density grid of a training of `scene` before its first step."""
+    cells = learnable_cells(scene.bounds.to(device), scene.splits["train"].cameras)
+    if not cells.any():
+        raise SteerbenchError(
+            f"scene {scene.name}: no part of the unit cube is seen by {MIN_VIEWS} training "
+            "cameras: expected pictures that overlap there; look at the poses and the scale"
+        )
+    return DensityGrid(cells)
+
+
+class FieldTraining:
+    """Stage 1 as a `loop.Training`."""
+
+    advice = "Try a smaller learning rate (method.training.rate)."
+
+    def __init__(
+        self, field: HashField, scene: Scene, budget: Budget, options: TrainingOptions, seed: int
+    ) -> None:
+        device = field.table.device
+        self.field, self.budget, self.options = field, budget, options
+        self.grid = new_grid(scene, device)
+        self.batches = PixelBatches(scene.splits["train"], device)
+        self.background = scene.background.to(device)
+        self.step, self.steps = 0, budget.steps
+        self.rays = min(1024, options.max_rays)
+        self.seconds = 0.0
+        self.generator = torch.Generator(device).manual_seed(seed)
+        self.optimiser = FieldOptimiser(field)
+
+    def learning_rate(self) -> float:
+        """Of the next step."""
+        return self.options.rate * cosine(self.step / self.steps, self.options.final_rate)
+
+    def advance(self) -> dict[str, float]:
+        """One step; its mean squared error.
+
+        Raises:
+            SteerbenchError: the loss is not finite.
+        """
+        if self.step % EVERY == 0:
+            young = self.step < GRID_YOUTH_STEPS
+            samples = self.options.grid_samples * (4 if young else 1)
+            self.grid.update(self.field, self.generator, samples)
+        rays, colours = self.batches.draw(self.rays, self.generator)
+        target, background = self._target(colours)
+        jitter = torch.rand(len(target), generator=self.generator, device=target.device)
+        pixels, samples = render_batch(self.field, rays, self.grid.occupancy, jitter, background)
+        loss = functional.mse_loss(pixels.values, target)
+        entropy = opacity_entropy(pixels.alpha)
+        (loss + self.options.opacity_entropy * entropy).backward()
+        value = loss.item()
+        if not math.isfinite(value):
+            loop.check_finite(self, {"loss": loss, "rendered pixels": pixels.values})
+        self._update()
+        self._fit_batch(samples)
+        self.step += 1
+        return {"": value}
+
+    def _target(self, colours: Tensor) -> tuple[Tensor, Tensor]:
+        """Colours composited on the background, and that background ([3] or a ray's own [R, 3])."""
+        if colours.shape[-1] == 3:
+            return colours, self.background
+        background = self.background
+        if self.options.random_background:
+            background = torch.rand(
+                len(colours), 3, generator=self.generator, device=colours.device
+            )
+        rgb, alpha = colours[:, :3], colours[:, 3:]
+        return rgb * alpha + background * (1 - alpha), background
+
+    def _update(self) -> None:
+        self.optimiser.step(self.learning_rate())
+
+    def _fit_batch(self, samples: int) -> None:
+        """Choose the next number of rays so that it brings about `budget.samples` samples."""
+        change = min(max(self.budget.samples / max(samples, 1), 0.5), 1.25)
+        self.rays = min(max(int(self.rays * change), MIN_RAYS), self.options.max_rays)
+
+    def watched(self) -> dict[str, Tensor]:
+        """Table and its moments, networks."""
+        moments = self.optimiser.table_moments
+        return {"table": self.field.table, "table moments": moments, **self.field.layers}
+
+    def result(self) -> dict[str, Tensor]:
+        """Field and density grid."""
+        tensors = {f"field.{name}": value for name, value in self.field.state_dict().items()}
+        return tensors | {"grid.density": self.grid.density}
+
+    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+        """Put back what `result` gave."""
+        restore_field(self.field, self.grid, tensors)
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+        """Optimisers, random numbers, size of the batch."""
+        generator = {"generator": self.generator.get_state()}
+        return self.optimiser.tensors() | generator, {"rays": self.rays}
+
+    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
+        """See `loop.Training`."""
+        self.restore_result(tensors)
+        self.rays = int(figures["rays"])
+        self.optimiser.restore(tensors)
+        self.generator.set_state(tensors["generator"].cpu())
+
+
+def train_field(
+    field: HashField,
+    scene: Scene,
+    budget: Budget,
+    options: TrainingOptions,
+    seed: int,
+    folder: Path,
+    log: Log,
+) -> tuple[DensityGrid, float]:
+    """Train `field` on the pictures of `scene`; its density grid and the seconds it took.
+
+    The result stands in `folder` as `field.safetensors`; a training that is found there is loaded,
+    one that was killed goes on from its last checkpoint.
+    """
+    finished = folder / "field.safetensors"
+    if finished.exists():
+        tensors, figures = checkpoint.read(finished)
+        grid = new_grid(scene, field.table.device)
+        with checkpoint.restoring(finished):
+            restore_field(field, grid, tensors)
+            seconds = figures["seconds"]
+        log.info(f"trained field found: {finished}")
+        return grid, seconds
+    training = FieldTraining(field, scene, budget, options, seed)
+    loop.train(training, finished, "training", log)
+    field.grad_buffer = None
+    return training.grid, training.seconds
+
+
+def restore_field(field: HashField, grid: DensityGrid, tensors: Mapping[str, Tensor]) -> None:
+    """Put back what `FieldTraining.result` gave."""
+    field.load_state_dict(checkpoint.part(tensors, "field."))
+    field.repack()
+    grid.restore(tensors["grid.density"])

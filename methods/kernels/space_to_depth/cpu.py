@@ -1,0 +1,360 @@
+"""Rows and pixels of cells with numba: a cell at a time, one pass over what it is told.
+
+Gradients of what several cells share (samples, points) are added up by a single thread: the same
+sums every time. It takes as long to read what is added as to add it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from numba import njit, prange
+from torch import Tensor
+
+from methods.kernels.cpu import f32
+from methods.kernels.space_to_depth import TAPS, Layout, Told
+
+FAST = {"contract", "reassoc", "nsz"}
+
+
+def lift(
+    values: Tensor,
+    alpha: Tensor,
+    background: Tensor,
+    cells: Tensor,
+    preceding: Sequence[Told],
+    history: Told | None,
+    surface: Told | None,
+    layout: Layout,
+    taps: Tensor,
+    count: int,
+) -> tuple[Tensor, Tensor]:
+    """See `methods.kernels.space_to_depth.lift`."""
+    _check_float32(values)
+    points = [part for pair in preceding for part in pair]
+    layers = history, *(surface or (None, None)), *points
+    return _Lift.apply(layout, count, values, alpha, background, cells, taps, *layers)
+
+
+def draw(
+    base: Tensor, rows: Tensor, answer: Tensor, matrix: Tensor | None, layout: Layout
+) -> Tensor:
+    """See `methods.kernels.space_to_depth.draw`."""
+    _check_float32(base)
+    if matrix is None:
+        matrix = base.new_zeros(len(rows), 0)
+    return _Draw.apply(layout, base, rows, answer.float(), matrix.float())
+
+
+def _check_float32(x: Tensor) -> None:
+    if x.dtype != torch.float32:
+        raise ValueError(f"backend 'cpu' takes float32, got {x.dtype}: use backend='reference'")
+
+
+class _Lift(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx,
+        layout,
+        count,
+        values,
+        alpha,
+        background,
+        cells,
+        taps,
+        history,
+        surface,
+        at_surface,
+        *points,
+    ):
+        values, alpha, background = (x.detach().contiguous() for x in (values, alpha, background))
+        scale, begins, width = layout.scale, layout.begins, values.shape[1]
+        base = torch.empty(len(cells), scale**2, 3)
+        rows = torch.empty(count, layout.width)
+        rows[len(cells) :] = 0
+        frame = (values.flatten(0, 1).numpy(), alpha.view(-1).numpy(), background.numpy())
+        _present(*frame, width, cells.numpy(), taps.numpy(), base.numpy(), rows.numpy())
+        pairs = list(zip(points[::2], points[1::2], strict=True))
+        for age in range(layout.frames):
+            begin = begins[f"preceding {age}"]
+            if age >= len(pairs):
+                rows[:, begin : begin + scale**2 * (layout.channels + 1)] = 0
+                continue
+            told, index = pairs[age][0].detach().contiguous(), pairs[age][1].contiguous()
+            where = (index.numpy(), cells.numpy(), width, scale, begin)
+            _check(_preceding(told.numpy(), background.numpy(), *where, rows.numpy()), told)
+        if layout.history:
+            begin = begins["history"]
+            if history is None:
+                rows[:, begin : begin + 4 * scale**2] = 0
+            else:
+                recent, valid = (x.contiguous().numpy() for x in history)
+                _history(recent, valid, background.numpy(), base.numpy(), begin, rows.numpy())
+        if layout.surface:
+            begin = begins["surface"]
+            if surface is None:
+                rows[:, begin:] = 0
+            else:
+                told = surface.detach().contiguous()
+                index = at_surface.contiguous()
+                known = (told.numpy(), background.numpy(), index.numpy(), base.numpy())
+                _check(_surface(*known, begin, rows.numpy()), told)
+        ctx.layout, ctx.shape, ctx.counts = layout, values.shape, [len(x) for x in points[::2]]
+        ctx.surfaces = None if surface is None else len(surface)
+        valid = None if history is None else history[1].contiguous()
+        ctx.save_for_backward(cells, taps, valid, at_surface, *points[1::2])
+        return base, rows
+
+    @staticmethod
+    def backward(ctx, grad_base, grad_rows):
+        layout, (cells, taps, valid, at_surface, *indices) = ctx.layout, ctx.saved_tensors
+        height, width, channels = ctx.shape
+        grad_base, grad_rows = grad_base.contiguous().clone(), grad_rows.contiguous()
+        rows, begins = grad_rows.numpy(), layout.begins
+        if valid is not None:
+            _history_back(valid.numpy(), rows, begins["history"], grad_base.numpy())
+        grad_surface = None
+        if ctx.surfaces is not None:
+            grad_surface = torch.zeros(ctx.surfaces, channels + 1)
+            grads = (grad_base.numpy(), grad_surface.numpy())
+            _surface_back(at_surface.contiguous().numpy(), rows, begins["surface"], *grads)
+        grad_points: list[Tensor | None] = []
+        for age, index in enumerate(indices):
+            grad = None
+            if ctx.needs_input_grad[10 + 2 * age]:
+                grad = torch.zeros(ctx.counts[age], channels)
+                where = (cells.numpy(), width, layout.scale, rows, begins[f"preceding {age}"])
+                _preceding_back(index.contiguous().numpy(), *where, grad.numpy())
+            grad_points += [grad, None]
+        grad_values, grad_alpha = torch.zeros(height * width, channels), torch.zeros(height, width)
+        frame = (grad_values.numpy(), grad_alpha.view(-1).numpy())
+        _present_back(rows, grad_base.numpy(), height, width, cells.numpy(), taps.numpy(), *frame)
+        frame_grads = (grad_values.view(height, width, channels), grad_alpha)
+        return None, None, *frame_grads, None, None, None, None, grad_surface, None, *grad_points
+
+
+class _Draw(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, layout, base, rows, answer, matrix):
+        parts = [x.detach().contiguous() for x in (base, rows, answer, matrix)]
+        pixels = torch.empty_like(base)
+        _draw(*(x.numpy() for x in parts), *_columns(layout), pixels.numpy())
+        ctx.layout = layout
+        ctx.save_for_backward(*parts[1:])
+        return pixels
+
+    @staticmethod
+    def backward(ctx, grad):
+        rows, answer, matrix = ctx.saved_tensors
+        grad = grad.contiguous()
+        grads = [torch.zeros_like(x) for x in (rows, answer, matrix)]
+        arrays = (x.numpy() for x in (rows, answer, matrix, grad, *grads))
+        _draw_back(*arrays, *_columns(ctx.layout))
+        return None, grad, *grads
+
+
+def _columns(layout: Layout) -> tuple[int, int, int]:
+    """K, and where history and surface begin; -1: nowhere."""
+    begins = layout.begins
+    return layout.channels, begins.get("history", -1), begins.get("surface", -1)
+
+
+def _check(wrong: int, values: Tensor) -> None:
+    if wrong:
+        raise ValueError(
+            f"index: expected -1 to {len(values) - 1}, got {wrong} entries that are not"
+        )
+
+
+@njit(cache=True)
+def _put(row, column, values, background, known):
+    """Features less their background from `column` on, `known` behind the colours."""
+    for c in range(3):
+        row[column + c] = values[c] - background[c]
+    row[column + 3] = known
+    for c in range(3, len(background)):
+        row[column + 1 + c] = values[c] - background[c]
+
+
+@njit(cache=True)
+def _nearest(row, column, tap, height, width):
+    """Which of all samples is tap 0 to 8 of the 3 x 3 around (row, column), the border repeated."""
+    y = min(max(row + tap // 3 - 1, 0), height - 1)
+    x = min(max(column + tap % 3 - 1, 0), width - 1)
+    return y * width + x
+
+
+@njit(cache=True, parallel=True, fastmath=FAST)
+def _present(values, alpha, background, width, cells, taps, base, rows):
+    height, pixels = len(alpha) // width, len(taps)
+    for n in prange(len(cells)):
+        cell = cells[n]
+        _put(rows[n], 0, values[cell], background, alpha[cell])
+        base[n] = 0
+        for tap in range(TAPS):
+            near = _nearest(cell // width, cell % width, tap, height, width)
+            for c in range(3):
+                colour = values[near, c] - background[c]
+                for sub in range(pixels):
+                    base[n, sub, c] += taps[sub, tap] * colour
+
+
+@njit(cache=True, parallel=True)
+def _preceding(values, background, index, cells, width, scale, begin, rows):
+    features, wrong = len(background) + 1, 0
+    for n in prange(len(cells)):
+        top, left = cells[n] // width * scale, cells[n] % width * scale
+        for sub in range(scale * scale):
+            column = begin + sub * features
+            point = index[top + sub // scale, left + sub % scale]
+            if 0 <= point < len(values):
+                _put(rows[n], column, values[point], background, f32(1))
+            else:
+                rows[n, column : column + features] = 0
+                wrong += point != -1
+    return wrong
+
+
+@njit(cache=True, parallel=True)
+def _history(recent, valid, background, base, begin, rows):
+    for n in prange(len(base)):
+        for sub in range(base.shape[1]):
+            known = valid[n, sub]
+            for c in range(3):
+                less = recent[n, sub, c] - background[c] - base[n, sub, c]
+                rows[n, begin + 4 * sub + c] = less * known
+            rows[n, begin + 4 * sub + 3] = known
+
+
+@njit(cache=True, parallel=True)
+def _surface(values, background, index, base, begin, rows):
+    features, wrong = values.shape[1], 0
+    for n in prange(len(base)):
+        for sub in range(base.shape[1]):
+            column, point = begin + sub * features, index[n, sub]
+            if 0 <= point < len(values):
+                told = values[point]
+                _put(rows[n], column, told, background, told[features - 1])
+                for c in range(3):
+                    rows[n, column + c] -= base[n, sub, c]
+            else:
+                rows[n, column : column + features] = 0
+                wrong += point != -1
+    return wrong
+
+
+@njit(cache=True, parallel=True)
+def _history_back(valid, grad_rows, begin, grad_base):
+    for n in prange(len(valid)):
+        for sub in range(valid.shape[1]):
+            for c in range(3):
+                grad_base[n, sub, c] -= valid[n, sub] * grad_rows[n, begin + 4 * sub + c]
+
+
+@njit(cache=True)
+def _surface_back(index, grad_rows, begin, grad_base, grad):
+    features = grad.shape[1]
+    for n in range(len(index)):
+        for sub in range(index.shape[1]):
+            column, point = begin + sub * features, index[n, sub]
+            if point >= 0:
+                for c in range(3):
+                    grad_base[n, sub, c] -= grad_rows[n, column + c]
+                    grad[point, c] += grad_rows[n, column + c]
+                grad[point, features - 1] += grad_rows[n, column + 3]
+                for c in range(3, features - 1):
+                    grad[point, c] += grad_rows[n, column + 1 + c]
+
+
+@njit(cache=True)
+def _preceding_back(index, cells, width, scale, grad_rows, begin, grad):
+    channels = grad.shape[1]
+    for n in range(len(cells)):
+        top, left = cells[n] // width * scale, cells[n] % width * scale
+        for sub in range(scale * scale):
+            column = begin + sub * (channels + 1)
+            point = index[top + sub // scale, left + sub % scale]
+            if point >= 0:
+                for c in range(channels):
+                    grad[point, c] += grad_rows[n, column + (c if c < 3 else c + 1)]
+
+
+@njit(cache=True)
+def _present_back(grad_rows, grad_base, height, width, cells, taps, grad_values, grad_alpha):
+    channels, pixels = grad_values.shape[1], len(taps)
+    for n in range(len(cells)):
+        cell = cells[n]
+        for c in range(channels):
+            grad_values[cell, c] += grad_rows[n, c if c < 3 else c + 1]
+        grad_alpha[cell] += grad_rows[n, 3]
+        for tap in range(TAPS):
+            near = _nearest(cell // width, cell % width, tap, height, width)
+            for sub in range(pixels):
+                weight = taps[sub, tap]
+                for c in range(3):
+                    grad_values[near, c] += weight * grad_base[n, sub, c]
+
+
+@njit(cache=True, parallel=True, fastmath=FAST)
+def _draw(base, rows, answer, matrix, channels, history, surface, pixels):
+    features = channels + 1
+    outputs = answer.shape[1] // base.shape[1]
+    for n in prange(len(base)):
+        for sub in range(base.shape[1]):
+            for c in range(3):
+                pixels[n, sub, c] = base[n, sub, c] + answer[n, sub * outputs + c]
+            if history >= 0:
+                column = history + 4 * sub
+                share = _sigmoid(answer[n, sub * outputs + 3]) * rows[n, column + 3]
+                for c in range(3):
+                    pixels[n, sub, c] += share * rows[n, column + c]
+            if surface >= 0:
+                column = surface + features * sub
+                opacity = rows[n, column + 3]
+                for c in range(3):
+                    total = f32(0)
+                    for i in range(features):
+                        weight = opacity if i < 3 else f32(1)
+                        total += matrix[n, c * features + i] * weight * rows[n, column + i]
+                    pixels[n, sub, c] += total
+
+
+@njit(cache=True, parallel=True, fastmath=FAST)
+def _draw_back(
+    rows, answer, matrix, grad, grad_rows, grad_answer, grad_matrix, channels, history, surface
+):
+    features = channels + 1
+    outputs = answer.shape[1] // grad.shape[1]
+    for n in prange(len(grad)):
+        for sub in range(grad.shape[1]):
+            for c in range(3):
+                grad_answer[n, sub * outputs + c] = grad[n, sub, c]
+            if history >= 0:
+                column = history + 4 * sub
+                share, known = _sigmoid(answer[n, sub * outputs + 3]), rows[n, column + 3]
+                along = f32(0)
+                for c in range(3):
+                    grad_rows[n, column + c] = share * known * grad[n, sub, c]
+                    along += grad[n, sub, c] * rows[n, column + c]
+                grad_rows[n, column + 3] = share * along
+                grad_answer[n, sub * outputs + 3] = share * (f32(1) - share) * known * along
+            if surface >= 0:
+                column = surface + features * sub
+                opacity = rows[n, column + 3]
+                for i in range(features):
+                    told = rows[n, column + i]
+                    weight = opacity if i < 3 else f32(1)
+                    along = f32(0)
+                    for c in range(3):
+                        along += matrix[n, c * features + i] * grad[n, sub, c]
+                        grad_matrix[n, c * features + i] += weight * told * grad[n, sub, c]
+                    grad_rows[n, column + i] += weight * along
+                    if i < 3:
+                        grad_rows[n, column + 3] += told * along
+
+
+@njit(cache=True)
+def _sigmoid(x):
+    return f32(1) / (f32(1) + math.exp(-x))

@@ -1,0 +1,106 @@
+"""Rows and pixels of cells in plain torch, any dtype and device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from methods.kernels.space_to_depth import Layout, Told
+
+
+def lift(
+    values: Tensor,
+    alpha: Tensor,
+    background: Tensor,
+    cells: Tensor,
+    preceding: Sequence[Told],
+    history: Told | None,
+    surface: Told | None,
+    layout: Layout,
+    taps: Tensor,
+    count: int,
+) -> tuple[Tensor, Tensor]:
+    """See `methods.kernels.space_to_depth.lift`."""
+    pixels, missing = layout.scale**2, layout.frames - len(preceding)
+    base = _enlarged(values[..., :3] - background[:3], cells, taps)
+    present = values.flatten(0, 1)[cells] - background
+    parts = [_tell(present, alpha.flatten()[cells, None])]
+    for points, index in preceding:
+        less = points - background
+        told = _tell(less, torch.ones_like(less[:, :1]))
+        parts.append(_shown(told, _in_cells(index, cells, layout.scale)))
+    parts += [base.new_zeros(len(cells), pixels * (layout.channels + 1))] * missing
+    if layout.history:
+        if history is None:
+            parts.append(base.new_zeros(len(cells), pixels * 4))
+        else:
+            known = history[1][..., None]
+            recent = (history[0] - background[:3] - base) * known
+            parts.append(torch.cat((recent, known), dim=-1))
+    if layout.surface:
+        if surface is None:
+            parts.append(base.new_zeros(len(cells), pixels * (layout.channels + 1)))
+        else:
+            points, index = surface
+            told = _shown(_tell(points[:, :-1] - background, points[:, -1:]), index)
+            less = base * (index >= 0)[..., None]
+            parts.append(told - functional.pad(less, (0, layout.channels - 2)))
+    rows = torch.cat([part.flatten(start_dim=1) for part in parts], dim=1)
+    return base, functional.pad(rows, (0, 0, 0, count - len(rows)))
+
+
+def draw(
+    base: Tensor, rows: Tensor, answer: Tensor, matrix: Tensor | None, layout: Layout
+) -> Tensor:
+    """See `methods.kernels.space_to_depth.draw`."""
+    pixels, features = layout.scale**2, layout.channels + 1
+    rows, answer = rows[: len(base)], answer[: len(base)]
+    out = answer.unflatten(1, (pixels, -1))
+    drawn = base + out[..., :3]
+    if layout.history:
+        begin = layout.begins["history"]
+        recent = rows[:, begin : begin + 4 * pixels].unflatten(1, (pixels, 4))
+        drawn = drawn + (out[..., 3:].sigmoid() * recent[..., 3:]) * recent[..., :3]
+    if matrix is not None:
+        begin = layout.begins["surface"]
+        told = rows[:, begin : begin + features * pixels].unflatten(1, (pixels, features))
+        weighed = torch.cat((told[..., :3] * told[..., 3:4], told[..., 3:]), dim=-1)
+        matrix = matrix[: len(base)].unflatten(1, (3, features))
+        drawn = drawn + weighed @ matrix.transpose(1, 2)
+    return drawn
+
+
+def _enlarged(colours: Tensor, cells: Tensor, taps: Tensor) -> Tensor:
+    """`colours` [h, w, 3] at the pixels of `cells`, each the mean, with weights `taps` [s^2, 9], of
+    the 3 x 3 samples around its cell: [N, s^2, 3]."""
+    height, width, _ = colours.shape
+    around = torch.arange(-1, 2, device=cells.device)
+    row = (cells // width)[:, None] + around.repeat_interleave(3)
+    column = (cells % width)[:, None] + around.repeat(3)
+    near = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)  # [N, 9]
+    samples = colours.flatten(0, 1)[near].transpose(1, 2).flatten(0, 1)  # [3 N, 9]
+    return (samples @ taps.T).view(-1, 3, len(taps)).transpose(1, 2)
+
+
+def _in_cells(image: Tensor, cells: Tensor, scale: int) -> Tensor:
+    """Of `image` [h s, w s] the pixels of `cells`, [N, s^2]."""
+    height, width = (side // scale for side in image.shape)
+    blocks = image.view(height, scale, width, scale).transpose(1, 2)
+    return blocks[cells // width, cells % width].flatten(1)
+
+
+def _shown(values: Tensor, index: Tensor) -> Tensor:
+    """Rows of `values` at `index`, zeros where it is -1."""
+    if wrong := int(((index < -1) | (index >= len(values))).sum()):
+        raise ValueError(
+            f"index: expected -1 to {len(values) - 1}, got {wrong} entries that are not"
+        )
+    return functional.pad(values, (0, 0, 0, 1))[index.long()]
+
+
+def _tell(values: Tensor, known: Tensor) -> Tensor:
+    """`known` [N, 1] put behind the colours of `values` [N, K]."""
+    return torch.cat((values[:, :3], known, values[:, 3:]), dim=1)

@@ -1,0 +1,121 @@
+"""Learning where a field is empty: a decaying maximum of its density on a grid of cells.
+
+After Instant-NGP (appendix E.2): every `EVERY` steps the density is sampled at random points of
+some cells, and a cell counts as occupied when its running maximum exceeds min(mean of the cells,
+the density that is opaque to 1 % over one step). Two things differ. A cell's value changes only
+when the cell is visited, so that a cell that was not looked at is not forgotten. And all cells
+start out occupied, one visit away from being empty, so that no step ever samples the whole grid.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from bench.cameras import place_camera, project
+from bench.types import Camera
+from methods.instant_ngp.field import LOG_DENSITY_CLAMP, HashField
+from methods.kernels.march import BRICK, MAX_SAMPLES, Occupancy
+
+RESOLUTION = 128
+STEP = math.sqrt(3) / MAX_SAMPLES
+"""World length of a ray-marching step: the cube's diagonal in 1024 steps."""
+
+EVERY = 16
+"""Training steps between two updates."""
+
+DECAY = 0.8
+"""What a visit that finds nothing leaves of a cell's value."""
+
+MIN_ALPHA = 0.01
+THRESHOLD = MIN_ALPHA / STEP
+INITIAL = 1.2 * THRESHOLD
+
+LARGEST = math.exp(LOG_DENSITY_CLAMP)
+"""A cell that was denser is remembered as this and can be forgotten: infinity does not decay."""
+
+MIN_VIEWS = 2
+"""Training cameras that must see a place before anything is believed to be there."""
+
+CHUNK = 1 << 18
+"""Visits whose density is evaluated together: bounds the memory of an update."""
+
+
+def learnable_cells(bounds: Tensor, cameras: Sequence[Camera]) -> Tensor:
+    """Cells [G, G, G] of which the pictures of `cameras` can tell whether they are empty.
+
+    They lie inside `bounds` [2, 3] and in a brick of 4^3 cells that at least `MIN_VIEWS` cameras
+    have in their picture: what a single one sees could be anywhere along its rays, and training
+    would put it right before the camera. Bricks that touch a camera are left out as well.
+    """
+    device = bounds.device
+    edge = torch.arange(RESOLUTION, device=device) / RESOLUTION
+    lower, upper = bounds
+    x, y, z = ((edge[:, None] + 1 / RESOLUTION > lower) & (edge[:, None] < upper)).unbind(dim=1)
+    inside = x[:, None, None] & y[:, None] & z
+
+    side = RESOLUTION // BRICK
+    axis = (torch.arange(side, device=device) + 0.5) / side
+    centres = torch.cartesian_prod(axis, axis, axis)
+    views = torch.zeros(len(centres), dtype=torch.int32, device=device)
+    free = torch.ones(len(centres), dtype=torch.bool, device=device)
+    for camera in cameras:
+        camera = place_camera(camera, device)
+        pixels, depth = project(camera, centres)
+        size = pixels.new_tensor((camera.width, camera.height))
+        views += (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
+        free &= (centres - camera.c2w[:, 3]).abs().amax(dim=1) > 1.5 / side
+    bricks = ((views >= MIN_VIEWS) & free).view(side, side, side)
+    for dim in range(3):
+        bricks = bricks.repeat_interleave(BRICK, dim=dim)
+    return inside & bricks
+
+
+class DensityGrid:
+    """Running density of [G, G, G] cells of the unit cube and the occupancy that follows from it.
+
+    Only `cells` [G, G, G] bool may ever be occupied.
+    """
+
+    def __init__(self, cells: Tensor) -> None:
+        self.density = INITIAL * cells.float()
+        self._candidates = cells.flatten().nonzero().squeeze(1)
+        self.occupancy = Occupancy(cells)
+
+    def restore(self, density: Tensor) -> None:
+        """Take over the density of a checkpoint."""
+        self.density.copy_(density)
+        self._threshold()
+
+    @torch.no_grad()
+    def update(self, field: HashField, generator: torch.Generator, samples: int) -> None:
+        """Visit `samples` random cells, half of them among all, half among the occupied ones."""
+        cells = self._draw(samples, generator)
+        found = torch.full_like(self.density.view(-1), -1.0)
+        for part in cells.split(CHUNK):
+            corner = torch.stack(torch.unravel_index(part, self.density.shape), dim=-1)
+            jitter = torch.rand(len(part), 3, generator=generator, device=part.device)
+            sigma, _ = field.density((corner + jitter) / RESOLUTION)
+            found.scatter_reduce_(0, part, sigma.clamp(max=LARGEST), "amax")
+        found = found.view_as(self.density)
+        visited = torch.maximum(DECAY * self.density, found)
+        self.density = torch.where(found >= 0, visited, self.density)
+        self._threshold()
+
+    def _draw(self, samples: int, generator: torch.Generator) -> Tensor:
+        device = self.density.device
+        occupied = self.occupancy.cells.flatten().nonzero().squeeze(1)
+        pools = [pool for pool in (self._candidates, occupied) if len(pool)]
+        return torch.cat(
+            [
+                pool[torch.randint(len(pool), (samples // 2,), generator=generator, device=device)]
+                for pool in pools
+            ]
+        )
+
+    def _threshold(self) -> None:
+        mean = self.density.view(-1)[self._candidates].mean().item()
+        self.occupancy = Occupancy(self.density > min(mean, THRESHOLD))

@@ -1,0 +1,210 @@
+"""A lean 2D renderer that works at low resolution, where something is, and nowhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+from torch.nn import functional
+
+from bench.types import Probe
+from methods.kernels.depthwise import neighbours_of
+from methods.kernels.space_to_depth import Layout, draw, lift
+from methods.steernerf.beyond.cell_network import CellNetwork
+from methods.steernerf.beyond.cells import number, paint
+from methods.steernerf.renderer import UNWATCHED, Drawing, Observation, Renderer2d, check_size
+
+GENERIC = Path(__file__).parent / "weights" / "generic.safetensors"
+"""Weights trained on other scenes, by `steerbench generic`."""
+
+GENERIC_GROUPS = (
+    ("present", 1, 4),
+    ("preceding 0", 16, 4),
+    ("preceding 1", 16, 4),
+    ("history", 16, 4),
+    ("surface", 16, 4),
+)
+"""What those weights expect: K = 3, L = 2, s = 4."""
+
+GENERIC_SCALE = 4
+
+
+Groups = Sequence[tuple[str, int, int]]
+
+
+class SpaceToDepth(Renderer2d):
+    """A network on cells: the s x s pixels of a low-resolution pixel are channels of its cell.
+
+    A picture is the aligned bilinear enlargement of the present RGB (the base), blended pixel by
+    pixel with the preceding picture where that is known, plus a correction, plus what the features
+    at the surface of each pixel say, read by a matrix that all pixels of a cell share. Shares,
+    corrections and matrices come from a network on cells; so does the error to be expected there.
+
+    Only the cells of an observation are drawn; all others are background, and 0 to their
+    neighbours. So nothing is computed for them, and a part of a frame is drawn exactly as in the
+    whole. All features enter less their background, so that nothing is 0.
+
+    Args:
+        channels: K.
+        frames: L.
+        scale: s.
+        width: channels of the trunk.
+        blocks: residual blocks of the trunk.
+        init: "generic": start from the weights that come with the package, trained on other
+            scenes; "scratch": from random ones.
+        history: use the preceding picture.
+        surface: use the features at the surface, pixel by pixel.
+    """
+
+    doubts = True
+    shifts = True
+    network: CellNetwork
+
+    def __init__(
+        self,
+        channels: int,
+        frames: int,
+        scale: int,
+        *,
+        width: int = 64,
+        blocks: int = 6,
+        init: Literal["generic", "scratch"] = "generic",
+        history: bool = True,
+        surface: bool = True,
+    ) -> None:
+        super().__init__()
+        check_size("renderer.width", width, 1, 4096)
+        check_size("renderer.blocks", blocks, 0, 256)
+        self.channels, self.frames, self.scale = channels, frames, scale
+        layout = self.layout = Layout(channels, frames, scale, history and frames > 0, surface)
+        self.network = CellNetwork(layout, width, blocks)
+        if init == "generic":
+            self._start_from(load_file(GENERIC))
+
+    def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Drawing:
+        """See `Renderer2d`."""
+        base, rows = self._lift(observations)
+        neighbours, backend = self._neighbours(observations, len(rows)), observations[0].backend
+        self.network.backend = backend
+        answer, doubt, *matrix = (x.to(base) for x in self.run(probe, rows, neighbours))
+        drawn = draw(base, rows, answer, next(iter(matrix), None), self.layout, backend=backend)
+        return Drawing(self._paint(observations, drawn), doubt[: len(base), 0])
+
+    def base(self, observations: Sequence[Observation]) -> Tensor:
+        """See `Renderer2d`."""
+        alone = Layout(self.channels, 0, self.scale, history=False, surface=False)
+        parts = [
+            lift(
+                o.frame.values,
+                o.frame.alpha,
+                o.background,
+                o.cells,
+                [],
+                None,
+                None,
+                alone,
+                o.phase,
+                backend=o.backend,
+            )[0]
+            for o in observations
+        ]
+        return self._paint(observations, torch.cat(parts))
+
+    def _lift(self, observations: Sequence[Observation]) -> tuple[Tensor, Tensor]:
+        """The base and the rows of all their cells, rows of 0 behind them; see `lift`.
+
+        The library behind the products prepares code for every new size, which takes longer than
+        the product itself: it sees few sizes.
+        """
+        alone = len(observations) == 1
+        quantum = self.network.quantum
+        parts = [self._lift_one(o, quantum if alone else 1) for o in observations]
+        if alone:
+            return parts[0]
+        base, rows = (torch.cat(some) for some in zip(*parts, strict=True))
+        return base, functional.pad(rows, (0, 0, 0, -len(rows) % quantum))
+
+    def _lift_one(self, observation: Observation, multiple: int) -> tuple[Tensor, Tensor]:
+        o, layout = observation, self.layout
+        history = surface = None
+        if o.history is not None and layout.history:
+            history = o.history.values, o.history.valid
+        if o.surface is not None and layout.surface:
+            surface = o.surface.values, o.surface.index
+        return lift(
+            o.frame.values,
+            o.frame.alpha,
+            o.background,
+            o.cells,
+            [(points.values, points.index) for points in o.preceding],
+            history,
+            surface,
+            layout,
+            o.phase,
+            multiple=multiple,
+            backend=o.backend,
+        )
+
+    def _neighbours(self, observations: Sequence[Observation], rows: int) -> Tensor:
+        """Of all cells, and of as many more as make `rows`, which have none: [R, 9]."""
+        size, device = observations[0].frame.alpha.shape, observations[0].cells.device
+        active = torch.zeros(len(observations), *size, dtype=torch.bool, device=device)
+        active.view(-1)[number([o.cells for o in observations], size)] = True
+        neighbours = neighbours_of(active)
+        return functional.pad(neighbours, (0, 0, 0, rows - len(neighbours)), value=-1)
+
+    def _paint(self, observations: Sequence[Observation], less: Tensor) -> Tensor:
+        """Pictures [B, H, W, 3] of all cells, of which `less` [N, s^2, 3] has no background."""
+        size, background = observations[0].frame.alpha.shape, observations[0].background[:3]
+        shown = [o.cells for o in observations]
+        return paint(shown, size, self.scale, less + background, background)
+
+    @torch.no_grad()
+    def _start_from(self, generic: Mapping[str, Tensor]) -> None:
+        """Take over the weights of a renderer of the same trunk that was trained at K = 3, L = 2.
+
+        Weights of features beyond RGB, and of frames it did not have, stay as they are.
+
+        Raises:
+            ValueError: this renderer is of another shape.
+        """
+        weights = dict(self.network.named_parameters())
+        unused = {name for name in generic if name.startswith("read") and not self.layout.surface}
+        ours, theirs = _same_columns(self.layout.groups, GENERIC_GROUPS)
+        slots = range(self.scale**2)
+        written = [4 * slot + i for slot in slots for i in range(3 + self.layout.history)]
+        matrix = [(self.channels + 1) * row + column for row in range(3) for column in range(4)]
+        try:
+            if weights.keys() != generic.keys() - unused or self.scale != GENERIC_SCALE:
+                raise RuntimeError("other layers, or another scale")
+            for name, weight in weights.items():
+                new = generic[name].float()
+                if name == "enter.weight":
+                    weight[:, ours] = new[:, theirs]
+                elif name.startswith("read"):
+                    weight[matrix] = new
+                else:
+                    weight.copy_(new[written] if name.startswith("leave") else new)
+        except RuntimeError as error:
+            raise ValueError(
+                "renderer.init=generic: the weights are those of a renderer of the default scale, "
+                f"width and blocks ({error}): use renderer.init=scratch"
+            ) from error
+
+
+def _same_columns(ours: Groups, theirs: Groups) -> tuple[list[int], list[int]]:
+    """Columns of colours and validity that two layouts of the inputs have in common."""
+    columns: tuple[dict[tuple[str, int, int], int], ...] = ({}, {})
+    for groups, place in zip((ours, theirs), columns, strict=True):
+        begin = 0
+        for name, slots, features in groups:
+            for slot in range(slots):
+                for feature in range(min(features, 4)):
+                    place[name, slot, feature] = begin + slot * features + feature
+            begin += slots * features
+    both = [key for key in columns[0] if key in columns[1]]
+    return [columns[0][key] for key in both], [columns[1][key] for key in both]

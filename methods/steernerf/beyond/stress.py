@@ -1,0 +1,164 @@
+"""Engines on constants, on what they never saw, and on what is no number."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from functools import cache, partial
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from bench.console import ConsoleLog
+from bench.stress import Cell, StressCase
+from methods.engines import Engine, Inputs, Precision
+from methods.engines.onnxruntime_engine import OnnxRuntime
+from methods.engines.openvino_engine import OpenVino
+from methods.engines.tensorrt_engine import TensorRt
+from methods.engines.torch_engine import TorchEngine
+from methods.kernels.depthwise import neighbours_of
+from methods.steernerf.beyond.lean_renderer import SpaceToDepth
+
+ENGINES: tuple[type[Engine], ...] = (TorchEngine, OpenVino, OnnxRuntime, TensorRt)
+CELLS: list[Cell] = [
+    (engine.name, precision) for engine in ENGINES for precision in engine.precisions
+]
+
+TOLERANCE = {"fp32": 1e-5, "bf16": 0.03, "fp16": 0.03, "int8": 0.1}
+SHARE = (
+    "of the root mean square: fp32 adds hundreds of products in another order; below, numbers are "
+    "rounded by 2^-8, or 1/510 of the range seen, before each of some ten layers"
+)
+
+SIDE, BLOCKS = 16, 6
+"""Cells along a side of the view; blocks of the network, each of which reaches a cell further."""
+
+
+def cases() -> list[StressCase]:
+    """Constants, numbers far beyond those an engine was calibrated on, a cell of NaN."""
+    shares = {cell: TOLERANCE[cell[1]] for cell in CELLS}
+    rounded = {cell: share for cell, share in shares.items() if cell[1] != "int8"}
+    counted = {cell: 0.0 for cell in CELLS if cell[1] == "int8"}
+    same = "it says what the network says"
+    return [
+        _case("all inputs 0", same, SHARE, shares, partial(_error, 0.0)),
+        # In int8 it saturates, layer by layer: no random view is as bright inside.
+        _case("all inputs 1/2", same, SHARE, rounded, partial(_error, 0.5)),
+        _case(
+            "inputs up to 1e4",
+            "what it says is finite",
+            "it is, or is not: 0",
+            dict.fromkeys(CELLS, 0.0),
+            _not_finite,
+        ),
+        _case(
+            "inputs 8 times as large as those seen",
+            "int8 saturates: twice as large, they say the same, number by number",
+            "numbers that differ are counted: 0",
+            counted,
+            _not_saturated,
+        ),
+        _case(
+            "a cell of NaN",
+            "it is reported, but in int8, and cells out of its reach say what they said",
+            SHARE,
+            shares,
+            _spread_of_nan,
+        ),
+    ]
+
+
+def _case(
+    name: str,
+    holds: str,
+    derivation: str,
+    tolerances: Mapping[Cell, float],
+    worst: Callable[[str, str, str], float],
+) -> StressCase:
+    # Engines take seconds to build.
+    return StressCase("engine", name, holds, derivation, tolerances, worst, slow=True)
+
+
+@cache
+def _renderer() -> SpaceToDepth:
+    """With the weights that come with the package."""
+    return SpaceToDepth(3, 2, 4).requires_grad_(False)
+
+
+def _placed(rows: Tensor, device: str) -> Inputs:
+    """The network's inputs: `rows` and who is beside whom."""
+    neighbours = neighbours_of(torch.ones(1, SIDE, SIDE, dtype=torch.bool))
+    return rows.to(device), neighbours.to(device)
+
+
+def _random_rows(seed: int) -> Tensor:
+    """What a view of 16 x 16 cells may look like."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(SIDE**2, _renderer().layout.width, generator=generator) - 0.5
+
+
+@cache
+def _built(engine: str, device: str, precision: Precision) -> Callable[..., Inputs]:
+    """The network as an engine runs it, calibrated on random views.
+
+    Raises:
+        Unavailable: the engine, or its precision, cannot be had on `device`.
+    """
+    chosen = next(kind for kind in ENGINES if kind.name == engine)(precision)
+    chosen.check(torch.device(device))
+    network = deepcopy(_renderer().network).to(device)
+    views = [_placed(_random_rows(seed), device) for seed in range(4)]
+    with tempfile.TemporaryDirectory() as folder:
+        log = ConsoleLog(Path(folder), quiet=True)
+        return chosen.build(network, lambda: views, lambda: Path(folder), log).run
+
+
+def _said(engine: str, device: str, precision: str, rows: Tensor) -> list[Tensor]:
+    """All that the engine says of `rows`, in float64."""
+    run = _built(engine, device, precision)
+    with torch.no_grad():
+        return [x.cpu().double().clone() for x in run(*_placed(rows, device))]
+
+
+def _apart(got: list[Tensor], want: list[Tensor]) -> float:
+    """Root mean square of the difference over that of `want`, of the worst output."""
+    shares = [
+        ((g - w).square().mean() / w.square().mean()).sqrt().item()
+        for g, w in zip(got, want, strict=True)
+    ]
+    return math.inf if any(map(math.isnan, shares)) else max(shares)
+
+
+def _error(value: float, engine: str, device: str, precision: str) -> float:
+    rows = torch.full_like(_random_rows(0), value)
+    with torch.no_grad():
+        want = [x.double() for x in _renderer().network(*_placed(rows, "cpu"))]
+    return _apart(_said(engine, device, precision, rows), want)
+
+
+def _not_finite(engine: str, device: str, precision: str) -> float:
+    """How many of the numbers said are not finite."""
+    said = _said(engine, device, precision, 2e4 * _random_rows(0))
+    return float(sum((~x.isfinite()).sum() for x in said))
+
+
+def _not_saturated(engine: str, device: str, precision: str) -> float:
+    """How many of the numbers said still change when inputs out of range double."""
+    rows = _random_rows(0).sign() * 4
+    once, twice = (_said(engine, device, precision, factor * rows) for factor in (1, 2))
+    return float(sum((a != b).sum() for a, b in zip(once, twice, strict=True)))
+
+
+def _spread_of_nan(engine: str, device: str, precision: str) -> float:
+    rows = _random_rows(0)
+    want = _said(engine, device, precision, rows)
+    rows[0] = torch.nan
+    got = _said(engine, device, precision, rows)
+    if precision != "int8" and not all(x[0].isnan().all() for x in got):
+        return math.inf
+    cell = torch.arange(SIDE**2)
+    far = (cell // SIDE > BLOCKS) | (cell % SIDE > BLOCKS)
+    return _apart([x[far] for x in got], [x[far] for x in want])

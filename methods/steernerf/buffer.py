@@ -1,0 +1,201 @@
+"""Preceding frames, kept as points and brought into the present view (SteerNeRF Eq. 6, 9, 10)."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from bench.cameras import pack_camera, pixel_grid, place_camera, project, unpack_camera, unproject
+from bench.types import Camera
+from methods.kernels.splat import splat
+from methods.rendering.batch import FeatureFrame
+from methods.training.checkpoint import part
+
+SPLAT_ALPHA = 0.1
+"""Least opacity of a pixel that becomes a point: the depth of a fainter one means little."""
+
+OVERLAP_POINTS = 256
+"""Points, evenly spread, that tell how much of a frame another view shares."""
+
+
+@dataclass(frozen=True)
+class Reprojection:
+    """How a frame is brought into another view; each `paper` value is what the release does.
+
+    Attributes:
+        rule: which point a pixel shows, the "nearest", or the "last" written (paper).
+        centres: "exact", or "paper": unprojected through the corner of a pixel, which is constant
+            offset of s / 2 - 1/2 pixels that the 2D renderer has to learn.
+        depth: "expected" termination, or the "sum" of w t (paper): too near where alpha < 1; empty
+            pixels become points at the camera.
+    """
+
+    rule: Literal["nearest", "last"] = "nearest"
+    centres: Literal["exact", "paper"] = "exact"
+    depth: Literal["expected", "sum"] = "expected"
+
+
+CLOUD = ("source", "points", "values", "alpha", "age")
+"""The tensors of a cloud."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """The pixels of a low-resolution frame that show something, as points in the scene.
+
+    Attributes:
+        camera: of the frame.
+        source: [N] index of each point's pixel, row by row.
+        points: [N, 3].
+        values: [N, K] features.
+        alpha: [N] opacity.
+        age: [N] uint8, frames since the oldest of what a pixel is made of was rendered.
+    """
+
+    camera: Camera
+    source: Tensor
+    points: Tensor
+    values: Tensor
+    alpha: Tensor
+    age: Tensor
+
+    @classmethod
+    def of(cls, frame: FeatureFrame, options: Reprojection, age: Tensor | None = None) -> Cloud:
+        """Unproject `frame` (Eq. 6), whose pixels are of `age` [h * w]; None: of 0."""
+        alpha, depth = frame.alpha.flatten(), frame.depth.flatten()
+        if options.depth == "sum":
+            source = torch.arange(len(alpha), device=alpha.device)
+            depth = torch.where(alpha > 0, depth.nan_to_num(posinf=0) * alpha, 0) + 1e-12
+        else:
+            source = ((alpha > SPLAT_ALPHA) & depth.isfinite()).nonzero().squeeze(1)
+            depth = depth[source]
+        camera = frame.camera
+        centres = pixel_grid(camera.width, camera.height, alpha.device)[source]
+        if options.centres == "paper":
+            centres = centres - 0.5
+        values = frame.values.reshape(len(alpha), -1)[source]
+        points = unproject(camera, centres, depth)
+        ages = torch.zeros_like(source, dtype=torch.uint8) if age is None else age[source]
+        return cls(camera, source, points, values, alpha[source], ages)
+
+    def land(self, camera: Camera, options: Reprojection, backend: str) -> tuple[Tensor, Tensor]:
+        """Which point each pixel of `camera` shows (Eq. 9, 10).
+
+        Returns:
+            [H, W] int32, the index of the point, -1 for none; and [N] the z-depth of the points.
+        """
+        pixels, depth = project(camera, self.points)
+        if options.centres == "paper":
+            pixels = pixels + 0.5  # pixel i is at i there, and shows what rounds to it
+        size = camera.width, camera.height
+        return splat(pixels, depth, *size, rule=options.rule, backend=backend), depth
+
+    def overlap(self, camera: Camera) -> float:
+        """About which share of what this frame shows `camera` can see, 0 to 1.
+
+        A point is seen again if it lies inside the other picture and its surface faces that camera,
+        too. Of a ball's disc, as a far camera sees it, another one at an angle of t sees
+        (1 + cos t) / 2, half the disc and a half-ellipse; all that is seen is taken for such balls.
+        What hides behind something else is not found out. 0 for a frame that shows nothing.
+        """
+        points = self.points[self.alpha > SPLAT_ALPHA]
+        if not len(points):
+            return 0.0
+        points = points[:: math.ceil(len(points) / OVERLAP_POINTS)]
+        pixels, depth = project(camera, points)
+        size = torch.tensor((camera.width, camera.height), device=pixels.device)
+        inside = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
+        here, there = (points - view.c2w[:3, 3] for view in (self.camera, camera))
+        return float((inside * (1 + functional.cosine_similarity(here, there, dim=1)) / 2).mean())
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """What is kept of a frame: its `cloud`, and its `picture` [H, W, 3] as `camera` saw it."""
+
+    cloud: Cloud
+    camera: Camera
+    picture: Tensor
+
+
+class RenderingBuffer:
+    """The last `length` frames of a sequence; more are forgotten.
+
+    Attributes:
+        turn: frames since the sequence began.
+    """
+
+    def __init__(self, length: int, turn: int = 0) -> None:
+        self._frames: deque[Remembered] = deque(maxlen=length)
+        self.turn = turn
+
+    @property
+    def frames(self) -> Sequence[Remembered]:
+        """Newest first; fewer than `length` after a cold start."""
+        return tuple(self._frames)
+
+    @property
+    def clouds(self) -> Sequence[Cloud]:
+        """Those of `frames`."""
+        return tuple(frame.cloud for frame in self._frames)
+
+    def push(self, frame: Remembered) -> None:
+        """Remember `frame`, forget the oldest one if there are too many."""
+        self._frames.appendleft(frame)
+        self.turn += 1
+
+    def copy(self) -> RenderingBuffer:
+        """A buffer that has seen the same frames, and goes on by itself."""
+        other = RenderingBuffer(self._frames.maxlen or 0, self.turn)
+        other._frames.extend(self._frames)
+        return other
+
+    def state(self) -> dict[str, Tensor]:
+        """All that is remembered, to be kept in a file."""
+        tensors = {"turn": torch.tensor(self.turn)}
+        for age, frame in enumerate(self._frames):
+            tensors |= {f"{age}.{name}": x for name, x in _packed(frame).items()}
+        return tensors
+
+    def restore(self, tensors: Mapping[str, Tensor], device: torch.device) -> None:
+        """Remember on `device` what `state` gave of another buffer."""
+        self.turn = int(tensors["turn"])
+        ages = sum(name.endswith(".camera") for name in tensors)
+        frames = (_unpacked(part(tensors, f"{age}."), device) for age in range(ages))
+        self._frames = deque(frames, self._frames.maxlen)
+
+    def reset(self) -> None:
+        """Forget all: a new sequence starts."""
+        self._frames.clear()
+        self.turn = 0
+
+
+def _packed(frame: Remembered) -> dict[str, Tensor]:
+    """Of the picture only what differs from its first pixel: most of it is background."""
+    cloud, pixels = frame.cloud, frame.picture.flatten(0, 1)
+    places = (pixels != pixels[0]).any(dim=1).nonzero().squeeze(1)
+    parts = {name: getattr(cloud, name) for name in CLOUD}
+    return parts | {
+        "cloud_camera": pack_camera(cloud.camera),
+        "camera": pack_camera(frame.camera),
+        "background": pixels[0].clone(),
+        "places": places.int(),
+        "pixels": pixels[places],
+    }
+
+
+def _unpacked(tensors: Mapping[str, Tensor], device: torch.device) -> Remembered:
+    cloud_camera, camera = (
+        place_camera(unpack_camera(tensors[name]), device) for name in ("cloud_camera", "camera")
+    )
+    cloud = Cloud(cloud_camera, **{name: tensors[name].to(device) for name in CLOUD})
+    picture = tensors["background"].repeat(camera.height * camera.width, 1)
+    picture[tensors["places"].long()] = tensors["pixels"]
+    return Remembered(cloud, camera, picture.view(camera.height, camera.width, 3).to(device))

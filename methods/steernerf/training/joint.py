@@ -1,0 +1,307 @@
+"""Stage 2: the 2D renderer, and with it the field, trained on patches of pictures (Section 3.5)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.optim.swa_utils import AveragedModel
+
+from bench.cameras import cast
+from bench.types import Rays
+from methods.kernels import multiplies_bf16
+from methods.rendering.batch import opacity_entropy, render_batch
+from methods.rendering.occupancy import STEP
+from methods.steernerf.beyond.cells import centres, pixels_of
+from methods.steernerf.pipeline import Pipeline, most_doubted
+from methods.steernerf.renderer import Drawing, Renderer2d
+from methods.steernerf.training.patches import Batch, Patches, Through
+from methods.steernerf.training.sequences import MotionOptions
+from methods.training import checkpoint, loop
+from methods.training.optimiser import FieldOptimiser, cosine, step_at
+
+LEAST_ERROR = 1e-6
+"""Mean squared error of a cell below which one is as good as another."""
+
+Tensors = tuple[Tensor, ...] | list[Tensor]
+
+
+@dataclass(frozen=True)
+class JointOptions:
+    """How stage 2 is trained.
+
+    Attributes:
+        field: "joint", or "frozen" as stage 1 left it (the ablation of the paper's Table 5).
+        through: which frames the field learns from: "all", also the preceding ones, or only the
+            "present" one.
+        rate: learning rate of the 2D renderer at the beginning.
+        field_rate: of the field.
+        final_rate: share of both left at the end of the cosine schedule.
+        patch: side of a patch, low-resolution pixels.
+        batch: patches of a step.
+        precision: of the 2D renderer's convolutions while it is trained. Where the device has no
+            products of bfloat16, "bf16" is "fp32".
+        opacity_entropy: weight of -o ln o of the rays.
+        doubt: weight of the squared error of the doubt, in log.
+        refined: share of the cells that are refined while it is trained.
+        refined_rays: pixels of those that the field learns from in a step.
+        clip: largest norm of the 2D renderer's gradient.
+        average: decay of the running mean of the 2D renderer's weights that is used in the end.
+        distilled_views: most pictures of the stage 1 field at random views, to learn from as well.
+        distilled_share: of the patches that are taken from those.
+        motion: what precedes a training view.
+    """
+
+    field: Literal["joint", "frozen"] = "joint"
+    through: Through = "present"
+    rate: float = 1e-3
+    field_rate: float = 1e-3
+    final_rate: float = 0.01
+    patch: int = 32
+    batch: int = 2
+    precision: Literal["bf16", "fp32"] = "bf16"
+    opacity_entropy: float = 1e-3
+    doubt: float = 1e-4
+    refined: float = 0.2
+    refined_rays: int = 2048
+    clip: float = 1.0
+    average: float = 0.999
+    distilled_views: int = 100
+    distilled_share: float = 0.5
+    motion: MotionOptions = MotionOptions()
+
+    def __post_init__(self) -> None:
+        fits = {
+            "rate": (self.rate > 0, "more than 0"),
+            "field_rate": (self.field_rate > 0, "more than 0"),
+            "final_rate": (0 < self.final_rate <= 1, "a share, more than 0"),
+            "patch": (self.patch >= 1, "1 or more"),
+            "batch": (self.batch >= 1, "1 or more"),
+            "opacity_entropy": (self.opacity_entropy >= 0, "0 or more"),
+            "doubt": (self.doubt >= 0, "0 or more"),
+            "refined": (0 <= self.refined <= 1, "a share of 0 to 1"),
+            "refined_rays": (self.refined_rays >= 1, "1 or more"),
+            "clip": (self.clip > 0, "more than 0"),
+            "average": (0 <= self.average < 1, "a share of less than 1"),
+            "distilled_views": (self.distilled_views >= 0, "0 or more"),
+            "distilled_share": (0 <= self.distilled_share <= 1, "a share of 0 to 1"),
+        }
+        for name, (fit, wanted) in fits.items():
+            if not fit:
+                raise ValueError(f"joint.{name}: expected {wanted}, got {getattr(self, name)}")
+
+    def distilled(self, steps: int, frames: int) -> int:
+        """Distilled views of a training of so many steps: no more than it has a use for.
+
+        Without preceding `frames` every sequence begins anew.
+        """
+        longer = self.motion.longer if frames else 0.0
+        anew = (1 - longer) * steps * self.batch / self.motion.uses
+        sequences = self.motion.pool + anew
+        return min(self.distilled_views, math.ceil(self.distilled_share * sequences))
+
+
+class RendererTraining:
+    """Stage 2 of the 2D renderer alone, as a `loop.Training`: the field stays as it is.
+
+    Args:
+        renderer: trained in place.
+        patches: what it is shown.
+        steps: optimiser steps.
+        generator: of all random numbers, also those of `patches`.
+
+    Attributes:
+        mean: the running mean of the renderer's weights, which is what is used in the end.
+    """
+
+    advice = "Try smaller learning rates (method.joint.rate, method.joint.field_rate)."
+
+    def __init__(
+        self,
+        renderer: Renderer2d,
+        patches: Patches,
+        options: JointOptions,
+        steps: int,
+        generator: torch.Generator,
+    ) -> None:
+        self.renderer, self.patches, self.options = renderer, patches, options
+        self.generator = generator
+        self.step, self.steps, self.seconds = 0, steps, 0.0
+        self.optimiser = torch.optim.Adam(renderer.parameters(), lr=options.rate, fused=True)
+        self._averaged = AveragedModel(renderer, multi_avg_fn=self._average)
+        self.mean: Renderer2d = self._averaged.module  # type: ignore[assignment]
+
+    def advance(self) -> dict[str, float]:
+        """One step; mean squared error of the picture and of the base that it corrects.
+
+        Raises:
+            SteerbenchError: the loss is not finite.
+        """
+        batch = self.patches.draw(self.options.batch)
+        kind = batch.truth.device.type
+        half = self.options.precision == "bf16" and multiplies_bf16(kind)
+        with torch.autocast(kind, torch.bfloat16, enabled=half):
+            drawing = self.renderer(batch.observations)
+        loss = functional.mse_loss(drawing.pictures, batch.truth)
+        (loss + self._doubt_loss(batch, drawing) + self._field_loss(batch, drawing)).backward()
+        value = loss.item()
+        if not math.isfinite(value):
+            loop.check_finite(self, {"loss": loss, "picture": drawing.pictures})
+        nn.utils.clip_grad_norm_(self.renderer.parameters(), self.options.clip)
+        self._update(cosine(self.step / self.steps, self.options.final_rate))
+        self.step += 1
+        with torch.no_grad():
+            base = functional.mse_loss(self.renderer.base(batch.observations), batch.truth).item()
+        return {"": value, "base": base}
+
+    def _doubt_loss(self, batch: Batch, drawing: Drawing) -> Tensor | float:
+        """How far the errors that the renderer expected are from those it made."""
+        if drawing.doubt is None:
+            return 0.0
+        errors = (drawing.pictures.detach() - batch.truth).square().mean(dim=-1)
+        made = [
+            pixels_of(error, o.cells, self.renderer.scale).mean(dim=1)
+            for error, o in zip(errors, batch.observations, strict=True)
+        ]
+        wanted = (torch.cat(made) + LEAST_ERROR).log()
+        return self.options.doubt * functional.mse_loss(drawing.doubt, wanted)
+
+    def _field_loss(self, batch: Batch, drawing: Drawing) -> Tensor | float:
+        """What the field learns from, beside the pictures that are drawn."""
+        return 0.0
+
+    def _update(self, share: float) -> None:
+        """Change the weights, at `share` of the learning rates of the beginning."""
+        step_at(self.optimiser, share * self.options.rate)
+        self._averaged.update_parameters(self.renderer)
+
+    @torch.no_grad()
+    def _average(self, mean: Tensors, new: Tensors, count: Tensor | int) -> None:
+        # In the beginning, over fewer steps: the first weights are not worth remembering.
+        keep = min(self.options.average, (1 + int(count)) / (10 + int(count)))
+        torch._foreach_lerp_(mean, new, 1 - keep)
+
+    def watched(self) -> dict[str, Tensor]:
+        """The renderer."""
+        return {f"renderer.{name}": x for name, x in self.renderer.named_parameters()}
+
+    def result(self) -> dict[str, Tensor]:
+        """The running mean of the renderer."""
+        return {f"mean.{name}": x for name, x in self.mean.state_dict().items()}
+
+    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+        """Put back what `result` gave."""
+        self.mean.load_state_dict(checkpoint.part(tensors, "mean."))
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+        """Renderer, optimiser, random numbers, and what the next patches are cut out of."""
+        tensors = {f"renderer.{name}": x for name, x in self.renderer.state_dict().items()}
+        tensors |= checkpoint.optimiser_tensors(self.optimiser, "renderer_adam.")
+        tensors |= {f"patches.{name}": x for name, x in self.patches.state().items()}
+        return tensors | {
+            "generator": self.generator.get_state(),
+            "averaged": self._averaged.n_averaged,
+        }, {}
+
+    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
+        """See `loop.Training`."""
+        self.restore_result(tensors)
+        self.renderer.load_state_dict(checkpoint.part(tensors, "renderer."))
+        checkpoint.restore_optimiser(self.optimiser, tensors, "renderer_adam.")
+        self.patches.restore(checkpoint.part(tensors, "patches."))
+        self.generator.set_state(tensors["generator"].cpu())
+        self._averaged.n_averaged.copy_(tensors["averaged"])
+
+
+class JointTraining(RendererTraining):
+    """Stage 2 end to end: the field learns through the 2D renderer.
+
+    Args:
+        pipeline: that `patches` go through; its field is trained in place.
+    """
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        renderer: Renderer2d,
+        patches: Patches,
+        options: JointOptions,
+        steps: int,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__(renderer, patches, options, steps, generator)
+        self.pipeline, self.field = pipeline, pipeline.field
+        self.field_optimiser = FieldOptimiser(self.field, fused=True)
+
+    def _field_loss(self, batch: Batch, drawing: Drawing) -> Tensor | float:
+        return self._opacity_loss(batch.opacity) + self._refinement_loss(batch, drawing)
+
+    def _opacity_loss(self, opacity: Tensor) -> Tensor | float:
+        return self.options.opacity_entropy * opacity_entropy(opacity) if len(opacity) else 0.0
+
+    def _refinement_loss(self, batch: Batch, drawing: Drawing) -> Tensor | float:
+        """Mean squared error that the pixels to be refined add to the pictures, estimated from
+        `refined_rays` of them.
+
+        Without it the field forgets how to look at full resolution.
+        """
+        pipeline = self.pipeline
+        if not pipeline.options.refined or drawing.doubt is None:
+            return 0.0
+        scale, rays, truth = pipeline.options.scale, [], []
+        doubts = drawing.doubt.detach().split([len(o.cells) for o in batch.observations])
+        for o, view, picture, doubt in zip(
+            batch.observations, batch.views, batch.truth, doubts, strict=True
+        ):
+            worst = o.cells[most_doubted(doubt, pipeline.options.refined)]
+            rays.append(cast(view.full, centres(worst, view.low.width, scale).flatten(0, 1)))
+            truth.append(pixels_of(picture, worst, scale).flatten(0, 1))
+        wanted, every = torch.cat(truth), Rays.joined(rays)
+        if not len(wanted):
+            return 0.0
+        some = torch.randperm(len(wanted), generator=self.generator)[: self.options.refined_rays]
+        pixels, _ = render_batch(
+            self.field,
+            every.take(some),
+            pipeline.occupancy,
+            jitter=None,
+            background=pipeline.background,
+            stop=pipeline.options.stop,
+            step=pipeline.options.refined_steps * STEP,
+        )
+        error = (pixels.values[:, :3] - wanted[some]).square().sum() / len(some)
+        return error * len(wanted) / batch.truth.numel()
+
+    def _update(self, share: float) -> None:
+        super()._update(share)
+        self.field_optimiser.step(share * self.options.field_rate)
+
+    def watched(self) -> dict[str, Tensor]:
+        """Table, networks, 2D renderer."""
+        return {"table": self.field.table, **self.field.layers, **super().watched()}
+
+    def result(self) -> dict[str, Tensor]:
+        """Field and running mean of the renderer."""
+        field = {f"field.{name}": x for name, x in self.field.state_dict().items()}
+        return field | super().result()
+
+    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+        """Put back what `result` gave."""
+        super().restore_result(tensors)
+        self.field.load_state_dict(checkpoint.part(tensors, "field."))
+        self.field.repack()
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+        """The optimisers of the field, too."""
+        tensors, figures = super().state()
+        return tensors | self.field_optimiser.tensors(), figures
+
+    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
+        """See `loop.Training`."""
+        super().restore(tensors, figures)
+        self.field_optimiser.restore(tensors)

@@ -1,0 +1,209 @@
+"""Patches of training views, seen through the pipeline as far as a 2D renderer needs it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol
+
+import torch
+from torch import Tensor
+
+from bench.cameras import cast, crop_camera, pixel_grid
+from bench.protocol import composite
+from bench.types import Camera, NullProbe, Rays
+from methods.kernels.composite import Pixels
+from methods.rendering.batch import FeatureFrame, rays_at_matter, render_batch
+from methods.rendering.occupancy import STEP
+from methods.steernerf.buffer import Cloud
+from methods.steernerf.pipeline import Pipeline
+from methods.steernerf.renderer import Observation, Points
+from methods.steernerf.training.sequences import Sequence, SequencePool
+from methods.steernerf.view import View
+
+Through = Literal["all", "present"]
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A patch of a training view, and the rays of the field that it is drawn from.
+
+    Attributes:
+        sequence: what it was cut from.
+        view: its cameras.
+        truth: [H, W, 3].
+        seen: [P] pixels of `view.low` whose rays are rendered.
+        indices: what each preceding frame shows at its pixels, [H, W].
+        shown: the points of each preceding frame that are seen.
+        rays: of `seen`, then of each of `shown`.
+    """
+
+    sequence: Sequence
+    view: View
+    truth: Tensor
+    seen: Tensor
+    indices: list[Tensor]
+    shown: list[Tensor]
+    rays: list[Rays]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Patches to learn from.
+
+    Attributes:
+        observations: what is known of each, with a gradient if the field is to learn.
+        views: the cameras of each.
+        truth: their true pictures, [B, H, W, 3].
+        opacity: of the rays that were rendered.
+    """
+
+    observations: list[Observation]
+    views: list[View]
+    truth: Tensor
+    opacity: Tensor
+
+
+class Patches(Protocol):
+    """Where a training gets its patches from."""
+
+    def draw(self, count: int) -> Batch:
+        """`count` patches."""
+
+    def state(self) -> dict[str, Tensor]:
+        """What the next patches depend on, beside the pipeline and the random numbers."""
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Put back what `state` gave."""
+
+
+class PatchSource:
+    """Batches of random patches of the sequences of a pool.
+
+    Args:
+        side: of a patch, low-resolution pixels.
+        learning: the field is to learn from the patches.
+        through: which frames it learns from: "all", or only the "present" one.
+    """
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        pool: SequencePool,
+        side: int,
+        learning: bool,
+        through: Through,
+        generator: torch.Generator,
+    ) -> None:
+        self.pipeline, self.pool, self.side = pipeline, pool, side
+        self.learning, self.through, self.generator = learning, through, generator
+
+    def draw(self, count: int) -> Batch:
+        """See `Patches`."""
+        patches = [self.cut(self.pool.draw()) for _ in range(count)]
+        observations, opacity = self.observe(patches)
+        truth = torch.stack([patch.truth for patch in patches])
+        return Batch(observations, [patch.view for patch in patches], truth, opacity)
+
+    def state(self) -> dict[str, Tensor]:
+        """See `Patches`."""
+        return self.pool.state()
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """See `Patches`."""
+        self.pool.restore(tensors)
+
+    def cut(self, sequence: Sequence) -> Patch:
+        """A random patch of `sequence` in which there is more than background."""
+        scale, view = self.pipeline.options.scale, sequence.view
+        place = sequence.cells[self._random(len(sequence.cells))].tolist()
+        size = view.low.height, view.low.width
+        height, width = (min(self.side, side) for side in size)
+        top, left = (
+            min(max(centre - self._random(extent), 0), side - extent)
+            for centre, extent, side in zip(place, (height, width), size, strict=True)
+        )
+        low = crop_camera(view.low, left, top, width, height)
+        full = crop_camera(view.full, left * scale, top * scale, width * scale, height * scale)
+        cut = View(full, low, view.phase)
+        seen, rays = rays_at_matter(low, self.pipeline.occupancy)
+        patch = Patch(sequence, cut, self._truth(sequence, top, left, full), seen, [], [], [rays])
+        for frame in sequence.buffer.frames:
+            index, _ = frame.cloud.land(
+                full, self.pipeline.options.reprojection, self.pipeline.backend
+            )
+            shown = index[index >= 0].unique().long()
+            patch.indices.append(index)
+            patch.shown.append(shown)
+            if self.learning and self.through == "all":
+                patch.rays.append(_rays_of(frame.cloud, shown))
+        return patch
+
+    def _truth(self, sequence: Sequence, top: int, left: int, full: Camera) -> Tensor:
+        """The true picture [H, W, 3] of the patch; the background where it ends."""
+        scale = self.pipeline.options.scale
+        background = self.pipeline.background[:3]
+        rows = slice(top * scale, top * scale + full.height)
+        columns = slice(left * scale, left * scale + full.width)
+        part = composite(sequence.truth.picture[rows, columns].to(background.device), background)
+        truth = background.expand(full.height, full.width, 3).clone()
+        truth[: part.shape[0], : part.shape[1]] = part
+        return truth
+
+    def observe(self, patches: list[Patch]) -> tuple[list[Observation], Tensor]:
+        """What the renderer is given of `patches`, with the gradient it is to have; opacities."""
+        rays = [rays for patch in patches for rays in patch.rays]
+        together = Rays.joined(rays)
+        pipeline = self.pipeline
+        with torch.set_grad_enabled(self.learning):
+            pixels, _ = render_batch(
+                pipeline.low_field,
+                together,
+                pipeline.occupancy,
+                jitter=None,
+                background=None,
+                stop=pipeline.options.stop,
+                step=pipeline.options.steps * STEP,
+            )
+            parts = iter(_split(pixels, [len(r.origins) for r in rays]))
+            observations = [self._observation(p, [next(parts) for _ in p.rays]) for p in patches]
+        return observations, pixels.alpha
+
+    def _observation(self, patch: Patch, rendered: list[Pixels]) -> Observation:
+        present, *preceding = rendered
+        frame = self._spread(patch, present)
+        frames = patch.sequence.buffer.frames
+        values = [frame.cloud.values for frame in frames]
+        for age, pixels in enumerate(preceding):
+            shine = (1 - pixels.alpha)[:, None] * self.pipeline.background
+            values[age] = values[age].index_copy(0, patch.shown[age], pixels.values + shine)
+        points = [Points(v, i) for v, i in zip(values, patch.indices, strict=True)]
+        newest = frames[0] if frames else None
+        sight = self.pipeline.sight(frame, points, patch.view, NullProbe())
+        return self.pipeline.observe(frame, points, newest, patch.view, sight, NullProbe())
+
+    def _spread(self, patch: Patch, pixels: Pixels) -> FeatureFrame:
+        """All pixels of the patch, from those that were rendered."""
+        low = patch.view.low
+
+        def spread(part: Tensor) -> Tensor:
+            blank = part.new_zeros(low.height * low.width, *part.shape[1:])
+            return blank.index_copy(0, patch.seen, part)
+
+        canvas = Pixels(spread(pixels.values), spread(pixels.depth_sum), spread(pixels.alpha))
+        frame = FeatureFrame.of(low, canvas, self.pipeline.background)
+        return replace(frame, depth=frame.depth.detach())
+
+    def _random(self, below: int) -> int:
+        return int(torch.randint(below, (), generator=self.generator))
+
+
+def _rays_of(cloud: Cloud, points: Tensor) -> Rays:
+    camera = cloud.camera
+    centres = pixel_grid(camera.width, camera.height, points.device)
+    return cast(camera, centres[cloud.source[points]])
+
+
+def _split(pixels: Pixels, sizes: list[int]) -> list[Pixels]:
+    parts = (x.split(sizes) for x in (pixels.values, pixels.depth_sum, pixels.alpha))
+    return [Pixels(*part) for part in zip(*parts, strict=True)]

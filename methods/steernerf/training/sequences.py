@@ -1,0 +1,208 @@
+"""Training sequences: a true picture, and the frames that came before it.
+
+Training views are scattered, so the cameras before each are made up: a random smooth motion that
+ends there. The frames before it are rendered as they will be when the method is used, by the same
+pipeline as it stands, and rendered anew, along another motion, when they have served for a while.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from collections.abc import Sequence as Seq
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bench.motion import preceding
+from bench.types import Camera, NullProbe, Scene
+from methods.steernerf.buffer import RenderingBuffer
+from methods.steernerf.pipeline import Pipeline
+from methods.steernerf.view import View
+from methods.training.checkpoint import part
+
+
+@dataclass(frozen=True)
+class TrueView:
+    """A `camera` and its `picture`, uint8 [H, W, 3 or 4]."""
+
+    camera: Camera
+    picture: Tensor
+
+
+def true_views(scene: Scene) -> list[TrueView]:
+    """The training pictures of `scene`."""
+    split = scene.splits["train"]
+    return [TrueView(c, p) for c, p in zip(split.cameras, split.images, strict=True)]
+
+
+@dataclass
+class Sequence:
+    """A view to be drawn and what precedes it; good for `uses` more patches, after which it begins
+    anew or, if it is `lasting`, goes on.
+
+    Attributes:
+        number: of the view, among those of its pool.
+        truth: the view and its picture.
+        view: the view as the pipeline sees it.
+        buffer: the preceding frames.
+        cells: [N, 2] row and column of the low-resolution pixels in which the picture is not just
+            background, or of all if it is.
+    """
+
+    number: int
+    truth: TrueView
+    view: View
+    buffer: RenderingBuffer
+    cells: Tensor
+    uses: int
+    lasting: bool
+
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """The made-up motions before a training view.
+
+    Attributes:
+        degrees: range of the angular speed, degrees a frame.
+        length: most frames that precede a view; fewer, and none at times, teach the cold start.
+        pool: sequences kept at a time.
+        uses: patches cut out of a sequence before it is rendered anew.
+        longer: share of the sequences that then go on, there and back to their view, instead of
+            beginning anew: what is drawn must also do as its own history, again and again.
+    """
+
+    degrees: tuple[float, float] = (0.0, 2.5)
+    length: int = 4
+    pool: int = 32
+    uses: int = 32
+    longer: float = 0.75
+
+    def __post_init__(self) -> None:
+        low, high = self.degrees
+        if not (0 <= low <= high and self.length >= 0 and self.pool >= 1 and self.uses >= 1):
+            raise ValueError(
+                f"expected 0 <= degrees[0] <= degrees[1], length >= 0, pool and uses >= 1: {self}"
+            )
+        if not 0 <= self.longer < 1:
+            raise ValueError(f"longer: expected a share from 0 to less than 1, got {self.longer}")
+
+
+class SequencePool:
+    """Sequences that end in randomly chosen views, always as fresh as `MotionOptions` says.
+
+    Args:
+        real: training views.
+        distilled: views whose picture a trained field has rendered.
+        share: of the sequences that end in a distilled view.
+        target: [3] the point that motions turn about.
+    """
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        real: Seq[TrueView],
+        distilled: Seq[TrueView],
+        share: float,
+        target: Tensor,
+        options: MotionOptions,
+        generator: torch.Generator,
+    ) -> None:
+        self._pipeline, self._target, self._options = pipeline, target, options
+        self._views, self._real = [*real, *distilled], len(real)
+        self._share = share if distilled else 0.0
+        self._generator = generator
+        self._pool: list[Sequence] = []
+
+    def draw(self) -> Sequence:
+        """A sequence of the pool; counts as one use."""
+        place = self._random(self._options.pool)
+        if place >= len(self._pool):
+            self._pool.append(self._make())
+            place = len(self._pool) - 1
+        elif self._pool[place].uses <= 0:
+            old = self._pool[place]
+            self._pool[place] = self._go_on(old) if old.lasting else self._make()
+        sequence = self._pool[place]
+        sequence.uses -= 1
+        return sequence
+
+    def state(self) -> dict[str, Tensor]:
+        """All sequences as they stand, to be kept in a file."""
+        tensors = {}
+        for place, sequence in enumerate(self._pool):
+            figures = (sequence.number, sequence.uses, sequence.lasting)
+            tensors[f"{place}.figures"] = torch.tensor(figures)
+            tensors |= {f"{place}.{name}": x for name, x in sequence.buffer.state().items()}
+        return tensors
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Go on with the sequences that `state` gave, of a pool of the same views and options."""
+        count = sum(name.endswith(".figures") for name in tensors)
+        self._pool = [self._restored(part(tensors, f"{place}.")) for place in range(count)]
+
+    def _restored(self, tensors: Mapping[str, Tensor]) -> Sequence:
+        number, uses, lasting = tensors["figures"].tolist()
+        buffer = RenderingBuffer(self._pipeline.options.frames)
+        buffer.restore(tensors, self._pipeline.background.device)
+        cells = _cells_with_content(self._views[number].picture, self._pipeline)
+        return self._sequence(number, buffer, cells, uses, bool(lasting))
+
+    def _make(self) -> Sequence:
+        distilled = self._chance() < self._share
+        first, end = (self._real, len(self._views)) if distilled else (0, self._real)
+        number = first + self._random(end - first)
+        options = self._pipeline.options
+        buffer = RenderingBuffer(options.frames, turn=self._random(options.scale**2))
+        cells = _cells_with_content(self._views[number].picture, self._pipeline)
+        return self._ended(number, self._motion(self._views[number]), buffer, cells)
+
+    def _go_on(self, old: Sequence) -> Sequence:
+        """Go on from the view that `old` ends in, there and back."""
+        back = self._motion(old.truth)
+        back = back[len(back) // 2 :]
+        path = [old.truth.camera, *reversed(back), *back[1:]]
+        return self._ended(old.number, path, old.buffer.copy(), old.cells)
+
+    def _motion(self, truth: TrueView) -> list[Camera]:
+        options = self._options
+        count = self._random(options.length + 1)
+        return preceding(truth.camera, self._target, count, options.degrees, self._generator)
+
+    def _ended(
+        self, number: int, motion: Seq[Camera], buffer: RenderingBuffer, cells: Tensor
+    ) -> Sequence:
+        """The sequence of a view whose `buffer` has seen the frames of a `motion` besides."""
+        if self._pipeline.options.frames:
+            for camera in motion:
+                self._pipeline.render(camera, buffer, NullProbe())
+        # Without frames before it, a view that goes on would be the same once more.
+        lasting = self._chance() < self._options.longer and self._pipeline.options.frames > 0
+        return self._sequence(number, buffer, cells, self._options.uses, lasting)
+
+    def _sequence(
+        self, number: int, buffer: RenderingBuffer, cells: Tensor, uses: int, lasting: bool
+    ) -> Sequence:
+        truth = self._views[number]
+        view = self._pipeline.view(truth.camera, buffer.turn)
+        return Sequence(number, truth, view, buffer, cells, uses, lasting)
+
+    def _chance(self) -> float:
+        return torch.rand((), generator=self._generator).item()
+
+    def _random(self, below: int) -> int:
+        return int(torch.randint(below, (), generator=self._generator))
+
+
+def _cells_with_content(picture: Tensor, pipeline: Pipeline) -> Tensor:
+    scale = pipeline.options.scale
+    if picture.shape[-1] == 4:
+        content = picture[..., 3] > 0
+    else:
+        background = (pipeline.background[:3].cpu() * 255).round().to(torch.uint8)
+        content = (picture != background).any(dim=-1)
+    height, width = (-(-side // scale) for side in content.shape)
+    cells = torch.zeros(height, width, dtype=torch.bool)
+    rows, columns = content.nonzero().unbind(dim=1)
+    cells[rows // scale, columns // scale] = True
+    return cells.nonzero() if cells.any() else (~cells).nonzero()

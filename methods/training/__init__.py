@@ -1,0 +1,1 @@
+"""What every training needs: its loop, its checkpoints, steps of an optimiser."""

@@ -1,0 +1,128 @@
+"""The loop of every training: progress, checkpoints, going on after a kill, guards."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Protocol
+
+from torch import Tensor
+
+from bench.sharing import missing
+from bench.types import Log, SteerbenchError
+from methods.training import checkpoint
+
+CHECKPOINT_S = 20.0
+"""Seconds between checkpoints: what a killed training loses at most."""
+
+
+class Training(Protocol):
+    """What the loop drives.
+
+    Attributes:
+        steps: how many there are to be.
+        step: how many there were.
+        seconds: that they took, over all the processes the training was continued in.
+        advice: what to try where the training breaks down.
+    """
+
+    steps: int
+    step: int
+    seconds: float
+    advice: str
+
+    def advance(self) -> Mapping[str, float]:
+        """One step; the mean squared errors to show, by label ("" for the main one)."""
+
+    def watched(self) -> Mapping[str, Tensor]:
+        """What must be finite in a good state."""
+
+    def result(self) -> dict[str, Tensor]:
+        """What the training is for."""
+
+    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+        """Put back what `result` gave."""
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+        """What, beside the result, a checkpoint must hold to go on as if never stopped."""
+
+    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
+        """Put back results and state."""
+
+
+def train(training: Training, finished: Path, label: str, log: Log) -> None:
+    """Drive `training` to its end and write its result to `finished`, or load what is there.
+
+    Another process that does the same is waited for. A training that was killed goes on from the
+    checkpoint beside it.
+
+    Raises:
+        SteerbenchError: something is not finite; the last good checkpoint is kept.
+    """
+    with missing(finished, log) as to_train:
+        if to_train:
+            _drive(training, finished, label, log)
+        else:
+            tensors, figures = checkpoint.read(finished)
+            with checkpoint.restoring(finished):
+                training.restore_result(tensors)
+                training.seconds = figures["seconds"]
+            log.info(f"{label}: found in {finished}")
+
+
+def _drive(training: Training, finished: Path, label: str, log: Log) -> None:
+    unfinished = finished.with_name("checkpoint.safetensors")
+    if unfinished.exists():
+        resume(training, unfinished)
+        log.info(f"going on from step {training.step} of {unfinished}")
+    began, saved = time.monotonic() - training.seconds, time.monotonic()
+    means: dict[str, float] = {}
+    with log.progress(label, training.steps) as progress:
+        progress.advance(training.step, note="compiling kernels")  # on their first use ever
+        while training.step < training.steps:
+            errors = training.advance()
+            means = {k: 0.99 * means.get(k, mse) + 0.01 * mse for k, mse in errors.items()}
+            progress.advance(note=", ".join(f"{k} {_db(mse)}".strip() for k, mse in means.items()))
+            training.seconds = time.monotonic() - began
+            if time.monotonic() - saved > CHECKPOINT_S:
+                save(training, unfinished)
+                saved = time.monotonic()
+    save(training, finished, done=True)
+    unfinished.unlink(missing_ok=True)
+
+
+def save(training: Training, path: Path, done: bool = False) -> None:
+    """Write a good state; a bad one raises and leaves the last good file alone."""
+    check_finite(training)
+    more, figures = training.state()
+    figures |= {"step": training.step, "seconds": training.seconds}
+    checkpoint.write(path, training.result() | ({} if done else more), figures)
+
+
+def resume(training: Training, path: Path) -> None:
+    """Put `training` back into the state of a checkpoint.
+
+    Raises:
+        SteerbenchError: the file is damaged, or of another training.
+    """
+    tensors, figures = checkpoint.read(path)
+    with checkpoint.restoring(path):
+        training.restore(tensors, figures)
+        training.step, training.seconds = int(figures["step"]), figures["seconds"]
+
+
+def check_finite(training: Training, more: Mapping[str, Tensor] | None = None) -> None:
+    """Raise `SteerbenchError` naming the step and the tensors that are not finite, if any are."""
+    tensors = {**training.watched(), **(more or {})}
+    bad = [name for name, tensor in tensors.items() if not tensor.isfinite().all()]
+    if bad:
+        raise SteerbenchError(
+            f"training stopped at step {training.step}: not finite: {', '.join(bad)}. The last "
+            f"good checkpoint was kept. {training.advice}"
+        )
+
+
+def _db(mse: float) -> str:
+    return f"{-10 * math.log10(max(mse, 1e-10)):.1f} dB"

@@ -1,0 +1,161 @@
+"""TensorRT as an engine, without a GPU: what it is told, and what is kept of what it builds.
+
+What TensorRT itself makes of the models is not tested here; see `tensorrt_double`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from tests.methods.test_engines import TOLERANCE, cells, lean, unet
+
+from bench.errors import SteerbenchError, Unavailable
+from methods.engines import resized
+from methods.engines.tensorrt_engine import TensorRt
+from tests.methods import tensorrt_double
+
+
+@pytest.fixture
+def double(monkeypatch: pytest.MonkeyPatch) -> None:
+    """TensorRT and a GPU, both played."""
+    monkeypatch.setitem(sys.modules, "tensorrt", tensorrt_double)
+    monkeypatch.setattr(tensorrt_double.Builder, "built", 0)
+    for name, value in (
+        ("is_available", lambda: True),
+        ("get_device_name", lambda: "a GPU"),
+        ("Stream", tensorrt_double.Stream),
+        ("current_stream", tensorrt_double.Stream),
+    ):
+        monkeypatch.setattr(torch.cuda, name, value)
+
+
+@pytest.mark.parametrize("precision", TensorRt.precisions)
+@pytest.mark.parametrize("network", [lean, unet])
+def test_tensors_go_in_and_out_as_the_network_takes_and_gives_them(
+    precision, network, double, tmp_path, quiet_log
+):
+    module, inputs = network()
+    built = TensorRt(precision).build(module, lambda: inputs, lambda: tmp_path, quiet_log)
+    for some in inputs:
+        for got, want in zip(built.run(*some), module(*some), strict=True):
+            assert got.shape == want.shape
+            assert got.dtype == torch.float32
+            error = (got - want).square().mean().sqrt()
+            assert error < TOLERANCE.get(precision, 2**-8) * want.square().mean().sqrt()
+
+
+def test_plans_are_built_for_the_sizes_to_expect_and_found_again(double, tmp_path, quiet_log):
+    module, _ = lean()
+    sample = resized(cells(0), module, 2 * module.quantum)
+
+    def build(samples: Callable) -> None:
+        TensorRt("fp16").build(module, samples, lambda: tmp_path, quiet_log)
+
+    build(lambda: [sample])
+    plans = {path.name for path in tmp_path.glob("*.plan")}
+    assert plans == {"upto-512.plan", "upto-1024.plan", "upto-2048.plan"}  # 1, 2 and 3 times 512
+    build(lambda: pytest.fail("the frames are not needed again"))
+    assert tensorrt_double.Builder.built == 3
+
+
+def test_a_view_with_more_cells_than_expected_has_a_plan_built(double, tmp_path, quiet_log):
+    module, inputs = lean()
+    built = TensorRt("fp32").build(module, lambda: inputs, lambda: tmp_path, quiet_log)
+    before = tensorrt_double.Builder.built
+    many = cells(70 * 70)
+    for _ in range(2):
+        for got, want in zip(built.run(*many), module(*many), strict=True):
+            assert torch.allclose(got, want, atol=1e-4)
+    assert tensorrt_double.Builder.built == before + 1
+    assert (tmp_path / "upto-8192.plan").exists()
+
+
+def test_a_view_of_nothing_has_no_cells(double, tmp_path, quiet_log):
+    module, inputs = lean()
+    built = TensorRt("fp32").build(module, lambda: inputs, lambda: tmp_path, quiet_log)
+    for got, want in zip(built.run(*cells(0)), module(*cells(0)), strict=True):
+        assert got.shape == want.shape
+
+
+def test_int8_is_symmetric_with_biases_in_float32(double, tmp_path, quiet_log):
+    module, inputs = unet()
+    TensorRt("int8").build(module, lambda: inputs, lambda: tmp_path, quiet_log)
+    graph = onnx.load(tmp_path / "network.onnx").graph
+    values = {x.name: onnx.numpy_helper.to_array(x) for x in graph.initializer}
+    pairs = [n for n in graph.node if n.op_type in ("QuantizeLinear", "DequantizeLinear")]
+    assert pairs
+    assert not any(np.any(values[node.input[2]]) for node in pairs)
+    biases = [node.input[2] for node in graph.node if node.op_type == "Conv"]
+    assert biases
+    assert all(values[bias].dtype == np.float32 for bias in biases)
+
+
+def test_float32_is_not_computed_in_tf32(double, tmp_path, quiet_log, monkeypatch):
+    configs = []
+    make = tensorrt_double.Builder.create_builder_config
+    monkeypatch.setattr(
+        tensorrt_double.Builder,
+        "create_builder_config",
+        lambda self: configs.append(make(self)) or configs[-1],
+    )
+    module, inputs = unet()
+    for precision in ("fp32", "fp16"):
+        folder = tmp_path / precision
+        folder.mkdir()
+        TensorRt(precision).build(module, lambda: inputs, lambda at=folder: at, quiet_log)
+    assert [config.cleared for config in configs] == [[tensorrt_double.BuilderFlag.TF32], []]
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        ("OnnxParser.parse_from_file", r"TensorRT 11\.4\.0 cannot read .*no such operator"),
+        ("Builder.build_serialized_network", r"cannot build .* for up to \d+ cells"),
+        ("Runtime.deserialize_cuda_engine", r"cannot load its plan: remove .*\.plan"),
+    ],
+)
+def test_what_tensorrt_refuses_is_said(broken, message, double, tmp_path, quiet_log, monkeypatch):
+    monkeypatch.setattr(f"tests.methods.tensorrt_double.{broken}", lambda *arguments: None)
+    module, inputs = lean()
+    with pytest.raises(SteerbenchError, match=message):
+        TensorRt("fp32").build(module, lambda: inputs, lambda: tmp_path, quiet_log)
+    plans = [path.name for path in tmp_path.iterdir() if path.suffix == ".plan"]
+    assert len(plans) == (1 if "Runtime" in broken else 0)
+
+
+def test_a_build_belongs_to_its_gpu_and_version(double, monkeypatch):
+    first = TensorRt("fp16").key()
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "another GPU")
+    second = TensorRt("fp16").key()
+    monkeypatch.setattr(tensorrt_double, "__version__", "12.0")
+    assert len({str(key) for key in (first, second, TensorRt("fp16").key())}) == 3
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda:1"])
+def test_what_is_not_the_first_gpu_is_refused(device, double):
+    with pytest.raises(Unavailable, match=f"this is device={device}: use device=cuda"):
+        TensorRt("fp16").check(torch.device(device))
+
+
+def test_inputs_that_a_plan_is_not_for_are_refused(double, tmp_path, quiet_log):
+    module, inputs = unet()  # of one size
+    built = TensorRt("fp32").build(module, lambda: inputs, lambda: tmp_path, quiet_log)
+    with pytest.raises(SteerbenchError, match=r"on \[1, 12, 40, 44\]; it says why above"):
+        built.run(torch.zeros(1, 12, 40, 44))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="for a machine without a GPU")
+def test_without_a_gpu_that_is_the_reason_and_not_a_library():
+    with pytest.raises(Unavailable, match="torch sees none here: use engine=openvino"):
+        TensorRt("fp16")
+
+
+def test_without_tensorrt_the_command_that_installs_it_is_named(double, monkeypatch):
+    monkeypatch.setitem(sys.modules, "tensorrt", None)
+    with pytest.raises(Unavailable, match=r'pip install .*"\.\[tensorrt\]"'):
+        TensorRt("fp16")

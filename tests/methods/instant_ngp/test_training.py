@@ -1,0 +1,256 @@
+"""The training loop: what it learns, that it repeats, goes on after a kill, and stops on NaN."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from bench.console import ConsoleLog
+from bench.sharing import locked
+from bench.types import Budget, Log, Scene, Split, SteerbenchError
+from methods.instant_ngp.field import HashField
+from methods.instant_ngp.training import (
+    MIN_RAYS,
+    FieldTraining,
+    PixelBatches,
+    TrainingOptions,
+    train_field,
+)
+from methods.kernels.encode import HashGrid
+from methods.training import checkpoint, loop
+
+GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
+BUDGET = Budget("test", steps=40, samples=4096)
+
+
+def new_field() -> HashField:
+    return HashField(GRID, generator=torch.Generator().manual_seed(0))
+
+
+def trained(scene: Scene, folder: Path, log: Log) -> HashField:
+    field = new_field()
+    folder.mkdir(parents=True, exist_ok=True)
+    train_field(field, scene, BUDGET, TrainingOptions(), 0, folder, log)
+    return field
+
+
+def test_rays_go_through_the_pixels_whose_colours_they_carry(ball_scene: Scene) -> None:
+    batches = PixelBatches(ball_scene.splits["train"], torch.device("cpu"))
+    rays, colours = batches.draw(500, torch.Generator().manual_seed(0))
+    towards = torch.nn.functional.normalize(rays.directions, dim=-1)
+    offset = 0.5 - rays.origins
+    along = (offset * towards).sum(dim=-1, keepdim=True)
+    hit = (offset - along * towards).norm(dim=-1) < 0.3
+    assert torch.equal(colours[:, 3] == 1, hit)
+    assert 0.1 < hit.float().mean() < 0.6
+
+
+def test_the_loss_falls(ball_scene: Scene) -> None:
+    training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
+    losses = [training.advance()[""] for _ in range(BUDGET.steps)]
+    assert sum(losses[-10:]) < 0.5 * sum(losses[:10])
+
+
+def test_the_batch_grows_to_the_samples_of_the_budget(ball_scene: Scene) -> None:
+    training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
+    training.rays = 100
+    for wanted in (50, 50, 50):  # each ray brought half a sample: the batch may grow by a quarter
+        training._fit_batch(wanted)
+    assert training.rays == int(int(125 * 1.25) * 1.25)
+    training._fit_batch(2 * BUDGET.samples)
+    assert training.rays == 195 // 2
+
+
+def test_the_learning_rate_falls_from_the_first_to_the_last_step(ball_scene: Scene) -> None:
+    training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
+    rates = []
+    for training.step in range(BUDGET.steps + 1):
+        rates.append(training.learning_rate())
+    assert rates == sorted(rates, reverse=True)
+    assert rates[0] == pytest.approx(1e-2)
+    assert rates[-1] == pytest.approx(1e-2 / 30)
+
+
+def test_the_same_seed_gives_the_same_bits(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log
+) -> None:
+    first = trained(ball_scene, tmp_path / "first", quiet_log)
+    second = trained(ball_scene, tmp_path / "second", quiet_log)
+    assert torch.equal(first.table, second.table)
+    assert all(torch.equal(first.layers[n], second.layers[n]) for n in first.layers)
+
+
+def test_a_killed_training_ends_as_if_it_had_never_stopped(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = trained(ball_scene, tmp_path / "whole", quiet_log)
+
+    monkeypatch.setattr(loop, "CHECKPOINT_S", -1.0)  # after every step
+    advance = FieldTraining.advance
+
+    def killed_at_23(training: FieldTraining) -> dict[str, float]:
+        if training.step == 23:
+            raise KeyboardInterrupt
+        return advance(training)
+
+    monkeypatch.setattr(FieldTraining, "advance", killed_at_23)
+    folder = tmp_path / "killed"
+    with pytest.raises(KeyboardInterrupt):
+        trained(ball_scene, folder, quiet_log)
+    assert {path.name for path in folder.iterdir()} == {"checkpoint.safetensors", "lock"}
+
+    monkeypatch.setattr(FieldTraining, "advance", advance)
+    resumed = trained(ball_scene, folder, quiet_log)
+    assert torch.equal(resumed.table, whole.table)
+    assert {path.name for path in folder.iterdir()} == {"field.safetensors", "lock"}
+
+
+def test_a_finished_training_is_loaded(ball_scene: Scene, tmp_path: Path, quiet_log: Log) -> None:
+    first = trained(ball_scene, tmp_path, quiet_log)
+    written = (tmp_path / "field.safetensors").stat().st_mtime_ns
+    second = trained(ball_scene, tmp_path, quiet_log)
+    assert torch.equal(first.table, second.table)
+    assert torch.equal(first.packed, second.packed)
+    assert (tmp_path / "field.safetensors").stat().st_mtime_ns == written
+
+
+def test_who_finds_the_same_training_under_way_waits_and_loads_its_result(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = trained(ball_scene, tmp_path / "first", quiet_log)
+    monkeypatch.delattr(FieldTraining, "advance")
+    folder = tmp_path / "shared"
+    folder.mkdir()
+
+    class Told(ConsoleLog):
+        """A log whose first line, that of waiting, lets the other one end."""
+
+        def info(self, message: str) -> None:
+            said.append(message)
+            if len(said) == 1:
+                (tmp_path / "first" / "field.safetensors").rename(folder / "field.safetensors")
+                other.close()
+
+    said: list[str] = []
+    other = ExitStack()
+    other.enter_context(locked(folder / "lock", "", quiet_log))
+    second = trained(ball_scene, folder, Told(tmp_path, quiet=True))
+    assert f"waits for another process that makes the same: {folder}" in said[0]
+    assert torch.equal(first.table, second.table)
+    assert torch.equal(first.packed, second.packed)
+
+
+def test_a_loss_that_is_no_number_stops_and_keeps_the_last_good_checkpoint(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "CHECKPOINT_S", -1.0)
+    advance = FieldTraining.advance
+
+    def spoiled_at_10(training: FieldTraining) -> dict[str, float]:
+        if training.step == 10:
+            with torch.no_grad():
+                training.field.layers["feature_mid"][0, 0] = torch.nan
+        return advance(training)
+
+    monkeypatch.setattr(FieldTraining, "advance", spoiled_at_10)
+    with pytest.raises(SteerbenchError, match=r"step 10.*feature_mid.*last good checkpoint"):
+        trained(ball_scene, tmp_path, quiet_log)
+    training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
+    loop.resume(training, tmp_path / "checkpoint.safetensors")
+    assert training.step == 10
+    assert all(layer.isfinite().all() for layer in training.field.layers.values())
+
+
+def test_a_training_that_went_bad_in_its_last_step_is_not_finished(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    update = FieldTraining._update
+
+    def spoiled(training: FieldTraining) -> None:
+        update(training)
+        if training.step == BUDGET.steps - 1:
+            with torch.no_grad():
+                training.field.table[0, 0] = torch.inf
+
+    monkeypatch.setattr(FieldTraining, "_update", spoiled)
+    with pytest.raises(SteerbenchError, match=r"step 40: not finite: table"):
+        trained(ball_scene, tmp_path, quiet_log)
+    assert [path.name for path in tmp_path.iterdir()] == ["lock"]
+
+
+def test_a_damaged_field_is_named_with_what_to_do(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log
+) -> None:
+    (tmp_path / "field.safetensors").write_bytes(b"half a file")
+    with pytest.raises(SteerbenchError, match=r"field\.safetensors.*remove it, and it is made"):
+        trained(ball_scene, tmp_path, quiet_log)
+
+
+@pytest.mark.parametrize("name", ["field", "checkpoint"])
+def test_a_file_of_another_training_is_named_with_what_to_do(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, name: str
+) -> None:
+    checkpoint.write(tmp_path / f"{name}.safetensors", {"mean.weight": torch.zeros(3)}, {})
+    message = rf"{name}\.safetensors: expected the file of this .*; remove it to train again"
+    with pytest.raises(SteerbenchError, match=message):
+        trained(ball_scene, tmp_path, quiet_log)
+
+
+def test_no_step_has_more_rays_than_it_may(ball_scene: Scene) -> None:
+    options = TrainingOptions(max_rays=MIN_RAYS)
+    training = FieldTraining(new_field(), ball_scene, BUDGET, options, seed=0)
+    rays = []
+    for _ in range(2):
+        rays.append(training.rays)
+        training.advance()
+    assert max(rays) <= MIN_RAYS
+
+
+def test_an_opaque_picture_among_transparent_ones_is_opaque(ball_scene: Scene) -> None:
+    split = ball_scene.splits["train"]
+    images = [split.images[0][..., :3], split.images[1]]
+    mixed = Split(split.cameras[:2], images, split.names[:2])
+    _, colours = PixelBatches(mixed, torch.device("cpu")).draw(
+        4000, torch.Generator().manual_seed(0)
+    )
+    transparent = (split.images[1][..., 3] == 0).float().mean().item() / 2
+    assert (colours[:, 3] == 0).float().mean().item() == pytest.approx(transparent, abs=0.05)
+
+
+def test_pictures_that_do_not_overlap_are_refused(ball_scene: Scene) -> None:
+    train = ball_scene.splits["train"]
+    alone = Split(train.cameras[:1], train.images[:1], train.names[:1])
+    with pytest.raises(SteerbenchError, match="no part of the unit cube is seen by 2 training"):
+        FieldTraining(
+            new_field(), replace(ball_scene, splits={"train": alone}), BUDGET, TrainingOptions(), 0
+        )
+
+
+@pytest.mark.parametrize("setting", [{"rate": 0.0}, {"final_rate": 2.0}, {"max_rays": 1}])
+def test_options_that_make_no_sense_are_refused(setting: dict) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(setting))}"):
+        TrainingOptions(**setting)
+
+
+def test_a_checkpoint_that_cannot_be_written_says_so(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log
+) -> None:
+    with pytest.raises(SteerbenchError, match=r"cannot write to .*gone"):  # before it is trained
+        train_field(
+            new_field(), ball_scene, BUDGET, TrainingOptions(), 0, tmp_path / "gone", quiet_log
+        )
+    with pytest.raises(SteerbenchError, match=r"gone.*cannot write the checkpoint"):
+        checkpoint.write(tmp_path / "gone" / "field.safetensors", {}, {})
+
+
+def test_pictures_without_alpha_are_trained_on_as_they_are(ball_scene: Scene) -> None:
+    split = ball_scene.splits["train"]
+    opaque = replace(split, images=[image[..., :3] for image in split.images])
+    scene = replace(ball_scene, splits={"train": opaque, "test": opaque})
+    training = FieldTraining(new_field(), scene, BUDGET, TrainingOptions(), seed=0)
+    losses = [training.advance()[""] for _ in range(5)]
+    assert all(loss < 1 for loss in losses)

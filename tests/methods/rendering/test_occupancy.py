@@ -1,0 +1,114 @@
+"""The density grid that tells where a field is empty."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from methods.rendering.occupancy import (
+    DECAY,
+    INITIAL,
+    RESOLUTION,
+    STEP,
+    THRESHOLD,
+    DensityGrid,
+    learnable_cells,
+)
+from tests.methods.conftest import look_at_the_middle
+
+UNIT_CUBE = torch.tensor([[0.0] * 3, [1.0] * 3])
+WHOLE = torch.ones(RESOLUTION, RESOLUTION, RESOLUTION, dtype=torch.bool)
+AROUND = [look_at_the_middle(turn / 4, lift) for turn in range(4) for lift in (-0.5, 0.5)]
+
+
+class Slab:
+    """A field of density `sigma` where x < 1/4, nothing elsewhere."""
+
+    def __init__(self, sigma: float) -> None:
+        self.sigma = sigma
+
+    def density(self, positions: Tensor) -> tuple[Tensor, None]:
+        return self.sigma * (positions[:, 0] < 0.25).float(), None
+
+
+GENERATOR = torch.Generator().manual_seed(0)
+
+
+def test_the_threshold_is_an_opacity_of_one_percent_a_step() -> None:
+    assert abs(THRESHOLD * STEP - 0.01) < 1e-12
+
+
+def swept(grid: DensityGrid, field: Slab, sweeps: int = 8) -> DensityGrid:
+    """Visit each cell `sweeps` times and more; one in e^sweeps is left out."""
+    for _ in range(sweeps):
+        grid.update(field, GENERATOR, samples=2 * grid.density.numel())
+    return grid
+
+
+def test_visits_find_the_matter_and_nothing_else() -> None:
+    cells = swept(DensityGrid(WHOLE), Slab(100.0)).occupancy.cells
+    assert cells[: RESOLUTION // 4].all()
+    assert cells[RESOLUTION // 4 :].float().mean() < 10 * math.exp(-8)
+
+
+def test_cells_that_may_not_be_occupied_stay_empty() -> None:
+    allowed = WHOLE.clone()
+    allowed[:, RESOLUTION // 2 :] = False
+    cells = swept(DensityGrid(allowed), Slab(100.0)).occupancy.cells
+    assert cells[: RESOLUTION // 4, : RESOLUTION // 2].all()
+    assert not cells[:, RESOLUTION // 2 :].any()
+
+
+def test_cells_outside_the_bounds_cannot_be_learnt() -> None:
+    cells = learnable_cells(torch.tensor([[0.375, 0.375, 0.375], [0.625, 0.5, 0.625]]), AROUND)
+    inside = torch.zeros_like(WHOLE)
+    inside[48:80, 48:64, 48:80] = True
+    assert torch.equal(cells, inside)  # in the middle, where every camera looks
+
+
+def test_what_one_camera_sees_cannot_be_learnt() -> None:
+    one, other = AROUND[:2]
+    assert not learnable_cells(UNIT_CUBE, [one]).any()
+    assert learnable_cells(UNIT_CUBE, [one, other]).any()
+    behind = replace(other, c2w=other.c2w * torch.tensor([[-1.0, 1.0, -1.0, 1.0]]))  # turned away
+    assert not learnable_cells(UNIT_CUBE, [one, behind]).any()
+
+
+def test_cells_at_a_camera_cannot_be_learnt() -> None:
+    inside = replace(AROUND[0], c2w=AROUND[0].c2w.clone())
+    inside.c2w[:, 3] = torch.tensor([0.51, 0.51, 0.51])
+    without, with_it = (
+        learnable_cells(UNIT_CUBE, AROUND),
+        learnable_cells(UNIT_CUBE, [*AROUND, inside]),
+    )
+    lost = (without & ~with_it).nonzero()
+    assert len(lost) == (3 * 4) ** 3  # the camera's brick and those that touch it
+    assert ((lost + 0.5) / RESOLUTION - 0.51).abs().max() < 2 / 32
+
+
+def test_a_cell_is_occupied_until_it_was_visited_and_keeps_its_value_in_between() -> None:
+    grid = DensityGrid(WHOLE)
+    grid.update(Slab(0.0), GENERATOR, samples=4096)
+    visited = grid.density < INITIAL
+    assert 0 < visited.sum() <= 4096
+    torch.testing.assert_close(
+        grid.density[visited], torch.full((int(visited.sum()),), DECAY * INITIAL)
+    )
+    assert torch.equal(grid.occupancy.cells, ~visited)
+
+
+def test_matter_that_is_thin_everywhere_is_kept_where_it_is_denser_than_the_mean() -> None:
+    thin = Slab(0.1 * THRESHOLD)
+    cells = swept(DensityGrid(WHOLE), thin, sweeps=24).occupancy.cells  # 1.2 * 0.8^24 < 0.1
+    assert cells[: RESOLUTION // 4].all()
+    assert cells[RESOLUTION // 4 :].float().mean() < 0.5
+
+
+def test_a_restored_grid_is_the_same_grid() -> None:
+    grid, restored = DensityGrid(WHOLE), DensityGrid(WHOLE)
+    grid.update(Slab(100.0), GENERATOR, samples=1 << 16)
+    restored.restore(grid.density)
+    assert torch.equal(restored.occupancy.cells, grid.occupancy.cells)

@@ -1,0 +1,74 @@
+"""Rendering rays in rounds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from bench.cameras import cast
+from bench.types import NullProbe
+from methods.instant_ngp.field import HashField
+from methods.kernels.march import Occupancy, march
+from methods.rendering.batch import render_batch
+from methods.rendering.occupancy import STEP
+from methods.rendering.rays import FAINT, ROUND_SAMPLES, render_rays
+from tests.methods.conftest import GRID, Work, look_at_the_middle
+
+
+def test_rounds_render_what_one_go_renders(cloud: tuple[HashField, Occupancy], device: str) -> None:
+    field, occupancy = cloud
+    camera = look_at_the_middle(0.1, 0.4)
+    rays = cast(replace(camera, c2w=camera.c2w.to(device)))
+    half = torch.full((len(rays.origins),), 0.5, device=device)
+    with torch.no_grad():
+        whole, _ = render_batch(field, rays, occupancy, half, torch.zeros(3, device=device))
+    rounds = render_rays(field, rays, occupancy, NullProbe())
+    assert whole.alpha.max() > 0.5
+    # Both end a ray at the same transmittance; sums are added up in another grouping.
+    torch.testing.assert_close(rounds.values, whole.values, rtol=0, atol=1e-4)
+    torch.testing.assert_close(rounds.depth_sum, whole.depth_sum, rtol=0, atol=3e-4)
+    torch.testing.assert_close(rounds.alpha, whole.alpha, rtol=0, atol=1e-4)
+
+
+def test_samples_behind_the_early_stop_are_hardly_evaluated() -> None:
+    field = HashField(GRID, precision="fp32", generator=torch.Generator().manual_seed(0))
+    field.density = lambda positions: (  # type: ignore[method-assign]
+        torch.full((len(positions),), 1e5),
+        torch.zeros(len(positions), 16),
+    )
+    occupancy = Occupancy(torch.ones(32, 32, 32, dtype=torch.bool))
+    rays, work = cast(look_at_the_middle(0.0, 0.0)), Work()
+    pixels = render_rays(field, rays, occupancy, work)
+    hit = int((pixels.alpha > 0).sum())
+    assert hit > 0
+    assert work.done["samples"] <= ROUND_SAMPLES * hit  # one round for each ray that hits
+
+
+def test_faint_samples_are_black_and_not_looked_at(cloud: tuple[HashField, Occupancy]) -> None:
+    field, occupancy = cloud
+    camera = look_at_the_middle(0.1, 0.4)
+    rays = cast(replace(camera, c2w=camera.c2w.to(field.table.device)))
+    stop, work = 0.01, Work()
+    rendered = render_rays(field, rays, occupancy, work, stop=stop)
+    assert 0 < work.done["shaded_samples"] < work.done["samples"]
+    # Of a field whose features are 1 everywhere, what is shown is the sum of the weights seen.
+    field.features = lambda geometry, directions: torch.ones(  # type: ignore[method-assign]
+        len(geometry), field.channels, device=geometry.device
+    )
+    seen = render_rays(field, rays, occupancy, NullProbe(), stop=stop)
+    torch.testing.assert_close(seen.alpha, rendered.alpha, rtol=0, atol=0)
+    missing = seen.alpha - seen.values[:, 0]
+    samples = march(rays.origins, rays.directions, occupancy, STEP).offsets.diff()
+    assert missing.min() > -1e-5
+    assert (missing <= samples * FAINT * stop + 1e-5).all()
+    assert missing.max() > 0
+
+
+def test_an_empty_grid_renders_nothing() -> None:
+    field = HashField(GRID, generator=torch.Generator().manual_seed(0))
+    occupancy = Occupancy(torch.zeros(16, 16, 16, dtype=torch.bool))
+    camera = look_at_the_middle(0.0, 0.0)
+    rendered = render_rays(field, cast(camera), occupancy, NullProbe())
+    assert len(rendered.alpha) == camera.width * camera.height
+    assert not rendered.alpha.any()

@@ -1,0 +1,363 @@
+"""Stage 2: the gradient of the whole chain, what is trained, killed trainings, the guard."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from bench.types import Camera, Log, NullProbe, Scene, SteerbenchError
+from methods.instant_ngp.field import HashField
+from methods.kernels.encode import HashGrid
+from methods.kernels.march import Occupancy
+from methods.steernerf.beyond.cells import pixels_of
+from methods.steernerf.beyond.lean_renderer import SpaceToDepth
+from methods.steernerf.beyond.surface import Surface
+from methods.steernerf.options import PipelineOptions
+from methods.steernerf.pipeline import Pipeline
+from methods.steernerf.range_reduction import RangeReduction
+from methods.steernerf.renderer import Renderer2d
+from methods.steernerf.training.joint import (
+    LEAST_ERROR,
+    JointOptions,
+    JointTraining,
+    RendererTraining,
+)
+from methods.steernerf.training.patches import Batch, PatchSource, Through
+from methods.steernerf.training.sequences import MotionOptions, SequencePool, true_views
+from methods.steernerf.unet import UnetRelease
+from methods.steernerf.view import View
+from methods.training import loop
+from tests.methods.observations import shaken
+
+GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)
+MOTION = MotionOptions(pool=3, uses=4, length=2)
+OPTIONS = JointOptions(patch=4, batch=2, motion=MOTION, precision="fp32")
+PIPELINE = PipelineOptions(channels=4, frames=2, steps=8)
+TARGET = torch.full((3,), 0.5)
+
+
+def shell() -> Occupancy:
+    """Where the surface of the ball is, and a little more."""
+    axis = (torch.arange(32) + 0.5) / 32 - 0.5
+    radius = torch.cartesian_prod(axis, axis, axis).norm(dim=1).view(32, 32, 32)
+    return Occupancy((radius - 0.3).abs() < 0.06)
+
+
+def misty_field(precision: str = "bf16", backend: str = "auto", channels: int = 4) -> HashField:
+    """A field in which every sample matters: density of about 10, features all different."""
+    generator = torch.Generator().manual_seed(3)
+    field = HashField(GRID, channels, precision=precision, backend=backend, generator=generator)
+    with torch.no_grad():
+        field.table.uniform_(-1, 1, generator=generator)
+        field.layers["density_out"][0] = 0.3
+    field.repack()
+    return field
+
+
+def new_training(
+    scene: Scene,
+    options: JointOptions = OPTIONS,
+    pipeline: PipelineOptions = PIPELINE,
+    field: HashField | None = None,
+    renderer: Renderer2d | None = None,
+    steps: int = 12,
+) -> RendererTraining:
+    torch.manual_seed(0)
+    field = field or misty_field(channels=pipeline.channels)
+    renderer = renderer or SpaceToDepth(
+        pipeline.channels,
+        pipeline.frames,
+        pipeline.scale,
+        width=8,
+        blocks=1,
+        init="scratch",
+        history=pipeline.history,
+        surface=pipeline.surface,
+    )
+    views = true_views(scene)
+    generator = torch.Generator().manual_seed(1)
+    whole = Pipeline(field, shell(), scene.background, renderer, pipeline)
+    pool = SequencePool(whole, views, [], 0.0, TARGET, options.motion, generator)
+    learning = options.field == "joint"
+    patches = PatchSource(whole, pool, options.patch, learning, options.through, generator)
+    rest = (renderer, patches, options, steps, generator)
+    training = JointTraining(whole, *rest) if learning else RendererTraining(*rest)
+    whole.renderer = training.mean
+    return training
+
+
+@pytest.mark.parametrize("surface", [False, True])
+@pytest.mark.parametrize("through", ["all", "present"])
+def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
+    ball_scene: Scene, through: Through, surface: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In float64, along a random direction of all parameters, against a central difference.
+
+    Table, networks and renderer are differentiated through compositing, the splatted features of
+    two preceding frames, the features at the surface, and the 2D renderer; depths, and so places,
+    are constants.
+    """
+    field = misty_field("fp32", "reference").double()
+    pipeline = replace(PIPELINE, history=False, surface=surface)
+    renderer = SpaceToDepth(
+        4, 2, 4, width=6, blocks=1, init="scratch", history=False, surface=surface
+    )
+    options = replace(OPTIONS, through=through, motion=MotionOptions(pool=16))
+    with torch.no_grad():
+        for layer in filter(
+            None, (renderer.network.leave, renderer.network.read, renderer.network.doubt)
+        ):
+            layer.weight.normal_(0, 0.1)
+    training = new_training(ball_scene, options, pipeline, field.float(), renderer)
+    patches = [training.patches.cut(training.patches.pool.draw()) for _ in range(16)]
+    after_two = [patch for patch in patches if len(patch.shown) == 2]
+    patches = [patch for patch in after_two if all(len(shown) for shown in patch.shown)][:2]
+    assert len(patches) == 2
+    field.double(), renderer.double()
+    training.patches.pipeline.background = torch.ones(4, dtype=torch.float64)
+    field.grad_buffer = None
+    clouds = [f.cloud for patch in patches for f in patch.sequence.buffer.frames]
+    frozen = [cloud.values.double() for cloud in clouds]
+    for cloud, values in zip(clouds, frozen, strict=True):
+        object.__setattr__(cloud, "values", values)
+    depths: dict[int, Tensor] = {}
+
+    def at_first_depth(
+        field: HashField, depth: Tensor, cells: Tensor, view: View, scale: int
+    ) -> Surface:
+        return Surface(field, depths.setdefault(id(view), depth), cells, view, scale)
+
+    monkeypatch.setattr("methods.steernerf.pipeline.Surface", at_first_depth)
+
+    def loss() -> Tensor:
+        observations, opacity = training.patches.observe(patches)
+        drawing = renderer(observations)
+        assert drawing.doubt is not None
+        truth = torch.stack([patch.truth for patch in patches])
+        more = opacity.square().mean() + drawing.doubt.square().mean()
+        return (drawing.pictures - truth).square().mean() + 1e-2 * more
+
+    parameters = [field.table, *field.layers.values(), *renderer.parameters()]
+    gradient = torch.autograd.grad(loss(), parameters)
+    assert all(g.abs().max() > 0 for g in gradient)
+    generator = torch.Generator().manual_seed(0)
+    for group in (parameters[:1], parameters[1:6], parameters[6:]):
+        slope, step = 0.0, 1e-8  # so short that it hardly ever crosses the kink of a ReLU
+        directions = [torch.randn(p.shape, generator=generator).double() for p in group]
+        for p, d in zip(group, directions, strict=True):
+            place = next(i for i, q in enumerate(parameters) if q is p)
+            slope += (gradient[place] * d).sum().item()
+        values = []
+        with torch.no_grad():
+            for sign in (1, -2):
+                for p, d in zip(group, directions, strict=True):
+                    p += sign * step * d
+                values.append(loss().item())
+            for p, d in zip(group, directions, strict=True):
+                p += step * d
+        assert (values[0] - values[1]) / (2 * step) == pytest.approx(slope, rel=1e-4)
+
+
+def state_of(training: RendererTraining) -> dict[str, Tensor]:
+    return {name: tensor.clone() for name, tensor in training.result().items()}
+
+
+def test_frozen_leaves_the_field_alone_and_trains_the_renderer(ball_scene: Scene) -> None:
+    field = misty_field()
+    untouched = {name: x.clone() for name, x in field.state_dict().items()}
+    training = new_training(ball_scene, replace(OPTIONS, field="frozen"), field=field)
+    before = state_of(training)
+    for _ in range(3):
+        training.advance()
+    assert not any(torch.equal(x, before[name]) for name, x in training.result().items())
+    assert all(torch.equal(x, untouched[name]) for name, x in field.state_dict().items())
+
+
+def test_joint_trains_table_networks_and_renderer(ball_scene: Scene) -> None:
+    training = new_training(ball_scene)
+    before = state_of(training)
+    for _ in range(3):
+        training.advance()
+    after = training.result()
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert {"field.table", "field.layers.density_out", "field.layers.feature_out"} <= changed
+    assert {
+        "mean.network.leave.weight",
+        "mean.network.leave.bias",
+        "mean.network.read.weight",
+    } <= changed
+
+
+@pytest.mark.parametrize("frames", [0, 2])
+def test_the_error_falls(ball_scene: Scene, frames: int) -> None:
+    """On patches that are kept: one patch is much harder than another."""
+    pipeline = replace(PIPELINE, frames=frames)
+    options = replace(OPTIONS, rate=1e-2, field_rate=1e-2)
+    training = new_training(ball_scene, options, pipeline, steps=120)
+    kept = [training.patches.cut(training.patches.pool.draw()) for _ in range(8)]
+    truth = torch.stack([patch.truth for patch in kept])
+
+    @torch.no_grad()
+    def error() -> float:
+        observations, _ = training.patches.observe(kept)
+        return (training.mean(observations).pictures - truth).square().mean().item()
+
+    before = error()
+    for _ in range(120):
+        training.advance()
+    assert error() < 0.8 * before
+
+
+def refined_loss(training: JointTraining, batch: Batch) -> Tensor:
+    loss = training._refinement_loss(batch, training.renderer(batch.observations))
+    assert isinstance(loss, Tensor)
+    return loss
+
+
+def test_the_field_learns_from_the_pixels_it_is_to_refine(ball_scene: Scene) -> None:
+    """From all of them: the squared error of the field's own rays, over all numbers of the
+    pictures. From some: the same in the mean."""
+    pipeline = replace(PIPELINE, refined=0.25, range=RangeReduction("off"))
+    training = new_training(ball_scene, replace(OPTIONS, refined_rays=10**6), pipeline)
+    assert isinstance(training, JointTraining)
+    shaken(training.renderer)
+    batch = training.patches.draw(2)
+    doubt = training.renderer(batch.observations).doubt
+    assert doubt is not None
+    error, first = 0.0, 0
+    for o, view, truth in zip(batch.observations, batch.views, batch.truth, strict=True):
+        own = doubt[first : first + len(o.cells)]
+        first += len(o.cells)
+        worst = own.sort(descending=True).indices[: math.ceil(0.25 * len(own))]
+        shown = training.pipeline.refine(o.cells[worst], o.frame, view, NullProbe())
+        error += (shown - pixels_of(truth, o.cells[worst], 4)).square().sum().item()
+    whole = refined_loss(training, batch)
+    # The same samples, taken in rounds or at once, and a thousand squares added up.
+    torch.testing.assert_close(whole.item(), error / batch.truth.numel(), rtol=1e-4, atol=0)
+    whole.backward()
+    assert training.field.grad_buffer is not None
+    assert training.field.grad_buffer.any()
+
+    training.options = replace(OPTIONS, refined_rays=64)
+    some = torch.stack([refined_loss(training, batch).detach() for _ in range(200)])
+    # 5 standard deviations of the mean of 200.
+    assert (some.mean() - whole.detach()).abs() < 5 * some.std() / math.sqrt(200)
+
+
+def test_doubt_learns_the_log_of_the_error(ball_scene: Scene) -> None:
+    training = new_training(ball_scene)
+    batch = training.patches.draw(2)
+    drawing = training.renderer(batch.observations)
+    assert drawing.doubt is not None
+    made = [
+        pixels_of((picture - truth).square(), o.cells, 4).flatten(1).mean(dim=1)
+        for picture, truth, o in zip(drawing.pictures, batch.truth, batch.observations, strict=True)
+    ]
+    right = (torch.cat(made) + LEAST_ERROR).log()
+    at_best = training._doubt_loss(batch, replace(drawing, doubt=right))
+    assert at_best < 1e-12  # the logarithm is rounded
+    off = training._doubt_loss(batch, replace(drawing, doubt=right + 2))
+    torch.testing.assert_close(off, torch.tensor(4 * OPTIONS.doubt), rtol=1e-5, atol=0)
+
+
+def test_the_renderer_of_the_release_can_be_trained(ball_scene: Scene) -> None:
+    pipeline = replace(PIPELINE, frames=1, history=False)
+    options = replace(OPTIONS, batch=1)
+    training = new_training(ball_scene, options, pipeline, renderer=UnetRelease(4, 1, 4))
+    before = state_of(training)
+    training.advance()
+    after = training.result()
+    assert all(
+        not torch.equal(before[name], after[name]) for name in before if name.endswith("weight")
+    )
+
+
+def test_the_learning_rate_only_falls(ball_scene: Scene) -> None:
+    training = new_training(ball_scene)
+    rates = []
+    for _ in range(12):
+        training.advance()
+        rates.append(training.optimiser.param_groups[0]["lr"])
+    assert rates == sorted(rates, reverse=True)
+    assert rates[0] == OPTIONS.rate
+
+
+def test_a_patch_shows_what_the_picture_shows_there(ball_scene: Scene) -> None:
+    """The true colour of a pixel of the ball is its normal: also that of the patch's own camera."""
+    training = new_training(ball_scene)
+    patch = training.patches.cut(training.patches.pool.draw())
+    cut: Camera = patch.view.full
+    assert patch.truth.shape == (cut.height, cut.width, 3)
+    from tests.methods.conftest import ball
+
+    expected = ball(cut).float() / 255
+    expected = expected[..., :3] * expected[..., 3:] + 1 - expected[..., 3:]
+    assert (patch.truth - expected).abs().max() <= 1 / 255  # the colour of a ray, rounded twice
+
+
+def test_a_killed_training_goes_on_with_the_same_state(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "CHECKPOINT_S", -1.0)  # after every step
+    training = new_training(ball_scene)
+    advance = RendererTraining.advance
+
+    def killed_at_5(training: RendererTraining) -> dict[str, float]:
+        if training.step == 5:
+            raise KeyboardInterrupt
+        return advance(training)
+
+    finished = tmp_path / "steernerf.safetensors"
+    monkeypatch.setattr(RendererTraining, "advance", killed_at_5)
+    with pytest.raises(KeyboardInterrupt):
+        loop.train(training, finished, "training", quiet_log)
+    again = new_training(ball_scene)
+    loop.resume(again, tmp_path / "checkpoint.safetensors")
+    assert again.step == 5
+    for name, tensor in training.result().items():
+        assert torch.equal(tensor, again.result()[name])
+    for name, tensor in training.state()[0].items():
+        assert torch.equal(tensor, again.state()[0][name])
+
+    monkeypatch.setattr(RendererTraining, "advance", advance)
+    loop.train(again, finished, "training", quiet_log)
+    assert {path.name for path in tmp_path.iterdir()} == {"steernerf.safetensors", "lock"}
+    found = new_training(ball_scene)
+    monkeypatch.delattr(RendererTraining, "advance")
+    loop.train(found, finished, "training", quiet_log)
+    assert found.seconds == again.seconds
+    for name, tensor in again.result().items():
+        assert torch.equal(tensor, found.result()[name])
+
+
+def test_a_killed_training_ends_as_if_it_had_never_stopped(
+    ball_scene: Scene, tmp_path: Path
+) -> None:
+    """The sequences go on, too: there and back, or to be made anew when they are used up."""
+    options = replace(OPTIONS, motion=MotionOptions(pool=2, uses=3, longer=0.5))
+    whole = new_training(ball_scene, options)
+    for _ in range(4):
+        whole.advance()
+    loop.save(whole, tmp_path / "checkpoint.safetensors")
+    again = new_training(ball_scene, options)
+    loop.resume(again, tmp_path / "checkpoint.safetensors")
+    for training in (whole, again):
+        for _ in range(4):
+            training.advance()
+    for name, tensor in (whole.result() | whole.state()[0]).items():
+        assert torch.equal(tensor, (again.result() | again.state()[0])[name]), name
+
+
+def test_a_loss_that_is_no_number_stops_and_names_what_is_not_finite(ball_scene: Scene) -> None:
+    training = new_training(ball_scene)
+    with torch.no_grad():
+        training.renderer.network.leave.bias[0] = torch.nan
+    with pytest.raises(
+        SteerbenchError, match=r"step 0: not finite: .*renderer\.network\.leave\.bias.*rate"
+    ):
+        training.advance()
