@@ -72,7 +72,7 @@ class RangeReduction:
 
     Attributes:
         mode: "off": everywhere. "paper": within `epsilon` of the depth reprojected onto the pixel,
-            whatever is found there (SteerNeRF, Section 3.3). "window": within `epsilon` of the
+            whatever is found there (SteerNeRF, Section 3.2). "window": within `epsilon` of the
             depths reprojected onto its 3 x 3 neighbourhood, until the ray has the opacity they had;
             a ray that does not reach it looks behind the window as well, and one at a depth edge
             everywhere.

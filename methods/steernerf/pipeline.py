@@ -7,9 +7,9 @@
 | feature_reprojection | preceding features at H x W                             | 6, 9, 10  |
 | renderer2d           | the 2D neural renderer draws the picture                | 11        |
 
-Beyond the paper, and off in its method: the preceding picture is reprojected (`history`), the field
-is evaluated at the surface of each pixel (`surface`), and the cells with the largest estimated error
-are rendered by the field after all (`refinement`).
+Beyond the paper, and off in its method: the preceding picture is reprojected (`history`), the
+field is evaluated at the surface of each pixel (`surface`), and the cells with the largest
+estimated error are rendered by the field after all (`refinement`).
 """
 
 from __future__ import annotations
@@ -183,7 +183,7 @@ class Pipeline:
     def refined(
         self, cells: Tensor, frame: FeatureFrame, view: View, rendering: Rendering, probe: Probe
     ) -> Tensor:
-        """Colours [n, s^2, 3] of `cells` [n], by a ray of the field through each of their pixels."""
+        """Colours [n, s^2, 3] of `cells` [n], by a ray through each of their pixels."""
         rays = rays_of_cells(cells, view)
         how = refined_march(cells, frame, view.scale, rendering)
         probe.count("refined_rays", len(rays.origins), view.full.width * view.full.height)

@@ -1,4 +1,4 @@
-"""Range reduction: the depth of a preceding frame limits where rays look (SteerNeRF, Section 3.3)."""
+"""Range reduction: a preceding depth limits where rays look (SteerNeRF, Section 3.2)."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from methods.steernerf.options import Reprojection
 def depth_interval(
     cloud: Cloud, camera: Camera, epsilon: float, how: Reprojection, backend: str
 ) -> Tensor:
-    """[h, w, 2]: the interval [D - epsilon, D + epsilon] of z-depth in which each pixel of `camera`,
-    a low-resolution one, looks; [0, inf) where no point of `cloud` falls."""
+    """[h, w, 2]: the interval [D - epsilon, D + epsilon] of z-depth in which each pixel of
+    `camera`, a low-resolution one, looks; [0, inf) where no point of `cloud` falls."""
     index, depth = cloud.splat(camera, how, backend)  # Eq. 6 to 8
     reprojected = at_pixels(depth, index, torch.inf)  # D, t' -> t
     known = index >= 0

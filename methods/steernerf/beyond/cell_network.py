@@ -39,7 +39,7 @@ class CellNetwork(Network):
             nn.init.zeros_(layer.bias)
 
     def forward(self, rows: Tensor, neighbours: Tensor) -> tuple[Tensor, ...]:
-        """What `depth_to_space` makes pixels of, from the `rows` [R, layout.width] of cells that have
+        """What `depth_to_space` makes pixels of, from the `rows` [R, layout.width] of cells with
         `neighbours` [R, 9].
 
         Returns:

@@ -162,7 +162,7 @@ class LeanRenderer(Renderer2d):
         return paint(shown, size, self.scale, less + background, background)
 
     @torch.no_grad()
-    def _start_from(self, generic: Mapping[str, Tensor]) -> None:
+    def _start_from(self, pretrained: Mapping[str, Tensor]) -> None:
         """Take over the weights of a renderer of the same trunk that was trained at K = 3, L = 2.
 
         Weights of features beyond RGB, and of frames it did not have, stay as they are.
@@ -191,8 +191,8 @@ class LeanRenderer(Renderer2d):
                     weight.copy_(new[written] if name.startswith("leave") else new)
         except RuntimeError as error:
             raise ValueError(
-                "renderer.init=pretrained: the weights are those of a renderer of the default scale, "
-                f"width and blocks ({error}): use renderer.init=scratch"
+                "renderer.init=pretrained: those weights are of a renderer of the default "
+                f"scale, width and blocks ({error}): use renderer.init=scratch"
             ) from error
 
 

@@ -1,6 +1,6 @@
 """Range reduction by a window of depths, with a way out where the window misses the surface.
 
-Not in the paper, whose interval leaves holes where the reprojected depth is that of another surface.
+Not in the paper: its interval leaves holes where the reprojected depth is that of another surface.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ def _highest(image: Tensor) -> Tensor:
 def within(
     field: Field, occupancy: Occupancy, probe: Probe, how: March, prior: DepthPrior
 ) -> Callable[[Tensor, Rays], Pixels]:
-    """For `rendering.frame.render_frame`: rays are marched within the windows of `prior`, and behind
-    them where they do not find the opacity to expect."""
+    """For `rendering.frame.render_frame`: rays are marched within the windows of `prior`, and
+    behind them where they do not find the opacity to expect."""
 
     def render(seen: Tensor, rays: Rays) -> Pixels:
         window, expected = prior.window.view(-1, 2)[seen], prior.alpha.flatten()[seen]

@@ -60,7 +60,7 @@ class Stage2:
 
 @dataclass(frozen=True)
 class TrainedPipeline:
-    """A trained `pipeline`, the `key` of its training and the seconds this took, without stage 1."""
+    """A trained `pipeline`, the `key` of its training, and the seconds of stage 2."""
 
     pipeline: Pipeline
     key: dict[str, object]
