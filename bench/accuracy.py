@@ -134,13 +134,14 @@ def render_in_turns(
     not a frame, which would find the caches full of another model.
 
     Returns:
-        One row for each method, of the frames that have as many frames before them since the last
-        cut as any of the methods looks back on: setting (its name), ms (a round's mean time of a
-        frame, of the median round, the lower of two), ms_lo and ms_hi (its extremes), and of the
-        same round p99_to_p50 and, as in the rows of `bench.run.measure`, stage_ms.* and work.*. Of
-        those with a ground truth: psnr (mean over the frames), psnr_to_first (against the pictures of the first method,
-        all frames together, inf where there is no difference) and worst (the largest difference of
-        a channel from these, of 1), all of pictures as `protocol` rounds them.
+        One row for each method: setting (its name), ms (the mean time of a frame in the median
+        round, the lower of two), ms_lo and ms_hi (the extremes over the rounds), and of that median
+        round p99_to_p50 and, as in the rows of `bench.run.measure`, stage_ms.* and work.*. Only
+        frames count that have as many frames before them since the last cut as any of the methods
+        looks back on. Of those with a ground truth: psnr (mean over the frames), psnr_to_first
+        (against the pictures of the first method, all frames together, inf where there is no
+        difference) and worst (the largest difference of a channel from these, of 1), all of
+        pictures as `protocol` rounds them.
 
     Raises:
         SteerbenchError: there is no such frame, or a method rendered values that are not finite.

@@ -24,7 +24,7 @@ import numpy as np
 import pandas as pd
 from PIL import Image
 
-from bench.errors import SteerbenchError
+from bench.errors import SteerbenchError, explained
 from bench.provenance import commit, machine
 
 SCHEMA_VERSION = 2
@@ -53,19 +53,6 @@ def content_key(parts: Mapping[str, object]) -> str:
     """SHA-256 of `parts`, whatever their order; they hold what JSON can hold, and no NaN."""
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-@contextmanager
-def explained(folder: Path) -> Iterator[None]:
-    """Turn what the system says when `folder` cannot be written into an error for the user."""
-    try:
-        yield
-    except OSError as error:
-        raise SteerbenchError(
-            f"cannot write to {error.filename or folder}: {error.strerror or error}; nothing was "
-            "kept of it. Make room, correct the permissions, or choose another folder "
-            "with outputs=DIR"
-        ) from error
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bench.results import Store, explained
+from bench.errors import explained
+from bench.results import Store
 from reports import figures, tables
 from reports.comparison import comparison, setting
 from reports.pictures import BESIDE, beside, shown_frames

@@ -9,8 +9,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from bench.errors import explained
 from bench.motion import viewing_target
-from bench.results import explained
 from bench.types import Budget, Log, Scene, SteerbenchError
 from methods.instant_ngp.stage1 import Setup, pretrain
 from methods.steernerf.options import PipelineOptions
