@@ -7,7 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bench.results import Store, explained
+from bench.errors import explained
+from bench.results import Store
 from reports import figures, tables
 from reports.comparison import comparison, setting
 from reports.pictures import BESIDE, beside, shown_frames
@@ -151,7 +152,7 @@ def _facts(run: Run) -> dict[str, str]:
         "machine": f"{machine['cpu']}, {machine['threads']} threads, {memory}",
         "GPU": ", ".join(machine["gpus"]) or "none",
         "system": f"{machine['system']}, Python {machine['python']}",
-        "versions": _listed(machine["versions"] | machine.get("engines", {})),
+        "versions": _listed(record["made_of"].get("libraries", {})),
     }
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from bench.results import explained
+from bench.errors import explained
 from reports import doubts, figures
 from reports.doubts import Doubt
 from reports.pictures import beside, shown_frames

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from bench.results import explained
+from bench.errors import explained
 from bench.sharing import whole
 from reports.runs import load
 from reports.tables import number

@@ -15,10 +15,9 @@ from omegaconf import DictConfig
 
 from bench.cameras import frame_camera
 from bench.console import ConsoleLog
-from bench.errors import SteerbenchError
+from bench.errors import SteerbenchError, explained
 from bench.frontier import observed_order
 from bench.probes import FrameRecord, MemoryMeter, StageClock, p99_to_p50
-from bench.results import explained
 from bench.study import Study
 from bench.threads import torch_threads
 from bench.types import Camera, Log, Method, Scene
