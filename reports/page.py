@@ -151,7 +151,7 @@ def _facts(run: Run) -> dict[str, str]:
         "machine": f"{machine['cpu']}, {machine['threads']} threads, {memory}",
         "GPU": ", ".join(machine["gpus"]) or "none",
         "system": f"{machine['system']}, Python {machine['python']}",
-        "versions": _listed(machine["versions"] | machine.get("engines", {})),
+        "versions": _listed(record["made_of"].get("libraries", {})),
     }
 
 
