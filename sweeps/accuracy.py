@@ -17,7 +17,7 @@ from bench.accuracy import experiment_rows
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from bench.frontier import best_instead, cheapest_within
-from reports.accuracy import experiment_table, setting_table, write_accuracy
+from reports.tradeoff import experiment_table, setting_table, write_tradeoff
 from sweeps.knobs import ALWAYS, knobs
 from sweeps.measurement import checked_settings
 from sweeps.overrides import composed
@@ -48,7 +48,7 @@ def main(options: argparse.Namespace) -> int:
         experiments = experiment_rows(all_experiments(), options.repeats, log)
     console().print(rich_table(experiment_table(experiments)))
     command = shlex.join(["steerbench", *sys.argv[1:]])
-    page = write_accuracy(experiments, settings, outputs / "accuracy", command)
+    page = write_tradeoff(experiments, settings, outputs / "accuracy", command)
     log.info(f"report: {page}")
     if settings and limit is not None:
         print(_recommended(settings, limit))

@@ -10,7 +10,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from reports.runs import load
-from reports.tables import number
+from reports.tables import decimal
 from sweeps import failures
 from sweeps.measurement import Obtained, described, obtain
 
@@ -32,7 +32,7 @@ def attempt(config: DictConfig, command: Sequence[str], name: str) -> Obtained:
 def say(obtained: Obtained, name: str, more: str) -> None:
     """Print the figures of a job in a line."""
     (run,) = load(obtained.store, {obtained.run: name})
-    psnr, ms = number(run.values.get("psnr"), 2), number(run.values["frame_ms"], 1)
+    psnr, ms = decimal(run.values.get("psnr"), 2), decimal(run.values["frame_ms"], 1)
     print(f"{name}: {psnr} dB, {ms} ms a frame{more}", file=sys.stderr)
 
 

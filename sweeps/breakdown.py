@@ -10,7 +10,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from bench.probes import OTHER
-from reports.tables import Table, number, share
+from reports.tables import Table, decimal, share
 from sweeps.overrides import composed
 from sweeps.skips import NOTHING_SKIPPED
 from sweeps.terminal import console, rich_table
@@ -142,13 +142,13 @@ def _row(one: Rendered) -> Row:
 def _line(row: Row) -> tuple[str, ...]:
     return (
         row["line"],
-        *(number(row[part], 1) for part in PARTS),
-        number(row["frame_ms"], 1),
+        *(decimal(row[part], 1) for part in PARTS),
+        decimal(row["frame_ms"], 1),
         range_text(row),
-        number(row["latency_ms"], 1),
-        number(row["p99_to_p50"], 2),
-        number(1e3 / row["frame_ms"], 2),
-        number(row["psnr"], 2),
+        decimal(row["latency_ms"], 1),
+        decimal(row["p99_to_p50"], 2),
+        decimal(1e3 / row["frame_ms"], 2),
+        decimal(row["psnr"], 2),
     )
 
 
@@ -157,10 +157,10 @@ def _compared(rows: Mapping[str, Row], name: str, standard: str) -> tuple[str, .
     lean, dense, unet = (rows[name + ending] for ending in ("", DENSE, UNET))
     return (
         name,
-        number(rows[NGP]["frame_ms"] / lean["frame_ms"], 1),
-        number(unet["network"] / lean["frame_ms"], 1),
-        number(unet["network"] / lean["network"], 1),
-        number(rows[standard]["psnr"] - lean["psnr"], 3),
-        number(dense["psnr"] - lean["psnr"], 3),
+        decimal(rows[NGP]["frame_ms"] / lean["frame_ms"], 1),
+        decimal(unet["network"] / lean["frame_ms"], 1),
+        decimal(unet["network"] / lean["network"], 1),
+        decimal(rows[standard]["psnr"] - lean["psnr"], 3),
+        decimal(dense["psnr"] - lean["psnr"], 3),
         share(lean["frame_ms"], dense["frame_ms"]),
     )

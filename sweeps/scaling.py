@@ -23,8 +23,8 @@ from bench.probes import FrameRecord, MemoryMeter, StageClock, p99_to_p50
 from bench.results import explained
 from bench.threads import torch_threads
 from bench.types import Camera, Log, Method, Scene
-from reports.growth import growth_panels
-from reports.tables import Table, megabytes, number
+from reports.figures import growth_panels
+from reports.tables import Table, decimal, megabytes
 from sweeps.build import build
 from sweeps.measurement import checked_settings
 from sweeps.overrides import composed
@@ -178,18 +178,18 @@ def _lines(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
     lines = [
         (
             row["label"],
-            number(row["frame_ms"], 1),
-            number(row["latency_ms"], 1),
-            number(row["p99_to_p50"], 2),
-            number(1e3 / row["frame_ms"], 2),
-            number(row["samples"], 0),
+            decimal(row["frame_ms"], 1),
+            decimal(row["latency_ms"], 1),
+            decimal(row["p99_to_p50"], 2),
+            decimal(1e3 / row["frame_ms"], 2),
+            decimal(row["samples"], 0),
             megabytes(row["peak_bytes"]),
             megabytes(row["size_bytes"]),
         )
         for row in rows
     ]
     exponents = [growth(rows, name) for name in ("frame_ms", "samples", "peak_bytes", "size_bytes")]
-    ms, samples, peak, size = (number(exponent, 2) for exponent in exponents)
+    ms, samples, peak, size = (decimal(exponent, 2) for exponent in exponents)
     return [*lines, (f"exponent of {rows[0]['axis']}", ms, "", "", "", samples, peak, size)]
 
 

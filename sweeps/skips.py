@@ -6,7 +6,7 @@ import argparse
 import json
 from typing import Any
 
-from reports.tables import Table, number, share
+from reports.tables import Table, decimal, share
 from sweeps.overrides import composed
 from sweeps.terminal import console, rich_table
 from sweeps.variants import (
@@ -98,15 +98,15 @@ def _row(one: Rendered, standard: Rendered) -> dict[str, Any]:
 
 def _line(row: dict[str, Any], dense: dict[str, Any]) -> tuple[str, ...]:
     figures = (
-        f"{number(row[name], 2 if ',' in name else 0)} ({share(row[name], dense[name])})"
+        f"{decimal(row[name], 2 if ',' in name else 0)} ({share(row[name], dense[name])})"
         for name in WORK
     )
     return (
         row["skipped"],
         apart_text(row["apart"]),
-        number(row["psnr"], 2),
-        number(row["lost"], 3),
-        number(row["frame_ms"], 1),
+        decimal(row["psnr"], 2),
+        decimal(row["lost"], 3),
+        decimal(row["frame_ms"], 1),
         range_text(row),
         *figures,
     )

@@ -18,7 +18,7 @@ from bench.errors import SteerbenchError, Unavailable
 from bench.protocol import EvaluationProtocol
 from bench.trajectories import Trajectory
 from bench.types import Log, Method, Scene
-from reports.tables import number
+from reports.tables import decimal
 from sweeps.build import build
 from sweeps.measurement import checked_settings
 from sweeps.overrides import CONFIGS, composed
@@ -213,4 +213,4 @@ def finite(row: Mapping[str, Any]) -> dict[str, Any]:
 
 def range_text(values: Mapping[str, Any]) -> str:
     """The mean times of a frame of the fastest and of the slowest round, for a table."""
-    return f"{number(values['ms_lo'], 1)} – {number(values['ms_hi'], 1)}"
+    return f"{decimal(values['ms_lo'], 1)} – {decimal(values['ms_hi'], 1)}"
