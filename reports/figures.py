@@ -156,7 +156,7 @@ def frontier_plot(rows: Sequence[Row], path: Path) -> None:
 
 def _circle(axes: Axes, rows: Sequence[Row], column: str) -> None:
     """Circle the points of `rows`; name each to its left, unless another name is there already."""
-    style = {"textcoords": "offset points", "size": 8, "ha": "right", "va": "top"}
+    style: dict[str, Any] = {"textcoords": "offset points", "size": 8, "ha": "right", "va": "top"}
     names: list[np.ndarray] = []
     for row in rows:
         place = (row["ms"], _rms(row[column]))
