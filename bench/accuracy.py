@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
 from typing import Any
@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from bench.frontier import observed_order
-from bench.lookahead import announce_next
 from bench.metrics import psnr, psnr_of_mse
 from bench.probes import FrameRecord, StageClock, p99_to_p50
 from bench.protocol import EvaluationProtocol, composite
@@ -128,25 +127,21 @@ def render_in_turns(
     protocol: EvaluationProtocol,
     repeats: int,
     log: Log,
-    told: Collection[str] = (),
 ) -> list[dict[str, Any]]:
     """Render the same trajectory with every one of the fitted `methods` in turn, again and again.
 
     A first round warms up and is scored; `repeats` more are timed. A turn is the whole trajectory,
     not a frame, which would find the caches full of another model.
 
-    Args:
-        told: methods that know the camera of the next frame, if they have a use for it.
-
     Returns:
-        One row for each method, of the frames that have as many frames before them since the last
-        cut as any of the methods looks back on: setting (its name), ms (a round's mean time of a
-        frame, of the median round, the lower of two), ms_lo and ms_hi (its extremes), and of the
-        same round latency_ms (mean time since the camera of a frame had to be known), p99_to_p50
-        and, as in the rows of `bench.run.measure`, stage_ms.* and work.*. Of those with a ground
-        truth: psnr (mean over the frames), psnr_to_first (against the pictures of the first method,
-        all frames together, inf where there is no difference) and worst (the largest difference of
-        a channel from these, of 1), all of pictures as `protocol` rounds them.
+        One row for each method: setting (its name), ms (the mean time of a frame in the median
+        round, the lower of two), ms_lo and ms_hi (the extremes over the rounds), and of that median
+        round p99_to_p50 and, as in the rows of `bench.run.measure`, stage_ms.* and work.*. Only
+        frames count that have as many frames before them since the last cut as any of the methods
+        looks back on. Of those with a ground truth: psnr (mean over the frames), psnr_to_first
+        (against the pictures of the first method, all frames together, inf where there is no
+        difference) and worst (the largest difference of a channel from these, of 1), all of
+        pictures as `protocol` rounds them.
 
     Raises:
         SteerbenchError: there is no such frame, or a method rendered values that are not finite.
@@ -160,8 +155,7 @@ def render_in_turns(
             for name, method in methods.items():
                 method.reset()
                 for number, camera in enumerate(cameras):
-                    next_known = name in told and announce_next(method, cameras, number)
-                    with clocks[name].frame(next_known):
+                    with clocks[name].frame():
                         frame = method.render(camera, clocks[name])
                     check_frame(frame, camera, name, number)
                     if round_ == 0 and number in scored:
@@ -207,7 +201,6 @@ def _costs(records: Sequence[FrameRecord], ready: Sequence[bool]) -> dict[str, f
     return {
         **_spread(means),
         "ms": ms,  # of a round that there was, whose parts follow
-        "latency_ms": statistics.fmean(record.latency_ns / 1e6 for record in usual),
         "p99_to_p50": p99_to_p50(usual),
         **_means("stage_ms", [record.stages_ns for record in usual], 1e-6),
         **_means("work", [record.done for record in usual]),

@@ -11,7 +11,8 @@ from pathlib import Path
 from rich import progress
 from rich.console import Console
 
-from bench.results import content_key, explained
+from bench.errors import explained
+from bench.results import content_key
 
 PLAIN_INTERVAL_S = 10.0
 """Between two lines of progress where there is no terminal to draw a bar on."""

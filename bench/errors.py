@@ -1,5 +1,11 @@
 """Errors for users. Apart from `bench.types`, so that the command line need not load torch."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
 
 class SteerbenchError(Exception):
     """An error a user can act on: the message names what was expected, what came, what to do.
@@ -10,3 +16,16 @@ class SteerbenchError(Exception):
 
 class Unavailable(SteerbenchError):
     """Something asked for by name cannot be used here; the message says why and how to get it."""
+
+
+@contextmanager
+def explained(folder: Path) -> Iterator[None]:
+    """Turn the system's error for a `folder` that cannot be written into a SteerbenchError."""
+    try:
+        yield
+    except OSError as error:
+        raise SteerbenchError(
+            f"cannot write to {error.filename or folder}: {error.strerror or error}; nothing was "
+            "kept of it. Make room, correct the permissions, or choose another folder "
+            "with outputs=DIR"
+        ) from error

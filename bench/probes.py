@@ -29,23 +29,16 @@ class FrameRecord:
             "outer/inner", and its time is not in that of "outer".
         done: units of work by counter.
         dense: what a method that skips nothing would have done, for the counters that say so.
-        known_ns: time of the frame before, if the camera of this one was known when it began.
     """
 
     stages_ns: dict[str, int]
     done: dict[str, int]
     dense: dict[str, int]
-    known_ns: int = 0
 
     @property
     def total_ns(self) -> int:
         """Time from the beginning to the end of the frame: every nanosecond has its stage."""
         return sum(self.stages_ns.values())
-
-    @property
-    def latency_ns(self) -> int:
-        """Time from when the camera had to be known to the end of the frame."""
-        return self.known_ns + self.total_ns
 
 
 def p99_to_p50(frames: Sequence[FrameRecord]) -> float:
@@ -68,28 +61,21 @@ class StageClock:
         self._device = torch.device(device)
         self._clock = clock
         self._open: list[str] | None = None  # names of the open stages; None outside a frame
-        self._last = self._known_ns = 0
+        self._last = 0
         self._begin()
 
     @contextmanager
-    def frame(self, next_known: bool = False) -> Iterator[None]:
-        """Delimit one frame; its record is kept unless the body raises.
-
-        Args:
-            next_known: whatever is rendered already knows the camera of the frame after it.
-        """
+    def frame(self) -> Iterator[None]:
+        """Delimit one frame; its record is kept unless the body raises."""
         if self._open is not None:
             raise RuntimeError("a frame may not begin inside a frame")
         self._begin()
-        known_ns, self._known_ns = self._known_ns, 0
         self._open = []
         self._last = self._now()
         try:
             yield
             self._charge()
-            figures = dict(self._ns), dict(self._done), dict(self._dense)
-            self.frames.append(FrameRecord(*figures, known_ns))
-            self._known_ns = self.frames[-1].total_ns if next_known else 0
+            self.frames.append(FrameRecord(dict(self._ns), dict(self._done), dict(self._dense)))
         finally:
             self._open = None
 

@@ -36,9 +36,6 @@ class EvaluationProtocol:
         flicker: where the true pictures of two consecutive frames come from: "split": frames with
             ground truth alone; "exact": at the others from the scene, where it knows its picture
             at any camera, which takes it about half a second at 400 x 400.
-        lookahead: a method that can begin a frame beside the one before it is told of its camera
-            that much sooner. The time of a frame is then that from one picture to the next, and
-            `latency_ms` that from when its camera had to be known.
     """
 
     name: str = "steerbench-1"
@@ -49,7 +46,6 @@ class EvaluationProtocol:
     warmup: int = 3
     memory: str = "steady"
     flicker: str = "split"
-    lookahead: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lpips", tuple(self.lpips))  # a list, when read from YAML
@@ -66,11 +62,6 @@ class EvaluationProtocol:
                     f"protocol.{option}: expected {' or '.join(allowed)}, "
                     f"got {getattr(self, option)!r}"
                 )
-        if self.lookahead and self.memory == "cold":
-            raise SteerbenchError(
-                "protocol.lookahead: expected false with memory=cold, which has no frame before "
-                "another one, got true"
-            )
         if self.warmup < 0:
             raise SteerbenchError(f"protocol.warmup: expected 0 or more, got {self.warmup}")
         default = {field.name: field.default for field in fields(self)}

@@ -11,6 +11,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import shutil
 import time
 import uuid
@@ -24,11 +25,16 @@ import numpy as np
 import pandas as pd
 from PIL import Image
 
-from bench.errors import SteerbenchError
+from bench.errors import SteerbenchError, explained
 from bench.provenance import commit, machine
 
-SCHEMA_VERSION = 2
-"""Of record.json and rows.csv; a folder of another version is reported and left alone."""
+SCHEMA_VERSION = 3
+"""Of record.json and rows.csv."""
+
+READABLE = (2, SCHEMA_VERSION)
+"""The versions that can be read; a folder of another one is reported and left alone.
+
+Version 2 has the libraries of a run beside its machine, and other names for two methods."""
 
 COLUMNS = [
     *("run", "method", "scene", "split", "trajectory", "resolution", "protocol", "budget"),
@@ -53,19 +59,6 @@ def content_key(parts: Mapping[str, object]) -> str:
     """SHA-256 of `parts`, whatever their order; they hold what JSON can hold, and no NaN."""
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-@contextmanager
-def explained(folder: Path) -> Iterator[None]:
-    """Turn what the system says when `folder` cannot be written into an error for the user."""
-    try:
-        yield
-    except OSError as error:
-        raise SteerbenchError(
-            f"cannot write to {error.filename or folder}: {error.strerror or error}; nothing was "
-            "kept of it. Make room, correct the permissions, or choose another folder "
-            "with outputs=DIR"
-        ) from error
 
 
 @dataclass(frozen=True)
@@ -144,25 +137,30 @@ class Store:
                 shutil.rmtree(partial, ignore_errors=True)
 
     def rows(self, report: Callable[[str], object] = warnings.warn) -> pd.DataFrame:
-        """Every row of every run, `COLUMNS`; `report` is told of runs that cannot be read."""
+        """Every row of every run, `COLUMNS`, methods under their present names.
+
+        `report` is called with a message for each run that cannot be read.
+        """
         header = ",".join(COLUMNS)
-        bodies = []
+        bodies, old = [], []
         for folder in sorted(self.folder.glob("[!.]*")):
             schema = _schema_version(folder)
             first, _, body = _text(folder / "rows.csv").partition("\n")
-            if schema == SCHEMA_VERSION and first == header:
+            if schema in READABLE and first == header:
                 bodies.append(body)
+                old += [folder.name] if schema == 2 else []
             else:
-                report(
-                    f"{folder}: left out, its rows have schema {schema}; "
-                    f"this version reads schema {SCHEMA_VERSION}"
-                )
-        return pd.read_csv(
+                report(f"{folder}: left out, {unreadable(schema)}")
+        rows = pd.read_csv(
             io.StringIO("\n".join((header, "".join(bodies)))),
             dtype={column: FIGURES.get(column, "str") for column in COLUMNS},
             keep_default_na=False,
             na_values={column: ["", "nan"] for column in ("value", "lo", "hi")},
         )
+        rows["method"] = rows["method"].mask(
+            rows["run"].isin(old), rows["method"].map(present_name)
+        )
+        return rows
 
     def frames(self, run: str) -> pd.DataFrame:
         """Every frame of a run."""
@@ -170,8 +168,16 @@ class Store:
         return pd.read_csv(path, dtype={"name": "str"}, keep_default_na=False, na_values=[""])
 
     def record(self, run: str) -> dict[str, object]:
-        """What a run was made of, and on which machine."""
-        return json.loads((self._existing(run) / RECORD).read_text(encoding="utf-8"))
+        """What a run was made of, and on which machine.
+
+        The versions of its libraries are in `record["made_of"]["libraries"]`, whatever its schema.
+        """
+        record = json.loads((self._existing(run) / RECORD).read_text(encoding="utf-8"))
+        if record.get("schema_version") == 2:
+            machine = record["machine"]
+            versions = machine.pop("versions", {}) | machine.pop("engines", {})
+            record["made_of"].setdefault("libraries", versions)
+        return record
 
     def _publish(self, partial: Path, key: str) -> None:
         try:
@@ -196,6 +202,22 @@ class Store:
         if folder is None:
             raise SteerbenchError(f"no run {run!r} in {self.folder}: see `steerbench results`")
         return folder
+
+
+def present_name(method: str) -> str:
+    """The name of today for what schema 2 calls `method`.
+
+    "steernerf" was the lean method and "steernerf_paper" the paper's; variants have a suffix.
+    """
+    return re.sub(
+        r"^steernerf(_paper)?(?=_|$)", lambda old: f"steernerf{'' if old[1] else '_lean'}", method
+    )
+
+
+def unreadable(schema: object) -> str:
+    """Why a run of this schema cannot be read."""
+    known = " and ".join(map(str, READABLE))
+    return f"its rows have schema {schema}; this version reads schema {known}"
 
 
 def _schema_version(folder: Path) -> object:

@@ -15,7 +15,6 @@ import pandas as pd
 import torch
 from scipy import stats
 
-from bench.lookahead import announce_next
 from bench.probes import FrameRecord, MemoryMeter, StageClock
 from bench.protocol import EvaluationProtocol
 from bench.results import COLD, STEADY, WHOLE, Measurement
@@ -28,7 +27,6 @@ QUANTILES = (50, 95, 99)
 UNITS = {
     "psnr": "dB",
     "frame_ms": "ms",
-    "latency_ms": "ms",
     "fps": "1/s",
     "stage_ms": "ms",
     "work": "1/frame",
@@ -108,30 +106,25 @@ def _render(
 ) -> pd.DataFrame:
     """Warm up, then render the sequence in its order; each frame is scored and let go."""
     steps = trajectory.steps
-    cameras = [step.camera for step in steps]
     phases = _phases(trajectory, method.memory, protocol)
     clock = StageClock(method.settings()["device"])
-    warmup = [cameras[index] for index in spread(len(steps), protocol.warmup)]
+    warmup = [steps[index].camera for index in spread(len(steps), protocol.warmup)]
     table: list[dict[str, Any]] = []
     with torch.no_grad(), log.progress("rendering", len(warmup) + len(steps)) as progress:
         method.reset()
-        for index, camera in enumerate(warmup):
-            with clock.frame(protocol.lookahead and announce_next(method, warmup, index)):
+        for camera in warmup:
+            with clock.frame():
                 method.render(camera, clock)
             progress.advance(note="warming up")
         method.reset()
         for index, (step, phase) in enumerate(zip(steps, phases, strict=True)):
             if protocol.memory == "cold":
                 method.reset()
-            next_known = protocol.lookahead and announce_next(method, cameras, index)
-            with meter, clock.frame(next_known):
+            with meter, clock.frame():
                 frame = method.render(step.camera, clock)
             check_frame(frame, step.camera, method.name, index)
             figures = {"frame": index, "phase": phase, "peak_bytes": meter.last_bytes}
-            record = clock.frames[-1]
-            figures |= _times_and_work(record)
-            if protocol.lookahead:
-                figures["latency_ms"] = record.latency_ns / 1e6
+            figures |= _times_and_work(clock.frames[-1])
             table.append(figures | scoring.score(index, step, frame.rgb))
             progress.advance(note=_mean_psnr(table))
     return _frame_table(table, protocol)
@@ -162,8 +155,7 @@ def _frame_table(table: list[dict[str, Any]], protocol: EvaluationProtocol) -> p
     touched = [name for name in map(str, frames) if name.startswith(("stage_ms.", "work."))]
     touched.sort(key=lambda name: (name.startswith("work."), name == "stage_ms.other"))
     scores = (*protocol.metric_names, "flicker")
-    times = ("frame_ms", *(["latency_ms"] if protocol.lookahead else []))
-    columns = ["frame", "name", "phase", *scores, *times, *touched, "peak_bytes"]
+    columns = ["frame", "name", "phase", *scores, "frame_ms", *touched, "peak_bytes"]
     return frames.reindex(columns=columns).fillna(dict.fromkeys(touched, 0))
 
 
@@ -185,9 +177,7 @@ def _rows_of_phase(frames: pd.DataFrame, protocol: EvaluationProtocol) -> list[d
         _single(f"frame_ms.p{percent}", np.percentile(frames["frame_ms"], percent))
         for percent in QUANTILES
     ]
-    parts = [
-        name for name in map(str, frames) if name.startswith(("latency_ms", "stage_ms.", "work."))
-    ]
+    parts = [name for name in map(str, frames) if name.startswith(("stage_ms.", "work."))]
     return [
         *(_mean(name, frames[name]) for name in scores),
         *(ms, *quantiles, {"metric": "fps", "n": ms["n"]} | _rate(ms)),

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from bench.results import explained
+from bench.errors import explained
 from bench.types import Log
 
 

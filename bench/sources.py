@@ -9,7 +9,8 @@ from __future__ import annotations
 import ast
 import hashlib
 import importlib.util
-from collections.abc import Iterable, Iterator
+import sys
+from collections.abc import Iterator
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -17,15 +18,15 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 OURS = ("bench", "methods")
-DATA = ("*.safetensors",)
+WEIGHTS = "*.safetensors"
 CHECKS = ("cases.py", "experiments.py")
 """Files of a folder that hold its checks. They compute nothing that a result is made of."""
 
 
 def digest(*things: Any) -> str:
-    """SHA-256 of the paths and bytes of the `sources` of `things`."""
+    """SHA-256 of the names and bytes of the `sources` of `things`."""
     total = hashlib.sha256()
-    for name, path in sorted((_name(path), path) for path in sources(*things)):
+    for name, path in sorted(sources(*things).items()):
         content = path.read_bytes()
         total.update(f"{name} {len(content)}\n".encode())
         total.update(content)
@@ -33,74 +34,93 @@ def digest(*things: Any) -> str:
 
 
 def libraries(*things: Any) -> dict[str, str]:
-    """The version of every distribution that the `sources` of `things` import.
+    """The version of every installed distribution that the `sources` of `things` import.
 
     A class whose libraries are loaded by name lists them in its attribute `libraries`.
     """
-    names = {name for path in sources(*things) for name in _imports(path)}
-    distributions = {
-        distribution
-        for name in {name.partition(".")[0] for name in names} - set(OURS)
-        for distribution in _distributions().get(name, ())
-    }
-    distributions |= {name for thing in things for name in getattr(thing, "libraries", ())}
-    found = ((name, _version(name)) for name in sorted(distributions))
-    return {name: version for name, version in found if version is not None}
+    imported = {name for path in sources(*things).values() for name in _imports(path)}
+    packages = {name.partition(".")[0] for name in imported} - set(OURS)
+    names = {name for package in packages for name in _distributions().get(package, ())}
+    names |= {name for thing in things for name in getattr(thing, "libraries", ())}
+    versions = ((name, _version(name)) for name in sorted(names))
+    return {name: version for name, version in versions if version is not None}
 
 
-def sources(*things: Any) -> frozenset[Path]:
+def sources(*things: Any) -> dict[str, Path]:
     """The files that decide what `things`, classes or functions, compute.
 
     Of this project: the module that each thing is defined in and all that it imports. An imported
-    package counts with every file beside its `__init__`, because backends are loaded by name. Of
-    other projects: the whole top-level package of the thing, and what of ours it imports.
+    package counts with every file beside its `__init__`, because backends are loaded by name, and
+    with the weights that lie there. Of other projects: the whole top-level package of the thing,
+    and what that imports of ours and of packages that no installed distribution has.
+
+    Returns:
+        Their paths by name, which begins with the top-level package, wherever that lies.
     """
-    found: set[Path] = set()
-    pending = {path for thing in things for path in _home(thing.__module__)}
+    found: dict[str, Path] = {}
+    pending = {
+        name: path for thing in things for name, path in _files(thing.__module__, home=True).items()
+    }
     while pending:
-        path = pending.pop()
-        found.add(path)
-        for name in _imports(path):
-            pending |= set(_ours(name)) - found
-    return frozenset(found | {data for path in found for data in _data(path)})
+        name, path = pending.popitem()
+        found[name] = path
+        for imported in _imports(path):
+            files = _files(imported)
+            pending |= {name: files[name] for name in files.keys() - found.keys()}
+    return found
 
 
-def _home(module: str) -> list[Path]:
-    """The files that stand for the module a thing is defined in."""
-    top = module.partition(".")[0]
+def _files(name: str, home: bool = False) -> dict[str, Path]:
+    """The files of the module or package `name`, or of the one that defines it.
+
+    Where an installed distribution or Python itself has it, its version is enough: none, unless it
+    is the `home` of a thing.
+    """
+    top = name.partition(".")[0]
     if top in OURS:
-        return _ours(module)
+        return {path.relative_to(ROOT).as_posix(): path for path in _ours(name)}
+    if not home and (top in _distributions() or top in sys.stdlib_module_names):
+        return {}
     spec = importlib.util.find_spec(top)
-    if spec is None or spec.origin in (None, "built-in", "frozen"):
-        return []
+    if spec is None:
+        return {}
     if spec.submodule_search_locations is None:
-        return [Path(str(spec.origin))]
-    folders = map(Path, spec.submodule_search_locations)
-    files = (path for folder in folders for path in folder.rglob("*") if path.is_file())
-    return [path for path in files if "__pycache__" not in path.parts]
+        return {Path(str(spec.origin)).name: Path(str(spec.origin))} if spec.has_location else {}
+    return {
+        path.relative_to(Path(folder).parent).as_posix(): path
+        for folder in spec.submodule_search_locations
+        for path in Path(folder).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
 
 
 def _ours(name: str) -> list[Path]:
-    """The files of the module or package `name` of this project, or of the one that defines it."""
+    """The files of this project that `name` stands for."""
     parts = name.split(".")
-    while parts and parts[0] in OURS:
+    while parts:
         path = ROOT.joinpath(*parts)
         if (path / "__init__.py").exists():
-            return [file for file in path.glob("*.py") if file.name not in CHECKS]
+            files = [file for file in path.glob("*.py") if file.name not in CHECKS]
+            return files + _weights(path)
         if path.with_suffix(".py").exists():
-            return [path.with_suffix(".py")]
+            return [path.with_suffix(".py"), *_weights(path.parent)]
         parts.pop()
     return []
 
 
-def _imports(path: Path) -> Iterable[str]:
+def _weights(folder: Path) -> list[Path]:
+    """Weights below a folder of a top-level package."""
+    return list(folder.rglob(WEIGHTS)) if folder.parent != ROOT else []
+
+
+def _imports(path: Path) -> tuple[str, ...]:
     """The modules, and the names in them, that a file imports anywhere."""
     return _parsed(path, path.stat().st_mtime_ns) if path.suffix == ".py" else ()
 
 
 @cache
 def _parsed(path: Path, changed: int) -> tuple[str, ...]:
-    return tuple(_imported(ast.parse(path.read_text(encoding="utf-8"))))
+    return tuple(_imported(ast.parse(path.read_bytes())))
 
 
 def _imported(tree: ast.AST) -> Iterator[str]:
@@ -111,23 +131,9 @@ def _imported(tree: ast.AST) -> Iterator[str]:
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def _data(path: Path) -> Iterator[Path]:
-    """Weights that lie below the folder of a source file of this project."""
-    if path.is_relative_to(ROOT) and path.parent.parent != ROOT:
-        for kind in DATA:
-            yield from path.parent.rglob(kind)
-
-
-def _name(path: Path) -> str:
-    """A path as it stands in a digest: it does not depend on where a project is installed."""
-    base = path.parent
-    while (base / "__init__.py").exists():
-        base = base.parent
-    return path.relative_to(base).as_posix()
-
-
 @cache
 def _distributions() -> dict[str, list[str]]:
+    """The distributions that have a top-level package, by its name."""
     return dict(metadata.packages_distributions())
 
 

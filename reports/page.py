@@ -7,7 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bench.results import Store, explained
+from bench.errors import explained
+from bench.results import Store
 from reports import figures
 from reports.comparison import comparison, conditions_of
 from reports.images import MOST_RENDERINGS, frame_section, kept_frames

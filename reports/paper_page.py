@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bench.results import explained
+from bench.errors import explained
 from reports import figures
 from reports.images import frame_section, kept_frames
 from reports.outliers import Outlier, outlier_table

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from markdown_it import MarkdownIt
 
-from bench.results import explained
+from bench.errors import explained
 from bench.sharing import whole
 
 STYLE = """\

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from bench.errors import SteerbenchError
-from bench.results import SCHEMA_VERSION, WHOLE, Store
+from bench.results import WHOLE, Store, unreadable
 from bench.run import half_interval
 from reports.tables import headline, phases, suffix
 
@@ -145,10 +145,8 @@ def load(store: Store, labels: Mapping[str, str]) -> list[Run]:
     by_run = _rows_by_run(store)
     for key in labels:
         if key not in by_run:
-            raise SteerbenchError(
-                f"{store.folder / key}: its rows have schema {records[key].get('schema_version')}; "
-                f"this version reads schema {SCHEMA_VERSION}"
-            )
+            schema = records[key].get("schema_version")
+            raise SteerbenchError(f"{store.folder / key}: {unreadable(schema)}")
     return [_run(store, key, label, by_run[key], records[key]) for key, label in labels.items()]
 
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import pandas as pd
 
+from bench.errors import explained
 from bench.provenance import commit, machine
-from bench.results import explained
 from bench.sharing import whole
 from reports.figures import frontier_plot
 from reports.publish import publish

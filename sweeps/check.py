@@ -10,8 +10,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from bench.errors import SteerbenchError
-from bench.results import Store, explained
+from bench.errors import SteerbenchError, explained
+from bench.results import Store
 from bench.sharing import whole
 from reports.regression import LIMITS, Figures, Limit, change_table, changes
 from reports.runs import Run, load, readable

@@ -8,7 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from bench.results import content_key, explained
+from bench.errors import explained
+from bench.results import content_key
 from bench.sharing import whole
 
 

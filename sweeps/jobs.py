@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from bench.results import explained
+from bench.errors import explained
 from bench.sharing import whole
 
 SUFFIX = ".job.json"

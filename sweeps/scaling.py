@@ -12,15 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from bench.lookahead import announce_next
 from omegaconf import DictConfig
 
 from bench.cameras import frame_camera
 from bench.console import ConsoleLog
-from bench.errors import SteerbenchError
+from bench.errors import SteerbenchError, explained
 from bench.frontier import observed_order
-from bench.lookahead import announce_next
 from bench.probes import FrameRecord, MemoryMeter, StageClock, p99_to_p50
-from bench.results import explained
 from bench.threads import torch_threads
 from bench.types import Camera, Log, Method, Scene
 from reports.figures import growth_panels

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from bench.results import explained
+from bench.errors import explained
 from bench.sharing import missing
 from bench.types import Log
 from methods.engines import SIZES, Inputs, Network, Precision, readable, sizes_to_expect

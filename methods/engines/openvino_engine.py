@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bench.errors import Unavailable
-from bench.results import explained
+from bench.errors import Unavailable, explained
 from bench.sharing import missing
 from bench.types import Log
 from methods.engines import (

@@ -15,8 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bench.errors import SteerbenchError, Unavailable
-from bench.results import explained
+from bench.errors import SteerbenchError, Unavailable, explained
 from bench.sharing import missing, whole
 from bench.types import Log
 from methods.engines import (

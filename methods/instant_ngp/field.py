@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from typing import Literal
 
@@ -15,6 +14,7 @@ from methods.kernels import multiplies_bf16
 from methods.kernels.encode import HashGrid, encode, pack
 from methods.kernels.spherical import CHANNELS as DIRECTION_CHANNELS
 from methods.kernels.spherical import spherical_harmonics
+from methods.rendering.field import LOG_DENSITY_CLAMP
 
 Precision = Literal["bf16", "fp32"]
 
@@ -23,9 +23,6 @@ HIDDEN_CHANNELS = 64
 
 GEOMETRY_CHANNELS = 16
 """Outputs of the density network; the first is log density, all feed the feature network."""
-
-LOG_DENSITY_CLAMP = 15.0
-"""The gradient of exp is taken at a log density clamped to +- this (as torch-ngp and ngp_pl do)."""
 
 
 class HashField(nn.Module):
@@ -37,9 +34,6 @@ class HashField(nn.Module):
     With precision "bf16" the table is read as packed bfloat16, and the matrix products are those of
     bfloat16 weights with float32 accumulation; parameters, gradients of the table and outputs stay
     float32. So do the activations where the device has no products of bfloat16.
-
-    Attributes:
-        levels: of the grid that are read, the coarsest first.
     """
 
     def __init__(
@@ -53,7 +47,6 @@ class HashField(nn.Module):
     ) -> None:
         super().__init__()
         self.grid, self.channels, self.precision, self.backend = grid, channels, precision, backend
-        self.levels = grid.levels
         table = torch.empty(grid.entries, grid.features).uniform_(-1e-4, 1e-4, generator=generator)
         self.table = nn.Parameter(table)
         sizes = {
@@ -86,11 +79,10 @@ class HashField(nn.Module):
             functional.pad(old, (0, 0, 0, channels - len(old)))
         )
 
-    def coarse(self, levels: int) -> HashField:
-        """This very field, of which only the coarsest `levels` are read."""
-        field = copy.copy(self)  # shares parameters and buffers
-        field.levels = levels
-        return field
+    @property
+    def device(self) -> torch.device:
+        """Where table and networks lie."""
+        return self.table.device
 
     def encode_directions(self, directions: Tensor) -> Tensor:
         """Spherical harmonics [R, 16] of ray `directions` [R, 3] of any length."""
@@ -103,12 +95,11 @@ class HashField(nn.Module):
             positions,
             self.table,
             self.grid,
-            levels=self.levels,
             packed=self.packed,
             grad_buffer=self.grad_buffer,
             backend=self.backend,
         ).to(self._compute_dtype)
-        hidden = self._linear(features, self._density_in).relu_()
+        hidden = self._linear(features, self.layers["density_in"]).relu_()
         geometry = self._linear(hidden, self.layers["density_out"])
         return _ClampedExp.apply(geometry[:, 0].to(self.table.dtype)), geometry
 
@@ -120,10 +111,10 @@ class HashField(nn.Module):
         return self._linear(hidden, layers["feature_out"]).to(self.table.dtype).sigmoid()
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
-        """Tell `probe` the work of the densities of `samples` and of the features of `shaded`."""
-        density = self._density_in.numel() + self.layers["density_out"].numel()
+        """Count the work of the densities of `samples` and of the features of `shaded`."""
+        density = self.layers["density_in"].numel() + self.layers["density_out"].numel()
         features = sum(self.layers[f"feature_{name}"].numel() for name in ("in", "mid", "out"))
-        probe.count("table_reads", 8 * self.levels * samples)
+        probe.count("table_reads", 8 * self.grid.levels * samples)
         probe.count("products", density * samples + features * shaded)
 
     def sizes(self) -> dict[str, int]:
@@ -134,13 +125,8 @@ class HashField(nn.Module):
 
     @property
     def _compute_dtype(self) -> torch.dtype:
-        half = self.precision == "bf16" and multiplies_bf16(self.table.device.type)
+        half = self.precision == "bf16" and multiplies_bf16(self.device.type)
         return torch.bfloat16 if half else self.table.dtype
-
-    @property
-    def _density_in(self) -> Tensor:
-        """The weights of the levels that are read."""
-        return self.layers["density_in"][:, : self.levels * self.grid.features]
 
     def _linear(self, inputs: Tensor, weights: Tensor) -> Tensor:
         if self.precision == "bf16":

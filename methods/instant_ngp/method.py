@@ -5,14 +5,15 @@ from __future__ import annotations
 import torch
 
 from bench.cameras import place_camera
+from bench.study import Study, Variant
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.instant_ngp.field import Precision
-from methods.instant_ngp.stage1 import Setup, pretrain
+from methods.instant_ngp.stage1 import Setup, train_field
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.composite import STOP, check_stop
 from methods.kernels.encode import HashGrid
-from methods.steernerf.buffer import Cloud, Reprojection
-from methods.steernerf.range_reduction import RangeReduction, evidence, render_guided
+from methods.rendering.frame import everywhere, render_frame
+from methods.rendering.march import March
 
 
 class InstantNgp:
@@ -23,10 +24,19 @@ class InstantNgp:
         training: how the field is trained.
         precision: "bf16" (packed table, bfloat16 networks) or "fp32".
         stop: transmittance at which a ray ends when rendering, less than 1.
-        range: where rays look, given the depth of the preceding frame; null: every frame stands
-            alone.
         name: as it stands in result rows.
     """
+
+    memory = 0
+    study = Study(
+        knobs={
+            "stop": [
+                Variant(f"stop {stop}", (f"method.stop={stop}",))
+                for stop in ("1e-1", "1e-2", "1e-3")
+            ]
+        },
+        exact=("method.stop=1e-4",),
+    )
 
     def __init__(
         self,
@@ -35,7 +45,6 @@ class InstantNgp:
         training: TrainingOptions,
         precision: Precision = "bf16",
         stop: float = STOP,
-        range: RangeReduction | None = None,
         name: str = "ngp",
         backend: str = "auto",
         device: str = "auto",
@@ -44,39 +53,24 @@ class InstantNgp:
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         check_stop(stop)
         self.stop, self.name = stop, name
-        self.range = range if range is not None and range.mode != "off" else None
-        self.memory = 0 if self.range is None else 1
-        self.reprojection = Reprojection()
-        self.preceding: Cloud | None = None
         self.train_s = 0.0
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Train the field, or load the one that the same training left behind."""
-        self.trained = pretrain(self.setup, scene, budget, log)
+        self.trained = train_field(self.setup, scene, budget, log)
         self.train_s = self.trained.train_s
         self.background = scene.background.to(self.setup.device)
 
     def reset(self) -> None:
-        """Forget the preceding frame."""
-        self.preceding = None
+        """Do nothing: every frame stands alone."""
 
     @torch.no_grad()
     def render(self, camera: Camera, probe: Probe) -> Frame:
         """One frame at the camera's full resolution."""
-        field, occupancy = self.trained.field, self.trained.occupancy
         camera = place_camera(camera, self.setup.device)
-        found = None
-        if self.range is not None and self.preceding is not None:
-            with probe.stage("depth_reprojection"):
-                found = evidence(
-                    self.preceding, camera, self.range, self.reprojection, field.backend
-                )
-        frame = render_guided(
-            field, camera, occupancy, self.background, probe, found, stop=self.stop
-        )
-        if self.range is not None:
-            with probe.stage("depth_reprojection"):
-                self.preceding = Cloud.of(frame, self.reprojection)
+        field, occupancy = self.trained.field, self.trained.occupancy
+        render = everywhere(field, occupancy, probe, March(stop=self.stop))
+        frame = render_frame(field, camera, occupancy, self.background, probe, render)
         return Frame(frame.values, frame.depth, frame.alpha)
 
     def sizes(self) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""Stage 1: the field that every method on a hash grid starts from, trained once and shared."""
+"""The trained field of a scene: made once, found again by every method that stands on it."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from bench.provenance import decisive
 from bench.sources import digest, libraries
 from bench.types import DEVICE, Budget, Log, Scene
 from methods.instant_ngp.field import HashField, Precision
-from methods.instant_ngp.training import TrainingOptions, train_field
-from methods.kernels import resolve
+from methods.instant_ngp.training import FieldTraining, TrainingOptions, new_grid, restore_field
+from methods.kernels import multiplies_bf16, resolve
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy
+from methods.training import checkpoint, loop
 
 
 @dataclass(frozen=True)
@@ -65,11 +66,12 @@ class Setup:
 
     def settings(self) -> dict[str, str]:
         """See `bench.types.Method.settings`."""
+        multiplied = self.precision == "fp32" or multiplies_bf16(self.device.type)
         return {
             "device": str(self.device),
             "backend": self.backend,
             "engine": "torch",
-            "precision": self.precision,
+            "precision": self.precision if multiplied else "bf16 in fp32",
         }
 
     def key(self, scene: Scene, budget: Budget) -> dict[str, object]:
@@ -92,7 +94,7 @@ class Setup:
 
 
 @dataclass(frozen=True)
-class Pretrained:
+class TrainedField:
     """A trained `field`, where it may hold matter, and the seconds its training took."""
 
     field: HashField
@@ -104,12 +106,25 @@ class Pretrained:
         return self.field.sizes() | {"occupancy": self.occupancy.cells.numel() // 8}
 
 
-def pretrain(setup: Setup, scene: Scene, budget: Budget, log: Log) -> Pretrained:
-    """Train a field on the pictures of `scene`, or load the one the same training left behind."""
+def train_field(setup: Setup, scene: Scene, budget: Budget, log: Log) -> TrainedField:
+    """Train a field on the pictures of `scene`, or load the one of the same training.
+
+    A training that was killed goes on from its last checkpoint.
+    """
     generator = torch.Generator().manual_seed(setup.seed)
     field = HashField(
         setup.grid, precision=setup.precision, backend=setup.backend, generator=generator
     ).to(setup.device)
-    folder = log.stage_dir("field", setup.key(scene, budget))
-    density, train_s = train_field(field, scene, budget, setup.training, setup.seed, folder, log)
-    return Pretrained(field, density.occupancy, train_s)
+    finished = log.stage_dir("field", setup.key(scene, budget)) / "field.safetensors"
+    if finished.exists():
+        tensors, figures = checkpoint.read(finished)
+        grid = new_grid(scene, setup.device)
+        with checkpoint.restoring(finished):
+            restore_field(field, grid, tensors)
+            seconds = figures["seconds"]
+        log.info(f"trained field found: {finished}")
+        return TrainedField(field, grid.occupancy, seconds)
+    training = FieldTraining(field, scene, budget, setup.training, setup.seed)
+    loop.train(training, finished, "training", log)
+    field.grad_buffer = None
+    return TrainedField(field, training.grid.occupancy, training.seconds)

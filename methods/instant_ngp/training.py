@@ -1,22 +1,23 @@
-"""Training a field on the pictures of a scene: the loop, its checkpoints and its guards."""
+"""Stage 1: a hash-grid field learns from random pixels of the training pictures."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.types import Budget, Log, Rays, Scene, Split, SteerbenchError
+from bench.types import Budget, Rays, Scene, Split, SteerbenchError
 from methods.instant_ngp.field import HashField
+from methods.instant_ngp.optimiser import FieldOptimiser
 from methods.rendering.batch import opacity_entropy, render_batch
+from methods.rendering.march import March
 from methods.rendering.occupancy import EVERY, MIN_VIEWS, DensityGrid, learnable_cells
 from methods.training import checkpoint, loop
-from methods.training.optimiser import FieldOptimiser, cosine
+from methods.training.optimiser import cosine
 
 MIN_RAYS = 64
 """Fewest rays of a step."""
@@ -110,7 +111,7 @@ class FieldTraining:
     def __init__(
         self, field: HashField, scene: Scene, budget: Budget, options: TrainingOptions, seed: int
     ) -> None:
-        device = field.table.device
+        device = field.device
         self.field, self.budget, self.options = field, budget, options
         self.grid = new_grid(scene, device)
         self.batches = PixelBatches(scene.splits["train"], device)
@@ -138,7 +139,9 @@ class FieldTraining:
         rays, colours = self.batches.draw(self.rays, self.generator)
         target, background = self._target(colours)
         jitter = torch.rand(len(target), generator=self.generator, device=target.device)
-        pixels, samples = render_batch(self.field, rays, self.grid.occupancy, jitter, background)
+        pixels, samples = render_batch(
+            self.field, rays, self.grid.occupancy, March(), jitter=jitter, background=background
+        )
         loss = functional.mse_loss(pixels.values, target)
         entropy = opacity_entropy(pixels.alpha)
         (loss + self.options.opacity_entropy * entropy).backward()
@@ -195,35 +198,6 @@ class FieldTraining:
         self.rays = int(figures["rays"])
         self.optimiser.restore(tensors)
         self.generator.set_state(tensors["generator"].cpu())
-
-
-def train_field(
-    field: HashField,
-    scene: Scene,
-    budget: Budget,
-    options: TrainingOptions,
-    seed: int,
-    folder: Path,
-    log: Log,
-) -> tuple[DensityGrid, float]:
-    """Train `field` on the pictures of `scene`; its density grid and the seconds it took.
-
-    The result stands in `folder` as `field.safetensors`; a training that is found there is loaded,
-    one that was killed goes on from its last checkpoint.
-    """
-    finished = folder / "field.safetensors"
-    if finished.exists():
-        tensors, figures = checkpoint.read(finished)
-        grid = new_grid(scene, field.table.device)
-        with checkpoint.restoring(finished):
-            restore_field(field, grid, tensors)
-            seconds = figures["seconds"]
-        log.info(f"trained field found: {finished}")
-        return grid, seconds
-    training = FieldTraining(field, scene, budget, options, seed)
-    loop.train(training, finished, "training", log)
-    field.grad_buffer = None
-    return training.grid, training.seconds
 
 
 def restore_field(field: HashField, grid: DensityGrid, tensors: Mapping[str, Tensor]) -> None:

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from bench.cameras import place_camera, project
 from bench.types import Camera
-from methods.instant_ngp.field import LOG_DENSITY_CLAMP, HashField
 from methods.kernels.march import BRICK, MAX_SAMPLES, Occupancy
+from methods.rendering.field import LOG_DENSITY_CLAMP, Field
 
 RESOLUTION = 128
 STEP = math.sqrt(3) / MAX_SAMPLES
@@ -91,7 +91,7 @@ class DensityGrid:
         self._threshold()
 
     @torch.no_grad()
-    def update(self, field: HashField, generator: torch.Generator, samples: int) -> None:
+    def update(self, field: Field, generator: torch.Generator, samples: int) -> None:
         """Visit `samples` random cells, half of them among all, half among the occupied ones."""
         cells = self._draw(samples, generator)
         found = torch.full_like(self.density.view(-1), -1.0)

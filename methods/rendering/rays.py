@@ -1,4 +1,4 @@
-"""Volume rendering of a field along rays, a few samples at a time: to render."""
+"""Volume rendering to render: rays take a few samples at a time and end early."""
 
 from __future__ import annotations
 
@@ -6,113 +6,88 @@ import torch
 from torch import Tensor
 
 from bench.types import Probe, Rays
-from methods.instant_ngp.field import HashField
-from methods.kernels.composite import STOP, Pixels, composite, weights
-from methods.kernels.march import Occupancy, march
-from methods.rendering.batch import pad
-from methods.rendering.occupancy import STEP
+from methods.kernels.composite import Pixels, composite, weights
+from methods.kernels.march import Occupancy, Samples, march
+from methods.rendering.field import Field, pad
+from methods.rendering.march import March
 
 CHUNK_RAYS = 1 << 16
 """Rays rendered together: enough to keep all threads busy, few enough to stay in the cache."""
 
 ROUND_SAMPLES = 6
-"""Samples a ray may take in a round: more are evaluated in vain, fewer take more rounds. The few
-rays that are left in the end are not worth many rounds: they may take as many more as they are
-fewer than half of all."""
-
-FAINT = 0.1
-"""Samples of less weight than this share of the transmittance at which a ray may end have an
-opacity, but no features: black instead, each changes a pixel by less than its weight, and so less
-than a tenth of what may lie behind its end. A ray through haze has many of them."""
+"""Samples of a ray in a round: with more, some are evaluated in vain behind its end; with fewer,
+there are more rounds. When fewer than half of the rays are left, each takes as many more."""
 
 
 @torch.no_grad()
 def render_rays(
-    field: HashField,
+    field: Field,
     rays: Rays,
     occupancy: Occupancy,
     probe: Probe,
-    *,
-    stop: float = STOP,
-    step: float = STEP,
-    window: Tensor | None = None,
+    how: March,
     carry: Pixels | None = None,
-    faint: float | None = None,
 ) -> Pixels:
-    """Render `rays` in rounds, so that samples behind the early stop are hardly ever evaluated.
+    """Render `rays`, R of them, in rounds, so that few samples are evaluated behind the early stop.
 
-    Values are not composited onto a background. A round takes the next few samples of the rays
-    that are still open, evaluates and composites them, and drops the rays that are done.
+    A round takes the next few samples of the rays that are still open, evaluates and composites
+    them, and drops the rays that have ended. Values are not composited on a background.
 
     Args:
-        window: [R, 2] nearest and farthest t of each ray; None: all.
-        carry: what lies in front of the windows; taken over and changed in place.
-        faint: samples of less weight have no features; None: `FAINT * stop`.
+        carry: what lies in front of the windows of `how`; changed in place and returned.
     """
     device = rays.origins.device
-    faint = FAINT * stop if faint is None else faint
     canvas = carry or Pixels.blank(len(rays.origins), field.channels, device)
     for first in range(0, len(rays.origins), CHUNK_RAYS):
-        alive = torch.arange(first, min(first + CHUNK_RAYS, len(rays.origins)), device=device)
-        start = torch.zeros(len(alive), dtype=torch.int32, device=device)
-        count = len(alive)
-        while len(alive):
-            limit = ROUND_SAMPLES * max(count // (2 * len(alive)), 1)
-            alive, start = _render_round(
-                field,
-                rays,
-                window,
-                occupancy,
-                probe,
-                canvas,
-                alive,
-                start,
-                limit,
-                stop,
-                step,
-                faint,
-            )
+        open_ = torch.arange(first, min(first + CHUNK_RAYS, len(rays.origins)), device=device)
+        start = torch.zeros(len(open_), dtype=torch.int32, device=device)
+        count = len(open_)
+        while len(open_):
+            with probe.stage("march"):
+                some = rays.take(open_)
+                samples = march(
+                    some.origins,
+                    some.directions,
+                    occupancy,
+                    how.step,
+                    window=None if how.window is None else how.window[open_],
+                    start=start,
+                    limit=ROUND_SAMPLES * max(count // (2 * len(open_)), 1),
+                    backend=field.backend,
+                )
+            probe.count("samples", len(samples))
+            if not len(samples):
+                break
+            front = canvas.take(open_)
+            sigma, values = _evaluated(field, samples, some.directions, front, how, probe)
+            with probe.stage("composite"):
+                pixels = composite(
+                    sigma,
+                    values,
+                    samples.t,
+                    samples.delta,
+                    samples.offsets,
+                    stop=how.stop,
+                    carry=front,
+                    backend=field.backend,
+                )
+                canvas.put(open_, pixels)
+                left = (samples.resume >= 0) & (1 - pixels.alpha > how.stop)
+                open_, start = open_[left], samples.resume[left]
     return canvas
 
 
-def _render_round(
-    field: HashField,
-    rays: Rays,
-    window: Tensor | None,
-    occupancy: Occupancy,
-    probe: Probe,
-    canvas: Pixels,
-    alive: Tensor,
-    start: Tensor,
-    limit: int,
-    stop: float,
-    step: float,
-    faint: float,
+def _evaluated(
+    field: Field, samples: Samples, directions: Tensor, front: Pixels, how: March, probe: Probe
 ) -> tuple[Tensor, Tensor]:
-    """One round of at most `limit` samples of the rays `alive` from their steps `start`; those left
-    and where they go on."""
-    with probe.stage("march"):
-        origins, directions = rays.origins[alive], rays.directions[alive]
-        samples = march(
-            origins,
-            directions,
-            occupancy,
-            step,
-            window=None if window is None else window[alive],
-            start=start,
-            limit=limit,
-            backend=field.backend,
-        )
-    probe.count("samples", len(samples))
-    if len(samples) == 0:
-        return alive[:0], start[:0]
-    carry = canvas.take(alive)
+    """Density [S] and features [S, K] of `samples` behind what is in `front` of them; features of
+    faint samples are 0."""
     with probe.stage("field"):
         sigma, geometry = field.density(pad(samples.positions))
         sigma = sigma[: len(samples)]
         along = (sigma, samples.delta, samples.offsets)
-        weight = weights(*along, stop=stop, front=1 - carry.alpha, backend=field.backend)
-        seen = (weight > faint).nonzero().squeeze(1)
+        weight = weights(*along, stop=how.stop, front=1 - front.alpha, backend=field.backend)
+        seen = (weight > how.least_weight).nonzero().squeeze(1)
         encoded = field.encode_directions(directions)
         index = pad(seen)
         values = sigma.new_zeros(len(samples), field.channels)
@@ -120,17 +95,4 @@ def _render_round(
         values[seen] = shown[: len(seen)]
     probe.count("shaded_samples", len(seen), len(samples))
     field.count(probe, len(samples), len(seen))
-    with probe.stage("composite"):
-        pixels = composite(
-            sigma,
-            values,
-            samples.t,
-            samples.delta,
-            samples.offsets,
-            stop=stop,
-            carry=carry,
-            backend=field.backend,
-        )
-        canvas.put(alive, pixels)
-        left = (samples.resume >= 0) & (1 - pixels.alpha > stop)
-        return alive[left], samples.resume[left]
+    return sigma, values

@@ -1,4 +1,4 @@
-"""Preceding frames, kept as points and brought into the present view (SteerNeRF Eq. 6, 9, 10)."""
+"""The rendering buffer: preceding frames as points, reprojected into the present view."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -15,7 +14,8 @@ from torch.nn import functional
 from bench.cameras import pack_camera, pixel_grid, place_camera, project, unpack_camera, unproject
 from bench.types import Camera
 from methods.kernels.splat import splat
-from methods.rendering.batch import FeatureFrame
+from methods.rendering.frame import FeatureFrame
+from methods.steernerf.options import Reprojection
 from methods.training.checkpoint import part
 
 SPLAT_ALPHA = 0.1
@@ -25,24 +25,7 @@ OVERLAP_POINTS = 256
 """Points, evenly spread, that tell how much of a frame another view shares."""
 
 
-@dataclass(frozen=True)
-class Reprojection:
-    """How a frame is brought into another view; each `paper` value is what the release does.
-
-    Attributes:
-        rule: which point a pixel shows, the "nearest", or the "last" written (paper).
-        centres: "exact", or "paper": unprojected through the corner of a pixel, which is constant
-            offset of s / 2 - 1/2 pixels that the 2D renderer has to learn.
-        depth: "expected" termination, or the "sum" of w t (paper): too near where alpha < 1; empty
-            pixels become points at the camera.
-    """
-
-    rule: Literal["nearest", "last"] = "nearest"
-    centres: Literal["exact", "paper"] = "exact"
-    depth: Literal["expected", "sum"] = "expected"
-
-
-CLOUD = ("source", "points", "values", "alpha", "age")
+CLOUD = ("source", "points", "values", "alpha")
 """The tensors of a cloud."""
 
 
@@ -56,7 +39,6 @@ class Cloud:
         points: [N, 3].
         values: [N, K] features.
         alpha: [N] opacity.
-        age: [N] uint8, frames since the oldest of what a pixel is made of was rendered.
     """
 
     camera: Camera
@@ -64,13 +46,12 @@ class Cloud:
     points: Tensor
     values: Tensor
     alpha: Tensor
-    age: Tensor
 
     @classmethod
-    def of(cls, frame: FeatureFrame, options: Reprojection, age: Tensor | None = None) -> Cloud:
-        """Unproject `frame` (Eq. 6), whose pixels are of `age` [h * w]; None: of 0."""
+    def of(cls, frame: FeatureFrame, how: Reprojection) -> Cloud:
+        """The points of `frame`."""
         alpha, depth = frame.alpha.flatten(), frame.depth.flatten()
-        if options.depth == "sum":
+        if how.depth == "sum":
             source = torch.arange(len(alpha), device=alpha.device)
             depth = torch.where(alpha > 0, depth.nan_to_num(posinf=0) * alpha, 0) + 1e-12
         else:
@@ -78,24 +59,24 @@ class Cloud:
             depth = depth[source]
         camera = frame.camera
         centres = pixel_grid(camera.width, camera.height, alpha.device)[source]
-        if options.centres == "paper":
+        if how.centres == "paper":
             centres = centres - 0.5
         values = frame.values.reshape(len(alpha), -1)[source]
-        points = unproject(camera, centres, depth)
-        ages = torch.zeros_like(source, dtype=torch.uint8) if age is None else age[source]
-        return cls(camera, source, points, values, alpha[source], ages)
+        points = unproject(camera, centres, depth)  # Eq. 6
+        return cls(camera, source, points, values, alpha[source])
 
-    def land(self, camera: Camera, options: Reprojection, backend: str) -> tuple[Tensor, Tensor]:
-        """Which point each pixel of `camera` shows (Eq. 9, 10).
+    def splat(self, camera: Camera, how: Reprojection, backend: str) -> tuple[Tensor, Tensor]:
+        """Which point each pixel of `camera` shows.
 
         Returns:
             [H, W] int32, the index of the point, -1 for none; and [N] the z-depth of the points.
         """
-        pixels, depth = project(camera, self.points)
-        if options.centres == "paper":
+        pixels, depth = project(camera, self.points)  # Eq. 7 at low resolution, Eq. 9 at full
+        if how.centres == "paper":
             pixels = pixels + 0.5  # pixel i is at i there, and shows what rounds to it
         size = camera.width, camera.height
-        return splat(pixels, depth, *size, rule=options.rule, backend=backend), depth
+        index = splat(pixels, depth, *size, rule=how.rule, backend=backend)  # Eq. 8, Eq. 10
+        return index, depth
 
     def overlap(self, camera: Camera) -> float:
         """About which share of what this frame shows `camera` can see, 0 to 1.
@@ -126,47 +107,35 @@ class Remembered:
 
 
 class RenderingBuffer:
-    """The last `length` frames of a sequence; more are forgotten.
+    """The last `length` frames of a sequence; more are forgotten."""
 
-    Attributes:
-        turn: frames since the sequence began.
-    """
-
-    def __init__(self, length: int, turn: int = 0) -> None:
+    def __init__(self, length: int) -> None:
         self._frames: deque[Remembered] = deque(maxlen=length)
-        self.turn = turn
 
     @property
     def frames(self) -> Sequence[Remembered]:
         """Newest first; fewer than `length` after a cold start."""
         return tuple(self._frames)
 
-    @property
-    def clouds(self) -> Sequence[Cloud]:
-        """Those of `frames`."""
-        return tuple(frame.cloud for frame in self._frames)
-
     def push(self, frame: Remembered) -> None:
         """Remember `frame`, forget the oldest one if there are too many."""
         self._frames.appendleft(frame)
-        self.turn += 1
 
     def copy(self) -> RenderingBuffer:
         """A buffer that has seen the same frames, and goes on by itself."""
-        other = RenderingBuffer(self._frames.maxlen or 0, self.turn)
+        other = RenderingBuffer(self._frames.maxlen or 0)
         other._frames.extend(self._frames)
         return other
 
     def state(self) -> dict[str, Tensor]:
         """All that is remembered, to be kept in a file."""
-        tensors = {"turn": torch.tensor(self.turn)}
+        tensors: dict[str, Tensor] = {}
         for age, frame in enumerate(self._frames):
             tensors |= {f"{age}.{name}": x for name, x in _packed(frame).items()}
         return tensors
 
     def restore(self, tensors: Mapping[str, Tensor], device: torch.device) -> None:
         """Remember on `device` what `state` gave of another buffer."""
-        self.turn = int(tensors["turn"])
         ages = sum(name.endswith(".camera") for name in tensors)
         frames = (_unpacked(part(tensors, f"{age}."), device) for age in range(ages))
         self._frames = deque(frames, self._frames.maxlen)
@@ -174,7 +143,6 @@ class RenderingBuffer:
     def reset(self) -> None:
         """Forget all: a new sequence starts."""
         self._frames.clear()
-        self.turn = 0
 
 
 def _packed(frame: Remembered) -> dict[str, Tensor]:

@@ -1,18 +1,90 @@
-"""What a frame of the pipeline is made of, and what of it a training depends on."""
+"""What of a frame is trained for (`Model`), and what is chosen afterwards (`Rendering`)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
+from typing import Literal
 
-from methods.kernels.composite import STOP, check_stop
-from methods.kernels.encode import HashGrid
-from methods.steernerf.buffer import Reprojection
-from methods.steernerf.range_reduction import RangeReduction
-from methods.steernerf.refresh import Refresh
-from methods.steernerf.renderer import Renderer2d, check_refined, check_size
+from methods.kernels.composite import check_stop
+from methods.rendering.march import March
+from methods.rendering.occupancy import STEP
 
 SIZES = {"channels": (3, 256), "frames": (0, 64), "scale": (1, 64)}
-"""K, L and s that a pipeline may have: from, to."""
+"""K, L and s that a model may have: from, to."""
+
+
+@dataclass(frozen=True)
+class Reprojection:
+    """How a frame is brought into another view; each `paper` value is what the release does.
+
+    Attributes:
+        rule: which point a pixel shows, the "nearest", or the "last" written (paper).
+        centres: "exact", or "paper": unprojected through the corner of a pixel, a constant offset
+            of s / 2 - 1/2 pixels that the 2D renderer has to learn.
+        depth: "expected" termination, or the "sum" of w t (paper): too near where alpha < 1; empty
+            pixels become points at the camera.
+    """
+
+    rule: Literal["nearest", "last"] = "nearest"
+    centres: Literal["exact", "paper"] = "exact"
+    depth: Literal["expected", "sum"] = "expected"
+
+
+@dataclass(frozen=True)
+class Model:
+    """What a SteerNeRF is trained for: a change of any of it is another training.
+
+    Attributes:
+        channels: K, features of the field; the first three are RGB.
+        frames: L, preceding frames.
+        scale: s, the field is rendered at 1/s of the resolution.
+        step: length of a ray-marching step at low resolution, in those of stage 1. Stage 2 teaches
+            the field to do with longer ones.
+        stop: transmittance at which a ray ends.
+        reprojection: how preceding frames are brought into the present view.
+        feature_background: what the features beyond RGB are composited on. 1/2 is what an
+            untrained feature is everywhere.
+        history: the preceding picture is reprojected, too (not in the paper).
+        surface: the field is also evaluated once a pixel at full resolution, where the
+            low-resolution depth has the surface (not in the paper).
+    """
+
+    channels: int
+    frames: int
+    scale: int
+    step: float
+    stop: float
+    reprojection: Reprojection
+    feature_background: float
+    history: bool
+    surface: bool
+
+    def __post_init__(self) -> None:
+        for name, (least, most) in SIZES.items():
+            check_size(name, getattr(self, name), least, most)
+        check_step("step", self.step)
+        check_stop(self.stop)
+
+
+@dataclass(frozen=True)
+class RangeReduction:
+    """Where along a ray to look for a surface, given the depth of the newest preceding frame.
+
+    Attributes:
+        mode: "off": everywhere. "paper": within `epsilon` of the depth reprojected onto the pixel,
+            whatever is found there (SteerNeRF, Section 3.2). "window": within `epsilon` of the
+            depths reprojected onto its 3 x 3 neighbourhood, until the ray has the opacity they had;
+            a ray that does not reach it looks behind the window as well, and one at a depth edge
+            everywhere.
+        epsilon: scene units along z.
+    """
+
+    mode: Literal["off", "paper", "window"] = "off"
+    epsilon: float = 0.03
+
+    def __post_init__(self) -> None:
+        if not self.epsilon > 0:
+            raise ValueError(f"range.epsilon: expected more than 0, got {self.epsilon}")
 
 
 @dataclass(frozen=True)
@@ -21,7 +93,7 @@ class Skips:
 
     Attributes:
         empty: samples where the field holds nothing, and rays that meet nothing else.
-        hidden: samples behind a transmittance of `PipelineOptions.stop`.
+        hidden: samples behind a transmittance of `Rendering.stop`.
         background: cells near which nothing is seen.
     """
 
@@ -31,97 +103,64 @@ class Skips:
 
 
 @dataclass(frozen=True)
-class PipelineOptions:
-    """What a frame is made of.
+class Rendering:
+    """What is chosen after the training: one training serves every choice.
 
     Attributes:
-        channels: K, features of the field; the first three are RGB.
-        frames: L, preceding frames.
-        scale: s, the field is rendered at 1/s of the resolution.
-        range: where rays look for a surface. It is not trained for, and can be chosen afterwards.
-        refresh: which low-resolution rays are not rendered anew. It is not trained for, either.
-        reprojection: how preceding frames are brought into the present view.
-        history: the preceding picture is reprojected, too.
-        surface: the field is looked at once a pixel at full resolution, too, where the
-            low-resolution depth has the surface.
-        overlap: a preceding frame of which the present view shares less than this is not brought
-            into it, neither its features nor its depth or picture; see `Cloud.overlap`. It can be
-            chosen after the training.
-        jitter: the samples of the low-resolution grid move from frame to frame, so that
-            preceding frames carry samples of other places.
-        feature_background: what the features beyond RGB are composited on. 1/2 is what an
-            untrained feature is everywhere.
+        step: length of a ray-marching step at low resolution, in those of stage 1.
         stop: transmittance at which a ray ends.
-        steps: length of a ray-marching step at low resolution, in those of stage 1: stage 2 teaches
-            the field to do with longer ones.
-        levels: of the field's grid that low-resolution rays read, the coarsest first: cells of the
-            others may be far smaller than their pixels. None: all.
-        refined: share of the cells whose pixels are rendered by the field after all, those that
-            the 2D renderer doubts most. It can be chosen after the training, too.
-        refined_steps: length of a ray-marching step there. It can be chosen after the training,
-            which takes steps as short as those of stage 1: at full resolution longer ones show.
-        skip: what is not computed. Nor is it trained for.
+        range: where rays look for a surface.
+        overlap: a preceding frame that shares less than this of what it shows with the present view
+            is not used; see `buffer.Cloud.overlap`.
+        refined: share of the cells whose pixels are rendered by the field after all: those with the
+            largest estimated error (not in the paper).
+        refined_step: length of a ray-marching step there. Training takes those of stage 1.
+        skip: what is not computed.
     """
 
-    channels: int = 6
-    frames: int = 2
-    scale: int = 4
-    range: RangeReduction = RangeReduction("off")
-    refresh: Refresh = Refresh()
-    reprojection: Reprojection = Reprojection()
-    history: bool = True
-    surface: bool = True
+    step: float
+    stop: float
+    range: RangeReduction = RangeReduction()
     overlap: float = 0.0
-    jitter: bool = False
-    feature_background: float = 0.5
-    stop: float = STOP
-    steps: float = 1.0
-    levels: int | None = None
     refined: float = 0.0
-    refined_steps: float = 1.0
-    skip: Skips = Skips()
+    refined_step: float = 1.0
+    skip: Skips = field(default_factory=Skips)
 
     def __post_init__(self) -> None:
-        for name, (least, most) in SIZES.items():
-            check_size(name, getattr(self, name), least, most)
-        for name in ("steps", "refined_steps"):
-            if not (length := getattr(self, name)) > 0:
-                raise ValueError(f"{name}: expected a length of more than 0, got {length}")
+        check_step("step", self.step)
+        check_step("refined_step", self.refined_step)
         for name in ("overlap", "refined"):
             if not 0 <= (share := getattr(self, name)) <= 1:
                 raise ValueError(f"{name}: expected a share of 0 to 1, got {share}")
         check_stop(self.stop)
-        if not self.frames and self.range.mode != "off":
-            raise ValueError(
-                f"range.mode: expected off without preceding frames (L = 0), got {self.range.mode}"
-            )
-        if self.refresh.age and (not self.frames or self.reprojection != Reprojection()):
-            raise ValueError(
-                "refresh.age: expected 0 without preceding frames (L = 0) or where reprojection is "
-                f"not nearest, exact and expected, got {self.refresh.age}"
-            )
 
-    def check(self, grid: HashGrid, renderer: Renderer2d) -> None:
-        """Refuse, with a ValueError, what a field of `grid` or the `renderer` cannot do."""
-        if self.levels is not None:
-            grid.check_levels(self.levels)
-        check_refined("pipeline.refined", self.refined, renderer)
-        if self.jitter and not renderer.shifts:
-            raise ValueError(
-                f"pipeline.jitter: {type(renderer).__name__} takes every sample for the middle of "
-                "its cell, expected false, got true"
-            )
+    @classmethod
+    def in_training(cls, model: Model, refined: float) -> Rendering:
+        """How `model` is rendered while it is trained: rays look everywhere, so that one training
+        serves all choices; a share `refined` of the cells is refined."""
+        return cls(model.step, model.stop, refined=refined)
 
-    def taught(self, refined: float) -> PipelineOptions:
-        """The options of a training. It looks everywhere, so that one serves all choices of where
-        to look that are made afterwards."""
-        off = RangeReduction("off")
-        return replace(
-            self,
-            range=off,
-            refresh=Refresh(),
-            overlap=0.0,
-            refined=refined,
-            refined_steps=1.0,
-            skip=Skips(),
-        )
+    @property
+    def march(self) -> March:
+        """Of the rays at low resolution."""
+        return self._march(self.step)
+
+    @property
+    def refined_march(self) -> March:
+        """Of the rays of refined cells."""
+        return self._march(self.refined_step)
+
+    def _march(self, step: float) -> March:
+        return March(step=step * STEP, stop=self.stop if self.skip.hidden else 0.0)
+
+
+def check_size(name: str, got: int, least: int, most: int) -> None:
+    """Refuse, with a ValueError, a size that is not of `least` to `most`."""
+    if not least <= got <= most:
+        raise ValueError(f"{name}: expected {least} to {most}, got {got}")
+
+
+def check_step(name: str, length: float) -> None:
+    """Refuse, with a ValueError, a step that leads nowhere."""
+    if not length > 0:
+        raise ValueError(f"{name}: expected a length of more than 0, got {length}")

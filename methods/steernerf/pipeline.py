@@ -1,36 +1,41 @@
-"""SteerNeRF's rendering of one frame, top-down beside Section 3 of the paper.
+"""One frame of SteerNeRF, top-down, beside Section 3 of the paper.
 
-depth_reprojection    the newest preceding depth narrows where rays look     Eq. 6 to 8
-field                 features, depth and opacity at h x w = H/s x W/s       Eq. 3 to 5
-feature_reprojection  preceding features, and the preceding picture, at H x W   Eq. 9, 10
-renderer2d            the 2D neural renderer                                 Eq. 11
-refinement            the field at H x W, where the 2D renderer doubts itself   not in the paper
+| stage                | what it does                                            | equations |
+|----------------------|---------------------------------------------------------|-----------|
+| depth_reprojection   | the newest preceding depth limits where rays look       | 6 to 8    |
+| field                | features F and depth D at h x w = H/s x W/s             | 2 to 5    |
+| feature_reprojection | preceding features at H x W                             | 6, 9, 10  |
+| renderer2d           | the 2D neural renderer draws the picture                | 11        |
+
+Beyond the paper, and off in its method: the preceding picture is reprojected (`history`), the
+field is evaluated at the surface of each pixel (`surface`), and the cells with the largest
+estimated error are rendered by the field after all (`refinement`).
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from functools import cached_property
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.cameras import cast, place_camera
-from bench.types import Camera, Frame, Probe
-from methods.instant_ngp.field import HashField
+from bench.cameras import place_camera
+from bench.types import Camera, Frame, Probe, Rays
+from methods.kernels.composite import Pixels
 from methods.kernels.march import Occupancy
 from methods.kernels.warp import enlarge, warp
-from methods.rendering.batch import FeatureFrame
-from methods.rendering.occupancy import STEP
+from methods.rendering.field import Field
+from methods.rendering.frame import FeatureFrame, everywhere, render_frame
 from methods.rendering.rays import render_rays
-from methods.steernerf.beyond.cells import centres, put_pixels
-from methods.steernerf.beyond.surface import Surface
+from methods.steernerf.beyond import window
+from methods.steernerf.beyond.cells import put_pixels
+from methods.steernerf.beyond.refinement import rays_of_cells, refined_march, worst_cells
+from methods.steernerf.beyond.surface import surface_points
 from methods.steernerf.buffer import Cloud, Remembered, RenderingBuffer
-from methods.steernerf.options import PipelineOptions
-from methods.steernerf.range_reduction import depths_around, evidence, render_guided
-from methods.steernerf.refresh import first_ages, known_pixels
+from methods.steernerf.options import Model, Rendering
+from methods.steernerf.range_reduction import depth_interval
 from methods.steernerf.renderer import (
     Detail,
     Observation,
@@ -45,116 +50,95 @@ class Pipeline:
     """A field and a 2D renderer that together render frames, one after the other.
 
     Args:
-        field: with `options.channels` features.
+        field: with `model.channels` features.
+        occupancy: where the field may hold matter.
         background: [3] of the scene.
-
-    Raises:
-        ValueError: see `PipelineOptions.check`.
+        renderer: draws pictures; may be exchanged.
+        model: what both are trained for.
     """
 
     def __init__(
         self,
-        field: HashField,
+        field: Field,
         occupancy: Occupancy,
         background: Tensor,
         renderer: Renderer2d,
-        options: PipelineOptions,
+        model: Model,
     ) -> None:
-        options.check(field.grid, renderer)
-        self.field, self.renderer = field, renderer
-        self.options, self.backend = options, field.backend
-        skip = options.skip
-        self.occupancy = occupancy if skip.empty else Occupancy(torch.ones_like(occupancy.cells))
-        self.stop = options.stop if skip.hidden else 0.0
+        self.field, self.occupancy, self.renderer = field, occupancy, renderer
+        self.model, self.backend = model, field.backend
         self.background = functional.pad(
-            background, (0, options.channels - 3), value=options.feature_background
+            background, (0, model.channels - 3), value=model.feature_background
         )  # [K]
 
-    @property
-    def low_field(self) -> HashField:
-        """The field as low-resolution rays read it."""
-        levels = self.options.levels
-        return self.field if levels is None else self.field.coarse(levels)
-
-    def view(self, camera: Camera, turn: int) -> View:
-        """The view of the `turn`-th frame of a sequence, where the field is."""
-        camera = place_camera(camera, self.background.device)
-        return View.of(camera, self.options.scale, turn, jitter=self.options.jitter)
-
-    def render(self, camera: Camera, buffer: RenderingBuffer, probe: Probe) -> Frame:
-        """Render one frame that follows those in `buffer`, and remember it there."""
-        glance = self.glance(camera, buffer.clouds, buffer.turn, probe)
-        return self.draw(camera, glance, buffer, probe)
+    def view(self, camera: Camera) -> View:
+        """The view of `camera`, where the field is."""
+        return View.of(place_camera(camera, self.background.device), self.model.scale)
 
     @torch.no_grad()
-    def glance(self, camera: Camera, clouds: Sequence[Cloud], turn: int, probe: Probe) -> Glance:
-        """The `turn`-th frame of a sequence, as far as it needs no pictures of those before it: it
-        has all to do with their `clouds`, newest first."""
-        options, view = self.options, self.view(camera, turn)
-        used = self.shared(clouds, view, probe)
-        features, ages = self._features(view, clouds, used, probe)
+    def render(
+        self, camera: Camera, buffer: RenderingBuffer, rendering: Rendering, probe: Probe
+    ) -> Frame:
+        """Render the frame that follows those in `buffer`, and remember it there."""
+        model, view = self.model, self.view(camera)
+        preceding = self.overlapping(buffer.frames, view, rendering, probe)
+        frame = self.features(view, preceding, rendering, probe)  # F, D
         with probe.stage("feature_reprojection"):
-            preceding = [self.reproject(clouds[number], view) for number in used]
-            sight = self.sight(features, preceding, view, probe)
-        with probe.stage("finish"):
-            cloud = Cloud.of(features, options.reprojection, ages)
-        return Glance(view, features, cloud, used, preceding, sight)
-
-    @torch.no_grad()
-    def draw(self, camera: Camera, glance: Glance, buffer: RenderingBuffer, probe: Probe) -> Frame:
-        """The rest of the frame that follows those in `buffer`; it is remembered there."""
-        options, view, features = self.options, glance.view, glance.features
-        newest = buffer.frames[glance.used[0]] if glance.used else None
-        with probe.stage("feature_reprojection"):
-            observation = self.observe(
-                features, glance.preceding, newest, view, glance.sight, probe
-            )
+            points = [self.reproject(old.cloud, view) for old in preceding]
+            newest = preceding[0] if preceding else None
+            observation = self.observe(frame, points, newest, view, rendering, probe)
         with probe.stage("renderer2d"):
-            drawing = self.renderer([observation], probe)
-            picture = drawing.pictures[0].clamp_(0, 1)
-        if options.refined and drawing.doubt is not None:
+            drawing = self.renderer([observation], probe)  # Eq. 11
+            picture = drawing.pictures[0].clamp_(0, 1)  # I
+        if rendering.refined and drawing.error is not None:
             with probe.stage("refinement"):
-                worst = observation.cells[most_doubted(drawing.doubt, options.refined)]
-                colours = self.refine(worst, features, view, probe).clamp_(0, 1)
-                put_pixels(picture, worst, options.scale, colours)
+                cells = observation.cells[worst_cells(drawing.error, rendering.refined)]
+                colours = self.refined(cells, frame, view, rendering, probe)
+                put_pixels(picture, cells, model.scale, colours)
         with probe.stage("finish"):
-            buffer.push(Remembered(glance.cloud, view.full, picture))
-            return _finish(camera, picture, features, options.scale)
+            buffer.push(Remembered(Cloud.of(frame, model.reprojection), view.full, picture))
+            return _finished(camera, picture, frame, model.scale)
 
-    def shared(self, clouds: Sequence[Cloud], view: View, probe: Probe) -> Sequence[int]:
-        """Which of the preceding frames show enough of what is in `view`."""
-        used: Sequence[int] = range(len(clouds))
-        if least := self.options.overlap:
+    def overlapping(
+        self, frames: Sequence[Remembered], view: View, rendering: Rendering, probe: Probe
+    ) -> Sequence[Remembered]:
+        """Those of the preceding `frames` that share enough with `view`."""
+        if rendering.overlap:
             with probe.stage("feature_reprojection"):
-                used = [number for number in used if clouds[number].overlap(view.full) >= least]
-        probe.count("preceding_frames", len(used), self.options.frames)
-        return used
+                frames = [f for f in frames if f.cloud.overlap(view.full) >= rendering.overlap]
+        probe.count("preceding_frames", len(frames), self.model.frames)
+        return frames
+
+    def features(
+        self, view: View, preceding: Sequence[Remembered], rendering: Rendering, probe: Probe
+    ) -> FeatureFrame:
+        """Features and depth at low resolution (Eq. 2 to 5), marched where the newest of the
+        `preceding` frames has a surface."""
+        newest = preceding[0].cloud if preceding else None
+        render = self._marcher(newest, view, rendering, probe)
+        with probe.stage("field"):
+            occupancy = self._occupied(rendering)
+            return render_frame(self.field, view.low, occupancy, self.background, probe, render)
+
+    def _marcher(
+        self, newest: Cloud | None, view: View, rendering: Rendering, probe: Probe
+    ) -> Callable[[Tensor, Rays], Pixels]:
+        """How rays at low resolution are marched, as of `render_frame`."""
+        occupancy, how, reduction = self._occupied(rendering), rendering.march, rendering.range
+        if newest is None or reduction.mode == "off":
+            return everywhere(self.field, occupancy, probe, how)
+        by = newest, view.low, reduction.epsilon, self.model.reprojection, self.backend
+        with probe.stage("depth_reprojection"):
+            if reduction.mode == "window":
+                prior = window.depth_prior(*by)
+                return window.within(self.field, occupancy, probe, how, prior)
+            how = how.within(depth_interval(*by).view(-1, 2))  # D - epsilon to D + epsilon
+            return everywhere(self.field, occupancy, probe, how)
 
     def reproject(self, cloud: Cloud, view: View) -> Points:
-        """The features of a preceding frame where the present picture sees them."""
-        index, _ = cloud.land(view.full, self.options.reprojection, self.backend)
+        """The features of a preceding frame where the present picture sees them (Eq. 9, 10)."""
+        index, _ = cloud.splat(view.full, self.model.reprojection, self.backend)
         return Points(cloud.values, index)
-
-    def sight(
-        self, frame: FeatureFrame, preceding: Sequence[Points], view: View, probe: Probe
-    ) -> Sight:
-        """Where matter is seen in `view`, by its `frame` and the `preceding` ones."""
-        options = self.options
-        if options.skip.background:
-            cells = cells_at_matter(frame.alpha, preceding)
-        else:
-            cells = torch.arange(frame.alpha.numel(), device=frame.alpha.device)
-        probe.count("cells", len(cells), frame.alpha.numel())
-        if not (options.history or options.surface):
-            return Sight(cells)
-        depth = frame.depth.detach()
-        depth = enlarge(depth, cells, options.scale, view.phase, backend=self.backend)
-        if not options.surface:
-            return Sight(cells, depth)
-        with probe.stage("surface"):
-            surface = Surface(self.field, depth, cells, view, options.scale)
-        probe.count("surface_samples", len(surface), view.full.width * view.full.height)
-        return Sight(cells, depth, surface)
 
     def observe(
         self,
@@ -162,132 +146,65 @@ class Pipeline:
         preceding: Sequence[Points],
         newest: Remembered | None,
         view: View,
-        sight: Sight,
+        rendering: Rendering,
         probe: Probe,
     ) -> Observation:
-        """All that is known of the picture of `view` from its `frame`, the `preceding` ones, and
-        its `sight`."""
-        cells, history = sight.cells, None
-        if newest is not None and sight.depth is not None and self.options.history:
-            history = self.history(newest, sight.depth, cells, view)
-        surface = sight.surface.points(probe) if sight.surface else None
-        return Observation(
-            frame, self.background, preceding, cells, history, surface, view.phase, self.backend
-        )
+        """All that the 2D renderer is given: the present `frame`, the `preceding` features and,
+        beyond the paper, the `newest` preceding picture and the field at the surface."""
+        model, size = self.model, frame.alpha.numel()
+        if rendering.skip.background:
+            cells = cells_at_matter(frame.alpha, preceding)
+        else:
+            cells = torch.arange(size, device=frame.alpha.device)
+        probe.count("cells", len(cells), size)
+        history = surface = None
+        if model.history or model.surface:
+            depth = enlarge(frame.depth.detach(), cells, model.scale, backend=self.backend)
+            if model.surface:
+                with probe.stage("surface"):
+                    surface = surface_points(self.field, depth, cells, view, model.scale, probe)
+            if model.history and newest is not None:
+                history = self._history(newest, depth, cells, view)
+        return Observation(frame, self.background, preceding, cells, history, surface, self.backend)
 
-    def history(self, newest: Remembered, depth: Tensor, cells: Tensor, view: View) -> Detail:
+    def _history(self, newest: Remembered, depth: Tensor, cells: Tensor, view: View) -> Detail:
         """The preceding picture where the present one, of `depth` [N, s^2] in `cells`, sees it."""
-        scale, backend = self.options.scale, self.backend
         values, valid = warp(
-            newest.picture, newest.camera, depth, cells, view.full, scale, backend=backend
+            newest.picture,
+            newest.camera,
+            depth,
+            cells,
+            view.full,
+            self.model.scale,
+            backend=self.backend,
         )
         return Detail(values, valid)
 
-    def refine(self, cells: Tensor, frame: FeatureFrame, view: View, probe: Probe) -> Tensor:
-        """Colours [n, s^2, 3] of `cells` [n], by a ray of the field through each of their pixels.
-
-        With range reduction in mode "window" rays look where the low-resolution `frame` has
-        something around their cell.
-        """
-        options = self.options
-        pixels = centres(cells, view.low.width, options.scale)
-        window = None
-        if options.range.mode == "window":
-            # Between the samples of the frame a surface may lie farther off.
-            window = depths_around(frame.depth, 2 * options.range.epsilon).view(-1, 2)[cells]
-            window = window.repeat_interleave(options.scale**2, dim=0)
-        probe.count("refined_rays", pixels[..., 0].numel(), view.full.width * view.full.height)
-        found = render_rays(
-            self.field,
-            cast(view.full, pixels.flatten(0, 1)),
-            self.occupancy,
-            probe,
-            stop=self.stop,
-            step=options.refined_steps * STEP,
-            window=window,
-        )
+    def refined(
+        self, cells: Tensor, frame: FeatureFrame, view: View, rendering: Rendering, probe: Probe
+    ) -> Tensor:
+        """Colours [n, s^2, 3] of `cells` [n], by a ray through each of their pixels."""
+        rays = rays_of_cells(cells, view)
+        how = refined_march(cells, frame, view.scale, rendering)
+        probe.count("refined_rays", len(rays.origins), view.full.width * view.full.height)
+        found = render_rays(self.field, rays, self._occupied(rendering), probe, how)
         colours = found.values[:, :3] + (1 - found.alpha)[:, None] * self.background[:3]
-        return colours.view(*pixels.shape[:2], 3)
+        return colours.clamp_(0, 1).view(len(cells), -1, 3)
 
-    def _features(
-        self, view: View, clouds: Sequence[Cloud], used: Sequence[int], probe: Probe
-    ) -> tuple[FeatureFrame, Tensor | None]:
-        """The field at low resolution, looked at where the newest of the `used` frames says and
-        what the frame just before shows does not suffice; and the ages of the pixels."""
-        options, found, known, ages = self.options, None, None, None
-        how = options.reprojection, self.backend
-        if used and options.range.mode != "off":
-            with probe.stage("depth_reprojection"):
-                found = evidence(clouds[used[0]], view.low, options.range, *how)
-        if 0 in used and options.refresh.age:
-            with probe.stage("depth_reprojection"):
-                known = known_pixels(clouds[0], view.low, options.refresh, *how)
-        with probe.stage("field"):
-            features = render_guided(
-                self.low_field,
-                view.low,
-                self.occupancy,
-                self.background,
-                probe,
-                found,
-                stop=self.stop,
-                step=options.steps * STEP,
-                known=None if known is None else known.pixels,
-            )
-            if known is not None:
-                probe.count("known_pixels", len(known.pixels), features.alpha.numel())
-                features, ages = known.put(features), known.ages(view.low)
-            elif options.refresh.age:
-                ages = first_ages(view.low, options.refresh, self.background.device)
-        return features, ages
+    def _occupied(self, rendering: Rendering) -> Occupancy:
+        """Where rays take samples."""
+        return self.occupancy if rendering.skip.empty else self._everywhere
+
+    @cached_property
+    def _everywhere(self) -> Occupancy:
+        return Occupancy(torch.ones_like(self.occupancy.cells))
 
 
-@dataclass(frozen=True)
-class Sight:
-    """Where matter is seen in a picture.
-
-    Attributes:
-        cells: [N] that have any.
-        depth: [N, s^2] of their pixels, +inf where there is none; None: of no use.
-        surface: what the field has there; None: of no use.
-    """
-
-    cells: Tensor
-    depth: Tensor | None = None
-    surface: Surface | None = None
-
-
-@dataclass(frozen=True)
-class Glance:
-    """What is known of a frame before the pictures of the preceding ones are.
-
-    Attributes:
-        view: of its camera.
-        features: the field at low resolution.
-        cloud: the same as points, to be remembered.
-        used: which of the preceding frames show enough of the view, 0 for the newest.
-        preceding: their features in it.
-        sight: where matter is seen.
-    """
-
-    view: View
-    features: FeatureFrame
-    cloud: Cloud
-    used: Sequence[int]
-    preceding: Sequence[Points]
-    sight: Sight
-
-
-def most_doubted(doubt: Tensor, share: float) -> Tensor:
-    """Which of N cells, `share` of them, have the largest `doubt` [N]."""
-    return doubt.topk(math.ceil(share * len(doubt)), sorted=False).indices
-
-
-def _finish(camera: Camera, picture: Tensor, features: FeatureFrame, scale: int) -> Frame:
+def _finished(camera: Camera, picture: Tensor, frame: FeatureFrame, scale: int) -> Frame:
     """What the harness asks for: depth and opacity of the nearest low-resolution pixel."""
     size = slice(0, camera.height), slice(0, camera.width)
     depth, alpha = (
         image.repeat_interleave(scale, 0).repeat_interleave(scale, 1)[size]
-        for image in (features.depth, features.alpha)
+        for image in (frame.depth, frame.alpha)
     )
     return Frame(picture[size], depth, alpha)

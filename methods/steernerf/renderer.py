@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from bench.types import NullProbe, Probe
 from methods.engines import Network
-from methods.rendering.batch import FeatureFrame
+from methods.rendering.frame import FeatureFrame
 from methods.steernerf.beyond.cells import cells_near, largest_in_cell
 
 
@@ -40,14 +40,12 @@ class Observation:
         background: [K] that they are composited on.
         preceding: newest first, with an index for every pixel [H, W]; fewer than L after a cold
             start.
-        cells: [N] int64, the cells in which there may be anything; see `methods.steernerf.beyond.cells`.
+        cells: [N] int64, the cells in which there may be anything; see `beyond.cells`.
         history: the newest preceding picture in `cells`; None after a cold start, or where it is
             not used.
         surface: features of the field where the low-resolution depth has the surface of a pixel,
             and their opacity as the last of K + 1, with an index for every pixel of `cells`
             [N, s^2]; None where they are not used.
-        phase: of the samples of `frame` against the centres of its pixels, in pixels of the
-            picture.
         backend: of the kernels that a renderer calls.
     """
 
@@ -57,7 +55,6 @@ class Observation:
     cells: Tensor
     history: Detail | None
     surface: Points | None = None
-    phase: tuple[float, float] = (0.0, 0.0)
     backend: str = "auto"
 
 
@@ -77,12 +74,12 @@ class Drawing:
 
     Attributes:
         pictures: [B, H, W, 3].
-        doubt: [N] of all cells of the observations, one observation after the other: log of the
-            mean squared error that is expected there. None: the renderer does not say.
+        error: [N] estimated error of all cells, one observation after the other: the log of the
+            mean squared error of their pixels. None: the renderer does not estimate it.
     """
 
     pictures: Tensor
-    doubt: Tensor | None = None
+    error: Tensor | None = None
 
 
 UNWATCHED = NullProbe()
@@ -93,15 +90,13 @@ class Renderer2d(nn.Module, ABC):
 
     Attributes:
         scale: s.
-        doubts: it says where its pictures may be wrong.
-        shifts: it draws frames whose samples lie beside the centres of their pixels.
+        estimates_error: it says which cells of its pictures may be wrong.
         network: what is learned.
         engine: computes what the network does, in its place; see `methods.engines`.
     """
 
     scale: int
-    doubts = False
-    shifts = False
+    estimates_error = False
     network: Network
     engine: Callable[..., tuple[Tensor, ...]] | None = None
 
@@ -118,18 +113,3 @@ class Renderer2d(nn.Module, ABC):
     @abstractmethod
     def base(self, observations: Sequence[Observation]) -> Tensor:
         """The pictures [B, H, W, 3] that the network corrects: RGB, enlarged."""
-
-
-def check_size(name: str, got: int, least: int, most: int) -> None:
-    """Refuse, with a ValueError, a size that is not of `least` to `most`."""
-    if not least <= got <= most:
-        raise ValueError(f"{name}: expected {least} to {most}, got {got}")
-
-
-def check_refined(name: str, share: float, renderer: Renderer2d) -> None:
-    """Refuse, with a ValueError, a `share` of cells to be refined that `renderer` cannot choose."""
-    if share and not renderer.doubts:
-        raise ValueError(
-            f"{name}: {type(renderer).__name__} does not say where it may be wrong, expected 0, "
-            f"got {share}"
-        )

@@ -14,7 +14,7 @@ from methods.kernels.splat import gather
 from methods.steernerf.renderer import UNWATCHED, Drawing, Observation, Renderer2d
 
 
-class UnetRelease(Renderer2d):
+class UNet(Renderer2d):
     """The U-Net of the released code (`ReconstructionNet_v4`), at full resolution.
 
     Its input are the features of all frames, zero where nothing is: those of the present one at
@@ -32,7 +32,7 @@ class UnetRelease(Renderer2d):
     def __init__(self, channels: int, frames: int, scale: int, *, aligned: bool = False) -> None:
         super().__init__()
         self.channels, self.frames, self.scale, self.aligned = channels, frames, scale, aligned
-        self.network = _Unet(channels * (frames + 1))
+        self.network = _Network(channels * (frames + 1))
 
     def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Drawing:
         """See `Renderer2d`."""
@@ -62,7 +62,7 @@ class UnetRelease(Renderer2d):
         return torch.cat((*rgb, *rest), dim=-1).permute(2, 0, 1)
 
 
-class _Unet(Network):
+class _Network(Network):
     varying = ((),)
 
     def __init__(self, inputs: int) -> None:

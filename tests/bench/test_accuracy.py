@@ -133,21 +133,6 @@ def test_of_two_rounds_the_lower_counts():
     assert _costs([frame(9.0), frame(3.0), frame(5.0)], [True])["ms"] == 3.0
 
 
-def test_only_who_is_to_be_told_is_told_of_the_next_camera(tiny_scene, quiet_log):
-    class Foreseeing(Brighter):
-        def foresee(self, camera) -> bool:
-            self.turns.append((self.levels, "told"))
-            return True
-
-    turns: list = []
-    methods = {str(n): Foreseeing(tiny_scene, n, turns) for n in (0, 8)}
-    path = from_split(tiny_scene)
-    told, not_told = render_in_turns(methods, tiny_scene, path, QUICK, 1, quiet_log, told=["0"])
-    assert {levels for levels, turn in turns if turn == "told"} == {0}
-    assert told["latency_ms"] > told["ms"]
-    assert not_told["latency_ms"] == pytest.approx(not_told["ms"])
-
-
 def test_frames_without_a_ground_truth_are_not_scored(in_turns, tiny_scene):
     cameras = tiny_scene.splits["test"].cameras
     between = Trajectory("between", "test", (Step(cameras[0], 0), Step(cameras[1], None)))

@@ -89,26 +89,6 @@ def test_a_frame_that_raises_leaves_no_record_and_the_clock_usable():
     assert frame.stages_ns == {"other": 1}
 
 
-def test_the_latency_of_a_frame_has_the_one_before_it_if_its_camera_was_known_by_then():
-    clock = clock_reading([0, 10, 100, 130, 200, 207])
-    for next_known in (True, False, False):
-        with clock.frame(next_known):
-            pass
-    assert [frame.total_ns for frame in clock.frames] == [10, 30, 7]
-    assert [frame.latency_ns for frame in clock.frames] == [10, 10 + 30, 7]
-
-
-def test_the_latency_after_a_frame_that_raised_is_that_of_a_frame_alone():
-    clock = clock_reading(itertools.count())
-    with clock.frame(next_known=True):
-        pass
-    with pytest.raises(KeyError), clock.frame(next_known=True):
-        raise KeyError("from the method")
-    with clock.frame():
-        pass
-    assert clock.frames[-1].latency_ns == clock.frames[-1].total_ns
-
-
 def test_a_stage_outside_a_frame_a_frame_in_a_frame_and_a_stage_named_other_are_refused():
     clock = clock_reading(itertools.count())
     with (

@@ -54,11 +54,6 @@ def test_a_negative_warmup_is_refused():
         EvaluationProtocol(name="mine", warmup=-1)
 
 
-def test_a_lookahead_needs_frames_that_follow_each_other():
-    with pytest.raises(SteerbenchError, match=r"protocol\.lookahead: expected false .*, got true"):
-        EvaluationProtocol(name="other", memory="cold", lookahead=True)
-
-
 def test_a_picture_is_composited_with_its_straight_alpha(device):
     picture = torch.tensor([[[255, 0, 51, 0], [255, 0, 51, 255], [255, 0, 51, 102]]]).byte()
     background = torch.tensor([1.0, 0.5, 0.0], device=device)

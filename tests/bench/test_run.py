@@ -15,8 +15,7 @@ from bench.protocol import EvaluationProtocol, composite
 from bench.results import COLUMNS, Store
 from bench.run import measure
 from bench.trajectories import from_split
-from bench.types import Budget, Camera, SteerbenchError
-from tests.conftest import OffsetMethod
+from bench.types import Budget, SteerbenchError
 
 QUICK = EvaluationProtocol(name="quick", lpips=(), warmup=2)
 BUDGET = Budget("tiny", steps=1, samples=1)
@@ -175,48 +174,6 @@ def test_frames_with_too_little_to_look_back_on_are_cold(run, offset_method, tin
 def test_a_cut_is_not_announced_to_the_method(run, offset_method, tiny_scene):
     run(offset_method, trajectory=with_cuts(from_split(tiny_scene), 2, 4))
     assert offset_method.calls.count("reset") == 2
-
-
-AHEAD = replace(QUICK, name="ahead", lookahead=True)
-
-
-class Told(OffsetMethod):
-    """Can, or cannot, begin a frame beside the one before it; lists what it was told of."""
-
-    of_use = True
-
-    def foresee(self, camera: Camera) -> bool:
-        self.calls.append(f"then {next(known[0] for known in self._known if known[1] is camera)}")
-        return self.of_use
-
-
-def test_with_lookahead_a_method_is_told_of_the_next_camera_and_has_a_latency(run, device):
-    method = Told(device, 0.0)
-    measured = run(method, protocol=AHEAD)
-    then = [call for i in range(6) for call in (f"then r_{min(i + 1, 5)}", f"r_{i}")]
-    warmup = ["then r_5", "r_0", "then r_5", "r_5"]  # as many are begun as there are frames
-    assert method.calls == ["fit", "reset", *warmup, "reset", *then]
-    ms, latency = measured.frames["frame_ms"], measured.frames["latency_ms"]
-    assert latency.tolist() == pytest.approx((ms + ms.shift(fill_value=0.0)).tolist())
-    found = row(measured.rows, "latency_ms")
-    assert (found["value"], found["unit"], found["n"]) == (latency.mean(), "ms", 6)
-    assert value(measured.rows, "fps") == pytest.approx(1000 / ms.mean())
-
-
-def test_a_method_that_has_no_use_for_the_next_camera_has_the_latency_of_a_frame(
-    run, offset_method, device
-):
-    useless = Told(device, 0.0)
-    useless.of_use = False
-    for method in (useless, offset_method):
-        frames = run(method, protocol=AHEAD).frames
-        assert frames["latency_ms"].tolist() == frames["frame_ms"].tolist()
-
-
-def test_without_lookahead_nobody_is_told_and_there_is_no_latency(run, device):
-    method = Told(device, 0.0)
-    assert "latency_ms" not in set(run(method).rows["metric"])
-    assert not [call for call in method.calls if call.startswith("then")]
 
 
 @pytest.mark.parametrize(

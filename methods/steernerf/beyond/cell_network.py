@@ -1,4 +1,4 @@
-"""The network on cells that the lean 2D renderer asks, after ConvNeXt (Liu et al. 2022)."""
+"""The network of the lean 2D renderer, on cells, after ConvNeXt (Liu et al. 2022)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ LEAK = 0.1
 
 
 class CellNetwork(Network):
-    """A trunk of depthwise 3 x 3 convolutions and matrix products, and what is read from it.
+    """A trunk of depthwise 3 x 3 convolutions and matrix products, with one head for each output.
 
     Args:
-        layout: of the rows that it is told.
+        layout: of its input rows.
         width: channels of the trunk.
         blocks: residual blocks of the trunk.
     """
@@ -33,24 +33,24 @@ class CellNetwork(Network):
         self.trunk = nn.ModuleList(_Block(width) for _ in range(blocks))
         self.leave = _Linear(width, cell * (3 + layout.history))
         self.read = _Linear(width, 3 * (layout.channels + 1)) if layout.surface else None
-        self.doubt = _Linear(width, 1)
-        for layer in filter(None, (self.leave, self.read, self.doubt)):
+        self.error = _Linear(width, 1)
+        for layer in filter(None, (self.leave, self.read, self.error)):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
 
     def forward(self, rows: Tensor, neighbours: Tensor) -> tuple[Tensor, ...]:
-        """What `lift.draw` makes pixels of, from the `rows` [R, layout.width] of cells that have
+        """What `depth_to_space` makes pixels of, from the `rows` [R, layout.width] of cells with
         `neighbours` [R, 9].
 
         Returns:
-            answer [R, s^2 (3 + layout.history)]; doubt [R, 1], log of the mean squared error to be
-            expected; with `layout.surface`, matrix [R, 3 (K + 1)].
+            answer [R, s^2 (3 + layout.history)]; estimated error [R, 1], the log of the mean
+            squared error; with `layout.surface`, matrix [R, 3 (K + 1)].
         """
         hidden = self.enter(rows).to(rows)
         for block in self.trunk:
             hidden = block(hidden, neighbours, self.backend)
         hidden = functional.leaky_relu(hidden, LEAK)
-        heads = (self.leave, self.doubt, self.read)
+        heads = (self.leave, self.error, self.read)
         return tuple(head(hidden) for head in heads if head is not None)
 
     def products(self, *inputs: Tensor) -> int:

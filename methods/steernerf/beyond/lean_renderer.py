@@ -16,12 +16,13 @@ from methods.kernels.depthwise import neighbours_of
 from methods.kernels.space_to_depth import Layout, draw, lift
 from methods.steernerf.beyond.cell_network import CellNetwork
 from methods.steernerf.beyond.cells import number, paint
-from methods.steernerf.renderer import UNWATCHED, Drawing, Observation, Renderer2d, check_size
+from methods.steernerf.options import check_size
+from methods.steernerf.renderer import UNWATCHED, Drawing, Observation, Renderer2d
 
-GENERIC = Path(__file__).parent / "weights" / "generic.safetensors"
-"""Weights trained on other scenes, by `steerbench generic`."""
+PRETRAINED = Path(__file__).parent / "weights" / "lean.safetensors"
+"""Weights trained on other scenes, by `steerbench pretrain`."""
 
-GENERIC_GROUPS = (
+PRETRAINED_GROUPS = (
     ("present", 1, 4),
     ("preceding 0", 16, 4),
     ("preceding 1", 16, 4),
@@ -30,13 +31,13 @@ GENERIC_GROUPS = (
 )
 """What those weights expect: K = 3, L = 2, s = 4."""
 
-GENERIC_SCALE = 4
+PRETRAINED_SCALE = 4
 
 
 Groups = Sequence[tuple[str, int, int]]
 
 
-class SpaceToDepth(Renderer2d):
+class LeanRenderer(Renderer2d):
     """A network on cells: the s x s pixels of a low-resolution pixel are channels of its cell.
 
     A picture is the aligned bilinear enlargement of the present RGB (the base), blended pixel by
@@ -54,14 +55,13 @@ class SpaceToDepth(Renderer2d):
         scale: s.
         width: channels of the trunk.
         blocks: residual blocks of the trunk.
-        init: "generic": start from the weights that come with the package, trained on other
+        init: "pretrained": start from the weights that come with the package, trained on other
             scenes; "scratch": from random ones.
         history: use the preceding picture.
         surface: use the features at the surface, pixel by pixel.
     """
 
-    doubts = True
-    shifts = True
+    estimates_error = True
     network: CellNetwork
 
     def __init__(
@@ -72,7 +72,7 @@ class SpaceToDepth(Renderer2d):
         *,
         width: int = 64,
         blocks: int = 6,
-        init: Literal["generic", "scratch"] = "generic",
+        init: Literal["pretrained", "scratch"] = "pretrained",
         history: bool = True,
         surface: bool = True,
     ) -> None:
@@ -82,17 +82,17 @@ class SpaceToDepth(Renderer2d):
         self.channels, self.frames, self.scale = channels, frames, scale
         layout = self.layout = Layout(channels, frames, scale, history and frames > 0, surface)
         self.network = CellNetwork(layout, width, blocks)
-        if init == "generic":
-            self._start_from(load_file(GENERIC))
+        if init == "pretrained":
+            self._start_from(load_file(PRETRAINED))
 
     def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Drawing:
         """See `Renderer2d`."""
         base, rows = self._lift(observations)
         neighbours, backend = self._neighbours(observations, len(rows)), observations[0].backend
         self.network.backend = backend
-        answer, doubt, *matrix = (x.to(base) for x in self.run(probe, rows, neighbours))
+        answer, error, *matrix = (x.to(base) for x in self.run(probe, rows, neighbours))
         drawn = draw(base, rows, answer, next(iter(matrix), None), self.layout, backend=backend)
-        return Drawing(self._paint(observations, drawn), doubt[: len(base), 0])
+        return Drawing(self._paint(observations, drawn), error[: len(base), 0])
 
     def base(self, observations: Sequence[Observation]) -> Tensor:
         """See `Renderer2d`."""
@@ -107,7 +107,6 @@ class SpaceToDepth(Renderer2d):
                 None,
                 None,
                 alone,
-                o.phase,
                 backend=o.backend,
             )[0]
             for o in observations
@@ -144,7 +143,6 @@ class SpaceToDepth(Renderer2d):
             history,
             surface,
             layout,
-            o.phase,
             multiple=multiple,
             backend=o.backend,
         )
@@ -164,7 +162,7 @@ class SpaceToDepth(Renderer2d):
         return paint(shown, size, self.scale, less + background, background)
 
     @torch.no_grad()
-    def _start_from(self, generic: Mapping[str, Tensor]) -> None:
+    def _start_from(self, pretrained: Mapping[str, Tensor]) -> None:
         """Take over the weights of a renderer of the same trunk that was trained at K = 3, L = 2.
 
         Weights of features beyond RGB, and of frames it did not have, stay as they are.
@@ -173,16 +171,18 @@ class SpaceToDepth(Renderer2d):
             ValueError: this renderer is of another shape.
         """
         weights = dict(self.network.named_parameters())
-        unused = {name for name in generic if name.startswith("read") and not self.layout.surface}
-        ours, theirs = _same_columns(self.layout.groups, GENERIC_GROUPS)
+        unused = {
+            name for name in pretrained if name.startswith("read") and not self.layout.surface
+        }
+        ours, theirs = _same_columns(self.layout.groups, PRETRAINED_GROUPS)
         slots = range(self.scale**2)
         written = [4 * slot + i for slot in slots for i in range(3 + self.layout.history)]
         matrix = [(self.channels + 1) * row + column for row in range(3) for column in range(4)]
         try:
-            if weights.keys() != generic.keys() - unused or self.scale != GENERIC_SCALE:
+            if weights.keys() != pretrained.keys() - unused or self.scale != PRETRAINED_SCALE:
                 raise RuntimeError("other layers, or another scale")
             for name, weight in weights.items():
-                new = generic[name].float()
+                new = pretrained[name].float()
                 if name == "enter.weight":
                     weight[:, ours] = new[:, theirs]
                 elif name.startswith("read"):
@@ -191,8 +191,8 @@ class SpaceToDepth(Renderer2d):
                     weight.copy_(new[written] if name.startswith("leave") else new)
         except RuntimeError as error:
             raise ValueError(
-                "renderer.init=generic: the weights are those of a renderer of the default scale, "
-                f"width and blocks ({error}): use renderer.init=scratch"
+                "renderer.init=pretrained: those weights are of a renderer of the default "
+                f"scale, width and blocks ({error}): use renderer.init=scratch"
             ) from error
 
 

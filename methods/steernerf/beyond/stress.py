@@ -20,7 +20,7 @@ from methods.engines.openvino_engine import OpenVino
 from methods.engines.tensorrt_engine import TensorRt
 from methods.engines.torch_engine import TorchEngine
 from methods.kernels.depthwise import neighbours_of
-from methods.steernerf.beyond.lean_renderer import SpaceToDepth
+from methods.steernerf.beyond.lean_renderer import LeanRenderer
 
 ENGINES: tuple[type[Engine], ...] = (TorchEngine, OpenVino, OnnxRuntime, TensorRt)
 CELLS: list[Cell] = [
@@ -83,9 +83,9 @@ def _case(
 
 
 @cache
-def _renderer() -> SpaceToDepth:
+def _renderer() -> LeanRenderer:
     """With the weights that come with the package."""
-    return SpaceToDepth(3, 2, 4).requires_grad_(False)
+    return LeanRenderer(3, 2, 4).requires_grad_(False)
 
 
 def _placed(rows: Tensor, device: str) -> Inputs:

@@ -1,80 +1,62 @@
-"""Pictures that a trained field shows at views nobody photographed, to learn from as if true."""
+"""Distilled views: what the field of stage 1 shows to random cameras, to learn from as well."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from bench.cameras import pack_camera, place_camera, unpack_camera
-from bench.motion import novel_view
+from bench.motion import novel_view, viewing_target
 from bench.sharing import missing
-from bench.types import Camera, Log, NullProbe, Scene
-from methods.instant_ngp.stage1 import Pretrained
-from methods.steernerf.range_reduction import render_guided
+from bench.sources import digest
+from bench.types import Budget, Camera, Log, NullProbe, Scene
+from methods.instant_ngp.stage1 import Setup, TrainedField
+from methods.rendering.frame import everywhere, render_frame
+from methods.rendering.march import March
 from methods.steernerf.training.sequences import TrueView
 from methods.training import checkpoint
 
 
 def distilled_views(
-    trained: Pretrained,
-    scene: Scene,
-    target: Tensor,
-    count: int,
-    seed: int,
-    folder: Path,
-    log: Log,
+    setup: Setup, trained: TrainedField, scene: Scene, budget: Budget, count: int, log: Log
 ) -> tuple[list[TrueView], float]:
     """`count` views among the training cameras as `trained` shows them at full resolution, and the
     seconds that it took to render them.
 
-    Args:
-        target: [3] the point that the cameras look at, more or less.
-        folder: where they are kept, and found again.
+    They are kept, and found again by the same `setup`, `scene` and `budget`.
     """
-    path = folder / "views.safetensors"
+    if not count:
+        return [], 0.0
+    key = {**setup.key(scene, budget), "views": count, "distillation": digest(distilled_views)}
+    path = log.stage_dir("distilled", key) / "views.safetensors"
     with missing(path, log) as to_render:
         if to_render:
-            generator = torch.Generator().manual_seed(seed)
-            taken = scene.splits["train"].cameras
+            generator = torch.Generator().manual_seed(setup.seed)
+            taken, target = scene.splits["train"].cameras, viewing_target(scene)
             cameras = [novel_view(taken, target, generator) for _ in range(count)]
-            began = time.monotonic()
-            tensors = _rendered(trained, scene, cameras, log)
-            seconds = time.monotonic() - began
-            checkpoint.write(path, tensors, {"views": count, "seconds": seconds})
+            began, tensors = time.monotonic(), {}
+            with log.progress("distilling", count) as progress:
+                for number, camera in enumerate(cameras):
+                    tensors[f"{number}.picture"] = _picture(trained, camera, scene.background)
+                    tensors[f"{number}.camera"] = pack_camera(camera)
+                    progress.advance()
+            figures = {"views": count, "seconds": time.monotonic() - began}
+            checkpoint.write(path, tensors, figures)
     tensors, figures = checkpoint.read(path)
     with checkpoint.restoring(path):
-        views = [_unpacked(tensors, number) for number in range(int(figures["views"]))]
+        views = [
+            TrueView(unpack_camera(tensors[f"{number}.camera"]), tensors[f"{number}.picture"])
+            for number in range(int(figures["views"]))
+        ]
         return views, figures["seconds"]
 
 
-def _rendered(
-    trained: Pretrained, scene: Scene, views: Sequence[Camera], log: Log
-) -> dict[str, Tensor]:
-    tensors: dict[str, Tensor] = {}
-    with log.progress("distilling", len(views)) as progress:
-        for number, camera in enumerate(views):
-            tensors |= _packed(number, camera, _picture(trained, camera, scene.background))
-            progress.advance()
-    return tensors
-
-
-def _picture(trained: Pretrained, camera: Camera, background: Tensor) -> Tensor:
+def _picture(trained: TrainedField, camera: Camera, background: Tensor) -> Tensor:
     """uint8 [H, W, 3]."""
-    device = trained.field.table.device
-    camera = place_camera(camera, device)
-    rgb = render_guided(
-        trained.field, camera, trained.occupancy, background.to(device), NullProbe(), None
-    ).values
-    return (rgb.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
-
-
-def _packed(number: int, camera: Camera, picture: Tensor) -> dict[str, Tensor]:
-    return {f"{number}.picture": picture, f"{number}.camera": pack_camera(camera)}
-
-
-def _unpacked(tensors: Mapping[str, Tensor], number: int) -> TrueView:
-    return TrueView(unpack_camera(tensors[f"{number}.camera"]), tensors[f"{number}.picture"])
+    field, probe = trained.field, NullProbe()
+    camera, background = place_camera(camera, field.device), background.to(field.device)
+    render = everywhere(field, trained.occupancy, probe, March())
+    frame = render_frame(field, camera, trained.occupancy, background, probe, render)
+    return (frame.values.clamp(0, 1) * 255).round().to(torch.uint8).cpu()

@@ -12,18 +12,18 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel
 
-from bench.cameras import cast
 from bench.types import Rays
+from methods.instant_ngp.field import HashField
+from methods.instant_ngp.optimiser import FieldOptimiser
 from methods.kernels import multiplies_bf16
 from methods.rendering.batch import opacity_entropy, render_batch
-from methods.rendering.occupancy import STEP
-from methods.steernerf.beyond.cells import centres, pixels_of
-from methods.steernerf.pipeline import Pipeline, most_doubted
+from methods.steernerf.beyond.cells import pixels_of
+from methods.steernerf.beyond.refinement import rays_of_cells, worst_cells
 from methods.steernerf.renderer import Drawing, Renderer2d
-from methods.steernerf.training.patches import Batch, Patches, Through
+from methods.steernerf.training.patches import Batch, Patches, PatchSource
 from methods.steernerf.training.sequences import MotionOptions
 from methods.training import checkpoint, loop
-from methods.training.optimiser import FieldOptimiser, cosine, step_at
+from methods.training.optimiser import cosine, step_at
 
 LEAST_ERROR = 1e-6
 """Mean squared error of a cell below which one is as good as another."""
@@ -47,7 +47,7 @@ class JointOptions:
         precision: of the 2D renderer's convolutions while it is trained. Where the device has no
             products of bfloat16, "bf16" is "fp32".
         opacity_entropy: weight of -o ln o of the rays.
-        doubt: weight of the squared error of the doubt, in log.
+        error_weight: of the squared error of the estimated error, in log.
         refined: share of the cells that are refined while it is trained.
         refined_rays: pixels of those that the field learns from in a step.
         clip: largest norm of the 2D renderer's gradient.
@@ -58,7 +58,7 @@ class JointOptions:
     """
 
     field: Literal["joint", "frozen"] = "joint"
-    through: Through = "present"
+    through: Literal["all", "present"] = "present"
     rate: float = 1e-3
     field_rate: float = 1e-3
     final_rate: float = 0.01
@@ -66,7 +66,7 @@ class JointOptions:
     batch: int = 2
     precision: Literal["bf16", "fp32"] = "bf16"
     opacity_entropy: float = 1e-3
-    doubt: float = 1e-4
+    error_weight: float = 1e-4
     refined: float = 0.2
     refined_rays: int = 2048
     clip: float = 1.0
@@ -83,7 +83,7 @@ class JointOptions:
             "patch": (self.patch >= 1, "1 or more"),
             "batch": (self.batch >= 1, "1 or more"),
             "opacity_entropy": (self.opacity_entropy >= 0, "0 or more"),
-            "doubt": (self.doubt >= 0, "0 or more"),
+            "error_weight": (self.error_weight >= 0, "0 or more"),
             "refined": (0 <= self.refined <= 1, "a share of 0 to 1"),
             "refined_rays": (self.refined_rays >= 1, "1 or more"),
             "clip": (self.clip > 0, "more than 0"),
@@ -148,7 +148,7 @@ class RendererTraining:
         with torch.autocast(kind, torch.bfloat16, enabled=half):
             drawing = self.renderer(batch.observations)
         loss = functional.mse_loss(drawing.pictures, batch.truth)
-        (loss + self._doubt_loss(batch, drawing) + self._field_loss(batch, drawing)).backward()
+        (loss + self._error_loss(batch, drawing) + self._field_loss(batch, drawing)).backward()
         value = loss.item()
         if not math.isfinite(value):
             loop.check_finite(self, {"loss": loss, "picture": drawing.pictures})
@@ -159,9 +159,9 @@ class RendererTraining:
             base = functional.mse_loss(self.renderer.base(batch.observations), batch.truth).item()
         return {"": value, "base": base}
 
-    def _doubt_loss(self, batch: Batch, drawing: Drawing) -> Tensor | float:
-        """How far the errors that the renderer expected are from those it made."""
-        if drawing.doubt is None:
+    def _error_loss(self, batch: Batch, drawing: Drawing) -> Tensor | float:
+        """How far the estimated errors of the renderer are from the errors it made."""
+        if drawing.error is None:
             return 0.0
         errors = (drawing.pictures.detach() - batch.truth).square().mean(dim=-1)
         made = [
@@ -169,7 +169,7 @@ class RendererTraining:
             for error, o in zip(errors, batch.observations, strict=True)
         ]
         wanted = (torch.cat(made) + LEAST_ERROR).log()
-        return self.options.doubt * functional.mse_loss(drawing.doubt, wanted)
+        return self.options.error_weight * functional.mse_loss(drawing.error, wanted)
 
     def _field_loss(self, batch: Batch, drawing: Drawing) -> Tensor | float:
         """What the field learns from, beside the pictures that are drawn."""
@@ -219,23 +219,21 @@ class RendererTraining:
 
 
 class JointTraining(RendererTraining):
-    """Stage 2 end to end: the field learns through the 2D renderer.
+    """Stage 2 end to end: the field of `patches` learns through the 2D renderer, in place."""
 
-    Args:
-        pipeline: that `patches` go through; its field is trained in place.
-    """
+    patches: PatchSource
 
     def __init__(
         self,
-        pipeline: Pipeline,
+        field: HashField,
         renderer: Renderer2d,
-        patches: Patches,
+        patches: PatchSource,
         options: JointOptions,
         steps: int,
         generator: torch.Generator,
     ) -> None:
         super().__init__(renderer, patches, options, steps, generator)
-        self.pipeline, self.field = pipeline, pipeline.field
+        self.field = field
         self.field_optimiser = FieldOptimiser(self.field, fused=True)
 
     def _field_loss(self, batch: Batch, drawing: Drawing) -> Tensor | float:
@@ -250,16 +248,16 @@ class JointTraining(RendererTraining):
 
         Without it the field forgets how to look at full resolution.
         """
-        pipeline = self.pipeline
-        if not pipeline.options.refined or drawing.doubt is None:
+        pipeline, rendering = self.patches.pipeline, self.patches.rendering
+        if not rendering.refined or drawing.error is None:
             return 0.0
-        scale, rays, truth = pipeline.options.scale, [], []
-        doubts = drawing.doubt.detach().split([len(o.cells) for o in batch.observations])
-        for o, view, picture, doubt in zip(
-            batch.observations, batch.views, batch.truth, doubts, strict=True
+        scale, rays, truth = pipeline.model.scale, [], []
+        errors = drawing.error.detach().split([len(o.cells) for o in batch.observations])
+        for o, view, picture, error in zip(
+            batch.observations, batch.views, batch.truth, errors, strict=True
         ):
-            worst = o.cells[most_doubted(doubt, pipeline.options.refined)]
-            rays.append(cast(view.full, centres(worst, view.low.width, scale).flatten(0, 1)))
+            worst = o.cells[worst_cells(error, rendering.refined)]
+            rays.append(rays_of_cells(worst, view))
             truth.append(pixels_of(picture, worst, scale).flatten(0, 1))
         wanted, every = torch.cat(truth), Rays.joined(rays)
         if not len(wanted):
@@ -269,10 +267,8 @@ class JointTraining(RendererTraining):
             self.field,
             every.take(some),
             pipeline.occupancy,
-            jitter=None,
+            rendering.refined_march,
             background=pipeline.background,
-            stop=pipeline.options.stop,
-            step=pipeline.options.refined_steps * STEP,
         )
         error = (pixels.values[:, :3] - wanted[some]).square().sum() / len(some)
         return error * len(wanted) / batch.truth.numel()

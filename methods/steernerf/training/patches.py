@@ -9,19 +9,18 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
-from bench.cameras import cast, crop_camera, pixel_grid
+from bench.cameras import cast, pixel_grid
 from bench.protocol import composite
 from bench.types import Camera, NullProbe, Rays
 from methods.kernels.composite import Pixels
-from methods.rendering.batch import FeatureFrame, rays_at_matter, render_batch
-from methods.rendering.occupancy import STEP
+from methods.rendering.batch import render_batch
+from methods.rendering.frame import FeatureFrame, rays_at_matter
 from methods.steernerf.buffer import Cloud
-from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.renderer import Observation, Points
 from methods.steernerf.training.sequences import Sequence, SequencePool
 from methods.steernerf.view import View
 
-Through = Literal["all", "present"]
+Through = Literal["all", "present", "none"]
 
 
 @dataclass(frozen=True)
@@ -82,21 +81,14 @@ class PatchSource:
 
     Args:
         side: of a patch, low-resolution pixels.
-        learning: the field is to learn from the patches.
-        through: which frames it learns from: "all", or only the "present" one.
+        through: frames that the field learns from: "all", only the "present" one, or "none".
     """
 
     def __init__(
-        self,
-        pipeline: Pipeline,
-        pool: SequencePool,
-        side: int,
-        learning: bool,
-        through: Through,
-        generator: torch.Generator,
+        self, pool: SequencePool, side: int, through: Through, generator: torch.Generator
     ) -> None:
-        self.pipeline, self.pool, self.side = pipeline, pool, side
-        self.learning, self.through, self.generator = learning, through, generator
+        self.pipeline, self.rendering = pool.pipeline, pool.rendering
+        self.pool, self.side, self.through, self.generator = pool, side, through, generator
 
     def draw(self, count: int) -> Batch:
         """See `Patches`."""
@@ -115,7 +107,7 @@ class PatchSource:
 
     def cut(self, sequence: Sequence) -> Patch:
         """A random patch of `sequence` in which there is more than background."""
-        scale, view = self.pipeline.options.scale, sequence.view
+        view = sequence.view
         place = sequence.cells[self._random(len(sequence.cells))].tolist()
         size = view.low.height, view.low.width
         height, width = (min(self.side, side) for side in size)
@@ -123,25 +115,22 @@ class PatchSource:
             min(max(centre - self._random(extent), 0), side - extent)
             for centre, extent, side in zip(place, (height, width), size, strict=True)
         )
-        low = crop_camera(view.low, left, top, width, height)
-        full = crop_camera(view.full, left * scale, top * scale, width * scale, height * scale)
-        cut = View(full, low, view.phase)
-        seen, rays = rays_at_matter(low, self.pipeline.occupancy)
-        patch = Patch(sequence, cut, self._truth(sequence, top, left, full), seen, [], [], [rays])
+        cut = view.crop(left, top, width, height)
+        seen, rays = rays_at_matter(cut.low, self.pipeline.occupancy)
+        truth = self._truth(sequence, top, left, cut.full)
+        patch = Patch(sequence, cut, truth, seen, [], [], [rays])
         for frame in sequence.buffer.frames:
-            index, _ = frame.cloud.land(
-                full, self.pipeline.options.reprojection, self.pipeline.backend
-            )
+            index = self.pipeline.reproject(frame.cloud, cut).index
             shown = index[index >= 0].unique().long()
             patch.indices.append(index)
             patch.shown.append(shown)
-            if self.learning and self.through == "all":
+            if self.through == "all":
                 patch.rays.append(_rays_of(frame.cloud, shown))
         return patch
 
     def _truth(self, sequence: Sequence, top: int, left: int, full: Camera) -> Tensor:
         """The true picture [H, W, 3] of the patch; the background where it ends."""
-        scale = self.pipeline.options.scale
+        scale = self.pipeline.model.scale
         background = self.pipeline.background[:3]
         rows = slice(top * scale, top * scale + full.height)
         columns = slice(left * scale, left * scale + full.width)
@@ -155,15 +144,9 @@ class PatchSource:
         rays = [rays for patch in patches for rays in patch.rays]
         together = Rays.joined(rays)
         pipeline = self.pipeline
-        with torch.set_grad_enabled(self.learning):
+        with torch.set_grad_enabled(self.through != "none"):
             pixels, _ = render_batch(
-                pipeline.low_field,
-                together,
-                pipeline.occupancy,
-                jitter=None,
-                background=None,
-                stop=pipeline.options.stop,
-                step=pipeline.options.steps * STEP,
+                pipeline.field, together, pipeline.occupancy, self.rendering.march
             )
             parts = iter(_split(pixels, [len(r.origins) for r in rays]))
             observations = [self._observation(p, [next(parts) for _ in p.rays]) for p in patches]
@@ -179,8 +162,7 @@ class PatchSource:
             values[age] = values[age].index_copy(0, patch.shown[age], pixels.values + shine)
         points = [Points(v, i) for v, i in zip(values, patch.indices, strict=True)]
         newest = frames[0] if frames else None
-        sight = self.pipeline.sight(frame, points, patch.view, NullProbe())
-        return self.pipeline.observe(frame, points, newest, patch.view, sight, NullProbe())
+        return self.pipeline.observe(frame, points, newest, patch.view, self.rendering, NullProbe())
 
     def _spread(self, patch: Patch, pixels: Pixels) -> FeatureFrame:
         """All pixels of the patch, from those that were rendered."""

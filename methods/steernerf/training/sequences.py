@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bench.motion import preceding
+from bench.motion import preceding, viewing_target
 from bench.types import Camera, NullProbe, Scene
 from methods.steernerf.buffer import RenderingBuffer
+from methods.steernerf.options import Rendering
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.view import View
 from methods.training.checkpoint import part
@@ -30,10 +31,33 @@ class TrueView:
     picture: Tensor
 
 
-def true_views(scene: Scene) -> list[TrueView]:
-    """The training pictures of `scene`."""
-    split = scene.splits["train"]
-    return [TrueView(c, p) for c, p in zip(split.cameras, split.images, strict=True)]
+@dataclass(frozen=True)
+class TrainingViews:
+    """The views of a scene that a 2D renderer learns from.
+
+    Attributes:
+        real: the training pictures.
+        target: [3] the point that the cameras look at, more or less.
+        distilled: views whose pictures a trained field has rendered.
+        share: of the sequences that end in a distilled view.
+    """
+
+    real: Seq[TrueView]
+    target: Tensor
+    distilled: Seq[TrueView] = ()
+    share: float = 0.0
+
+    @classmethod
+    def of(cls, scene: Scene, distilled: Seq[TrueView] = (), share: float = 0.0) -> TrainingViews:
+        """The training pictures of `scene`, and a `share` of the `distilled` views."""
+        split = scene.splits["train"]
+        real = [TrueView(c, p) for c, p in zip(split.cameras, split.images, strict=True)]
+        return cls(real, viewing_target(scene), distilled, share)
+
+    @property
+    def all(self) -> Seq[TrueView]:
+        """The real views, then the distilled ones."""
+        return [*self.real, *self.distilled]
 
 
 @dataclass
@@ -92,26 +116,21 @@ class SequencePool:
     """Sequences that end in randomly chosen views, always as fresh as `MotionOptions` says.
 
     Args:
-        real: training views.
-        distilled: views whose picture a trained field has rendered.
-        share: of the sequences that end in a distilled view.
-        target: [3] the point that motions turn about.
+        pipeline: renders the frames that precede a view,
+        rendering: in this way.
+        views: that sequences end in.
     """
 
     def __init__(
         self,
         pipeline: Pipeline,
-        real: Seq[TrueView],
-        distilled: Seq[TrueView],
-        share: float,
-        target: Tensor,
+        rendering: Rendering,
+        views: TrainingViews,
         options: MotionOptions,
         generator: torch.Generator,
     ) -> None:
-        self._pipeline, self._target, self._options = pipeline, target, options
-        self._views, self._real = [*real, *distilled], len(real)
-        self._share = share if distilled else 0.0
-        self._generator = generator
+        self.pipeline, self.rendering = pipeline, rendering
+        self._views, self._options, self._generator = views, options, generator
         self._pool: list[Sequence] = []
 
     def draw(self) -> Sequence:
@@ -143,19 +162,21 @@ class SequencePool:
 
     def _restored(self, tensors: Mapping[str, Tensor]) -> Sequence:
         number, uses, lasting = tensors["figures"].tolist()
-        buffer = RenderingBuffer(self._pipeline.options.frames)
-        buffer.restore(tensors, self._pipeline.background.device)
-        cells = _cells_with_content(self._views[number].picture, self._pipeline)
+        buffer = RenderingBuffer(self.pipeline.model.frames)
+        buffer.restore(tensors, self.pipeline.background.device)
+        cells = _cells_with_content(self._views.all[number].picture, self.pipeline)
         return self._sequence(number, buffer, cells, uses, bool(lasting))
 
     def _make(self) -> Sequence:
-        distilled = self._chance() < self._share
-        first, end = (self._real, len(self._views)) if distilled else (0, self._real)
-        number = first + self._random(end - first)
-        options = self._pipeline.options
-        buffer = RenderingBuffer(options.frames, turn=self._random(options.scale**2))
-        cells = _cells_with_content(self._views[number].picture, self._pipeline)
-        return self._ended(number, self._motion(self._views[number]), buffer, cells)
+        views = self._views
+        distilled = self._chance() < (views.share if views.distilled else 0.0)
+        first, pictures = (len(views.real), views.distilled) if distilled else (0, views.real)
+        number = first + self._random(len(pictures))
+        self._random(self.pipeline.model.scale**2)
+        buffer = RenderingBuffer(self.pipeline.model.frames)
+        view = views.all[number]
+        cells = _cells_with_content(view.picture, self.pipeline)
+        return self._ended(number, self._motion(view), buffer, cells)
 
     def _go_on(self, old: Sequence) -> Sequence:
         """Go on from the view that `old` ends in, there and back."""
@@ -167,24 +188,24 @@ class SequencePool:
     def _motion(self, truth: TrueView) -> list[Camera]:
         options = self._options
         count = self._random(options.length + 1)
-        return preceding(truth.camera, self._target, count, options.degrees, self._generator)
+        return preceding(truth.camera, self._views.target, count, options.degrees, self._generator)
 
     def _ended(
         self, number: int, motion: Seq[Camera], buffer: RenderingBuffer, cells: Tensor
     ) -> Sequence:
         """The sequence of a view whose `buffer` has seen the frames of a `motion` besides."""
-        if self._pipeline.options.frames:
+        if self.pipeline.model.frames:
             for camera in motion:
-                self._pipeline.render(camera, buffer, NullProbe())
+                self.pipeline.render(camera, buffer, self.rendering, NullProbe())
         # Without frames before it, a view that goes on would be the same once more.
-        lasting = self._chance() < self._options.longer and self._pipeline.options.frames > 0
+        lasting = self._chance() < self._options.longer and self.pipeline.model.frames > 0
         return self._sequence(number, buffer, cells, self._options.uses, lasting)
 
     def _sequence(
         self, number: int, buffer: RenderingBuffer, cells: Tensor, uses: int, lasting: bool
     ) -> Sequence:
-        truth = self._views[number]
-        view = self._pipeline.view(truth.camera, buffer.turn)
+        truth = self._views.all[number]
+        view = self.pipeline.view(truth.camera)
         return Sequence(number, truth, view, buffer, cells, uses, lasting)
 
     def _chance(self) -> float:
@@ -195,7 +216,7 @@ class SequencePool:
 
 
 def _cells_with_content(picture: Tensor, pipeline: Pipeline) -> Tensor:
-    scale = pipeline.options.scale
+    scale = pipeline.model.scale
     if picture.shape[-1] == 4:
         content = picture[..., 3] > 0
     else:

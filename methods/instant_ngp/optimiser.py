@@ -1,0 +1,61 @@
+"""Adam for a hash-grid field: dense for its networks, sparse for its table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from methods.instant_ngp.field import HashField
+from methods.kernels.adam import AdamState, sparse_adam_
+from methods.training import checkpoint
+from methods.training.optimiser import step_at
+
+
+class FieldOptimiser:
+    """Adam for the networks of `field`, and for its table one that changes touched entries only.
+
+    From now on the field collects the gradients of its table in `grad_buffer`.
+    """
+
+    def __init__(self, field: HashField, *, fused: bool = False) -> None:
+        self._field = field
+        self._table = AdamState.like(field.table.detach())
+        self._networks = torch.optim.Adam(
+            list(field.layers.values()), betas=(0.9, 0.99), eps=1e-15, fused=fused
+        )
+        field.grad_buffer = torch.zeros_like(field.table)
+
+    def step(self, rate: float) -> None:
+        """Change table and networks at learning rate `rate`."""
+        step_at(self._networks, rate)
+        field = self._field
+        assert field.grad_buffer is not None
+        sparse_adam_(
+            field.table.detach(),
+            field.grad_buffer,
+            self._table,
+            rate,
+            packed=field.packed,
+            backend=field.backend,
+        )
+
+    @property
+    def table_moments(self) -> Tensor:
+        """Not finite where a moment of the table is not."""
+        return self._table.first + self._table.second
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The state, for a checkpoint."""
+        adam = self._table
+        tensors = {"adam.first": adam.first, "adam.second": adam.second, "adam.steps": adam.steps}
+        return tensors | checkpoint.optimiser_tensors(self._networks, "network.")
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Put back what `tensors` gave."""
+        device = self._field.table.device
+        self._table = AdamState(
+            *(tensors[f"adam.{name}"].to(device) for name in ("first", "second", "steps"))
+        )
+        checkpoint.restore_optimiser(self._networks, tensors, "network.")

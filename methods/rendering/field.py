@@ -1,0 +1,63 @@
+"""What a radiance field is to those who render it, and how batches of its samples are evaluated."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from bench.types import Probe
+
+BATCH_QUANTUM = 1 << 11
+"""Samples are handed to a field in multiples of this."""
+
+LOG_DENSITY_CLAMP = 15.0
+"""The gradient of exp is taken at a log density clamped to +- this (as torch-ngp and ngp_pl do)."""
+
+
+class Field(Protocol):
+    """A density and K features of a position and a view direction (SteerNeRF Eq. 1, 2).
+
+    Attributes:
+        channels: K; the first three features are RGB.
+        backend: of the kernels that render it.
+    """
+
+    channels: int
+    backend: str
+
+    @property
+    def device(self) -> torch.device:
+        """Where it lies."""
+
+    def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """Density [S] at `positions` [S, 3], and what `features` needs of them [S, G]."""
+
+    def encode_directions(self, directions: Tensor) -> Tensor:
+        """Encoding [R, D] of ray `directions` [R, 3] of any length."""
+
+    def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
+        """Features [S, K] of samples with `geometry` [S, G] and encoded directions [S, D]."""
+
+    def count(self, probe: Probe, samples: int, shaded: int) -> None:
+        """Count the work of the densities of `samples` and of the features of `shaded`."""
+
+
+def query(field: Field, positions: Tensor, ray: Tensor, encoded: Tensor) -> tuple[Tensor, Tensor]:
+    """Density [S] and features [S, K] at `positions` [S, 3] on rays `ray` [S], whose directions are
+    `encoded` [R, D]; evaluated as a padded batch."""
+    sigma, geometry = field.density(pad(positions))
+    values = field.features(geometry, encoded[pad(ray)])
+    return sigma[: len(positions)], values[: len(positions)]
+
+
+def pad(samples: Tensor) -> Tensor:
+    """Zeros at the end of [S, ...], up to a multiple of `BATCH_QUANTUM`.
+
+    oneDNN prepares code for every new matrix size, which takes longer than the product itself, so a
+    field sees batches of a few round sizes only.
+    """
+    padding = -len(samples) % BATCH_QUANTUM
+    return functional.pad(samples, (0, 0) * (samples.dim() - 1) + (0, padding))

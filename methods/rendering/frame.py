@@ -1,0 +1,116 @@
+"""A frame of a field: features, depth and opacity of every pixel of a camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bench.cameras import cast, project
+from bench.types import EMPTY_ALPHA, Camera, Probe, Rays
+from methods.kernels.composite import Pixels
+from methods.kernels.march import BRICK, Occupancy
+from methods.rendering.field import Field
+from methods.rendering.march import March
+from methods.rendering.rays import render_rays
+
+
+@dataclass(frozen=True)
+class FeatureFrame:
+    """What a field shows to a camera: F and D of SteerNeRF.
+
+    Attributes:
+        camera: of `width` x `height` pixels, w x h below.
+        values: [h, w, K] features on the background, the first three are RGB.
+        depth: [h, w] z-depth, +inf where nothing is.
+        alpha: [h, w] opacity.
+    """
+
+    camera: Camera
+    values: Tensor
+    depth: Tensor
+    alpha: Tensor
+
+    @classmethod
+    def of(cls, camera: Camera, pixels: Pixels, background: Tensor) -> FeatureFrame:
+        """From all pixels of `camera`, not yet composited on `background` [K]."""
+        values = pixels.values + (1 - pixels.alpha)[:, None] * background
+        seen = pixels.alpha > EMPTY_ALPHA
+        depth = torch.where(seen, pixels.depth_sum / pixels.alpha, torch.inf)
+        shape = (camera.height, camera.width)
+        return cls(camera, values.view(*shape, -1), depth.view(shape), pixels.alpha.view(shape))
+
+
+@torch.no_grad()
+def render_frame(
+    field: Field,
+    camera: Camera,
+    occupancy: Occupancy,
+    background: Tensor,
+    probe: Probe,
+    render: Callable[[Tensor, Rays], Pixels],
+) -> FeatureFrame:
+    """The frame of `camera`, composited on `background` [K].
+
+    Args:
+        render: renders the pixels [P], indices row by row, that may see anything, by their rays.
+    """
+    size = camera.height * camera.width
+    with probe.stage("rays"):
+        seen, rays = rays_at_matter(camera, occupancy)
+        canvas = Pixels.blank(size, field.channels, field.device)
+    probe.count("rays", len(seen), size)
+    rendered = render(seen, rays)
+    with probe.stage("finish"):
+        canvas.put(seen, rendered)
+        return FeatureFrame.of(camera, canvas, background)
+
+
+def everywhere(
+    field: Field, occupancy: Occupancy, probe: Probe, how: March
+) -> Callable[[Tensor, Rays], Pixels]:
+    """For `render_frame`: rays are marched from the camera to their end, or in the window of `how`,
+    here of all pixels, [h * w, 2]."""
+
+    def render(seen: Tensor, rays: Rays) -> Pixels:
+        window = None if how.window is None else how.window[seen]
+        return render_rays(field, rays, occupancy, probe, how.within(window))
+
+    return render
+
+
+def rays_at_matter(camera: Camera, occupancy: Occupancy) -> tuple[Tensor, Rays]:
+    """The pixels that may see an occupied cell, as indices [P] row by row, and their rays.
+
+    A pixel may see an occupied brick if it lies in the box around the projected corners of the
+    brick; every pixel may, if one of them is not in front of the camera.
+    """
+    device = camera.c2w.device
+    bricks = occupancy.words.nonzero().to(device)  # [B, 3]
+    unit = torch.arange(2, device=device)
+    corners = (bricks[:, None] + torch.cartesian_prod(unit, unit, unit)) * BRICK
+    projected, depth = project(camera, corners.reshape(-1, 3) / occupancy.resolution)
+    projected = projected.view(-1, 8, 2)
+    behind = (depth.view(-1, 8) <= 0).any(dim=1)[:, None]  # [B, 1]
+
+    size = torch.tensor((camera.width, camera.height), device=device)
+    low = torch.where(behind, 0, projected.amin(dim=1)).floor().clamp(min=0)
+    high = torch.where(behind, size, projected.amax(dim=1)).ceil().clamp(min=0)
+    left, top = torch.minimum(low, size).long().unbind(dim=1)
+    right, bottom = torch.minimum(high, size).long().unbind(dim=1)
+
+    # How many boxes cover a pixel: the sum, over all pixels above and to the left, of +1 and -1 at
+    # the boxes' corners.
+    edges = torch.zeros(camera.height + 1, camera.width + 1, dtype=torch.int32, device=device)
+    for row, column, sign in (
+        (top, left, 1),
+        (top, right, -1),
+        (bottom, left, -1),
+        (bottom, right, 1),
+    ):
+        edges.index_put_((row, column), torch.tensor(sign, dtype=torch.int32, device=device), True)
+    covers = edges.cumsum(dim=0).cumsum(dim=1)[:-1, :-1]
+    row, column = covers.nonzero().unbind(dim=1)
+    return row * camera.width + column, cast(camera, torch.stack((column, row), dim=1) + 0.5)

@@ -1,0 +1,40 @@
+"""How far rays are marched, and in which steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from torch import Tensor
+
+from methods.kernels.composite import STOP
+from methods.rendering.occupancy import STEP
+
+FAINT = 0.1
+"""Share of `stop` below which the weight of a sample is faint: black instead of its colour, it
+changes a pixel by less than a tenth of what may lie behind the end of its ray."""
+
+
+@dataclass(frozen=True)
+class March:
+    """How rays are marched.
+
+    Attributes:
+        step: world length of a step.
+        stop: transmittance at which a ray ends.
+        window: [R, 2] nearest and farthest t of each ray; None: all of it.
+        faint: weight below which a sample has an opacity but no features; None: `FAINT * stop`.
+    """
+
+    step: float = STEP
+    stop: float = STOP
+    window: Tensor | None = None
+    faint: float | None = None
+
+    @property
+    def least_weight(self) -> float:
+        """Weight of a sample below which its features are not evaluated."""
+        return FAINT * self.stop if self.faint is None else self.faint
+
+    def within(self, window: Tensor | None) -> March:
+        """The same within `window` [R, 2]."""
+        return replace(self, window=window)

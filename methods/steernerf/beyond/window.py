@@ -1,0 +1,108 @@
+"""Range reduction by a window of depths, with a way out where the window misses the surface.
+
+Not in the paper: its interval leaves holes where the reprojected depth is that of another surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from bench.types import Camera, Probe, Rays
+from methods.kernels.composite import Pixels
+from methods.kernels.march import Occupancy
+from methods.rendering.field import Field
+from methods.rendering.march import FAINT, March
+from methods.rendering.rays import render_rays
+from methods.steernerf.buffer import Cloud
+from methods.steernerf.options import Reprojection
+from methods.steernerf.range_reduction import at_pixels
+
+KEPT_ALPHA = 0.95
+"""Share of the expected opacity at which a ray has found what was expected."""
+
+EDGE = 2.0
+"""Depths of a neighbourhood that differ by more than this many epsilons are those of an edge."""
+
+
+@dataclass(frozen=True)
+class DepthPrior:
+    """What a preceding frame says of a view of h x w pixels.
+
+    Attributes:
+        window: [h, w, 2] nearest and farthest z-depth worth looking at; [0, inf) if unknown.
+        alpha: [h, w] the opacity to expect; 0 if unknown.
+    """
+
+    window: Tensor
+    alpha: Tensor
+
+
+def depth_prior(
+    cloud: Cloud, camera: Camera, epsilon: float, how: Reprojection, backend: str
+) -> DepthPrior:
+    """The depths of `cloud` around each pixel of `camera`, a low-resolution one; unknown where no
+    point is near, or a depth edge is."""
+    index, depth = cloud.splat(camera, how, backend)
+    near = -_highest(-at_pixels(depth, index, torch.inf))
+    far = _highest(at_pixels(depth, index, -torch.inf))
+    alpha = _highest(at_pixels(cloud.alpha, index, 0.0))
+    known = (alpha > 0) & (far - near < EDGE * epsilon)
+    window = torch.stack(
+        (torch.where(known, near - epsilon, 0), torch.where(known, far + epsilon, torch.inf)),
+        dim=-1,
+    )
+    return DepthPrior(window, alpha)
+
+
+def depths_around(depth: Tensor, epsilon: float) -> Tensor:
+    """[h, w, 2] nearest and farthest z-depth within `epsilon` of those of the 3 x 3 neighbourhood
+    in `depth` [h, w]; [0, inf) where none of them is finite."""
+    near = -_highest(-depth)
+    far = _highest(torch.where(depth.isfinite(), depth, -torch.inf))
+    window = torch.stack((near - epsilon, far + epsilon), dim=-1)
+    return torch.where(near.isfinite()[..., None], window, window.new_tensor((0.0, torch.inf)))
+
+
+def _highest(image: Tensor) -> Tensor:
+    """Largest value of each pixel's 3 x 3 neighbourhood."""
+    return functional.max_pool2d(image[None], 3, stride=1, padding=1)[0]
+
+
+def within(
+    field: Field, occupancy: Occupancy, probe: Probe, how: March, prior: DepthPrior
+) -> Callable[[Tensor, Rays], Pixels]:
+    """For `rendering.frame.render_frame`: rays are marched within the windows of `prior`, and
+    behind them where they do not find the opacity to expect."""
+
+    def render(seen: Tensor, rays: Rays) -> Pixels:
+        window, expected = prior.window.view(-1, 2)[seen], prior.alpha.flatten()[seen]
+        narrow = window[:, 1].isfinite()
+        inside = narrow.nonzero().squeeze(1)
+        expected = expected[inside]
+        # Most rays end here, but those that go on must not lack what is faint in front.
+        loose = March(
+            how.step, max(how.stop, 1 - KEPT_ALPHA), window[inside], faint=FAINT * how.stop
+        )
+        first = render_rays(field, rays.take(inside), occupancy, probe, loose)
+        enough = first.alpha >= KEPT_ALPHA * expected
+        # What is left of the opacity looks like what was found.
+        more = torch.where(enough & (first.alpha < expected), expected / first.alpha, 1)
+        canvas = Pixels.blank(len(seen), first.values.shape[1], field.device)
+        canvas.put(
+            inside, Pixels(first.values * more[:, None], first.depth_sum * more, first.alpha * more)
+        )
+        unfinished = torch.ones_like(narrow)
+        unfinished[inside[enough]] = False
+        rest = unfinished.nonzero().squeeze(1)
+        begin = torch.where(narrow, window[:, 1], 0)[rest]
+        behind = how.within(torch.stack((begin, torch.full_like(begin, torch.inf)), dim=1))
+        carry = canvas.take(rest)
+        canvas.put(rest, render_rays(field, rays.take(rest), occupancy, probe, behind, carry))
+        return canvas
+
+    return render

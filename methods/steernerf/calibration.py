@@ -1,0 +1,96 @@
+"""Inputs of a 2D renderer's network on real frames, for engines that calibrate on them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from bench.motion import preceding, viewing_target
+from bench.sharing import missing
+from bench.types import Camera, Log, NullProbe, Scene
+from methods.engines import Inputs
+from methods.steernerf.buffer import RenderingBuffer
+from methods.steernerf.options import Rendering
+from methods.steernerf.pipeline import Pipeline
+from methods.training import checkpoint
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Frames of a trained pipeline that an engine may see.
+
+    Attributes:
+        pipeline: whose renderer has no engine yet.
+        rendering: of the frames.
+        scene: whose training views they are.
+        degrees: range of the angular speed of the motions before the views, degrees a frame.
+        seed: of the motions.
+    """
+
+    pipeline: Pipeline
+    rendering: Rendering
+    scene: Scene
+    degrees: tuple[float, float]
+    seed: int
+
+    def inputs(self, count: int, folder: Path, log: Log) -> list[Inputs]:
+        """What the network is given in `count` frames, 1 or more: recorded once, kept in `folder`.
+
+        Raises:
+            SteerbenchError: the file there cannot be written or read.
+        """
+        path = folder / "inputs.safetensors"
+        with missing(path, log) as to_record:
+            if to_record:
+                frames = self.record(count, log)
+                tensors = {
+                    f"{frame:03} {place}": x
+                    for frame, inputs in enumerate(frames)
+                    for place, x in enumerate(inputs)
+                }
+                checkpoint.write(path, tensors, {})
+                return frames
+        log.info(f"frames to build the network on: found in {path}")
+        tensors, _ = checkpoint.read(path)
+        device = self.pipeline.background.device
+        by_frame = groupby(sorted(tensors), lambda name: name.partition(" ")[0])
+        return [tuple(tensors[name].to(device) for name in names) for _, names in by_frame]
+
+    def record(self, count: int, log: Log) -> list[Inputs]:
+        """What the network is given in `count` training views, evenly spread.
+
+        Each view ends a random smooth motion of as many frames as the buffer holds and one more.
+        """
+        generator = torch.Generator().manual_seed(self.seed)
+        cameras, target = self.scene.splits["train"].cameras, viewing_target(self.scene)
+        renderer, frames = self.pipeline.renderer, []
+        seen: list[Inputs] = []
+
+        def recorded(*inputs: Tensor) -> Inputs:
+            seen.append(inputs)
+            return renderer.network(*inputs)
+
+        renderer.engine = recorded
+        try:
+            with log.progress("frames to build the network on", count) as progress:
+                for place in range(count):
+                    camera = cameras[place * len(cameras) // count]
+                    before = self.pipeline.model.frames + 1
+                    motion = preceding(camera, target, before, self.degrees, generator)
+                    self._render([*motion, camera])
+                    frames.append(seen[-1])
+                    seen.clear()
+                    progress.advance()
+        finally:
+            renderer.engine = None
+        return frames
+
+    def _render(self, path: Sequence[Camera]) -> None:
+        buffer = RenderingBuffer(self.pipeline.model.frames)
+        for camera in path:
+            self.pipeline.render(camera, buffer, self.rendering, NullProbe())

@@ -1,0 +1,109 @@
+"""Stage 2: a 2D renderer, and with it the field, trained for one model; found again if it was."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bench.sources import digest, libraries
+from bench.types import Budget, Log, Scene
+from methods.instant_ngp.stage1 import Setup, TrainedField
+from methods.steernerf.options import Model, Rendering
+from methods.steernerf.pipeline import Pipeline
+from methods.steernerf.renderer import Renderer2d
+from methods.steernerf.training.distillation import distilled_views
+from methods.steernerf.training.joint import JointOptions, JointTraining, RendererTraining
+from methods.steernerf.training.patches import PatchSource
+from methods.steernerf.training.sequences import SequencePool, TrainingViews
+from methods.training import loop
+
+
+@dataclass(frozen=True)
+class Stage2:
+    """What is trained in stage 2, and how.
+
+    Attributes:
+        model: what it is trained for.
+        make_renderer: makes the 2D renderer, called with K, L and s.
+        joint: how it is trained.
+    """
+
+    model: Model
+    make_renderer: Callable[..., Renderer2d]
+    joint: JointOptions
+
+    def new_renderer(self, seed: int, device: torch.device) -> Renderer2d:
+        """A 2D renderer that has learned nothing."""
+        torch.manual_seed(seed)
+        model = self.model
+        renderer = self.make_renderer(model.channels, model.frames, model.scale).to(device)
+        return renderer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def key(self, budget: Budget) -> dict[str, object]:
+        """Everything that the result depends on, beside the field of stage 1."""
+        make: Any = self.make_renderer
+        kind, settings = (make.func, make.keywords) if isinstance(make, partial) else (make, {})
+        return {
+            "renderer_steps": budget.renderer_steps,
+            "model": asdict(self.model),
+            "renderer": {"kind": f"{kind.__module__}.{kind.__qualname__}", **settings},
+            "joint": asdict(self.joint),
+            "stage2": digest(train_stage2, kind),
+            "stage2_libraries": libraries(train_stage2, kind),
+        }
+
+
+@dataclass(frozen=True)
+class TrainedPipeline:
+    """A trained `pipeline`, the `key` of its training, and the seconds of stage 2."""
+
+    pipeline: Pipeline
+    key: dict[str, object]
+    train_s: float
+
+
+def train_stage2(
+    trained: TrainedField, setup: Setup, stage2: Stage2, scene: Scene, budget: Budget, log: Log
+) -> TrainedPipeline:
+    """Train `stage2` on the field that `setup` made for `scene`, or load what the same training
+    left behind; the field is widened to K features and changed in place."""
+    model, joint = stage2.model, stage2.joint
+    count = joint.distilled(budget.renderer_steps, model.frames)
+    distilled, distilled_s = distilled_views(setup, trained, scene, budget, count, log)
+    trained.field.widen(model.channels)
+    views = TrainingViews.of(scene, distilled, joint.distilled_share)
+    background = scene.background.to(setup.device)
+    pipeline, training = _prepared(trained, background, stage2, views, budget, setup.seed)
+    key = {**setup.key(scene, budget), **stage2.key(budget)}
+    finished = log.stage_dir("steernerf", key) / "steernerf.safetensors"
+    loop.train(training, finished, "training the 2D renderer", log)
+    trained.field.requires_grad_(False).grad_buffer = None
+    pipeline.renderer.requires_grad_(False)
+    return TrainedPipeline(pipeline, key, distilled_s + training.seconds)
+
+
+def _prepared(
+    trained: TrainedField,
+    background: Tensor,
+    stage2: Stage2,
+    views: TrainingViews,
+    budget: Budget,
+    seed: int,
+) -> tuple[Pipeline, RendererTraining]:
+    model, joint, field = stage2.model, stage2.joint, trained.field
+    renderer = stage2.new_renderer(seed, field.device)
+    pipeline = Pipeline(field, trained.occupancy, background, renderer, model)
+    generator = torch.Generator().manual_seed(seed)
+    rendering = Rendering.in_training(model, joint.refined)
+    pool = SequencePool(pipeline, rendering, views, joint.motion, generator)
+    learning = joint.field == "joint"
+    patches = PatchSource(pool, joint.patch, joint.through if learning else "none", generator)
+    rest = renderer, patches, joint, budget.renderer_steps, generator
+    training = JointTraining(field, *rest) if learning else RendererTraining(*rest)
+    pipeline.renderer = training.mean
+    return pipeline, training

@@ -1,0 +1,194 @@
+"""The digest of a thing follows the files that it stands on, and no other file."""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bench import sources
+from bench.run import measure
+from bench.sources import digest, libraries
+from methods.instant_ngp.training import train_field
+
+FILES = {
+    "bench/ruler.py": "",
+    "bench/unused.py": "A = 1\n",
+    "methods/__init__.py": "",
+    "methods/fields/__init__.py": "import importlib\n",
+    "methods/fields/cpu.py": "from bench import ruler\nimport numpy.linalg\n",
+    "methods/fields/cases.py": "import scipy\n",
+    "methods/fields/experiments.py": "import scipy\n",
+    "methods/fields/inner/weights.safetensors": "12",
+    "methods/alone/__init__.py": "",
+    "methods/alone/beside.py": "",
+    "methods/alone/method.py": "def fit():\n    from methods.fields import field\n",
+    "methods/alone/learned.safetensors": "34",
+}
+
+
+def write(root: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+
+
+def defined_in(module: str, **attributes: Any) -> type:
+    return type("Thing", (), {"__module__": module, **attributes})
+
+
+METHOD = defined_in("methods.alone.method")
+
+
+@pytest.fixture
+def tree(tmp_path, monkeypatch) -> Path:
+    """A small project: a method in a module that imports a package of fields."""
+    write(tmp_path / "here", FILES)
+    monkeypatch.setattr(sources, "ROOT", tmp_path / "here")
+    return tmp_path / "here"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "methods/alone/method.py",
+        "methods/alone/learned.safetensors",
+        "methods/fields/__init__.py",
+        "methods/fields/cpu.py",
+        "methods/fields/inner/weights.safetensors",
+        "bench/ruler.py",
+    ],
+)
+def test_what_a_thing_stands_on_changes_its_digest(tree, name):
+    before = digest(METHOD)
+    assert digest(METHOD) == before
+    (tree / name).write_text(FILES[name] + "\n")
+    assert digest(METHOD) != before
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "bench/unused.py",
+        "bench/notes.txt",
+        "methods/__init__.py",
+        "methods/alone/beside.py",
+        "methods/fields/cases.py",
+        "methods/fields/experiments.py",
+        "methods/fields/__pycache__/cpu.pyc",
+        "sweeps/other.py",
+    ],
+)
+def test_a_file_that_a_thing_does_not_stand_on_leaves_its_digest(tree, name):
+    before = digest(METHOD)
+    write(tree, {name: FILES.get(name, "") + "# a comment\n"})
+    assert digest(METHOD) == before
+
+
+def test_a_new_file_beside_an_imported_package_counts_and_so_does_a_new_name(tree):
+    digests = [digest(METHOD)]
+    write(tree, {"methods/fields/gpu.py": "A = 1\n"})
+    digests.append(digest(METHOD))
+    (tree / "methods/fields/gpu.py").rename(tree / "methods/fields/cuda.py")
+    digests.append(digest(METHOD))
+    assert len(set(digests)) == 3
+
+
+def test_the_digest_does_not_depend_on_where_the_project_lies(tree, monkeypatch):
+    before = digest(METHOD)
+    shutil.move(tree, tree.with_name("there"))
+    monkeypatch.setattr(sources, "ROOT", tree.with_name("there"))
+    assert digest(METHOD) == before
+
+
+def test_a_thing_that_does_not_change_has_the_digest_of_all_it_is_combined_with(tree):
+    ruler = defined_in("bench.ruler")
+    assert digest(METHOD, ruler) == digest(ruler, METHOD) == digest(METHOD)
+    assert digest(ruler) != digest(METHOD)
+
+
+PLUGIN = {
+    "foreign_{}/__init__.py": "",
+    "foreign_{}/method.py": "from bench import ruler\nfrom foreign_{0} import helper\n",
+    "foreign_{}/helper.py": "A = 1\n",
+    "foreign_{}/data/table.bin": "5",
+    "other_{}/__init__.py": "",
+}
+
+
+@pytest.fixture(params=["package", "namespace"])
+def plugin(request, tree, tmp_path, monkeypatch) -> tuple[Path, type]:
+    """A method of another project in a package of two modules, with or without an `__init__`."""
+    files = {name.format(request.param): text for name, text in PLUGIN.items()}
+    write(tmp_path / "site", {name: text.format(request.param) for name, text in files.items()})
+    folder = tmp_path / "site" / f"foreign_{request.param}"
+    if request.param == "namespace":
+        (folder / "__init__.py").unlink()
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    importlib.invalidate_caches()
+    return folder, defined_in(f"foreign_{request.param}.method")
+
+
+@pytest.mark.parametrize("name", ["method.py", "helper.py", "data/table.bin"])
+def test_every_file_of_a_plugin_changes_its_digest(plugin, name):
+    folder, thing = plugin
+    before = digest(thing)
+    (folder / name).write_text("A = 2\n")
+    assert digest(thing) != before
+
+
+def test_what_a_plugin_imports_of_ours_counts_and_nothing_else(plugin, tree):
+    folder, thing = plugin
+    before = digest(thing)
+    write(tree, {"bench/unused.py": "# another\n"})
+    write(folder.parent, {"beside.py": "", f"{folder.name}/__pycache__/helper.pyc": ""})
+    assert digest(thing) == before
+    write(tree, {"bench/ruler.py": "# another\n"})
+    assert digest(thing) != before
+
+
+def test_the_digest_of_a_plugin_does_not_depend_on_where_it_lies(plugin, monkeypatch):
+    folder, thing = plugin
+    before = digest(thing)
+    shutil.move(folder.parent, folder.parent.with_name("elsewhere"))
+    monkeypatch.syspath_prepend(folder.parent.with_name("elsewhere"))
+    importlib.invalidate_caches()
+    assert digest(thing) == before
+
+
+def test_a_single_file_counts_with_the_module_beside_it_that_it_imports(
+    tree, tmp_path, monkeypatch
+):
+    write(tmp_path / "site", {"single_file.py": "import its_helper\n", "its_helper.py": "A = 1\n"})
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    importlib.invalidate_caches()
+    thing = defined_in("single_file")
+    before = digest(thing)
+    write(tmp_path / "site", {"its_helper.py": "A = 2\n"})
+    assert digest(thing) != before
+
+
+def test_libraries_are_those_that_the_sources_import(tree):
+    assert libraries(METHOD) == {"numpy": metadata.version("numpy")}
+    assert libraries(defined_in("bench.unused")) == {}
+
+
+def test_libraries_that_are_loaded_by_name_are_those_that_a_class_lists(tree):
+    thing = defined_in("bench.unused", libraries=("scipy", "not-installed"))
+    assert libraries(thing) == {"scipy": metadata.version("scipy")}
+
+
+def test_the_libraries_of_the_real_things_are_found_through_their_backends():
+    assert {"torch", "numba"} <= libraries(train_field).keys()
+    assert {"torch", "scipy", "torchvision", "scikit-image", "lpips"} <= libraries(measure).keys()
+
+
+def test_a_training_does_not_stand_on_how_results_are_kept_and_shown():
+    names = sources.sources(train_field)
+    assert "methods/instant_ngp/training.py" in names
+    assert not [name for name in names if name.startswith(("bench/results", "bench/console"))]
+    assert "pandas" not in libraries(train_field)
