@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 from bench.errors import explained
 from bench.sharing import whole
 from reports.runs import load
-from reports.tables import number
+from reports.tables import decimal
 from sweeps import failures
 from sweeps.measurement import Obtained, described, obtain
 
@@ -105,7 +105,7 @@ def attempt(config: DictConfig, command: Sequence[str], name: str) -> Obtained:
 def say(obtained: Obtained, name: str, more: str) -> None:
     """Print the figures of a job in one line, and `more` after them."""
     (run,) = load(obtained.store, {obtained.run: name})
-    psnr, ms = number(run.values.get("psnr"), 2), number(run.values["frame_ms"], 1)
+    psnr, ms = decimal(run.values.get("psnr"), 2), decimal(run.values["frame_ms"], 1)
     print(f"{name}: {psnr} dB, {ms} ms a frame{more}", file=sys.stderr)
 
 

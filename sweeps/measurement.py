@@ -24,7 +24,7 @@ from bench.sources import digest, libraries
 from bench.types import DEVICE, Method, Scene
 from reports.page import write_page
 from reports.runs import Run, load
-from reports.tables import blocks
+from reports.tables import run_tables
 from sweeps import failures
 from sweeps.build import build, check_settings, target_of
 from sweeps.device_lock import device_lock
@@ -217,6 +217,6 @@ def _show(run: Run, explain: bool) -> None:
     what = run.facts[["method", "scene", "trajectory", "resolution", "budget", "protocol"]]
     out = console()
     out.print(f"{', '.join(what)}, seed {run.facts['seed']}: run {run.key}", style="bold")
-    out.print(Columns([rich_table(table) for table in blocks(run.rows)]))
+    out.print(Columns([rich_table(table) for table in run_tables(run.rows)]))
     for metric, reason in run.record["missing"].items() if explain else ():
         out.print(f"{metric}: n/a. {reason}", markup=False, soft_wrap=True)

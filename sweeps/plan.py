@@ -12,9 +12,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import SteerbenchError
 from bench.results import Store, content_key
-from reports.published import Line, PaperTable, paper_tables
-from reports.runs import Run, readable
-from reports.seeds import Repeated
+from reports.paper_tables import Line, PaperTable, paper_tables
+from reports.runs import Repeated, Run, readable
 from sweeps import failures
 from sweeps.measurement import described, of_scene
 from sweeps.names import unknown

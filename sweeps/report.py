@@ -9,9 +9,9 @@ from itertools import chain
 from pathlib import Path
 
 from bench.results import Store
-from reports.doubts import doubts, table
+from reports.outliers import outlier_table, outliers
 from reports.paper_page import write_paper_page
-from reports.published import PaperTable
+from reports.paper_tables import PaperTable
 from sweeps.overrides import composed
 from sweeps.plan import Planned, chosen, gather, newest, plan
 from sweeps.terminal import console, show
@@ -31,16 +31,16 @@ def write(tables: Sequence[PaperTable], jobs: Sequence[Planned], folder: Path | 
     """Write the page about `tables` from the results of `jobs`, and print its path."""
     outputs = Path(jobs[0].config.outputs)
     runs = newest(Store(outputs))
-    lines, found = gather(jobs, runs, outputs), doubts(list(chain(*runs.values())))
+    lines, found = gather(jobs, runs, outputs), outliers(list(chain(*runs.values())))
     page = write_paper_page(tables, lines, found, folder or outputs / "paper")
     print(f"report: {page}", file=sys.stderr)
 
 
 def _check(store: Store) -> int:
     runs = list(chain(*newest(store).values()))
-    found = doubts(runs)
+    found = outliers(runs)
     if found:
-        show(table(found, runs))
-    doubted = len({doubt.key for doubt in found})
-    console().print(f"{doubted} of {len(runs)} runs are to be doubted")
+        show(outlier_table(found, runs))
+    broken = len({outlier.key for outlier in found})
+    console().print(f"{broken} of {len(runs)} runs look broken")
     return int(len(found) > 0)

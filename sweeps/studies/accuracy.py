@@ -17,7 +17,7 @@ from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from bench.frontier import best_instead, cheapest_within
 from bench.study import Variant
-from reports.accuracy import experiment_table, setting_table, write_accuracy
+from reports.tradeoff import experiment_table, setting_table, write_tradeoff
 from sweeps.device_lock import device_lock
 from sweeps.measurement import checked_settings
 from sweeps.overrides import composed
@@ -63,7 +63,7 @@ def main(options: argparse.Namespace) -> int:
         experiments = experiment_rows(found("experiments"), options.repeats, log)
     show(experiment_table(experiments))
     command = shlex.join(["steerbench", *sys.argv[1:]])
-    page = write_accuracy(experiments, settings, outputs / "accuracy", command)
+    page = write_tradeoff(experiments, settings, outputs / "accuracy", command)
     log.info(f"report: {page}")
     if settings and limit is not None:
         print(_recommended(settings, limit))

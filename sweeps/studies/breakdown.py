@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from bench.probes import OTHER
 from bench.study import Study, Variant
-from reports.tables import Table, number, share
+from reports.tables import Table, decimal, share
 from sweeps.overrides import composed
 from sweeps.studies.skips import nothing_skipped
 from sweeps.studies.variants import (
@@ -115,12 +115,12 @@ def _parts(study: Study, rows: Iterable[Row]) -> list[str]:
 def _line(row: Row, parts: Iterable[str]) -> tuple[str, ...]:
     return (
         row["line"],
-        *(number(row["parts"].get(part, 0.0), 1) for part in parts),
-        number(row["frame_ms"], 1),
+        *(decimal(row["parts"].get(part, 0.0), 1) for part in parts),
+        decimal(row["frame_ms"], 1),
         range_text(row),
-        number(row["p99_to_p50"], 2),
-        number(1e3 / row["frame_ms"], 2),
-        number(row["psnr"], 2),
+        decimal(row["p99_to_p50"], 2),
+        decimal(1e3 / row["frame_ms"], 2),
+        decimal(row["psnr"], 2),
     )
 
 
@@ -138,7 +138,7 @@ def _ratios(rows: Mapping[str, Row], name: str, first: str, study: Study) -> dic
 
     def ratio(other: Mapping[str, Any], of: str, to: str) -> str:
         known = other.get(of) and row[to]
-        return number(other[of] / row[to] if known else None, 1)
+        return decimal(other[of] / row[to] if known else None, 1)
 
     for method in study.beside:
         other = rows.get(f"{name}, {method}", rows.get(method, {}))
@@ -148,8 +148,8 @@ def _ratios(rows: Mapping[str, Row], name: str, first: str, study: Study) -> dic
         else:
             cells[f"frame of {method} / frame ↑"] = ratio(other, "frame_ms", "frame_ms")
     if len(rows) > 1 and name != "as it is":
-        cells[f"lost to {first}, dB ↓"] = number(rows[first]["psnr"] - row["psnr"], 3)
+        cells[f"lost to {first}, dB ↓"] = decimal(rows[first]["psnr"] - row["psnr"], 3)
     if dense := rows.get(name + DENSE):
-        cells["lost by skipping, dB ↓"] = number(dense["psnr"] - row["psnr"], 3)
+        cells["lost by skipping, dB ↓"] = decimal(dense["psnr"] - row["psnr"], 3)
         cells["time, of nothing skipped ↓"] = share(row["frame_ms"], dense["frame_ms"])
     return cells

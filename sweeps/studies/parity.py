@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from bench.errors import SteerbenchError
-from reports.tables import Table, megabytes, number
+from reports.tables import Table, decimal, megabytes
 from sweeps.overrides import composed
 from sweeps.studies.variants import (
     METHOD,
@@ -71,12 +71,12 @@ def _line(row: Row) -> tuple[str, ...]:
     return (
         row["engine"],
         apart_text(row["apart"]),
-        number(row["worst"], 4),
-        number(row["psnr"], 2),
-        number(row["lost"], 3),
-        number(row["network_ms"], 2),
-        number(row["frame_ms"], 1),
+        decimal(row["worst"], 4),
+        decimal(row["psnr"], 2),
+        decimal(row["lost"], 3),
+        decimal(row["network_ms"], 2),
+        decimal(row["frame_ms"], 1),
         range_text(row),
-        number(row["p99_to_p50"], 2),
+        decimal(row["p99_to_p50"], 2),
         megabytes(row["bytes"]),
     )

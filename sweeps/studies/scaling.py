@@ -21,8 +21,8 @@ from bench.probes import FrameRecord, MemoryMeter, StageClock, p99_to_p50
 from bench.study import Study
 from bench.threads import torch_threads
 from bench.types import Camera, Log, Method, Scene
-from reports.growth import growth_panels
-from reports.tables import Table, megabytes, number
+from reports.figures import growth_panels
+from reports.tables import Table, decimal, megabytes
 from sweeps.build import build
 from sweeps.device_lock import device_lock
 from sweeps.measurement import checked_settings
@@ -172,8 +172,8 @@ def _table(title: str, axes: Mapping[str, Sequence[Row]]) -> Table:
         name for rows in axes.values() for row in rows for name in row if name.startswith("work.")
     )
     figures = {
-        "frame_ms": ("ms / frame ↓", lambda ms: number(ms, 1)),
-        "p99_to_p50": ("p99 / p50 ↓", lambda ratio: number(ratio, 2)),
+        "frame_ms": ("ms / frame ↓", lambda ms: decimal(ms, 1)),
+        "p99_to_p50": ("p99 / p50 ↓", lambda ratio: decimal(ratio, 2)),
         **{name: (name.removeprefix("work.").replace("_", " "), amount) for name in counters},
         "peak_bytes": ("peak, MB ↓", megabytes),
         "size_bytes": ("model, MB ↓", megabytes),
@@ -183,7 +183,9 @@ def _table(title: str, axes: Mapping[str, Sequence[Row]]) -> Table:
         for row in rows:
             cells = (write(row.get(name, 0)) for name, (_, write) in figures.items())
             lines.append((row["label"], *cells))
-        powers = ("" if name == "p99_to_p50" else number(growth(rows, name), 2) for name in figures)
+        powers = (
+            "" if name == "p99_to_p50" else decimal(growth(rows, name), 2) for name in figures
+        )
         lines.append((f"exponent of {axis}", *powers))
     return Table(title, ("", *(label for label, _ in figures.values())), tuple(lines))
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from bench.errors import SteerbenchError
 from bench.study import Study, Variant
-from reports.tables import Table, number, share
+from reports.tables import Table, decimal, share
 from sweeps.overrides import composed
 from sweeps.studies.variants import (
     METHOD,
@@ -88,9 +88,9 @@ def _line(row: Row, dense: Row, work: list[str]) -> tuple[str, ...]:
     return (
         row["skipped"],
         apart_text(row["apart"]),
-        number(row["psnr"], 2),
-        number(row["lost"], 3),
-        number(row["frame_ms"], 1),
+        decimal(row["psnr"], 2),
+        decimal(row["lost"], 3),
+        decimal(row["frame_ms"], 1),
         range_text(row),
         *(f"{amount(row[name])} ({share(row[name], dense[name])})" for name in work),
     )

@@ -19,7 +19,7 @@ from bench.protocol import EvaluationProtocol
 from bench.study import Study, Variant, study_of
 from bench.trajectories import Trajectory
 from bench.types import Log, Method, Scene
-from reports.tables import number
+from reports.tables import decimal
 from sweeps.build import build, target_of
 from sweeps.device_lock import device_lock
 from sweeps.measurement import checked_settings
@@ -224,12 +224,12 @@ def apart_text(psnr: float) -> str:
 
 def range_text(values: Mapping[str, Any]) -> str:
     """The mean times of a frame of the fastest and of the slowest round, for a table."""
-    return f"{number(values['ms_lo'], 1)} – {number(values['ms_hi'], 1)}"
+    return f"{decimal(values['ms_lo'], 1)} – {decimal(values['ms_hi'], 1)}"
 
 
 def amount(value: float) -> str:
     """A count in few digits: 12,345 or 1.23 M."""
     for size, letter in ((1e9, "G"), (1e6, "M")):
         if value >= size:
-            return f"{number(value / size, 2)} {letter}"
-    return number(value, 0)
+            return f"{decimal(value / size, 2)} {letter}"
+    return decimal(value, 0)

@@ -42,7 +42,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sweeps.variants.render_in_turns", rendered)
     monkeypatch.setattr("sweeps.accuracy.experiment_rows", lambda *arguments: [ERROR])
     monkeypatch.setattr("methods.accuracy.all_experiments", lambda: [])
-    monkeypatch.setattr("reports.accuracy.frontier_plot", lambda rows, path: path.touch())
+    monkeypatch.setattr("reports.tradeoff.frontier_plot", lambda rows, path: path.touch())
 
 
 @pytest.mark.parametrize("text", ["0.1dB", "0.1 dB", ".1", "0.1", "0.10db"])

@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 
 from bench.results import Store
 from bench.types import SteerbenchError
-from reports.published import paper_tables
+from reports.paper_tables import paper_tables
 from sweeps import attempt, failures
 from sweeps.measurement import Obtained, described
 from sweeps.overrides import composed
