@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -128,9 +129,9 @@ def _overrides(words: Sequence[str]) -> list[str]:
 def _folders(words: Sequence[str]) -> list[Path]:
     """Our configurations and the folders that `words` name: `--config-dir=DIR` or, as Hydra takes
     it too, in two words."""
-    pairs = zip(words, [*words[1:], ""], strict=True)
-    typed = ((word.partition("="), after) for word, after in pairs)
-    further = (
-        value if equals else after for (name, equals, value), after in typed if name in FLAGS
-    )
-    return [CONFIGS, *(Path(folder).resolve() for folder in further)]
+    further = []
+    for word, after in pairwise([*words, ""]):
+        name, equals, value = word.partition("=")
+        if name in FLAGS:
+            further.append(Path(value if equals else after).resolve())
+    return [CONFIGS, *further]

@@ -75,7 +75,8 @@ def _ending(variants: Iterable[Variant], ending: str) -> list[Variant]:
 def _shared(words: Sequence[str], study: Study) -> list[str]:
     """The `words` that hold for all methods compared with, too: of the settings of the method those
     that all of them have, and all other words."""
-    others = [composed(settings) for settings in study.beside.values()]
+    folders = [word for word in words if word.startswith("--config-dir=")]
+    others = [composed([*folders, *settings]) for settings in study.beside.values()]
     return [word for word in words if _holds(word, others)]
 
 

@@ -31,7 +31,7 @@ from sweeps.overrides import composed
 from sweeps.studies.variants import METHOD, Row, amount, computes_with_engine, declared
 from sweeps.terminal import show
 
-SETTINGS = (METHOD, "trajectory=smooth", "budget.renderer_steps=8")
+SETTINGS = (METHOD, "trajectory=smooth", "++budget.renderer_steps=8")
 """What a 2D renderer has learned does not change what it costs."""
 
 SIZES = ((200, 200), (400, 400), (800, 800), (1920, 1080), (3840, 2160))
