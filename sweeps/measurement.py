@@ -20,7 +20,7 @@ from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
 from bench.provenance import decisive
 from bench.results import Store
-from bench.run import measure
+from bench.run import Task, measure
 from bench.sources import digest, libraries
 from bench.types import DEVICE, Method, Scene
 from reports.page import write_page
@@ -107,16 +107,8 @@ def _obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
     with turn(method.settings()["device"], log):
         if store.find(run) is not None:
             return Obtained(store, run, measured=False)  # by the process that had the turn before
-        measurement = measure(
-            method,
-            scene,
-            trajectory,
-            protocol,
-            budget,
-            log,
-            seed=settings.seed,
-            weights_dir=weights,
-        )
+        task = Task(scene, trajectory, protocol, budget, settings.seed, weights)
+        measurement = measure(method, task, log)
     record = {**measurement.record, "command": shlex.join(command)}
     record["scene_path"] = _folder(config)
     store.save(parts, replace(measurement, record=record))
