@@ -6,7 +6,7 @@ import json
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
 
 import torch
 from torch import Tensor, nn
@@ -59,10 +59,9 @@ def kept(
         if precision == "int8":
             exported = path.with_name("exported.onnx")
             _export(plain, network, seen[0], exported)
-            _quantise(exported, _Reader(seen, input_names(network)), path, options or {})
+            _quantise(exported, seen, input_names(network), path, options or {})
         else:
-            module = _Halved(plain) if precision == "fp16" else plain
-            _export(module, network, seen[0], path)
+            _export(_Halved(plain) if precision == "fp16" else plain, network, seen[0], path)
         _note_sizes(path, sizes_to_expect(seen, network))
 
     path = folder() / "network.onnx"
@@ -134,32 +133,27 @@ def _export(module: nn.Module, network: Network, sample: Inputs, path: Path) -> 
         )
 
 
-def _quantise(exported: Path, frames: _Reader, path: Path, options: Mapping[str, bool]) -> None:
+def _quantise(
+    exported: Path,
+    samples: Sequence[Inputs],
+    names: Sequence[str],
+    path: Path,
+    options: Mapping[str, bool],
+) -> None:
+    """Write the model `exported` to `path` with 8-bit products, calibrated on `samples`."""
     from onnxruntime import quantization
     from onnxruntime.quantization import shape_inference
 
+    arrays = [[x.numpy() for x in inputs] for inputs in samples]
+    frames = iter([dict(zip(names, frame, strict=True)) for frame in arrays])
     prepared = path.with_name("prepared.onnx")
     shape_inference.quant_pre_process(exported, prepared, skip_symbolic_shape=True)
     quantization.quantize_static(
         prepared,
         path,
-        frames,
+        SimpleNamespace(get_next=lambda: next(frames, None)),
         quant_format=quantization.QuantFormat.QDQ,
         per_channel=True,
         op_types_to_quantize=list(PRODUCTS),
         extra_options=dict(options),
     )
-
-
-class _Reader:
-    """Inputs, one frame after the other, for ONNX Runtime."""
-
-    def __init__(self, samples: Sequence[Inputs], names: Sequence[str]) -> None:
-        self._frames, self._names = iter(samples), names
-
-    def get_next(self) -> dict[str, Any] | None:
-        """The next frame; None after the last."""
-        frame = next(self._frames, None)
-        if frame is None:
-            return None
-        return {name: x.numpy() for name, x in zip(self._names, frame, strict=True)}

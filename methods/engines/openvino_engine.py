@@ -88,10 +88,10 @@ class OpenVino(Engine):
         return Built(compiled, sum(op.data.nbytes for op in weights))
 
     def _convert(self, network: Network, samples: Sequence[Inputs]) -> Any:
-        shapes = [list(x.shape) for x in samples[0]]
-        for shape, axes in zip(shapes, network.varying, strict=True):
-            for axis in axes:
-                shape[axis] = -1
+        shapes = [
+            [-1 if axis in axes else length for axis, length in enumerate(x.shape)]
+            for x, axes in zip(samples[0], network.varying, strict=True)
+        ]
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about the tracer itself and checks of arguments
             model = self._openvino.convert_model(
