@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -14,7 +14,6 @@ from methods.instant_ngp.field import Precision
 from methods.instant_ngp.stage1 import Setup, train_field
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.encode import HashGrid
-from methods.steernerf.beyond.pretraining import pretrain_renderer
 from methods.steernerf.buffer import RenderingBuffer
 from methods.steernerf.calibration import Calibration
 from methods.steernerf.options import Model, Rendering
@@ -76,13 +75,6 @@ class SteerNerf:
         self.pipeline = second.pipeline
         self.train_s = self.trained.train_s + second.train_s
         self._build_network(second, scene, log)
-
-    def pretrain_renderer(
-        self, scenes: Sequence[Scene], budget: Budget, output: Path, log: Log
-    ) -> None:
-        """Train a 2D renderer on many scenes, for others to start from; see
-        `beyond.pretraining.pretrain_renderer`."""
-        pretrain_renderer(self.setup, self.stage2, scenes, budget, output, log)
 
     def reset(self) -> None:
         """Forget preceding frames."""

@@ -1,26 +1,25 @@
-"""`steerbench parity`: what every engine and precision of the 2D renderer loses, and saves."""
+"""`steerbench parity`: the error and the time of every engine and precision of the network."""
 
 from __future__ import annotations
 
 import argparse
-import json
-from typing import Any
 
 from bench.errors import SteerbenchError
 from reports.tables import Table, decimal, megabytes
 from sweeps.overrides import composed
-from sweeps.terminal import console, rich_table
-from sweeps.variants import (
+from sweeps.studies.variants import (
+    METHOD,
     Rendered,
+    Row,
     apart_text,
+    computes_with_engine,
     engines,
-    finite,
+    print_rows,
     range_text,
     render_variants,
     settings_of,
 )
-
-SETTINGS = ("method=steernerf", "trajectory=smooth")
+from sweeps.terminal import show
 
 COLUMNS = (
     "engine, precision",
@@ -38,38 +37,37 @@ COLUMNS = (
 
 def main(options: argparse.Namespace) -> int:
     """Print a table and, as the last line, the same rows as JSON."""
-    overrides = [*SETTINGS, *options.overrides]
-    if "engine" not in composed(overrides).method:
+    words = [METHOD, "trajectory=smooth", *options.overrides]
+    if not computes_with_engine(composed(words)):
         raise SteerbenchError(
-            "steerbench parity compares engines of a 2D renderer: expected method=steernerf or "
-            "steernerf_paper"
+            "steerbench parity compares the engines of a 2D renderer: expected a method with the "
+            "setting method.engine, for example method=steernerf_lean or steernerf"
         )
-    variants = settings_of(overrides, engines())
+    variants = settings_of(words, engines(words))
     found = render_variants(variants, options.frames, options.repeats)
     rows = [_row(one, found[0]) for one in found]
     title = f"{found[0].method.name}, {found[0].frames} frames"
-    console().print(rich_table(Table(title, COLUMNS, tuple(_line(row) for row in rows))))
-    print(json.dumps([finite(row) for row in rows]))
+    show(Table(title, COLUMNS, tuple(_line(row) for row in rows)))
+    print_rows(rows)
     return 0
 
 
-def _row(one: Rendered, standard: Rendered) -> dict[str, Any]:
+def _row(one: Rendered, standard: Rendered) -> Row:
+    values = one.values
     return {
         "engine": one.name,
-        "apart": one.values["psnr_to_first"],
-        "worst": one.values["worst"],
-        "psnr": one.values["psnr"],
-        "lost": standard.values["psnr"] - one.values["psnr"],
-        "network_ms": one.values["stage_ms.renderer2d/network"],
-        "frame_ms": one.values["ms"],
-        "ms_lo": one.values["ms_lo"],
-        "ms_hi": one.values["ms_hi"],
-        "p99_to_p50": one.values["p99_to_p50"],
-        "bytes": one.method.sizes()["renderer2d"],
+        "apart": values["psnr_to_first"],
+        "worst": values["worst"],
+        "psnr": values["psnr"],
+        "lost": standard.values["psnr"] - values["psnr"],
+        "network_ms": one.network_ms,
+        "frame_ms": values["ms"],
+        **{name: values[name] for name in ("ms_lo", "ms_hi", "p99_to_p50")},
+        "bytes": one.method.sizes().get(one.study.network_size),
     }
 
 
-def _line(row: dict[str, Any]) -> tuple[str, ...]:
+def _line(row: Row) -> tuple[str, ...]:
     return (
         row["engine"],
         apart_text(row["apart"]),
