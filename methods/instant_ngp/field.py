@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from typing import Literal
 
@@ -37,9 +36,6 @@ class HashField(nn.Module):
     With precision "bf16" the table is read as packed bfloat16, and the matrix products are those of
     bfloat16 weights with float32 accumulation; parameters, gradients of the table and outputs stay
     float32. So do the activations where the device has no products of bfloat16.
-
-    Attributes:
-        levels: of the grid that are read, the coarsest first.
     """
 
     def __init__(
@@ -53,7 +49,6 @@ class HashField(nn.Module):
     ) -> None:
         super().__init__()
         self.grid, self.channels, self.precision, self.backend = grid, channels, precision, backend
-        self.levels = grid.levels
         table = torch.empty(grid.entries, grid.features).uniform_(-1e-4, 1e-4, generator=generator)
         self.table = nn.Parameter(table)
         sizes = {
@@ -86,12 +81,6 @@ class HashField(nn.Module):
             functional.pad(old, (0, 0, 0, channels - len(old)))
         )
 
-    def coarse(self, levels: int) -> HashField:
-        """This very field, of which only the coarsest `levels` are read."""
-        field = copy.copy(self)  # shares parameters and buffers
-        field.levels = levels
-        return field
-
     def encode_directions(self, directions: Tensor) -> Tensor:
         """Spherical harmonics [R, 16] of ray `directions` [R, 3] of any length."""
         unit = functional.normalize(directions, dim=-1)
@@ -103,12 +92,11 @@ class HashField(nn.Module):
             positions,
             self.table,
             self.grid,
-            levels=self.levels,
             packed=self.packed,
             grad_buffer=self.grad_buffer,
             backend=self.backend,
         ).to(self._compute_dtype)
-        hidden = self._linear(features, self._density_in).relu_()
+        hidden = self._linear(features, self.layers["density_in"]).relu_()
         geometry = self._linear(hidden, self.layers["density_out"])
         return _ClampedExp.apply(geometry[:, 0].to(self.table.dtype)), geometry
 
@@ -121,9 +109,9 @@ class HashField(nn.Module):
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
         """Tell `probe` the work of the densities of `samples` and of the features of `shaded`."""
-        density = self._density_in.numel() + self.layers["density_out"].numel()
+        density = self.layers["density_in"].numel() + self.layers["density_out"].numel()
         features = sum(self.layers[f"feature_{name}"].numel() for name in ("in", "mid", "out"))
-        probe.count("table_reads", 8 * self.levels * samples)
+        probe.count("table_reads", 8 * self.grid.levels * samples)
         probe.count("products", density * samples + features * shaded)
 
     def sizes(self) -> dict[str, int]:
@@ -136,11 +124,6 @@ class HashField(nn.Module):
     def _compute_dtype(self) -> torch.dtype:
         half = self.precision == "bf16" and multiplies_bf16(self.table.device.type)
         return torch.bfloat16 if half else self.table.dtype
-
-    @property
-    def _density_in(self) -> Tensor:
-        """The weights of the levels that are read."""
-        return self.layers["density_in"][:, : self.levels * self.grid.features]
 
     def _linear(self, inputs: Tensor, weights: Tensor) -> Tensor:
         if self.precision == "bf16":

@@ -78,30 +78,17 @@ def render_batch(
         stop: transmittance at which a ray ends.
         step: world length of a ray-marching step.
     """
-    samples = march(
-        rays.origins, rays.directions, occupancy, step, jitter=jitter, backend=field.backend
-    )
+    samples = march(rays, occupancy, step, jitter=jitter, backend=field.backend)
     with torch.no_grad():
         parts = pad(samples.positions).split(CHUNK_SAMPLES)
         sigma = torch.cat([field.density(part)[0] for part in parts])[: len(samples)]
-        counts = visible_counts(
-            sigma, samples.delta, samples.offsets, stop=stop, backend=field.backend
-        )
+        counts = visible_counts(sigma, samples, stop=stop, backend=field.backend)
     samples = samples.front(counts)
     sigma, values = query(
         field, samples.positions, samples.ray, field.encode_directions(rays.directions)
     )
-    pixels = composite(
-        sigma,
-        values,
-        samples.t,
-        samples.delta,
-        samples.offsets,
-        background=background,
-        stop=stop,
-        backend=field.backend,
-    )
-    return pixels, len(samples)
+    pixels = composite(sigma, values, samples, stop=stop, backend=field.backend)
+    return pixels if background is None else pixels.over(background), len(samples)
 
 
 def opacity_entropy(opacity: Tensor) -> Tensor:

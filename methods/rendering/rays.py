@@ -92,10 +92,9 @@ def _render_round(
     """One round of at most `limit` samples of the rays `alive` from their steps `start`; those left
     and where they go on."""
     with probe.stage("march"):
-        origins, directions = rays.origins[alive], rays.directions[alive]
+        round_rays = rays.take(alive)
         samples = march(
-            origins,
-            directions,
+            round_rays,
             occupancy,
             step,
             window=None if window is None else window[alive],
@@ -110,10 +109,9 @@ def _render_round(
     with probe.stage("field"):
         sigma, geometry = field.density(pad(samples.positions))
         sigma = sigma[: len(samples)]
-        along = (sigma, samples.delta, samples.offsets)
-        weight = weights(*along, stop=stop, front=1 - carry.alpha, backend=field.backend)
+        weight = weights(sigma, samples, stop=stop, front=1 - carry.alpha, backend=field.backend)
         seen = (weight > faint).nonzero().squeeze(1)
-        encoded = field.encode_directions(directions)
+        encoded = field.encode_directions(round_rays.directions)
         index = pad(seen)
         values = sigma.new_zeros(len(samples), field.channels)
         shown = field.features(geometry[index], encoded[samples.ray[index]])
@@ -121,16 +119,7 @@ def _render_round(
     probe.count("shaded_samples", len(seen), len(samples))
     field.count(probe, len(samples), len(seen))
     with probe.stage("composite"):
-        pixels = composite(
-            sigma,
-            values,
-            samples.t,
-            samples.delta,
-            samples.offsets,
-            stop=stop,
-            carry=carry,
-            backend=field.backend,
-        )
+        pixels = composite(sigma, values, samples, stop=stop, carry=carry, backend=field.backend)
         canvas.put(alive, pixels)
         left = (samples.resume >= 0) & (1 - pixels.alpha > stop)
         return alive[left], samples.resume[left]

@@ -148,7 +148,7 @@ class Pipeline:
         if not (options.history or options.surface):
             return Sight(cells)
         depth = frame.depth.detach()
-        depth = enlarge(depth, cells, options.scale, view.phase, backend=self.backend)
+        depth = enlarge(depth, cells, options.scale, backend=self.backend)
         if not options.surface:
             return Sight(cells, depth)
         with probe.stage("surface"):
