@@ -42,10 +42,10 @@ def main(options: argparse.Namespace) -> int:
     if not options.kernels:
         settings = _setting_rows(overrides, turned, options)
         console().print(rich_table(setting_table(settings)))
-    from methods.accuracy import all_experiments
+    from methods.checks import found
 
     with turn("cpu", log):
-        experiments = experiment_rows(all_experiments(), options.repeats, log)
+        experiments = experiment_rows(found("experiments"), options.repeats, log)
     console().print(rich_table(experiment_table(experiments)))
     command = shlex.join(["steerbench", *sys.argv[1:]])
     page = write_accuracy(experiments, settings, outputs / "accuracy", command)

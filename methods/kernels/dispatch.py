@@ -36,8 +36,8 @@ def availability() -> dict[str, str]:
 
 
 def interpreted() -> bool:
-    """Whether Triton interprets the kernels of `gpu`, slowly and on CPU tensors, instead of compiling
-    them. For tests without a GPU."""
+    """Whether Triton interprets the kernels of `gpu` on CPU tensors, slowly, and compiles none. For
+    tests without a GPU."""
     return os.environ.get("TRITON_INTERPRET") == "1"
 
 

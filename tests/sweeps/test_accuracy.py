@@ -41,7 +41,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sweeps.variants.fit_each", lambda *arguments: None)
     monkeypatch.setattr("sweeps.variants.render_in_turns", rendered)
     monkeypatch.setattr("sweeps.accuracy.experiment_rows", lambda *arguments: [ERROR])
-    monkeypatch.setattr("methods.accuracy.all_experiments", lambda: [])
+    monkeypatch.setattr("methods.checks.found", lambda name: [])
     monkeypatch.setattr("reports.accuracy.frontier_plot", lambda rows, path: path.touch())
 
 
