@@ -100,7 +100,7 @@ class Lpips:
     Args:
         net: "alex", "vgg" or "squeeze".
         weights_dir: folder to look into first, or None.
-        log: told of a download.
+        log: shows a download.
 
     Raises:
         Unavailable: the backbone weights cannot be had, or are not those of this network.

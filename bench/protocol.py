@@ -103,7 +103,7 @@ class EvaluationProtocol:
     def load_lpips(
         self, weights_dir: Path | None, log: Log
     ) -> tuple[dict[str, metrics.Lpips], dict[str, str]]:
-        """LPIPS by backbone, and by metric why one is missing; the log is told of the latter."""
+        """LPIPS by backbone, and by metric why one is missing, which is logged, too."""
         loaded, missing = {}, {}
         for net in self.lpips:
             try:

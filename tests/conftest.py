@@ -21,7 +21,7 @@ from bench.lpips_weights import BACKBONES
 from bench.metrics import _lpips_package
 from bench.protocol import EvaluationProtocol
 from bench.results import Store
-from bench.run import measure
+from bench.run import Task, measure
 from bench.trajectories import from_split
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene, Split
 
@@ -188,15 +188,10 @@ def lpips_weights(shared_data: Path | None, tmp_path_factory: pytest.TempPathFac
 @pytest.fixture
 def store(tmp_path: Path, offset_method, tiny_scene, quiet_log) -> Store:
     """A store with one run, key `stored_run`, six frames, three of them pictured."""
-    measurement = measure(
-        offset_method,
-        tiny_scene,
-        from_split(tiny_scene),
-        EvaluationProtocol(name="quick", lpips=()),
-        Budget("none", steps=1, samples=1),
-        quiet_log,
-        seed=5,
-    )
+    protocol = EvaluationProtocol(name="quick", lpips=())
+    budget = Budget("none", steps=1, samples=1)
+    task = Task(tiny_scene, from_split(tiny_scene), protocol, budget, seed=5)
+    measurement = measure(offset_method, task, quiet_log)
     record = {
         **measurement.record,
         "command": "steerbench run method=offset",

@@ -96,9 +96,8 @@ def number(value: object, where: str, low: float = -math.inf, high: float = math
         if fits:
             return float(value)
     limits = [f"above {low:g}"] * (low > -math.inf) + [f"below {high:g}"] * (high < math.inf)
-    raise unexpected(
-        where, " ".join(("a finite number", " and ".join(limits))).rstrip(), describe(value)
-    )
+    expected = f"a finite number {' and '.join(limits)}".rstrip()
+    raise unexpected(where, expected, describe(value))
 
 
 def focal_length(angle: object, size: float, where: str) -> float:
@@ -142,6 +141,12 @@ def rigid_pose(value: object, where: str) -> Tensor:
     if torch.linalg.det(rotation) < 0:
         raise unexpected(where, "a right-handed rotation", "a mirrored one")
     return matrix
+
+
+def opengl_pose(frame: Mapping, where: str) -> Tensor:
+    """The `transform_matrix` of a frame of a `transforms*.json`, as `rigid_pose`, OpenCV axes."""
+    matrix = rigid_pose(frame.get("transform_matrix"), f"{where}.transform_matrix")
+    return opengl_to_opencv(matrix)
 
 
 def opengl_to_opencv(pose: Tensor) -> Tensor:

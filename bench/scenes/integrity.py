@@ -41,19 +41,17 @@ class VerifyReport:
 
 
 def verify(path: str | Path, log: Log) -> VerifyReport:
-    """Check the whole release or one scene of it, told by the names inside.
+    """Check the whole release, or one scene of it, as the names of the folders say.
 
     Raises SteerbenchError when `path` does not look like either.
     """
-    root = data_folder(path)
-    official = official_hashes()
-    scenes = {name.split("/")[0] for name in official}
+    root, expected = data_folder(path), official_hashes()
+    scenes = {name.split("/")[0] for name in expected}
     if any((root / scene).is_dir() for scene in scenes):
         base = root
-        expected = official
     elif root.name in scenes:
         base = root.parent
-        expected = {k: v for k, v in official.items() if k.split("/")[0] == root.name}
+        expected = {k: v for k, v in expected.items() if k.split("/")[0] == root.name}
     else:
         expected_text = f"NeRF-Synthetic: a folder {' or '.join(sorted(scenes))}, or one above"
         raise unexpected(root, expected_text, "none of these names")

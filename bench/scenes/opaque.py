@@ -80,8 +80,7 @@ class Solids:
         for number, first, last in spans:
             part, columns = self.parts[number], slice(first, last)
             frame = part.frame.to(depth)
-            centre = torch.tensor(part.centre).to(depth)
-            x, y, z = ((band.origin - centre) @ frame).tolist()
+            x, y, z = ((band.origin - depth.new_tensor(part.centre)) @ frame).tolist()
             found = part.shape.hit((x, y, z), band.directions(frame, columns))
             nearest = depth[:, columns]
             owner[:, columns].masked_fill_(found < nearest, number)

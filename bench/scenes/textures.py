@@ -29,7 +29,7 @@ def polar_checker(first: Colour, second: Colour, sectors: int, ring: float) -> T
 
     def texture(points: Tensor) -> Tensor:
         x, y, z = points.unbind(1)
-        sector = (angle(x, y) * sectors / (2 * math.pi)).floor()
+        sector = (torch.atan2(y, x) * sectors / (2 * math.pi)).floor()
         level = ((x * x + y * y).sqrt() / ring + 0.29).floor() + (z / ring + 0.29).floor()
         return pick((sector + level) % 2 < 1, first, second)
 
@@ -41,7 +41,7 @@ def spiral(first: Colour, second: Colour, stripes: int, twist: float) -> Texture
 
     def texture(points: Tensor) -> Tensor:
         x, y, z = points.unbind(1)
-        phase = (angle(x, y) + twist * z) * stripes / (2 * math.pi)
+        phase = (torch.atan2(y, x) + twist * z) * stripes / (2 * math.pi)
         return pick(phase - phase.floor() < 0.5, first, second)
 
     return texture
@@ -132,11 +132,6 @@ def lattice() -> Tensor:
     """[33, 33, 33] random values whose last planes repeat the first."""
     values = torch.rand(32, 32, 32, generator=torch.Generator().manual_seed(1))
     return torch.nn.functional.pad(values[None, None], (0, 1) * 3, mode="circular")[0, 0]
-
-
-def angle(x: Tensor, y: Tensor) -> Tensor:
-    """Azimuth in [-pi, pi]."""
-    return torch.atan2(y, x)
 
 
 def pick(condition: Tensor, first: Colour, second: Colour) -> Tensor:

@@ -17,9 +17,8 @@ from bench.scenes.files import (
     frames_of,
     inside,
     number,
-    opengl_to_opencv,
+    opengl_pose,
     read_json,
-    rigid_pose,
     unexpected,
     whole_number,
 )
@@ -54,9 +53,7 @@ def load(
             the test split and all others the training.
         aabb_scale: how many sides of instant-ngp's unit cube, x * 0.33 + 0.5, fill ours; by
             default what the file says, or 1. The file's own `scale` and `offset` are heeded.
-        downscale: average blocks of this many pixels squared; what does not fill a block, at the
-            right and the bottom, is left out.
-        background: "white" or "black", what RGBA pictures are composited onto.
+        downscale, background: as of `bench.scenes.blender.load`.
 
     Intrinsics of a frame go before those of the file. Lens distortion is undone, and pictures are
     cropped to what the lens saw. Frames without a picture are named once and left out.
@@ -70,18 +67,13 @@ def load(
         "train": [view for i, view in enumerate(views) if i % split_every],
         "test": views[::split_every],
     }
+    path = root / CAMERA_FILE
     if not splits["train"]:
         got = f"{len(views)} pictures, each of which split_every={split_every} makes a test"
-        raise unexpected(root / CAMERA_FILE, "a picture to train on", got)
-    box = capture_box(root / CAMERA_FILE, record, aabb_scale)
-    return assemble(
-        root.name,
-        splits,
-        decode_splits(splits, downscale, log),
-        box,
-        background=background,
-        camera_files=[root / CAMERA_FILE],
-    )
+        raise unexpected(path, "a picture to train on", got)
+    box = capture_box(path, record, aabb_scale)
+    pictures = decode_splits(splits, downscale, log)
+    return assemble(root.name, splits, pictures, box, background=background, camera_files=[path])
 
 
 def read_views(root: Path, record: dict, log: Log) -> list[View]:
@@ -94,22 +86,16 @@ def read_views(root: Path, record: dict, log: Log) -> list[View]:
         if not file.is_file():
             missing.append(frame["file_path"])
             continue
-        pose = opengl_to_opencv(
-            rigid_pose(frame.get("transform_matrix"), f"{where}.transform_matrix")
-        )
         settings = ChainMap(frame, record)
-        camera = read_camera(settings, pose, file, where)
+        camera = read_camera(settings, opengl_pose(frame, where), file, where)
         lens = tuple(number(settings.get(name, 0.0), f"{where}.{name}") for name in LENS)
         refuse_other_lenses(settings, where)
         views.append(View(str(file.relative_to(root)), file, camera, lens if any(lens) else ()))
     if not views:
         raise unexpected(f"{path}: frames", "pictures", f"none of {len(missing)} files is there")
     if missing:
-        total = len(views) + len(missing)
-        log.info(
-            f"{path}: {len(missing)} of {total} pictures are not there, left out: "
-            + ", ".join(missing)
-        )
+        count = f"{len(missing)} of {len(views) + len(missing)}"
+        log.info(f"{path}: {count} pictures are not there, left out: {', '.join(missing)}")
     return views
 
 
@@ -152,9 +138,8 @@ def refuse_other_lenses(settings: Mapping, where: str) -> None:
     """
     model = settings.get("camera_model", "OPENCV")
     if model not in PINHOLE_MODELS:
-        raise unexpected(
-            f"{where}.camera_model", f"one of {', '.join(PINHOLE_MODELS)}", describe(model)
-        )
+        expected = f"one of {', '.join(PINHOLE_MODELS)}"
+        raise unexpected(f"{where}.camera_model", expected, describe(model))
     for name in OTHER_LENSES:
         if settings.get(name):
             raise unexpected(f"{where}.{name}", "a lens of k1 k2 p1 p2 k3", settings[name])
@@ -172,5 +157,4 @@ def capture_box(path: Path, record: dict, aabb_scale: float | None) -> Box:
     else:
         sides = number(aabb_scale, "aabb_scale", 0)
     middle = (0.5 - torch.tensor(offset, dtype=torch.float64)) / scale
-    half = sides / scale / 2
-    return Box(middle - half, middle + half)
+    return Box(middle - sides / scale / 2, middle + sides / scale / 2)

@@ -32,10 +32,10 @@ def test_leaving_out_hidden_samples_changes_no_gradient(
     grads = [p.grad.clone() for p in field.parameters() if p.grad is not None]
     field.zero_grad()
 
-    samples = march(rays.origins, rays.directions, occupancy, STEP, jitter=jitter)
+    samples = march(rays, occupancy, STEP, jitter=jitter)
     sigma, geometry = field.density(samples.positions)
     values = field.features(geometry, field.encode_directions(rays.directions)[samples.ray])
-    whole = composite(sigma, values, samples.t, samples.delta, samples.offsets, background=white)
+    whole = composite(sigma, values, samples).over(white)
     whole.values.square().sum().backward()
 
     assert used < 0.9 * len(samples)
@@ -54,7 +54,7 @@ def test_no_ray_that_has_samples_is_left_out(
     camera = look_at_the_middle(turn, lift)
     pixels, rays = rays_at_matter(camera, occupancy)
     everywhere = cast(camera)
-    counts = march(everywhere.origins, everywhere.directions, occupancy, STEP).offsets.diff()
+    counts = march(everywhere, occupancy, STEP).offsets.diff()
     left_out = torch.ones(len(counts), dtype=torch.bool)
     left_out[pixels] = False
     assert not counts[left_out].any()
