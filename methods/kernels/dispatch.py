@@ -18,6 +18,7 @@ from types import ModuleType
 import torch
 
 from bench.errors import Unavailable
+from bench.sources import sources
 
 BACKENDS = ("reference", "cpu", "gpu")
 
@@ -103,6 +104,12 @@ def description(backend: str, device: torch.device | str, kernels: Iterable[str]
     name = resolve(backend, device)
     others = [kernel for kernel in kernels if not has(kernel, name)]
     return f"{name}, reference: {', '.join(sorted(others))}" if others else name
+
+
+def used_by(thing: type) -> list[str]:
+    """The names of the kernels that a class stands on, by its imports."""
+    folders = {path.parent for path in sources(thing).values()}
+    return sorted(folder.name for folder in folders if folder.parent == Path(__file__).parent)
 
 
 def has(kernel: str, backend: str) -> bool:

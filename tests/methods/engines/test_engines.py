@@ -33,7 +33,7 @@ ENGINES = [
 ]
 
 TOLERANCE = {"fp32": 1e-5, "bf16": 0.03, "int8": 0.1}
-"""Of the root mean square of what the network says. fp32: sums of a few hundred products in another
+"""Of the root mean square of the network's outputs. fp32: sums of a few hundred products in another
 order. Below, a number is rounded by 2^-8 (bf16), or by half of 1/255 of the range that it
 was seen in (int8), before each of half a dozen layers; single layers are kept higher."""
 
