@@ -1,4 +1,4 @@
-"""What the documents tell a reader to write, to type and to open is there and does what they say."""
+"""What the documents tell a reader to write, to type and to open exists and does what they say."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import ast
 import re
 import shlex
 import shutil
+import sys
 from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,9 +19,10 @@ import pytest
 from omegaconf import OmegaConf
 
 from reports import paper_tables
-from sweeps import cli, overrides
+from sweeps import arguments, cli, overrides
 from sweeps.overrides import choices, composed, swept
 from sweeps.plan import chosen, plan
+from sweeps.studies.variants import METHOD
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -69,6 +71,9 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     poses = np.broadcast_to(np.eye(4)[:3], (4, 3, 4))
     np.savez(tmp_path / "views.npz", pictures=pictures, poses=poses, focal=40.0)
     monkeypatch.syspath_prepend(tmp_path)  # PYTHONPATH=.
+    for name in ("mean_colour", "mean_colour.method", "mean_colour.average", "npz"):
+        monkeypatch.delitem(sys.modules, name, raising=False)  # of another test's folder
+    monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
@@ -115,7 +120,6 @@ def test_the_method_of_the_document_is_studied(steerbench, mine, monkeypatch):
 
 def test_the_method_of_the_document_has_a_line_in_a_table(mine, monkeypatch):
     seen = captured(monkeypatch, typed("paper"))
-    monkeypatch.chdir(mine)
     (table,) = chosen(seen.table, seen.methods)
     assert "mean_colour" in [job.line for job in plan(table, seen.overrides)]
     assert captured(monkeypatch, typed("report")).methods == seen.methods
@@ -192,12 +196,14 @@ def test_every_command_of_a_document_can_be_typed(document, words, monkeypatch, 
             return
     else:
         options = captured(monkeypatch, words)
-        settings = getattr(options, "overrides", [])
+        usual = [METHOD] if words[0] in arguments.GROUPS[arguments.STUDIES] else []
+        settings = [*usual, *getattr(options, "overrides", [])]
     settings = [word for word in settings if not word.startswith(ELSEWHERE)]
     several = swept(settings)
     settings = [word for word in settings if word.partition("=")[0] not in several]
     first = [f"{name}={values[0]}" for name, values in several.items()]
-    assert composed([*settings, *first]).method
+    if settings or first:
+        assert composed([*settings, *first]).method
 
 
 def test_there_are_commands_to_look_at():
@@ -212,9 +218,11 @@ def settings_there_are() -> set[str]:
     """Every setting, and every group of settings, of any choice."""
     found = set()
     for group in GROUPS:
-        for name in choices(group):
-            node: Any = OmegaConf.to_container(composed([f"{group}={name}"]), resolve=False)
-            for leaf in overrides.leaves(node):
+        for name, path in choices(group).items():
+            inherits = group == "method"
+            node = composed([f"method={name}"]).method if inherits else OmegaConf.load(path)
+            settings: Any = OmegaConf.to_container(node, resolve=False)
+            for leaf in overrides.leaves(settings, f"{group}."):
                 parts = leaf.split(".")
                 found |= {".".join(parts[:n]) for n in range(1, len(parts) + 1)}
     return found
@@ -268,11 +276,10 @@ def definitions(node: ast.AST, prefix: str = "") -> Iterator[str]:
             yield from definitions(child, f"{prefix}{child.name}.")
 
 
-def test_the_equations_of_the_pipeline_are_marked_in_the_code():
-    """Each of Eq. 2 to 11 is named in `methods`, in the file that docs/steernerf.md names."""
-    table = re.findall(r"^\| (\d+) \|.*?\| `([\w/]+\.py)`", (DOCS / "steernerf.md").read_text(),
-                       re.MULTILINE)  # fmt: skip
-    assert [int(number) for number, _ in table] == list(range(1, 12))
+def test_every_equation_of_the_paper_has_a_place():
+    text = (DOCS / "steernerf.md").read_text()
+    numbers = re.findall(r"^\| (\d+) \|.*\| `[\w/]+\.py`: `", text, re.MULTILINE)
+    assert [int(number) for number in numbers] == list(range(1, 12))
 
 
 def test_the_citation_names_the_version_and_the_paper():
