@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from colorsys import hsv_to_rgb
 from typing import TypeVar
 
+from bench.scenes import textures
 from bench.scenes.opaque import Part, Solids
 from bench.scenes.solids import (
     Box,
@@ -26,20 +27,7 @@ from bench.scenes.solids import (
     Triple,
     ball,
 )
-from bench.scenes.textures import (
-    Colour,
-    Texture,
-    checker,
-    chevrons,
-    eye,
-    marble,
-    mottled,
-    pips,
-    plain,
-    polar_checker,
-    spiral,
-    wood,
-)
+from bench.scenes.textures import Colour, Texture
 
 Item = TypeVar("Item")
 
@@ -256,20 +244,20 @@ def pair(draw: Draw, colours: list[Colour]) -> tuple[Colour, Colour]:
 def rings(draw: Draw, colours: list[Colour], size: float) -> Texture:
     """A checkerboard on a disc."""
     width = stripe(draw, size) + FINEST  # it narrows towards the axis
-    return polar_checker(*pair(draw, colours), 2 * around(size, width), width)
+    return textures.polar_checker(*pair(draw, colours), 2 * around(size, width), width)
 
 
 def screw(draw: Draw, colours: list[Colour], size: float) -> Texture:
     """Stripes around the axis, straight or winding."""
     width = stripe(draw, size) + FINEST  # it narrows towards the axis and where it winds
     twist = draw.between(-1.2, 1.2) / max(size, 0.05)
-    return spiral(*pair(draw, colours), around(size, width), twist)
+    return textures.spiral(*pair(draw, colours), around(size, width), twist)
 
 
 def dots(draw: Draw, colours: list[Colour], size: float) -> Texture:
     """Dots on a lattice."""
     radius = 0.7 * stripe(draw, size)
-    return pips(*pair(draw, colours), draw.between(2.2, 3.5) * radius, radius)
+    return textures.pips(*pair(draw, colours), draw.between(2.2, 3.5) * radius, radius)
 
 
 def stripe(draw: Draw, size: float) -> float:
@@ -285,20 +273,20 @@ def around(size: float, width: float) -> int:
 Painter = Callable[[Draw, list[Colour], float], Texture]
 
 PATTERNS: tuple[Painter, ...] = (
-    lambda draw, colours, size: checker(*pair(draw, colours), stripe(draw, size)),
+    lambda draw, colours, size: textures.checker(*pair(draw, colours), stripe(draw, size)),
     rings,
     screw,
-    lambda draw, colours, size: chevrons(
+    lambda draw, colours, size: textures.chevrons(
         *pair(draw, colours), 2 * stripe(draw, size), draw.between(0.5, 2.5)
     ),
     dots,
-    lambda draw, colours, size: marble(*pair(draw, colours), 0.3 / stripe(draw, size)),
-    lambda draw, colours, size: wood(*pair(draw, colours), 0.5 / stripe(draw, size)),
-    lambda draw, colours, size: mottled(*pair(draw, colours), 0.3 / stripe(draw, size)),
+    lambda draw, colours, size: textures.marble(*pair(draw, colours), 0.3 / stripe(draw, size)),
+    lambda draw, colours, size: textures.wood(*pair(draw, colours), 0.5 / stripe(draw, size)),
+    lambda draw, colours, size: textures.mottled(*pair(draw, colours), 0.3 / stripe(draw, size)),
 )
 PAINTERS: tuple[Painter, ...] = (
     *PATTERNS,
-    lambda draw, colours, size: plain(draw.one(colours)),
-    lambda draw, colours, size: eye(draw.one(colours)),
+    lambda draw, colours, size: textures.plain(draw.one(colours)),
+    lambda draw, colours, size: textures.eye(draw.one(colours)),
 )
 """Textures in some of the colours, for a part of the size that is given."""
