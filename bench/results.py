@@ -42,9 +42,9 @@ COLUMNS = [
     *("device", "backend", "engine", "precision", "seed", "commit"),
 ]
 """`value` is a mean over `n` frames with its 95 % interval [lo, hi], or a single figure (n = 1,
-no interval); NaN with n = 0 is a figure that could not be had. `phase` says which frames: "steady",
-"cold" (a method that looks back had fewer frames to look back on than it can), or "all" for a
-figure of the whole run."""
+no interval); NaN with n = 0 is a figure that is not available. `phase` says which frames: "steady",
+"cold" (there were fewer frames before it than the method looks back on), or "all" for a figure of
+the whole run."""
 
 STEADY, COLD, WHOLE = "steady", "cold", "all"
 """The values of the column `phase`."""
@@ -63,7 +63,7 @@ def content_key(parts: Mapping[str, object]) -> str:
 
 @dataclass(frozen=True)
 class Measurement:
-    """What one run found out.
+    """The figures and pictures of one run.
 
     Attributes:
         rows: one metric per row, `COLUMNS` without `run` and `commit`.
@@ -190,7 +190,7 @@ class Store:
     def _sweep(self) -> None:
         """Delete what killed processes left behind; a day is longer than any writing takes.
 
-        What others publish or delete meanwhile is gone, and that is no reason to lose a run.
+        What other processes publish or delete meanwhile is ignored.
         """
         with suppress(OSError):
             for folder in self.folder.glob(f"{PARTIAL}*"):

@@ -1,7 +1,7 @@
 """Which files and libraries decide what a class or a function computes, found from the imports.
 
 A cache key holds the digest of these files, so that a change in any of them, and in no other file,
-asks for new results. Nobody keeps a list of files by hand.
+makes new results necessary. No list of files is kept by hand.
 """
 
 from __future__ import annotations

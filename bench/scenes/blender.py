@@ -97,7 +97,7 @@ def picture_path(root: Path, file_path: str, where: str) -> Path:
 
 
 def scene_box(bounds: str | list, train: list[Picture], log: Log) -> Box:
-    """The box in the data set's units that `bounds` asks for."""
+    """The box in the data set's units that `bounds`, as of `load`, means."""
     space = cube(HALF_EXTENT)
     if bounds == "full":
         return space

@@ -16,7 +16,7 @@ Settings = ParamSpec("Settings")
 
 
 def texture(paint: Callable[Concatenate[Tensor, Settings], Tensor]) -> Callable[Settings, Texture]:
-    """Make of a function of points and settings one that takes the settings and gives a texture."""
+    """Turn a function of points and settings into one that makes a texture from the settings."""
 
     def make(*settings: Settings.args, **named: Settings.kwargs) -> Texture:
         return wraps(paint)(lambda points: paint(points, *settings, **named))
