@@ -78,7 +78,7 @@ class EvaluationProtocol:
         return ("psnr", "ssim", *(f"lpips_{net}" for net in self.lpips))
 
     def check(self, scene: Scene, trajectory: Trajectory) -> None:
-        """Refuse, before any training, what could not be scored after it.
+        """Raise, before any training, if the frames could not be scored after it.
 
         Raises:
             SteerbenchError: the scene is composited on another background, or a frame is smaller

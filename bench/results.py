@@ -29,7 +29,7 @@ from bench.errors import SteerbenchError, explained
 from bench.provenance import commit, machine
 
 SCHEMA_VERSION = 3
-"""Of record.json and rows.csv."""
+"""The version of record.json and rows.csv that is written."""
 
 READABLE = (2, SCHEMA_VERSION)
 """The versions that can be read; a folder of another one is reported and left alone.
@@ -205,7 +205,7 @@ class Store:
 
 
 def present_name(method: str) -> str:
-    """The name of today for what schema 2 calls `method`.
+    """The present name of what schema 2 calls `method`.
 
     "steernerf" was the lean method and "steernerf_paper" the paper's; variants have a suffix.
     """
@@ -228,12 +228,12 @@ def _schema_version(folder: Path) -> object:
 
 
 def _text(path: Path) -> str:
-    """What a file holds; nothing where there is no such file."""
+    """The text of a file; empty where there is no such file."""
     return path.read_text(encoding="utf-8") if path.is_file() else ""
 
 
 def _sync(path: Path) -> None:
-    """Have the system write a file or folder to the disk now."""
+    """Write a file or folder to the disk now."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

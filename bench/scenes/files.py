@@ -1,4 +1,4 @@
-"""Reading a data set's files: nothing outside its folder, and every fault named.
+"""Reads the files of a data set: nothing outside its folder, and every error names its place.
 
 A `where` is what an error message starts with: the file, and the field inside it.
 """
@@ -17,7 +17,7 @@ from torch import Tensor
 from bench.types import SteerbenchError
 
 SMALLEST_ANGLE = 1e-9
-"""Of a view, in radians: less than any telescope's, and its tangent is not 0."""
+"""Smallest angle of view in radians: less than any telescope's, and its tangent is not 0."""
 
 ORTHONORMAL_TOLERANCE = 1e-3
 """Largest entry of R^T R - I: poses are stored with three digits or more."""
@@ -101,7 +101,7 @@ def number(value: object, where: str, low: float = -math.inf, high: float = math
 
 
 def focal_length(angle: object, size: float, where: str) -> float:
-    """In pixels, of a view of `angle` radians across `size` pixels."""
+    """Focal length in pixels of a view of `angle` radians across `size` pixels."""
     return size / 2 / math.tan(number(angle, where, SMALLEST_ANGLE, math.pi) / 2)
 
 
