@@ -180,8 +180,8 @@ def render_in_turns(
 def steady_frames(
     methods: Iterable[Method], trajectory: Trajectory
 ) -> tuple[list[bool], list[int]]:
-    """Whether each frame has all the preceding frames that any of the `methods` uses, and the numbers
-    of those frames that have a ground truth, too.
+    """Whether each frame has all preceding frames that any of the `methods` uses, and the numbers
+    of those that have a ground truth, too.
 
     Raises:
         SteerbenchError: there is none with a ground truth.

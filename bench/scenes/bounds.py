@@ -91,7 +91,7 @@ def hull_box(cameras: Sequence[Camera], images: Sequence[Tensor], space: Box) ->
 
 
 def maybe_seen(camera: Camera, mask: Tensor, corners: Tensor) -> Tensor:
-    """[M] bool: whether a cell of `corners` [M, 8, 3] may hold something that `mask` [H, W] shows."""
+    """[M] bool: whether a cell of `corners` [M, 8, 3] may hold what `mask` [H, W] shows."""
     pixels, depth = project(camera, corners.reshape(-1, 3))
     pixels, depth = pixels.reshape(-1, 8, 2), depth.reshape(-1, 8)
     first = pixels.amin(1).floor() - 1

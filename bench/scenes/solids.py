@@ -244,7 +244,7 @@ class Carved(Shape):
         return torch.maximum(self.body.distance(points), bites.amax(0))
 
     def normal(self, points: Tensor) -> Tensor:
-        """The normal of the operand whose surface a point lies on; that of a bite points into the bite."""
+        """The normal of the operand whose surface a point lies on; of a bite, into the bite."""
         nearest = self.body.distance(points).abs()
         normal = self.body.normal(points)
         for bite in self.bites:
