@@ -74,18 +74,18 @@ def read_json(root: Path, relative: str) -> dict:
     return value
 
 
-def frames_of(record: Mapping, path: Path) -> list[dict]:
-    """The frame list of a `transforms*.json`: not empty, every frame an object with a path."""
+def frames_of(record: Mapping, path: Path) -> list[tuple[str, dict]]:
+    """The frames of a `transforms*.json`, not empty, each an object with a path after its place."""
     frames = record.get("frames")
     if not isinstance(frames, list) or not frames:
         raise unexpected(f"{path}: frames", "a list with at least one frame", describe(frames))
-    for index, frame in enumerate(frames):
-        where = f"{path}: frames[{index}]"
+    named = [(f"{path}: frames[{index}]", frame) for index, frame in enumerate(frames)]
+    for where, frame in named:
         if not isinstance(frame, dict):
             raise unexpected(where, "an object", describe(frame))
         if not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
             raise unexpected(f"{where}.file_path", "a path", describe(frame.get("file_path")))
-    return frames
+    return named
 
 
 def number(value: object, where: str, low: float = -math.inf, high: float = math.inf) -> float:

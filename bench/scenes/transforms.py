@@ -80,8 +80,7 @@ def read_views(root: Path, record: dict, log: Log) -> list[View]:
     """The views of all frames whose picture is there."""
     path = root / CAMERA_FILE
     views, missing = [], []
-    for index, frame in enumerate(frames_of(record, path)):
-        where = f"{path}: frames[{index}]"
+    for where, frame in frames_of(record, path):
         file = inside(root, frame["file_path"], f"{where}.file_path")
         if not file.is_file():
             missing.append(frame["file_path"])
