@@ -1,7 +1,7 @@
 """Run time against error, for computations whose exact answer is known and for whole methods.
 
-What is compared takes turns, so that a drifting clock hits all of it alike; the times come from
-further rounds of what made the errors.
+The settings that are compared take turns, so that a drifting clock affects all of them alike. The
+times come from further rounds of the computation that gave the errors.
 """
 
 from __future__ import annotations

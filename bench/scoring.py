@@ -39,7 +39,7 @@ def check_frame(frame: Frame, camera: Camera, method: str, index: int) -> None:
 
 
 class Scoring:
-    """Scores the frames of a trajectory in their order; remembers the last one for its flicker.
+    """Scores the frames of a trajectory in their order; keeps the last one for the flicker.
 
     Attributes:
         images: of `PICTURES` scored frames, evenly spread: ground truth, rendering and error map

@@ -197,8 +197,8 @@ class Method(Protocol):
     Attributes:
         name: as it stands in result rows.
         train_s: seconds the training took, over all the processes it was continued in; `fit`
-            knows it also when it only loads.
-        memory: preceding frames it looks back on; 0: every frame stands alone.
+            sets it even when it only loads.
+        memory: preceding frames that it uses; 0: every frame is rendered independently.
     """
 
     name: str
