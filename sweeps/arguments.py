@@ -1,4 +1,4 @@
-"""The subcommands of `steerbench` and their arguments; commands.toml has the words of their help."""
+"""The arguments of the subcommands of `steerbench`, which commands.toml lists and explains."""
 
 from __future__ import annotations
 
@@ -63,7 +63,13 @@ FOLDER = _several(
     "folder with further choices, such as DIR/method/mine.yaml for method=mine",
     **{"type": config_dir, "default": [], "metavar": "DIR"},
 )
-OUTPUTS = _one("--outputs", help="(default outputs)", type=Path, default="outputs", metavar="DIR")
+OUTPUTS = _one(
+    "--outputs",
+    help="folder of the store (default outputs)",
+    type=Path,
+    default="outputs",
+    metavar="DIR",
+)
 TABLES = [
     *_one("--table", help="only this table, for example table3", metavar="NAME"),
     *_several(
