@@ -102,9 +102,8 @@ def render_variants(
         fit_each(methods, configs, scene, path, log)
         rows = render_in_turns(methods, scene, path, protocol, repeats, log)
     return [
-        Rendered(name, declared(configs[name]), methods[name], scene, path, row)
-        for row in rows
-        for name in [row["setting"]]
+        Rendered(name, declared(configs[name]), method, scene, path, row)
+        for (name, method), row in zip(methods.items(), rows, strict=True)
     ]
 
 
