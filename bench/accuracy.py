@@ -1,7 +1,7 @@
 """Run time against error, for computations whose exact answer is known and for whole methods.
 
-What is compared takes turns, so that a drifting clock hits all of it alike; the times come from
-further rounds of what made the errors.
+The settings that are compared take turns, so that a drifting clock affects all of them alike. The
+times come from further rounds of the computation that gave the errors.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ def render_in_turns(
 def steady_frames(
     methods: Iterable[Method], trajectory: Trajectory
 ) -> tuple[list[bool], list[int]]:
-    """Which frames have as many before them as any of the `methods` looks back on, and the numbers
+    """Whether each frame has all preceding frames that any of the `methods` uses, and the numbers
     of those that have a ground truth, too.
 
     Raises:
@@ -198,8 +198,7 @@ def steady_frames(
 
 
 def _costs(records: Sequence[FrameRecord], ready: Sequence[bool]) -> dict[str, float]:
-    """What the `ready` frames of a round took, in all rounds but the first; see
-    `render_in_turns`."""
+    """The costs of the `ready` frames in all rounds but the first; see `render_in_turns`."""
     count = len(ready)
     rounds = [
         list(compress(records[first : first + count], ready))
@@ -220,7 +219,7 @@ def _costs(records: Sequence[FrameRecord], ready: Sequence[bool]) -> dict[str, f
 def _means(
     kind: str, of_frames: Sequence[Mapping[str, int]], factor: float = 1
 ) -> dict[str, float]:
-    """The mean over frames of everything that any of them has; 0 where one has it not."""
+    """The mean over frames of every figure that one of them has; a missing one counts as 0."""
     names = dict.fromkeys(name for figures in of_frames for name in figures)
     return {
         f"{kind}.{name}": factor * statistics.fmean(figures.get(name, 0) for figures in of_frames)

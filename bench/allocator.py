@@ -1,4 +1,4 @@
-"""What glibc does with freed memory: it keeps it for the next step, or gives it back to the system.
+"""Tells glibc to keep freed memory for the next step, or to give it back to the system.
 
 A training step allocates and frees 50 MB of activations. Given back each time, they are some 12,000
 pages that must be mapped and cleared again. With another C library nothing happens here.

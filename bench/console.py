@@ -15,10 +15,10 @@ from bench.errors import explained
 from bench.results import content_key
 
 PLAIN_INTERVAL_S = 10.0
-"""Between two lines of progress where there is no terminal to draw a bar on."""
+"""Time between two lines of progress where there is no terminal to draw a bar on."""
 
 DRAW_INTERVAL_S = 0.2
-"""Between two drawings of a bar."""
+"""Time between two drawings of a bar."""
 
 WORTH_A_LINE_S = 2.0
 """Work that took longer leaves a line behind when it is done."""
@@ -110,7 +110,7 @@ class _Bar:
             self._line(f"done in {_duration(elapsed)}")
 
     def remove(self) -> None:
-        """Take the bar off the screen."""
+        """Remove the bar from the screen."""
         self._bars.remove_task(self._id)
         self._bars.refresh()
 

@@ -8,7 +8,7 @@ import numpy as np
 
 
 def best_instead(cost: Sequence[float], error: Sequence[float]) -> list[int]:
-    """Of each setting, the index of the one to take in its place: the least `error` among those
+    """For each setting, the index of the one to use in its place: the least `error` among those
     that cost no more, of equals the cheapest, of equals the first.
 
     A setting on the Pareto frontier (of several alike there, the first) gets its own index; any

@@ -22,7 +22,7 @@ OTHER = "other"
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """What one frame took.
+    """The times and the work of one frame.
 
     Attributes:
         stages_ns: own time of each stage, and of `other`; a stage inside another is named

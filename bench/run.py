@@ -34,7 +34,7 @@ UNITS = {
     "peak_bytes": "B",
     "train_s": "s",
 }
-"""By the name of a metric up to its first dot; what is not listed has none."""
+"""Units by the name of a metric up to its first dot; a metric that is not listed has none."""
 
 
 @dataclass(frozen=True)
@@ -204,6 +204,6 @@ def _rate(ms: dict) -> dict[str, float]:
 
 
 def _single(metric: str, value: float) -> dict[str, Any]:
-    """A single figure, of the whole run unless it is given another phase."""
+    """A row of a single figure, of the whole run unless its phase is replaced."""
     row = {"metric": metric, "value": float(value), "n": 1, "lo": math.nan, "hi": math.nan}
     return row | {"phase": WHOLE}

@@ -1,4 +1,4 @@
-"""Scores of a sequence of frames, taken one after another so that none has to be kept."""
+"""Scores a sequence of frames one after another, so that none has to be kept."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ERROR_RANGE = 0.1
 
 
 def check_frame(frame: Frame, camera: Camera, method: str, index: int) -> None:
-    """Refuse a picture with a NaN in it: it has no score, and a table may not invent one.
+    """Raise if a picture has a NaN in it: it has no score, and a table may not invent one.
 
     Raises:
         ValueError: the picture is not of the size of `camera`.
@@ -39,7 +39,7 @@ def check_frame(frame: Frame, camera: Camera, method: str, index: int) -> None:
 
 
 class Scoring:
-    """Scores the frames of a trajectory in their order; remembers the last one for its flicker.
+    """Scores the frames of a trajectory in their order; keeps the last one for the flicker.
 
     Attributes:
         images: of `PICTURES` scored frames, evenly spread: ground truth, rendering and error map

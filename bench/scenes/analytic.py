@@ -31,7 +31,7 @@ ANGLE_X = 0.69
 """Horizontal field of view in radians."""
 
 DISTANCE = 4.3
-"""Of all cameras from the middle of the scene, in the model's units."""
+"""Distance of all cameras from the middle of the scene, in the model's units."""
 
 MEDLEY = re.compile("medley-(0|[1-9][0-9]*)")
 """Names of the variants of `medley`."""
@@ -153,7 +153,7 @@ def _write_pictures(folder: Path, settings: dict, log: Log) -> None:
 
 
 def train_poses(count: int, seed: int) -> list[Tensor]:
-    """Spread evenly over a zone of the sphere by the golden angle, from a seeded start."""
+    """Poses spread evenly over a zone of the sphere by the golden angle, from a seeded start."""
     phase, shift = torch.rand(2, generator=torch.Generator().manual_seed(seed)).tolist()
     low, high = math.sin(math.radians(-10)), math.sin(math.radians(80))
     golden = math.pi * (3 - math.sqrt(5))
@@ -167,7 +167,7 @@ def train_poses(count: int, seed: int) -> list[Tensor]:
 
 
 def orbit_poses(count: int) -> list[Tensor]:
-    """1 degree of azimuth apart, centred on the front, swaying between 17 and 33 degrees above."""
+    """Poses 1 degree of azimuth apart, centred on the front, 17 to 33 degrees above the horizon."""
     azimuths = [math.radians(-90 + k - (count - 1) / 2) for k in range(count)]
     return [pose_on_sphere(a, math.radians(25 + 8 * math.sin(2 * a))) for a in azimuths]
 

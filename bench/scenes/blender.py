@@ -68,23 +68,21 @@ def read_split(root: Path, split: str, log: Log) -> list[View]:
         return []
     record = read_json(root, path.name)
     frames = frames_of(record, path)
-    fields = [f"{path}: frames[{i}]" for i in range(len(frames))]
-    files = [
-        picture_path(root, frame["file_path"], f"{field}.file_path")
-        for frame, field in zip(frames, fields, strict=True)
+    files = [picture_path(root, frame["file_path"], f"{at}.file_path") for at, frame in frames]
+    missing = [
+        (at, file) for (at, _), file in zip(frames, files, strict=True) if not file.is_file()
     ]
-    missing = [i for i, file in enumerate(files) if not file.is_file()]
     if optional and len(missing) == len(files):
         log.info(f"{path.name}: none of its {len(files)} pictures are there, split left out")
         return []
     if missing:
-        first = missing[0]
-        raise unexpected(f"{fields[first]}.file_path", "a picture", f"no file {files[first]}")
+        at, file = missing[0]
+        raise unexpected(f"{at}.file_path", "a picture", f"no file {file}")
     width, height = image_size(files[0])
     focal = focal_length(record.get("camera_angle_x"), width, f"{path}: camera_angle_x")
     views = []
-    for frame, field, file in zip(frames, fields, files, strict=True):
-        pose = opengl_pose(frame, field)
+    for (at, frame), file in zip(frames, files, strict=True):
+        pose = opengl_pose(frame, at)
         camera = Camera(pose, focal, focal, width / 2, height / 2, width, height)
         views.append(View(str(file.relative_to(root)), file, camera))
     return views
@@ -97,7 +95,7 @@ def picture_path(root: Path, file_path: str, where: str) -> Path:
 
 
 def scene_box(bounds: str | list, train: list[Picture], log: Log) -> Box:
-    """The box in the data set's units that `bounds` asks for."""
+    """The box in the data set's units that `bounds`, as of `load`, means."""
     space = cube(HALF_EXTENT)
     if bounds == "full":
         return space

@@ -44,7 +44,7 @@ class Cloud:
         return centres + signs * torch.tensor([ball.radius for ball in self.balls])[:, None, None]
 
     def trace(self, band: Band, spans: Sequence[Span]) -> Traced:
-        """All balls in `spans` together, for the rays that meet one."""
+        """Integrate all balls in `spans` together, for the rays that meet one."""
         shape = (band.y.shape[0], *band.x.shape[1:])
         balls = [self.balls[number] for number, _, _ in spans]
         directions = band.directions(torch.eye(3, device=band.x.device), slice(None))

@@ -1,4 +1,4 @@
-"""A heap of random solids, another one for every variant: scenes to train on, as many as wanted.
+"""A heap of random solids, a different one for every variant: any number of scenes to train on.
 
 Big parts make a core; smaller ones and rods are put on their surfaces, half inside, so that parts
 touch, cross and hide one another. Everything follows from `random.Random(variant).random`, whose
@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from colorsys import hsv_to_rgb
 from typing import TypeVar
 
+from bench.scenes import textures
 from bench.scenes.opaque import Part, Solids
 from bench.scenes.solids import (
     Box,
@@ -26,20 +27,7 @@ from bench.scenes.solids import (
     Triple,
     ball,
 )
-from bench.scenes.textures import (
-    Colour,
-    Texture,
-    checker,
-    chevrons,
-    eye,
-    marble,
-    mottled,
-    pips,
-    plain,
-    polar_checker,
-    spiral,
-    wood,
-)
+from bench.scenes.textures import Colour, Texture
 
 Item = TypeVar("Item")
 
@@ -47,43 +35,43 @@ REACH = 1.2
 """All parts lie in the ball of this radius: in the models' cube, and in every picture."""
 
 CORE = 5
-"""Parts that the others are put on."""
+"""The number of parts that the others are put on."""
 
 FINEST = 0.016
 """Width of the finest stripes and dots: two pixels of a picture 400 wide."""
 
 
 class Draw:
-    """Random numbers from one stream."""
+    """Draws random numbers and choices from one stream."""
 
     def __init__(self, variant: int) -> None:
         self.share = random.Random(variant).random
 
     def between(self, low: float, high: float) -> float:
-        """Uniform."""
+        """A uniform number from `low` to `high`."""
         return low + (high - low) * self.share()
 
     def small(self, low: float, high: float) -> float:
-        """More often near `low` than near `high`."""
+        """A number from `low` to `high`, more often near `low`."""
         return low + (high - low) * self.share() ** 2
 
     def whole(self, low: int, high: int) -> int:
-        """From `low` to `high`, both included."""
+        """A whole number from `low` to `high`, both included."""
         return low + int((high + 1 - low) * self.share())
 
     def one(self, items: Sequence[Item]) -> Item:
-        """Any of them."""
+        """One of the items."""
         return items[self.whole(0, len(items) - 1)]
 
     def deck(self, items: Sequence[Item], count: int) -> list[Item]:
-        """`count` of them in random order; none comes again before all have come."""
+        """`count` of the items in random order; none is repeated before all were drawn."""
         drawn: list[Item] = []
         while len(drawn) < count:
             drawn += sorted(items, key=lambda _: self.share())
         return drawn[:count]
 
     def direction(self) -> Triple:
-        """Of length 1."""
+        """A vector of length 1."""
         x, y, z = (self.between(-1, 1) for _ in range(3))
         length = max(math.sqrt(x * x + y * y + z * z), 1e-3)
         return (x / length, y / length, z / length)
@@ -115,7 +103,7 @@ def medley(variant: int) -> Solids:
 
 
 def place(draw: Draw, shape: Shape, core: Sequence[Part]) -> Triple:
-    """A centre: the middle for the first part, else near the surface of a part of the core.
+    """Draw the centre of a part: the middle for the first one, else near the surface of the core.
 
     The core surrounds its first part; the others are on the outer side of a part of the core.
     """
@@ -140,17 +128,17 @@ def place(draw: Draw, shape: Shape, core: Sequence[Part]) -> Triple:
 
 
 def dot(first: Sequence[float], second: Sequence[float]) -> float:
-    """Sum of the products."""
+    """The dot product."""
     return sum(a * b for a, b in zip(first, second, strict=True))
 
 
 def norm(vector: Triple) -> float:
-    """Its length."""
+    """The length of a vector."""
     return math.sqrt(dot(vector, vector))
 
 
 def scaled(vector: Sequence[float], factor: float) -> Triple:
-    """Each component times the factor."""
+    """A vector times a factor."""
     x, y, z = vector
     return x * factor, y * factor, z * factor
 
@@ -227,7 +215,7 @@ SHAPES: dict[str, Callable[[Draw, float], Shape]] = {
     "ring": ring,
     "window": window,
 }
-"""Solids of about the size that is given, by their kind."""
+"""Makers of solids by kind; each takes the size, roughly half the width of its solid."""
 
 BULKY = ("ball", "egg", "block", "drum", "die", "barrel")
 FLAT, LONG = ("plate", "disc", "petal"), ("beam", "pill", "rod", "rod", "rod")
@@ -256,24 +244,24 @@ def pair(draw: Draw, colours: list[Colour]) -> tuple[Colour, Colour]:
 def rings(draw: Draw, colours: list[Colour], size: float) -> Texture:
     """A checkerboard on a disc."""
     width = stripe(draw, size) + FINEST  # it narrows towards the axis
-    return polar_checker(*pair(draw, colours), 2 * around(size, width), width)
+    return textures.polar_checker(*pair(draw, colours), 2 * around(size, width), width)
 
 
 def screw(draw: Draw, colours: list[Colour], size: float) -> Texture:
     """Stripes around the axis, straight or winding."""
     width = stripe(draw, size) + FINEST  # it narrows towards the axis and where it winds
     twist = draw.between(-1.2, 1.2) / max(size, 0.05)
-    return spiral(*pair(draw, colours), around(size, width), twist)
+    return textures.spiral(*pair(draw, colours), around(size, width), twist)
 
 
 def dots(draw: Draw, colours: list[Colour], size: float) -> Texture:
     """Dots on a lattice."""
     radius = 0.7 * stripe(draw, size)
-    return pips(*pair(draw, colours), draw.between(2.2, 3.5) * radius, radius)
+    return textures.pips(*pair(draw, colours), draw.between(2.2, 3.5) * radius, radius)
 
 
 def stripe(draw: Draw, size: float) -> float:
-    """A width of stripes, more often fine than coarse, on a part of that size."""
+    """A random width of stripes on a part of that size, more often fine than coarse."""
     return draw.small(FINEST, max(0.4 * size, 2 * FINEST))
 
 
@@ -285,20 +273,20 @@ def around(size: float, width: float) -> int:
 Painter = Callable[[Draw, list[Colour], float], Texture]
 
 PATTERNS: tuple[Painter, ...] = (
-    lambda draw, colours, size: checker(*pair(draw, colours), stripe(draw, size)),
+    lambda draw, colours, size: textures.checker(*pair(draw, colours), stripe(draw, size)),
     rings,
     screw,
-    lambda draw, colours, size: chevrons(
+    lambda draw, colours, size: textures.chevrons(
         *pair(draw, colours), 2 * stripe(draw, size), draw.between(0.5, 2.5)
     ),
     dots,
-    lambda draw, colours, size: marble(*pair(draw, colours), 0.3 / stripe(draw, size)),
-    lambda draw, colours, size: wood(*pair(draw, colours), 0.5 / stripe(draw, size)),
-    lambda draw, colours, size: mottled(*pair(draw, colours), 0.3 / stripe(draw, size)),
+    lambda draw, colours, size: textures.marble(*pair(draw, colours), 0.3 / stripe(draw, size)),
+    lambda draw, colours, size: textures.wood(*pair(draw, colours), 0.5 / stripe(draw, size)),
+    lambda draw, colours, size: textures.mottled(*pair(draw, colours), 0.3 / stripe(draw, size)),
 )
 PAINTERS: tuple[Painter, ...] = (
     *PATTERNS,
-    lambda draw, colours, size: plain(draw.one(colours)),
-    lambda draw, colours, size: eye(draw.one(colours)),
+    lambda draw, colours, size: textures.plain(draw.one(colours)),
+    lambda draw, colours, size: textures.eye(draw.one(colours)),
 )
-"""Textures in some of the colours, for a part of the size that is given."""
+"""Makers of textures from some of the colours, for a part of the given size."""

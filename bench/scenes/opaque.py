@@ -120,7 +120,7 @@ class Solids:
         return colour.clamp(max=1)
 
     def shadowed(self, number: int, points: Tensor) -> Tensor:
-        """[N] bool: is another part between these points of part `number` and the light?"""
+        """[N] bool: whether another part is between these points of part `number` and the light."""
         dark = torch.zeros(len(points), dtype=torch.bool, device=points.device)
         light, columns = points.new_tensor(LIGHT), points.T.contiguous()
         for caster in (self.parts[k] for k in self.casters(number, points)):

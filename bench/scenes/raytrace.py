@@ -1,7 +1,7 @@
 """Exact pictures of analytic models: every sub-pixel ray is solved in closed form.
 
-A picture is worked through in bands of rows; each part of a model is asked only about the columns
-that its bounding box can cover in a band.
+A picture is rendered in bands of rows; a part of a model is traced only in the columns that its
+bounding box can cover in a band.
 """
 
 from __future__ import annotations

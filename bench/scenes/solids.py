@@ -1,4 +1,4 @@
-"""Shapes that a ray meets in closed form.
+"""Shapes whose intersection with a ray has a closed form.
 
 Every shape is centred, in its own frame. Rays come as components, three origins and three
 directions that broadcast: a camera has one origin (three floats) and many directions, a light at
@@ -52,7 +52,7 @@ class Convex(Shape, Protocol):
 
 @dataclass(frozen=True)
 class Ellipsoid(Convex):
-    """Semi-axes along x, y, z."""
+    """An ellipsoid with semi-axes along x, y, z."""
 
     radii: Triple
 
@@ -60,7 +60,7 @@ class Ellipsoid(Convex):
         return self.radii
 
     def interval(self, origin: Origin, directions: Directions) -> Interval:
-        """In the space where it is the unit sphere, from the point nearest to its centre."""
+        """Computed in the space where the ellipsoid is the unit sphere."""
         o = [x / r for x, r in zip(origin, self.radii, strict=True)]
         d = [x / r for x, r in zip(directions, self.radii, strict=True)]
         return ball_interval(o, d, 1.0)
@@ -82,7 +82,7 @@ def ball(radius: float) -> Ellipsoid:
 
 @dataclass(frozen=True)
 class Box(Convex):
-    """Half sizes along x, y, z."""
+    """A box with half sizes along x, y, z."""
 
     half: Triple
 
@@ -97,14 +97,14 @@ class Box(Convex):
         return (points.abs() - points.new_tensor(self.half)).amax(1)
 
     def normal(self, points: Tensor) -> Tensor:
-        """The axis of the nearest face."""
+        """The normal of the nearest face."""
         axis = (points.abs() - points.new_tensor(self.half)).argmax(1)
         return torch.nn.functional.one_hot(axis, 3).to(points.dtype) * points.sign()
 
 
 @dataclass(frozen=True)
 class Cylinder(Convex):
-    """Capped, along z."""
+    """A capped cylinder along z."""
 
     radius: float
     half: float
@@ -122,7 +122,7 @@ class Cylinder(Convex):
         )
 
     def normal(self, points: Tensor) -> Tensor:
-        """Of the wall or of a cap, whichever is nearer."""
+        """The normal of the wall or of a cap, whichever is nearer."""
         on_wall = points[:, :2].norm(dim=1) - self.radius > points[:, 2].abs() - self.half
         wall = unit(points * points.new_tensor((1, 1, 0)))
         cap = points.sign() * points.new_tensor((0, 0, 1))
@@ -170,7 +170,7 @@ class Shifted(Convex):
     offset: Triple
 
     def extent(self) -> Triple:
-        """Of a centred box that holds the moved shape."""
+        """Half sizes of a centred box that holds the moved shape."""
         x, y, z = (abs(o) + e for o, e in zip(self.offset, self.shape.extent(), strict=True))
         return x, y, z
 
@@ -187,7 +187,7 @@ class Shifted(Convex):
 
 @dataclass(frozen=True)
 class Common(Convex):
-    """What two convex shapes share."""
+    """The intersection of two convex shapes."""
 
     first: Convex
     second: Convex
@@ -204,7 +204,7 @@ class Common(Convex):
         return torch.maximum(self.first.distance(points), self.second.distance(points))
 
     def normal(self, points: Tensor) -> Tensor:
-        """Of the shape whose surface it is."""
+        """The normal of the shape whose surface a point lies on."""
         first = self.first.distance(points) > self.second.distance(points)
         return torch.where(first[:, None], self.first.normal(points), self.second.normal(points))
 
@@ -244,7 +244,7 @@ class Carved(Shape):
         return torch.maximum(self.body.distance(points), bites.amax(0))
 
     def normal(self, points: Tensor) -> Tensor:
-        """Of the operand whose surface it is; a bite's normal points into the bite."""
+        """The normal of the operand whose surface a point lies on; of a bite, into the bite."""
         nearest = self.body.distance(points).abs()
         normal = self.body.normal(points)
         for bite in self.bites:
@@ -270,7 +270,7 @@ def ball_interval(origin: Sequence, directions: Sequence[Tensor], radius: float)
 
 
 def overlap(first: Interval, second: Interval) -> Interval:
-    """Where rays are within both of two intervals."""
+    """The intersection of two intervals along each ray."""
     return torch.maximum(first[0], second[0]), torch.minimum(first[1], second[1])
 
 

@@ -51,12 +51,12 @@ def load(
         path: the folder with `transforms.json`.
         split_every: in the order of their names, pictures 0, split_every, 2 * split_every ... are
             the test split and all others the training.
-        aabb_scale: how many sides of instant-ngp's unit cube, x * 0.33 + 0.5, fill ours; by
-            default what the file says, or 1. The file's own `scale` and `offset` are heeded.
+        aabb_scale: the side of our unit cube in sides of instant-ngp's, x * 0.33 + 0.5; by default
+            what the file says, or 1. The `scale` and `offset` of the file are used, if any.
         downscale, background: as of `bench.scenes.blender.load`.
 
     Intrinsics of a frame go before those of the file. Lens distortion is undone, and pictures are
-    cropped to what the lens saw. Frames without a picture are named once and left out.
+    cropped to what the lens saw. Frames without a picture are logged and left out.
     Raises SteerbenchError naming file and field when anything is not as it should be.
     """
     whole_number(split_every, "split_every", 2)
@@ -80,8 +80,7 @@ def read_views(root: Path, record: dict, log: Log) -> list[View]:
     """The views of all frames whose picture is there."""
     path = root / CAMERA_FILE
     views, missing = [], []
-    for index, frame in enumerate(frames_of(record, path)):
-        where = f"{path}: frames[{index}]"
+    for where, frame in frames_of(record, path):
         file = inside(root, frame["file_path"], f"{where}.file_path")
         if not file.is_file():
             missing.append(frame["file_path"])
@@ -100,7 +99,7 @@ def read_views(root: Path, record: dict, log: Log) -> list[View]:
 
 
 def read_camera(settings: ChainMap, pose: torch.Tensor, file: Path, where: str) -> Camera:
-    """The pinhole of a frame; what is not said about its size the picture's header tells.
+    """The pinhole of a frame; a size that is missing is read from the picture's header.
 
     Focal lengths come from fl_x and fl_y or from camera_angle_x and camera_angle_y; the vertical
     one is the horizontal when missing, and the principal point the middle.
@@ -117,9 +116,9 @@ def read_camera(settings: ChainMap, pose: torch.Tensor, file: Path, where: str) 
 
 
 def focal(settings: ChainMap, axis: str, size: float, where: str) -> float | None:
-    """Focal length in pixels along an axis of `size` pixels; None when nothing is said.
+    """Focal length in pixels along an axis of `size` pixels; None when there is none.
 
-    A frame's angle of view goes before the file's focal length: they say the same thing.
+    A frame's angle of view goes before the file's focal length: they mean the same thing.
     """
     length, angle = f"fl_{axis}", f"camera_angle_{axis}"
     for level in settings.maps:
