@@ -1,41 +1,28 @@
-"""The one table in which several runs stand beside each other, a line for each."""
+"""One table of several runs, a line each, with the best figures in bold."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Protocol
 
 from bench.errors import SteerbenchError
 from bench.run import UNITS
-from reports.runs import Run
-from reports.tables import QUALITY, Table, megabytes, number
+from reports.runs import Repeated, Run
+from reports.tables import QUALITY, Table, decimal, megabytes
 
 Write = Callable[[float | None], str]
 
 COST: dict[str, tuple[str, Write]] = {
-    "frame_ms": ("ms / frame ↓", partial(number, decimals=1)),
-    "fps": ("FPS ↑", partial(number, decimals=2)),
+    "frame_ms": ("ms / frame ↓", partial(decimal, decimals=1)),
+    "fps": ("FPS ↑", partial(decimal, decimals=2)),
     "size_bytes.total": ("model, MB ↓", megabytes),
-    "train_s": ("training, s ↓", partial(number, decimals=0)),
+    "train_s": ("training, s ↓", partial(decimal, decimals=0)),
 }
-"""Label of each figure that is no quality, and how it is written."""
-
-
-class Comparable(Protocol):
-    """What can be held against others that were made under the same conditions."""
-
-    @property
-    def values(self) -> Mapping[str, float]:
-        """Figures by metric."""
-
-    @property
-    def conditions(self) -> tuple[object, ...]:
-        """See `Run.conditions`."""
-
+"""Label and format of the columns that are no quality."""
 
 COMMON = ("scene", "resolution", "trajectory", "budget", "protocol", "device")
+"""Facts that a heading lists."""
 
 
 def comparison(runs: Sequence[Run], failures: Mapping[str, str]) -> Table:
@@ -45,43 +32,37 @@ def comparison(runs: Sequence[Run], failures: Mapping[str, str]) -> Table:
     at least two of them.
 
     Args:
-        runs: what was measured.
+        runs: with any of the qualities; a quality that no run has gets no column.
         failures: why a run is missing, by its label.
     """
-    columns = _columns(runs)
+    quality = [metric for metric in QUALITY if any(metric in run.values for run in runs)]
+    columns = {metric: metric_format(metric) for metric in (*quality, *COST)}
     parts = [part for run in runs for part in run.phases()]
     lines = [
-        (part.label, *(write(part.values.get(metric)) for metric, _, write in columns))
+        (part.label, *(write(part.values.get(metric)) for metric, (_, write) in columns.items()))
         for part in parts
     ]
     bold = frozenset(
         (row, column)
-        for column, (metric, _, _) in enumerate(columns, 1)
+        for column, metric in enumerate(columns, 1)
         for row, place in ranks(parts, metric).items()
         if place == 1
     )
     blank = ("",) * len(columns)
     lines += [(f"{label}: failed: {reason}", *blank) for label, reason in failures.items()]
-    labels = (label for _, label, _ in columns)
-    title = f"Comparison: {setting(runs)}" if runs else "Comparison"
-    return Table(title, ("run", *labels), tuple(lines), bold=bold)
+    title = f"Comparison: {conditions_of(runs)}" if runs else "Comparison"
+    return Table(title, ("run", *(label for label, _ in columns.values())), tuple(lines), bold=bold)
 
 
-def _columns(runs: Sequence[Run]) -> list[tuple[str, str, Write]]:
-    """Metric, label and writer of every column; of the qualities, those that any run has."""
-    quality = [metric for metric in QUALITY if any(metric in run.values for run in runs)]
-    return [(metric, *written(metric)) for metric in (*quality, *COST)]
-
-
-def written(metric: str) -> tuple[str, Write]:
-    """What the column of a metric is called, with an arrow to better, and how it is written.
+def metric_format(metric: str) -> tuple[str, Write]:
+    """The label of a metric, with its unit and an arrow to better, and the format of its figures.
 
     Raises:
         SteerbenchError: there is no such metric.
     """
     if metric in QUALITY:
         label, decimals = QUALITY[metric]
-        return label, partial(number, decimals=decimals)
+        return label, partial(decimal, decimals=decimals)
     if metric in COST:
         return COST[metric]
     family, _, rest = metric.partition(".")
@@ -92,16 +73,15 @@ def written(metric: str) -> tuple[str, Write]:
         )
     if unit == "B":
         return f"{rest or 'peak memory'}, MB ↓", megabytes
-    return f"{rest or family}, {unit} ↓", partial(number, decimals=0 if family == "work" else 2)
+    return f"{rest or family}, {unit} ↓", partial(decimal, decimals=0 if family == "work" else 2)
 
 
-def ranks(runs: Sequence[Comparable], metric: str) -> dict[int, int]:
-    """The place, from 1, that each of `runs` has among those of its conditions.
+def ranks(runs: Sequence[Run | Repeated], metric: str) -> dict[int, int]:
+    """The place, from 1, of each of `runs`, by its index, among those of the same conditions.
 
-    Figures written alike share a place; where only one run was made under its conditions, it has
-    none.
+    Figures that are written alike share a place. A run that is alone under its conditions has none.
     """
-    label, write = written(metric)
+    label, write = metric_format(metric)
     known: dict[tuple[object, ...], dict[int, float]] = {}
     for row, run in enumerate(runs):
         if math.isfinite(run.values.get(metric, math.nan)):
@@ -115,7 +95,8 @@ def ranks(runs: Sequence[Comparable], metric: str) -> dict[int, int]:
     return places
 
 
-def setting(runs: Sequence[Run]) -> str:
-    """Under what the runs were made: what they have in common, or the several there are of it."""
-    several = {name: dict.fromkeys(str(run.facts[name]) for run in runs) for name in COMMON}
-    return ", ".join(f"{name} {' / '.join(values)}" for name, values in several.items())
+def conditions_of(runs: Sequence[Run]) -> str:
+    """Scene, resolution, trajectory and so on of `runs`, as text; several values of a fact are all
+    listed."""
+    values = {name: dict.fromkeys(str(run.facts[name]) for run in runs) for name in COMMON}
+    return ", ".join(f"{name} {' / '.join(several)}" for name, several in values.items())

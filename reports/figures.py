@@ -1,18 +1,21 @@
-"""Plots of measured rows. Drawn without a display and without global state."""
+"""Plots of measured rows, as PNG. Drawn without a display and without global state."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, ScalarFormatter
+from numpy.typing import ArrayLike
 
 from bench.results import COLD
-from reports.runs import Run
-from reports.seeds import Repeated
+from reports.runs import Repeated, Run
 
 STAGE = "stage_ms."
 LEGEND_COLUMNS = 4
@@ -20,19 +23,23 @@ MARKERS = "osD^vP*X<>"
 COLOURS = [matplotlib.colormaps["tab20"](index) for index in (*range(0, 20, 2), *range(1, 20, 2))]
 COLOURS = [colour for colour in COLOURS if len(set(colour[:3])) > 1]  # grey is for "other"
 
+NAME_SIZE = (160, 13)
+"""Pixels that the name of a setting takes on a plot."""
+
+Row = Mapping[str, Any]
+
 
 def stage_bars(runs: Sequence[Run], path: Path) -> None:
     """Write a PNG: one bar per run, its mean frame time in ms divided into stages.
 
-    A stage, which holds the stages inside it, has one colour in all bars; what lies in no stage is
-    grey and comes last.
+    A stage, which includes the stages inside it, has one colour in all bars. Time outside all
+    stages is grey and comes last.
     """
     bars = [_stages(run) for run in runs]
     stages = list(dict.fromkeys(name for bar in bars for name in bar))
     stages.sort(key=lambda name: name == "other")
     legend_lines = -(-len(stages) // LEGEND_COLUMNS)
-    height = 0.7 + 0.25 * legend_lines + 0.5 * len(runs)
-    figure = Figure(figsize=(8, height), layout="constrained")
+    figure = Figure(figsize=(8, 0.7 + 0.25 * legend_lines + 0.5 * len(runs)), layout="constrained")
     axes = figure.subplots()
     ends = [0.0] * len(runs)
     for number, stage in enumerate(stages):
@@ -52,7 +59,7 @@ def stage_bars(runs: Sequence[Run], path: Path) -> None:
 
 
 def _stages(run: Run) -> dict[str, float]:
-    """Mean ms of every stage, with the stages inside it."""
+    """Mean ms of every outermost stage, with the stages inside it."""
     stages: dict[str, float] = {}
     for name, ms in run.values.items():
         if name.startswith(STAGE):
@@ -64,11 +71,11 @@ def _stages(run: Run) -> dict[str, float]:
 def quality_against(
     lines: Sequence[Repeated], metric: str, unit: float, axis: str, path: Path
 ) -> None:
-    """Write a PNG: PSNR of each of `lines` against its `metric`, in `unit`, called `axis`.
+    """Write a PNG: PSNR of each of `lines` against its `metric`, divided by `unit`, on `axis`.
 
-    Both have the bars of their intervals where there are several seeds.
+    Bars show the intervals of both where there are several seeds.
     """
-    figure, axes = _quality(4.0, axis)
+    figure, axes = _psnr_axes(4.0, axis)
     for number, line in enumerate(lines):
         across, up = line.mean(metric), line.mean("psnr")
         if across is None or up is None:
@@ -93,9 +100,11 @@ def quality_against(
 
 
 def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
-    """Write a PNG: PSNR of every frame with a ground truth along the path, a curve for each run;
-    cold frames are hollow."""
-    figure, axes = _quality(3.5, "frame of the path")
+    """Write a PNG: PSNR of every frame of the path with a ground truth, one curve per run.
+
+    Cold frames are hollow.
+    """
+    figure, axes = _psnr_axes(3.5, "frame of the path")
     for number, run in enumerate(runs):
         scored = run.frames.dropna(subset=["psnr"])
         colour, cold = COLOURS[number % len(COLOURS)], scored[scored["phase"] == COLD]
@@ -105,8 +114,8 @@ def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-def _quality(height: float, across: str) -> tuple[Figure, Axes]:
-    """Axes for PSNR, upwards, and what `across` says; `height` in inches."""
+def _psnr_axes(height: float, across: str) -> tuple[Figure, Axes]:
+    """Axes with PSNR upwards and the label `across`; `height` in inches."""
     figure = Figure(figsize=(8, height), layout="constrained")
     axes = figure.subplots()
     axes.set_xlabel(across)
@@ -114,3 +123,121 @@ def _quality(height: float, across: str) -> tuple[Figure, Axes]:
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     return figure, axes
+
+
+def frontier_plot(rows: Sequence[Row], path: Path) -> None:
+    """Write a PNG: error of a frame against its time, log-log, one point per setting.
+
+    The left panel has the error against the ground truth, with the Pareto frontier as a staircase;
+    the right one that against everything off. Settings on the frontier are circled, and named where
+    there is room; so is the unchanged setting.
+
+    Args:
+        rows: everything off, the unchanged setting, others. Each has its knob, setting, ms, ms_lo,
+            ms_hi, psnr, psnr_to_first and instead: its own setting if it lies on the frontier.
+    """
+    figure = Figure(figsize=(13, 7), layout="constrained")
+    truth, off = figure.subplots(1, 2, sharex=True)
+    best = sorted((row for row in rows if row["instead"] == row["setting"]), key=lambda r: r["ms"])
+    for axes, column in ((truth, "psnr"), (off, "psnr_to_first")):
+        _error_against_time(axes, rows, column)
+    fastest, slowest = truth.get_xlim()
+    truth.set_xlim(fastest * (fastest / slowest) ** 0.2, slowest)  # names stand to the left
+    stairs = [row["ms"] for row in best], [_rms(row["psnr"]) for row in best]
+    truth.step(*stairs, where="post", color="black", linewidth=1, label="frontier")
+    truth.set_title("against the ground truth: lower left is better")
+    off.set_title("against the same model with everything off")
+    figure.legend(*truth.get_legend_handles_labels(), loc="outside lower center", ncols=6)
+    figure.draw_without_rendering()  # fixes where a point lies on the page
+    _circle(truth, [*rows[1:2], *best], "psnr")
+    _circle(off, rows[1:2], "psnr_to_first")
+    figure.savefig(path, dpi=100)
+
+
+def _circle(axes: Axes, rows: Sequence[Row], column: str) -> None:
+    """Circle the points of `rows`; name each to its left, unless another name is there already."""
+    style: dict[str, Any] = {"textcoords": "offset points", "size": 8, "ha": "right", "va": "top"}
+    names: list[np.ndarray] = []
+    for row in rows:
+        place = (row["ms"], _rms(row[column]))
+        axes.plot(*place, "o", markersize=11, fillstyle="none", color="black")
+        on_page = axes.transData.transform(place)
+        if all((abs(on_page - other) > NAME_SIZE).any() for other in names):
+            names.append(on_page)
+            axes.annotate(row["setting"], place, xytext=(-5, -5), **style)
+
+
+def _error_against_time(axes: Axes, rows: Sequence[Row], column: str) -> None:
+    """The points of one panel; a knob has one colour and one marker."""
+    for number, knob in enumerate(dict.fromkeys(row["knob"] for row in rows)):
+        some = [row for row in rows if row["knob"] == knob and math.isfinite(row[column])]
+        low = [row["ms"] - row["ms_lo"] for row in some]
+        high = [row["ms_hi"] - row["ms"] for row in some]
+        axes.errorbar(
+            [row["ms"] for row in some],
+            [_rms(row[column]) for row in some],
+            xerr=(low, high),
+            fmt=MARKERS[number % len(MARKERS)],
+            color=COLOURS[number % len(COLOURS)],
+            alpha=0.8,
+            elinewidth=0.6,
+            label=knob,
+        )
+    axes.loglog()
+    axes.margins(0.15, 0.12)
+    axes.set_xlabel("ms of a frame: median of the rounds, bars from the fastest to the slowest")
+    axes.set_ylabel("error of a pixel (root mean square; 1 is black against white)")
+    decibels = axes.secondary_yaxis("right", functions=(_psnr, _rms))
+    decibels.set_ylabel("PSNR, dB")
+    decibels.yaxis.set_major_locator(MaxNLocator(10))
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
+    for axis in (axes.xaxis, axes.yaxis, decibels.yaxis):
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_locator(NullLocator())
+    axes.grid(color="0.92")
+    axes.set_axisbelow(True)
+
+
+def _rms(psnr: ArrayLike) -> np.ndarray:
+    return 10 ** (-np.asarray(psnr) / 20)
+
+
+def _psnr(rms: ArrayLike) -> np.ndarray:
+    return -20 * np.log10(rms)
+
+
+def growth_panels(
+    axes: Mapping[str, Sequence[Row]],
+    figures: Mapping[str, str],
+    exponents: Mapping[tuple[str, str], float],
+    path: Path,
+) -> None:
+    """Write a PNG: how figures grow, a column of panels per axis and a line of panels per figure.
+
+    Both scales are logarithmic, so that a power is a straight line; an axis that begins at 0 is
+    linear.
+
+    Args:
+        axes: by name, rows with "value", its "label" and a value of every figure.
+        figures: key in a row, and label with unit.
+        exponents: by axis and figure, shown where they are finite.
+    """
+    size = (0.5 + 2.2 * len(axes), 0.5 + 2.0 * len(figures))
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(len(figures), len(axes), squeeze=False, sharey="row")
+    for line, (key, label) in zip(panels, figures.items(), strict=True):
+        for panel, (axis, rows) in zip(line, axes.items(), strict=True):
+            values = [row["value"] for row in rows]
+            panel.plot(values, [row[key] for row in rows], "o-", color=COLOURS[0], markersize=4)
+            panel.set_yscale("log")
+            if min(values) > 0:
+                panel.set_xscale("log")
+            panel.set_xticks(values, [row["label"] for row in rows], rotation=90, fontsize="small")
+            panel.xaxis.set_minor_locator(NullLocator())
+            if math.isfinite(exponents[axis, key]):
+                panel.set_title(f"~ {axis}^{exponents[axis, key]:.2f}", fontsize="medium")
+            panel.grid(alpha=0.3, which="both")
+            panel.spines[["top", "right"]].set_visible(False)
+        line[0].set_ylabel(label)
+    figure.savefig(path, dpi=150)

@@ -9,11 +9,12 @@ from typing import Any
 
 from bench.errors import explained
 from bench.results import Store
-from reports import figures, tables
-from reports.comparison import comparison, setting
-from reports.pictures import BESIDE, beside, shown_frames
+from reports import figures
+from reports.comparison import comparison, conditions_of
+from reports.images import MOST_RENDERINGS, frame_section, kept_frames
 from reports.publish import add_picture, publish
 from reports.runs import Run, load
+from reports.tables import Table, run_tables
 
 
 def write_page(
@@ -22,14 +23,13 @@ def write_page(
     folder: Path,
     failures: Mapping[str, str] | None = None,
 ) -> Path:
-    """Write `folder/report.md` with its pictures beside it, and return its path; the same as
-    `report.html`.
+    """Write `folder/report.md` with its pictures, and the same as `report.html`; return the former.
 
     The page replaces an earlier one only when it is whole.
 
     Args:
         store: where the runs are.
-        labels: what each run is called, by its key, in the order of the page.
+        labels: the name of each run on the page, by its key, in the order of the page.
         folder: made if missing.
         failures: why a run is missing, by its label.
 
@@ -54,13 +54,14 @@ TIME = """\
 
 ![Mean time of a frame in ms, one bar per run, divided into stages]({stages})
 
-One bar per run: the mean time of a frame, divided into the stages of the method; a stage holds
-those inside it. What was spent between the stages is `other`."""
+One bar per run: the mean time of a frame, divided into the stages of the method; a stage includes
+the stages inside it. Time outside all stages is `other`."""
 
 
 def _heading(runs: Sequence[Run], failures: Mapping[str, str]) -> str:
     """Title, the table of all runs and how to read it."""
-    labels = ", ".join(run.label for run in runs) if len(runs) <= BESIDE else f"{len(runs)} runs"
+    few = len(runs) <= MOST_RENDERINGS
+    labels = ", ".join(run.label for run in runs) if few else f"{len(runs)} runs"
     scenes = ", ".join(dict.fromkeys(run.facts["scene"] for run in runs))
     table = comparison(runs, failures)
     scored, timed = (
@@ -73,43 +74,38 @@ def _heading(runs: Sequence[Run], failures: Mapping[str, str]) -> str:
             " The best figure of each column is **bold**, among runs with the same frames, protocol"
             " and machine."
         )
-    notes = dict.fromkeys(
-        f"{name}: n/a. {why}" for run in runs for name, why in run.record["missing"].items()
-    )
-    texts = (
-        f"# {labels} on {scenes}",
-        f"Measured: {setting(runs)}.",
-        table.markdown(),
-        reading,
-        *notes,
-    )
-    return "\n\n".join(texts)
+    title, conditions = f"# {labels} on {scenes}", f"Measured: {conditions_of(runs)}."
+    return "\n\n".join((title, conditions, table.markdown(), reading, *missing_figures(runs)))
+
+
+def missing_figures(runs: Sequence[Run]) -> list[str]:
+    """A note for every metric that could not be measured."""
+    notes = (f"{name}: n/a. {why}" for run in runs for name, why in run.record["missing"].items())
+    return list(dict.fromkeys(notes))
 
 
 def _pictures(runs: Sequence[Run], folder: Path) -> str:
-    """Pictures of the shown frames; runs that rendered the same frames share them."""
+    """Images of the kept frames; runs that rendered the same frames share them."""
     groups: dict[tuple[object, ...], list[Run]] = {}
     for run in runs:
         groups.setdefault(run.views, []).append(run)
     parts = [
         text
         for number, group in enumerate(groups.values(), 1)
-        for frame in shown_frames(group[0])
-        for text in beside(group, frame, f"frames-{number}", folder)
+        for frame in kept_frames(group[0])
+        for text in frame_section(group, frame, f"frames-{number}", folder)
     ]
     return "\n\n".join(("## Pictures", *(parts or ["No frame has a ground truth."])))
 
 
 def _figures(run: Run) -> str:
     """All figures of one run."""
-    blocks = "\n\n".join(
-        f"### {table.title}\n\n{table.markdown()}" for table in tables.blocks(run.rows)
-    )
-    return f"## {run.label}, run {run.key}\n\n{blocks}"
+    tables = (table.section(level=3) for table in run_tables(run.rows))
+    return "\n\n".join((f"## {run.label}, run {run.key}", *tables))
 
 
 def _provenance(runs: Sequence[Run]) -> str:
-    """Commands, then where the figures come from: a line for what all have in common."""
+    """The commands, then one line for each fact that all runs share, one per run for others."""
     commands = "\n".join(dict.fromkeys(run.record["command"] for run in runs))
     facts = [_facts(run) for run in runs]
     lines = []
@@ -121,7 +117,7 @@ def _provenance(runs: Sequence[Run]) -> str:
             lines += [
                 (f"{name}, {run.label}", value) for run, value in zip(runs, values, strict=True)
             ]
-    table = tables.Table("Provenance", ("", ""), tuple(lines), figures=False)
+    table = Table("Provenance", ("", ""), tuple(lines), figures=False)
     return f"""\
 ## Provenance
 
@@ -157,5 +153,7 @@ def _facts(run: Run) -> dict[str, str]:
 
 
 def _listed(values: Mapping[str, Any]) -> str:
-    texts = (" + ".join(value) if isinstance(value, list) else value for value in values.values())
-    return ", ".join(f"{name} {text}" for name, text in zip(values.keys(), texts, strict=True))
+    return ", ".join(
+        f"{name} {' + '.join(value) if isinstance(value, list) else value}"
+        for name, value in values.items()
+    )

@@ -1,4 +1,4 @@
-"""Whether a run is as good as an earlier one: metric by metric, frame by frame."""
+"""Comparison of a run with an earlier one: metric by metric, frame by frame."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Limit:
     Attributes:
         better: 1 where more is better, -1 where less is.
         absolute: in the unit of the metric.
-        relative: share of what it was.
-        here: it depends on the machine, and is compared on the same one only.
+        relative: share of the old figure.
+        here: it depends on the machine and is compared on the same one only.
     """
 
     better: int
@@ -43,22 +43,22 @@ LIMITS: Mapping[str, Limit] = {
     "frame_ms": Limit(-1, relative=0.25, here=True),
     "peak_bytes": Limit(-1, relative=0.2, here=True),
 }
-"""What is compared, unless a baseline says otherwise."""
+"""The metrics that are compared, unless a baseline has limits of its own."""
 
 LARGEST = ("peak_bytes",)
-"""Metrics whose headline is the largest figure of a frame, not the mean of all."""
+"""Metrics whose headline is the largest figure of a frame, not the mean over frames."""
 
 
 @dataclass(frozen=True)
 class Figures:
-    """What is kept of a run to compare later ones with.
+    """The figures of a run that later runs are compared with.
 
     Attributes:
         values: of its headline, by metric.
-        frames: what the headline is the mean of, by metric and by number and name of the frame:
-            of qualities, the steady frames with ground truth, else all steady ones.
-        machine: name of its processor and graphics processors.
-        views: the same where the same frames of the same scene were rendered by one protocol.
+        frames: the figures that the headline averages, by metric and by number and name of the
+            frame. Qualities have steady frames with ground truth, other metrics all steady frames.
+        machine: names of its processor and graphics processors.
+        views: equal for the same frames of the same scene under one protocol.
     """
 
     values: Mapping[str, float]
@@ -91,13 +91,13 @@ class Figures:
 
 @dataclass(frozen=True)
 class Change:
-    """What became of one metric.
+    """The change of one metric.
 
     Attributes:
-        old, new: `new` is nan where the metric is gone.
-        by: new less old; of metrics that frames have, the mean over those that both runs have.
-        interval: of that mean over the frames, 95 %; None where only two figures are known.
-        verdict: "" as good, "worse" by more than its limit, "missing" if it or a frame is gone.
+        old, new: `new` is nan if the new run lacks the metric.
+        by: new less old; the mean over the frames that both runs have, where frames are known.
+        interval: 95 % interval of that mean over frames; None where only two figures are known.
+        verdict: "" if as good, "worse" by more than its limit, "missing" if it or a frame is gone.
     """
 
     metric: str
@@ -109,7 +109,7 @@ class Change:
 
 
 def changes(old: Figures, new: Figures, limits: Mapping[str, Limit] = LIMITS) -> Iterator[Change]:
-    """What became of every metric of `old` that has a limit.
+    """The change of every metric of `old` that has a limit.
 
     Raises:
         SteerbenchError: the runs rendered other frames.
@@ -137,19 +137,18 @@ def changes(old: Figures, new: Figures, limits: Mapping[str, Limit] = LIMITS) ->
         yield Change(metric, before, after, by, interval, verdict)
 
 
-def table(title: str, found: Sequence[Change]) -> Table:
-    """`found` as a table."""
-    columns = ("metric", "was", "is", "change", "95 % interval", "")
-    return Table(title, columns, tuple(map(_line, found)))
-
-
-def _line(change: Change) -> tuple[str, ...]:
-    ends = () if change.interval is None else change.interval
-    return (
-        change.metric,
-        f"{change.old:.6g}",
-        f"{change.new:.6g}",
-        f"{change.by:+.4g}",
-        " – ".join(f"{end:+.4g}" for end in ends),
-        change.verdict,
+def change_table(title: str, found: Sequence[Change]) -> Table:
+    """The changes `found`, a line each."""
+    lines = (
+        (
+            change.metric,
+            f"{change.old:.6g}",
+            f"{change.new:.6g}",
+            f"{change.by:+.4g}",
+            " – ".join(f"{end:+.4g}" for end in change.interval or ()),
+            change.verdict,
+        )
+        for change in found
     )
+    columns = ("metric", "was", "is", "change", "95 % interval", "")
+    return Table(title, columns, tuple(lines))

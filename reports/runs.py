@@ -1,17 +1,20 @@
-"""Runs as a page or a table needs them: all that the store knows of each, and what it is called."""
+"""Runs of the store, with everything that tables and pages read of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from bench.errors import SteerbenchError
 from bench.results import WHOLE, Store, unreadable
+from bench.run import half_interval
 from reports.tables import headline, phases, suffix
 
 
@@ -21,9 +24,9 @@ class Run:
 
     Attributes:
         key: in the store.
-        label: what it is called beside the others.
+        label: its name in a table or figure.
         rows: one metric per row.
-        read_frames: gives `frames`; few reports look at single frames, which are most of a run.
+        read_frames: reads `frames`, which few reports need and which are most of a run.
         record: what the figures mean, and where they come from.
         pictures: folder of ground truths, renderings and error maps.
     """
@@ -42,7 +45,7 @@ class Run:
 
     @cached_property
     def headline(self) -> pd.DataFrame:
-        """The rows that speak for the run, one per metric: of steady frames, where it has any."""
+        """One row per metric: of the steady frames, or of the cold ones if there are no others."""
         return headline(self.rows).set_index("metric")
 
     @cached_property
@@ -51,7 +54,7 @@ class Run:
         return {str(metric): value for metric, value in self.headline["value"].items()}
 
     def phases(self) -> list[Run]:
-        """The run once for each of its phases, each with the figures of that phase alone."""
+        """The run once for each of its phases, with the figures of that phase alone."""
         whole = self.rows[self.rows["phase"] == WHOLE]
         return [
             replace(self, label=self.label + suffix(phase), rows=pd.concat([of_phase, whole]))
@@ -65,21 +68,71 @@ class Run:
 
     @property
     def views(self) -> tuple[object, ...]:
-        """The same for runs that rendered the same frames of the same scene."""
+        """Equal for runs that rendered the same frames of the same scene."""
         where = (self.facts["split"], self.facts["trajectory"], self.facts["resolution"])
         return (self.record["scene"]["digest"], *where, len(self.frames))
 
     @property
+    def computer(self) -> tuple[str, ...]:
+        """Equal for runs on the same device of machines with the same processors."""
+        machine = self.record["machine"]
+        return (self.facts["device"], machine["cpu"], *machine["gpus"])
+
+    @property
     def conditions(self) -> tuple[object, ...]:
-        """The same for runs whose figures may be held against each other."""
+        """Equal for runs whose figures may be compared."""
         phase = self.headline["phase"].iloc[0]
         return (*self.views, phase, self.facts["protocol"], *self.computer)
 
+
+@dataclass(frozen=True)
+class Repeated:
+    """Runs that differ in their seed alone. Figures are means over them.
+
+    Attributes:
+        label: name of the line of a table that they fill.
+        runs: one for each seed that was measured.
+        gaps: why others are missing.
+    """
+
+    label: str
+    runs: Sequence[Run]
+    gaps: Sequence[str] = ()
+
+    @cached_property
+    def values(self) -> dict[str, float]:
+        """Means by metric, of the metrics that all runs have."""
+        if not self.runs:
+            return {}
+        tables = [run.values for run in self.runs]
+        names = [name for name in tables[0] if all(name in table for table in tables)]
+        return {name: float(np.mean([table[name] for table in tables])) for name in names}
+
     @property
-    def computer(self) -> tuple[str, ...]:
-        """The same for runs on the same device of machines with the same processors."""
-        machine = self.record["machine"]
-        return (self.facts["device"], machine["cpu"], *machine["gpus"])
+    def conditions(self) -> tuple[object, ...]:
+        """See `Run.conditions`."""
+        return self.runs[0].conditions if self.runs else ()
+
+    def mean(self, metric: str) -> float | None:
+        """The mean of a metric; of a stage with the stages inside it; None without figures."""
+        figures = self._figures(metric)
+        return float(np.mean(figures)) if figures else None
+
+    def half(self, metric: str) -> float:
+        """Half of the 95 % interval of that mean; nan with fewer than two seeds."""
+        return half_interval(np.array(self._figures(metric)))
+
+    def _figures(self, metric: str) -> list[float]:
+        """The metric, with the stages inside it, of every run that has it."""
+        of_runs = (
+            [
+                value
+                for name, value in run.values.items()
+                if name == metric or name.startswith(f"{metric}/")
+            ]
+            for run in self.runs
+        )
+        return [math.fsum(figures) for figures in of_runs if figures]
 
 
 def load(store: Store, labels: Mapping[str, str]) -> list[Run]:
@@ -98,7 +151,7 @@ def load(store: Store, labels: Mapping[str, str]) -> list[Run]:
 
 
 def readable(store: Store) -> list[Run]:
-    """Every run that this version can read, under its key; the last that was stored comes last."""
+    """Every run that this version can read, labelled with its key, in the order of storing."""
     by_run = _rows_by_run(store)
     folders = [folder for folder in map(store.find, by_run) if folder]
     folders.sort(key=lambda folder: folder.stat().st_mtime)
@@ -112,6 +165,6 @@ def _run(store: Store, key: str, label: str, rows: pd.DataFrame, record: Mapping
 
 
 def _rows_by_run(store: Store) -> dict[str, pd.DataFrame]:
-    """The rows of every run that can be read, and no word on the others."""
+    """The rows of every run that can be read; others are left out without a warning."""
     rows = store.rows(report=lambda unreadable: None)
     return {str(run): of_run for run, of_run in rows.groupby("run")}

@@ -1,10 +1,10 @@
-"""The rows of a run as tables of text: for the terminal, for a page.
+"""Tables of text, for the terminal and for pages, and how a figure is written in them.
 
 Units are those of the field: dB, milliseconds, MB = 10^6 bytes. Every LPIPS column names its
-network. A figure that could not be had reads `n/a`.
+network. A missing figure reads `n/a`.
 
-The headline figures of a run are those of its steady frames. Where a method also rendered frames
-with less to look back on than it can use, these stand apart and are called cold.
+The headline figures of a run are those of its steady frames. Cold frames, which have fewer
+preceding frames than the method can use, are listed apart.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from bench.results import COLD, STEADY
 NOT_AVAILABLE = "n/a"
 
 DENSE = ".dense"
-"""How the name of a counter ends that says what skipping nothing would have taken."""
+"""Ending of a work counter that says what a method that skips nothing would have done."""
 
 QUALITY = {
     "psnr": ("PSNR, dB ↑", 2),
@@ -29,15 +29,16 @@ QUALITY = {
     "lpips_squeeze": ("LPIPS squeeze ↓", 4),
     "flicker": ("flicker ↓", 4),
 }
-"""Label and decimals of each metric of a picture; the arrow points to better."""
+"""Label and decimals of each quality metric. The arrow points to better."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """`lines` of text under `columns`.
+    """Lines of text under columns.
 
-    The first column is a label; the others are figures, or text when `figures` is False. `bold`
-    holds the line and the column, from 0, of every cell that stands out.
+    Attributes:
+        columns: the first is a label; the others are figures, or text when `figures` is False.
+        bold: line and column, both from 0, of every bold cell.
     """
 
     title: str
@@ -55,26 +56,36 @@ class Table:
         ]
         return "\n".join(f"| {' | '.join(line)} |" for line in (self.columns, rule, *lines))
 
+    def section(self, level: int = 2) -> str:
+        """The table in Markdown under its title as a heading."""
+        return f"{'#' * level} {self.title}\n\n{self.markdown()}"
+
     def _cell(self, text: str, place: tuple[int, int]) -> str:
         escaped = text.replace("|", "\\|")
         return f"**{escaped}**" if place in self.bold else escaped
 
 
+def decimal(value: float | None, decimals: int) -> str:
+    """`value` with so many decimals, or `n/a`. What rounds to 0 has no sign."""
+    if value is None or math.isnan(value):
+        return NOT_AVAILABLE
+    return f"{round(value, decimals) + 0.0:,.{decimals}f}"
+
+
+def megabytes(size: float | None) -> str:
+    """Bytes as MB = 10^6 bytes."""
+    return decimal(None if size is None else size / 1e6, 2)
+
+
+def share(part: float, whole: float) -> str:
+    """`part` as a percentage of `whole`."""
+    return f"{decimal(100 * part / whole, 1)} %" if whole else NOT_AVAILABLE
+
+
 def headline(rows: pd.DataFrame) -> pd.DataFrame:
-    """Of every run the rows of its first phase, steady where it has one, and of the whole run."""
+    """The rows of whole runs and of their steady frames; of cold ones for runs without steady."""
     steady = set(rows.loc[rows["phase"] == STEADY, "run"])
     return rows[(rows["phase"] != COLD) | ~rows["run"].isin(steady)]
-
-
-def blocks(rows: pd.DataFrame) -> list[Table]:
-    """The tables of one run: quality, time by stage and, where it counted any, work of each phase;
-    memory."""
-    tables = [
-        table(of_phase, suffix(phase))
-        for phase, of_phase in phases(rows)
-        for table in (_quality, _time, _work)
-    ]
-    return [*(table for table in tables if table.lines), _memory(rows)]
 
 
 def phases(rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
@@ -84,8 +95,19 @@ def phases(rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
 
 
 def suffix(phase: str) -> str:
-    """What a label says of its frames: nothing when they are steady."""
+    """Ending of a label for figures of `phase`: empty for steady frames."""
     return "" if phase == STEADY else f", {phase}"
+
+
+def run_tables(rows: pd.DataFrame) -> list[Table]:
+    """The tables of one run: quality, time by stage and work (if any was counted) of each phase;
+    memory."""
+    tables = [
+        table(of_phase, suffix(phase))
+        for phase, of_phase in phases(rows)
+        for table in (_quality, _time, _work)
+    ]
+    return [*(table for table in tables if table.lines), _memory(rows)]
 
 
 def _values(rows: pd.DataFrame, prefix: str = "", column: str = "value") -> dict[str, float]:
@@ -102,11 +124,9 @@ def _quality(rows: pd.DataFrame, suffix: str) -> Table:
     lines = []
     for metric, (label, decimals) in QUALITY.items():
         if metric in value:
-            known = math.isfinite(low[metric])
-            ends = (number(end[metric], decimals) for end in (low, high))
-            lines.append(
-                (label, number(value[metric], decimals), " – ".join(ends) if known else "")
-            )
+            ends = [decimal(end[metric], decimals) for end in (low, high)]
+            interval = " – ".join(ends) if math.isfinite(low[metric]) else ""
+            lines.append((label, decimal(value[metric], decimals), interval))
     title = f"Quality{suffix}, mean of {frames['psnr']} frames"
     return Table(title, ("metric", "mean", "95 % interval"), tuple(lines))
 
@@ -114,52 +134,32 @@ def _quality(rows: pd.DataFrame, suffix: str) -> Table:
 def _time(rows: pd.DataFrame, suffix: str) -> Table:
     value, stages = _values(rows), _values(rows, "stage_ms.")
     total = value["frame_ms"]
-    lines = [(name, number(ms, 2), share(ms, total)) for name, ms in stages.items()]
-    lines.append(("frame", number(total, 2), share(sum(stages.values()), total)))
+    lines = [(name, decimal(ms, 2), share(ms, total)) for name, ms in stages.items()]
+    lines.append(("frame", decimal(total, 2), share(sum(stages.values()), total)))
     lines += [
-        (f"frame, {quantile}", number(value[f"frame_ms.{quantile}"], 2), "")
+        (f"frame, {quantile}", decimal(value[f"frame_ms.{quantile}"], 2), "")
         for quantile in ("p50", "p95", "p99")
     ]
-    if "latency_ms" in value:
-        lines.append(("latency", number(value["latency_ms"], 2), ""))
-    lines.append(("FPS", number(value["fps"], 2), ""))
+    lines.append(("FPS", decimal(value["fps"], 2), ""))
     return Table(f"Time of a frame{suffix}", ("stage", "mean ms", "share"), tuple(lines))
 
 
 def _work(rows: pd.DataFrame, suffix: str) -> Table:
-    """The ledger: what was done, beside what a method that skips nothing would have done."""
+    """What was done, beside what a method that skips nothing would have done."""
     value = _values(rows, "work.")
     lines = []
-    for name in value:
-        done, dense = value[name], value.get(f"{name}{DENSE}")
+    for name, done in value.items():
         if not name.endswith(DENSE):
+            dense = value.get(f"{name}{DENSE}")
             saved = "" if dense is None else share(dense - done, dense)
-            figures = ("" if x is None else number(x, 0 if x >= 100 else 1) for x in (done, dense))
+            figures = ("" if x is None else decimal(x, 0 if x >= 100 else 1) for x in (done, dense))
             lines.append((name.replace("_", " "), *figures, saved))
     return Table(f"Work of a frame{suffix}", ("work", "done", "dense", "saved"), tuple(lines))
 
 
 def _memory(rows: pd.DataFrame) -> Table:
-    value, sizes = _values(rows), _values(rows, "size_bytes.")
-    total = sizes.pop("total")
-    lines = [(name, megabytes(size)) for name, size in sizes.items()]
-    lines.append(("model", megabytes(total)))
-    lines.append(("peak, rendering", megabytes(value["peak_bytes"])))
-    return Table("Memory", ("component", "MB"), tuple(lines))
-
-
-def number(value: float | None, decimals: int) -> str:
-    """A figure with `decimals`, or `n/a` where there is none; what rounds to 0 has no sign."""
-    if value is None or math.isnan(value):
-        return NOT_AVAILABLE
-    return f"{round(value, decimals) + 0.0:,.{decimals}f}"
-
-
-def megabytes(size: float | None) -> str:
-    """Bytes as MB = 10^6 bytes."""
-    return number(None if size is None else size / 1e6, 2)
-
-
-def share(part: float, whole: float) -> str:
-    """`part` as a percentage of `whole`."""
-    return f"{number(100 * part / whole, 1)} %" if whole else NOT_AVAILABLE
+    sizes = _values(rows, "size_bytes.")
+    sizes["model"] = sizes.pop("total")
+    sizes["peak, rendering"] = _values(rows)["peak_bytes"]
+    lines = tuple((name, megabytes(size)) for name, size in sizes.items())
+    return Table("Memory", ("component", "MB"), lines)

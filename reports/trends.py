@@ -1,4 +1,4 @@
-"""Whether what the paper says becomes better, faster or smaller does so here: step by step."""
+"""Trends of the paper, step by step: whether a metric grows here as it grows there."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from itertools import pairwise
 import numpy as np
 
 from bench.run import half_interval
-from reports.comparison import written
+from reports.comparison import metric_format
 from reports.regression import LIMITS, Figures
-from reports.seeds import Repeated
+from reports.runs import Repeated
 from reports.tables import Table
 
 HOLDS, FAILS, OPEN = "holds", "does not hold", "cannot be told"
 SEEN, REVERSED = "so, by one seed", "the reverse, by one seed"
-"""What frames of one seed can say: another training may turn it around."""
+"""Verdicts from the frames of one seed: another training may turn them around."""
 
 COMPUTED = "computed, not sampled"
 
 
 @dataclass(frozen=True)
 class Trend:
-    """`metric` grows along the lines `rising`, by their labels."""
+    """`metric` grows along the lines `rising`, which are labels."""
 
     metric: str
     rising: Sequence[str]
@@ -34,10 +34,10 @@ class Step:
     """From one line of a trend to the next.
 
     Attributes:
-        by: what the metric grows by.
-        half: half of the 95 % interval of that; nan where it is not known.
-        over: of what the interval is.
-        proves: whether the interval holds the difference between one training and the next.
+        by: the growth of the metric.
+        half: half of the 95 % interval of `by`; nan where it is not known.
+        over: the samples that `by` is the mean of, in words.
+        proves: whether the interval covers the differences between trainings.
     """
 
     metric: str
@@ -50,7 +50,7 @@ class Step:
 
     @property
     def verdict(self) -> str:
-        """Whether it grows, does not, or neither can be told."""
+        """Whether the metric grows, does not, or neither can be told."""
         if self.by - self.half > 0:
             return HOLDS if self.proves else SEEN
         if self.by + self.half <= 0:
@@ -63,18 +63,21 @@ def steps(trend: Trend, lines: Mapping[str, Repeated]) -> Iterator[Step]:
     for smaller, larger in pairwise(trend.rising):
         one, other = lines.get(smaller), lines.get(larger)
         if one is not None and other is not None:
-            apart, over, proves = _apart(one, other, trend.metric)
-            if len(apart):
-                half = half_interval(apart)
+            differences, over, proves = _differences(one, other, trend.metric)
+            if len(differences):
+                half = half_interval(differences)
                 if trend.metric.startswith("size_bytes"):
                     half, over, proves = 0.0, COMPUTED, True
-                by = float(apart.mean())
+                by = float(differences.mean())
                 yield Step(trend.metric, smaller, larger, by, half, over, proves)
 
 
-def _apart(one: Repeated, other: Repeated, metric: str) -> tuple[np.ndarray, str, bool]:
-    """Differences of pairs, of the same seed where there are several, else of the same frame; of
-    what; and whether of several trainings."""
+def _differences(one: Repeated, other: Repeated, metric: str) -> tuple[np.ndarray, str, bool]:
+    """Differences of pairs [n], what the pairs are, and whether they cover several trainings.
+
+    Pairs have the same seed if there are several seeds, else they are the same frame of one seed.
+    """
+    anywhere = not (metric in LIMITS and LIMITS[metric].here)
     pairs = [
         (run, twin)
         for run in one.runs
@@ -82,20 +85,20 @@ def _apart(one: Repeated, other: Repeated, metric: str) -> tuple[np.ndarray, str
         if run.facts["seed"] == twin.facts["seed"]
         and metric in run.values
         and metric in twin.values
-        and (run.computer == twin.computer or not (metric in LIMITS and LIMITS[metric].here))
+        and (anywhere or run.computer == twin.computer)
     ]
     if len(pairs) == 1:
         frames, others = (Figures.of(run).frames.get(metric, {}) for run in pairs[0])
-        apart = [others[name] - frames[name] for name in frames if name in others]
-        if len(apart) > 1:
-            return np.array(apart), f"{len(apart)} frames of one seed", False
-    differences = [twin.values[metric] - run.values[metric] for run, twin in pairs]
+        by_frame = [others[name] - frames[name] for name in frames if name in others]
+        if len(by_frame) > 1:
+            return np.array(by_frame), f"{len(by_frame)} frames of one seed", False
+    by_seed = np.array([twin.values[metric] - run.values[metric] for run, twin in pairs])
     several = len(pairs) > 1
-    return np.array(differences), f"{len(pairs)} seeds" if several else "one figure each", several
+    return by_seed, f"{len(pairs)} seeds" if several else "one figure each", several
 
 
-def table(found: Sequence[Step]) -> Table:
-    """`found` as a table."""
+def trend_table(found: Sequence[Step]) -> Table:
+    """The steps `found`, a line each."""
     columns = ("grows in the paper", "here by", "95 % interval", "over", "")
     return Table("Trends", columns, tuple(map(_line, found)))
 
@@ -104,7 +107,7 @@ def _line(step: Step) -> tuple[str, ...]:
     scale = 1e6 if step.metric.startswith("size_bytes") else 1.0
     by, half = step.by / scale, step.half / scale
     return (
-        f"{written(step.metric)[0].rstrip(' ↑↓')}: {step.smaller} < {step.larger}",
+        f"{metric_format(step.metric)[0].rstrip(' ↑↓')}: {step.smaller} < {step.larger}",
         f"{by:+.3f}",
         f"{by - half:+.3f} to {by + half:+.3f}" if half >= 0 and step.over != COMPUTED else "",
         step.over,

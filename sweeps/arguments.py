@@ -14,22 +14,28 @@ def _run(run: Parser) -> None:
 
 
 def _tables(tables: Parser) -> None:
-    tables.add_argument("--table", metavar="NAME", help="only this one, as table3")
+    tables.add_argument("--table", metavar="NAME", help="only this table, for example table3")
+    tables.add_argument(
+        "--with",
+        dest="methods",
+        action="append",
+        default=[],
+        metavar="METHOD",
+        help="add a line to Table 1 for this method, under the same settings as the others and "
+        "without published figures; may be repeated. With --config-dir also for a method of your "
+        "own: steerbench paper --table table1 --config-dir DIR --with mine",
+    )
     tables.add_argument(
         "--report", type=Path, metavar="DIR", help="where the page goes (default OUTPUTS/paper)"
     )
-    tables.add_argument(
-        "overrides",
-        nargs="*",
-        help="settings as of `steerbench run`; seed=0,1,2 gives means and intervals",
-    )
+    _overrides(tables, "; seed=0,1,2 gives means and intervals")
 
 
 def _paper(paper: Parser) -> None:
     paper.description = (
         "Measure every table of the SteerNeRF paper and write them beside the paper's figures. "
-        "What was measured before is taken from the store: after an interruption, type the same "
-        "again. Exits with 1 if a job failed."
+        "What was measured before is read from the store: after an interruption, type the same "
+        "command again. Exits with 1 if a job failed."
     )
     _tables(paper)
 
@@ -37,8 +43,8 @@ def _paper(paper: Parser) -> None:
 def _report(report: Parser) -> None:
     report.description = (
         "Write the tables of the SteerNeRF paper beside the paper's figures, as Markdown and as "
-        "one HTML file, from what the store has under the same settings. With --check: name what "
-        "looks broken in the whole store."
+        "one HTML file, from what the store has under the same settings; nothing is measured. With "
+        "--check: print the rows of the store that look broken."
     )
     _tables(report)
     report.add_argument(
@@ -47,10 +53,15 @@ def _report(report: Parser) -> None:
 
 
 def _list(listing: Parser) -> None:
+    listing.description = (
+        "List the choices of `steerbench run`, and which backends and engines this machine has."
+    )
+    _config_dir(listing)
     listing.set_defaults(module="catalogue")
 
 
 def _results(results: Parser) -> None:
+    results.description = "Print the rows of all runs in the store."
     _outputs(results)
     results.add_argument("--format", choices=["table", "csv", "json"], default="table")
     for column in ("method", "scene", "metric"):
@@ -58,75 +69,75 @@ def _results(results: Parser) -> None:
 
 
 def _kernels(kernels: Parser) -> None:
+    kernels.description = (
+        "Compare every kernel with its reference and measure its speed. Exits with 1 if a result "
+        "is wrong."
+    )
     kernels.add_argument("--filter", default="", help="only kernels whose name contains this")
     _count(kernels, "--repeats", 5, "timed calls of each")
 
 
 VARIANTS = (
-    "Train SteerNeRF, or take what the same training left behind; then render the same frames, in "
-    "turn, again and again, "
+    "Train a method, or read the same training from the store. Then render the same frames again "
+    "and again, in turn, "
 )
 
 
 def _rounds(parser: Parser, frames: int, repeats: int = 3) -> None:
     _count(parser, "--frames", frames, "first frames of the trajectory")
-    _count(parser, "--repeats", repeats, "timed rounds over all of them; the median counts")
+    _count(parser, "--repeats", repeats, "timed rounds over these frames; the median counts")
 
 
 def _parity(parity: Parser) -> None:
     parity.description = VARIANTS + (
-        "with every engine and precision that can be used here, and compare them with torch in "
-        "fp32."
+        "with every engine and precision that this machine has, and compare them with torch in "
+        "fp32. The method must have a network that an engine computes."
     )
     _rounds(parity, 40)
-    _overrides(parity)
+    _overrides(parity, " (default method=steernerf_lean trajectory=smooth)")
 
 
 def _skips(skips: Parser) -> None:
     skips.description = VARIANTS + (
-        "with everything computed that could be left out, with each of it left out alone, and with "
-        "all of it; without refinement."
+        "with nothing skipped, with each skip of the method alone, and with all of them."
     )
     _rounds(skips, 10)
-    _overrides(skips)
+    _overrides(skips, " (default method=steernerf_lean trajectory=smooth)")
 
 
 def _breakdown(breakdown: Parser) -> None:
     breakdown.description = VARIANTS + (
-        "at every precision of an engine, with and without skipping, and where the camera of the "
-        "next frame is known, and tell the time of a frame by its parts; beside Instant-NGP, which "
-        "renders the field of stage 1 at full resolution, and the paper's pipeline, whose U-Net is "
-        "trained for its time alone. Where nothing is skipped, refinement takes its share of all "
-        "cells: method.pipeline.refined=0 leaves it out."
+        "at every precision of an engine, with and without the skips of the method, and beside the "
+        "methods that it names for comparison; print the time of a frame by its parts."
     )
     _rounds(breakdown, 10)
-    _overrides(breakdown, " (default engine=openvino)")
+    _overrides(breakdown, " (default method=steernerf_lean trajectory=smooth engine=openvino)")
 
 
 def _scaling(scaling: Parser) -> None:
     scaling.description = (
         "Render the first steady frames of a trajectory at several sizes, with several numbers of "
-        "threads, preceding frames (L) and features (K), and lengths of the hash table (T), and "
-        "fit a power of each to time and memory. A field is trained for each T; 2D renderers "
-        "hardly, for what they have learned does not change what they cost."
+        "threads, and along the axes that the method declares (of SteerNeRF: L, K and T), and fit "
+        "a power of each to time, work and memory. 2D renderers are hardly trained: what they have "
+        "learned does not change what they cost."
     )
     _count(scaling, "--frames", 20, "steady frames of each")
     scaling.add_argument(
         "--axis",
         action="append",
-        choices=["pixels", "threads", "L", "K", "T"],
-        help="only this one; may be given more than once",
+        metavar="NAME",
+        help="only this axis: pixels, threads, or one of the method's; may be repeated",
     )
-    scaling.add_argument("--plot", type=Path, metavar="FILE.png", help="draw it, too")
-    _overrides(scaling)
+    scaling.add_argument("--plot", type=Path, metavar="FILE.png", help="also draw the figures")
+    _overrides(scaling, " (default method=steernerf_lean trajectory=smooth)")
 
 
 def _accuracy(accuracy: Parser) -> None:
     accuracy.description = (
-        "Turn every knob that trades time for error and measure both: of the kernels where the "
-        "exact answer is known, of SteerNeRF on the frames of one trained model, all settings in "
-        "turn. Prints what no other setting beats (the Pareto frontier); table, plot and rows go "
-        "to OUTPUTS/accuracy."
+        "Vary every knob that trades time for error and measure both: for the kernels where the "
+        "exact answer is known, for a method on the frames of one trained model. Prints which "
+        "settings no other beats (the Pareto frontier); table, plot and rows go to "
+        "OUTPUTS/accuracy."
     )
     accuracy.add_argument(
         "--within",
@@ -140,16 +151,17 @@ def _accuracy(accuracy: Parser) -> None:
     accuracy.add_argument(
         "--trained",
         action="store_true",
-        help="also what asks for trainings of its own: L, K, s, T, taught steps, a field in fp32",
+        help="also knobs each of whose settings needs a training of its own",
     )
     accuracy.add_argument(
         "--filter",
         action="append",
-        help="only knobs whose name contains this: step, range, engine, refined, trained, ...; may "
-        "be given more than once",
+        help="only knobs whose name contains this, for example range or engine; may be repeated",
     )
     _rounds(accuracy, 24, 5)
-    _overrides(accuracy, " (default scene=totem budget=demo trajectory=orbit)")
+    _overrides(
+        accuracy, " (default method=steernerf_lean scene=totem budget=demo trajectory=orbit)"
+    )
 
 
 def _stress(stress: Parser) -> None:
@@ -169,9 +181,9 @@ def _stress(stress: Parser) -> None:
 
 def _check(check: Parser) -> None:
     check.description = (
-        "Compare the runs of the store with those of a baseline that were made by the same "
-        "command, metric by metric with its own limit, frame by frame where both have them. Exits "
-        "with 1 if anything is worse or missing."
+        "Compare the runs of the store with those of a baseline that the same commands made, "
+        "metric by metric with its own limit, frame by frame where both have them. Exits with 1 if "
+        "anything is worse or missing."
     )
     check.add_argument("baseline", type=Path, metavar="BASELINE.json")
     check.add_argument("--record", action="store_true", help="write the baseline from the store")
@@ -180,7 +192,7 @@ def _check(check: Parser) -> None:
 
 def _compare(compare: Parser) -> None:
     compare.description = "Compare two runs of the store, as `steerbench check` does."
-    compare.add_argument("old", metavar="RUN_A", help="its key, or how that begins")
+    compare.add_argument("old", metavar="RUN_A", help="the key of a run, or its beginning")
     compare.add_argument("new", metavar="RUN_B")
     _outputs(compare)
     compare.set_defaults(module="check", function="compare")
@@ -193,70 +205,114 @@ def _scenes(scenes: Parser) -> None:
     verify.set_defaults(module="verify", parser=verify)
 
 
-def _generic(generic: Parser) -> None:
-    generic.description = (
+def _pretrain(pretrain: Parser) -> None:
+    pretrain.description = (
         "Fit a field to each of many random scenes, train one 2D renderer on all of them, write "
-        "its weights: what renderer.init=generic starts from."
+        "its weights: renderer.init=pretrained starts from them."
     )
-    _count(generic, "--scenes", 8, "random scenes")
-    generic.add_argument(
+    _count(pretrain, "--scenes", 8, "random scenes")
+    pretrain.add_argument(
         "--output", type=Path, required=True, metavar="FILE", help="the weights, safetensors"
     )
-    _overrides(generic)
+    _overrides(pretrain)
 
 
 def _overrides(parser: Parser, usual: str = "") -> None:
     parser.add_argument("overrides", nargs="*", help=f"settings as of `steerbench run`{usual}")
+    _config_dir(parser)
+
+
+def _config_dir(parser: Parser) -> None:
+    parser.add_argument(
+        "--config-dir",
+        action="append",
+        type=config_dir,
+        default=[],
+        metavar="DIR",
+        help="folder with further choices, as DIR/method/mine.yaml for method=mine",
+    )
+
+
+def config_dir(text: str) -> str:
+    """The word for the folder `text`, which must exist; see `sweeps.overrides`."""
+    if not Path(text).is_dir():
+        raise argparse.ArgumentTypeError(f"expected a folder, there is none at {text}")
+    return f"--config-dir={Path(text).resolve()}"
+
+
+def positive_int(text: str) -> int:
+    """A whole number of at least 1."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected 1 or more, got {text}")
+    return int(text)
 
 
 def _count(parser: Parser, name: str, usual: int, of_what: str) -> None:
     help_ = f"{of_what} (default {usual})"
-    parser.add_argument(name, type=number, default=usual, metavar="N", help=help_)
-
-
-def number(text: str) -> int:
-    """A number of things; argparse calls it by the name of this function where it is none."""
-    count = int(text)
-    if count < 1:
-        raise argparse.ArgumentTypeError(f"expected 1 or more, got {count}")
-    return count
+    parser.add_argument(name, type=positive_int, default=usual, metavar="N", help=help_)
 
 
 def _outputs(parser: Parser) -> None:
-    parser.add_argument("--outputs", type=Path, default=Path("outputs"), metavar="DIR")
+    parser.add_argument(
+        "--outputs", type=Path, default=Path("outputs"), metavar="DIR", help="(default outputs)"
+    )
 
 
-COMMANDS: dict[str, tuple[str, Callable[[Parser], None]]] = {
-    "run": ("train, render, measure; print and store the table", _run),
-    "paper": ("every table of the SteerNeRF paper, measured, as one page", _paper),
-    "report": ("the same page of what was measured so far", _report),
-    "list": ("methods, scenes, backends, engines", _list),
-    "results": ("print all that was measured", _results),
-    "kernels": ("throughput and error of every kernel", _kernels),
-    "parity": ("every engine and precision of the 2D renderer on the same frames", _parity),
-    "skips": ("what is not computed, what that saves and what it costs", _skips),
-    "breakdown": (
-        "where the time of a frame goes, by precision, with and without skips",
-        _breakdown,
-    ),
-    "scaling": ("how a frame's time and memory grow with its size, L, K, T and threads", _scaling),
-    "accuracy": ("run time against error of every knob, and which setting to take", _accuracy),
-    "stress": ("what must hold where numbers are extreme", _stress),
-    "check": ("compare what was measured with a recorded baseline", _check),
-    "compare": ("what one run is against another", _compare),
-    "scenes": ("look after copies of data sets", _scenes),
-    "generic": ("train the 2D renderer that scenes start from", _generic),
+STUDIES = "studies of a method"
+
+Command = tuple[str, Callable[[Parser], None]]
+
+GROUPS: dict[str, dict[str, Command]] = {
+    "measure": {
+        "run": ("train, render and measure; print and store the table", _run),
+        "paper": ("measure every table of the SteerNeRF paper, as one page", _paper),
+        "pretrain": ("train the weights that the lean 2D renderer starts from", _pretrain),
+    },
+    "look": {
+        "list": ("methods, scenes, budgets, engines: what can be chosen", _list),
+        "results": ("everything measured so far, as a table, csv or json", _results),
+        "report": ("the page of `steerbench paper`, from what was measured so far", _report),
+        "compare": ("the differences between two runs", _compare),
+    },
+    STUDIES: {
+        "accuracy": ("run time against error of every knob, and which setting to take", _accuracy),
+        "parity": ("error and time of every engine and precision", _parity),
+        "skips": ("what is not computed, what that saves and what it costs", _skips),
+        "breakdown": ("the time of a frame by its parts, at every precision", _breakdown),
+        "scaling": (
+            "how time and memory grow with the size of a frame, threads, L, K, T",
+            _scaling,
+        ),
+    },
+    "checks": {
+        "check": ("compare the store with a recorded baseline", _check),
+        "kernels": ("error and speed of every kernel", _kernels),
+        "stress": ("what must hold where numbers are extreme", _stress),
+        "scenes": ("compare a copy of NeRF-Synthetic with the official checksums", _scenes),
+    },
 }
-"""What each is for, and what gives its parser its arguments; a module of its name runs it, unless
-that says another."""
+"""By group, the purpose of each command and the function that adds its arguments. The module of
+its name runs it, unless these say another."""
+
+COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
 
 
 def add_commands(parser: Parser) -> None:
-    """Give `parser` all commands. What it reads has the `module` of `sweeps` to run, None for no
+    """Add all commands to `parser`. What it reads has the `module` of `sweeps` to run, None for no
     command, the `function` in it, and the innermost `parser`."""
     parser.set_defaults(module=None, function="main", parser=parser)
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for name, (purpose, give_arguments) in COMMANDS.items():
-        command = commands.add_parser(name, help=purpose)
-        command.set_defaults(module=name, parser=command)
-        give_arguments(command)
+    commands = parser.add_subparsers(prog=parser.prog, metavar="COMMAND", help=argparse.SUPPRESS)
+    for title, group in GROUPS.items():
+        folder = "studies." if title == STUDIES else ""
+        for name, (purpose, add_arguments) in group.items():
+            command = commands.add_parser(name, description=f"{purpose[0].upper()}{purpose[1:]}.")
+            command.set_defaults(module=f"{folder}{name}", parser=command)
+            add_arguments(command)
+
+
+def overview() -> str:
+    """All commands in their groups, a line each."""
+    lines = []
+    for title, commands in GROUPS.items():
+        lines += ["", title, *(f"  {name:11}{purpose}" for name, (purpose, _) in commands.items())]
+    return "\n".join(lines[1:])

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import inspect
+import pkgutil
 from collections.abc import Collection, Mapping
 from dataclasses import is_dataclass
 from types import UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from hydra.errors import InstantiationException
-from hydra.utils import get_object, instantiate
+from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -17,7 +18,22 @@ from bench.errors import SteerbenchError
 from sweeps.names import unknown
 
 STANDS_FOR = {"Path": str, "tuple": list, "Sequence": list, "Mapping": dict, "float": float | int}
-"""What a configuration holds where the name of a type on the left is asked for."""
+"""What a configuration holds where a signature has a type of the name on the left."""
+
+
+def target_of(node: Mapping[str, Any] | DictConfig) -> Any:
+    """The class or function that the `_target_` of `node` names.
+
+    Raises:
+        SteerbenchError: it cannot be imported.
+    """
+    try:
+        return pkgutil.resolve_name(node["_target_"])
+    except (ImportError, AttributeError, ValueError) as error:
+        raise SteerbenchError(
+            f"cannot import {node['_target_']}: {error}; PYTHONPATH must name the folder of a "
+            "package that is not installed"
+        ) from error
 
 
 def build(config: DictConfig, group: str, *args: Any, **extra: Any) -> Any:
@@ -26,16 +42,17 @@ def build(config: DictConfig, group: str, *args: Any, **extra: Any) -> Any:
     Nodes below it that have a `_target_` are built first. What a target raises passes through.
 
     Raises:
-        SteerbenchError: a setting is missing, unknown to its target, or of another type.
+        SteerbenchError: a setting is missing, unknown to its target, or of another type, or there
+            is no such target.
     """
     try:
         missing = sorted(OmegaConf.missing_keys(config[group]))  # full keys: "scene.path"
         if missing:
             raise SteerbenchError(f"{missing[0]} is not set: give {missing[0]}=...")
         node: Any = OmegaConf.to_container(config[group], resolve=True)
-    except OmegaConfBaseException as error:  # of what was taken away (~backend), others stand on it
+    except OmegaConfBaseException as error:  # a setting was removed (~backend) that others use
         raise SteerbenchError(f"{group}: {str(error).splitlines()[0]}") from error
-    target = get_object(node["_target_"])
+    target = target_of(node)
     given = [*list(inspect.signature(target).parameters)[: len(args)], *extra]
     check_settings(target, node, f"{group}.", given)
     try:
@@ -49,7 +66,7 @@ def build(config: DictConfig, group: str, *args: Any, **extra: Any) -> Any:
 
 
 def _refused(group: str, error: BaseException) -> SteerbenchError:
-    """A value that the thing itself refuses: the message names it, the group says where."""
+    """The error for a value that the target refused in a message that names the setting."""
     return SteerbenchError(f"{group}: {error}")
 
 
@@ -58,16 +75,16 @@ def check_settings(
 ) -> None:
     """Raise `SteerbenchError` unless `target` takes these settings, by name and by type.
 
-    `prefix` stands before their names in the error; parameters `given` by the caller are no
-    settings. Settings that are nodes with a `_target_` are checked against that.
+    Errors put `prefix` before their names. Parameters `given` by the caller are no settings.
+    Settings that are nodes with a `_target_` are checked against that.
     """
-    # The fields of a dataclass may come from bases whose modules alone know their types.
+    # The types of inherited fields of a dataclass are names of the modules of its bases.
     plain = inspect.isclass(target) and not is_dataclass(target)
     hints = get_type_hints(target.__init__ if plain else target)
     parameters = inspect.signature(target).parameters
     names = [name for name in parameters if name not in given]
     if not settings.get("_partial_"):
-        for name in names:  # ~name takes away what the configurations give
+        for name in names:  # ~name removes what the configurations give
             if _required(parameters[name]) and name not in settings:
                 raise SteerbenchError(f"{prefix}{name} is not set: give {prefix}{name}=...")
     for name, value in settings.items():
@@ -76,7 +93,7 @@ def check_settings(
         if name not in names:
             raise unknown("setting", f"{prefix}{name}", [f"{prefix}{other}" for other in names])
         if isinstance(value, dict) and "_target_" in value:
-            check_settings(get_object(value["_target_"]), value, f"{prefix}{name}.")
+            check_settings(target_of(value), value, f"{prefix}{name}.")
         elif not _fits(value, hints.get(name, Any)):
             wanted = " or ".join(map(str, _choices(hints[name]))) or parameters[name].annotation
             raise SteerbenchError(f"{prefix}{name}: expected {wanted}, got {value!r}")
@@ -93,7 +110,7 @@ def _choices(hint: Any) -> tuple[object, ...]:
 
 
 def _fits(value: object, hint: Any) -> bool:
-    """Whether a plain YAML `value` can stand where `hint` is asked for; if in doubt, it can."""
+    """Whether a plain YAML `value` has the type `hint`; if that cannot be decided, it has."""
     if get_origin(hint) is UnionType:
         return any(_fits(value, option) for option in get_args(hint))
     if choices := _choices(hint):

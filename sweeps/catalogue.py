@@ -7,11 +7,11 @@ from contextlib import suppress
 from importlib import metadata
 from typing import Any
 
-from bench.errors import Unavailable
+from bench.errors import SteerbenchError, Unavailable
 from reports.tables import Table
-from sweeps.overrides import CONFIGS
-from sweeps.terminal import console, rich_table
-from sweeps.variants import engine_kinds
+from sweeps.overrides import choices
+from sweeps.studies.variants import engine_kinds
+from sweeps.terminal import show
 
 GROUPS = ("method", "engine", "scene", "trajectory", "protocol", "budget", "experiment")
 
@@ -20,34 +20,29 @@ def main(options: argparse.Namespace) -> int:
     """Print the choices of `steerbench run`, then the backends of the kernels and the engines."""
     from methods.kernels import availability
 
-    backends = tuple((name, why or "usable") for name, why in availability().items())
+    files = [
+        (f"{'+' if group == 'experiment' else ''}{group}={name}", _comment(path.read_text()))
+        for group in GROUPS
+        for name, path in choices(group, options.config_dir).items()
+    ]
+    backends = [(name, why or "usable") for name, why in availability().items()]
+    engines = [
+        (name, _state(name, kind)) for name, kind in engine_kinds(options.config_dir).items()
+    ]
     for title, columns, lines in (
-        ("Choices", ("choice", "what it is"), choices()),
+        ("Choices", ("choice", "what it is"), files),
         ("Backends of the kernels", ("backend", "here"), backends),
-        ("Engines of the networks", ("engine", "here"), engines()),
+        ("Engines of the networks", ("engine", "here"), engines),
     ):
-        console().print(rich_table(Table(title, columns, lines, figures=False)))
+        show(Table(title, columns, tuple(lines), figures=False))
     return 0
 
 
-def choices() -> tuple[tuple[str, str], ...]:
-    """Every `group=name` there is, with the first comment of its file."""
-    return tuple(
-        (f"{'+' if group == 'experiment' else ''}{group}={path.stem}", _comment(path.read_text()))
-        for group in GROUPS
-        for path in sorted((CONFIGS / group).glob("*.yaml"))
-    )
-
-
-def engines() -> tuple[tuple[str, str], ...]:
-    """Every engine, and whether it can be used here, or why not."""
-    return tuple((name, _state(name, kind)) for name, kind in engine_kinds().items())
-
-
 def _state(name: str, kind: Any) -> str:
+    """Whether an engine can be used here, or why not."""
     try:
         kind(kind.precisions[0])
-    except Unavailable as reason:
+    except (Unavailable, SteerbenchError) as reason:
         return str(reason)
     with suppress(metadata.PackageNotFoundError):  # an engine need not be called as its library
         return f"usable (version {metadata.version(name)})"

@@ -13,10 +13,10 @@ from typing import Any
 from bench.errors import SteerbenchError, explained
 from bench.results import Store
 from bench.sharing import whole
-from reports.regression import LIMITS, Figures, Limit, changes, table
+from reports.regression import LIMITS, Figures, Limit, change_table, changes
 from reports.runs import Run, load, readable
 from sweeps.measurement import PLACES
-from sweeps.terminal import console, rich_table
+from sweeps.terminal import console, show
 
 SCHEMA = 1
 """Of baseline files."""
@@ -43,7 +43,7 @@ def main(options: argparse.Namespace) -> int:
             failed += 1
             continue
         failed += sum(row.verdict != "" for row in rows)
-        console().print(rich_table(table(command, rows)))
+        show(change_table(command, rows))
     console().print("as good as the baseline" if not failed else f"worse or missing: {failed}")
     return int(failed > 0)
 
@@ -54,7 +54,7 @@ def compare(options: argparse.Namespace) -> int:
     keys = [_whole(store, key) for key in (options.old, options.new)]
     old, new = (Figures.of(load(store, {key: key})[0]) for key in keys)
     rows = list(changes(old, new))
-    console().print(rich_table(table(" to ".join(keys), rows)))
+    show(change_table(" to ".join(keys), rows))
     return int(any(row.verdict for row in rows))
 
 

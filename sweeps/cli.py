@@ -1,4 +1,4 @@
-"""The command `steerbench`: what can be asked for, and how errors and signals end it.
+"""The command `steerbench`: its subcommands, and how errors and signals end it.
 
 Exit statuses: 0 done, 1 a check failed (a kernel is wrong, a file differs) or a bug (with its
 traceback), 2 an error the user can act on, 130 interrupted, 141 the reader of a pipe went away,
@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 from bench.errors import SteerbenchError
-from sweeps.arguments import COMMANDS, add_commands
+from sweeps.arguments import COMMANDS, add_commands, overview
 from sweeps.names import unknown
 
 EXAMPLES = """\
@@ -26,12 +26,13 @@ examples
   steerbench run +experiment=demo              three methods on an embedded scene, and a page
   steerbench run scene=blender scene.path=DIR  Instant-NGP on your copy of a NeRF-Synthetic scene
   steerbench run --help                        all choices and settings
-  steerbench list                              what there is, and what of it is usable here
   steerbench paper budget=demo                 every table of the SteerNeRF paper, as a page
   steerbench parity scene=totem budget=demo    what int8 costs, in decibels, and saves, in time
   steerbench accuracy --within 0.1dB           the fastest setting that loses no more than that
   steerbench check BASELINE.json               is everything as good as it was
   steerbench results --format csv              every number measured so far
+
+`steerbench COMMAND --help` explains a command.
 """
 
 # What the disk refuses: worth a plain sentence, not a traceback.
@@ -52,7 +53,7 @@ def main() -> None:
 
 
 def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
-    """Run `command` and turn what ends it into an exit status and at most one message."""
+    """Run `command`; its end becomes an exit status and at most one message."""
     try:
         status = command(argv)
         sys.stdout.flush()
@@ -81,8 +82,9 @@ def dispatch(argv: Sequence[str]) -> int:
     if argv and not argv[0].startswith("-") and argv[0] not in COMMANDS:
         raise unknown("command", argv[0], COMMANDS)
     options, unread = parser.parse_known_args(argv)
-    if "overrides" in options:  # of which argparse takes those up to the next option alone
+    if "overrides" in options:  # argparse reads only those before the next option
         options.overrides += [word for word in unread if not word.startswith("-")]
+        options.overrides = [*options.config_dir, *options.overrides]
         unread = [word for word in unread if word.startswith("-")]
     if unread:
         known = re.findall(r"--[\w-]+", options.parser.format_help())
@@ -97,7 +99,8 @@ def dispatch(argv: Sequence[str]) -> int:
 def _parser() -> Parser:
     parser = Parser(
         prog="steerbench",
-        description="Radiance-field renderers measured under one ruler.",
+        usage="steerbench COMMAND [...]",
+        description=f"Radiance-field renderers measured under one ruler.\n\n{overview()}",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -106,7 +109,7 @@ def _parser() -> Parser:
 
 
 def _terminate(signum: int, frame: object) -> NoReturn:
-    """Leave through every `finally`, so that checkpoints are kept and temporary files are not."""
+    """Leave through every `finally`: checkpoints are kept, temporary files are removed."""
     sys.exit(128 + signum)
 
 

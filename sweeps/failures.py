@@ -14,13 +14,13 @@ from bench.sharing import whole
 
 
 def reason(error: Exception) -> str:
-    """What `error` says, in one line."""
+    """The message of `error` in one line."""
     return " ".join(str(error).split()) or type(error).__name__
 
 
 @contextmanager
-def told_only() -> Iterator[None]:
-    """Say what goes wrong in the body and go on: it must not hide the failure it is about."""
+def printed() -> Iterator[None]:
+    """Print an error of the body and go on: it must not hide the failure that it is about."""
     try:
         yield
     except Exception as error:
@@ -28,7 +28,7 @@ def told_only() -> Iterator[None]:
 
 
 def keep(outputs: Path, job: Mapping[str, Any], why: str) -> None:
-    """Leave behind why `job`, as its settings describe it, failed."""
+    """Write down why the `job` with these settings failed."""
     path = _path(outputs, job)
     with explained(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -37,12 +37,12 @@ def keep(outputs: Path, job: Mapping[str, Any], why: str) -> None:
 
 
 def forget(outputs: Path, job: Mapping[str, Any]) -> None:
-    """`job` has succeeded."""
+    """Remove the note on `job`, which has succeeded."""
     _path(outputs, job).unlink(missing_ok=True)
 
 
 def found(outputs: Path, job: Mapping[str, Any]) -> str | None:
-    """Why `job` failed when it was tried last; None if it did not."""
+    """Why `job` failed when it ran last; None if it did not."""
     path = _path(outputs, job)
     return path.read_text(encoding="utf-8").strip() if path.exists() else None
 

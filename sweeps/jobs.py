@@ -1,14 +1,22 @@
-"""What every job of a sweep leaves in the folder of the sweep, in whichever process it ran."""
+"""One job among others: its line at the terminal, and what it leaves in the folder of a sweep."""
 
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
+from datetime import timedelta
 from pathlib import Path
+
+from omegaconf import DictConfig
 
 from bench.errors import explained
 from bench.sharing import whole
+from reports.runs import load
+from reports.tables import decimal
+from sweeps import failures
+from sweeps.measurement import Obtained, described, obtain
 
 SUFFIX = ".job.json"
 
@@ -40,36 +48,37 @@ class Job:
     failure: str | None = None
 
     def write(self, folder: Path) -> None:
-        """Leave it in `folder`; it appears there whole or not at all."""
+        """Write it to `folder`; it appears there whole or not at all."""
         with explained(folder), whole(folder / f"{self.number}{SUFFIX}") as new:
             new.write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
 
     def label(self, names: Collection[str]) -> str:
-        """What the job is called beside others: its method, and its settings of these `names`.
+        """The name of the job beside others: its method, and its settings of these `names`.
 
         Of a name its last part is enough, unless another of them ends in the same.
         """
         ends = [name.rpartition(".")[2] for name in names]
-        told = [
+        shown = [
             f"{end if ends.count(end) == 1 else name}={self.settings[name]}"
             for name, end in zip(names, ends, strict=True)
             if name in self.settings
         ]
-        return f"{self.method} ({', '.join(told)})" if told else self.method
+        return f"{self.method} ({', '.join(shown)})" if shown else self.method
 
     @property
     def settings(self) -> dict[str, str]:
-        """The overrides by name, but for the method."""
+        """The overrides by name, without the method."""
         pairs = (override.split("=", 1) for override in self.overrides if "=" in override)
         return {name: value for name, value in pairs if name != "method"}
 
 
 def read(folder: Path) -> list[Job]:
     """Every job that has ended, in the order of the sweep."""
-    jobs = []
-    for path in folder.glob(f"*{SUFFIX}"):
-        fields = json.loads(path.read_text(encoding="utf-8"))
-        jobs.append(Job(**fields | {"overrides": tuple(fields["overrides"])}))
+    texts = (path.read_text(encoding="utf-8") for path in folder.glob(f"*{SUFFIX}"))
+    jobs = [
+        Job(**fields | {"overrides": tuple(fields["overrides"])})
+        for fields in map(json.loads, texts)
+    ]
     return sorted(jobs, key=lambda job: job.number)
 
 
@@ -77,3 +86,31 @@ def varying(jobs: Sequence[Job]) -> list[str]:
     """Names of the settings that are not the same in all jobs."""
     names = dict.fromkeys(name for job in jobs for name in job.settings)
     return [name for name in names if len({job.settings.get(name) for job in jobs}) > 1]
+
+
+def attempt(config: DictConfig, command: Sequence[str], name: str) -> Obtained:
+    """Obtain the run that `config` describes; a failure is printed at once and kept for reports.
+
+    Raises as `obtain` does.
+    """
+    try:
+        return obtain(config, command)
+    except Exception as error:
+        print(f"steerbench: failed: {name}: {error}", file=sys.stderr)
+        with failures.printed():
+            failures.keep(Path(config.outputs), described(config), failures.reason(error))
+        raise
+
+
+def say(obtained: Obtained, name: str, more: str) -> None:
+    """Print the figures of a job in one line, and `more` after them."""
+    (run,) = load(obtained.store, {obtained.run: name})
+    psnr, ms = decimal(run.values.get("psnr"), 2), decimal(run.values["frame_ms"], 1)
+    print(f"{name}: {psnr} dB, {ms} ms a frame{more}", file=sys.stderr)
+
+
+def time_left(seconds: float, measured: int, jobs: int) -> str:
+    """How long `jobs` may take after `measured` ones took `seconds`; empty where nobody knows."""
+    if not (measured and jobs):
+        return ""
+    return f", about {timedelta(seconds=round(seconds / measured * jobs))} left"

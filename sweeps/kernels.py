@@ -11,8 +11,8 @@ from typing import Any
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from reports.tables import Table
+from sweeps.device_lock import device_lock
 from sweeps.terminal import console, rich_table
-from sweeps.turns import turn
 
 COLUMNS = ("kernel", "case", "backend", "dtype", "error", "tolerance", "ms", "M items/s", "ratio")
 """`ratio`: time of the reference backend over that of this one, same case, same run."""
@@ -23,7 +23,7 @@ def main(options: argparse.Namespace) -> int:
     from methods.kernels.benchmark import main_rows
 
     log = ConsoleLog(Path())
-    with turn("auto", log):
+    with device_lock("auto", log):
         rows = main_rows(options.filter, options.repeats, log)
     if not rows:
         raise SteerbenchError(f"--filter: no kernel has {options.filter!r} in its name")

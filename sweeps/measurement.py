@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.columns import Columns
@@ -25,22 +24,22 @@ from bench.sources import digest, libraries
 from bench.types import DEVICE, Method, Scene
 from reports.page import write_page
 from reports.runs import Run, load
-from reports.tables import blocks
+from reports.tables import run_tables
 from sweeps import failures
-from sweeps.build import build, check_settings
+from sweeps.build import build, check_settings, target_of
+from sweeps.device_lock import device_lock
 from sweeps.terminal import console, rich_table
-from sweeps.turns import turn
 
 PLACES = ("outputs", "report", "weights_dir")
 """Settings that say where things lie: they do not change a row."""
 
 USUAL_THREADS = torch.get_num_threads()
-"""What torch takes where nothing is said."""
+"""How many threads torch uses by default."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings of a run that are no choices; run.yaml says what each of them means."""
+    """The settings of a run that are no choices; run.yaml explains each of them."""
 
     seed: int
     device: str
@@ -53,7 +52,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Obtained:
-    """A run that is in the store; `measured` tells whether it had to be measured for that."""
+    """A run that is in the store; `measured` says whether it had to be measured for that."""
 
     store: Store
     run: str
@@ -79,7 +78,7 @@ def obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
 
     Args:
         config: the composed run.yaml.
-        command: what was typed, for the record.
+        command: the words that were typed, for the record.
 
     Raises:
         SteerbenchError: a setting is wrong, or something in the measurement went wrong.
@@ -104,9 +103,9 @@ def _obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
     if store.find(run) is not None:
         log.info(f"already measured; to measure again, remove {store.folder / run}")
         return Obtained(store, run, measured=False)
-    with turn(method.settings()["device"], log):
-        if store.find(run) is not None:
-            return Obtained(store, run, measured=False)  # by the process that had the turn before
+    with device_lock(method.settings()["device"], log):
+        if store.find(run) is not None:  # measured by the process that had the lock before
+            return Obtained(store, run, measured=False)
         measurement = measure(
             method,
             scene,
@@ -125,12 +124,12 @@ def _obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
 
 @lru_cache(maxsize=1)
 def _scene(node: str, root: Path) -> Scene:
-    """The scene that `node`, as YAML, describes; the jobs of a sweep share it."""
+    """The scene that `node`, as YAML, describes, kept for the next job of a sweep."""
     return build(OmegaConf.create({"scene": OmegaConf.create(node)}), "scene", log=ConsoleLog(root))
 
 
 def checked_settings(config: DictConfig) -> Settings:
-    """The settings in `config`; from now on torch uses as many threads as they say.
+    """The settings in `config`. From now on torch uses as many threads as they say.
 
     Raises:
         SteerbenchError: one of them is wrong.
@@ -158,14 +157,14 @@ def checked_settings(config: DictConfig) -> Settings:
 
 
 def described(config: DictConfig) -> dict[str, Any]:
-    """The settings that make a run what it is; the same for jobs that are the same.
+    """The settings that decide a run; equal for equal jobs.
 
-    Where weights and scenes lie is not part of it, but for the last name of a scene's folder, which
-    is what rows call it; nor an engine that the method has no use for.
+    Without the places of weights and scenes, except for the last name of a scene's folder, which
+    rows show; and without the engine where the method uses none.
     """
     try:
         plain: Any = OmegaConf.to_container(config, resolve=True)
-    except OmegaConfBaseException as error:  # what one setting takes from another was deleted
+    except OmegaConfBaseException as error:  # a setting was removed that others use
         raise SteerbenchError(" ".join(str(error).split())) from error
     unused = () if "engine" in plain["method"] else ("engine", "precision")
     kept = {key: value for key, value in plain.items() if key not in (*PLACES, *unused)}
@@ -176,8 +175,8 @@ def described(config: DictConfig) -> dict[str, Any]:
 
 
 def of_scene(run: Run, config: DictConfig) -> bool:
-    """Whether `run`, whose settings are those of `config`, shows the very scene, and not one whose
-    folder has the same last name. Of a folder that is not here nothing but its name is known."""
+    """Whether `run`, which has the settings of `config`, shows this scene, and not another whose
+    folder has the same last name. Of a folder that is not here only the name is compared."""
     folder = _folder(config)
     if folder is None or run.record.get("scene_path") == folder or not Path(folder).is_dir():
         return True
@@ -191,9 +190,8 @@ def _folder(config: DictConfig) -> str | None:
 
 
 def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any]:
-    """Everything that can change the rows but for the weights at hand: what makes a run's key."""
-    targets = set(_targets(OmegaConf.to_container(config, resolve=True)))
-    things = [measure, *map(get_object, sorted(targets))]
+    """Everything that can change the rows, except for the weights of LPIPS: a run's key."""
+    things = [measure, *_targets(OmegaConf.to_container(config, resolve=True))]
     return {
         "code": digest(*things),
         "libraries": libraries(*things),
@@ -205,11 +203,11 @@ def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any
     }
 
 
-def _targets(node: Any) -> Iterator[str]:
-    """What `node` and all below it are built by."""
+def _targets(node: Any) -> Iterator[Any]:
+    """The classes and functions that `node` and all nodes below it name."""
     if isinstance(node, Mapping):
         if "_target_" in node:
-            yield node["_target_"]
+            yield target_of(node)
         for value in node.values():
             yield from _targets(value)
 
@@ -219,6 +217,6 @@ def _show(run: Run, explain: bool) -> None:
     what = run.facts[["method", "scene", "trajectory", "resolution", "budget", "protocol"]]
     out = console()
     out.print(f"{', '.join(what)}, seed {run.facts['seed']}: run {run.key}", style="bold")
-    out.print(Columns([rich_table(table) for table in blocks(run.rows)]))
+    out.print(Columns([rich_table(table) for table in run_tables(run.rows)]))
     for metric, reason in run.record["missing"].items() if explain else ():
         out.print(f"{metric}: n/a. {reason}", markup=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""Errors about names: what was typed, what is nearest to it, what exists."""
+"""Errors about names: what was typed, what it is called now or is nearest to it, what exists."""
 
 from __future__ import annotations
 
@@ -7,9 +7,49 @@ from difflib import get_close_matches
 
 from bench.errors import SteerbenchError
 
+RENAMED = {
+    "command=generic": "steerbench pretrain",
+    "method=steernerf_paper": "method=steernerf",
+    "method=steernerf_frozen": "method=steernerf_lean_frozen",
+    "method=steernerf_k3": "method=steernerf_lean_k3",
+    "method=steernerf_untaught": "method=steernerf_lean with method.rendering.step or .stop",
+    "renderer=s2d": "renderer=lean",
+    "renderer=unet_release": "renderer=unet",
+    "method.pipeline": "method.model, or method.rendering for what needs no training",
+    "method.pipeline.steps": "method.model.step, or method.rendering.step after the training",
+    "method.pipeline.stop": "method.model.stop, or method.rendering.stop after the training",
+    "method.pipeline.refined_steps": "method.rendering.refined_step",
+}
+RENAMED |= {
+    f"method.pipeline.{name}": f"method.{part}.{name}"
+    for part, names in {
+        "model": "channels frames scale reprojection history surface feature_background",
+        "rendering": "range overlap refined skip",
+    }.items()
+    for name in names.split()
+}
+"""What an earlier version understood, and its name now; it stands for all settings below it."""
+
+REMOVED = {
+    "method=ngp_guided",
+    "protocol=steerbench-1-lookahead",
+    "protocol.lookahead",
+    "method.pipeline.jitter",
+    "method.pipeline.levels",
+    "method.pipeline.refresh",
+}
+
 
 def unknown(kind: str, name: str, existing: Iterable[str]) -> SteerbenchError:
-    """The error for a `name` that is none of the `existing` ones, with the nearest of them."""
+    """The error for a `name` that is none of the `existing` ones: its new name, or near ones."""
+    old, below = name if kind == "setting" else f"{kind}={name}", ""
+    while old and old not in RENAMED and old not in REMOVED:
+        old, dot, last = old.rpartition(".")
+        below = f"{dot}{last}{below}"
+    if old in REMOVED:
+        return SteerbenchError(f"{kind} '{name}' was removed; its figures are in docs/log.md")
+    if old:
+        return SteerbenchError(f"{kind} '{name}' was renamed; use {RENAMED[old]}{below}")
     names = sorted(existing)
     near = _nearest(name, names)
     guess = f" Did you mean {' or '.join(near)}?" if near else ""

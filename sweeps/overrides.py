@@ -1,12 +1,17 @@
-"""The configuration that overrides describe; what is wrong with them, in the words of who typed
-them."""
+"""The configuration that the words of a command describe, and errors that quote these words.
+
+Words are overrides as `steerbench run` takes them (scene=wires), and `--config-dir=DIR` for a
+folder with further choices.
+"""
 
 from __future__ import annotations
 
 import re
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_loader import ConfigLoader
@@ -18,45 +23,60 @@ from bench.errors import SteerbenchError
 from sweeps.names import unknown
 
 CONFIGS = Path(__file__).parent / "configs"
+FLAGS = ("--config-dir", "-cd")
 
 
-def composed(overrides: Sequence[str], **options: bool) -> DictConfig:
+def composed(words: Sequence[str], **options: bool) -> DictConfig:
     """The configuration of a run; `options` as of Hydra's `compose`.
 
     Raises:
         SteerbenchError: a setting or a choice does not exist, or cannot be read.
     """
+    overrides = _overrides(words)
+    if further := [str(folder).replace("'", r"\'") for folder in _folders(words)[1:]]:
+        paths = ",".join(f"'file://{folder}'" for folder in further)
+        overrides.append(f"hydra.searchpath=[{paths}]")
     try:
         with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-            return compose("run", overrides=list(overrides), **options)
+            return compose("run", overrides=overrides, **options)
     except Exception as error:
         if not of_hydra(error):
             raise
-        raise explain(error, overrides) from error
+        raise explain(error, words) from error
+
+
+def choices(group: str, words: Sequence[str] = ()) -> dict[str, Path]:
+    """The file of every choice of `group` by its name, also of the folders that `words` name."""
+    found = {
+        path.stem: path
+        for folder in reversed(_folders(words))  # of one name, the first folder has the choice
+        for path in (folder / group).glob("*.yaml")
+    }
+    return dict(sorted(found.items()))
 
 
 def of_hydra(error: Exception) -> bool:
-    """Whether Hydra raised it. Its own exceptions are not all: some of the wrong things that can be
-    typed (budget=0.0) it answers with a ValueError or with what its parser stumbled over."""
+    """Whether Hydra raised it: for some mistakes (budget=0.0) it raises no exception of its own,
+    but a ValueError or what its parser stumbled over."""
     *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
     return innermost.f_globals["__name__"].partition(".")[0] in ("hydra", "omegaconf", "antlr4")
 
 
-def swept(overrides: Sequence[str], loader: ConfigLoader | None = None) -> dict[str, list[str]]:
-    """The values of every setting that takes several in turn (seed=0,1,2); later ones count.
+def swept(words: Sequence[str], loader: ConfigLoader | None = None) -> dict[str, list[str]]:
+    """The values of every setting that has several (seed=0,1,2); the last word for it counts.
 
     Args:
-        loader: of Hydra's, where a choice may be given as a pattern (method=*).
+        loader: Hydra's, where a choice may be a pattern (method=*).
 
     Raises:
-        SteerbenchError: one of them cannot be read.
+        SteerbenchError: a word cannot be read.
     """
     try:
-        parsed = OverridesParser.create(loader).parse_overrides(list(overrides))
+        parsed = OverridesParser.create(loader).parse_overrides(_overrides(words))
     except Exception as error:
         if not of_hydra(error):
             raise
-        raise explain(error, overrides) from error
+        raise explain(error, words) from error
     values = {
         override.get_key_element(): list(override.sweep_string_iterator())
         if override.is_discrete_sweep()
@@ -66,7 +86,7 @@ def swept(overrides: Sequence[str], loader: ConfigLoader | None = None) -> dict[
     return {name: several for name, several in values.items() if several}
 
 
-def explain(error: Exception, argv: Sequence[str]) -> SteerbenchError:
+def explain(error: Exception, words: Sequence[str]) -> SteerbenchError:
     """Translate an error of Hydra's; names that do not exist come with the nearest that do."""
     if isinstance(error, OverrideParseException):
         return SteerbenchError(
@@ -76,29 +96,42 @@ def explain(error: Exception, argv: Sequence[str]) -> SteerbenchError:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
         return unknown(group, name, error.options)
-    key = re.match(r"Could not override '([^']+)'", str(error))
-    if key:
-        return unknown("setting", key[1], _settings(argv))
+    if key := re.match(r"Could not override '([^']+)'", str(error)):
+        return unknown("setting", key[1], _settings(words))
     causes = [error, error.__cause__] if error.__cause__ else [error]
     lines = [line.strip() for cause in causes for line in str(cause).splitlines()]
     return SteerbenchError("; ".join(line for line in lines if line))
 
 
-def _settings(argv: Sequence[str]) -> list[str]:
-    """All that can be set, given the choices (scene=blender) in `argv`."""
-    groups = [path.name for path in CONFIGS.iterdir() if path.is_dir()]
-    there = {str(path.relative_to(CONFIGS))[:-5] for path in CONFIGS.glob("*/*.yaml")}
-    choices = [argument for argument in argv if argument.replace("=", "/", 1) in there]
-    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        config = OmegaConf.to_container(compose("run", overrides=choices), resolve=False)
-    assert isinstance(config, dict)
-    return [*groups, *leaves(config)]
+def _settings(words: Sequence[str]) -> list[str]:
+    """All that can be set with the choices (scene=blender) in `words`."""
+    folders = _folders(words)
+    groups = {path.name for folder in folders for path in folder.iterdir() if path.is_dir()}
+    there = {f"{group}={name}" for group in groups for name in choices(group, words)}
+    chosen = [word for word in words if word in there]
+    config: Any = composed([*(f"{FLAGS[0]}={folder}" for folder in folders[1:]), *chosen])
+    return [*groups, *leaves(OmegaConf.to_container(config, resolve=False))]
 
 
-def leaves(config: Mapping, prefix: str = "") -> Iterator[str]:
+def leaves(config: Any, prefix: str = "") -> Iterator[str]:
     """The names of all settings in `config`, with dots between the levels."""
     for key, value in config.items():
-        if isinstance(value, dict):
+        if isinstance(value, Mapping):
             yield from leaves(value, f"{prefix}{key}.")
         elif not key.startswith("_"):
             yield f"{prefix}{key}"
+
+
+def _overrides(words: Sequence[str]) -> list[str]:
+    return [word for word in words if not word.startswith(f"{FLAGS[0]}=")]
+
+
+def _folders(words: Sequence[str]) -> list[Path]:
+    """Our configurations and the folders that `words` name: `--config-dir=DIR` or, as Hydra takes
+    it too, in two words."""
+    further = []
+    for word, after in pairwise([*words, ""]):
+        name, equals, value = word.partition("=")
+        if name in FLAGS:
+            further.append(Path(value if equals else after).resolve())
+    return [CONFIGS, *further]

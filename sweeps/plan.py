@@ -1,11 +1,10 @@
-"""What there is to measure for the tables of the paper, and what of it is there."""
+"""The jobs of the tables of the paper, and their results as far as the store has them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
 from pathlib import Path
 from typing import cast
 
@@ -13,21 +12,21 @@ from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import SteerbenchError
 from bench.results import Store, content_key
-from reports.published import PaperTable, paper_tables
-from reports.runs import Run, readable
-from reports.seeds import Repeated
+from reports.paper_tables import Line, PaperTable, paper_tables
+from reports.runs import Repeated, Run, readable
 from sweeps import failures
 from sweeps.measurement import described, of_scene
 from sweeps.names import unknown
 from sweeps.overrides import composed, swept
 
+METHOD = "method"
 REPEATED = "seed"
-"""The one setting that may take several values: a cell then has a mean and an interval."""
+"""The one setting that may have several values: a cell then has a mean and an interval."""
 
 
 @dataclass(frozen=True)
 class Planned:
-    """A job: the line of a table that it fills, with which seed, and its whole configuration."""
+    """A job: the line of a table that it fills, its configuration, and the command that runs it."""
 
     table: str
     line: str
@@ -36,79 +35,89 @@ class Planned:
 
     @property
     def name(self) -> str:
-        """What it is called while it runs."""
+        """The name of the job at the terminal."""
         return f"{self.table}: {self.line}, seed {self.config.seed}"
 
     @cached_property
     def key(self) -> str:
-        """The same for jobs that are the same."""
+        """Equal for equal jobs."""
         return content_key(described(self.config))
 
 
-def chosen(name: str | None) -> list[PaperTable]:
-    """The table called `name`; all of them without one."""
+def chosen(name: str | None, methods: Sequence[str]) -> list[PaperTable]:
+    """The table called `name`, all of them without one; the table of methods has a line more for
+    each of `methods`.
+
+    Raises:
+        SteerbenchError: there is no such table, or it compares no methods.
+    """
     tables = {table.name: table for table in paper_tables()}
     if name is not None and name not in tables:
         raise unknown("table", name, tables)
-    return [tables[name]] if name else list(tables.values())
+    further = [Line(method, {METHOD: method}) for method in methods]
+    found = []
+    for table in [tables[name]] if name else tables.values():
+        of_methods = any(METHOD in line.job for line in table.lines if line.job)
+        lines = [*table.lines, *further] if of_methods else table.lines
+        found.append(replace(table, lines=lines))
+    if methods and name and found[0].lines == tables[name].lines:
+        raise SteerbenchError(f"--with: {name} compares no methods; table1 does")
+    return found
 
 
-def plan(table: PaperTable, overrides: Sequence[str]) -> list[Planned]:
-    """The jobs of the experiment of `table` under `overrides`, once for each of their seeds.
+def plan(table: PaperTable, words: Sequence[str]) -> list[Planned]:
+    """The jobs of the experiment of `table` under the settings in `words`: one for each line that
+    has a job, and for each seed.
 
-    What the experiment sweeps over and fills no line is left out: Instant-NGP has no 2D renderer to
+    A job of the experiment that no line names is left out: Instant-NGP has no 2D renderer to
     compute in int8.
 
     Raises:
-        SteerbenchError: an override cannot be read, names nothing, or is swept and no seed; or a
-            line asks for a job that the experiment does not have.
+        SteerbenchError: a word cannot be read, names nothing, or gives several values to another
+            setting than the seed; or a line asks for a job that the experiment does not have.
     """
-    fixed, seeds = _seeds(overrides)
-    lines = {
-        frozenset(f"{name}={value}" for name, value in line.job.items()): line.label
-        for line in table.lines
-        if line.job
-    }
+    fixed, seeds = _seeds(words)
     experiment = composed([f"+experiment={table.name}", *fixed], return_hydra_config=True)
     params = experiment.hydra.sweeper.params
     grid = swept([f"{name}={values}" for name, values in params.items()])
     jobs = []
-    for values in product(*grid.values()):
-        settings = [f"{name}={value}" for name, value in zip(grid, values, strict=True)]
-        label = lines.get(frozenset(settings))
-        if label is not None:
-            together = [f"+experiment={table.name}", *fixed, *settings]
-            config = composed(together)
-            for seed in seeds:
-                command = ["steerbench", "run", *together, *seed, "hydra.mode=RUN"]
-                merged = OmegaConf.merge(config, OmegaConf.from_dotlist(seed))
-                jobs.append(Planned(table.name, label, cast(DictConfig, merged), command))
-    made = {job.line for job in jobs}
-    if lost := [label for label in lines.values() if label not in made]:
-        choices = "; ".join(f"{name}={','.join(some)}" for name, some in grid.items())
-        raise SteerbenchError(
-            f"{table.name}: no job of its experiment fills the line {lost[0]!r}; expected the "
-            f"settings of its job among {choices}"
-        )
+    for line in table.lines:
+        if not line.job:
+            continue
+        in_grid = {name for name in grid if line.job.get(name) in grid[name]}
+        added = line.job == {METHOD: line.label}
+        if not added and not line.job.keys() == grid.keys() == in_grid:
+            choices = "; ".join(f"{name}={','.join(some)}" for name, some in grid.items())
+            raise SteerbenchError(
+                f"{table.name}: no job of its experiment fills the line {line.label!r}; expected "
+                f"the settings of its job among {choices}"
+            )
+        settings = [f"{name}={line.job[name]}" for name in grid if name in line.job]
+        together = [f"+experiment={table.name}", *fixed, *settings]
+        config = composed(together)
+        for seed in seeds:
+            command = ["steerbench", "run", *together, *seed, "hydra.mode=RUN"]
+            merged = OmegaConf.merge(config, OmegaConf.from_dotlist(seed))
+            jobs.append(Planned(table.name, line.label, cast(DictConfig, merged), command))
     return jobs
 
 
-def _seeds(overrides: Sequence[str]) -> tuple[list[str], list[list[str]]]:
-    """Overrides that all jobs share, and those of each repetition."""
-    several = swept(overrides)
+def _seeds(words: Sequence[str]) -> tuple[list[str], list[list[str]]]:
+    """The words that all jobs share, and those of each repetition."""
+    several = swept(words)
     if others := sorted(several.keys() - {REPEATED}):
         raise SteerbenchError(
             f"{others[0]}: expected one value, got {', '.join(several[others[0]])}; only "
             f"{REPEATED} may take several here"
         )
-    fixed = [text for text in overrides if REPEATED not in swept([text])]
+    fixed = [text for text in words if REPEATED not in swept([text])]
     values = dict.fromkeys(several.get(REPEATED, ()))
     return fixed, [[f"{REPEATED}={value}"] for value in values] or [[]]
 
 
 def newest(store: Store) -> dict[str, list[Run]]:
-    """The runs of the store by the key of their job, one for each scene that has its settings: that
-    which was stored last, and the last of these first."""
+    """The runs of the store by the key of their job, the newest first: of each scene that has the
+    settings of the job, the run that was stored last."""
     found: dict[str, dict[str, Run]] = {}
     for run in reversed(readable(store)):
         parts = run.record["made_of"]
@@ -121,7 +130,7 @@ def newest(store: Store) -> dict[str, list[Run]]:
 def gather(
     jobs: Sequence[Planned], runs: Mapping[str, Sequence[Run]], outputs: Path
 ) -> dict[str, list[Repeated]]:
-    """What there is of every line, by table: its runs, and why others are missing.
+    """The lines of every table: the runs of each, and why others are missing.
 
     Args:
         runs: as `newest` has them.

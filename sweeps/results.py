@@ -12,21 +12,11 @@ from bench.errors import SteerbenchError
 from bench.results import Store
 from reports.tables import NOT_AVAILABLE, Table
 from sweeps.names import unknown
-from sweeps.terminal import console, rich_table
+from sweeps.terminal import show
 
 SHOWN = (
-    "run",
-    "method",
-    "scene",
-    "trajectory",
-    "seed",
-    "phase",
-    "metric",
-    "value",
-    "lo",
-    "hi",
-    "n",
-    "unit",
+    *("run", "method", "scene", "trajectory", "seed", "phase"),
+    *("metric", "value", "lo", "hi", "n", "unit"),
 )
 """The columns shown as a table; csv and json have all of them."""
 
@@ -34,10 +24,10 @@ FILTERS = ("method", "scene", "metric")
 
 
 def main(options: argparse.Namespace) -> int:
-    """Print the rows below `options.outputs` as a table, csv or json, all or those asked for.
+    """Print the rows below `options.outputs`, all or some, as a table, csv or json.
 
     Raises:
-        SteerbenchError: nothing was measured, or nothing of what is asked for.
+        SteerbenchError: nothing was measured, or nothing that the filters let through.
     """
     rows = Store(options.outputs).rows(report=lambda message: print(message, file=sys.stderr))
     if rows.empty:
@@ -54,7 +44,7 @@ def main(options: argparse.Namespace) -> int:
         rows.to_json(sys.stdout, orient="records", indent=1, double_precision=15)
         print()
     else:
-        console().print(rich_table(Table(str(options.outputs), SHOWN, _lines(rows))))
+        show(Table(str(options.outputs), SHOWN, _lines(rows)))
     return 0
 
 

@@ -11,40 +11,40 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from sweeps.announced import Announced
 from sweeps.overrides import CONFIGS, explain, of_hydra
+from sweeps.sweep_callback import SweepCallback
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run what the overrides and flags in `argv` ask for: one job, a sweep, or Hydra's own help.
+    """Run one job, a sweep, or Hydra's own help, as the overrides and flags in `argv` say.
 
-    In a sweep a job that fails is named at once and the others still run; at the end all stand in
-    one table.
+    In a sweep, a job that fails is named at once and the others still run; the table at the end has
+    all of them.
 
     Raises:
         SteerbenchError: a setting or a choice does not exist, or a job failed.
     """
-    # Hydra's parser takes the overrides in one piece only: flags first, whatever was typed.
+    # Hydra's parser takes the overrides in one piece only, so the flags go first.
     sys.argv = [sys.argv[0], *sorted(argv, key=_is_override)]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors instead of printing them
     _hide_subcommand_from_completion()
-    Announced.folder = None
+    SweepCallback.folder = None
     error = _launch(argv)
-    if Announced.folder is not None:
+    if SweepCallback.folder is not None:
         from sweeps.sweep import finish
 
-        finish(Announced.folder)
+        finish(SweepCallback.folder)
     if error is not None:
         raise error
     return 0
 
 
 def _launch(argv: Sequence[str]) -> Exception | None:
-    """Have Hydra run every job; the error that a job or a setting ended with."""
+    """Let Hydra run every job; return the error that a job or a setting ended with."""
     failures: list[Exception] = []
 
     def job(config: DictConfig) -> None:
-        # These load torch: not for --help or completion.
+        # These load torch, which --help and completion can do without.
         from sweeps.measurement import execute
         from sweeps.sweep import run_job
 
@@ -55,7 +55,7 @@ def _launch(argv: Sequence[str]) -> Exception | None:
         try:
             execute(config, command)
         except Exception as error:
-            failures.append(error)  # past Hydra, which would announce it in its own way
+            failures.append(error)  # past Hydra, which would print it in its own way
 
     try:
         hydra.main(str(CONFIGS), "run", version_base="1.3")(job)()
@@ -69,8 +69,7 @@ def _launch(argv: Sequence[str]) -> Exception | None:
 
 
 def _config_dir() -> list[str]:
-    """The folder of further settings that was typed, as one word: without it others cannot run the
-    command."""
+    """The folder of further choices that was typed, as one word: the command needs it."""
     sources = HydraConfig.get().runtime.config_sources
     return [f"--config-dir={x.path}" for x in sources if x.provider == "command-line"]
 

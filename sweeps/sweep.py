@@ -1,6 +1,6 @@
 """A sweep: its jobs one by one, and at its end one table and one page about all of them.
 
-Jobs may run in other processes, so they meet in the folder of the sweep and in the store alone.
+Jobs may run in other processes, so they share nothing but the folder of the sweep and the store.
 """
 
 from __future__ import annotations
@@ -20,14 +20,13 @@ from reports.comparison import comparison
 from reports.page import write_page
 from reports.runs import load
 from sweeps import failures
-from sweeps.announced import Announced
-from sweeps.attempt import attempt, say, time_left
-from sweeps.jobs import Job, read, varying
-from sweeps.terminal import console, rich_table
+from sweeps.jobs import Job, attempt, read, say, time_left, varying
+from sweeps.sweep_callback import SweepCallback
+from sweeps.terminal import console, show
 
 
 def run_job(config: DictConfig, command: Sequence[str]) -> None:
-    """Run the present job of a sweep, leave behind how it ended, say so in a line.
+    """Run the present job of a sweep, write down how it ended, print that in a line.
 
     `command` runs this job alone. Raises what the measurement raises.
     """
@@ -44,11 +43,11 @@ def run_job(config: DictConfig, command: Sequence[str]) -> None:
     try:
         obtained = attempt(config, command, " ".join(job.overrides))
     except Exception as error:
-        with failures.told_only():
+        with failures.printed():
             replace(job, failure=failures.reason(error)).write(folder)
         raise
     replace(job, run=obtained.run, measured=obtained.measured).write(folder)
-    swept = [name for name in Announced.sizes if name != "method"]
+    swept = [name for name in SweepCallback.sizes if name != "method"]
     say(obtained, job.label(swept), _progress(read(folder)))
 
 
@@ -64,16 +63,16 @@ def finish(folder: Path) -> None:
         names, store = varying(there), Store(Path(outputs))
         _show(store, *_labels(there, names))
         for report in dict.fromkeys(job.report for job in there if job.report):
-            runs, failures = _labels([job for job in there if job.report == report], names)
+            runs, failed = _labels([job for job in there if job.report == report], names)
             if runs:
-                page = write_page(store, runs, Path(report), failures)
+                page = write_page(store, runs, Path(report), failed)
                 print(f"report: {page}", file=sys.stderr)
 
 
 def _progress(ended: Sequence[Job]) -> str:
-    """How far the sweep is and, from what had to be measured so far, how long the rest takes."""
-    total, measured = prod(Announced.sizes.values()), sum(job.measured for job in ended)
-    if Announced.folder is None or len(ended) > total:
+    """How many jobs are done and, from those that had to be measured, how long the rest takes."""
+    total, measured = prod(SweepCallback.sizes.values()), sum(job.measured for job in ended)
+    if SweepCallback.folder is None or len(ended) > total:
         return ""
     seconds = time.time() - min(job.begun for job in ended)
     left = time_left(seconds, measured, total - len(ended))
@@ -81,17 +80,16 @@ def _progress(ended: Sequence[Job]) -> str:
 
 
 def _labels(jobs: Sequence[Job], names: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
-    """What runs are called, by their keys; why others failed, by what they are called."""
+    """The labels of the runs by their keys, and why others failed, by their labels."""
     runs = {job.run: job.label(names) for job in jobs if job.run}
     return runs, {job.label(names): job.failure for job in jobs if job.failure}
 
 
-def _show(store: Store, labels: dict[str, str], failures: dict[str, str]) -> None:
+def _show(store: Store, labels: dict[str, str], failed: dict[str, str]) -> None:
     """Print the table of all jobs, and why a figure is missing."""
     runs = load(store, labels)
-    out = console()
-    out.print(rich_table(comparison(runs, failures)))
+    show(comparison(runs, failed))
     for note in dict.fromkeys(
         f"{metric}: n/a. {why}" for run in runs for metric, why in run.record["missing"].items()
     ):
-        out.print(note, markup=False, soft_wrap=True)
+        console().print(note, markup=False, soft_wrap=True)

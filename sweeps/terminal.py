@@ -25,6 +25,12 @@ def console() -> Console:
     return _Output(width=None if sys.stdout.isatty() else PIPE_WIDTH, highlight=False)
 
 
+def show(*tables: Table) -> None:
+    """Print `tables`, one below the other."""
+    for table in tables:
+        console().print(rich_table(table))
+
+
 def rich_table(table: Table) -> RichTable:
     """`table` with labels and text to the left and figures to the right."""
     grid = RichTable(title=table.title, title_justify="left")

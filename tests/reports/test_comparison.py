@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from bench.errors import SteerbenchError
-from reports.comparison import comparison, written
+from reports.comparison import comparison, metric_format
 from reports.runs import Run
 
 FACTS = dict.fromkeys(("split", "trajectory", "budget", "protocol", "device"), "same")
@@ -67,7 +67,7 @@ def test_one_run_or_runs_of_different_kinds_have_no_best(make):
     assert bold(comparison(runs, {})) == set()
 
 
-def test_a_failure_is_a_line_that_tells_its_reason(make):
+def test_a_failure_is_a_line_with_its_reason(make):
     table = comparison([make("a")], {"b (level=7)": "expected 0 to 1"})
     assert table.lines[1][0] == "b (level=7): failed: expected 0 to 1"
     assert {len(line) for line in table.lines} == {len(table.columns)}
@@ -93,10 +93,10 @@ def test_cold_frames_have_a_line_of_their_own_and_compete_among_themselves(make,
     ],
 )
 def test_a_figure_is_written_in_its_unit(metric, label, text):
-    got, write = written(metric)
+    got, write = metric_format(metric)
     assert (got, write(1.5e6).replace(",", "")) == (label, text)
 
 
 def test_a_metric_that_does_not_exist_is_refused():
     with pytest.raises(SteerbenchError, match="pnsr: no such metric; expected one as"):
-        written("pnsr")
+        metric_format("pnsr")

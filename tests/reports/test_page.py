@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from bench.types import SteerbenchError
-from reports import figures, sheets
+from reports import figures, images
 from reports.page import write_page
 from reports.runs import Run
 
@@ -59,11 +59,13 @@ def test_a_picture_of_a_cold_frame_says_so(store, stored_run, tmp_path, monkeypa
     frames.to_csv(store.folder / stored_run / "frames.csv", index=False)
     titles = []
 
-    def write_sheet(truth, views, *rest):
-        titles.extend(views[0].titles[1:])
-        sheets.write_sheet(truth, views, *rest)
+    write_image = images.write_image
 
-    monkeypatch.setattr("reports.pictures.write_sheet", write_sheet)
+    def note_titles(truth, views, *rest):
+        titles.extend(views[0].titles[1:])
+        write_image(truth, views, *rest)
+
+    monkeypatch.setattr(images, "write_image", note_titles)
     write_page(store, {stored_run: "offset"}, tmp_path)
     assert [title.endswith(" ms, cold") for title in titles] == [True, False, False]
 
@@ -132,7 +134,7 @@ def test_a_page_of_several_runs_has_all_of_them_beside_each_other(several, tmp_p
         assert f"| run, {label} | {key} |" in text
 
 
-def test_provenance_tells_once_what_all_runs_have_in_common(several, tmp_path):
+def test_provenance_lists_once_what_all_runs_have_in_common(several, tmp_path):
     text = write_page(*several, tmp_path / "page").read_text()
     assert text.count("steerbench run method=offset") == 1
     assert text.count("| seed | 5 |") == 1

@@ -1,4 +1,4 @@
-"""The page about the paper's tables: its pictures, its curves, what is to be doubted."""
+"""The page about the paper's tables: its pictures, its curves, its outliers."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ from pathlib import Path
 import pytest
 
 from reports import figures
-from reports.doubts import Doubt
-from reports.paper_page import ABLATION, METHODS, RANGE, write_paper_page
-from reports.published import paper_tables
-from reports.runs import Run, load
-from reports.seeds import Repeated
+from reports.outliers import Outlier
+from reports.paper_page import PAGE, write_paper_page
+from reports.paper_tables import paper_tables
+from reports.runs import Repeated, Run, load
 
 
 @pytest.fixture
@@ -29,7 +28,10 @@ def of(run: Run, label: str) -> Repeated:
 
 def test_every_line_that_is_shown_in_a_figure_is_one_of_the_tables() -> None:
     lines = {(table.name, line.label) for table in paper_tables() for line in table.lines}
-    assert {*METHODS, *ABLATION, *RANGE} <= lines
+    shown = [entry["lines"] for entry in (*PAGE["plot"], *PAGE["images"]) if "lines" in entry]
+    assert shown
+    assert {tuple(line) for entry in shown for line in entry.values()} <= lines
+    assert all(set(plot.get("tables", ())) <= {name for name, _ in lines} for plot in PAGE["plot"])
 
 
 def test_the_page_has_every_table_and_every_figure(run: Run, tmp_path: Path) -> None:
@@ -44,7 +46,7 @@ def test_the_page_has_every_table_and_every_figure(run: Run, tmp_path: Path) -> 
     assert {page.parent / name for name in shown} == set((tmp_path / "pictures").iterdir())
     assert all(f"## Table {number}" in text for number in range(1, 7))
     assert text.count(f"{run.key}  steerbench run method=offset") == 1
-    assert "to be doubted" not in text
+    assert "Outliers" not in text
     assert (tmp_path / "report.html").read_text().count("data:image/png") == 6
 
 
@@ -55,10 +57,11 @@ def test_a_page_of_nothing_still_says_what_is_missing(tmp_path: Path) -> None:
     assert "![" not in text
 
 
-def test_what_is_to_be_doubted_is_said_of_the_runs_of_the_page(run: Run, tmp_path: Path) -> None:
+def test_outliers_among_the_runs_of_the_page_are_listed(run: Run, tmp_path: Path) -> None:
     lines = {"table5": [of(run, "with joint training")]}
-    found = [Doubt(run.key, "13 dB among 30s"), Doubt("another", "not of this page")]
+    found = [Outlier(run.key, "13 dB among 30s"), Outlier("another", "not of this page")]
     text = write_paper_page(paper_tables(), lines, found, tmp_path).read_text()
+    assert "## Outliers: runs that look broken" in text
     assert "13 dB among 30s" in text
     assert "not of this page" not in text
 

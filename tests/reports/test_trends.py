@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from bench.run import half_interval
-from reports.runs import Run, load
-from reports.seeds import Repeated
+from reports.runs import Repeated, Run, load
 from reports.trends import FAILS, HOLDS, OPEN, REVERSED, SEEN, Trend, steps
 
 TREND = Trend("psnr", ["one", "two"])

@@ -1,13 +1,18 @@
-"""A method and a scene that take no time, for tests of what happens around a measurement."""
+"""Methods and a scene that take no time, for tests of what happens around a measurement."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from bench.types import Budget, Camera, Frame, Log, Probe, Scene, Split, SteerbenchError
+from bench.study import Axis, Study, Variant
+from bench.types import Budget, Camera, Frame, Log, NullProbe, Probe, Scene, Split, SteerbenchError
+
+LEVELS = (0.4, 0.6, 1.0)
 
 
 class Grey:
@@ -48,6 +53,49 @@ class Grey:
 
     def settings(self) -> dict[str, str]:
         return {"device": "cpu", "backend": "none", "engine": "torch", "precision": "fp32"}
+
+
+class Shades(Grey):
+    """A grey that can be varied: it paints again and again, and leaves out what is `skipped`.
+
+    Its engine computes nothing, but is built like any other.
+    """
+
+    name = "shades"
+    study = Study(
+        knobs={
+            "level": [Variant(f"level {level}", (f"method.level={level}",)) for level in LEVELS]
+        },
+        trained={"seed, trained": [Variant("seed 7", ("method.seed=7",))]},
+        exact=("method.skip.left=false",),
+        skips={"left half": "method.skip.left", "right half": "method.skip.right"},
+        savings=[Variant("and half as bright", ("method.level=0.25",))],
+        axes={"N": Axis("N = 2^{}", "method.log2_layers", (0, 3), (1.0, 8.0))},
+        parts={"paint": "painting"},
+        network_stage="paint/network",
+        network_size="level",
+        beside={"a twin": ("method=shades",), "plain grey": ("method=grey",)},
+    )
+
+    def __init__(
+        self,
+        seed: int,
+        engine: Any,
+        skip: Mapping[str, bool],
+        level: float = 0.5,
+        log2_layers: int = 0,
+    ) -> None:
+        super().__init__(seed, "cpu", "none", level)
+        self.skip, self.layers, self.engine = skip, 2**log2_layers, engine
+
+    def render(self, camera: Camera, probe: Probe) -> Frame:
+        painted = 2 - sum(self.skip.values())
+        probe.count("halves", painted * self.layers, 2 * self.layers)
+        with probe.stage("paint"), probe.stage("network"):
+            for _ in range(painted * self.layers):
+                torch.full((camera.height, camera.width), self.level)
+        with probe.stage("varnish"):
+            return super().render(camera, NullProbe())
 
 
 def white(*, frames: int = 2, path: str = "", log: Log) -> Scene:

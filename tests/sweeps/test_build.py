@@ -10,11 +10,10 @@ from types import ModuleType
 from typing import Literal
 
 import pytest
-from hydra.utils import get_object
 from omegaconf import OmegaConf
 
 from bench.errors import SteerbenchError
-from sweeps.build import build, check_settings
+from sweeps.build import build, check_settings, target_of
 from sweeps.overrides import composed
 
 
@@ -112,38 +111,54 @@ def test_a_setting_that_does_not_fit_is_named_in_full(override, message):
         built(override)
 
 
-def test_a_dataclass_may_have_fields_of_types_that_only_the_module_of_its_base_knows():
-    options = get_object(
-        "methods.steernerf.untaught.UntaughtOptions"
-    )  # does not import RangeReduction
-    check_settings(options, {"steps": 3.0, "taught_steps": 2.0})
-    with pytest.raises(SteerbenchError, match="jitter: expected bool, got 'much'"):
-        check_settings(options, {"jitter": "much"})
+def test_a_dataclass_may_have_fields_of_types_that_only_the_module_of_its_base_knows(monkeypatch):
+    base = ModuleType("base_of_build")
+    source = """
+from __future__ import annotations
+from dataclasses import dataclass
+from decimal import Decimal
+@dataclass
+class Base:
+    exact: Decimal | None = None
+    flag: bool = False
+"""
+    monkeypatch.setitem(sys.modules, base.__name__, base)
+    base.__dict__["__name__"] = base.__name__
+    exec(source, base.__dict__)
+
+    @dataclass
+    class Options(base.Base):
+        more: int = 0
+
+    check_settings(Options, {"more": 3})
+    with pytest.raises(SteerbenchError, match="flag: expected bool, got 'much'"):
+        check_settings(Options, {"flag": "much"})
+
+
+@pytest.mark.parametrize("name", ["nowhere.Method", "bench.types.Nothing", "..", "bench.nothing.X"])
+def test_a_target_that_cannot_be_imported_is_named(name):
+    with pytest.raises(SteerbenchError, match=f"cannot import {re.escape(name)}: .*PYTHONPATH"):
+        target_of({"_target_": name})
 
 
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
         (["~method.grid"], ".grid is not set: give method.grid=..."),
-        (["method.pipeline.levels=17"], "levels: expected 1 to 16, got 17"),
-        (["method.pipeline.scale=8"], "use renderer.init=scratch"),
+        (["method.model.scale=8"], "use renderer.init=scratch"),
         (["method.renderer.width=0"], "renderer.width: expected 1 to 4096, got 0"),
         (["method.renderer.blocks=-1"], "renderer.blocks: expected 0 to 256, got -1"),
         (
-            ["method=steernerf_paper", "method.pipeline.refined=0.1"],
-            "pipeline.refined: UnetRelease does not say where it may be wrong, expected 0, got 0.1",
+            ["method=steernerf", "method.rendering.refined=0.1"],
+            "rendering.refined: UNet does not",
         ),
-        (["method=steernerf_paper", "method.joint.refined=0.2"], "joint.refined: UnetRelease does"),
-        (
-            ["method=steernerf_paper", "method.pipeline.jitter=true"],
-            "pipeline.jitter: UnetRelease takes every sample for the middle of its cell",
-        ),
+        (["method=steernerf", "method.joint.refined=0.2"], "joint.refined: UNet does"),
         (["method.joint.opacity_entropy=-1"], "joint.opacity_entropy: expected 0 or more, got -1"),
     ],
 )
 def test_what_field_and_renderer_cannot_do_is_refused_before_anything_is_trained(
     overrides, message
 ):
-    config = composed(["method=steernerf", *overrides])
+    config = composed(["method=steernerf_lean", *overrides])
     with pytest.raises(SteerbenchError, match=rf"^method.*{re.escape(message)}"):
         build(config, "method")

@@ -65,7 +65,7 @@ def test_list_says_how_to_get_an_engine_that_is_not_installed(steerbench, monkey
         (["results", "--format", "cvs"], "invalid choice: 'cvs'"),
         (["kernels", "--repeats", "0"], "--repeats: expected 1 or more, got 0"),
         (["skips", "--frames", "0"], "--frames: expected 1 or more, got 0"),
-        (["parity", "--frames", "many"], "--frames: invalid number value: 'many'"),
+        (["parity", "--frames", "many"], "--frames: expected 1 or more, got many"),
         (["scenes", "verfy", "x"], "invalid choice: 'verfy'"),
     ],
 )

@@ -10,7 +10,7 @@ from textwrap import dedent
 
 import numpy as np
 
-from reports import published
+from reports import paper_tables
 from sweeps import overrides
 from sweeps.plan import chosen, plan
 
@@ -58,10 +58,10 @@ def test_the_method_and_the_scene_of_the_document_are_measured_from_outside_the_
 
 
 def test_the_table_of_the_document_is_planned(tmp_path, monkeypatch):
-    for part in (overrides.CONFIGS, published.FOLDER):
+    for part in (overrides.CONFIGS, paper_tables.FOLDER):
         shutil.copytree(part, tmp_path / part.relative_to(DOCS.parent))
     assert len(write_files("experiments.md", tmp_path)) == 2
     monkeypatch.setattr(overrides, "CONFIGS", tmp_path / "sweeps" / "configs")
-    monkeypatch.setattr(published, "FOLDER", tmp_path / "reports" / "paper")
+    monkeypatch.setattr(paper_tables, "FOLDER", tmp_path / "reports" / "paper")
     (table,) = chosen("table7")
     assert [job.line for job in plan(table, [])] == [line.label for line in table.lines]

@@ -6,9 +6,9 @@ import fcntl
 import json
 
 import pytest
+from sweeps.turns import lock_file
 
 from bench.types import Log
-from sweeps.turns import lock_file
 
 RIGHT = {
     "kernel": "encode", "case": "view", "backend": "cpu", "dtype": "float32", "error": 1e-7,

@@ -14,8 +14,8 @@ from omegaconf import DictConfig
 
 from bench.results import Store
 from bench.types import SteerbenchError
-from reports.published import paper_tables
-from sweeps import attempt, failures
+from reports.paper_tables import paper_tables
+from sweeps import failures, jobs
 from sweeps.measurement import Obtained, described
 from sweeps.overrides import composed
 from sweeps.plan import plan
@@ -35,7 +35,7 @@ def test_settings_hold_for_every_job() -> None:
     for job in plan(TABLES["table3"], ["budget=tiny", "seed=3"]):
         assert job.config.budget.name == "tiny"
         assert job.config.seed == 3
-        assert job.line == f"L = {job.config.method.pipeline.frames}"
+        assert job.line == f"L = {job.config.method.model.frames}"
         assert job.config.trajectory._target_ == "bench.trajectories.smooth"
 
 
@@ -62,9 +62,9 @@ def test_tables_share_the_run_that_they_have_in_common() -> None:
     ("method", "name", "line"),
     [
         ("ngp", "table1", "Instant-NGP"),
-        ("steernerf", "table4", "K = 6"),
-        ("steernerf_frozen", "table5", "without joint training"),
-        ("steernerf_k3", "table4", "K = 3"),
+        ("steernerf_lean", "table4", "K = 6"),
+        ("steernerf_lean_frozen", "table5", "without joint training"),
+        ("steernerf_lean_k3", "table4", "K = 3"),
     ],
 )
 def test_what_the_figures_show_is_what_the_tables_measure(
@@ -94,11 +94,11 @@ def measured(
 
     def obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
         asked.append(config)
-        if config.method.pipeline.frames == 3:
+        if config.method.model.frames == 3:
             raise SteerbenchError("no room\nfor L = 3")
         return Obtained(store, put(store, stored_run, config), measured=True)
 
-    monkeypatch.setattr(attempt, "obtain", obtain)
+    monkeypatch.setattr(jobs, "obtain", obtain)
     monkeypatch.chdir(tmp_path)
     return asked
 
@@ -192,7 +192,7 @@ def test_the_frames_of_runs_that_are_not_on_a_page_are_not_read(
     for run in (stored_run, key):
         (store.folder / run / "frames.csv").unlink()
     checked = steerbench("report", "--check", outputs)
-    assert "of 1 runs are to be doubted" in checked.out
+    assert "of 1 runs look broken" in checked.out
     assert steerbench("report", "--table", "table3", "seed=1", outputs).status == 0
 
 

@@ -14,7 +14,7 @@ import pytest
 from bench.errors import SteerbenchError
 from bench.results import Store
 from bench.types import Scene
-from reports.published import paper_tables
+from reports.paper_tables import paper_tables
 from sweeps import failures, measurement
 from sweeps.measurement import described
 from sweeps.plan import Planned, gather, newest, plan

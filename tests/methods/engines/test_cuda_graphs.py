@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from tests.methods.test_engines import TOLERANCE, cells, lean, unet
 
 from methods.engines import Inputs
 from methods.engines.cuda_graphs import Replayed
 from methods.engines.torch_engine import TorchEngine
+from tests.methods.engines.test_engines import TOLERANCE, cells, lean, unet
 
 
 class Recorder:

@@ -12,12 +12,12 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from tests.methods.test_engines import TOLERANCE, cells, lean, unet
 
 from bench.errors import SteerbenchError, Unavailable
 from methods.engines import resized
 from methods.engines.tensorrt_engine import TensorRt
-from tests.methods import tensorrt_double
+from tests.methods.engines import tensorrt_double
+from tests.methods.engines.test_engines import TOLERANCE, cells, lean, unet
 
 
 @pytest.fixture
@@ -120,7 +120,7 @@ def test_float32_is_not_computed_in_tf32(double, tmp_path, quiet_log, monkeypatc
     ],
 )
 def test_what_tensorrt_refuses_is_said(broken, message, double, tmp_path, quiet_log, monkeypatch):
-    monkeypatch.setattr(f"tests.methods.tensorrt_double.{broken}", lambda *arguments: None)
+    monkeypatch.setattr(f"tests.methods.engines.tensorrt_double.{broken}", lambda *arguments: None)
     module, inputs = lean()
     with pytest.raises(SteerbenchError, match=message):
         TensorRt("fp32").build(module, lambda: inputs, lambda: tmp_path, quiet_log)

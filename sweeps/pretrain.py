@@ -1,4 +1,4 @@
-"""`steerbench generic`: train the 2D renderer that every scene starts from."""
+"""`steerbench pretrain`: train the weights that the 2D renderer of every scene starts from."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ import argparse
 from pathlib import Path
 
 from bench.console import ConsoleLog
+from bench.errors import SteerbenchError
 from sweeps.build import build
 from sweeps.measurement import checked_settings
 from sweeps.overrides import composed
 
 SETTINGS = (
-    "method=steernerf",
+    "method=steernerf_lean",
     "scene=medley",
     "budget=generic",
-    "method.pipeline.channels=3",  # features beyond colour mean something else in every scene
+    "method.model.channels=3",  # features beyond colour mean something else in every scene
     "method.renderer.init=scratch",
 )
 
@@ -24,8 +25,10 @@ def main(options: argparse.Namespace) -> int:
     config = composed([*SETTINGS, *options.overrides])
     log = ConsoleLog(Path(checked_settings(config).outputs))
     method, budget = build(config, "method"), build(config, "budget")
+    if not hasattr(method, "pretrain_renderer"):
+        raise SteerbenchError(f"method: {method.name} has no 2D renderer that could be pretrained")
     scenes = []
     for config.scene.variant in range(options.scenes):
         scenes.append(build(config, "scene", log=log))
-    method.fit_generic(scenes, budget, options.output, log)
+    method.pretrain_renderer(scenes, budget, options.output, log)
     return 0

@@ -1,4 +1,4 @@
-"""The tables of the SteerNeRF paper, and what was measured in their place."""
+"""The tables of the paper, read from `paper/table*.toml`, and measured figures beside them."""
 
 from __future__ import annotations
 
@@ -8,16 +8,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from reports import trends
-from reports.comparison import ranks, setting, written
-from reports.runs import Run
-from reports.seeds import Repeated
+from reports.comparison import conditions_of, metric_format, ranks
+from reports.page import missing_figures
+from reports.runs import Repeated, Run
 from reports.tables import Table
-from reports.trends import Trend
+from reports.trends import Trend, steps, trend_table
 
 FOLDER = Path(__file__).parent / "paper"
 ABSENT = "–"
-"""In place of a figure that the paper does not give, or that there is nothing to measure with."""
+"""In place of a figure that the paper does not give or that nothing here can measure."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +24,8 @@ class Line:
     """A line of a table.
 
     Attributes:
-        label: what it is called.
-        job: the settings that make it, beside those of all lines; None where no method here is
-            that of the line.
+        label: its name.
+        job: the settings that measure it, beside those of all lines; None if no method here does.
         published: the paper's figures by metric; bytes, ms, dB as in our rows.
     """
 
@@ -41,9 +39,9 @@ class PaperTable:
     """A table of the paper.
 
     Attributes:
-        name: as the experiment that measures it is called.
+        name: that of the experiment that measures it.
         title: what it shows.
-        published_on: on what the paper measured it.
+        published_on: scenes, size and machine of the paper's figures.
         metrics: its columns.
         lines: in the paper's order.
         notes: what a reader should know before comparing.
@@ -60,11 +58,9 @@ class PaperTable:
 
 
 def paper_tables() -> list[PaperTable]:
-    """All of them, in the paper's order."""
-    return [
-        _table(path)
-        for path in sorted(FOLDER.glob("table*.toml"), key=lambda path: (len(path.stem), path.stem))
-    ]
+    """All tables, in the paper's order."""
+    paths = sorted(FOLDER.glob("table*.toml"), key=lambda path: (len(path.stem), path.stem))
+    return [_table(path) for path in paths]
 
 
 def _table(path: Path) -> PaperTable:
@@ -75,14 +71,15 @@ def _table(path: Path) -> PaperTable:
     return PaperTable(path.stem, lines=lines, notes=notes, trends=trends, **content)
 
 
-def beside(table: PaperTable, measured: Mapping[str, Repeated]) -> Table:
-    """What was measured beside what the paper gives, and the difference, in Markdown.
+def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table:
+    """Measured figures, the paper's and their difference.
 
     The best measured figure of a column is bold, the second of at least three italic, among those
-    that may be compared.
+    of the same conditions.
 
     Args:
-        measured: by the label of a line; a line without one has nothing to be measured with.
+        table: of the paper.
+        measured: by the label of a line; lines may be missing.
     """
     lines = [measured.get(line.label, Repeated(line.label, ())) for line in table.lines]
     columns = []
@@ -97,48 +94,50 @@ def beside(table: PaperTable, measured: Mapping[str, Repeated]) -> Table:
         )
     names = [": ".join((line.label, *line.gaps)) for line in lines]
     title = f"{table.name.replace('table', 'Table ')}: {table.title}"
-    heads = ("measured / paper / difference", *(written(metric)[0] for metric in table.metrics))
+    labels = (metric_format(metric)[0] for metric in table.metrics)
+    heads = ("measured / paper / difference", *labels)
     return Table(title, heads, tuple(zip(names, *columns, strict=True)))
 
 
 def section(table: PaperTable, lines: Sequence[Repeated]) -> str:
-    """A table as a part of a page: what was measured where, the figures, trends, notes."""
+    """A table as a part of a page: conditions of both, the figures, trends, notes."""
     measured = {line.label: line for line in lines}
-    shown = beside(table, measured)
+    shown = with_published(table, measured)
     parts = [f"## {shown.title}"]
     runs = [run for line in lines for run in line.runs]
     if runs:
-        parts.append(f"Measured: {setting(runs)}, {_origin(runs)}.")
+        parts.append(f"Measured: {conditions_of(runs)}, {_origin(runs)}.")
     parts.append(f"Paper: {table.published_on}.")
     parts.append(shown.markdown())
-    if found := [step for trend in table.trends for step in trends.steps(trend, measured)]:
-        parts.append(trends.table(found).markdown())
-    missing = (f"{name}: n/a. {why}" for run in runs for name, why in run.record["missing"].items())
-    parts.append("\n".join(f"- {note}" for note in dict.fromkeys((*table.notes, *missing))))
+    if found := [step for trend in table.trends for step in steps(trend, measured)]:
+        parts.append(trend_table(found).markdown())
+    notes = dict.fromkeys((*table.notes, *missing_figures(runs)))
+    parts.append("\n".join(f"- {note}" for note in notes))
     return "\n\n".join(filter(None, parts))
 
 
 def _origin(runs: Sequence[Run]) -> str:
     """Methods, seeds, commits and processors of `runs`."""
     machines = [run.record["machine"] for run in runs]
-    told = {
+    origin = {
         "method": [run.facts["method"] for run in runs],
         "seed": [str(run.facts["seed"]) for run in runs],
         "commit": [run.facts["commit"] for run in runs],
         "on": [f"{each['cpu']} with {each['threads']} threads" for each in machines],
     }
-    return ", ".join(f"{name} {' / '.join(dict.fromkeys(of))}" for name, of in told.items())
+    return ", ".join(f"{name} {' / '.join(dict.fromkeys(of))}" for name, of in origin.items())
 
 
 def _cell(found: Repeated, published: float | None, metric: str, mark: str) -> str:
-    measured, write = found.mean(metric), written(metric)[1]
+    """Measured, published and their difference; `mark` goes around the first."""
+    measured, (_, write) = found.mean(metric), metric_format(metric)
     if measured is None and published is None:
         return ABSENT
-    told = [ABSENT if figure is None else write(figure) for figure in (measured, published)]
+    texts = [ABSENT if figure is None else write(figure) for figure in (measured, published)]
     if found.half(metric) > 0:
-        told[0] += f" ± {write(found.half(metric))}"
-    told[0] = f"{mark}{told[0]}{mark}"
-    if measured is None or published is None or math.isnan(measured):
-        return " / ".join(told)
-    difference = write(abs(measured - published))
-    return " / ".join((*told, f"{'-' if measured < published else '+'}{difference}"))
+        texts[0] += f" ± {write(found.half(metric))}"
+    texts[0] = f"{mark}{texts[0]}{mark}"
+    if measured is not None and published is not None and not math.isnan(measured):
+        sign = "-" if measured < published else "+"
+        texts.append(f"{sign}{write(abs(measured - published))}")
+    return " / ".join(texts)

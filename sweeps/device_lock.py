@@ -1,4 +1,4 @@
-"""Whatever is timed takes turns on a device: what runs beside other work is not worth timing."""
+"""One timed process at a time on each device: what runs beside other work is not worth timing."""
 
 from __future__ import annotations
 
@@ -15,22 +15,20 @@ from bench.sharing import locked
 from bench.types import Log
 
 FOLDER = "STEERBENCH_LOCKS"
-"""Of the environment: another folder for the locks."""
+"""The environment variable that names another folder for the locks."""
 
 
-def turn(device: str, log: Log) -> AbstractContextManager[None]:
-    """Have `device`, as of `steerbench run`, alone among all that is timed on this machine.
-
-    The system ends the turn of a process that is killed.
-    """
+def device_lock(device: str, log: Log) -> AbstractContextManager[None]:
+    """Wait until no other process of this machine measures on `device`, as `steerbench run` names
+    it, and keep others waiting. The system releases the lock of a process that is killed."""
     waiting = f"waiting: another process measures on {device}"
     return locked(lock_file(device), waiting, log)
 
 
 def lock_file(device: str) -> Path:
-    """What is locked: not in `outputs`, which may lie on a file system that has no locks.
+    """The file to lock. It is not in `outputs`, which may lie on a file system without locks.
 
-    Graphics processors are told apart by what they are: each job may see its own as the first.
+    GPUs are told apart by their UUID: each job may see its own as the first.
     """
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -44,5 +42,5 @@ def _folder() -> Path:
     """One for all users and jobs: Slurm gives each job a /tmp and a /dev/shm of its own."""
     if chosen := os.environ.get(FOLDER):
         return Path(chosen)
-    everybodys = Path("/var/tmp")
-    return everybodys if os.access(everybodys, os.W_OK) else Path(tempfile.gettempdir())
+    shared = Path("/var/tmp")
+    return shared if os.access(shared, os.W_OK) else Path(tempfile.gettempdir())

@@ -1,4 +1,4 @@
-"""Jobs take turns on a device, and sweeps run through Hydra's launchers as they do without."""
+"""One process at a time measures on a device; sweeps run through Hydra's launchers alike."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ import pytest
 import torch
 
 from bench.console import ConsoleLog
-from sweeps import turns
-from sweeps.turns import lock_file, turn
+from sweeps import device_lock
+from sweeps.device_lock import lock_file
 
 PATIENCE_S = 60.0
 """A test that waits longer has failed."""
 
 
-class Told(ConsoleLog):
-    """A log that hands on what it is told."""
+class Heard(ConsoleLog):
+    """A log that keeps its messages in a queue."""
 
     def __init__(self, root: Path) -> None:
         super().__init__(root, quiet=True)
@@ -32,15 +32,15 @@ class Told(ConsoleLog):
 
 @pytest.fixture(autouse=True)
 def locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(turns.FOLDER, str(tmp_path))
+    monkeypatch.setenv(device_lock.FOLDER, str(tmp_path))
 
 
-def waiting(outputs: Path, device: str) -> tuple[threading.Thread, Told, threading.Event]:
-    """Somebody else who wants a turn: what they are told, and whether they had it."""
-    log, had = Told(outputs), threading.Event()
+def waiting(outputs: Path, device: str) -> tuple[threading.Thread, Heard, threading.Event]:
+    """A second thread that wants the lock: its log, and whether it had the lock."""
+    log, had = Heard(outputs), threading.Event()
 
     def other() -> None:
-        with turn(device, log):
+        with device_lock.device_lock(device, log):
             had.set()
 
     thread = threading.Thread(target=other, daemon=True)
@@ -48,8 +48,8 @@ def waiting(outputs: Path, device: str) -> tuple[threading.Thread, Told, threadi
     return thread, log, had
 
 
-def test_who_wants_a_device_that_is_taken_waits_for_it(tmp_path: Path) -> None:
-    with turn("cpu", Told(tmp_path)):
+def test_a_device_that_is_locked_is_waited_for(tmp_path: Path) -> None:
+    with device_lock.device_lock("cpu", Heard(tmp_path)):
         thread, log, had = waiting(tmp_path / "elsewhere", "cpu")
         assert "waiting: another process measures on cpu" in log.messages.get(timeout=PATIENCE_S)
         assert not had.is_set()
@@ -57,17 +57,15 @@ def test_who_wants_a_device_that_is_taken_waits_for_it(tmp_path: Path) -> None:
     assert had.is_set()
 
 
-def test_a_failure_ends_the_turn(tmp_path: Path) -> None:
-    with pytest.raises(KeyError), turn("cpu", Told(tmp_path)):
+def test_a_failure_releases_the_lock(tmp_path: Path) -> None:
+    with pytest.raises(KeyError), device_lock.device_lock("cpu", Heard(tmp_path)):
         raise KeyError
     thread, _, had = waiting(tmp_path, "cpu")
     thread.join(PATIENCE_S)
     assert had.is_set()
 
 
-def test_graphics_processors_are_told_apart_by_what_they_are(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gpus_are_told_apart_by_their_uuid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = {"cuda:0": "GPU-a", "cuda:1": "GPU-b"}
     monkeypatch.setattr(
         torch.cuda, "get_device_properties", lambda device: SimpleNamespace(uuid=names[device])
@@ -81,13 +79,13 @@ def test_graphics_processors_are_told_apart_by_what_they_are(
 def test_locks_lie_where_every_job_and_user_of_the_machine_sees_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delenv(turns.FOLDER)
+    monkeypatch.delenv(device_lock.FOLDER)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "of this job"))
     assert lock_file("cpu").parent == Path("/var/tmp")
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local", "ray"])
-def test_a_launcher_runs_every_job_and_tells_of_those_that_fail(spawn, launcher: str) -> None:
+def test_a_launcher_runs_every_job_and_names_those_that_fail(spawn, launcher: str) -> None:
     plugin = f"hydra_{launcher.partition('_')[0]}_launcher"
     pytest.importorskip(f"hydra_plugins.{plugin}", reason=f"{plugin} is an extra")
     process = spawn("-m", "method.level=0.3,0.6,7", f"hydra/launcher={launcher}")

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from bench.errors import SteerbenchError
-from bench.types import Camera, Log
 from sweeps.cli import dispatch
-from sweeps.scaling import _render, growth
-from tests.sweeps.stand_ins import Grey, white
+from sweeps.studies.scaling import growth
 
 
 @given(power=st.floats(-3, 3), factor=st.floats(1e-3, 1e3))
@@ -31,29 +28,11 @@ def test_a_single_value_has_no_exponent() -> None:
     assert math.isnan(growth([{"value": 2.0, "ms": 1.0}, {"value": 2.0, "ms": 2.0}], "ms"))
 
 
-class Foreseeing(Grey):
-    """Has a use for the next camera."""
-
-    def foresee(self, camera: Camera) -> bool:
-        return True
-
-
-@pytest.mark.parametrize("lookahead", [False, True])
-def test_latency_has_the_frame_before_where_the_next_camera_is_known(
-    quiet_log: Log, lookahead: bool
-) -> None:
-    cameras = white(frames=4, log=quiet_log).splits["test"].cameras
-    records, _ = _render(Foreseeing(0, "cpu", "none"), cameras, lookahead, quiet_log)
-    assert len(records) == 4
-    for before, record in pairwise(records):
-        assert record.latency_ns == record.total_ns + lookahead * before.total_ns
-
-
 @pytest.mark.parametrize(
     ("argument", "said"),
     [
-        ("method=ngp", "expected a method with a 2D renderer"),
         ("engine=openvino", "--axis threads: expected engine=torch"),
+        ("--axis=width", "unknown axis 'width'"),
         ("--frames=0", "expected 1 or more, got 0"),
         ("--plot=picture.jpg", "ends in .png"),
     ],

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from reports.accuracy import experiment_table, setting_table, write_accuracy
-from reports.frontier import frontier_plot
+from reports.figures import frontier_plot
+from reports.tradeoff import experiment_table, setting_table, write_tradeoff
 
 STEP = {"subject": "ramp: depth", "knob": "step", "order": 1.996,
         "order_from": 1 / 64, "order_to": 0.25, "ms_lo": 1.0, "ms_hi": 2.0}  # fmt: skip
@@ -37,14 +37,14 @@ SETTINGS = [
 ]
 
 
-def test_an_experiment_is_told_once_with_its_order_and_where_that_was_fitted():
+def test_an_experiment_is_named_once_with_its_order_and_where_that_was_fitted():
     lines = experiment_table(EXPERIMENTS).lines
     assert lines[0] == ("ramp: depth", "step", "1/4", "3.8e-03", "0.39", "2.00 (1/64 to 1/4)")
     assert lines[1] == ("", "", "1/64", "1.5e-05", "0.60", "")
     assert lines[2] == ("encoding", "table", "packed bf16", "3.7e-03", "6.00", "")
 
 
-def test_settings_stand_in_the_order_of_their_time_and_the_frontier_is_bold():
+def test_settings_are_sorted_by_time_and_the_frontier_is_bold():
     table = setting_table(SETTINGS)
     assert [line[0] for line in table.lines] == ["refined 0", "as it is", "everything off"]
     assert table.bold == {(0, 0), (2, 0)}
@@ -55,7 +55,7 @@ def test_settings_stand_in_the_order_of_their_time_and_the_frontier_is_bold():
 
 
 def test_the_page_shows_both_tables_and_the_plot(tmp_path):
-    page = write_accuracy(
+    page = write_tradeoff(
         EXPERIMENTS, SETTINGS, tmp_path / "accuracy", "steerbench accuracy seed=3"
     )
     text = page.read_text()
@@ -67,21 +67,21 @@ def test_the_page_shows_both_tables_and_the_plot(tmp_path):
 
 
 def test_a_plot_that_is_interrupted_leaves_the_earlier_one(tmp_path, monkeypatch):
-    write_accuracy(EXPERIMENTS, SETTINGS, tmp_path, "steerbench accuracy")
+    write_tradeoff(EXPERIMENTS, SETTINGS, tmp_path, "steerbench accuracy")
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
 
     def half(rows: list[dict], path: Path) -> None:
         path.write_bytes(b"half")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("reports.accuracy.frontier_plot", half)
+    monkeypatch.setattr("reports.tradeoff.frontier_plot", half)
     with pytest.raises(KeyboardInterrupt):
-        write_accuracy(EXPERIMENTS, SETTINGS, tmp_path, "steerbench accuracy")
+        write_tradeoff(EXPERIMENTS, SETTINGS, tmp_path, "steerbench accuracy")
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_without_settings_the_page_is_that_of_the_kernels(tmp_path):
-    page = write_accuracy(EXPERIMENTS, [], tmp_path, "steerbench accuracy --kernels")
+    page = write_tradeoff(EXPERIMENTS, [], tmp_path, "steerbench accuracy --kernels")
     assert "frontier" not in page.read_text()
     assert {path.name for path in tmp_path.iterdir()} == {"report.md", "report.html", "kernels.csv"}
 

@@ -1,4 +1,4 @@
-"""`steerbench accuracy`: what is asked for, what is recommended, what is left behind."""
+"""`steerbench accuracy`: which knobs are varied, what is recommended, what is written."""
 
 from __future__ import annotations
 
@@ -9,21 +9,23 @@ from types import SimpleNamespace
 import pytest
 
 from bench.errors import SteerbenchError
-from sweeps.accuracy import decibels
-from sweeps.knobs import EVERYTHING_OFF
-from sweeps.variants import Variant
+from bench.study import Study, Variant
+from sweeps.studies.accuracy import decibels
+
+VARIANTS = "sweeps.studies.variants"
+EXACT = "method.rendering.skip.empty=false"
 
 ERROR = {"subject": "ramp", "knob": "step", "setting": 0.25, "error": 0.125, "order": None,
          "order_from": None, "order_to": None, "ms": 1.5, "ms_lo": 1.0, "ms_hi": 2.0}  # fmt: skip
-FIGURES = {"everything off": (100.0, 30.0), "fast": (10.0, 29.9), "faster": (5.0, 29.0),
-           "poor": (20.0, 20.0)}  # fmt: skip
+FIGURES = {"everything off": (100.0, 30.0), "as it is": (100.0, 30.0), "fast": (10.0, 29.9),
+           "faster": (5.0, 29.0), "poor": (20.0, 20.0)}  # fmt: skip
 
 
 @pytest.fixture
 def measured(monkeypatch: pytest.MonkeyPatch) -> None:
     """`FIGURES`, in place of what the settings take and lose."""
-    variants = [Variant(name, (f"method.pipeline.refined={ms / 100}",)) for name, (ms, _) in
-                list(FIGURES.items())[1:]]  # fmt: skip
+    variants = [Variant(name, (f"method.rendering.refined={ms / 100}",)) for name, (ms, _) in
+                list(FIGURES.items())[2:]]  # fmt: skip
     rows = [
         {"setting": name, "ms": ms, "ms_lo": ms, "ms_hi": ms, "psnr": psnr,
          "psnr_to_first": 40.0 if index else math.inf}
@@ -34,15 +36,16 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> None:
         return [row for row in rows if row["setting"] in methods]
 
     ground = SimpleNamespace(name="totem"), SimpleNamespace(name="orbit", resolution="8x8"), None
-    known = {"everything off": [EVERYTHING_OFF], "share": variants[:2], "engine": variants[2:]}
-    monkeypatch.setattr("sweeps.accuracy.knobs", lambda trained: known)
-    monkeypatch.setattr("sweeps.variants.common_ground", lambda *arguments: ground)
-    monkeypatch.setattr("sweeps.variants.usable", lambda configs, log: configs)
-    monkeypatch.setattr("sweeps.variants.fit_each", lambda *arguments: None)
-    monkeypatch.setattr("sweeps.variants.render_in_turns", rendered)
-    monkeypatch.setattr("sweeps.accuracy.experiment_rows", lambda *arguments: [ERROR])
-    monkeypatch.setattr("methods.accuracy.all_experiments", lambda: [])
-    monkeypatch.setattr("reports.accuracy.frontier_plot", lambda rows, path: path.touch())
+    study = Study({"share": variants[:2], "length": variants[2:]}, exact=(EXACT,))
+    monkeypatch.setattr("sweeps.studies.accuracy.declared", lambda config: study)
+    monkeypatch.setattr("sweeps.studies.accuracy.computes_with_engine", lambda config: False)
+    monkeypatch.setattr(f"{VARIANTS}.common_ground", lambda *arguments: ground)
+    monkeypatch.setattr(f"{VARIANTS}.usable", lambda configs, log: configs)
+    monkeypatch.setattr(f"{VARIANTS}.fit_each", lambda *arguments: None)
+    monkeypatch.setattr(f"{VARIANTS}.render_in_turns", rendered)
+    monkeypatch.setattr("sweeps.studies.accuracy.experiment_rows", lambda *arguments: [ERROR])
+    monkeypatch.setattr("methods.checks.found", lambda name: [])
+    monkeypatch.setattr("reports.tradeoff.frontier_plot", lambda rows, path: path.touch())
 
 
 @pytest.mark.parametrize("text", ["0.1dB", "0.1 dB", ".1", "0.1", "0.10db"])
@@ -76,16 +79,15 @@ def test_the_fastest_setting_within_the_budget_is_printed_as_a_command(
     outcome = steerbench("accuracy", "--within", budget, "seed=3")
     command = outcome.out.splitlines()[-2]
     assert command == (
-        "steerbench run method=steernerf scene=totem budget=demo trajectory=orbit seed=3 "
-        f"method.pipeline.refined={refined}"
+        "steerbench run method=steernerf_lean scene=totem budget=demo trajectory=orbit seed=3 "
+        f"method.rendering.refined={refined}"
     )
 
 
 def test_where_nothing_faster_keeps_within_it_everything_off_is_recommended(steerbench, measured):
     outcome = steerbench("accuracy", "--within", "0.01")
     command = outcome.out.splitlines()[-2]
-    assert "method=steernerf_untaught" in command
-    assert "method=steernerf " not in command
+    assert command.endswith(EXACT)
 
 
 def test_a_report_a_plot_and_the_rows_are_left_in_outputs(steerbench, measured, tmp_path):
@@ -97,15 +99,15 @@ def test_a_report_a_plot_and_the_rows_are_left_in_outputs(steerbench, measured, 
 def test_a_filter_leaves_the_knobs_with_it_in_their_name_and_what_they_are_compared_with(
     steerbench, measured
 ):
-    outcome = steerbench("accuracy", "--filter", "gin")
+    outcome = steerbench("accuracy", "--filter", "eng")
     settings = json.loads(outcome.out.splitlines()[-1])["settings"]
-    assert [row["setting"] for row in settings] == ["everything off", "poor"]
-    both = steerbench("accuracy", "--filter", "gin", "--filter", "share")
+    assert [row["setting"] for row in settings] == ["everything off", "as it is", "poor"]
+    both = steerbench("accuracy", "--filter", "eng", "--filter", "share")
     assert len(json.loads(both.out.splitlines()[-1])["settings"]) == len(FIGURES)
 
 
 def test_the_kernels_alone_train_and_render_nothing(steerbench, measured, monkeypatch):
-    monkeypatch.setattr("sweeps.variants.common_ground", None)
+    monkeypatch.setattr(f"{VARIANTS}.common_ground", None)
     outcome = steerbench("accuracy", "--kernels")
     assert json.loads(outcome.out.splitlines()[-1]) == {"kernels": [ERROR], "settings": []}
 
@@ -115,12 +117,11 @@ def test_the_kernels_alone_train_and_render_nothing(steerbench, measured, monkey
     [
         (["--repeats", "0"], "--repeats: expected 1 or more, got 0"),
         (["--within", "much"], "--within: expected decibels, 0.1dB for example, got 'much'"),
-        (["--filter", "colour"], "no knob has 'colour' in its name; expected part of one of step"),
-        (["method=ngp"], "expected a method with renderer=s2d, as method=steernerf"),
+        (["--filter", "colour"], "no knob has 'colour' in its name; expected part of one of share"),
         (["budget=demmo"], "Did you mean demo?"),
     ],
 )
-def test_what_is_wrong_is_said_before_anything_is_computed(steerbench, argv, message):
+def test_what_is_wrong_is_said_before_anything_is_computed(steerbench, measured, argv, message):
     outcome = steerbench("accuracy", *argv)
     assert outcome.status == 2
     assert message in outcome.err

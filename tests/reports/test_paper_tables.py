@@ -8,9 +8,15 @@ import pandas as pd
 import pytest
 
 from bench.results import Store
-from reports.published import ABSENT, Line, PaperTable, beside, paper_tables, section
-from reports.runs import Run, load
-from reports.seeds import Repeated
+from reports.paper_tables import (
+    ABSENT,
+    Line,
+    PaperTable,
+    paper_tables,
+    section,
+    with_published,
+)
+from reports.runs import Repeated, Run, load
 from reports.tables import QUALITY
 from reports.trends import Trend
 
@@ -62,7 +68,7 @@ def test_the_first_files_are_the_six_tables_of_the_paper() -> None:
 
 
 def test_a_cell_is_measured_published_and_their_difference(run: Run) -> None:
-    shown = beside(TABLE, {"here": Repeated("here", [run])})
+    shown = with_published(TABLE, {"here": Repeated("here", [run])})
     assert shown.columns[1:] == ("PSNR, dB ↑", "ms / frame ↓", "model, MB ↓", "other, ms ↓")
     assert shown.lines[0] == (
         "here",
@@ -80,19 +86,21 @@ def test_a_stage_holds_the_stages_inside_it(run: Run) -> None:
         metric="stage_ms.other/march", value=3.0
     )
     whole = replace(run, rows=pd.concat([rows, inside]))
-    shown = beside(TABLE, {"here": Repeated("here", [whole])})
+    shown = with_published(TABLE, {"here": Repeated("here", [whole])})
     assert shown.lines[0][4] == f"11.00 / {ABSENT}"
 
 
 def test_several_seeds_give_their_mean_and_its_interval(run: Run) -> None:
-    shown = beside(TABLE, {"here": Repeated("here", [with_psnr(run, x) for x in (29.0, 31.0)])})
+    shown = with_published(
+        TABLE, {"here": Repeated("here", [with_psnr(run, x) for x in (29.0, 31.0)])}
+    )
     # Half of a t-interval of two values that are 2 apart: t(0.975, 1) * sqrt(2) / sqrt(2).
     assert shown.lines[0][1] == "30.00 ± 12.71 / 31.00 / -1.00"
     assert shown.lines[0][2] == "12.0 / 10.0 / +2.0"
 
 
 def test_a_gap_says_why_in_its_line() -> None:
-    shown = beside(TABLE, {"here": Repeated("here", [], ["failed: no room"])})
+    shown = with_published(TABLE, {"here": Repeated("here", [], ["failed: no room"])})
     assert shown.lines[0][:2] == ("here: failed: no room", f"{ABSENT} / 31.00")
 
 
@@ -100,9 +108,9 @@ def test_the_best_is_bold_and_the_second_of_three_italic(run: Run) -> None:
     table = replace(TABLE, lines=[Line(name, {"method": name}) for name in "abc"])
     psnr = {"a": 1.0, "b": 3.0, "c": 2.0}
     of = {name: Repeated(name, [with_psnr(run, value)]) for name, value in psnr.items()}
-    cells = [line[1] for line in beside(table, of).lines]
+    cells = [line[1] for line in with_published(table, of).lines]
     assert cells == ["1.00 / –", "**3.00** / –", "*2.00* / –"]
-    two = beside(table, {name: of[name] for name in "ab"})
+    two = with_published(table, {name: of[name] for name in "ab"})
     assert [line[1] for line in two.lines] == ["1.00 / –", "**3.00** / –", ABSENT]
 
 

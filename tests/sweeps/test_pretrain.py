@@ -1,4 +1,4 @@
-"""`steerbench generic`: which scenes, which settings, and what is refused before any training."""
+"""`steerbench pretrain`: its scenes and settings, and what it refuses before any training."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ class Recorder:
         self.variants.append(config.scene.variant)
         return f"medley {config.scene.variant}"
 
-    def fit_generic(self, scenes: list[str], budget: str, output: Path, log: object) -> None:
+    def pretrain_renderer(self, scenes: list[str], budget: str, output: Path, log: object) -> None:
         self.fitted.append((scenes, budget, output))
 
 
 @pytest.fixture
 def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
-    """What `steerbench generic` has built and trained."""
+    """What `steerbench pretrain` has built and trained."""
     recorder = Recorder()
-    monkeypatch.setattr("sweeps.generic.build", recorder.build)
+    monkeypatch.setattr("sweeps.pretrain.build", recorder.build)
     return recorder
 
 
 def test_help_says_what_it_does_and_what_can_be_set(steerbench):
-    outcome = steerbench("generic", "--help")
+    outcome = steerbench("pretrain", "--help")
     assert outcome.status == 0
     words = " ".join(outcome.out.split())
     for text in (
@@ -49,28 +49,28 @@ def test_help_says_what_it_does_and_what_can_be_set(steerbench):
 
 
 def test_one_renderer_is_trained_on_as_many_scenes_as_asked_for(steerbench, recorder):
-    outcome = steerbench("generic", "--scenes", "3", "--output", "w.safetensors", "seed=5")
+    outcome = steerbench("pretrain", "--scenes", "3", "--output", "w.safetensors", "seed=5")
     assert outcome.status == 0
     scenes = ["medley 0", "medley 1", "medley 2"]
     assert recorder.fitted == [(scenes, "budget", Path("w.safetensors"))]
     assert recorder.config["budget"]["name"] == "generic"
     method = recorder.config["method"]
-    assert method["name"] == "steernerf"
+    assert method["name"] == "steernerf_lean"
     assert method["seed"] == 5
-    assert method["pipeline"]["channels"] == 3
+    assert method["model"]["channels"] == 3
     assert method["renderer"]["init"] == "scratch"
 
 
 def test_as_many_threads_are_used_as_asked_for(steerbench, recorder, monkeypatch):
     asked = []
     monkeypatch.setattr("torch.set_num_threads", asked.append)
-    assert steerbench("generic", "--scenes", "1", "--output", "w", "threads=1").status == 0
+    assert steerbench("pretrain", "--scenes", "1", "--output", "w", "threads=1").status == 0
     assert asked == [1]
 
 
 @pytest.mark.parametrize("scenes", ["0", "-2"])
 def test_no_scenes_at_all_are_refused(steerbench, recorder, scenes):
-    outcome = steerbench("generic", "--scenes", scenes, "--output", "w.safetensors")
+    outcome = steerbench("pretrain", "--scenes", scenes, "--output", "w.safetensors")
     assert outcome.status == 2
     assert f"--scenes: expected 1 or more, got {scenes}" in outcome.err
     assert recorder.config == {}
@@ -79,7 +79,7 @@ def test_no_scenes_at_all_are_refused(steerbench, recorder, scenes):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["--scenes", "two", "--output", "w"], "--scenes: invalid number value: 'two'"),
+        (["--scenes", "two", "--output", "w"], "--scenes: expected 1 or more, got two"),
         (["--scenes", "2"], "the following arguments are required: --output"),
         (["--output", "w", "method.joint.rat=1"], "Did you mean method.joint.rate?"),
         (["--output", "w", "budget=genric"], "Did you mean generic?"),
@@ -90,7 +90,7 @@ def test_no_scenes_at_all_are_refused(steerbench, recorder, scenes):
     ],
 )
 def test_a_wrong_word_is_answered_with_what_is_expected(steerbench, recorder, argv, message):
-    outcome = steerbench("generic", *argv)
+    outcome = steerbench("pretrain", *argv)
     assert outcome.status == 2
     assert message in outcome.err
     assert recorder.fitted == []

@@ -1,4 +1,4 @@
-"""Run time against error, as tables and a page; see `bench.accuracy` for the rows."""
+"""Time against error: the tables and the page of kernels and of whole methods."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import pandas as pd
 from bench.errors import explained
 from bench.provenance import commit, machine
 from bench.sharing import whole
-from reports.frontier import frontier_plot
+from reports.figures import frontier_plot
 from reports.publish import publish
-from reports.tables import Table, number
+from reports.tables import Table, decimal
 
 Row = Mapping[str, Any]
 
@@ -33,7 +33,7 @@ ON_FRONTIER = "— (frontier)"
 
 
 def experiment_table(rows: Sequence[Row]) -> Table:
-    """Every setting of every experiment; its order stands in the first line of an experiment."""
+    """Every setting of every experiment; the first line of an experiment has its observed order."""
     lines = []
     subject = None
     for row in rows:
@@ -45,7 +45,7 @@ def experiment_table(rows: Sequence[Row]) -> Table:
                 row["knob"] if begins else "",
                 _setting(row["setting"]),
                 f"{row['error']:.1e}",
-                number(row["ms"], 2),
+                decimal(row["ms"], 2),
                 _order(row) if begins else "",
             )
         )
@@ -54,19 +54,18 @@ def experiment_table(rows: Sequence[Row]) -> Table:
 
 
 def setting_table(rows: Sequence[Row]) -> Table:
-    """Every setting, the fastest first; what lies on the frontier is bold."""
-    ordered = sorted(rows, key=lambda row: row["ms"])
+    """Every setting, the fastest first; those on the Pareto frontier are bold."""
     lines = tuple(
         (
             row["setting"],
-            number(row["ms"], 1),
-            f"{number(row['ms_lo'], 1)} – {number(row['ms_hi'], 1)}",
-            number(row["psnr"], 2),
-            number(row["lost"], 2),
-            number(row["psnr_to_first"], 1) if math.isfinite(row["psnr_to_first"]) else "the same",
+            decimal(row["ms"], 1),
+            f"{decimal(row['ms_lo'], 1)} – {decimal(row['ms_hi'], 1)}",
+            decimal(row["psnr"], 2),
+            decimal(row["lost"], 2),
+            decimal(row["psnr_to_first"], 1) if math.isfinite(row["psnr_to_first"]) else "the same",
             ON_FRONTIER if row["instead"] == row["setting"] else row["instead"],
         )
-        for row in ordered
+        for row in sorted(rows, key=lambda row: row["ms"])
     )
     bold = frozenset((line, 0) for line, text in enumerate(lines) if text[-1] == ON_FRONTIER)
     where = ", ".join(str(rows[0][name]) for name in ("scene", "trajectory", "resolution"))
@@ -75,13 +74,17 @@ def setting_table(rows: Sequence[Row]) -> Table:
     )
 
 
-def write_accuracy(
+def write_tradeoff(
     experiments: Sequence[Row], settings: Sequence[Row], folder: Path, command: str
 ) -> Path:
-    """Write `folder/report.md` and `report.html`, the plot and all rows as CSV beside them; return
-    the path of the first.
+    """Write `folder/report.md` and `report.html`, with the plot and all rows as CSV beside them;
+    return the path of the first.
 
-    `command` is what was typed.
+    Args:
+        experiments: rows of kernels, for `experiment_table`.
+        settings: rows of methods, for `setting_table` and `frontier_plot`; empty: both are left
+            out.
+        command: as it was typed.
 
     Raises:
         SteerbenchError: `folder` cannot be written to.
@@ -89,23 +92,26 @@ def write_accuracy(
     tables = [experiment_table(experiments)]
     with explained(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        with whole(folder / "kernels.csv") as new:
-            pd.DataFrame(experiments).to_csv(new, index=False)
+        _write_csv(experiments, folder / "kernels.csv")
         made = f"```sh\n{command}\n```\n\nCommit {commit()}, {machine()['cpu']}."
         parts = ["# Run time against error", made]
         if settings:
-            with whole(folder / "settings.csv") as new:
-                pd.DataFrame(settings).to_csv(new, index=False)
+            _write_csv(settings, folder / "settings.csv")
             with whole(folder / "frontier.png") as new:
                 frontier_plot(settings, new)
             parts.append("![Error of a frame against its time, one point a setting](frontier.png)")
             tables.insert(0, setting_table(settings))
-        parts += [f"## {table.title}\n\n{table.markdown()}" for table in tables]
+        parts += [table.section() for table in tables]
     return publish("\n\n".join(parts), folder)
 
 
+def _write_csv(rows: Sequence[Row], path: Path) -> None:
+    with whole(path) as new:
+        pd.DataFrame(rows).to_csv(new, index=False)
+
+
 def _setting(value: float | str) -> str:
-    """In few digits; a power of two below 1 as a fraction."""
+    """A number in few digits, a power of two below 1 as a fraction; a text as it is."""
     if isinstance(value, str):
         return value
     if 0 < value < 1 and math.frexp(value)[0] == 0.5:

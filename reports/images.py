@@ -1,29 +1,38 @@
-"""A frame of several runs in one picture: ground truth, renderings, a detail of each, errors."""
+"""A frame of several runs in one image: ground truth, renderings, a detail of each, error maps."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import uniform_filter
 
+from bench.results import COLD
+from reports.publish import add_picture
+from reports.runs import Run
+
+MOST_RENDERINGS = 4
+"""Renderings in one image, beside the ground truth; more runs get further images."""
+
 NARROW_PX, WIDE_PX = 200, 400
-"""Between these a picture is shown pixel by pixel; others are enlarged or reduced."""
+"""Pictures of these widths are shown pixel by pixel; others are enlarged or reduced."""
 
 GAP_PX = 8
 LINE_PX = 24
 INK, PAPER, MARK = (30, 30, 30), (255, 255, 255), (214, 0, 110)
 
 ZOOM = 4
-"""How many times a detail is enlarged over the picture it is taken from."""
+"""Enlargement of the detail over the picture that it is taken from."""
 
 
 @dataclass(frozen=True)
 class View:
-    """A frame as one run rendered it: its titles, and uint8 [H, W, 3] with its error map."""
+    """A frame as one run rendered it: titles, and uint8 [H, W, 3] with its error map."""
 
     titles: tuple[str, ...]
     rendering: np.ndarray
@@ -31,26 +40,67 @@ class View:
 
 
 @dataclass(frozen=True)
-class Band:
-    """One line of panels below what is said about it; None leaves a place empty."""
-
-    caption: str
-    panels: Sequence[Image.Image | None]
-
-
-@dataclass(frozen=True)
 class Detail:
-    """The part of a frame that is shown enlarged: left, top, right, bottom, and why this one."""
+    """The part of a frame that is enlarged: left, top, right, bottom, and why this part."""
 
     box: tuple[int, int, int, int]
     where: str
 
 
-def find_detail(truth: np.ndarray, renderings: Sequence[np.ndarray]) -> Detail:
-    """The part of a frame in which its pictures differ most, in the mean over that part.
+@dataclass(frozen=True)
+class Band:
+    """One line of panels below a caption; None leaves a place empty."""
 
-    Of several renderings, from each other; of a single one, from the ground truth. Where nothing
-    differs, it is the middle.
+    caption: str
+    panels: Sequence[Image.Image | None]
+
+
+def kept_frames(run: Run) -> list[str]:
+    """The frames whose pictures `run` kept: how the names of their files begin."""
+    return sorted(path.name.split("-")[0] for path in run.pictures.glob("*-truth.png"))
+
+
+def frame_section(runs: Sequence[Run], frame: str, stem: str, folder: Path) -> Iterator[str]:
+    """Draw `frame` of `runs` for the page in `folder`; yield its heading, images and caption."""
+    truth = _read(runs[0].pictures / f"{frame}-truth.png")
+    views = [_view(run, frame) for run in runs]
+    detail = find_detail(truth, [view.rendering for view in views])
+    name = runs[0].frames.set_index("frame")["name"][int(frame)]
+    yield (f"### {runs[0].facts['scene']}, {name}, frame {int(frame) + 1} of {len(runs[0].frames)}")
+    errors = runs[0].record["error_map"]
+    width = math.ceil(len(views) / math.ceil(len(views) / MOST_RENDERINGS))  # all about as wide
+    for first in range(0, len(views), width):
+        group = views[first : first + width]
+        draw = partial(write_image, truth, group, detail, errors)
+        file = add_picture(folder, f"{stem}-{frame}-{first}", draw)
+        shown = ", ".join(view.titles[0] for view in group)
+        yield f"![Ground truth, {shown}; a detail of each; error maps]({file})"
+    yield (
+        f"PSNR and time above a picture are of this frame alone. The framed part, where"
+        f" {detail.where}, is enlarged {ZOOM} times. Error maps show the {errors}."
+    )
+
+
+def _view(run: Run, frame: str) -> View:
+    """A kept frame of a run, titled with its own PSNR and time."""
+    figures = run.frames.set_index("frame").loc[int(frame)]
+    title = f"PSNR {figures['psnr']:.2f} dB, {figures['frame_ms']:.1f} ms"
+    if figures["phase"] == COLD:
+        title += ", cold"
+    pictures = [_read(run.pictures / f"{frame}-{kind}.png") for kind in ("rendered", "error")]
+    return View((run.label, title), *pictures)
+
+
+def _read(path: Path) -> np.ndarray:
+    with Image.open(path) as picture:
+        return np.asarray(picture.convert("RGB"))
+
+
+def find_detail(truth: np.ndarray, renderings: Sequence[np.ndarray]) -> Detail:
+    """The part of a frame with the largest mean difference between its pictures.
+
+    Several renderings are compared with each other, a single one with the ground truth. Where
+    nothing differs, it is the middle.
     """
     alone = len(renderings) == 1
     stack = np.stack([*renderings, truth] if alone else renderings).astype(float)
@@ -67,10 +117,10 @@ def find_detail(truth: np.ndarray, renderings: Sequence[np.ndarray]) -> Detail:
     return Detail((left, top, left + wide, top + high), where)
 
 
-def write_sheet(
+def write_image(
     truth: np.ndarray, views: Sequence[View], detail: Detail, errors: str, path: Path
 ) -> None:
-    """Write the PNG that shows the ground truth and the `views`, each with the `detail`.
+    """Write a PNG with the ground truth and the `views`, the `detail` of each, and error maps.
 
     `errors` says what the error maps show. A single view takes two lines, several take three.
     """
@@ -99,14 +149,10 @@ def _shown(height: int, width: int) -> tuple[int, int]:
 def _whole(picture: np.ndarray, detail: Detail) -> Image.Image:
     """The picture with the detail outlined."""
     size = _shown(*picture.shape[:2])
-    enlarged = size[0] > picture.shape[1]
-    panel = Image.fromarray(picture).resize(
-        size, Image.Resampling.NEAREST if enlarged else Image.Resampling.BOX
-    )
     scale = size[0] / picture.shape[1]
-    ImageDraw.Draw(panel).rectangle(
-        [round(edge * scale) for edge in detail.box], outline=MARK, width=2
-    )
+    how = Image.Resampling.NEAREST if scale > 1 else Image.Resampling.BOX
+    panel = Image.fromarray(picture).resize(size, how)
+    _outline(panel, [round(edge * scale) for edge in detail.box])
     return panel
 
 
@@ -114,10 +160,12 @@ def _part(picture: np.ndarray, detail: Detail) -> Image.Image:
     """The outlined part, as large as the picture is shown, its pixels kept apart."""
     part = Image.fromarray(picture).crop(detail.box)
     panel = part.resize(_shown(*picture.shape[:2]), Image.Resampling.NEAREST)
-    ImageDraw.Draw(panel).rectangle(
-        (0, 0, panel.width - 1, panel.height - 1), outline=MARK, width=2
-    )
+    _outline(panel, [0, 0, panel.width - 1, panel.height - 1])
     return panel
+
+
+def _outline(panel: Image.Image, box: Sequence[int]) -> None:
+    ImageDraw.Draw(panel).rectangle(box, outline=MARK, width=2)
 
 
 def _compose(titles: Sequence[Sequence[str]], bands: Sequence[Band]) -> Image.Image:
@@ -126,22 +174,22 @@ def _compose(titles: Sequence[Sequence[str]], bands: Sequence[Band]) -> Image.Im
     heads = max(map(len, titles))
     captions = sum(bool(band.caption) for band in bands)
     total = LINE_PX * (heads + captions) + (height + GAP_PX) * len(bands) + 2 * GAP_PX
-    sheet = Image.new("RGB", (GAP_PX + (width + GAP_PX) * len(titles), total), PAPER)
-    draw = ImageDraw.Draw(sheet)
+    image = Image.new("RGB", (GAP_PX + (width + GAP_PX) * len(titles), total), PAPER)
+    draw = ImageDraw.Draw(image)
     across = [GAP_PX + (width + GAP_PX) * column for column in range(len(titles))]
     for left, lines in zip(across, titles, strict=True):
-        for number, line in enumerate(lines):
-            _write(draw, (left, GAP_PX + LINE_PX * number), line, width)
+        for row, line in enumerate(lines):
+            _write(draw, (left, GAP_PX + LINE_PX * row), line, width)
     down = GAP_PX + LINE_PX * heads
     for band in bands:
         if band.caption:
-            _write(draw, (GAP_PX, down), band.caption, sheet.width - 2 * GAP_PX)
+            _write(draw, (GAP_PX, down), band.caption, image.width - 2 * GAP_PX)
             down += LINE_PX
         for left, panel in zip(across, band.panels, strict=True):
             if panel:
-                sheet.paste(panel, (left, down))
+                image.paste(panel, (left, down))
         down += height + GAP_PX
-    return sheet
+    return image
 
 
 def _write(draw: ImageDraw.ImageDraw, place: tuple[int, int], text: str, room_px: int) -> None:

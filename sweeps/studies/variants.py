@@ -1,38 +1,34 @@
-"""Variants of one method on the same frames, each compared with the first of them."""
+"""Variants of a method on the same frames, each compared with the first of them."""
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 
 from bench.accuracy import render_in_turns, steady_frames
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
 from bench.protocol import EvaluationProtocol
+from bench.study import Study, Variant, study_of
 from bench.trajectories import Trajectory
 from bench.types import Log, Method, Scene
-from reports.tables import number
-from sweeps.build import build
+from reports.tables import decimal
+from sweeps.build import build, target_of
+from sweeps.device_lock import device_lock
 from sweeps.measurement import checked_settings
-from sweeps.overrides import CONFIGS, composed
-from sweeps.turns import turn
+from sweeps.overrides import choices, composed
 
-LEAN = "methods.steernerf.beyond.lean_renderer.SpaceToDepth"
+Row = dict[str, Any]
 
-
-@dataclass(frozen=True)
-class Variant:
-    """A variant by its `name`, and the `settings` that make it."""
-
-    name: str
-    settings: tuple[str, ...] = ()
+METHOD = "method=steernerf_lean"
+"""What is studied by default."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +36,14 @@ class Rendered:
     """What a variant rendered.
 
     Attributes:
+        study: what its method declares.
         method: as it was used.
         scene, path: what all variants rendered.
         values: see `bench.accuracy.render_in_turns`.
     """
 
     name: str
+    study: Study
     method: Method
     scene: Scene
     path: Trajectory
@@ -56,43 +54,67 @@ class Rendered:
         """Frames of the path."""
         return len(self.path.steps)
 
+    @property
+    def network_ms(self) -> float | None:
+        """The time of the stage that the engine computes; None where the method declares none."""
+        return self.values.get(f"stage_ms.{self.study.network_stage}")
+
+    def work(self) -> dict[str, float]:
+        """The counters of a frame, without what skipping nothing would have taken."""
+        return {
+            name.removeprefix("work."): value
+            for name, value in self.values.items()
+            if name.startswith("work.") and not name.endswith(".dense")
+        }
+
+
+def declared(config: DictConfig) -> Study:
+    """What the method of `config` declares to be varied."""
+    return study_of(target_of(config.method))
+
+
+def computes_with_engine(config: DictConfig) -> bool:
+    """Whether the method of `config` has a network that an engine computes."""
+    return "engine" in config.method
+
 
 def render_variants(
     variants: Mapping[str, Sequence[str]], frames: int, repeats: int
 ) -> list[Rendered]:
     """Render the first `frames` of the trajectory with all variants that can be used here, in turn;
-    see `bench.accuracy.render_in_turns`.
-
-    What a variant is trained from is trained if need be, or found.
+    see `bench.accuracy.render_in_turns`. Trained stages are made, or found.
 
     Args:
-        variants: by name the settings of each, as of `steerbench run`. Scene, trajectory and
-            protocol, but for its lookahead, are those of the first.
+        variants: by name the words for each, as of `steerbench run`. Scene, trajectory and
+            protocol are those of the first.
 
     Raises:
         SteerbenchError: a setting is wrong, the first variant cannot be used here, or there is no
             steady frame with ground truth among the first ones.
     """
-    configs = {name: composed(overrides) for name, overrides in variants.items()}
+    configs = {name: composed(words) for name, words in variants.items()}
     first = next(iter(configs.values()))
     settings = checked_settings(first)
     log = OnceLog(Path(settings.outputs))
     methods = usable(configs, log)
     scene, path, protocol = common_ground(first, frames, log)
-    with turn(settings.device, log):
+    with device_lock(settings.device, log):
         fit_each(methods, configs, scene, path, log)
-        told = [name for name in methods if configs[name].protocol.lookahead]
-        rows = render_in_turns(methods, scene, path, protocol, repeats, log, told)
-    return [Rendered(row["setting"], methods[row["setting"]], scene, path, row) for row in rows]
+        rows = render_in_turns(methods, scene, path, protocol, repeats, log)
+    return [
+        Rendered(name, declared(configs[name]), methods[name], scene, path, row)
+        for row in rows
+        for name in [row["setting"]]
+    ]
 
 
-def settings_of(overrides: Sequence[str], variants: Iterable[Variant]) -> dict[str, list[str]]:
+def settings_of(words: Sequence[str], variants: Iterable[Variant]) -> dict[str, list[str]]:
     """By the name of each variant its settings after those of all."""
-    return {variant.name: [*overrides, *variant.settings] for variant in variants}
+    return {variant.name: [*words, *variant.settings] for variant in variants}
 
 
 def usable(configs: Mapping[str, DictConfig], log: Log) -> dict[str, Method]:
-    """The methods that can be used here. Of others the log is told why.
+    """The methods that can be used here; the log says why others cannot.
 
     Raises:
         Unavailable: the first of them cannot be used.
@@ -142,20 +164,6 @@ class OnceLog(ConsoleLog):
             super().info(message)
 
 
-def require_lean(config: DictConfig, purpose: str) -> None:
-    """Refuse a method without the lean 2D renderer, which the command needs for its `purpose`."""
-    if config.method.get("renderer", {}).get("_target_") != LEAN:
-        raise SteerbenchError(
-            f"{purpose}: expected a method with renderer=s2d, as method=steernerf"
-        )
-
-
-def reprojects_exactly(config: DictConfig) -> bool:
-    """Whether frames are reprojected as `method=steernerf` does it, which the refresh needs."""
-    exact = composed(["method=steernerf"]).method.pipeline.reprojection
-    return bool(config.method.pipeline.reprojection == exact)
-
-
 def common_ground(
     config: DictConfig, frames: int, log: Log
 ) -> tuple[Scene, Trajectory, EvaluationProtocol]:
@@ -180,22 +188,33 @@ def common_ground(
     return scene, path, protocol
 
 
-def engines() -> Iterator[Variant]:
+def engines(words: Sequence[str] = ()) -> list[Variant]:
     """All engines at all precisions; torch in fp32, the standard, first."""
-    for name, kind in engine_kinds().items():
-        for precision in kind.precisions:
-            settings = (f"engine={name}", f"precision={precision}")
-            yield Variant(f"{name}, {precision}", settings)
+    return [
+        Variant(f"{name}, {precision}", (f"engine={name}", f"precision={precision}"))
+        for name, kind in engine_kinds(words).items()
+        for precision in kind.precisions
+    ]
 
 
-def engine_kinds() -> dict[str, Any]:
+def engine_kinds(words: Sequence[str] = ()) -> dict[str, Any]:
     """The class of each engine by its name; torch, the standard, first."""
-    names = sorted(path.stem for path in (CONFIGS / "engine").glob("*.yaml"))
-    nodes: dict[str, Any] = {
-        name: OmegaConf.load(CONFIGS / "engine" / f"{name}.yaml")
-        for name in sorted(names, key=lambda name: name != "torch")
+    files = choices("engine", words)
+    names = sorted(files, key=lambda name: (name != "torch", name))
+    return {name: target_of(OmegaConf.load(files[name])) for name in names}  # type: ignore[arg-type]
+
+
+def print_rows(rows: Iterable[Mapping[str, Any]]) -> None:
+    """Print `rows` as one line of JSON, which has null for figures that are not finite."""
+    print(json.dumps([finite(row) for row in rows]))
+
+
+def finite(row: Mapping[str, Any]) -> Row:
+    """`row` with None for figures that are not finite."""
+    return {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value
+        for key, value in row.items()
     }
-    return {name: get_class(node["_target_"]) for name, node in nodes.items()}
 
 
 def apart_text(psnr: float) -> str:
@@ -203,14 +222,14 @@ def apart_text(psnr: float) -> str:
     return f"{psnr:.1f}" if math.isfinite(psnr) else "the same"
 
 
-def finite(row: Mapping[str, Any]) -> dict[str, Any]:
-    """`row` with None, which JSON has, for figures that are not finite, which it has not."""
-    return {
-        key: None if isinstance(value, float) and not math.isfinite(value) else value
-        for key, value in row.items()
-    }
-
-
 def range_text(values: Mapping[str, Any]) -> str:
     """The mean times of a frame of the fastest and of the slowest round, for a table."""
-    return f"{number(values['ms_lo'], 1)} – {number(values['ms_hi'], 1)}"
+    return f"{decimal(values['ms_lo'], 1)} – {decimal(values['ms_hi'], 1)}"
+
+
+def amount(value: float) -> str:
+    """A count in few digits: 12,345 or 1.23 M."""
+    for size, letter in ((1e9, "G"), (1e6, "M")):
+        if value >= size:
+            return f"{decimal(value / size, 2)} {letter}"
+    return decimal(value, 0)

@@ -1,4 +1,4 @@
-"""The picture of a frame: the right part enlarged, every run in it, nothing cut off."""
+"""The image of a frame: the right part enlarged, every run in it, nothing cut off."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from reports.sheets import View, find_detail, write_sheet
+from reports.images import View, find_detail, write_image
 
 HEIGHT, WIDTH = 64, 96
 
@@ -44,12 +44,12 @@ def test_where_nothing_differs_the_detail_is_the_middle():
 
 
 @pytest.mark.parametrize(("runs", "columns", "lines"), [(1, 3, 2), (2, 3, 3), (4, 5, 3)])
-def test_a_sheet_has_a_place_for_every_picture(tmp_path, runs, columns, lines):
+def test_an_image_has_a_place_for_every_picture(tmp_path, runs, columns, lines):
     views = [View(("a", "b"), flat(50 * number), flat(7)) for number in range(runs)]
     detail = find_detail(flat(255), [view.rendering for view in views])
-    write_sheet(flat(255), views, detail, "absolute error", tmp_path / "sheet.png")
-    with Image.open(tmp_path / "sheet.png") as sheet:
-        pixels = np.asarray(sheet)
+    write_image(flat(255), views, detail, "absolute error", tmp_path / "image.png")
+    with Image.open(tmp_path / "image.png") as image:
+        pixels = np.asarray(image)
     panel = (3 * HEIGHT, 3 * WIDTH)  # small pictures are enlarged by a whole number
     assert columns * panel[1] < pixels.shape[1] < (columns + 1) * panel[1]
     assert lines * panel[0] < pixels.shape[0] < (lines + 1) * panel[0]

@@ -1,0 +1,160 @@
+"""Runs that look broken: rules, each a function of runs, that yield the outliers and say why."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from statistics import median
+
+from bench.results import content_key
+from bench.trajectories import MIXED
+from reports.runs import Run
+from reports.tables import Table
+
+REFERENCES = Path(__file__).parent / "paper" / "scenes.toml"
+"""Published PSNR of well-known scenes."""
+
+OTHER_SCENES_DB = 12.0
+"""Below the median of a method's scenes. The hardest scene of NeRF-Synthetic, drums, is 9 dB below
+the median of its eight."""
+
+REFERENCE_DB = 10.0
+"""Below the published PSNR of the same scene."""
+
+INT8_DB = 1.0
+"""Below the same network in fp32. The paper loses 0.6 dB against FP16."""
+
+OUTSIDE_STAGES = 0.02
+"""Share of a frame's time outside all stages."""
+
+MORE_PIXELS = 4
+"""So many times the pixels take longer on one machine, though its times drift by a factor of 2."""
+
+FACTS = ("method", "scene", "budget", "precision", "seed")
+"""Columns that identify a run to a reader."""
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """The key of a run that looks broken, and the reason."""
+
+    key: str
+    why: str
+
+
+def outliers(runs: Sequence[Run]) -> list[Outlier]:
+    """The outliers among `runs` by every rule."""
+    published = tomllib.loads(REFERENCES.read_text(encoding="utf-8"))
+    return [
+        *far_from_other_scenes(runs),
+        *far_from_reference(runs, published["psnr"], published["method"]),
+        *stages_do_not_add_up(runs),
+        *int8_far_from_fp32(runs),
+        *faster_with_more_pixels(runs),
+    ]
+
+
+def far_from_other_scenes(runs: Sequence[Run]) -> Iterator[Outlier]:
+    """PSNR far below the median of the same method and settings on at least three scenes."""
+    scored = [run for run in runs if math.isfinite(_psnr(run))]
+    for group in _grouped(scored, lambda run: _settings(run, "scene", "seed", "method.seed")):
+        scenes: dict[str, list[float]] = {}
+        for run in group:
+            scenes.setdefault(run.facts["scene"], []).append(_psnr(run))
+        usual = median(median(values) for values in scenes.values())
+        for run in group:
+            below = usual - _psnr(run)
+            if len(scenes) > 2 and below > OTHER_SCENES_DB:
+                yield Outlier(
+                    run.key, f"PSNR {below:.1f} dB below the median of {len(scenes)} scenes"
+                )
+
+
+def far_from_reference(
+    runs: Sequence[Run], published: Mapping[str, float], method: str
+) -> Iterator[Outlier]:
+    """PSNR far below the `published` one of `method` on the same scene."""
+    for run in runs:
+        known = published.get(run.facts["scene"], math.nan)
+        below = known - _psnr(run)
+        if below > REFERENCE_DB:
+            yield Outlier(run.key, f"PSNR {below:.1f} dB below the {known} dB of {method}")
+
+
+def stages_do_not_add_up(runs: Sequence[Run]) -> Iterator[Outlier]:
+    """The named stages take more or less time than the frame."""
+    for run in runs:
+        frame = run.values["frame_ms"]
+        named = math.fsum(
+            ms
+            for name, ms in run.values.items()
+            if name.startswith("stage_ms.") and name != "stage_ms.other"
+        )
+        if abs(frame - named) > OUTSIDE_STAGES * frame:
+            yield Outlier(run.key, f"its stages take {named:.2f} ms, its frames {frame:.2f} ms")
+
+
+def int8_far_from_fp32(runs: Sequence[Run]) -> Iterator[Outlier]:
+    """int8 loses more than rounding should."""
+    for group in _grouped(runs, lambda run: _settings(run, "engine", "precision", "method.engine")):
+        exact = [_psnr(run) for run in group if run.facts["precision"] == "fp32"]
+        for run in group:
+            lost = max(exact, default=math.nan) - _psnr(run)
+            if run.facts["precision"].startswith("int8") and lost > INT8_DB:
+                yield Outlier(run.key, f"int8 {lost:.2f} dB below fp32")
+
+
+def faster_with_more_pixels(runs: Sequence[Run]) -> Iterator[Outlier]:
+    """Less time than the same on many times fewer pixels; only for frames of one size."""
+    size = ("scene.width", "scene.height", "scene.downscale", "seed", "method.seed")
+    sized = [run for run in runs if run.facts["resolution"] != MIXED]
+    for group in _grouped(sized, lambda run: (_settings(run, *size), run.computer)):
+        pixels = {run.key: _pixels(run) for run in group}
+        for one, other in combinations(sorted(group, key=lambda run: pixels[run.key]), 2):
+            fewer, more = one.values["frame_ms"], other.values["frame_ms"]
+            if pixels[other.key] >= MORE_PIXELS * pixels[one.key] and more < fewer:
+                at = f"{more:.1f} ms a frame at {other.facts['resolution']}"
+                yield Outlier(other.key, f"{at}, {fewer:.1f} ms at {one.facts['resolution']}")
+
+
+def outlier_table(found: Sequence[Outlier], runs: Sequence[Run]) -> Table:
+    """Those of the outliers `found` that are among `runs`."""
+    facts = {run.key: run.facts for run in runs}
+    lines = tuple(
+        (outlier.key, *(str(facts[outlier.key][name]) for name in FACTS), outlier.why)
+        for outlier in found
+        if outlier.key in facts
+    )
+    return Table("Outliers: runs that look broken", ("run", *FACTS, "why"), lines, figures=False)
+
+
+def _psnr(run: Run) -> float:
+    return run.values.get("psnr", math.nan)
+
+
+def _pixels(run: Run) -> int:
+    return math.prod(map(int, run.facts["resolution"].split("x")))
+
+
+def _grouped(runs: Sequence[Run], key: Callable[[Run], object]) -> list[list[Run]]:
+    """Groups of runs that have the same `key`."""
+    groups: dict[object, list[Run]] = {}
+    for run in runs:
+        groups.setdefault(key(run), []).append(run)
+    return list(groups.values())
+
+
+def _settings(run: Run, *without: str) -> str:
+    """A key that is equal for runs whose settings are equal, apart from those `without`."""
+    kept = {**run.record["made_of"]["config"]}
+    for name in without:
+        group, _, setting = name.partition(".")
+        if not setting:
+            kept.pop(group, None)
+        elif group in kept:
+            kept[group] = {key: value for key, value in kept[group].items() if key != setting}
+    return content_key(kept)

@@ -1,0 +1,154 @@
+"""`steerbench accuracy`: run time against error of every knob that trades them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from bench.accuracy import experiment_rows
+from bench.console import ConsoleLog
+from bench.errors import SteerbenchError
+from bench.frontier import best_instead, cheapest_within
+from bench.study import Variant
+from reports.tradeoff import experiment_table, setting_table, write_tradeoff
+from sweeps.device_lock import device_lock
+from sweeps.measurement import checked_settings
+from sweeps.overrides import composed
+from sweeps.studies.variants import (
+    METHOD,
+    Row,
+    computes_with_engine,
+    declared,
+    engines,
+    finite,
+    render_variants,
+)
+from sweeps.terminal import show
+
+Knobs = Mapping[str, Sequence[Variant]]
+
+SETTINGS = (METHOD, "scene=totem", "budget=demo", "trajectory=orbit")
+
+AS_IT_IS = Variant("as it is")
+"""The settings as they were typed, with which every knob is compared."""
+
+
+def main(options: argparse.Namespace) -> int:
+    """Print both tables and the setting that was asked for; as the last line, all rows as JSON."""
+    limit = None if options.within is None else decibels(options.within)
+    words = _last_words([*SETTINGS, *options.overrides])
+    config = composed(words)
+    outputs = Path(checked_settings(config).outputs)
+    log = ConsoleLog(outputs)
+    settings: list[Row] = []
+    if not options.kernels:
+        knobs = _knobs(config, words, options.trained)
+        if len(knobs) == 1:
+            log.info(
+                f"{config.method._target_} declares no knobs in `study` (bench/study.py): it is "
+                "rendered as it is"
+            )
+        settings = _setting_rows(words, _chosen(knobs, options.filter), options)
+        show(setting_table(settings))
+    from methods.checks import found
+
+    with device_lock("cpu", log):
+        experiments = experiment_rows(found("experiments"), options.repeats, log)
+    show(experiment_table(experiments))
+    command = shlex.join(["steerbench", *sys.argv[1:]])
+    page = write_tradeoff(experiments, settings, outputs / "accuracy", command)
+    log.info(f"report: {page}")
+    if settings and limit is not None:
+        print(_recommended(settings, limit))
+    print(json.dumps({"kernels": experiments, "settings": [finite(row) for row in settings]}))
+    return 0
+
+
+def decibels(text: str) -> float:
+    """The number in "0.1dB", "0.1 dB" or "0.1"; SteerbenchError where it is none or negative."""
+    number = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)\s*(dB)?", text, re.IGNORECASE)
+    if not number:
+        raise SteerbenchError(f"--within: expected decibels, 0.1dB for example, got {text!r}")
+    return float(number[1])
+
+
+def _last_words(words: Sequence[str]) -> list[str]:
+    """`words` without those that a later word for the same setting replaces."""
+    return list({word.partition("=")[0]: word for word in words}.values())
+
+
+def _knobs(config: DictConfig, words: Sequence[str], trained: bool) -> Knobs:
+    """By the name of a knob its settings, with everything else as it is.
+
+    What the knobs are compared with comes first: everything off, if the method says what that is,
+    and nothing changed. All are rendered from one training, except for those that `trained` adds.
+    """
+    study = declared(config)
+    standard, *others = engines(words) if computes_with_engine(config) else [AS_IT_IS]
+    off = Variant("everything off", (*standard.settings, *study.exact))
+    return {
+        **({off.name: [off]} if off.settings else {}),
+        AS_IT_IS.name: [AS_IT_IS],
+        **study.knobs,
+        **({"engine": others} if others else {}),
+        **(study.trained if trained else {}),
+    }
+
+
+def _chosen(knobs: Knobs, parts: Sequence[str] | None) -> list[tuple[str, Variant]]:
+    """The settings of the knobs whose names have any of `parts` in them, each with its knob, after
+    those that all knobs are compared with."""
+    chosen = set(list(knobs)[: list(knobs).index(AS_IT_IS.name) + 1])
+    turned = [knob for knob in knobs if knob not in chosen]
+    for part in parts or [""]:
+        found = {knob for knob in turned if part in knob}
+        if parts and not found:
+            raise SteerbenchError(
+                f"--filter: no knob has {part!r} in its name; expected part of one of "
+                f"{', '.join(turned)}"
+            )
+        chosen |= found
+    return [(knob, variant) for knob, some in knobs.items() if knob in chosen for variant in some]
+
+
+def _setting_rows(
+    words: Sequence[str], chosen: Sequence[tuple[str, Variant]], options: argparse.Namespace
+) -> list[Row]:
+    """Of every setting its knob, overrides, costs and errors, what it loses against the first, and
+    `instead`, the setting on the frontier that beats it; see `bench.accuracy.render_in_turns`."""
+    lines = {variant.name: _last_words([*words, *variant.settings]) for _, variant in chosen}
+    found = render_variants(lines, options.frames, options.repeats)
+    scene, path, rendered = found[0].scene, found[0].path, [one.values for one in found]
+    knob_of = {variant.name: knob for knob, variant in chosen}
+    best = best_instead([row["ms"] for row in rendered], [-row["psnr"] for row in rendered])
+    return [
+        {
+            "scene": scene.name,
+            "trajectory": path.name,
+            "resolution": path.resolution,
+            "knob": knob_of[row["setting"]],
+            **row,
+            "lost": rendered[0]["psnr"] - row["psnr"],
+            "instead": rendered[instead]["setting"],
+            "overrides": " ".join(lines[row["setting"]]),
+        }
+        for row, instead in zip(rendered, best, strict=True)
+    ]
+
+
+def _recommended(rows: Sequence[Row], limit: float) -> str:
+    """The fastest setting that loses at most `limit` dB, as a command; the first loses 0."""
+    index = cheapest_within([row["ms"] for row in rows], [row["lost"] for row in rows], limit)
+    assert index is not None
+    row = rows[index]
+    return (
+        f"within {limit:g} dB of {rows[0]['setting']}: {row['setting']}, {row['ms']:.1f} ms, "
+        f"{row['lost']:.3f} dB lost\nsteerbench run {row['overrides']}"
+    )

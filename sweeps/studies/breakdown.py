@@ -1,0 +1,156 @@
+"""`steerbench breakdown`: the time of a frame by its parts, precision by precision."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from bench.probes import OTHER
+from bench.study import Study, Variant
+from reports.tables import Table, decimal, share
+from sweeps.overrides import composed
+from sweeps.studies.skips import nothing_skipped
+from sweeps.studies.variants import (
+    METHOD,
+    Rendered,
+    Row,
+    computes_with_engine,
+    declared,
+    engines,
+    print_rows,
+    range_text,
+    render_variants,
+    settings_of,
+)
+from sweeps.terminal import show
+
+SETTINGS = (METHOD, "trajectory=smooth", "engine=openvino")
+
+DENSE = ", nothing skipped"
+"""How the name of a line ends whose method skips nothing."""
+
+
+def main(options: argparse.Namespace) -> int:
+    """Print two tables and, as the last line, the rows of the first as JSON."""
+    words = [*SETTINGS, *options.overrides]
+    config = composed(words)
+    study = declared(config)
+    usual = _precisions(words) or [Variant("as it is")]
+    variants = settings_of(words, usual)
+    if study.skips:
+        variants |= settings_of([*words, *nothing_skipped(study)], _ending(usual, DENSE))
+    shared = _shared(words, study)
+    for name, settings in study.beside.items():
+        other = [*shared, *settings]
+        variants |= settings_of(other, _ending(_precisions(other), f", {name}") or [Variant(name)])
+    found = render_variants(variants, options.frames, options.repeats)
+    rows = {one.name: _row(one, composed(variants[one.name]).budget == config.budget)
+            for one in found}  # fmt: skip
+    parts = _parts(study, rows.values())
+    columns = ("", *parts, "frame ↓", "of rounds", "p99 / p50 ↓", "FPS ↑", "PSNR, dB ↑")
+    title = f"ms of a frame, and what of it each part takes itself; {found[0].frames} frames"
+    show(Table(title, columns, tuple(_line(row, parts) for row in rows.values())))
+    if compared := _compared(rows, [variant.name for variant in usual], study):
+        show(compared)
+    print_rows(rows.values())
+    return 0
+
+
+def _precisions(words: Sequence[str]) -> list[Variant]:
+    """The chosen engine at each of its precisions; nothing for a method that uses none."""
+    config = composed(words, return_hydra_config=True)
+    if not computes_with_engine(config):
+        return []
+    chosen = f"engine={config.hydra.runtime.choices.engine}"
+    return [variant for variant in engines(words) if chosen in variant.settings]
+
+
+def _ending(variants: Iterable[Variant], ending: str) -> list[Variant]:
+    return [Variant(variant.name + ending, variant.settings) for variant in variants]
+
+
+def _shared(words: Sequence[str], study: Study) -> list[str]:
+    """The `words` that hold for all methods compared with, too: of the settings of the method those
+    that all of them have, and all other words."""
+    folders = [word for word in words if word.startswith("--config-dir=")]
+    others = [composed([*folders, *settings]) for settings in study.beside.values()]
+    return [word for word in words if _holds(word, others)]
+
+
+def _holds(word: str, configs: Iterable[DictConfig]) -> bool:
+    name, missing = word.partition("=")[0].lstrip("+~"), object()
+    if "@method" in name or name == "method":
+        return False
+    return not name.startswith("method.") or all(
+        OmegaConf.select(config, name, default=missing) is not missing for config in configs
+    )
+
+
+def _row(one: Rendered, trained_alike: bool) -> Row:
+    """One line; its PSNR is left out where the budget is another than that of the first line."""
+    parts: dict[str, float] = {}
+    for metric, value in one.values.items():
+        if metric.startswith("stage_ms."):
+            part = one.study.part_of(metric.removeprefix("stage_ms."))
+            parts[part] = parts.get(part, 0.0) + value
+    return {
+        "line": one.name,
+        "parts": parts,
+        "network_ms": one.network_ms,
+        "frame_ms": one.values["ms"],
+        **{name: one.values[name] for name in ("ms_lo", "ms_hi", "p99_to_p50")},
+        "psnr": one.values["psnr"] if trained_alike else None,
+    }
+
+
+def _parts(study: Study, rows: Iterable[Row]) -> list[str]:
+    """The parts that any line has: those that the method declares first, `other` last."""
+    there = dict.fromkeys(part for row in rows for part in row["parts"])
+    named = [part for part in dict.fromkeys(study.parts.values()) if part in there]
+    return [*named, *(part for part in there if part not in (*named, OTHER)), OTHER]
+
+
+def _line(row: Row, parts: Iterable[str]) -> tuple[str, ...]:
+    return (
+        row["line"],
+        *(decimal(row["parts"].get(part, 0.0), 1) for part in parts),
+        decimal(row["frame_ms"], 1),
+        range_text(row),
+        decimal(row["p99_to_p50"], 2),
+        decimal(1e3 / row["frame_ms"], 2),
+        decimal(row["psnr"], 2),
+    )
+
+
+def _compared(rows: Mapping[str, Row], names: Sequence[str], study: Study) -> Table | None:
+    """How the lines `names` compare with other methods, the first precision, and no skips; None
+    where there is nothing to compare with."""
+    lines = {name: _ratios(rows, name, names[0], study) for name in names if name in rows}
+    columns = tuple(next(iter(lines.values())))
+    cells = ((name, *ratios.values()) for name, ratios in lines.items())
+    return Table("Compared", ("", *columns), tuple(cells)) if columns else None
+
+
+def _ratios(rows: Mapping[str, Row], name: str, first: str, study: Study) -> dict[str, str]:
+    row, cells = rows[name], {}
+
+    def ratio(other: Mapping[str, Any], of: str, to: str) -> str:
+        known = other.get(of) and row[to]
+        return decimal(other[of] / row[to] if known else None, 1)
+
+    for method in study.beside:
+        other = rows.get(f"{name}, {method}", rows.get(method, {}))
+        if other.get("network_ms"):
+            cells[f"network of {method} / frame ↑"] = ratio(other, "network_ms", "frame_ms")
+            cells[f"network of {method} / network ↑"] = ratio(other, "network_ms", "network_ms")
+        else:
+            cells[f"frame of {method} / frame ↑"] = ratio(other, "frame_ms", "frame_ms")
+    if len(rows) > 1 and name != "as it is":
+        cells[f"lost to {first}, dB ↓"] = decimal(rows[first]["psnr"] - row["psnr"], 3)
+    if dense := rows.get(name + DENSE):
+        cells["lost by skipping, dB ↓"] = decimal(dense["psnr"] - row["psnr"], 3)
+        cells["time, of nothing skipped ↓"] = share(row["frame_ms"], dense["frame_ms"])
+    return cells

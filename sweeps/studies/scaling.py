@@ -1,0 +1,210 @@
+"""`steerbench scaling`: how time, work and memory of a frame grow with what a method declares."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import statistics
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig
+
+from bench.cameras import frame_camera
+from bench.console import ConsoleLog
+from bench.errors import SteerbenchError, explained
+from bench.frontier import observed_order
+from bench.probes import FrameRecord, MemoryMeter, StageClock, p99_to_p50
+from bench.study import Study
+from bench.threads import torch_threads
+from bench.types import Camera, Log, Method, Scene
+from reports.figures import growth_panels
+from reports.tables import Table, decimal, megabytes
+from sweeps.build import build
+from sweeps.device_lock import device_lock
+from sweeps.measurement import checked_settings
+from sweeps.names import unknown
+from sweeps.overrides import composed
+from sweeps.studies.variants import METHOD, Row, amount, computes_with_engine, declared
+from sweeps.terminal import show
+
+SETTINGS = (METHOD, "trajectory=smooth", "++budget.renderer_steps=8")
+"""What a 2D renderer has learned does not change what it costs."""
+
+SIZES = ((200, 200), (400, 400), (800, 800), (1920, 1080), (3840, 2160))
+
+
+@dataclass(frozen=True)
+class Point:
+    """One measurement.
+
+    Attributes:
+        axis: what is varied.
+        value: what the value amounts to, for the fit.
+        label: the value as it is shown.
+        settings: the words that make it, as of `steerbench run`.
+        size: width and height of the frames; None: those of the trajectory.
+        threads: None: the default.
+    """
+
+    axis: str
+    value: float
+    label: str
+    settings: tuple[str, ...] = ()
+    size: tuple[int, int] | None = None
+    threads: int | None = None
+
+
+def _points(study: Study) -> Iterator[Point]:
+    for width, height in SIZES:
+        yield Point("pixels", width * height, f"{width} x {height}", size=(width, height))
+    for threads in range(1, torch.get_num_threads() + 1):
+        yield Point("threads", threads, f"{threads} thread{'s' * (threads > 1)}", threads=threads)
+    for name, axis in study.axes.items():
+        for value, size in zip(axis.values, axis.size or axis.values, strict=True):
+            yield Point(name, size, axis.label.format(value), (f"{axis.setting}={value}",))
+
+
+def main(options: argparse.Namespace) -> int:
+    """Print a table with the fitted exponents and, as the last line, the rows as JSON."""
+    if options.plot is not None and options.plot.suffix != ".png":
+        raise SteerbenchError(f"--plot: expected a name that ends in .png, got {options.plot}")
+    words = [*SETTINGS, *options.overrides]
+    config = composed(words, return_hydra_config=True)
+    log = ConsoleLog(Path(checked_settings(config).outputs))
+    points = _chosen(config, options.axis)
+    scene = build(config, "scene", log=log)
+    configs = [composed([*words, *point.settings]) for point in points]
+    rows = []
+    with log.progress("scaling", len(points)) as progress, device_lock(config.device, log):
+        for point, made in zip(points, configs, strict=True):
+            rows.append(_row(point, made, scene, options.frames, log))
+            progress.advance(note=point.label)
+    axes: dict[str, list[Row]] = {}
+    for row in rows:
+        axes.setdefault(row["axis"], []).append(row)
+    title = f"{config.method.get('name', scene.name)} on {scene.name}, {rows[0]['frames']} frames"
+    show(_table(title, axes))
+    print(json.dumps(rows))
+    if options.plot is not None:
+        _plot(axes, options.plot)
+        log.info(f"plot: {options.plot}")
+    return 0
+
+
+def _chosen(config: DictConfig, names: Sequence[str] | None) -> list[Point]:
+    """The points of the axes `names`, of all by default.
+
+    Raises:
+        SteerbenchError: the method has no such axis, or the engine has a fixed number of threads.
+    """
+    study = declared(config)
+    axes = ("pixels", "threads", *study.axes)
+    for name in names or ():
+        if name not in axes:
+            raise unknown("axis", name, axes)
+    engine = config.hydra.runtime.choices.engine
+    if "threads" in (names or axes) and computes_with_engine(config) and engine != "torch":
+        others = [name for name in axes if name != "threads"]
+        raise SteerbenchError(
+            "--axis threads: expected engine=torch, whose threads can be chosen afterwards; for "
+            f"another engine give --axis {', '.join(others[:-1])} or {others[-1]}"
+        )
+    return [point for point in _points(study) if point.axis in (names or axes)]
+
+
+def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) -> Row:
+    """Time, work and memory of the first steady `frames` of the trajectory at `point`."""
+    torch.manual_seed(config.seed)
+    method: Method = build(config, "method")
+    method.fit(scene, build(config, "budget"), log)
+    cameras = [step.camera for step in build(config, "trajectory", scene).steps]
+    cameras = cameras[: method.memory + frames]
+    if len(cameras) <= method.memory:
+        raise SteerbenchError(
+            f"trajectory: expected more than the {method.memory} frames that {method.name} looks "
+            f"back on, got {len(cameras)}"
+        )
+    if point.size:
+        cameras = [frame_camera(camera, *point.size) for camera in cameras]
+    with torch_threads(point.threads or torch.get_num_threads()):  # trained with the default
+        records, peak_bytes = _render(method, cameras, log)
+    counters = dict.fromkeys(name for record in records for name in record.done)
+    return {
+        "axis": point.axis,
+        "label": point.label,
+        "value": point.value,
+        "frames": len(records),
+        "frame_ms": statistics.mean(record.total_ns for record in records) / 1e6,
+        "p99_to_p50": p99_to_p50(records),
+        **{
+            f"work.{name}": statistics.mean(record.done.get(name, 0) for record in records)
+            for name in counters
+        },
+        "peak_bytes": peak_bytes,
+        "size_bytes": sum(method.sizes().values()),
+    }
+
+
+@torch.no_grad()
+def _render(
+    method: Method, cameras: Sequence[Camera], log: Log
+) -> tuple[Sequence[FrameRecord], int]:
+    """The steady frames of the second of two rounds through `cameras`, and the peak of memory."""
+    device = method.settings()["device"]
+    clock, meter = StageClock(device), MemoryMeter(device)
+    with log.progress("rendering", 2 * len(cameras)) as progress:
+        for _ in range(2):
+            method.reset()
+            for camera in cameras:
+                with meter, clock.frame():
+                    method.render(camera, clock)
+                progress.advance()
+    return clock.frames[len(cameras) + method.memory :], meter.peak_bytes
+
+
+def _table(title: str, axes: Mapping[str, Sequence[Row]]) -> Table:
+    """All rows, and below those of each axis the power with which each figure grows."""
+    counters = dict.fromkeys(
+        name for rows in axes.values() for row in rows for name in row if name.startswith("work.")
+    )
+    figures = {
+        "frame_ms": ("ms / frame ↓", lambda ms: decimal(ms, 1)),
+        "p99_to_p50": ("p99 / p50 ↓", lambda ratio: decimal(ratio, 2)),
+        **{name: (name.removeprefix("work.").replace("_", " "), amount) for name in counters},
+        "peak_bytes": ("peak, MB ↓", megabytes),
+        "size_bytes": ("model, MB ↓", megabytes),
+    }
+    lines = []
+    for axis, rows in axes.items():
+        for row in rows:
+            cells = (write(row.get(name, 0)) for name, (_, write) in figures.items())
+            lines.append((row["label"], *cells))
+        powers = (
+            "" if name == "p99_to_p50" else decimal(growth(rows, name), 2) for name in figures
+        )
+        lines.append((f"exponent of {axis}", *powers))
+    return Table(title, ("", *(label for label, _ in figures.values())), tuple(lines))
+
+
+def _plot(axes: Mapping[str, Sequence[Row]], path: Path) -> None:
+    figures = {"frame_ms": "ms / frame", "peak_bytes": "peak memory, bytes"}
+    exponents = {(axis, key): growth(axes[axis], key) for axis in axes for key in figures}
+    with explained(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        growth_panels(axes, figures, exponents, path)
+
+
+def growth(rows: Sequence[Row], figure: str) -> float:
+    """The exponent p of `figure` ~ value^p, by least squares of the logarithms; nan if there are
+    fewer than two values above 0."""
+    points = [
+        (row["value"], row[figure]) for row in rows if row["value"] > 0 and row.get(figure, 0) > 0
+    ]
+    if len({value for value, _ in points}) < 2:
+        return math.nan
+    value, of = zip(*points, strict=True)
+    return observed_order(value, of)

@@ -1,0 +1,153 @@
+"""The studies of a method that declares what can be varied, and of one that declares nothing."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from bench.study import Study
+from tests.sweeps.conftest import STAND_INS, Outcome
+
+FRAMES = ["--frames", "2", "--repeats", "1"]
+
+
+@pytest.fixture
+def study(steerbench, monkeypatch):
+    """Call a study of a stand-in, without experiments on kernels."""
+    monkeypatch.setattr("methods.checks.found", lambda name: [])
+
+    def call(command: str, method: str, *argv: str) -> Outcome:
+        rounds = FRAMES if command != "scaling" else FRAMES[:2]
+        common = ["trajectory=test", "engine=torch", f"method={method}", *argv]
+        return steerbench(command, *STAND_INS, *rounds, *common)
+
+    return call
+
+
+def rows(outcome: Outcome) -> Any:
+    assert outcome.status == 0, outcome.err
+    return json.loads(outcome.out.splitlines()[-1])
+
+
+def test_accuracy_varies_every_knob_and_the_engine(study):
+    found = rows(study("accuracy", "shades"))["settings"]
+    names = [row["setting"] for row in found]
+    assert names[:5] == ["everything off", "as it is", "level 0.4", "level 0.6", "level 1.0"]
+    assert {"torch, bf16", "openvino, fp32"} <= set(names)
+    assert "torch, fp32" not in names  # the default
+    row = found[4]
+    assert (row["knob"], row["overrides"].split()[-1]) == ("level", "method.level=1.0")
+    assert row["lost"] is None  # white on white: nothing is wrong with it
+    assert found[0]["work.halves"] == 1  # `exact` switches one skip off
+
+
+def test_accuracy_adds_what_needs_a_training_when_asked(study):
+    found = rows(study("accuracy", "shades", "--trained", "--filter", "trained"))["settings"]
+    assert [row["setting"] for row in found] == ["everything off", "as it is", "seed 7"]
+
+
+def test_accuracy_renders_a_method_without_knobs_as_it_is_and_says_so(study):
+    outcome = study("accuracy", "grey", "--within", "1dB")
+    (row,) = rows(outcome)["settings"]
+    assert (row["setting"], row["lost"]) == ("as it is", 0)
+    assert "stand_ins.Grey declares no knobs in `study`" in outcome.err
+    assert "within 1 dB of as it is: as it is" in outcome.out
+
+
+def test_skips_shows_the_work_with_each_skip_alone(study):
+    found = {row["skipped"]: row for row in rows(study("skips", "shades"))}
+    halves = {name: row["halves"] for name, row in found.items()}
+    assert halves == {
+        "nothing": 2,
+        "left half": 1,
+        "right half": 1,
+        "all of these": 0,
+        "and half as bright": 0,
+    }
+    assert found["and half as bright"]["lost"] > 0
+
+
+def test_skips_refuses_a_method_that_declares_none(study):
+    outcome = study("skips", "grey")
+    assert outcome.status == 2
+    assert "stand_ins.Grey declares nothing in `study.skips`" in outcome.err
+
+
+def test_breakdown_divides_the_frame_and_names_every_line(study):
+    outcome = study("breakdown", "shades", "method.level=0.3")
+    found = {row["line"]: row for row in rows(outcome)}
+    ends = ("", ", nothing skipped", ", a twin")
+    lines = [f"torch, {precision}{end}" for end in ends for precision in ("fp32", "bf16")]
+    assert list(found) == [*lines, "plain grey"]
+    for row in found.values():
+        assert sum(row["parts"].values()) == pytest.approx(row["frame_ms"])
+    assert set(found["torch, fp32"]["parts"]) == {"painting", "varnish", "other"}
+    assert set(found["plain grey"]["parts"]) == {"paint", "other"}
+    assert len({row["psnr"] for row in found.values()}) == 1  # all have the level that was typed
+    for column in ("network of a twin / network", "frame of plain grey / frame", "by skipping"):
+        assert column in " ".join(outcome.out.split())
+
+
+def test_breakdown_of_a_method_without_engine_and_study_is_one_line(study):
+    (row,) = rows(study("breakdown", "grey"))
+    assert row["line"] == "as it is"
+    assert set(row["parts"]) == {"paint", "other"}
+
+
+def test_a_line_of_another_budget_has_no_quality(study, monkeypatch):
+    short = Study(beside={"short": ("method=grey", "budget.steps=2")})
+    monkeypatch.setattr("stand_ins.Shades.study", short)
+    found = {row["line"]: row for row in rows(study("breakdown", "shades"))}
+    assert found["short"]["psnr"] is None
+    assert found["torch, fp32"]["psnr"] is not None
+
+
+def test_parity_compares_every_engine_with_torch_in_fp32(study):
+    found = {row["engine"]: row for row in rows(study("parity", "shades"))}
+    assert next(iter(found)) == "torch, fp32"
+    assert "onnxruntime, int8" in found
+    for row in found.values():
+        assert (row["lost"], row["apart"], row["bytes"]) == (0, None, 4)
+        assert 0 < row["network_ms"] < row["frame_ms"]
+
+
+def test_parity_refuses_a_method_without_engine(study):
+    outcome = study("parity", "grey")
+    assert outcome.status == 2
+    assert "expected a method with the setting method.engine" in outcome.err
+
+
+def test_scaling_fits_the_axes_of_the_method(study):
+    outcome = study("scaling", "shades", "method.skip.left=false", "--axis", "N")
+    found = rows(outcome)
+    assert [(row["label"], row["value"], row["work.halves"]) for row in found] == [
+        ("N = 2^0", 1.0, 1),
+        ("N = 2^3", 8.0, 8),
+    ]
+    (line,) = [line for line in outcome.out.splitlines() if "exponent of N" in line]
+    assert "1.00" in line  # of the halves
+
+
+def test_scaling_has_pixels_and_threads_for_every_method(study):
+    found = rows(study("scaling", "grey"))
+    assert {row["axis"] for row in found} == {"pixels", "threads"}
+
+
+@pytest.mark.parametrize(
+    ("stage", "part"),
+    [
+        ("field", "field"),
+        ("field/march", "field"),
+        ("renderer", "renderer"),
+        ("renderer/network", "network"),
+        ("renderer/network/layer", "network"),
+        ("renderer/other", "renderer"),
+        ("some stage", "some stage"),
+        ("some stage/inside", "some stage/inside"),
+    ],
+)
+def test_a_stage_is_counted_with_the_innermost_that_is_declared(stage: str, part: str) -> None:
+    parts = {"field": "field", "renderer": "renderer", "renderer/network": "network"}
+    assert Study(parts=parts).part_of(stage) == part
