@@ -34,7 +34,7 @@ def small_model(**others: Any) -> Model:
 
 
 def small_rendering(**others: Any) -> Rendering:
-    """How `small_model()` is trained to be rendered, without refinement; `others` replace fields."""
+    """As `small_model()` is trained, but without refinement; `others` replace fields."""
     fields: dict[str, Any] = {"step": 8.0, "stop": STOP}
     return Rendering(**fields | others)
 
