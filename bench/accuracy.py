@@ -1,7 +1,7 @@
 """Run time against error, for computations whose exact answer is known and for whole methods.
 
-What is compared takes turns, so that a drifting clock hits all of it alike; the times come from
-further rounds of what made the errors.
+The settings that are compared take turns, so that a drifting clock affects all of them alike. The
+times come from further rounds of the computation that gave the errors.
 """
 
 from __future__ import annotations
@@ -146,31 +146,41 @@ def render_in_turns(
     Raises:
         SteerbenchError: there is no such frame, or a method rendered values that are not finite.
     """
-    cameras = [step.camera for step in trajectory.steps]
+    images = scene.splits[trajectory.split].images
     ready, scored = steady_frames(methods.values(), trajectory)
     clocks = {name: StageClock(method.settings()["device"]) for name, method in methods.items()}
-    scores = _Scores(scene, trajectory, protocol)
+    first: dict[int, Tensor] = {}
+    found: dict[str, list[tuple[float, float, float]]] = {name: [] for name in methods}
     with torch.no_grad(), log.progress("rendering", (repeats + 1) * len(methods)) as progress:
         for round_ in range(repeats + 1):
             for name, method in methods.items():
                 method.reset()
-                for number, camera in enumerate(cameras):
+                for number, step in enumerate(trajectory.steps):
                     with clocks[name].frame():
-                        frame = method.render(camera, clocks[name])
-                    check_frame(frame, camera, name, number)
-                    if round_ == 0 and number in scored:
-                        scores.add(name, number, frame.rgb)
+                        frame = method.render(step.camera, clocks[name])
+                    check_frame(frame, step.camera, name, number)
+                    if round_ == 0 and number in scored and step.truth is not None:
+                        picture = protocol.rounded(frame.rgb).cpu()
+                        truth = composite(images[step.truth], scene.background)
+                        one = first.setdefault(number, picture)
+                        found[name].append(_compared(picture, one, truth))
                 progress.advance(note=f"round {round_} of {repeats}" if round_ else "warming up")
-    return [
-        {"setting": name, **_costs(clock.frames, ready), **scores.of(name)}
-        for name, clock in clocks.items()
-    ]
+    rows = []
+    for name, clock in clocks.items():
+        scores, squares, largest = zip(*found[name], strict=True)
+        figures = {
+            "psnr": statistics.fmean(scores),
+            "psnr_to_first": psnr_of_mse(statistics.fmean(squares)),
+            "worst": max(largest),
+        }
+        rows.append({"setting": name, **_costs(clock.frames, ready), **figures})
+    return rows
 
 
 def steady_frames(
     methods: Iterable[Method], trajectory: Trajectory
 ) -> tuple[list[bool], list[int]]:
-    """Which frames have as many before them as any of the `methods` looks back on, and the numbers
+    """Whether each frame has all preceding frames that any of the `methods` uses, and the numbers
     of those that have a ground truth, too.
 
     Raises:
@@ -188,8 +198,7 @@ def steady_frames(
 
 
 def _costs(records: Sequence[FrameRecord], ready: Sequence[bool]) -> dict[str, float]:
-    """What the `ready` frames of a round took, in all rounds but the first; see
-    `render_in_turns`."""
+    """The costs of the `ready` frames in all rounds but the first; see `render_in_turns`."""
     count = len(ready)
     rounds = [
         list(compress(records[first : first + count], ready))
@@ -210,7 +219,7 @@ def _costs(records: Sequence[FrameRecord], ready: Sequence[bool]) -> dict[str, f
 def _means(
     kind: str, of_frames: Sequence[Mapping[str, int]], factor: float = 1
 ) -> dict[str, float]:
-    """The mean over frames of everything that any of them has; 0 where one has it not."""
+    """The mean over frames of every figure that one of them has; a missing one counts as 0."""
     names = dict.fromkeys(name for figures in of_frames for name in figures)
     return {
         f"{kind}.{name}": factor * statistics.fmean(figures.get(name, 0) for figures in of_frames)
@@ -218,32 +227,7 @@ def _means(
     }
 
 
-class _Scores:
-    """PSNR of each method's pictures, against the ground truth and against those of the first."""
-
-    def __init__(self, scene: Scene, path: Trajectory, protocol: EvaluationProtocol) -> None:
-        self._split, self._background = scene.splits[path.split], scene.background
-        self._steps, self._rounded = path.steps, protocol.rounded
-        self._first: dict[int, Tensor] = {}
-        self._psnr: dict[str, list[float]] = {}
-        self._apart: dict[str, list[float]] = {}
-        self._worst: dict[str, float] = {}
-
-    def add(self, name: str, number: int, rgb: Tensor) -> None:
-        """The frame `number` of the trajectory, as the method `name` rendered it."""
-        truth = self._steps[number].truth
-        assert truth is not None
-        picture = self._rounded(rgb).cpu()
-        exact = composite(self._split.images[truth], self._background)
-        apart = picture.double() - self._first.setdefault(number, picture).double()
-        self._psnr.setdefault(name, []).append(psnr(picture, exact))
-        self._apart.setdefault(name, []).append(apart.square().mean().item())
-        self._worst[name] = max(self._worst.get(name, 0.0), apart.abs().max().item())
-
-    def of(self, name: str) -> dict[str, float]:
-        """The scores of a method in a row."""
-        return {
-            "psnr": statistics.fmean(self._psnr[name]),
-            "psnr_to_first": psnr_of_mse(statistics.fmean(self._apart[name])),
-            "worst": self._worst[name],
-        }
+def _compared(picture: Tensor, first: Tensor, truth: Tensor) -> tuple[float, float, float]:
+    """The PSNR against `truth`, and the mean squared and the largest difference from `first`."""
+    apart = picture.double() - first.double()
+    return psnr(picture, truth), apart.square().mean().item(), apart.abs().max().item()

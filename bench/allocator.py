@@ -1,7 +1,7 @@
-"""What glibc does with freed memory: kept for the next step, or given back to the system.
+"""Tells glibc to keep freed memory for the next step, or to give it back to the system.
 
 A training step allocates and frees 50 MB of activations. Given back each time, they are some 12,000
-pages to be mapped and cleared anew. Where the C library is another one, nothing happens here.
+pages that must be mapped and cleared again. With another C library nothing happens here.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ LARGEST_KEPT = 32 << 20
 
 
 def keep_freed() -> None:
-    """Keep what is freed from now on, for whichever thread asks next."""
+    """Keep what is freed from now on, for the next allocation of any thread."""
     if mallopt := _of_libc("mallopt"):
         mallopt(M_MMAP_THRESHOLD, LARGEST_KEPT)
         mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
-        mallopt(M_ARENA_MAX, 1)  # of other arenas, freed memory is given back all the same
+        mallopt(M_ARENA_MAX, 1)  # other arenas give freed memory back all the same
 
 
 def give_back() -> None:

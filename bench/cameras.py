@@ -63,29 +63,16 @@ def scale_camera(camera: Camera, width: int, height: int) -> Camera:
     With centres at +0.5 every intrinsic scales by the same factor, so 1/4 and back is exact.
     """
     sx, sy = width / camera.width, height / camera.height
-    return replace(
-        camera,
-        fx=camera.fx * sx,
-        fy=camera.fy * sy,
-        cx=camera.cx * sx,
-        cy=camera.cy * sy,
-        width=width,
-        height=height,
-    )
+    fx, fy, cx, cy = camera.fx * sx, camera.fy * sy, camera.cx * sx, camera.cy * sy
+    return Camera(camera.c2w, fx, fy, cx, cy, width, height)
 
 
 def frame_camera(camera: Camera, width: int, height: int) -> Camera:
-    """The view on a grid of `width` x `height`: as much from top to bottom, more or less aside."""
+    """The view on a grid of `width` x `height` pixels: the same from top to bottom, but wider or
+    narrower."""
     zoom = height / camera.height
-    return replace(
-        camera,
-        fx=camera.fx * zoom,
-        fy=camera.fy * zoom,
-        cx=width / 2 + (camera.cx - camera.width / 2) * zoom,
-        cy=camera.cy * zoom,
-        width=width,
-        height=height,
-    )
+    cx, cy = width / 2 + (camera.cx - camera.width / 2) * zoom, camera.cy * zoom
+    return Camera(camera.c2w, camera.fx * zoom, camera.fy * zoom, cx, cy, width, height)
 
 
 def crop_camera(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
@@ -104,7 +91,7 @@ def move_camera(camera: Camera, scale: float, offset: Tensor) -> Camera:
 
 
 def place_camera(camera: Camera, device: torch.device | str) -> Camera:
-    """The same camera with its pose on `device`, where what is cast and projected then lies."""
+    """The same camera with its pose on `device`; rays and projections then are there, too."""
     return replace(camera, c2w=camera.c2w.to(device))
 
 

@@ -15,10 +15,10 @@ from bench.errors import explained
 from bench.results import content_key
 
 PLAIN_INTERVAL_S = 10.0
-"""Between two lines of progress where there is no terminal to draw a bar on."""
+"""Time between two lines of progress where there is no terminal to draw a bar on."""
 
 DRAW_INTERVAL_S = 0.2
-"""Between two drawings of a bar."""
+"""Time between two drawings of a bar."""
 
 WORTH_A_LINE_S = 2.0
 """Work that took longer leaves a line behind when it is done."""
@@ -60,7 +60,7 @@ class ConsoleLog:
     @contextmanager
     def progress(self, label: str, total: int) -> Iterator[_Bar]:
         """Show a bar, or without a terminal a line now and then; bars may nest."""
-        bar = _Bar(self.info, self._bars, label, total, self._clock)
+        bar = _Bar(self.info, self._bars, label, total)
         self._bars.start()
         try:
             yield bar
@@ -82,46 +82,41 @@ class _Bar:
     """One running bar; see `bench.types.Progress`."""
 
     def __init__(
-        self,
-        say: Callable[[str], None],
-        bars: progress.Progress,
-        label: str,
-        total: int,
-        clock: Callable[[], float],
+        self, say: Callable[[str], None], bars: progress.Progress, label: str, total: int
     ) -> None:
-        self._say, self._bars, self._label, self._clock = say, bars, label, clock
+        self._say, self._bars, self._label, self._clock = say, bars, label, bars.get_time
         self._id = bars.add_task(label, total=total, note="")
-        self._begun = self._shown = clock()
+        self._begun = self._shown = self._clock()
 
     def advance(self, steps: int = 1, note: str = "") -> None:
         self._bars.update(self._id, advance=steps, note=note)
         plain = self._bars.disable
-        if self._clock() - self._shown >= (PLAIN_INTERVAL_S if plain else DRAW_INTERVAL_S):
-            self._shown = self._clock()
-            if plain:
-                self._say(self._line())
-            else:
-                self._bars.refresh()
+        now = self._clock()
+        if now - self._shown < (PLAIN_INTERVAL_S if plain else DRAW_INTERVAL_S):
+            return
+        self._shown = now
+        if plain:
+            task = self._task()
+            left = "?" if task.time_remaining is None else _duration(task.time_remaining)
+            elapsed = _duration(now - self._begun)
+            self._line(f"{task.percentage:.0f} %, {elapsed} elapsed, {left} left")
+        else:
+            self._bars.refresh()
 
     def report_done(self) -> None:
         """Leave a line behind, if the work was worth one."""
-        if self._elapsed() > WORTH_A_LINE_S:
-            done = f"{self._label}: done in {_duration(self._elapsed())}"
-            self._say(", ".join(filter(None, (done, self._task().fields["note"]))))
+        elapsed = self._clock() - self._begun
+        if elapsed > WORTH_A_LINE_S:
+            self._line(f"done in {_duration(elapsed)}")
 
     def remove(self) -> None:
-        """Take the bar off the screen."""
+        """Remove the bar from the screen."""
         self._bars.remove_task(self._id)
         self._bars.refresh()
 
-    def _line(self) -> str:
-        task = self._task()
-        left = "?" if task.time_remaining is None else _duration(task.time_remaining)
-        done = f"{task.percentage:.0f} %, {_duration(self._elapsed())} elapsed, {left} left"
-        return ", ".join(filter(None, (f"{self._label}: {done}", task.fields["note"])))
-
-    def _elapsed(self) -> float:
-        return self._clock() - self._begun
+    def _line(self, text: str) -> None:
+        note = self._task().fields["note"]
+        self._say(f"{self._label}: {text}" + (f", {note}" if note else ""))
 
     def _task(self) -> progress.Task:
         return next(task for task in self._bars.tasks if task.id == self._id)

@@ -1,4 +1,4 @@
-"""Settings that cost time and make errors: which are worth having, which to take."""
+"""The Pareto frontier of settings that trade time for error."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 
 def best_instead(cost: Sequence[float], error: Sequence[float]) -> list[int]:
-    """Of each setting, the index of the one to take in its place: the least `error` among those
+    """For each setting, the index of the one to use in its place: the least `error` among those
     that cost no more, of equals the cheapest, of equals the first.
 
-    A setting stands for itself if it lies on the Pareto frontier (of several alike there, the
-    first); any other is dominated by the setting that stands for it.
+    A setting on the Pareto frontier (of several alike there, the first) gets its own index; any
+    other is dominated by the one at its index.
     """
     costs, errors = np.asarray(cost, float), np.asarray(error, float)
     best: list[int] = [0] * len(costs)
@@ -25,7 +25,7 @@ def best_instead(cost: Sequence[float], error: Sequence[float]) -> list[int]:
 
 
 def cheapest_within(cost: Sequence[float], error: Sequence[float], limit: float) -> int | None:
-    """The cheapest setting whose error is at most `limit`, as an index; None: there is none."""
+    """The index of the cheapest setting whose error is at most `limit`; None without one."""
     allowed = [index for index, size in enumerate(error) if size <= limit]
     return min(allowed, key=lambda index: (cost[index], error[index]), default=None)
 

@@ -15,9 +15,8 @@ import re
 import tempfile
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,8 +28,7 @@ TIMEOUT_S = 10.0
 CHUNK_BYTES = 1 << 20
 
 
-@dataclass(frozen=True)
-class Backbone:
+class Backbone(NamedTuple):
     """Names of a backbone's file: torchvision's own, and one with its `features.*` alone."""
 
     published: str
@@ -90,14 +88,9 @@ def load_features(net: str, weights_dir: Path | None, log: Log) -> tuple[Path, d
 
 
 def _folders(weights_dir: Path | None) -> list[Path]:
-    def named() -> Iterator[Path]:
-        if weights_dir is not None:
-            yield weights_dir
-        if folder := os.environ.get("STEERBENCH_WEIGHTS"):
-            yield Path(folder)
-        yield Path(torch.hub.get_dir()) / "checkpoints"
-
-    return list(named())
+    cache = Path(torch.hub.get_dir()) / "checkpoints"
+    named = (weights_dir, os.environ.get("STEERBENCH_WEIGHTS"), cache)
+    return [Path(folder) for folder in named if folder]
 
 
 def _verified(path: Path) -> Path:

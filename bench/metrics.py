@@ -20,7 +20,7 @@ from bench.lpips_weights import load_features
 from bench.types import Log, SteerbenchError, Unavailable, check_shape
 
 SMALLEST_SIDE = {"ssim": 11, "lpips_alex": 31, "lpips_vgg": 16, "lpips_squeeze": 17}
-"""In pixels: SSIM needs room for its window, LPIPS one position in the deepest feature map."""
+"""Smallest side in pixels: SSIM needs room for its window, LPIPS for one deepest feature."""
 
 
 def check_size(metric: str, width: int, height: int) -> None:
@@ -45,7 +45,7 @@ def psnr(image: Tensor, reference: Tensor) -> float:
 
 
 def psnr_of_mse(mse: float) -> float:
-    """The PSNR in dB that a mean squared error is, for a peak of 1; +inf for none."""
+    """The PSNR in dB of a mean squared error, for a peak of 1; +inf for an error of 0."""
     return math.inf if mse == 0.0 else -10.0 * math.log10(mse)  # nan stays nan
 
 
@@ -100,7 +100,7 @@ class Lpips:
     Args:
         net: "alex", "vgg" or "squeeze".
         weights_dir: folder to look into first, or None.
-        log: told of a download.
+        log: shows a download.
 
     Raises:
         Unavailable: the backbone weights cannot be had, or are not those of this network.

@@ -140,7 +140,7 @@ def _turned(camera: Camera, target: Tensor, turn: Tensor, zoom: float) -> Camera
 
 
 def _offset(camera: Camera, target: Tensor) -> Tensor:
-    """From `target` to the camera, [3]."""
+    """The vector [3] from `target` to the camera."""
     return camera.c2w[:, 3].double() - target.double()
 
 

@@ -22,7 +22,7 @@ OTHER = "other"
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """What one frame took.
+    """The times and the work of one frame.
 
     Attributes:
         stages_ns: own time of each stage, and of `other`; a stage inside another is named
@@ -42,8 +42,7 @@ class FrameRecord:
 
 
 def p99_to_p50(frames: Sequence[FrameRecord]) -> float:
-    """The 99th percentile of the times of `frames`, of their median: how much longer than usual the
-    longest take."""
+    """How much longer than usual the longest frames take: the 99th percentile over the median."""
     middle, last = np.percentile([frame.total_ns for frame in frames], (50, 99))
     return float(last / middle)
 
@@ -155,7 +154,7 @@ class MemoryMeter:
 
 
 def _reset_high_water_mark() -> bool:
-    """Let the peak resident memory of this process begin anew; False where the system cannot."""
+    """Reset the peak resident memory of this process; False where the system cannot."""
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:

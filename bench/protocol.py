@@ -1,4 +1,4 @@
-"""What counts as one fair measurement, as an object with a name that stands in every row."""
+"""The protocol: what one fair measurement is. Every row has its name."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from bench.types import BACKGROUNDS, Log, Scene, SteerbenchError, Unavailable
 class EvaluationProtocol:
     """How pictures are scored and how frames are timed; the defaults are `steerbench-1`.
 
-    A protocol that differs from the defaults needs a name of its own, so that rows of two
-    protocols are never taken for one.
+    A protocol that differs from the defaults needs a name of its own, so that its rows are never
+    mixed with those of another.
 
     Attributes:
         name: as it stands in result rows.
@@ -33,9 +33,9 @@ class EvaluationProtocol:
         warmup: frames rendered before the timed sequence, spread over the trajectory.
         memory: "steady": a method keeps its preceding frames along the trajectory; "cold": it is
             reset before every frame.
-        flicker: where the true pictures of two consecutive frames come from: "split": frames with
-            ground truth alone; "exact": at the others from the scene, where it knows its picture
-            at any camera, which takes it about half a second at 400 x 400.
+        flicker: where the true pictures of two consecutive frames come from: "split": only frames
+            with ground truth have one; "exact": the others get theirs from the scene, if it can
+            render its exact picture, in about half a second at 400 x 400.
     """
 
     name: str = "steerbench-1"
@@ -78,7 +78,7 @@ class EvaluationProtocol:
         return ("psnr", "ssim", *(f"lpips_{net}" for net in self.lpips))
 
     def check(self, scene: Scene, trajectory: Trajectory) -> None:
-        """Refuse, before any training, what could not be scored after it.
+        """Raise, before any training, if the frames could not be scored after it.
 
         Raises:
             SteerbenchError: the scene is composited on another background, or a frame is smaller
@@ -103,7 +103,7 @@ class EvaluationProtocol:
     def load_lpips(
         self, weights_dir: Path | None, log: Log
     ) -> tuple[dict[str, metrics.Lpips], dict[str, str]]:
-        """LPIPS by backbone, and by metric why one is missing; the log is told of the latter."""
+        """LPIPS by backbone, and by metric why one is missing, which is logged, too."""
         loaded, missing = {}, {}
         for net in self.lpips:
             try:

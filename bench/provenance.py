@@ -12,7 +12,7 @@ from pathlib import Path
 from bench.sources import ROOT
 
 CPU_MARKS = ("cpu family", "model", "CPU implementer", "CPU part")
-"""Of /proc/cpuinfo: names alone are shared by processors that compute differently."""
+"""Fields of /proc/cpuinfo: processors of one name may compute differently."""
 
 
 @functools.cache
@@ -45,7 +45,7 @@ def machine() -> dict[str, object]:
 
 
 def decisive() -> dict[str, object]:
-    """What of the machine can change a figure; the libraries are found by `bench.sources`."""
+    """The part of the machine that can change a figure; see `bench.sources` for its libraries."""
     found = machine()
     return {name: found[name] for name in ("cpu", "instructions", "gpus")}
 

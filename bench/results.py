@@ -29,7 +29,7 @@ from bench.errors import SteerbenchError, explained
 from bench.provenance import commit, machine
 
 SCHEMA_VERSION = 3
-"""Of record.json and rows.csv."""
+"""The version of record.json and rows.csv that is written."""
 
 READABLE = (2, SCHEMA_VERSION)
 """The versions that can be read; a folder of another one is reported and left alone.
@@ -42,9 +42,9 @@ COLUMNS = [
     *("device", "backend", "engine", "precision", "seed", "commit"),
 ]
 """`value` is a mean over `n` frames with its 95 % interval [lo, hi], or a single figure (n = 1,
-no interval); NaN with n = 0 is a figure that could not be had. `phase` says which frames: "steady",
-"cold" (a method that looks back had fewer frames to look back on than it can), or "all" for a
-figure of the whole run."""
+no interval); NaN with n = 0 is a figure that is not available. `phase` says which frames: "steady",
+"cold" (there were fewer frames before it than the method looks back on), or "all" for a figure of
+the whole run."""
 
 STEADY, COLD, WHOLE = "steady", "cold", "all"
 """The values of the column `phase`."""
@@ -63,7 +63,7 @@ def content_key(parts: Mapping[str, object]) -> str:
 
 @dataclass(frozen=True)
 class Measurement:
-    """What one run found out.
+    """The figures and pictures of one run.
 
     Attributes:
         rows: one metric per row, `COLUMNS` without `run` and `commit`.
@@ -190,7 +190,7 @@ class Store:
     def _sweep(self) -> None:
         """Delete what killed processes left behind; a day is longer than any writing takes.
 
-        What others publish or delete meanwhile is gone, and that is no reason to lose a run.
+        What other processes publish or delete meanwhile is ignored.
         """
         with suppress(OSError):
             for folder in self.folder.glob(f"{PARTIAL}*"):
@@ -205,7 +205,7 @@ class Store:
 
 
 def present_name(method: str) -> str:
-    """The name of today for what schema 2 calls `method`.
+    """The present name of what schema 2 calls `method`.
 
     "steernerf" was the lean method and "steernerf_paper" the paper's; variants have a suffix.
     """
@@ -228,12 +228,12 @@ def _schema_version(folder: Path) -> object:
 
 
 def _text(path: Path) -> str:
-    """What a file holds; nothing where there is no such file."""
+    """The text of a file; empty where there is no such file."""
     return path.read_text(encoding="utf-8") if path.is_file() else ""
 
 
 def _sync(path: Path) -> None:
-    """Have the system write a file or folder to the disk now."""
+    """Write a file or folder to the disk now."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

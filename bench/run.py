@@ -6,7 +6,7 @@ Quality, time and memory of a run come from the same rendering of the same frame
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,38 +34,40 @@ UNITS = {
     "peak_bytes": "B",
     "train_s": "s",
 }
-"""By the name of a metric up to its first dot; what is not listed has none."""
+"""Units by the name of a metric up to its first dot; a metric that is not listed has none."""
 
 
-def measure(
-    method: Method,
-    scene: Scene,
-    trajectory: Trajectory,
-    protocol: EvaluationProtocol,
-    budget: Budget,
-    log: Log,
-    *,
-    seed: int,
-    weights_dir: Path | None = None,
-    pictures: int = 3,
-) -> Measurement:
-    """Fit `method` to `scene`, render `trajectory` under the clock and score it.
+@dataclass(frozen=True)
+class Task:
+    """What a method is measured on.
 
-    Args:
+    Attributes:
         seed: for the rows; the method was made with it.
         weights_dir: where to look first for the backbones of LPIPS.
-        pictures: how many frames, evenly spread, are kept as ground truth, rendering, error map.
+    """
+
+    scene: Scene
+    trajectory: Trajectory
+    protocol: EvaluationProtocol
+    budget: Budget
+    seed: int
+    weights_dir: Path | None = None
+
+
+def measure(method: Method, task: Task, log: Log) -> Measurement:
+    """Fit `method` to the scene of `task`, render its trajectory under the clock and score it.
 
     Raises:
         SteerbenchError: the scene does not suit the protocol, or the method rendered values that
             are not finite.
     """
-    lpips, missing = protocol.load_lpips(weights_dir, log)
+    scene, trajectory, protocol, budget = task.scene, task.trajectory, task.protocol, task.budget
+    lpips, missing = protocol.load_lpips(task.weights_dir, log)
     protocol.check(scene, trajectory)
     method.fit(scene, budget, log)
     meter = MemoryMeter(method.settings()["device"])
-    scoring = Scoring(scene, trajectory, protocol, lpips, pictures)
-    frames = _render(method, trajectory, protocol, scoring, meter, log)
+    scoring = Scoring(scene, trajectory, protocol, lpips)
+    frames = _render(method, task, scoring, meter, log)
     summary = [
         *_frame_rows(frames, protocol),
         *(_single(f"size_bytes.{part}", size) for part, size in method.sizes().items()),
@@ -82,7 +84,7 @@ def measure(
         resolution=trajectory.resolution,
         protocol=protocol.name,
         budget=budget.name,
-        seed=seed,
+        seed=task.seed,
         **method.settings(),
     )
     record: dict[str, Any] = {
@@ -97,46 +99,35 @@ def measure(
 
 
 def _render(
-    method: Method,
-    trajectory: Trajectory,
-    protocol: EvaluationProtocol,
-    scoring: Scoring,
-    meter: MemoryMeter,
-    log: Log,
+    method: Method, task: Task, scoring: Scoring, meter: MemoryMeter, log: Log
 ) -> pd.DataFrame:
     """Warm up, then render the sequence in its order; each frame is scored and let go."""
-    steps = trajectory.steps
-    phases = _phases(trajectory, method.memory, protocol)
+    steps, protocol = task.trajectory.steps, task.protocol
     clock = StageClock(method.settings()["device"])
-    warmup = [steps[index].camera for index in spread(len(steps), protocol.warmup)]
+    warmup = spread(len(steps), protocol.warmup)
     table: list[dict[str, Any]] = []
     with torch.no_grad(), log.progress("rendering", len(warmup) + len(steps)) as progress:
         method.reset()
-        for camera in warmup:
+        for index in warmup:
             with clock.frame():
-                method.render(camera, clock)
+                method.render(steps[index].camera, clock)
             progress.advance(note="warming up")
         method.reset()
-        for index, (step, phase) in enumerate(zip(steps, phases, strict=True)):
+        # Nobody announces a cut to the method, as nobody announces a jump who steers a camera.
+        for index, (step, before) in enumerate(zip(steps, task.trajectory.preceding, strict=True)):
             if protocol.memory == "cold":
                 method.reset()
+                before = 0
             with meter, clock.frame():
                 frame = method.render(step.camera, clock)
             check_frame(frame, step.camera, method.name, index)
+            phase = COLD if before < method.memory else STEADY
             figures = {"frame": index, "phase": phase, "peak_bytes": meter.last_bytes}
             figures |= _times_and_work(clock.frames[-1])
             table.append(figures | scoring.score(index, step, frame.rgb))
-            progress.advance(note=_mean_psnr(table))
+            scores = [row["psnr"] for row in table if "psnr" in row]
+            progress.advance(note=f"{np.mean(scores):.2f} dB" if scores else "")
     return _frame_table(table, protocol)
-
-
-def _phases(trajectory: Trajectory, memory: int, protocol: EvaluationProtocol) -> list[str]:
-    """Of each frame: cold while fewer than `memory` were rendered since the last reset or cut.
-
-    The method is not told of a cut: whoever steers a camera does not announce a jump either.
-    """
-    known = trajectory.preceding if protocol.memory == "steady" else [0] * len(trajectory.steps)
-    return [COLD if count < memory else STEADY for count in known]
 
 
 def _times_and_work(record: FrameRecord) -> dict[str, Any]:
@@ -150,7 +141,7 @@ def _times_and_work(record: FrameRecord) -> dict[str, Any]:
 
 
 def _frame_table(table: list[dict[str, Any]], protocol: EvaluationProtocol) -> pd.DataFrame:
-    """One row per frame: a stage or counter a frame never touched is 0, a score it lacks NaN."""
+    """One row per frame: a stage or counter that a frame did not have is 0, a score NaN."""
     frames = pd.DataFrame(table)
     touched = [name for name in map(str, frames) if name.startswith(("stage_ms.", "work."))]
     touched.sort(key=lambda name: (name.startswith("work."), name == "stage_ms.other"))
@@ -160,29 +151,28 @@ def _frame_table(table: list[dict[str, Any]], protocol: EvaluationProtocol) -> p
 
 
 def _frame_rows(frames: pd.DataFrame, protocol: EvaluationProtocol) -> list[dict[str, Any]]:
-    """The rows of the steady frames, then those of the cold ones, of whichever there are."""
-    return [
-        row | {"phase": phase}
-        for phase in (STEADY, COLD)
-        if (frames["phase"] == phase).any()
-        for row in _rows_of_phase(frames[frames["phase"] == phase], protocol)
-    ]
+    """Mean and interval of every column, quantiles of the frame time, frames a second.
 
-
-def _rows_of_phase(frames: pd.DataFrame, protocol: EvaluationProtocol) -> list[dict[str, Any]]:
-    """Mean and interval of every column, quantiles of the frame time, frames a second."""
-    scores = [*protocol.metric_names, *(["flicker"] if frames["flicker"].notna().any() else [])]
-    ms = _mean("frame_ms", frames["frame_ms"])
-    quantiles = [
-        _single(f"frame_ms.p{percent}", np.percentile(frames["frame_ms"], percent))
-        for percent in QUANTILES
-    ]
-    parts = [name for name in map(str, frames) if name.startswith(("stage_ms.", "work."))]
-    return [
-        *(_mean(name, frames[name]) for name in scores),
-        *(ms, *quantiles, {"metric": "fps", "n": ms["n"]} | _rate(ms)),
-        *(_mean(name, frames[name]) for name in parts),
-    ]
+    First those of the steady frames, then those of the cold ones, where there are any.
+    """
+    rows: list[dict[str, Any]] = []
+    for phase in (STEADY, COLD):
+        of_phase = frames[frames["phase"] == phase]
+        if of_phase.empty:
+            continue
+        blink = ["flicker"] if of_phase["flicker"].notna().any() else []
+        parts = [name for name in map(str, frames) if name.startswith(("stage_ms.", "work."))]
+        times = of_phase["frame_ms"]
+        ms = _mean("frame_ms", times)
+        found = [
+            *(_mean(name, of_phase[name]) for name in (*protocol.metric_names, *blink)),
+            ms,
+            *(_single(f"frame_ms.p{part}", np.percentile(times, part)) for part in QUANTILES),
+            {"metric": "fps", "n": ms["n"]} | _rate(ms),
+            *(_mean(name, of_phase[name]) for name in parts),
+        ]
+        rows += [row | {"phase": phase} for row in found]
+    return rows
 
 
 def _mean(metric: str, values: pd.Series) -> dict[str, Any]:
@@ -194,13 +184,8 @@ def _mean(metric: str, values: pd.Series) -> dict[str, Any]:
     known = values.dropna().to_numpy(dtype=float)
     value = known.mean() if len(known) else math.nan
     half = half_interval(known)
-    return {
-        "metric": metric,
-        "value": value,
-        "n": len(known),
-        "lo": value - half,
-        "hi": value + half,
-    }
+    figures = {"value": value, "n": len(known), "lo": value - half, "hi": value + half}
+    return {"metric": metric} | figures
 
 
 def half_interval(values: np.ndarray) -> float:
@@ -219,11 +204,6 @@ def _rate(ms: dict) -> dict[str, float]:
 
 
 def _single(metric: str, value: float) -> dict[str, Any]:
-    """A single figure, of the whole run unless it is given another phase."""
+    """A row of a single figure, of the whole run unless its phase is replaced."""
     row = {"metric": metric, "value": float(value), "n": 1, "lo": math.nan, "hi": math.nan}
     return row | {"phase": WHOLE}
-
-
-def _mean_psnr(table: list[dict[str, Any]]) -> str:
-    scores = [row["psnr"] for row in table if "psnr" in row]
-    return f"{np.mean(scores):.2f} dB" if scores else ""

@@ -1,4 +1,4 @@
-"""Scores of a sequence of frames, taken one after another so that none has to be kept."""
+"""Scores a sequence of frames one after another, so that none has to be kept."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from bench.protocol import EvaluationProtocol, composite
 from bench.trajectories import Step, Trajectory, spread
 from bench.types import Camera, Frame, Scene, SteerbenchError, check_shape
 
+PICTURES = 3
+
 ERROR_RANGE = 0.1
 """Absolute error, mean over the channels, that the brightest colour of an error map stands for."""
 
 
 def check_frame(frame: Frame, camera: Camera, method: str, index: int) -> None:
-    """Refuse a picture with a NaN in it: it has no score, and a table may not invent one.
+    """Raise if a picture has a NaN in it: it has no score, and a table may not invent one.
 
     Raises:
         ValueError: the picture is not of the size of `camera`.
@@ -37,10 +39,10 @@ def check_frame(frame: Frame, camera: Camera, method: str, index: int) -> None:
 
 
 class Scoring:
-    """Scores the frames of a trajectory in their order; remembers the last one for its flicker.
+    """Scores the frames of a trajectory in their order; keeps the last one for the flicker.
 
     Attributes:
-        images: of `pictures` scored frames, evenly spread: ground truth, rendering and error map
+        images: of `PICTURES` scored frames, evenly spread: ground truth, rendering and error map
             as 8-bit pictures by file name; filled as the frames come.
     """
 
@@ -50,13 +52,12 @@ class Scoring:
         trajectory: Trajectory,
         protocol: EvaluationProtocol,
         lpips: Mapping[str, Lpips],
-        pictures: int,
     ) -> None:
         self.images: dict[str, np.ndarray] = {}
         self._scene, self._protocol, self._lpips = scene, protocol, lpips
         self._split = scene.splits[trajectory.split]
         scored = [index for index, step in enumerate(trajectory.steps) if step.truth is not None]
-        self._shown = {scored[i] for i in spread(len(scored), pictures)}
+        self._shown = {scored[i] for i in spread(len(scored), PICTURES)}
         self._last: tuple[Tensor, Tensor] | None = None
 
     def score(self, index: int, step: Step, rgb: Tensor) -> dict[str, Any]:

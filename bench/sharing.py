@@ -1,6 +1,6 @@
 """Files that several processes share, also of other users and machines: whole, and made once.
 
-A lock ends with the process that has it, however that ends.
+A lock ends with the process that holds it, however that ends.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from bench.types import Log
 def whole(path: Path) -> Iterator[Path]:
     """A file beside `path` to write, which becomes `path` when the body ends without an exception.
 
-    Its name is nobody else's, and ends as `path` does.
+    Its name is unique, and ends as `path` does.
     """
     new = path.with_name(f".{path.stem}-{uuid.uuid4().hex}{path.suffix}")
     try:
@@ -32,10 +32,10 @@ def whole(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def locked(path: Path, waiting: str, log: Log) -> Iterator[None]:
-    """Have the file `path`, made if missing and never removed, alone among all processes.
+    """Hold the lock file `path`, made if missing and never removed, alone among all processes.
 
-    The log is told `waiting` when somebody else has it, and where the file system has no locks: the
-    work is then done all the same, at worst twice.
+    `waiting` is logged while another process holds it. Where the file system has no locks, that is
+    logged, and the work is done all the same, at worst twice.
 
     Raises:
         SteerbenchError: `path` cannot be opened for writing.
@@ -54,7 +54,7 @@ def locked(path: Path, waiting: str, log: Log) -> Iterator[None]:
 
 @contextmanager
 def missing(path: Path, log: Log) -> Iterator[bool]:
-    """Whether `path` is still to be made: the body does so, and nobody else meanwhile.
+    """Whether `path` is still to be made: the body makes it, and no other process meanwhile.
 
     Raises:
         SteerbenchError: the folder of `path` cannot be written to.

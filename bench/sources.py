@@ -1,7 +1,7 @@
 """Which files and libraries decide what a class or a function computes, found from the imports.
 
 A cache key holds the digest of these files, so that a change in any of them, and in no other file,
-asks for new results. Nobody keeps a list of files by hand.
+makes new results necessary. No list of files is kept by hand.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import ast
 import hashlib
 import importlib.util
 import sys
-from collections.abc import Iterator
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -120,15 +119,13 @@ def _imports(path: Path) -> tuple[str, ...]:
 
 @cache
 def _parsed(path: Path, changed: int) -> tuple[str, ...]:
-    return tuple(_imported(ast.parse(path.read_bytes())))
-
-
-def _imported(tree: ast.AST) -> Iterator[str]:
-    for node in ast.walk(tree):
+    names: list[str] = []
+    for node in ast.walk(ast.parse(path.read_bytes())):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            names += (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            names += (f"{node.module}.{alias.name}" for alias in node.names)
+    return tuple(names)
 
 
 @cache

@@ -1,4 +1,4 @@
-"""How many threads torch has for an operation."""
+"""Sets how many threads torch uses for an operation."""
 
 from __future__ import annotations
 

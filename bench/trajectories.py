@@ -57,7 +57,7 @@ class Trajectory:
 
     @property
     def preceding(self) -> list[int]:
-        """Of each step, how many there were before it since the last cut."""
+        """For each step, the number of steps before it since the last cut."""
         counts: list[int] = []
         for step in self.steps:
             counts.append(counts[-1] + 1 if counts and not step.cut else 0)

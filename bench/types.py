@@ -39,11 +39,11 @@ EMPTY_ALPHA = 1e-3
 """Opacity below which a pixel is empty: its depth is +inf and it is never unprojected."""
 
 BACKGROUNDS = {"white": 1.0, "black": 0.0}
-"""What a scene may be composited on, by name: every channel of `Scene.background`."""
+"""Backgrounds by name: the value of every channel of `Scene.background`."""
 
 
 DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?")
-"""How a device is named; auto: the GPU where there is one."""
+"""Names of devices; auto is the GPU where there is one."""
 
 
 def check_shape(name: str, value: Tensor, *shape: int | None) -> None:
@@ -138,7 +138,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Budget:
-    """How much work a training may do. Counted in steps, never in seconds, so that it repeats.
+    """How much work a training may do: counted in steps, not seconds, so that it is repeatable.
 
     Attributes:
         name: as it stands in result rows.
@@ -162,10 +162,10 @@ class Budget:
 
 
 class Log(Protocol):
-    """What a training talks to: messages, progress with the time left, and its stage folders."""
+    """The log of a training: messages, progress with the time left, and folders of its stages."""
 
     def info(self, message: str) -> None:
-        """Say one line to the person at the terminal."""
+        """Show one line to the user."""
 
     def progress(self, label: str, total: int) -> AbstractContextManager[Progress]:
         """A progress bar with the time left, for work of `total` steps."""
@@ -182,7 +182,7 @@ class Progress(Protocol):
 
 
 class Probe(Protocol):
-    """Owns every clock and counter of a measurement; handed down to what is measured."""
+    """Owns every clock and counter of a measurement; a method gets it with every frame."""
 
     def stage(self, name: str) -> AbstractContextManager[None]:
         """Time a stage. Synchronises the device; a stage may be entered many times a frame."""
@@ -197,8 +197,8 @@ class Method(Protocol):
     Attributes:
         name: as it stands in result rows.
         train_s: seconds the training took, over all the processes it was continued in; `fit`
-            knows it also when it only loads.
-        memory: preceding frames it looks back on; 0: every frame stands alone.
+            sets it even when it only loads.
+        memory: preceding frames that it uses; 0: every frame is rendered independently.
     """
 
     name: str

@@ -1,21 +1,24 @@
-"""All checks of the methods: the `cases.py` and `experiments.py` of their folders."""
+"""All checks: the `cases.py` and `experiments.py` of the folders."""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-HERE = Path(__file__).parent
+ROOT = Path(__file__).parent.parent
 
 
 def found(name: str) -> list[Any]:
-    """What the function `name` of every module `name` below this folder returns, in one list."""
-    return [check for module in _modules(name) for check in getattr(module, name)()]
+    """The results of the function `name` of all modules `name` of bench and methods, in one list.
 
-
-def _modules(name: str) -> Iterator[Any]:
-    for path in sorted(HERE.rglob(f"{name}.py")):
-        folder = ".".join(path.parent.relative_to(HERE.parent).parts)
-        yield importlib.import_module(f"{folder}.{name}")
+    Args:
+        name: "cases" or "experiments".
+    """
+    paths = sorted(
+        path for top in ("bench", "methods") for path in (ROOT / top).rglob(f"{name}.py")
+    )
+    modules = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in paths]
+    return [
+        check for module in modules for check in getattr(importlib.import_module(module), name)()
+    ]

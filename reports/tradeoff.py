@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -35,20 +36,11 @@ ON_FRONTIER = "— (frontier)"
 def experiment_table(rows: Sequence[Row]) -> Table:
     """Every setting of every experiment; the first line of an experiment has its observed order."""
     lines = []
-    subject = None
-    for row in rows:
-        begins = row["subject"] != subject
-        subject = row["subject"]
-        lines.append(
-            (
-                subject if begins else "",
-                row["knob"] if begins else "",
-                _setting(row["setting"]),
-                f"{row['error']:.1e}",
-                decimal(row["ms"], 2),
-                _order(row) if begins else "",
-            )
-        )
+    for subject, some in groupby(rows, lambda row: row["subject"]):
+        for number, row in enumerate(some):
+            first = (subject, row["knob"], _order(row)) if number == 0 else ("", "", "")
+            figures = (_setting(row["setting"]), f"{row['error']:.1e}", decimal(row["ms"], 2))
+            lines.append((*first[:2], *figures, first[2]))
     title = "Kernels: run time against error, where the exact answer is known"
     return Table(title, EXPERIMENTS, tuple(lines))
 

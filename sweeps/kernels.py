@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from bench.checking import timed_rows
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from reports.tables import Table
@@ -20,11 +21,15 @@ COLUMNS = ("kernel", "case", "backend", "dtype", "error", "tolerance", "ms", "M 
 
 def main(options: argparse.Namespace) -> int:
     """Print a table and, as the last line, the same rows as JSON; 1 if any kernel is wrong."""
-    from methods.kernels.benchmark import main_rows
+    import torch
 
-    log = ConsoleLog(Path())
+    from methods.checks import found
+    from methods.kernels import compiled
+
+    log, device = ConsoleLog(Path()), "cuda" if torch.cuda.is_available() else "cpu"
+    cases = [case for case in found("cases") if options.filter in case.subject]
     with device_lock("auto", log):
-        rows = main_rows(options.filter, options.repeats, log)
+        rows = timed_rows(cases, device, compiled(device), options.repeats, log)
     if not rows:
         raise SteerbenchError(f"--filter: no kernel has {options.filter!r} in its name")
     console().print(rich_table(Table("Kernels", COLUMNS, tuple(_line(row) for row in rows))))
@@ -38,4 +43,5 @@ def _line(row: Mapping[str, Any]) -> tuple[str, ...]:
     errors = (error, f"{row['tolerance']:.1e}")
     if row["status"] != "ok":
         return (*labels, *errors, row["status"], "", "")
-    return (*labels, *errors, f"{row['ms']:.2f}", f"{row['mitems_s']:.2f}", f"{row['ratio']:.1f}x")
+    ratio = f"{row['ratio']:.1f}x" if "ratio" in row else ""
+    return (*labels, *errors, f"{row['ms']:.2f}", f"{row['mitems_s']:.2f}", ratio)

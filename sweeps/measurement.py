@@ -19,7 +19,7 @@ from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
 from bench.provenance import decisive
 from bench.results import Store
-from bench.run import measure
+from bench.run import Task, measure
 from bench.sources import digest, libraries
 from bench.types import DEVICE, Method, Scene
 from reports.page import write_page
@@ -106,16 +106,8 @@ def _obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
     with device_lock(method.settings()["device"], log):
         if store.find(run) is not None:  # measured by the process that had the lock before
             return Obtained(store, run, measured=False)
-        measurement = measure(
-            method,
-            scene,
-            trajectory,
-            protocol,
-            budget,
-            log,
-            seed=settings.seed,
-            weights_dir=weights,
-        )
+        task = Task(scene, trajectory, protocol, budget, settings.seed, weights)
+        measurement = measure(method, task, log)
     record = {**measurement.record, "command": shlex.join(command)}
     record["scene_path"] = _folder(config)
     store.save(parts, replace(measurement, record=record))

@@ -19,6 +19,7 @@ RENAMED = {
     "method.pipeline.steps": "method.model.step, or method.rendering.step after the training",
     "method.pipeline.stop": "method.model.stop, or method.rendering.stop after the training",
     "method.pipeline.refined_steps": "method.rendering.refined_step",
+    "method.joint.doubt": "method.joint.error_weight",
 }
 RENAMED |= {
     f"method.pipeline.{name}": f"method.{part}.{name}"

@@ -1,4 +1,4 @@
-"""`steerbench stress`: what must hold where numbers are extreme, and whether it does."""
+"""`steerbench stress`: runs all cases, by every backend, engine and precision."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from bench.checking import failed, run_cases
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
-from bench.stress import failed, run_cases
 from reports.tables import Table
 from sweeps.terminal import console, rich_table
 
@@ -38,16 +38,16 @@ CASE_COLUMNS = (
     "status",
     "the tolerance",
 )
-"""A line a case: the cell that comes nearest to its tolerance stands for all."""
+"""A line a case, with the figures of the cell that is nearest to its tolerance."""
 
 
 def main(options: argparse.Namespace) -> int:
     """Print a table and, as the last line, the same rows as JSON; 1 if anything fails."""
     import torch
 
-    from methods.stress import all_cases
+    from methods.checks import found
 
-    cases = [c for c in all_cases() if options.filter in f"{c.subject}, {c.name}"]
+    cases = [c for c in found("cases") if options.filter in f"{c.subject}, {c.name}"]
     if not cases:
         raise SteerbenchError(f"--filter: no subject or case has {options.filter!r} in it")
     devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
@@ -79,7 +79,7 @@ def _end(row: Mapping[str, Any]) -> tuple[str, str, str]:
 
 
 def _case_lines(rows: Iterable[Mapping[str, Any]]) -> Iterator[tuple[str, ...]]:
-    """A line a case: of its cells the one that is nearest to its tolerance, or beyond it."""
+    """A line a case, with the cell that is nearest to its tolerance, or beyond it."""
     for (subject, case), cells in groupby(rows, key=lambda row: (row["subject"], row["case"])):
         those = list(cells)
         worst = max(those, key=_nearness)

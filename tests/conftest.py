@@ -21,7 +21,7 @@ from bench.lpips_weights import BACKBONES
 from bench.metrics import _lpips_package
 from bench.protocol import EvaluationProtocol
 from bench.results import Store
-from bench.run import measure
+from bench.run import Task, measure
 from bench.trajectories import from_split
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene, Split
 
@@ -29,10 +29,10 @@ hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=Tr
 hypothesis.settings.register_profile("fuzz", max_examples=10_000, deadline=5000)  # ms; no hang
 hypothesis.settings.load_profile("repeatable")
 
-# A shell has what it starts in the background ignore SIGINT, and so all that is started from there.
+# A shell makes its background processes, and all that they start, ignore SIGINT.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# Before anything imports Triton, which looks at it once.
+# Set before anything imports Triton, which reads it once.
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"
 
@@ -56,7 +56,7 @@ def poisoned_empty() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def own_turns(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Tests wait for no measurement on this machine, and hold up none."""
+    """Tests wait for no measurement on this machine, and no measurement waits for them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("STEERBENCH_LOCKS", str(tmp_path_factory.mktemp("locks")))
         yield
@@ -114,7 +114,7 @@ def _orbit(turn: float) -> Camera:
 
 
 class OffsetMethod:
-    """Renders the ground truth of the camera plus `offset`; `calls` lists what it was asked."""
+    """Renders the ground truth of the camera plus `offset`; `calls` lists the calls it got."""
 
     name = "offset"
     train_s = 0.0
@@ -165,7 +165,7 @@ def _on_white(image: Tensor) -> Tensor:
 
 @pytest.fixture
 def offset_method(device: str) -> OffsetMethod:
-    """A method whose every figure is known: 8 levels brighter than the ground truth."""
+    """A method with known figures: its pictures are 8 levels brighter than the ground truth."""
     return OffsetMethod(device, 8 / 255)
 
 
@@ -188,15 +188,10 @@ def lpips_weights(shared_data: Path | None, tmp_path_factory: pytest.TempPathFac
 @pytest.fixture
 def store(tmp_path: Path, offset_method, tiny_scene, quiet_log) -> Store:
     """A store with one run, key `stored_run`, six frames, three of them pictured."""
-    measurement = measure(
-        offset_method,
-        tiny_scene,
-        from_split(tiny_scene),
-        EvaluationProtocol(name="quick", lpips=()),
-        Budget("none", steps=1, samples=1),
-        quiet_log,
-        seed=5,
-    )
+    protocol = EvaluationProtocol(name="quick", lpips=())
+    budget = Budget("none", steps=1, samples=1)
+    task = Task(tiny_scene, from_split(tiny_scene), protocol, budget, seed=5)
+    measurement = measure(offset_method, task, quiet_log)
     record = {
         **measurement.record,
         "command": "steerbench run method=offset",

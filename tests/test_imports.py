@@ -17,10 +17,10 @@ MAY_IMPORT = {
     "sweeps": {"bench", "reports", "sweeps"},
 }
 REACHES = {
-    "sweeps/accuracy.py": "methods.accuracy.",
-    "sweeps/kernels.py": "methods.kernels.",
+    "sweeps/accuracy.py": "methods.checks.",
+    "sweeps/kernels.py": ("methods.checks.", "methods.kernels."),
     "sweeps/catalogue.py": "methods.kernels.",
-    "sweeps/stress.py": "methods.stress.",
+    "sweeps/stress.py": "methods.checks.",
 }
 """What measures and lists parts of methods reaches them directly; methods only through
 `_target_`."""

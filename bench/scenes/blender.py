@@ -11,9 +11,8 @@ from bench.scenes.files import (
     focal_length,
     frames_of,
     inside,
-    opengl_to_opencv,
+    opengl_pose,
     read_json,
-    rigid_pose,
     unexpected,
 )
 from bench.scenes.images import Picture, View, image_size
@@ -47,20 +46,13 @@ def load(
     Raises SteerbenchError naming file and field when anything is not as it should be.
     """
     root = data_folder(path)
-    views = {}
-    for split in ("train", "val", "test"):
-        found = read_split(root, split, log)
-        if found:
-            views[split] = found
+    found = {split: read_split(root, split, log) for split in ("train", "val", "test")}
+    views = {split: of_split for split, of_split in found.items() if of_split}
     pictures = decode_splits(views, downscale, log)
-    return assemble(
-        name or root.name,
-        views,
-        pictures,
-        scene_box(bounds, pictures["train"], log),
-        background=background,
-        camera_files=[root / camera_file(split) for split in views],
-    )
+    box = scene_box(bounds, pictures["train"], log)
+    files = [root / camera_file(split) for split in views]
+    name = name or root.name
+    return assemble(name, views, pictures, box, background=background, camera_files=files)
 
 
 def camera_file(split: str) -> str:
@@ -76,26 +68,21 @@ def read_split(root: Path, split: str, log: Log) -> list[View]:
         return []
     record = read_json(root, path.name)
     frames = frames_of(record, path)
-    fields = [f"{path}: frames[{i}]" for i in range(len(frames))]
-    files = [
-        picture_path(root, frame["file_path"], f"{field}.file_path")
-        for frame, field in zip(frames, fields, strict=True)
+    files = [picture_path(root, frame["file_path"], f"{at}.file_path") for at, frame in frames]
+    missing = [
+        (at, file) for (at, _), file in zip(frames, files, strict=True) if not file.is_file()
     ]
-    missing = [i for i, file in enumerate(files) if not file.is_file()]
     if optional and len(missing) == len(files):
         log.info(f"{path.name}: none of its {len(files)} pictures are there, split left out")
         return []
     if missing:
-        raise unexpected(
-            f"{fields[missing[0]]}.file_path", "a picture", f"no file {files[missing[0]]}"
-        )
+        at, file = missing[0]
+        raise unexpected(f"{at}.file_path", "a picture", f"no file {file}")
     width, height = image_size(files[0])
     focal = focal_length(record.get("camera_angle_x"), width, f"{path}: camera_angle_x")
     views = []
-    for frame, field, file in zip(frames, fields, files, strict=True):
-        pose = opengl_to_opencv(
-            rigid_pose(frame.get("transform_matrix"), f"{field}.transform_matrix")
-        )
+    for (at, frame), file in zip(frames, files, strict=True):
+        pose = opengl_pose(frame, at)
         camera = Camera(pose, focal, focal, width / 2, height / 2, width, height)
         views.append(View(str(file.relative_to(root)), file, camera))
     return views
@@ -108,7 +95,7 @@ def picture_path(root: Path, file_path: str, where: str) -> Path:
 
 
 def scene_box(bounds: str | list, train: list[Picture], log: Log) -> Box:
-    """The box in the data set's units that `bounds` asks for."""
+    """The box in the data set's units that `bounds`, as of `load`, means."""
     space = cube(HALF_EXTENT)
     if bounds == "full":
         return space
@@ -116,7 +103,6 @@ def scene_box(bounds: str | list, train: list[Picture], log: Log) -> Box:
         return parse_box(bounds)
     hull = hull_box([p.camera for p in train], [p.image for p in train], space)
     if hull is None:
-        log.info(
-            f"bounds: the training pictures hold no masks, taking [-{HALF_EXTENT}, {HALF_EXTENT}]^3"
-        )
+        taken = f"[-{HALF_EXTENT}, {HALF_EXTENT}]^3"
+        log.info(f"bounds: the training pictures hold no masks, taking {taken}")
     return hull or space

@@ -47,7 +47,7 @@ class Box:
 
 
 def cube(half: float) -> Box:
-    """[-half, half]^3."""
+    """The box [-half, half]^3."""
     return Box(torch.full((3,), -half).double(), torch.full((3,), half).double())
 
 
@@ -91,7 +91,7 @@ def hull_box(cameras: Sequence[Camera], images: Sequence[Tensor], space: Box) ->
 
 
 def maybe_seen(camera: Camera, mask: Tensor, corners: Tensor) -> Tensor:
-    """[M] bool: may a cell of `corners` [M, 8, 3] hold something that `mask` [H, W] shows?"""
+    """[M] bool: whether a cell of `corners` [M, 8, 3] may hold what `mask` [H, W] shows."""
     pixels, depth = project(camera, corners.reshape(-1, 3))
     pixels, depth = pixels.reshape(-1, 8, 2), depth.reshape(-1, 8)
     first = pixels.amin(1).floor() - 1

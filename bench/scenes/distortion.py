@@ -1,4 +1,4 @@
-"""Undoing a lens: the picture a pinhole with the same intrinsics would have taken."""
+"""Undoes a lens distortion: gives the picture of a pinhole with the same intrinsics."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def undistort(
 def pinhole_window(
     width: int, height: int, intrinsics: tuple[float, ...], coefficients: tuple[float, ...]
 ) -> tuple[Tensor, int, int]:
-    """Where in the distorted picture the pixels of the pinhole's lie, for those that lie in it.
+    """Where the pinhole's pixels lie in the distorted picture, for those that lie inside.
 
     Returns [h, w, 2] as (u, v), and the column and row of its first pixel.
     """

@@ -1,4 +1,4 @@
-"""Reading a data set's files: nothing outside its folder, and every fault named.
+"""Reads the files of a data set: nothing outside its folder, and every error names its place.
 
 A `where` is what an error message starts with: the file, and the field inside it.
 """
@@ -17,7 +17,7 @@ from torch import Tensor
 from bench.types import SteerbenchError
 
 SMALLEST_ANGLE = 1e-9
-"""Of a view, in radians: less than any telescope's, and its tangent is not 0."""
+"""Smallest angle of view in radians: less than any telescope's, and its tangent is not 0."""
 
 ORTHONORMAL_TOLERANCE = 1e-3
 """Largest entry of R^T R - I: poses are stored with three digits or more."""
@@ -74,18 +74,18 @@ def read_json(root: Path, relative: str) -> dict:
     return value
 
 
-def frames_of(record: Mapping, path: Path) -> list[dict]:
-    """The frame list of a `transforms*.json`: not empty, every frame an object with a path."""
+def frames_of(record: Mapping, path: Path) -> list[tuple[str, dict]]:
+    """The frames of a `transforms*.json`, not empty, each an object with a path after its place."""
     frames = record.get("frames")
     if not isinstance(frames, list) or not frames:
         raise unexpected(f"{path}: frames", "a list with at least one frame", describe(frames))
-    for index, frame in enumerate(frames):
-        where = f"{path}: frames[{index}]"
+    named = [(f"{path}: frames[{index}]", frame) for index, frame in enumerate(frames)]
+    for where, frame in named:
         if not isinstance(frame, dict):
             raise unexpected(where, "an object", describe(frame))
         if not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
             raise unexpected(f"{where}.file_path", "a path", describe(frame.get("file_path")))
-    return frames
+    return named
 
 
 def number(value: object, where: str, low: float = -math.inf, high: float = math.inf) -> float:
@@ -96,13 +96,12 @@ def number(value: object, where: str, low: float = -math.inf, high: float = math
         if fits:
             return float(value)
     limits = [f"above {low:g}"] * (low > -math.inf) + [f"below {high:g}"] * (high < math.inf)
-    raise unexpected(
-        where, " ".join(("a finite number", " and ".join(limits))).rstrip(), describe(value)
-    )
+    expected = f"a finite number {' and '.join(limits)}".rstrip()
+    raise unexpected(where, expected, describe(value))
 
 
 def focal_length(angle: object, size: float, where: str) -> float:
-    """In pixels, of a view of `angle` radians across `size` pixels."""
+    """Focal length in pixels of a view of `angle` radians across `size` pixels."""
     return size / 2 / math.tan(number(angle, where, SMALLEST_ANGLE, math.pi) / 2)
 
 
@@ -142,6 +141,12 @@ def rigid_pose(value: object, where: str) -> Tensor:
     if torch.linalg.det(rotation) < 0:
         raise unexpected(where, "a right-handed rotation", "a mirrored one")
     return matrix
+
+
+def opengl_pose(frame: Mapping, where: str) -> Tensor:
+    """The `transform_matrix` of a frame of a `transforms*.json`, as `rigid_pose`, OpenCV axes."""
+    matrix = rigid_pose(frame.get("transform_matrix"), f"{where}.transform_matrix")
+    return opengl_to_opencv(matrix)
 
 
 def opengl_to_opencv(pose: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Is a copy of NeRF-Synthetic the official one? Compared with the release's SHA-256 list."""
+"""Compares a copy of NeRF-Synthetic with the SHA-256 list of the release."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LIST = Path(__file__).with_name("nerf_synthetic.sha256.txt")
 
 @dataclass(frozen=True)
 class VerifyReport:
-    """What became of each file, by its path in the release.
+    """The result of a check: files by their path in the release.
 
     Attributes:
         ok: there, with the official content.
@@ -32,7 +32,7 @@ class VerifyReport:
 
     @property
     def passed(self) -> bool:
-        """Nothing that is there differs; what is missing was perhaps never copied."""
+        """Whether no file differs; files that are missing were perhaps never copied."""
         return bool(self.ok) and not self.wrong
 
     def __str__(self) -> str:
@@ -41,19 +41,17 @@ class VerifyReport:
 
 
 def verify(path: str | Path, log: Log) -> VerifyReport:
-    """Check the whole release or one scene of it, told by the names inside.
+    """Check the whole release, or one scene of it, as the names of the folders say.
 
     Raises SteerbenchError when `path` does not look like either.
     """
-    root = data_folder(path)
-    official = official_hashes()
-    scenes = {name.split("/")[0] for name in official}
+    root, expected = data_folder(path), official_hashes()
+    scenes = {name.split("/")[0] for name in expected}
     if any((root / scene).is_dir() for scene in scenes):
         base = root
-        expected = official
     elif root.name in scenes:
         base = root.parent
-        expected = {k: v for k, v in official.items() if k.split("/")[0] == root.name}
+        expected = {k: v for k, v in expected.items() if k.split("/")[0] == root.name}
     else:
         expected_text = f"NeRF-Synthetic: a folder {' or '.join(sorted(scenes))}, or one above"
         raise unexpected(root, expected_text, "none of these names")
@@ -80,7 +78,7 @@ def official_hashes() -> dict[str, str]:
 
 
 def sha256(path: Path) -> str | None:
-    """Of a file's content; None when it cannot be read."""
+    """SHA-256 of a file's content; None when it cannot be read."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()

@@ -40,20 +40,15 @@ class Cloud:
     def boxes(self) -> Tensor:
         """Corners of a box around each ball, [P, 8, 3]."""
         signs = torch.cartesian_prod(*(torch.tensor((-1.0, 1.0)),) * 3)
-        centres = torch.tensor([ball.centre for ball in self.balls])
-        return (
-            centres[:, None]
-            + signs * torch.tensor([ball.radius for ball in self.balls])[:, None, None]
-        )
+        centres = torch.tensor([ball.centre for ball in self.balls])[:, None]
+        return centres + signs * torch.tensor([ball.radius for ball in self.balls])[:, None, None]
 
     def trace(self, band: Band, spans: Sequence[Span]) -> Traced:
-        """All balls in `spans` together, for the rays that meet one."""
+        """Integrate all balls in `spans` together, for the rays that meet one."""
         shape = (band.y.shape[0], *band.x.shape[1:])
         balls = [self.balls[number] for number, _, _ in spans]
-        axes = torch.eye(3, device=band.x.device)
-        directions = band.directions(axes, slice(None))
-        enter = band.x.new_zeros(len(balls), *shape)
-        leave = band.x.new_zeros(len(balls), *shape)
+        directions = band.directions(torch.eye(3, device=band.x.device), slice(None))
+        enter, leave = band.x.new_zeros(2, len(balls), *shape)
         for k, ((_, first, last), ball) in enumerate(zip(spans, balls, strict=True)):
             columns = slice(first, last)
             origin = (band.origin - torch.tensor(ball.centre).to(band.origin)).tolist()
@@ -66,11 +61,7 @@ class Cloud:
         density = speed.new_tensor([ball.density for ball in balls])
         colour = speed.new_tensor([ball.colour for ball in balls])
         found = integrate(enter[:, met], leave[:, met], speed, density, colour)
-        rgb, alpha, depth = (
-            speed.new_zeros(*shape, 3),
-            speed.new_zeros(shape),
-            speed.new_zeros(shape),
-        )
+        rgb, (alpha, depth) = speed.new_zeros(*shape, 3), speed.new_zeros(2, *shape)
         rgb[met], alpha[met], depth[met] = found
         return Traced(rgb, alpha, depth)
 
@@ -88,21 +79,19 @@ def integrate(
     ends, order = torch.cat((enter, leave)).sort(dim=0)  # [2B, N]
     step = torch.cat((density, -density))
     emission = torch.cat((density[:, None] * colour, -density[:, None] * colour))
-    k = speed.new_zeros(speed.shape)
-    glow = speed.new_zeros(len(speed), 3)
-    transmittance, alpha, depth = torch.ones_like(k), torch.zeros_like(k), torch.zeros_like(k)
-    rgb = torch.zeros_like(glow)
+    k, alpha, depth = speed.new_zeros(3, len(speed))
+    glow, rgb = speed.new_zeros(2, len(speed), 3)
+    transmittance = torch.ones_like(k)
     for piece in range(len(ends) - 1):
         k = k + step[order[piece]]
         glow = glow + emission[order[piece]]
         # What is left of k outside all media is rounding: the thinnest medium is far above it.
-        inside = k > 1e-3 * density.min()
-        rate = torch.where(inside, k * speed, torch.ones_like(k))
-        x = torch.where(inside, rate * (ends[piece + 1] - ends[piece]), torch.zeros_like(k))
-        passed = torch.exp(-x)
-        absorbed = -torch.expm1(-x)
+        outside = ~(k > 1e-3 * density.min())
+        rate = (k * speed).masked_fill(outside, 1)
+        x = (rate * (ends[piece + 1] - ends[piece])).masked_fill(outside, 0)
+        passed, absorbed = torch.exp(-x), -torch.expm1(-x)
         weight = transmittance * absorbed
-        rgb = rgb + (weight / torch.where(inside, k, torch.ones_like(k)))[:, None] * glow
+        rgb = rgb + (weight / k.masked_fill(outside, 1))[:, None] * glow
         alpha = alpha + weight
         depth = depth + weight * ends[piece] + transmittance * (absorbed - x * passed) / rate
         transmittance = transmittance * passed

@@ -1,4 +1,4 @@
-"""A heap of random solids, another one for every variant: scenes to train on, as many as wanted.
+"""A heap of random solids, a different one for every variant: any number of scenes to train on.
 
 Big parts make a core; smaller ones and rods are put on their surfaces, half inside, so that parts
 touch, cross and hide one another. Everything follows from `random.Random(variant).random`, whose
@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from colorsys import hsv_to_rgb
 from typing import TypeVar
 
+from bench.scenes import textures
 from bench.scenes.opaque import Part, Solids
 from bench.scenes.solids import (
     Box,
@@ -24,21 +25,9 @@ from bench.scenes.solids import (
     Shape,
     Shifted,
     Triple,
+    ball,
 )
-from bench.scenes.textures import (
-    Colour,
-    Texture,
-    checker,
-    chevrons,
-    eye,
-    marble,
-    mottled,
-    pips,
-    plain,
-    polar_checker,
-    spiral,
-    wood,
-)
+from bench.scenes.textures import Colour, Texture
 
 Item = TypeVar("Item")
 
@@ -46,43 +35,43 @@ REACH = 1.2
 """All parts lie in the ball of this radius: in the models' cube, and in every picture."""
 
 CORE = 5
-"""Parts that the others are put on."""
+"""The number of parts that the others are put on."""
 
 FINEST = 0.016
 """Width of the finest stripes and dots: two pixels of a picture 400 wide."""
 
 
 class Draw:
-    """Random numbers from one stream."""
+    """Draws random numbers and choices from one stream."""
 
     def __init__(self, variant: int) -> None:
         self.share = random.Random(variant).random
 
     def between(self, low: float, high: float) -> float:
-        """Uniform."""
+        """A uniform number from `low` to `high`."""
         return low + (high - low) * self.share()
 
     def small(self, low: float, high: float) -> float:
-        """More often near `low` than near `high`."""
+        """A number from `low` to `high`, more often near `low`."""
         return low + (high - low) * self.share() ** 2
 
     def whole(self, low: int, high: int) -> int:
-        """From `low` to `high`, both included."""
+        """A whole number from `low` to `high`, both included."""
         return low + int((high + 1 - low) * self.share())
 
     def one(self, items: Sequence[Item]) -> Item:
-        """Any of them."""
+        """One of the items."""
         return items[self.whole(0, len(items) - 1)]
 
     def deck(self, items: Sequence[Item], count: int) -> list[Item]:
-        """`count` of them in random order; none comes again before all have come."""
+        """`count` of the items in random order; none is repeated before all were drawn."""
         drawn: list[Item] = []
         while len(drawn) < count:
             drawn += sorted(items, key=lambda _: self.share())
         return drawn[:count]
 
     def direction(self) -> Triple:
-        """Of length 1."""
+        """A vector of length 1."""
         x, y, z = (self.between(-1, 1) for _ in range(3))
         length = max(math.sqrt(x * x + y * y + z * z), 1e-3)
         return (x / length, y / length, z / length)
@@ -93,10 +82,10 @@ def medley(variant: int) -> Solids:
     draw = Draw(variant)
     more = draw.whole(8, 11)
     shapes = [
-        *(make(draw, draw.between(0.36, 0.56)) for make in draw.deck(BULKY, CORE)),
-        *(make(draw, draw.between(0.10, 0.36)) for make in draw.deck(SMALLER, more)),
+        *(SHAPES[kind](draw, draw.between(0.36, 0.56)) for kind in draw.deck(BULKY, CORE)),
+        *(SHAPES[kind](draw, draw.between(0.10, 0.36)) for kind in draw.deck(SMALLER, more)),
     ]
-    painters = [*draw.deck(PATTERNS, CORE), *draw.deck((*PATTERNS, one_colour, gaze), more)]
+    painters = [*draw.deck(PATTERNS, CORE), *draw.deck(PAINTERS, more)]
     colours = palette(draw)
     parts: list[Part] = []
     for shape, paint in zip(shapes, painters, strict=True):
@@ -114,7 +103,7 @@ def medley(variant: int) -> Solids:
 
 
 def place(draw: Draw, shape: Shape, core: Sequence[Part]) -> Triple:
-    """A centre: the middle for the first part, else near the surface of a part of the core.
+    """Draw the centre of a part: the middle for the first one, else near the surface of the core.
 
     The core surrounds its first part; the others are on the outer side of a part of the core.
     """
@@ -139,57 +128,26 @@ def place(draw: Draw, shape: Shape, core: Sequence[Part]) -> Triple:
 
 
 def dot(first: Sequence[float], second: Sequence[float]) -> float:
-    """Sum of the products."""
+    """The dot product."""
     return sum(a * b for a, b in zip(first, second, strict=True))
 
 
 def norm(vector: Triple) -> float:
-    """Its length."""
+    """The length of a vector."""
     return math.sqrt(dot(vector, vector))
 
 
 def scaled(vector: Sequence[float], factor: float) -> Triple:
-    """Each component times the factor."""
+    """A vector times a factor."""
     x, y, z = vector
-    return (x * factor, y * factor, z * factor)
-
-
-def ball(draw: Draw, size: float) -> Shape:
-    """A sphere."""
-    return Ellipsoid((size, size, size))
-
-
-def egg(draw: Draw, size: float) -> Shape:
-    """Three different semi-axes."""
-    return Ellipsoid((size, draw.between(0.5, 0.9) * size, draw.between(0.7, 1.4) * size))
-
-
-def block(draw: Draw, size: float) -> Shape:
-    """A box, none of its sides much shorter than another."""
-    x, y, z = (draw.between(0.55, 1.0) * size for _ in range(3))
-    return Box((x, y, z))
-
-
-def drum(draw: Draw, size: float) -> Shape:
-    """A cylinder about as high as wide."""
-    return Cylinder(draw.between(0.5, 0.9) * size, draw.between(0.4, 1.0) * size)
+    return x * factor, y * factor, z * factor
 
 
 def die(draw: Draw, size: float) -> Shape:
     """A box with its corners rounded by a ball."""
     half = 0.8 * size
     sides = (half, draw.between(0.8, 1.0) * half, draw.between(0.8, 1.0) * half)
-    return Common(Box(sides), Ellipsoid((1.1 * size,) * 3))
-
-
-def barrel(draw: Draw, size: float) -> Shape:
-    """A cylinder with rounded rims."""
-    return Common(Cylinder(0.75 * size, draw.between(0.5, 0.9) * size), Ellipsoid((size,) * 3))
-
-
-def plate(draw: Draw, size: float) -> Shape:
-    """A thin box."""
-    return Box((1.5 * size, draw.between(0.5, 1.3) * size, draw.between(0.015, 0.05)))
+    return Common(Box(sides), ball(1.1 * size))
 
 
 def beam(draw: Draw, size: float) -> Shape:
@@ -198,36 +156,16 @@ def beam(draw: Draw, size: float) -> Shape:
     return Box((thick, draw.between(0.6, 2.0) * thick, draw.between(0.35, 0.8)))
 
 
-def disc(draw: Draw, size: float) -> Shape:
-    """A flat cylinder."""
-    return Cylinder(1.4 * size, draw.between(0.012, 0.04))
-
-
-def petal(draw: Draw, size: float) -> Shape:
-    """A flat ellipsoid."""
-    return Ellipsoid((1.7 * size, draw.between(0.02, 0.05), draw.between(0.4, 0.9) * size))
-
-
-def pill(draw: Draw, size: float) -> Shape:
-    """A thick capsule."""
-    return Capsule(draw.between(0.3, 0.5) * size, size)
-
-
-def rod(draw: Draw, size: float) -> Shape:
-    """A capsule two to six pixels across in a picture 400 wide."""
-    return Capsule(draw.small(0.007, 0.024), draw.between(0.4, 0.95))
-
-
 def bowl(draw: Draw, size: float) -> Shape:
     """A ball with another one taken out of it."""
     size = 1.2 * size
-    bite = Ellipsoid((draw.between(0.75, 0.95) * size,) * 3)
-    return Carved(Ellipsoid((size,) * 3), [Shifted(bite, (0.0, 0.0, 0.5 * size))])
+    bite = ball(draw.between(0.75, 0.95) * size)
+    return Carved(ball(size), [Shifted(bite, (0.0, 0.0, 0.5 * size))])
 
 
 def niches(draw: Draw, size: float) -> Shape:
     """A box with hollows in four of its sides."""
-    bite = Ellipsoid((draw.between(0.5, 0.75) * size,) * 3)
+    bite = ball(draw.between(0.5, 0.75) * size)
     sides = [(size, 0.0, 0.0), (-size, 0.0, 0.0), (0.0, size, 0.0), (0.0, -size, 0.0)]
     body = Box((size, size, draw.between(0.5, 1.0) * size))
     return Carved(body, [Shifted(bite, side) for side in sides])
@@ -248,13 +186,40 @@ def window(draw: Draw, size: float) -> Shape:
     return Carved(Box((x, y, thin)), [Shifted(opening, place) for place in places])
 
 
-Maker = Callable[[Draw, float], Shape]
+SHAPES: dict[str, Callable[[Draw, float], Shape]] = {
+    "ball": lambda draw, size: ball(size),
+    "egg": lambda draw, size: Ellipsoid(
+        (size, draw.between(0.5, 0.9) * size, draw.between(0.7, 1.4) * size)
+    ),
+    "block": lambda draw, size: Box(
+        (draw.between(0.55, 1) * size, draw.between(0.55, 1) * size, draw.between(0.55, 1) * size)
+    ),
+    "drum": lambda draw, size: Cylinder(draw.between(0.5, 0.9) * size, draw.between(0.4, 1) * size),
+    "die": die,
+    "barrel": lambda draw, size: Common(
+        Cylinder(0.75 * size, draw.between(0.5, 0.9) * size), ball(size)
+    ),
+    "plate": lambda draw, size: Box(
+        (1.5 * size, draw.between(0.5, 1.3) * size, draw.between(0.015, 0.05))
+    ),
+    "disc": lambda draw, size: Cylinder(1.4 * size, draw.between(0.012, 0.04)),
+    "petal": lambda draw, size: Ellipsoid(
+        (1.7 * size, draw.between(0.02, 0.05), draw.between(0.4, 0.9) * size)
+    ),
+    "beam": beam,
+    "pill": lambda draw, size: Capsule(draw.between(0.3, 0.5) * size, size),
+    # Two to six pixels across in a picture 400 wide.
+    "rod": lambda draw, size: Capsule(draw.small(0.007, 0.024), draw.between(0.4, 0.95)),
+    "bowl": bowl,
+    "niches": niches,
+    "ring": ring,
+    "window": window,
+}
+"""Makers of solids by kind; each takes the size, roughly half the width of its solid."""
 
-BULKY: tuple[Maker, ...] = (ball, egg, block, drum, die, barrel)
-FLAT: tuple[Maker, ...] = (plate, disc, petal)
-LONG: tuple[Maker, ...] = (beam, pill, rod, rod, rod)
-HOLLOW: tuple[Maker, ...] = (bowl, niches, ring, window)
-SMALLER = (*FLAT, *LONG, *HOLLOW, ball, block, drum, barrel)
+BULKY = ("ball", "egg", "block", "drum", "die", "barrel")
+FLAT, LONG = ("plate", "disc", "petal"), ("beam", "pill", "rod", "rod", "rod")
+SMALLER = (*FLAT, *LONG, "bowl", "niches", "ring", "window", "ball", "block", "drum", "barrel")
 
 
 def palette(draw: Draw) -> list[Colour]:
@@ -270,77 +235,58 @@ def palette(draw: Draw) -> list[Colour]:
     ]
 
 
-Painter = Callable[[Draw, list[Colour], float], Texture]
-
-
 def pair(draw: Draw, colours: list[Colour]) -> tuple[Colour, Colour]:
     """A light one and a dark one, either first."""
     light, dark = draw.one(colours[::2]), draw.one(colours[1::2])
     return (light, dark) if draw.share() < 0.5 else (dark, light)
 
 
-def one_colour(draw: Draw, colours: list[Colour], size: float) -> Texture:
-    """No pattern."""
-    return plain(draw.one(colours))
-
-
-def cubes(draw: Draw, colours: list[Colour], size: float) -> Texture:
-    """A checkerboard on flat faces."""
-    return checker(*pair(draw, colours), stripe(draw, size))
-
-
 def rings(draw: Draw, colours: list[Colour], size: float) -> Texture:
     """A checkerboard on a disc."""
     width = stripe(draw, size) + FINEST  # it narrows towards the axis
-    return polar_checker(*pair(draw, colours), 2 * around(size, width), width)
+    return textures.polar_checker(*pair(draw, colours), 2 * around(size, width), width)
 
 
 def screw(draw: Draw, colours: list[Colour], size: float) -> Texture:
     """Stripes around the axis, straight or winding."""
     width = stripe(draw, size) + FINEST  # it narrows towards the axis and where it winds
     twist = draw.between(-1.2, 1.2) / max(size, 0.05)
-    return spiral(*pair(draw, colours), around(size, width), twist)
-
-
-def zigzag(draw: Draw, colours: list[Colour], size: float) -> Texture:
-    """Zigzag stripes."""
-    return chevrons(*pair(draw, colours), 2 * stripe(draw, size), draw.between(0.5, 2.5))
+    return textures.spiral(*pair(draw, colours), around(size, width), twist)
 
 
 def dots(draw: Draw, colours: list[Colour], size: float) -> Texture:
     """Dots on a lattice."""
     radius = 0.7 * stripe(draw, size)
-    return pips(*pair(draw, colours), draw.between(2.2, 3.5) * radius, radius)
-
-
-def gaze(draw: Draw, colours: list[Colour], size: float) -> Texture:
-    """An eye."""
-    return eye(draw.one(colours))
-
-
-def veins(draw: Draw, colours: list[Colour], size: float) -> Texture:
-    """Marble."""
-    return marble(*pair(draw, colours), 0.3 / stripe(draw, size))
-
-
-def grain(draw: Draw, colours: list[Colour], size: float) -> Texture:
-    """Wood."""
-    return wood(*pair(draw, colours), 0.5 / stripe(draw, size))
-
-
-def clouds(draw: Draw, colours: list[Colour], size: float) -> Texture:
-    """Soft spots."""
-    return mottled(*pair(draw, colours), 0.3 / stripe(draw, size))
-
-
-PATTERNS: tuple[Painter, ...] = (cubes, rings, screw, zigzag, dots, veins, grain, clouds)
+    return textures.pips(*pair(draw, colours), draw.between(2.2, 3.5) * radius, radius)
 
 
 def stripe(draw: Draw, size: float) -> float:
-    """A width of stripes, more often fine than coarse, on a part of that size."""
+    """A random width of stripes on a part of that size, more often fine than coarse."""
     return draw.small(FINEST, max(0.4 * size, 2 * FINEST))
 
 
 def around(size: float, width: float) -> int:
     """How many pairs of stripes of `width` go around a part."""
     return max(round(math.pi * size / width), 2)
+
+
+Painter = Callable[[Draw, list[Colour], float], Texture]
+
+PATTERNS: tuple[Painter, ...] = (
+    lambda draw, colours, size: textures.checker(*pair(draw, colours), stripe(draw, size)),
+    rings,
+    screw,
+    lambda draw, colours, size: textures.chevrons(
+        *pair(draw, colours), 2 * stripe(draw, size), draw.between(0.5, 2.5)
+    ),
+    dots,
+    lambda draw, colours, size: textures.marble(*pair(draw, colours), 0.3 / stripe(draw, size)),
+    lambda draw, colours, size: textures.wood(*pair(draw, colours), 0.5 / stripe(draw, size)),
+    lambda draw, colours, size: textures.mottled(*pair(draw, colours), 0.3 / stripe(draw, size)),
+)
+PAINTERS: tuple[Painter, ...] = (
+    *PATTERNS,
+    lambda draw, colours, size: textures.plain(draw.one(colours)),
+    lambda draw, colours, size: textures.eye(draw.one(colours)),
+)
+"""Makers of textures from some of the colours, for a part of the given size."""

@@ -9,8 +9,19 @@ from itertools import pairwise
 from bench.scenes.media import Ball, Cloud
 from bench.scenes.opaque import Part, Solids
 from bench.scenes.raytrace import Model
-from bench.scenes.solids import Box, Capsule, Carved, Common, Cylinder, Ellipsoid, Shifted
+from bench.scenes.solids import (
+    Box,
+    Capsule,
+    Carved,
+    Common,
+    Cylinder,
+    Ellipsoid,
+    Shifted,
+    Triple,
+    ball,
+)
 from bench.scenes.textures import (
+    Colour,
     checker,
     chevrons,
     eye,
@@ -26,11 +37,7 @@ from bench.scenes.textures import (
 IVORY, INK, CORAL = (0.95, 0.92, 0.84), (0.09, 0.10, 0.14), (0.90, 0.27, 0.20)
 TEAL, NAVY, GOLD = (0.08, 0.55, 0.56), (0.10, 0.18, 0.38), (0.96, 0.70, 0.14)
 SLATE, PLUM, LEAF = (0.34, 0.37, 0.42), (0.47, 0.16, 0.42), (0.42, 0.66, 0.22)
-
-
-def ball(radius: float) -> Ellipsoid:
-    """A sphere."""
-    return Ellipsoid((radius, radius, radius))
+PINE, BARK = (0.76, 0.52, 0.28), (0.40, 0.23, 0.10)
 
 
 def totem() -> Solids:
@@ -42,23 +49,11 @@ def pedestal() -> list[Part]:
     """A disc, a marble block with a ball in each of its four niches, and a drum."""
     niches = [(0.42, 0.0, 0.0), (-0.42, 0.0, 0.0), (0.0, 0.42, 0.0), (0.0, -0.42, 0.0)]
     block = Carved(Box((0.42, 0.42, 0.24)), [Shifted(ball(0.21), niche) for niche in niches])
-    turn = math.radians(18)
+    c, s = math.cos(math.radians(18)), math.sin(math.radians(18))
+    patterns = plain(CORAL), spiral(IVORY, TEAL, 8, 4.0), plain(GOLD), mottled(NAVY, TEAL, 14.0)
     balls = [
-        Part(
-            ball(0.15),
-            texture,
-            (
-                x * math.cos(turn) - y * math.sin(turn),
-                x * math.sin(turn) + y * math.cos(turn),
-                -0.85,
-            ),
-            gloss=0.7,
-        )
-        for (x, y, _), texture in zip(
-            niches,
-            (plain(CORAL), spiral(IVORY, TEAL, 8, 4.0), plain(GOLD), mottled(NAVY, TEAL, 14.0)),
-            strict=True,
-        )
+        Part(ball(0.15), pattern, (x * c - y * s, x * s + y * c, -0.85), gloss=0.7)
+        for (x, y, _), pattern in zip(niches, patterns, strict=True)
     ]
     return [
         Part(Cylinder(0.76, 0.05), polar_checker(SLATE, IVORY, 48, 0.06), (0, 0, -1.09)),
@@ -104,20 +99,12 @@ def crown() -> list[Part]:
     for k in range(9):
         a = math.radians(40 * k + 10)
         c, s = math.cos(a), math.sin(a)
-        pins.append(
-            Part(
-                Capsule(0.016, 0.12),
-                plain(INK if k % 2 else PLUM),
-                (0.22 * c, 0.22 * s, 0.93),
-                (0, 30, math.degrees(a)),
-            )
-        )
-        colour = (CORAL, GOLD, TEAL)[k % 3]
-        tips.append(Part(ball(0.045), plain(colour), (0.29 * c, 0.29 * s, 1.05), gloss=0.8))
+        pin, tip = plain(INK if k % 2 else PLUM), plain((CORAL, GOLD, TEAL)[k % 3])
+        turn = (0, 30, math.degrees(a))
+        pins.append(Part(Capsule(0.016, 0.12), pin, (0.22 * c, 0.22 * s, 0.93), turn))
+        tips.append(Part(ball(0.045), tip, (0.29 * c, 0.29 * s, 1.05), gloss=0.8))
     return [
-        Part(
-            Cylinder(0.30, 0.05), wood((0.76, 0.52, 0.28), (0.40, 0.23, 0.10), 34.0), (0, 0, 0.44)
-        ),
+        Part(Cylinder(0.30, 0.05), wood(PINE, BARK, 34.0), (0, 0, 0.44)),
         Part(die, pips(IVORY, INK, 0.11, 0.031), (0, 0, 0.66), (0, 0, 33), gloss=0.3),
         Part(Cylinder(0.20, 0.02), checker(INK, IVORY, 0.05), (0, 0, 0.85)),
         Part(ball(0.13), mottled(GOLD, (0.80, 0.46, 0.05), 9.0), (0, 0, 0.97), gloss=0.9),
@@ -131,20 +118,14 @@ def wires() -> Solids:
     return Solids([*cage(), *helix(), *wheel()])
 
 
-def wire(
-    start: tuple[float, float, float],
-    end: tuple[float, float, float],
-    radius: float,
-    colour: tuple[float, float, float],
-) -> Part:
+def wire(start: Triple, end: Triple, radius: float, colour: Colour) -> Part:
     """A capsule from `start` to `end`."""
     x, y, z = (b - a for a, b in zip(start, end, strict=True))
     length = math.sqrt(x * x + y * y + z * z)
     tilt, azimuth = math.degrees(math.acos(z / length)), math.degrees(math.atan2(y, x))
     cx, cy, cz = ((a + b) / 2 for a, b in zip(start, end, strict=True))
-    return Part(
-        Capsule(radius, length / 2), plain(colour), (cx, cy, cz), (0, tilt, azimuth), gloss=0.3
-    )
+    rod = Capsule(radius, length / 2)
+    return Part(rod, plain(colour), (cx, cy, cz), (0, tilt, azimuth), gloss=0.3)
 
 
 def cage() -> list[Part]:
@@ -211,8 +192,5 @@ def void() -> Solids:
 
 
 MODELS: dict[str, Callable[[], Model]] = {
-    "totem": totem,
-    "wires": wires,
-    "cloud": cloud,
-    "void": void,
+    make.__name__: make for make in (totem, wires, cloud, void)
 }

@@ -27,20 +27,12 @@ SPLITS = {"0": "train", "1": "val", "2": "test"}
 PICTURE_NAME = re.compile(r"[012]_.*\.(png|jpg|jpeg)", re.IGNORECASE)
 
 
-def load(
-    path: str | Path,
-    *,
-    downscale: int = 1,
-    background: str = "white",
-    log: Log,
-) -> Scene:
+def load(path: str | Path, *, downscale: int = 1, background: str = "white", log: Log) -> Scene:
     """Read a scene folder.
 
     Args:
         path: the folder with `bbox.txt`, `intrinsics.txt`, `pose/` and `rgb/`.
-        downscale: average blocks of this many pixels squared; what does not fill a block, at the
-            right and the bottom, is left out.
-        background: "white" or "black", what RGBA pictures are composited onto.
+        downscale, background: as of `bench.scenes.blender.load`.
 
     Pictures are named 0_* (train), 1_* (val) and 2_* (test), poses alike; poses have OpenCV axes.
     Without any 2_* the 1_* are the test split, as in Tanks & Temples. The box of `bbox.txt`, with a
@@ -50,24 +42,22 @@ def load(
     root = data_folder(path)
     box = read_box(root)
     files = picture_files(root)
-    width, height = image_size(files[0])
-    focal_x, focal_y, cx, cy = read_intrinsics(root)
+    inner = (*read_intrinsics(root), *image_size(files[0]))
     views: dict[str, list[View]] = {}
     camera_files = [root / "bbox.txt", root / "intrinsics.txt"]
     for file in files:
-        relative = f"pose/{file.stem}.txt"
-        camera_files.append(root / relative)
-        where = f"{root / relative}"
-        pose = rigid_pose(numbers(read_text(root, relative), where), where)
-        camera = Camera(pose, focal_x, focal_y, cx, cy, width, height)
+        where = root / "pose" / f"{file.stem}.txt"
+        camera_files.append(where)
+        rows = numbers(read_text(root, f"pose/{where.name}"), where)
+        camera = Camera(rigid_pose(rows, str(where)), *inner)
         view = View(f"rgb/{file.name}", file, camera)
         views.setdefault(SPLITS[file.name[0]], []).append(view)
     if "test" not in views and "val" in views:
         log.info(f"{root / 'rgb'}: no pictures 2_*, so 1_* are the test split")
         views["test"] = views.pop("val")
-    for split, prefix in (("train", "0_*"), ("test", "2_* or 1_*")):
+    for split, names in (("train", "0_*"), ("test", "2_* or 1_*")):
         if split not in views:
-            raise unexpected(root / "rgb", f"pictures {prefix}", "none")
+            raise unexpected(root / "rgb", f"pictures {names}", "none")
     pictures = decode_splits(views, downscale, log)
     return assemble(
         root.name, views, pictures, box, background=background, camera_files=camera_files
@@ -95,15 +85,15 @@ def read_intrinsics(root: Path) -> tuple[float, float, float, float]:
     path = root / "intrinsics.txt"
     rows = numbers(read_text(root, path.name), path)
     if [len(row) for row in rows] in ([4] * 4, [3] * 3):
-        values = {"fx": rows[0][0], "fy": rows[1][1], "cx": rows[0][2], "cy": rows[1][2]}
+        (fx, _, cx, *_), (_, fy, cy, *_) = rows[:2]
     elif rows and len(rows[0]) == 4:
-        values = {"fx": rows[0][0], "fy": rows[0][0], "cx": rows[0][1], "cy": rows[0][2]}
+        fx, cx, cy, _ = rows[0]
+        fy = fx
     else:
         got = f"lines of {[len(row) for row in rows]} numbers"
         raise unexpected(path, 'a 4x4 or 3x3 matrix or a first line "f cx cy 0"', got)
-    fx, fy = (number(values[name], f"{path}: {name}", 0) for name in ("fx", "fy"))
-    cx, cy = (number(values[name], f"{path}: {name}") for name in ("cx", "cy"))
-    return fx, fy, cx, cy
+    fx, fy = number(fx, f"{path}: fx", 0), number(fy, f"{path}: fy", 0)
+    return fx, fy, number(cx, f"{path}: cx"), number(cy, f"{path}: cy")
 
 
 def picture_files(root: Path) -> list[Path]:

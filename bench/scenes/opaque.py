@@ -80,8 +80,7 @@ class Solids:
         for number, first, last in spans:
             part, columns = self.parts[number], slice(first, last)
             frame = part.frame.to(depth)
-            centre = torch.tensor(part.centre).to(depth)
-            x, y, z = ((band.origin - centre) @ frame).tolist()
+            x, y, z = ((band.origin - depth.new_tensor(part.centre)) @ frame).tolist()
             found = part.shape.hit((x, y, z), band.directions(frame, columns))
             nearest = depth[:, columns]
             owner[:, columns].masked_fill_(found < nearest, number)
@@ -121,7 +120,7 @@ class Solids:
         return colour.clamp(max=1)
 
     def shadowed(self, number: int, points: Tensor) -> Tensor:
-        """[N] bool: is another part between these points of part `number` and the light?"""
+        """[N] bool: whether another part is between these points of part `number` and the light."""
         dark = torch.zeros(len(points), dtype=torch.bool, device=points.device)
         light, columns = points.new_tensor(LIGHT), points.T.contiguous()
         for caster in (self.parts[k] for k in self.casters(number, points)):

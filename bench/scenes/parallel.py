@@ -1,4 +1,4 @@
-"""One kind of work on many things, on all cores."""
+"""Runs a function on many items, on all cores."""
 
 from __future__ import annotations
 

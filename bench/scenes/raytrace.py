@@ -1,7 +1,7 @@
 """Exact pictures of analytic models: every sub-pixel ray is solved in closed form.
 
-A picture is worked through in bands of rows; each part of a model is asked only about the columns
-that its bounding box can cover in a band.
+A picture is rendered in bands of rows; a part of a model is traced only in the columns that its
+bounding box can cover in a band.
 """
 
 from __future__ import annotations
@@ -71,19 +71,16 @@ def render(model: Model, camera: Camera, background: Tensor, samples: int) -> Fr
     Of a pixel's rays, alpha is the mean opacity, depth the mean z-depth weighted by opacity
     (+inf where alpha is below EMPTY_ALPHA), and rgb the mean colour. One sample is the centre's.
     """
-    device = camera.c2w.device
+    device, width, height = camera.c2w.device, camera.width, camera.height
     offsets = sample_offsets(samples).to(device)
-    x = (torch.arange(camera.width, device=device)[:, None] + offsets[:, 0] - camera.cx) / camera.fx
-    y = (
-        torch.arange(camera.height, device=device)[:, None] + offsets[:, 1] - camera.cy
-    ) / camera.fy
-    rgb = torch.zeros(camera.height, camera.width, 3, device=device)
-    alpha = torch.zeros(camera.height, camera.width, device=device)
-    depth = torch.zeros(camera.height, camera.width, device=device)
-    rows = max(BAND_RAYS // (camera.width * samples), 1)
+    x = (torch.arange(width, device=device)[:, None] + offsets[:, 0] - camera.cx) / camera.fx
+    y = (torch.arange(height, device=device)[:, None] + offsets[:, 1] - camera.cy) / camera.fy
+    rgb = torch.zeros(height, width, 3, device=device)
+    alpha, depth = torch.zeros(2, height, width, device=device)
+    rows = max(BAND_RAYS // (width * samples), 1)
     boxes = ProjectedBoxes(camera, model.boxes().to(device))
-    for top in range(0, camera.height, rows):
-        bottom = min(top + rows, camera.height)
+    for top in range(0, height, rows):
+        bottom = min(top + rows, height)
         spans = boxes.spans(top, bottom)
         if not spans:
             continue
@@ -103,11 +100,10 @@ def sample_offsets(samples: int) -> Tensor:
     if samples < 1 or samples & (samples - 1):
         raise SteerbenchError(f"samples: expected a power of two, got {samples}")
     bits = samples.bit_length() - 1
-    index = torch.arange(samples)
-    reversed_index = sum(
-        (((index >> bit) & 1) << (bits - 1 - bit) for bit in range(bits)), torch.zeros_like(index)
-    )
-    return (torch.stack((index, reversed_index), dim=1) + 0.5) / samples
+    index, mirrored = torch.arange(samples), torch.zeros(samples, dtype=torch.int64)
+    for bit in range(bits):
+        mirrored |= ((index >> bit) & 1) << (bits - 1 - bit)
+    return (torch.stack((index, mirrored), dim=1) + 0.5) / samples
 
 
 class ProjectedBoxes:
@@ -128,26 +124,17 @@ class ProjectedBoxes:
 
         A part that reaches behind the camera may show anywhere, one that lies behind it nowhere.
         """
-        u0, v0 = self.start.unbind(-1)
-        u1, v1 = self.end.unbind(-1)
-        rise = torch.where(v1 == v0, torch.ones_like(v0), v1 - v0)
-        low = ((top - 1 - v0) / rise).clamp(0, 1)  # one pixel of room for rounding
-        high = ((bottom + 1 - v0) / rise).clamp(0, 1)
-        meets = (torch.minimum(v0, v1) <= bottom + 1) & (torch.maximum(v0, v1) >= top - 1)
+        (u0, v0), (u1, v1) = self.start.unbind(-1), self.end.unbind(-1)
         flat = v0 == v1
-        ends = torch.stack(
-            (
-                u0 + torch.where(flat, torch.zeros_like(low), low) * (u1 - u0),
-                u0 + torch.where(flat, torch.ones_like(high), high) * (u1 - u0),
-            )
-        )
+        rise = (v1 - v0).masked_fill(flat, 1)
+        # The shares of each segment between the rows, with one pixel of room for rounding.
+        low = ((top - 1 - v0) / rise).clamp(0, 1).masked_fill(flat, 0)
+        high = ((bottom + 1 - v0) / rise).clamp(0, 1).masked_fill(flat, 1)
+        meets = (torch.minimum(v0, v1) <= bottom + 1) & (torch.maximum(v0, v1) >= top - 1)
+        ends = torch.stack((u0 + low * (u1 - u0), u0 + high * (u1 - u0)))
         first = ends.masked_fill(~meets, math.inf).amin((0, 2)).floor() - 1
         last = ends.masked_fill(~meets, -math.inf).amax((0, 2)).ceil() + 1
-        first = torch.where(self.in_front, first, torch.zeros_like(first)).clamp(min=0)
-        last = torch.where(self.in_front, last, torch.full_like(last, self.width))
-        last = last.clamp(max=self.width).masked_fill(self.behind, 0)
-        return [
-            (part, int(a), int(b))
-            for part, (a, b) in enumerate(zip(first.tolist(), last.tolist(), strict=True))
-            if a < b
-        ]
+        first = first.masked_fill(~self.in_front, 0).clamp(min=0)
+        last = last.masked_fill(~self.in_front, self.width).clamp(max=self.width)
+        columns = torch.stack((first, last.masked_fill(self.behind, 0)), dim=1).tolist()
+        return [(part, int(a), int(b)) for part, (a, b) in enumerate(columns) if a < b]

@@ -1,4 +1,4 @@
-"""Shapes that a ray meets in closed form.
+"""Shapes whose intersection with a ray has a closed form.
 
 Every shape is centred, in its own frame. Rays come as components, three origins and three
 directions that broadcast: a camera has one origin (three floats) and many directions, a light at
@@ -19,6 +19,7 @@ from torch import Tensor
 Triple = tuple[float, float, float]
 Origin = tuple[Any, Any, Any]  # floats or tensors
 Directions = tuple[Tensor, Tensor, Tensor]
+Interval = tuple[Tensor, Tensor]
 
 
 class Shape(Protocol):
@@ -37,15 +38,13 @@ class Shape(Protocol):
         """[N, 3]: outward unit normals at points of the surface."""
 
 
-class Convex:
+class Convex(Shape, Protocol):
     """A shape that a ray crosses in one interval."""
 
-    def interval(self, origin: Origin, directions: Directions) -> tuple[Tensor, Tensor]:
+    def interval(self, origin: Origin, directions: Directions) -> Interval:
         """Where rays enter and leave: enter > leave where they miss."""
-        raise TypeError(f"{type(self).__name__} has no interval")
 
     def hit(self, origin: Origin, directions: Directions) -> Tensor:
-        """The nearer end of the interval that lies in front of the camera."""
         enter, leave = self.interval(origin, directions)
         first = torch.where(enter > 0, enter, leave)
         return first.masked_fill_((enter > leave) | (first <= 0), math.inf)
@@ -53,16 +52,15 @@ class Convex:
 
 @dataclass(frozen=True)
 class Ellipsoid(Convex):
-    """Semi-axes along x, y, z."""
+    """An ellipsoid with semi-axes along x, y, z."""
 
     radii: Triple
 
     def extent(self) -> Triple:
-        """Its semi-axes."""
         return self.radii
 
-    def interval(self, origin: Origin, directions: Directions) -> tuple[Tensor, Tensor]:
-        """In the space where it is the unit sphere, from the point nearest to its centre."""
+    def interval(self, origin: Origin, directions: Directions) -> Interval:
+        """Computed in the space where the ellipsoid is the unit sphere."""
         o = [x / r for x, r in zip(origin, self.radii, strict=True)]
         d = [x / r for x, r in zip(directions, self.radii, strict=True)]
         return ball_interval(o, d, 1.0)
@@ -74,62 +72,57 @@ class Ellipsoid(Convex):
         return (length - 1) * length / (points / radii**2).norm(dim=1).clamp(min=1e-12)
 
     def normal(self, points: Tensor) -> Tensor:
-        """Gradient of |q|^2."""
         return unit(points / points.new_tensor(self.radii) ** 2)
+
+
+def ball(radius: float) -> Ellipsoid:
+    """A sphere."""
+    return Ellipsoid((radius, radius, radius))
 
 
 @dataclass(frozen=True)
 class Box(Convex):
-    """Half sizes along x, y, z."""
+    """A box with half sizes along x, y, z."""
 
     half: Triple
 
     def extent(self) -> Triple:
-        """Its half sizes."""
         return self.half
 
-    def interval(self, origin: Origin, directions: Directions) -> tuple[Tensor, Tensor]:
-        """Three slabs."""
-        slabs = [slab(*axis) for axis in zip(origin, directions, self.half, strict=True)]
-        enter = torch.maximum(torch.maximum(slabs[0][0], slabs[1][0]), slabs[2][0])
-        leave = torch.minimum(torch.minimum(slabs[0][1], slabs[1][1]), slabs[2][1])
-        return enter, leave
+    def interval(self, origin: Origin, directions: Directions) -> Interval:
+        x, y, z = (slab(*axis) for axis in zip(origin, directions, self.half, strict=True))
+        return overlap(overlap(x, y), z)
 
     def distance(self, points: Tensor) -> Tensor:
-        """Largest of the three distances to a pair of faces."""
         return (points.abs() - points.new_tensor(self.half)).amax(1)
 
     def normal(self, points: Tensor) -> Tensor:
-        """The axis of the nearest face."""
+        """The normal of the nearest face."""
         axis = (points.abs() - points.new_tensor(self.half)).argmax(1)
         return torch.nn.functional.one_hot(axis, 3).to(points.dtype) * points.sign()
 
 
 @dataclass(frozen=True)
 class Cylinder(Convex):
-    """Capped, along z."""
+    """A capped cylinder along z."""
 
     radius: float
     half: float
 
     def extent(self) -> Triple:
-        """Of its box."""
         return (self.radius, self.radius, self.half)
 
-    def interval(self, origin: Origin, directions: Directions) -> tuple[Tensor, Tensor]:
-        """The round wall and the slab between the caps."""
+    def interval(self, origin: Origin, directions: Directions) -> Interval:
         wall = ball_interval(origin[:2], directions[:2], self.radius)
-        caps = slab(origin[2], directions[2], self.half)
-        return torch.maximum(wall[0], caps[0]), torch.minimum(wall[1], caps[1])
+        return overlap(wall, slab(origin[2], directions[2], self.half))
 
     def distance(self, points: Tensor) -> Tensor:
-        """The larger of the distances to the wall and to the caps."""
         return torch.maximum(
             points[:, :2].norm(dim=1) - self.radius, points[:, 2].abs() - self.half
         )
 
     def normal(self, points: Tensor) -> Tensor:
-        """Of the wall or of a cap, whichever is nearer."""
+        """The normal of the wall or of a cap, whichever is nearer."""
         on_wall = points[:, :2].norm(dim=1) - self.radius > points[:, 2].abs() - self.half
         wall = unit(points * points.new_tensor((1, 1, 0)))
         cap = points.sign() * points.new_tensor((0, 0, 1))
@@ -144,14 +137,12 @@ class Capsule(Convex):
     half: float
 
     def extent(self) -> Triple:
-        """Of its box."""
         return (self.radius, self.radius, self.half + self.radius)
 
-    def interval(self, origin: Origin, directions: Directions) -> tuple[Tensor, Tensor]:
+    def interval(self, origin: Origin, directions: Directions) -> Interval:
         """The union of an open cylinder and two balls: convex, so the outermost ends."""
         wall = ball_interval(origin[:2], directions[:2], self.radius)
-        caps = slab(origin[2], directions[2], self.half)
-        enter, leave = torch.maximum(wall[0], caps[0]), torch.minimum(wall[1], caps[1])
+        enter, leave = overlap(wall, slab(origin[2], directions[2], self.half))
         missed = enter > leave
         enter, leave = enter.masked_fill(missed, math.inf), leave.masked_fill(missed, -math.inf)
         for end in (-self.half, self.half):
@@ -160,11 +151,9 @@ class Capsule(Convex):
         return enter, leave
 
     def distance(self, points: Tensor) -> Tensor:
-        """To the segment, less the radius."""
         return self.from_axis(points).norm(dim=1) - self.radius
 
     def normal(self, points: Tensor) -> Tensor:
-        """Away from the segment."""
         return unit(self.from_axis(points))
 
     def from_axis(self, points: Tensor) -> Tensor:
@@ -177,65 +166,57 @@ class Capsule(Convex):
 class Shifted(Convex):
     """A convex shape moved by `offset`: an operand of `Carved` or `Common`."""
 
-    shape: Box | Ellipsoid | Cylinder | Capsule
+    shape: Convex
     offset: Triple
 
     def extent(self) -> Triple:
-        """Of a centred box that holds the moved shape."""
+        """Half sizes of a centred box that holds the moved shape."""
         x, y, z = (abs(o) + e for o, e in zip(self.offset, self.shape.extent(), strict=True))
-        return (x, y, z)
+        return x, y, z
 
-    def interval(self, origin: Origin, directions: Directions) -> tuple[Tensor, Tensor]:
-        """From the origin moved back."""
+    def interval(self, origin: Origin, directions: Directions) -> Interval:
         x, y, z = (o - s for o, s in zip(origin, self.offset, strict=True))
         return self.shape.interval((x, y, z), directions)
 
     def distance(self, points: Tensor) -> Tensor:
-        """At the points moved back."""
         return self.shape.distance(points - points.new_tensor(self.offset))
 
     def normal(self, points: Tensor) -> Tensor:
-        """At the points moved back."""
         return self.shape.normal(points - points.new_tensor(self.offset))
 
 
 @dataclass(frozen=True)
 class Common(Convex):
-    """What two convex shapes share."""
+    """The intersection of two convex shapes."""
 
-    first: Box | Ellipsoid | Cylinder | Capsule | Shifted
-    second: Box | Ellipsoid | Cylinder | Capsule | Shifted
+    first: Convex
+    second: Convex
 
     def extent(self) -> Triple:
-        """The smaller of the two, axis by axis."""
         x, y, z = map(min, self.first.extent(), self.second.extent())
         return (x, y, z)
 
-    def interval(self, origin: Origin, directions: Directions) -> tuple[Tensor, Tensor]:
-        """Entered when both are entered, left when either is left."""
-        a = self.first.interval(origin, directions)
-        b = self.second.interval(origin, directions)
-        return torch.maximum(a[0], b[0]), torch.minimum(a[1], b[1])
+    def interval(self, origin: Origin, directions: Directions) -> Interval:
+        first, second = (x.interval(origin, directions) for x in (self.first, self.second))
+        return overlap(first, second)
 
     def distance(self, points: Tensor) -> Tensor:
-        """The larger of the two."""
         return torch.maximum(self.first.distance(points), self.second.distance(points))
 
     def normal(self, points: Tensor) -> Tensor:
-        """Of the shape whose surface it is."""
+        """The normal of the shape whose surface a point lies on."""
         first = self.first.distance(points) > self.second.distance(points)
         return torch.where(first[:, None], self.first.normal(points), self.second.normal(points))
 
 
 @dataclass(frozen=True)
-class Carved:
+class Carved(Shape):
     """A convex `body` with the convex `bites` taken out of it."""
 
-    body: Box | Ellipsoid | Cylinder | Capsule | Common
-    bites: Sequence[Shifted]
+    body: Convex
+    bites: Sequence[Convex]
 
     def extent(self) -> Triple:
-        """Of the body."""
         return self.body.extent()
 
     def hit(self, origin: Origin, directions: Directions) -> Tensor:
@@ -259,12 +240,11 @@ class Carved:
         return nearest
 
     def distance(self, points: Tensor) -> Tensor:
-        """Inside the body and outside every bite."""
         bites = torch.stack([-bite.distance(points) for bite in self.bites])
         return torch.maximum(self.body.distance(points), bites.amax(0))
 
     def normal(self, points: Tensor) -> Tensor:
-        """Of the operand whose surface it is; a bite's normal points into the bite."""
+        """The normal of the operand whose surface a point lies on; of a bite, into the bite."""
         nearest = self.body.distance(points).abs()
         normal = self.body.normal(points)
         for bite in self.bites:
@@ -274,9 +254,7 @@ class Carved:
         return normal
 
 
-def ball_interval(
-    origin: Sequence, directions: Sequence[Tensor], radius: float
-) -> tuple[Tensor, Tensor]:
+def ball_interval(origin: Sequence, directions: Sequence[Tensor], radius: float) -> Interval:
     """Where rays are within `radius` of 0, in as many dimensions as there are components.
 
     Measured from the ray's point nearest to 0: the textbook's b^2 - 4 a c loses a thin wire seen
@@ -287,13 +265,16 @@ def ball_interval(
     nearest = [torch.add(d * middle, o) for o, d in zip(origin, directions, strict=True)]
     gap = radius * radius - sum_of_products(nearest, nearest)
     reach = (gap.clamp(min=0) / a).sqrt_()
-    missed = gap < 0
-    return (middle - reach).masked_fill_(missed, math.inf), (middle + reach).masked_fill_(
-        missed, -math.inf
-    )
+    enter, leave = middle - reach, middle + reach
+    return enter.masked_fill_(gap < 0, math.inf), leave.masked_fill_(gap < 0, -math.inf)
 
 
-def slab(origin: float | Tensor, direction: Tensor, half: float) -> tuple[Tensor, Tensor]:
+def overlap(first: Interval, second: Interval) -> Interval:
+    """The intersection of two intervals along each ray."""
+    return torch.maximum(first[0], second[0]), torch.minimum(first[1], second[1])
+
+
+def slab(origin: float | Tensor, direction: Tensor, half: float) -> Interval:
     """Where rays are within `half` of 0 along one axis."""
     # A ray along the slab never leaves it or never enters: a tiny slope says so without 0 / 0.
     slope = torch.where(direction.abs() < 1e-12, torch.full_like(direction, 1e-12), direction)
@@ -303,10 +284,7 @@ def slab(origin: float | Tensor, direction: Tensor, half: float) -> tuple[Tensor
 
 def sum_of_products(first: Sequence, second: Sequence) -> Tensor:
     """Dot product by components."""
-    total = first[0] * second[0]
-    for a, b in zip(first[1:], second[1:], strict=True):
-        total = total + a * b
-    return total
+    return sum((a * b for a, b in zip(first[1:], second[1:], strict=True)), first[0] * second[0])
 
 
 def unit(vectors: Tensor) -> Tensor:

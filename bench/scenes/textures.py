@@ -4,113 +4,104 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cache
+from functools import cache, wraps
+from typing import Concatenate, ParamSpec
 
 import torch
 from torch import Tensor
 
 Colour = tuple[float, float, float]
 Texture = Callable[[Tensor], Tensor]
+Settings = ParamSpec("Settings")
 
 
-def plain(colour: Colour) -> Texture:
+def texture(paint: Callable[Concatenate[Tensor, Settings], Tensor]) -> Callable[Settings, Texture]:
+    """Turn a function of points and settings into one that makes a texture from the settings."""
+
+    def make(*settings: Settings.args, **named: Settings.kwargs) -> Texture:
+        return wraps(paint)(lambda points: paint(points, *settings, **named))
+
+    return make
+
+
+@texture
+def plain(points: Tensor, colour: Colour) -> Tensor:
     """One colour."""
-    return lambda points: points.new_tensor(colour).expand(len(points), 3)
+    return points.new_tensor(colour).expand(len(points), 3)
 
 
-def checker(first: Colour, second: Colour, size: float) -> Texture:
+@texture
+def checker(points: Tensor, first: Colour, second: Colour, size: float) -> Tensor:
     """Cubes of side `size`, alternating."""
     # The shift keeps faces at round coordinates away from the border between two cubes.
-    return lambda points: pick(((points / size + 0.137).floor().sum(1) % 2) < 1, first, second)
+    return pick(((points / size + 0.137).floor().sum(1) % 2) < 1, first, second)
 
 
-def polar_checker(first: Colour, second: Colour, sectors: int, ring: float) -> Texture:
+@texture
+def polar_checker(
+    points: Tensor, first: Colour, second: Colour, sectors: int, ring: float
+) -> Tensor:
     """Sectors around z and rings (or levels) of width `ring`, alternating."""
-
-    def texture(points: Tensor) -> Tensor:
-        x, y, z = points.unbind(1)
-        sector = (angle(x, y) * sectors / (2 * math.pi)).floor()
-        level = ((x * x + y * y).sqrt() / ring + 0.29).floor() + (z / ring + 0.29).floor()
-        return pick((sector + level) % 2 < 1, first, second)
-
-    return texture
+    x, y, z = points.unbind(1)
+    sector = (torch.atan2(y, x) * sectors / (2 * math.pi)).floor()
+    level = ((x * x + y * y).sqrt() / ring + 0.29).floor() + (z / ring + 0.29).floor()
+    return pick((sector + level) % 2 < 1, first, second)
 
 
-def spiral(first: Colour, second: Colour, stripes: int, twist: float) -> Texture:
+@texture
+def spiral(points: Tensor, first: Colour, second: Colour, stripes: int, twist: float) -> Tensor:
     """Stripes around z that turn `twist` radians per unit of height."""
-
-    def texture(points: Tensor) -> Tensor:
-        x, y, z = points.unbind(1)
-        phase = (angle(x, y) + twist * z) * stripes / (2 * math.pi)
-        return pick(phase - phase.floor() < 0.5, first, second)
-
-    return texture
+    x, y, z = points.unbind(1)
+    phase = (torch.atan2(y, x) + twist * z) * stripes / (2 * math.pi)
+    return pick(phase - phase.floor() < 0.5, first, second)
 
 
-def chevrons(first: Colour, second: Colour, period: float, slope: float) -> Texture:
+@texture
+def chevrons(points: Tensor, first: Colour, second: Colour, period: float, slope: float) -> Tensor:
     """Zigzag stripes along x that repeat every `period`."""
-
-    def texture(points: Tensor) -> Tensor:
-        x, _, z = points.unbind(1)
-        phase = x / period + slope * ((z / period - (z / period).floor()) - 0.5).abs()
-        return pick(phase - phase.floor() < 0.5, first, second)
-
-    return texture
+    x, _, z = points.unbind(1)
+    phase = x / period + slope * ((z / period - (z / period).floor()) - 0.5).abs()
+    return pick(phase - phase.floor() < 0.5, first, second)
 
 
-def pips(ground: Colour, dot: Colour, spacing: float, radius: float) -> Texture:
+@texture
+def pips(points: Tensor, ground: Colour, dot: Colour, spacing: float, radius: float) -> Tensor:
     """Dots on a lattice; on a face of a box, round ones."""
-
-    def texture(points: Tensor) -> Tensor:
-        cell = (points / spacing).round() * spacing
-        return pick((points - cell).norm(dim=1) < radius, dot, ground)
-
-    return texture
+    cell = (points / spacing).round() * spacing
+    return pick((points - cell).norm(dim=1) < radius, dot, ground)
 
 
-def eye(iris: Colour) -> Texture:
+@texture
+def eye(points: Tensor, iris: Colour) -> Tensor:
     """White, with an iris and a pupil that look along -y."""
-
-    def texture(points: Tensor) -> Tensor:
-        facing = -points[:, 1] / points.norm(dim=1)
-        inner = pick(facing > math.cos(0.32), (0.02, 0.02, 0.03), iris)
-        white = points.new_tensor((0.97, 0.96, 0.93))
-        return torch.where((facing > math.cos(0.62))[:, None], inner, white)
-
-    return texture
+    facing = -points[:, 1] / points.norm(dim=1)
+    inner = pick(facing > math.cos(0.32), (0.02, 0.02, 0.03), iris)
+    white = points.new_tensor((0.97, 0.96, 0.93))
+    return torch.where((facing > math.cos(0.62))[:, None], inner, white)
 
 
-def marble(ground: Colour, vein: Colour, scale: float) -> Texture:
+@texture
+def marble(points: Tensor, ground: Colour, vein: Colour, scale: float) -> Tensor:
     """Veins: a sine along x, bent by noise."""
-
-    def texture(points: Tensor) -> Tensor:
-        bend = noise(points * scale) + 0.5 * noise(points * (2.1 * scale))
-        wave = torch.sin((points[:, 0] + 0.6 * points[:, 2]) * 2 * scale + 5 * bend).abs()
-        return mix(wave.clamp(max=0.55) / 0.55, vein, ground)
-
-    return texture
+    bend = noise(points * scale) + 0.5 * noise(points * (2.1 * scale))
+    wave = torch.sin((points[:, 0] + 0.6 * points[:, 2]) * 2 * scale + 5 * bend).abs()
+    return mix(wave.clamp(max=0.55) / 0.55, vein, ground)
 
 
-def wood(light: Colour, dark: Colour, rings: float) -> Texture:
+@texture
+def wood(points: Tensor, light: Colour, dark: Colour, rings: float) -> Tensor:
     """Year rings around an axis along x that runs outside the part, bent by noise."""
-
-    def texture(points: Tensor) -> Tensor:
-        _, y, z = points.unbind(1)
-        radius = torch.hypot(y + 0.7, 2 * z + 0.4) + 0.08 * noise(points * 3)
-        phase = radius * rings
-        return mix((phase - phase.floor()) ** 2, light, dark)
-
-    return texture
+    _, y, z = points.unbind(1)
+    radius = torch.hypot(y + 0.7, 2 * z + 0.4) + 0.08 * noise(points * 3)
+    phase = radius * rings
+    return mix((phase - phase.floor()) ** 2, light, dark)
 
 
-def mottled(first: Colour, second: Colour, scale: float) -> Texture:
+@texture
+def mottled(points: Tensor, first: Colour, second: Colour, scale: float) -> Tensor:
     """Two octaves of noise between two colours."""
-
-    def texture(points: Tensor) -> Tensor:
-        share = 0.65 * noise(points * scale) + 0.35 * noise(points * (4.3 * scale))
-        return mix(share, first, second)
-
-    return texture
+    share = 0.65 * noise(points * scale) + 0.35 * noise(points * (4.3 * scale))
+    return mix(share, first, second)
 
 
 def noise(points: Tensor) -> Tensor:
@@ -132,11 +123,6 @@ def lattice() -> Tensor:
     """[33, 33, 33] random values whose last planes repeat the first."""
     values = torch.rand(32, 32, 32, generator=torch.Generator().manual_seed(1))
     return torch.nn.functional.pad(values[None, None], (0, 1) * 3, mode="circular")[0, 0]
-
-
-def angle(x: Tensor, y: Tensor) -> Tensor:
-    """Azimuth in [-pi, pi]."""
-    return torch.atan2(y, x)
 
 
 def pick(condition: Tensor, first: Colour, second: Colour) -> Tensor:

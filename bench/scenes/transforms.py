@@ -17,9 +17,8 @@ from bench.scenes.files import (
     frames_of,
     inside,
     number,
-    opengl_to_opencv,
+    opengl_pose,
     read_json,
-    rigid_pose,
     unexpected,
     whole_number,
 )
@@ -52,14 +51,12 @@ def load(
         path: the folder with `transforms.json`.
         split_every: in the order of their names, pictures 0, split_every, 2 * split_every ... are
             the test split and all others the training.
-        aabb_scale: how many sides of instant-ngp's unit cube, x * 0.33 + 0.5, fill ours; by
-            default what the file says, or 1. The file's own `scale` and `offset` are heeded.
-        downscale: average blocks of this many pixels squared; what does not fill a block, at the
-            right and the bottom, is left out.
-        background: "white" or "black", what RGBA pictures are composited onto.
+        aabb_scale: the side of our unit cube in sides of instant-ngp's, x * 0.33 + 0.5; by default
+            what the file says, or 1. The `scale` and `offset` of the file are used, if any.
+        downscale, background: as of `bench.scenes.blender.load`.
 
     Intrinsics of a frame go before those of the file. Lens distortion is undone, and pictures are
-    cropped to what the lens saw. Frames without a picture are named once and left out.
+    cropped to what the lens saw. Frames without a picture are logged and left out.
     Raises SteerbenchError naming file and field when anything is not as it should be.
     """
     whole_number(split_every, "split_every", 2)
@@ -70,51 +67,39 @@ def load(
         "train": [view for i, view in enumerate(views) if i % split_every],
         "test": views[::split_every],
     }
+    path = root / CAMERA_FILE
     if not splits["train"]:
         got = f"{len(views)} pictures, each of which split_every={split_every} makes a test"
-        raise unexpected(root / CAMERA_FILE, "a picture to train on", got)
-    box = capture_box(root / CAMERA_FILE, record, aabb_scale)
-    return assemble(
-        root.name,
-        splits,
-        decode_splits(splits, downscale, log),
-        box,
-        background=background,
-        camera_files=[root / CAMERA_FILE],
-    )
+        raise unexpected(path, "a picture to train on", got)
+    box = capture_box(path, record, aabb_scale)
+    pictures = decode_splits(splits, downscale, log)
+    return assemble(root.name, splits, pictures, box, background=background, camera_files=[path])
 
 
 def read_views(root: Path, record: dict, log: Log) -> list[View]:
     """The views of all frames whose picture is there."""
     path = root / CAMERA_FILE
     views, missing = [], []
-    for index, frame in enumerate(frames_of(record, path)):
-        where = f"{path}: frames[{index}]"
+    for where, frame in frames_of(record, path):
         file = inside(root, frame["file_path"], f"{where}.file_path")
         if not file.is_file():
             missing.append(frame["file_path"])
             continue
-        pose = opengl_to_opencv(
-            rigid_pose(frame.get("transform_matrix"), f"{where}.transform_matrix")
-        )
         settings = ChainMap(frame, record)
-        camera = read_camera(settings, pose, file, where)
+        camera = read_camera(settings, opengl_pose(frame, where), file, where)
         lens = tuple(number(settings.get(name, 0.0), f"{where}.{name}") for name in LENS)
         refuse_other_lenses(settings, where)
         views.append(View(str(file.relative_to(root)), file, camera, lens if any(lens) else ()))
     if not views:
         raise unexpected(f"{path}: frames", "pictures", f"none of {len(missing)} files is there")
     if missing:
-        total = len(views) + len(missing)
-        log.info(
-            f"{path}: {len(missing)} of {total} pictures are not there, left out: "
-            + ", ".join(missing)
-        )
+        count = f"{len(missing)} of {len(views) + len(missing)}"
+        log.info(f"{path}: {count} pictures are not there, left out: {', '.join(missing)}")
     return views
 
 
 def read_camera(settings: ChainMap, pose: torch.Tensor, file: Path, where: str) -> Camera:
-    """The pinhole of a frame; what is not said about its size the picture's header tells.
+    """The pinhole of a frame; a size that is missing is read from the picture's header.
 
     Focal lengths come from fl_x and fl_y or from camera_angle_x and camera_angle_y; the vertical
     one is the horizontal when missing, and the principal point the middle.
@@ -131,9 +116,9 @@ def read_camera(settings: ChainMap, pose: torch.Tensor, file: Path, where: str) 
 
 
 def focal(settings: ChainMap, axis: str, size: float, where: str) -> float | None:
-    """Focal length in pixels along an axis of `size` pixels; None when nothing is said.
+    """Focal length in pixels along an axis of `size` pixels; None when there is none.
 
-    A frame's angle of view goes before the file's focal length: they say the same thing.
+    A frame's angle of view goes before the file's focal length: they mean the same thing.
     """
     length, angle = f"fl_{axis}", f"camera_angle_{axis}"
     for level in settings.maps:
@@ -152,9 +137,8 @@ def refuse_other_lenses(settings: Mapping, where: str) -> None:
     """
     model = settings.get("camera_model", "OPENCV")
     if model not in PINHOLE_MODELS:
-        raise unexpected(
-            f"{where}.camera_model", f"one of {', '.join(PINHOLE_MODELS)}", describe(model)
-        )
+        expected = f"one of {', '.join(PINHOLE_MODELS)}"
+        raise unexpected(f"{where}.camera_model", expected, describe(model))
     for name in OTHER_LENSES:
         if settings.get(name):
             raise unexpected(f"{where}.{name}", "a lens of k1 k2 p1 p2 k3", settings[name])
@@ -172,5 +156,4 @@ def capture_box(path: Path, record: dict, aabb_scale: float | None) -> Box:
     else:
         sides = number(aabb_scale, "aabb_scale", 0)
     middle = (0.5 - torch.tensor(offset, dtype=torch.float64)) / scale
-    half = sides / scale / 2
-    return Box(middle - half, middle + half)
+    return Box(middle - sides / scale / 2, middle + sides / scale / 2)

@@ -1,12 +1,13 @@
-"""Engines: what computes the network of a 2D renderer once it is trained, and at which precision.
+"""Engines: they compute the trained network of a 2D renderer, each at its precisions.
 
-An engine makes of a network, and of inputs that it saw on real frames, a function of the same
-tensors. Kernels, reprojection and the field stay what they are.
+An engine turns a network, and inputs of it from real frames, into a function of the same tensors.
+Kernels, reprojection and the field do not pass through an engine.
 """
 
 from __future__ import annotations
 
 import importlib
+import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from copy import deepcopy
@@ -18,7 +19,8 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from bench.errors import Unavailable
+from bench.errors import Unavailable, explained
+from bench.sharing import missing
 from bench.sources import digest, libraries
 from bench.types import Log
 
@@ -26,16 +28,22 @@ Precision = Literal["fp32", "bf16", "fp16", "int8"]
 
 Inputs = tuple[Tensor, ...]
 
+Samples = Callable[[], Sequence[Inputs]]
+"""Gives the inputs of a network in several frames. Called only if something is built from them."""
+
+Folder = Callable[[], Path]
+"""Gives a folder of one network and engine alone. Called only if something is kept there."""
+
 CALIBRATION = 16
-"""Frames whose inputs tell the range of every number that is rounded to 8 bits, and the sizes of
-varying axes that are to be expected."""
+"""Frames whose inputs give the range of every number that is rounded to 8 bits, and the sizes of
+varying axes to expect."""
 
 SIZES = "steerbench_sizes"
-"""Where a stored model says for which sizes of varying axes it is made ready beforehand."""
+"""Key, in a stored model, of the sizes of varying axes to prepare."""
 
 
 class Network(nn.Module, ABC):
-    """A network as engines can run it: tensors to a tuple of tensors.
+    """A network that engines can run: tensors to a tuple of tensors.
 
     Attributes:
         varying: of each input, the axes whose size, the same for all of them, differs from frame to
@@ -59,7 +67,7 @@ class Built:
 
     Attributes:
         run: as the network. What it returns may be overwritten by the next call.
-        size: bytes of its weights, as a file needs them at its precision.
+        size: bytes of its weights in a file at its precision.
     """
 
     run: Callable[..., Inputs]
@@ -71,8 +79,10 @@ class Engine(ABC):
 
     Attributes:
         name: as it stands in rows.
-        precisions: that it has.
+        precisions: those it has.
         libraries: distributions that it loads when it is made.
+        prepares_sizes: whether it prepares, before a frame is rendered, for the sizes of varying
+            axes that it has seen.
 
     Raises:
         Unavailable: the engine does not have this precision, or cannot be used here.
@@ -81,6 +91,7 @@ class Engine(ABC):
     name: ClassVar[str]
     precisions: ClassVar[tuple[Precision, ...]]
     libraries: ClassVar[tuple[str, ...]] = ()
+    prepares_sizes: ClassVar[bool] = True
 
     def __init__(self, precision: Precision = "fp32") -> None:
         if precision not in self.precisions:
@@ -98,12 +109,20 @@ class Engine(ABC):
                 "engine=torch or device=cpu"
             )
 
+    def computed(self, device: torch.device) -> str:
+        """The precision that products really have on `device`, as it stands in rows.
+
+        With int8 a second part, after `+`, is the precision of everything that is not quantised.
+        """
+        return f"{self.precision}+fp32" if self.precision == "int8" else self.precision
+
     def samples(self, network: Network) -> int:
-        """Frames whose inputs `build` wants to see."""
-        return CALIBRATION if self.precision == "int8" else 1
+        """Number of frames whose inputs `build` needs."""
+        several = self.precision == "int8" or (self.prepares_sizes and any(network.varying))
+        return CALIBRATION if several else 1
 
     def key(self) -> dict[str, object]:
-        """Everything that what is built depends on, beside the network and its inputs."""
+        """Everything that the built network depends on, beside the network and its inputs."""
         kind = type(self)
         return {
             "engine": self.name,
@@ -113,19 +132,35 @@ class Engine(ABC):
         }
 
     @abstractmethod
-    def build(
-        self,
-        network: Network,
-        samples: Callable[[], Sequence[Inputs]],
-        folder: Callable[[], Path],
-        log: Log,
-    ) -> Built:
-        """Make `network` run, or load what the same build left behind.
+    def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
+        """Make `network` run, or load what an earlier build of the same kept.
 
         Args:
-            samples: called if they are needed: the inputs of `self.samples(network)` frames.
-            folder: called if something is kept there: of this network and engine alone.
+            network: on the device where it will run.
+            samples: of `self.samples(network)` frames.
+            folder: for what is built.
+            log: for progress, and where a built network was found.
         """
+
+
+def keep(path: Path, write: Callable[[Path], None], log: Log) -> None:
+    """Have `write` make the file `path`, unless it exists: whole or not at all, by one process.
+
+    `write` gets a path of the same name in a temporary folder. Of what it leaves there, the files
+    that differ from `path` in their suffix are kept, too.
+
+    Raises:
+        SteerbenchError: the folder of `path` cannot be written to.
+    """
+    with missing(path, log) as to_build:
+        if not to_build:
+            log.info(f"built network found: {path}")
+            return
+        with explained(path.parent), tempfile.TemporaryDirectory(dir=path.parent) as place:
+            write(Path(place, path.name))
+            parts = Path(place).glob(f"{path.stem}.*")
+            for part in sorted(parts, key=lambda part: part.name == path.name):  # `path` comes last
+                part.replace(path.parent / part.name)
 
 
 def readable(network: Network) -> Network:
@@ -136,7 +171,7 @@ def readable(network: Network) -> Network:
 
 
 def sizes_to_expect(samples: Sequence[Inputs], network: Network) -> list[int]:
-    """The sizes of varying axes that were seen, those between, and one beyond on either side."""
+    """The sizes of varying axes in `samples`, those between, and one quantum beyond either end."""
     seen = {
         x.shape[axis]
         for inputs in samples
@@ -151,7 +186,7 @@ def sizes_to_expect(samples: Sequence[Inputs], network: Network) -> list[int]:
 
 
 def resized(sample: Inputs, network: Network, size: int) -> Inputs:
-    """Zeros like `sample`, whose varying axes are of `size`."""
+    """Zeros like `sample`, with varying axes of `size`."""
     shapes = (
         [size if axis in axes else length for axis, length in enumerate(x.shape)]
         for x, axes in zip(sample, network.varying, strict=True)
@@ -160,7 +195,7 @@ def resized(sample: Inputs, network: Network, size: int) -> Inputs:
 
 
 def required(engine: str, library: str, extra: str) -> ModuleType:
-    """Import a library that `engine` stands on.
+    """Import a library that `engine` needs.
 
     Raises:
         Unavailable: it is not installed.

@@ -1,12 +1,12 @@
-"""CUDA graphs: a network's launches recorded once for inputs of one size, and played again.
+"""CUDA graphs: a network's kernel launches, recorded once for each size of inputs and replayed.
 
 In plain torch the lean network is some two hundred small operations, which the CPU launches one
-after the other; a graph is launched at once.
+after the other. A graph is launched at once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -19,14 +19,14 @@ WARM_UP = 3
 
 
 class Replayed:
-    """`run`, recorded for every size of its inputs that comes.
+    """`run`, recorded for every size of its inputs when that size first comes.
 
-    What it returns is overwritten by the next call, of whatever size: all recordings share memory.
+    The next call, of whatever size, overwrites the outputs: all recordings share memory.
 
     Args:
-        run: computes on a CUDA GPU, without asking it anything.
-        record: makes of a function without arguments one that replays it, and what it returned,
-            which every replay computes anew.
+        run: computes on a CUDA GPU, without waiting for it.
+        record: turns a function without arguments into one that replays it, and its outputs, which
+            every replay computes again.
     """
 
     def __init__(
@@ -39,30 +39,30 @@ class Replayed:
 
     def __call__(self, *inputs: Tensor) -> Inputs:
         if not all(x.numel() for x in inputs):
-            return self._run(*inputs)  # nothing would be launched, and nothing is not recorded
+            return self._run(*inputs)  # launches nothing, and CUDA records no empty graph
         with torch.cuda.device_of(inputs[0]):
             recording = self._recording(inputs)
-            for held, x in zip(recording.told, inputs, strict=True):
+            for held, x in zip(recording.inputs, inputs, strict=True):
                 held.copy_(x)
             recording.replay()
-        return recording.said
+        return recording.outputs
 
     def _recording(self, inputs: Inputs) -> _Recording:
         sizes = tuple(x.shape for x in inputs)
         if sizes not in self._recordings:
-            told = [x.clone() for x in inputs]
-            self._recordings[sizes] = _Recording(told, *self._record(lambda: self._run(*told)))
+            held = tuple(x.clone() for x in inputs)
+            self._recordings[sizes] = _Recording(held, *self._record(lambda: self._run(*held)))
         return self._recordings[sizes]
 
 
 class _Recording(NamedTuple):
-    told: Sequence[Tensor]
+    inputs: Inputs
     replay: Callable[[], Any]
-    said: Inputs
+    outputs: Inputs
 
 
 class _Recorder:
-    """Records graphs, all with one pool of memory: no two of them are played at a time."""
+    """Records graphs, all with one pool of memory: no two of them are replayed at a time."""
 
     def __init__(self) -> None:
         self._stream: torch.cuda.Stream | None = None
@@ -77,5 +77,5 @@ class _Recorder:
         torch.cuda.current_stream().wait_stream(stream)
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph, pool=self._pool, stream=stream):
-            said = run()
-        return graph.replay, said
+            outputs = run()
+        return graph.replay, outputs

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
-
 import torch
 from torch import Tensor
 
 from bench.types import Log
-from methods.engines import Built, Engine, Inputs, Network, Precision, onnx_model, required
+from methods.engines import (
+    Built,
+    Engine,
+    Folder,
+    Inputs,
+    Network,
+    Precision,
+    Samples,
+    onnx_model,
+    required,
+)
 
 
 class OnnxRuntime(Engine):
-    """ONNX Runtime on the CPU.
+    """ONNX Runtime on the CPU. With int8, what is not quantised is computed in float32.
 
     Raises:
         Unavailable: it, or onnx, is not installed.
@@ -22,19 +29,14 @@ class OnnxRuntime(Engine):
     name = "onnxruntime"
     precisions = ("fp32", "int8")
     libraries = ("onnx", "onnxruntime")
+    prepares_sizes = False
 
     def __init__(self, precision: Precision = "fp32") -> None:
         super().__init__(precision)
         _, self._runtime = (required(self.name, library, "onnx") for library in self.libraries)
         self._runtime.disable_telemetry_events()
 
-    def build(
-        self,
-        network: Network,
-        samples: Callable[[], Sequence[Inputs]],
-        folder: Callable[[], Path],
-        log: Log,
-    ) -> Built:
+    def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
         """See `Engine.build`."""
         path = onnx_model.kept(network, samples, folder, self.precision, log)
         options = self._runtime.SessionOptions()
@@ -43,7 +45,7 @@ class OnnxRuntime(Engine):
         names = onnx_model.input_names(network)
 
         def run(*inputs: Tensor) -> Inputs:
-            told = {name: x.numpy() for name, x in zip(names, inputs, strict=True)}
-            return tuple(torch.from_numpy(x) for x in session.run(None, told))
+            arrays = {name: x.numpy() for name, x in zip(names, inputs, strict=True)}
+            return tuple(torch.from_numpy(x) for x in session.run(None, arrays))
 
         return Built(run, onnx_model.weight_bytes(path))

@@ -6,9 +6,8 @@ import contextlib
 import json
 import logging
 import sys
-import tempfile
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,23 +15,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bench.errors import Unavailable, explained
-from bench.sharing import missing
+from bench.errors import Unavailable
 from bench.types import Log
 from methods.engines import (
-    CALIBRATION,
     SIZES,
     Built,
     Engine,
+    Folder,
     Inputs,
     Network,
     Precision,
+    Samples,
+    keep,
     readable,
     required,
     sizes_to_expect,
 )
 
-# Neither OpenVINO nor NNCF is to tell anybody that it is used: both do without this package.
+# Keeps OpenVINO and NNCF from reporting their use to anybody: both work without this package.
 sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
 
 Varying = tuple[tuple[int, ...], ...]
@@ -41,11 +41,11 @@ Varying = tuple[tuple[int, ...], ...]
 class OpenVino(Engine):
     """OpenVINO on the CPU.
 
-    With int8, what is not quantised is computed in bfloat16 where the CPU has it, else in float32.
+    With int8, what is not quantised is computed in bfloat16 if the CPU has it, else in float32.
 
     Raises:
-        Unavailable: it, or for int8 NNCF, is not installed; or it has no bfloat16 on this CPU, for
-            which it would take float32 without a word.
+        Unavailable: it, or for int8 NNCF, is not installed; or this CPU has no bfloat16, and
+            OpenVINO would compute in float32 without saying so.
     """
 
     name = "openvino"
@@ -56,34 +56,29 @@ class OpenVino(Engine):
         super().__init__(precision)
         self._openvino = required(self.name, "openvino", "openvino")
         self._nncf = required(self.name, "nncf", "openvino") if precision == "int8" else None
-        if precision == "bf16" and "BF16" not in _capabilities(self._openvino):
+        self._half = precision != "fp32" and "BF16" in _capabilities(self._openvino)
+        if precision == "bf16" and not self._half:
             raise Unavailable(
                 "precision=bf16: engine=openvino has no bfloat16 on this CPU, use precision=fp32"
             )
 
-    def samples(self, network: Network) -> int:
-        """See `Engine.samples`: enough to know the sizes that come."""
-        return CALIBRATION if any(network.varying) else super().samples(network)
+    def computed(self, device: torch.device) -> str:
+        """See `Engine.computed`."""
+        return "int8+bf16" if self.precision == "int8" and self._half else super().computed(device)
 
-    def build(
-        self,
-        network: Network,
-        samples: Callable[[], Sequence[Inputs]],
-        folder: Callable[[], Path],
-        log: Log,
-    ) -> Built:
+    def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
         """See `Engine.build`."""
+
+        def write(path: Path) -> None:
+            seen = samples()
+            model = self._convert(network, seen)
+            model.set_rt_info(json.dumps(sizes_to_expect(seen, network)), SIZES)
+            self._openvino.save_model(model, path, compress_to_fp16=self.precision == "bf16")
+
         path = folder() / "network.xml"
-        with missing(path, log) as to_build:
-            if to_build:
-                seen = samples()
-                model = self._convert(network, seen)
-                model.set_rt_info(json.dumps(sizes_to_expect(seen, network)), SIZES)
-                self._write(model, path)
-            else:
-                log.info(f"built network found: {path}")
+        keep(path, write, log)
         model = self._openvino.Core().read_model(path)
-        compiled = _Compiled(self._openvino, model, network.varying, self.precision)
+        compiled = _Compiled(self._openvino, model, network.varying, half=self._half)
         sizes = json.loads(model.get_rt_info(SIZES).value)
         with log.progress("compiling", len(sizes)) as progress:
             for size in sizes:
@@ -93,12 +88,12 @@ class OpenVino(Engine):
         return Built(compiled, sum(op.data.nbytes for op in weights))
 
     def _convert(self, network: Network, samples: Sequence[Inputs]) -> Any:
-        shapes = [list(x.shape) for x in samples[0]]
-        for shape, axes in zip(shapes, network.varying, strict=True):
-            for axis in axes:
-                shape[axis] = -1
+        shapes = [
+            [-1 if axis in axes else length for axis, length in enumerate(x.shape)]
+            for x, axes in zip(samples[0], network.varying, strict=True)
+        ]
         with torch.no_grad(), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of the tracer: on itself, and on checks of arguments
+            warnings.simplefilter("ignore")  # about the tracer itself and checks of arguments
             model = self._openvino.convert_model(
                 readable(network), example_input=samples[0], input=shapes
             )
@@ -114,41 +109,36 @@ class OpenVino(Engine):
                 subset_size=len(samples),
             )
 
-    def _write(self, model: Any, path: Path) -> None:
-        """Leave the model at `path`, whole or not at all."""
-        with explained(path.parent), tempfile.TemporaryDirectory(dir=path.parent) as place:
-            new = Path(place) / path.name
-            self._openvino.save_model(model, new, compress_to_fp16=self.precision == "bf16")
-            new.with_suffix(".bin").replace(path.with_suffix(".bin"))
-            new.replace(path)
-
 
 def _capabilities(openvino: Any) -> list[str]:
     return openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
 
 
 class _Compiled:
-    """A model, compiled for every size of its inputs that comes: a fixed size is a third faster."""
+    """A model, compiled for every size of its inputs when it first comes.
 
-    def __init__(self, openvino: Any, model: Any, varying: Varying, precision: Precision) -> None:
+    Compiled for a fixed size it is a third faster than for any size.
+    """
+
+    def __init__(self, openvino: Any, model: Any, varying: Varying, *, half: bool) -> None:
         self._model, self._varying, self._core = model, varying, openvino.Core()
         self._requests: dict[tuple[tuple[int, ...], ...], Any] = {}
         self._settings = {
-            "INFERENCE_PRECISION_HINT": "f32" if precision == "fp32" else "bf16",
+            "INFERENCE_PRECISION_HINT": "bf16" if half else "f32",
             "PERFORMANCE_HINT": "LATENCY",
             "INFERENCE_NUM_THREADS": torch.get_num_threads(),
         }
 
     def prepare(self, size: int) -> None:
-        """Compile for varying axes of `size`; what is done at the first call is done, too."""
-        told = []
+        """Compile for varying axes of `size`, and do the work of the first call."""
+        inputs = []
         for port, axes in zip(self._model.inputs, self._varying, strict=True):
             shape = [
                 size if axis in axes else part.get_length()
                 for axis, part in enumerate(port.partial_shape)
             ]
-            told.append(np.zeros(shape, port.element_type.to_dtype()))
-        self._request(tuple(x.shape for x in told)).infer(told)
+            inputs.append(np.zeros(shape, port.element_type.to_dtype()))
+        self._request(tuple(x.shape for x in inputs)).infer(inputs)
 
     def __call__(self, *inputs: Tensor) -> Inputs:
         arrays = [x.contiguous().numpy() for x in inputs]

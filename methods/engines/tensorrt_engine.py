@@ -1,30 +1,31 @@
 """TensorRT as an engine: fp32, fp16, and 8-bit integers quantised by ONNX Runtime.
 
-TensorRT 11 computes in the types that a model has (strong typing), so that these are written into
-the ONNX model: halves by casting the network, integers as pairs of QuantizeLinear and
-DequantizeLinear that are symmetric, and without a quantised bias, as TensorRT asks for
+TensorRT 11 computes in the types that a model has (strong typing), so the ONNX model has them:
+fp16 by casting the network, int8 by pairs of QuantizeLinear and DequantizeLinear. TensorRT requires
+that these are symmetric and leave the bias in float32
 (https://docs.nvidia.com/deeplearning/tensorrt, "Explicit Quantization").
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from bench.errors import SteerbenchError, Unavailable, explained
-from bench.sharing import missing, whole
+from bench.errors import SteerbenchError, Unavailable
 from bench.types import Log
 from methods.engines import (
-    CALIBRATION,
     Built,
     Engine,
+    Folder,
     Inputs,
     Network,
     Precision,
+    Samples,
+    keep,
     onnx_model,
     required,
 )
@@ -35,8 +36,9 @@ QUANTISED = {"ActivationSymmetric": True, "QuantizeBias": False}
 class TensorRt(Engine):
     """TensorRT on a CUDA GPU.
 
-    What is built, a plan, is good for one GPU and one version, and for up to so many cells: a power
-    of two. The plans for the sizes to expect are made beforehand, others when such a view comes.
+    It builds plans. A plan serves one GPU, one version and up to so many cells: a power of two.
+    Plans for the sizes to expect are built beforehand, others when such a view comes. With int8,
+    what is not quantised is computed in float32.
 
     Raises:
         Unavailable: there is no CUDA GPU, or TensorRT, onnx or ONNX Runtime is not installed.
@@ -64,30 +66,23 @@ class TensorRt(Engine):
                 "device=cuda, and CUDA_VISIBLE_DEVICES to choose among several"
             )
 
-    def samples(self, network: Network) -> int:
-        """See `Engine.samples`: enough to know the sizes that come."""
-        return CALIBRATION if any(network.varying) else super().samples(network)
-
     def key(self) -> dict[str, object]:
         """See `Engine.key`."""
         return super().key() | {"gpu": torch.cuda.get_device_name()}
 
-    def build(
-        self,
-        network: Network,
-        samples: Callable[[], Sequence[Inputs]],
-        folder: Callable[[], Path],
-        log: Log,
-    ) -> Built:
+    def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
         """See `Engine.build`."""
         path = onnx_model.kept(network, samples, folder, self.precision, log, QUANTISED)
-        plans = _Plans(self._tensorrt, path, network, exact=self.precision == "fp32", log=log)
+        plans = _Plans(self._tensorrt, path, network, exact=self.precision != "fp16", log=log)
         plans.prepare(onnx_model.sizes(path))
         return Built(plans, onnx_model.weight_bytes(path))
 
 
 class _Plans:
-    """A model, built for up to 2^n cells, for every n that comes."""
+    """A model, built for up to 2^n cells for every n when it first comes.
+
+    `exact`: what is in float32 is computed so, and not in TF32.
+    """
 
     def __init__(
         self, tensorrt: Any, model: Path, network: Network, *, exact: bool, log: Log
@@ -98,7 +93,7 @@ class _Plans:
         self._executions: dict[int, _Execution] = {}
 
     def prepare(self, sizes: Sequence[int]) -> None:
-        """Have a plan for each of these numbers of cells; for a network of fixed size, its plan."""
+        """Build the plans for these numbers of cells; for a network of fixed size, its one plan."""
         ceilings = sorted({_ceiling(size) for size in sizes or [1]})
         with self._log.progress("building for TensorRT", len(ceilings)) as progress:
             for ceiling in ceilings:
@@ -118,17 +113,13 @@ class _Plans:
     def _execution(self, ceiling: int) -> _Execution:
         if ceiling not in self._executions:
             path = self._model.with_name(f"upto-{ceiling}.plan")
-            with missing(path, self._log) as to_build:
-                if to_build:
-                    built = self._built(ceiling)
-                    with explained(path.parent), whole(path) as new:
-                        new.write_bytes(built)
+            keep(path, lambda new: self._build(ceiling, new), self._log)
             names = onnx_model.input_names(self._network)
             self._executions[ceiling] = _Execution(self._tensorrt, path, self._logger, names)
         return self._executions[ceiling]
 
-    def _built(self, ceiling: int) -> Any:
-        """The plan for 1 to `ceiling` cells, fastest at most of them."""
+    def _build(self, ceiling: int, path: Path) -> None:
+        """Write the plan for 1 to `ceiling` cells, fastest at `ceiling`."""
         trt = self._tensorrt
         builder = trt.Builder(self._logger)
         typed = 1 << int(trt.NetworkDefinitionCreationFlag.STRONGLY_TYPED)
@@ -140,12 +131,12 @@ class _Plans:
         if self._exact:
             config.clear_flag(trt.BuilderFlag.TF32)
         profile = builder.create_optimization_profile()
-        for told in map(network.get_input, range(network.num_inputs)):
+        for tensor in map(network.get_input, range(network.num_inputs)):
             shapes = (
-                [size if axis == -1 else axis for axis in told.shape]
+                [size if axis == -1 else axis for axis in tensor.shape]
                 for size in (1, ceiling, ceiling)  # the least, the usual, the most
             )
-            profile.set_shape(told.name, *shapes)
+            profile.set_shape(tensor.name, *shapes)
         config.add_optimization_profile(profile)
         plan = builder.build_serialized_network(network, config)
         if plan is None:
@@ -153,41 +144,41 @@ class _Plans:
                 f"TensorRT {trt.__version__} cannot build {self._model} for up to {ceiling} cells; "
                 "it says why above"
             )
-        return plan
+        path.write_bytes(plan)
 
 
 class _Execution:
-    """A plan, ready to run on a stream of its own: on torch's, TensorRT waits for the device."""
+    """A plan on a stream of its own: on torch's default stream TensorRT waits for the device."""
 
-    def __init__(self, tensorrt: Any, path: Path, logger: Any, told: Sequence[str]) -> None:
+    def __init__(self, tensorrt: Any, path: Path, logger: Any, inputs: Sequence[str]) -> None:
         engine = tensorrt.Runtime(logger).deserialize_cuda_engine(path.read_bytes())
         if engine is None:
             raise SteerbenchError(f"TensorRT cannot load its plan: remove {path} and run again")
         self._context = engine.create_execution_context()
-        self._told = told
-        self._said = onnx_model.output_names(engine.num_io_tensors - len(told))
+        self._inputs = inputs
+        self._outputs = onnx_model.output_names(engine.num_io_tensors - len(inputs))
         self._stream = torch.cuda.Stream()
 
     def __call__(self, *inputs: Tensor) -> Inputs:
         inputs, context = tuple(x.contiguous() for x in inputs), self._context
-        taken = [
+        accepted = [
             context.set_input_shape(name, tuple(x.shape))
-            for name, x in zip(self._told, inputs, strict=True)
+            for name, x in zip(self._inputs, inputs, strict=True)
         ]
-        if not all(taken):
+        if not all(accepted):
             raise _refused(inputs)
-        said = [
+        outputs = [
             torch.empty(tuple(context.get_tensor_shape(name)), device=inputs[0].device)
-            for name in self._said
+            for name in self._outputs
         ]
-        for name, x in zip((*self._told, *self._said), (*inputs, *said), strict=True):
-            taken.append(context.set_tensor_address(name, x.data_ptr()))
+        for name, x in zip((*self._inputs, *self._outputs), (*inputs, *outputs), strict=True):
+            accepted.append(context.set_tensor_address(name, x.data_ptr()))
         current = torch.cuda.current_stream()
         self._stream.wait_stream(current)
-        if not all(taken) or not context.execute_async_v3(self._stream.cuda_stream):
+        if not all(accepted) or not context.execute_async_v3(self._stream.cuda_stream):
             raise _refused(inputs)
         current.wait_stream(self._stream)
-        return tuple(said)
+        return tuple(outputs)
 
 
 def _refused(inputs: Inputs) -> SteerbenchError:

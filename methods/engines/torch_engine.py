@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from bench.errors import Unavailable
 from bench.types import Log
-from methods.engines import CALIBRATION, Built, Engine, Inputs, Network, resized, sizes_to_expect
+from methods.engines import (
+    Built,
+    Engine,
+    Folder,
+    Inputs,
+    Network,
+    Samples,
+    resized,
+    sizes_to_expect,
+)
 from methods.engines.cuda_graphs import Replayed
+from methods.kernels import multiplies_bf16
 
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 
 class TorchEngine(Engine):
-    """The network itself; below fp32, its products and convolutions in half precision."""
+    """The network itself; below fp32, its products and convolutions in half precision.
+
+    A device without products of bfloat16 multiplies numbers that were rounded to bfloat16 in
+    float32: rows then say `bf16 in fp32`.
+    """
 
     name = "torch"
     precisions = ("fp32", "bf16", "fp16")
@@ -28,19 +41,16 @@ class TorchEngine(Engine):
         if self.precision == "fp16" and device.type == "cpu":
             raise Unavailable("precision=fp16: engine=torch has it on a GPU, on a CPU use bf16")
 
-    def samples(self, network: Network) -> int:
-        """See `Engine.samples`: on a GPU, enough to know the sizes that come; on a CPU none."""
-        if _on_cpu(network):
-            return 0
-        return CALIBRATION if any(network.varying) else 1
+    def computed(self, device: torch.device) -> str:
+        """See `Engine.computed`."""
+        emulated = self.precision == "bf16" and not multiplies_bf16(device.type)
+        return "bf16 in fp32" if emulated else super().computed(device)
 
-    def build(
-        self,
-        network: Network,
-        samples: Callable[[], Sequence[Inputs]],
-        folder: Callable[[], Path],
-        log: Log,
-    ) -> Built:
+    def samples(self, network: Network) -> int:
+        """See `Engine.samples`: none on a CPU, which runs the network as it is."""
+        return 0 if _on_cpu(network) else super().samples(network)
+
+    def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
         """See `Engine.build`."""
         dtype = DTYPES[self.precision]
 
@@ -48,25 +58,23 @@ class TorchEngine(Engine):
             with _arithmetic(inputs[0].device, dtype):
                 return network(*inputs)
 
-        ready = run if _on_cpu(network) else _recorded(run, network, samples(), log)
-        return Built(ready, sum(weight.numel() for weight in network.parameters()) * dtype.itemsize)
+        size = sum(weight.numel() for weight in network.parameters()) * dtype.itemsize
+        return Built(run if _on_cpu(network) else _recorded(run, network, samples, log), size)
 
 
-def _recorded(
-    run: Callable[..., Inputs], network: Network, samples: Sequence[Inputs], log: Log
-) -> Replayed:
+def _recorded(run: Callable[..., Inputs], network: Network, samples: Samples, log: Log) -> Replayed:
     """`run` as CUDA graphs, recorded for the sizes to expect."""
-    replayed = Replayed(run)
-    sizes = sizes_to_expect(samples, network) or [1]  # or the one size that it has
+    replayed, seen = Replayed(run), samples()
+    sizes = sizes_to_expect(seen, network) or [1]  # a network of fixed size has one graph
     with torch.no_grad(), log.progress("recording CUDA graphs", len(sizes)) as progress:
         for size in sizes:
-            replayed(*resized(samples[0], network, size))
+            replayed(*resized(seen[0], network, size))
             progress.advance()
     return replayed
 
 
 def _arithmetic(device: torch.device, dtype: torch.dtype) -> AbstractContextManager[object]:
-    """Products in `dtype`; on a GPU convolutions in float32 would else be computed in TF32."""
+    """Products in `dtype`. On a GPU, float32 convolutions would otherwise be computed in TF32."""
     if dtype != torch.float32:
         return torch.autocast(device.type, dtype)
     if device.type == "cuda":

@@ -79,4 +79,4 @@ class InstantNgp:
 
     def settings(self) -> dict[str, str]:
         """See `bench.types.Method.settings`."""
-        return self.setup.settings()
+        return self.setup.settings(type(self))

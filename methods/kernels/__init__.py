@@ -1,23 +1,25 @@
 """Operations of radiance-field rendering, each as a plain torch reference beside fast backends.
 
 A kernel is a folder: `__init__` holds its signature and meaning, `reference` the plain torch
-version (any dtype, any device, differentiable: the oracle of all others), `cpu` the numba version,
-`gpu`, where there is one, the Triton version.
+version (any dtype, any device, differentiable; all others are compared with it), `cpu` the numba
+version, `gpu`, where there is one, the Triton version.
 All backends of a kernel have the same signature.
 """
 
 from methods.kernels.dispatch import (
     BACKENDS,
     availability,
+    compiled,
+    description,
     multiplies_bf16,
     resolve,
-    serves_many_threads,
 )
 
 __all__ = [
     "BACKENDS",
     "availability",
+    "compiled",
+    "description",
     "multiplies_bf16",
     "resolve",
-    "serves_many_threads",
 ]

@@ -16,18 +16,11 @@ f32, i32, u32 = np.float32, np.int32, np.uint32
 
 
 def follow_torch_threads() -> None:
-    """Let the kernels run on as many threads as torch does, as far as numba has started them."""
+    """Run the kernels on as many threads as torch uses, up to those that numba has started."""
     threads = torch.get_num_threads()
     numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-    if torch.get_num_threads() != threads:  # numba started its own, and told OpenMP how many
+    if torch.get_num_threads() != threads:  # starting its own, numba changed those of OpenMP
         torch.set_num_threads(threads)
-
-
-def serves_many_threads() -> bool:
-    """Whether several threads may call kernels at once. Without OpenMP and TBB numba has threads of
-    its own (`workqueue`), and ends the process that does so."""
-    numba.get_num_threads()  # starts them, if none are yet
-    return numba.threading_layer() != "workqueue"
 
 
 @njit(cache=True)

@@ -1,5 +1,8 @@
-"""Which backend serves a call: by name or by the device of the tensors, never a silent fallback but
-for what `gpu` has no kernel for, which torch computes on the device."""
+"""Which backend computes a kernel: by name, or by the device of the tensors.
+
+Not every kernel has a Triton version: with backend "gpu" torch computes the others on the device.
+`description` names them.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import difflib
 import importlib
 import importlib.util
 import os
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -14,6 +18,7 @@ from types import ModuleType
 import torch
 
 from bench.errors import Unavailable
+from bench.sources import sources
 
 BACKENDS = ("reference", "cpu", "gpu")
 
@@ -32,20 +37,20 @@ def availability() -> dict[str, str]:
 
 
 def interpreted() -> bool:
-    """Whether Triton's interpreter, in place of its compiler, runs the kernels of `gpu`: on CPU
-    tensors, and slowly. For tests where there is no GPU."""
+    """Whether Triton interprets the kernels of `gpu` on CPU tensors, slowly, and compiles none. For
+    tests without a GPU."""
     return os.environ.get("TRITON_INTERPRET") == "1"
 
 
 def resolve(backend: str, device: torch.device | str) -> str:
-    """The name of the backend that will serve tensors on `device`.
+    """The name of the backend that computes on `device`.
 
-    `auto` goes by the device alone: CPU tensors to `cpu`, all others to `reference`. The kernels of
-    `gpu` were never run on one: they serve who asks for them by name.
+    `auto` goes by the device alone: `cpu` for CPU tensors, `reference` for all others. The kernels
+    of `gpu` were never run on one: they have to be chosen by name.
 
     Raises:
-        Unavailable: the backend asked for by name is unknown, cannot be used here, or does not
-            serve this device.
+        Unavailable: the named backend is unknown, cannot be used here, or does not compute on this
+            device.
     """
     kind = torch.device(device).type
     if backend == "auto":
@@ -84,10 +89,7 @@ def multiplies_bf16(kind: str) -> bool:
 
 
 def implementation(kernel: str, backend: str, device: torch.device) -> ModuleType:
-    """The module that implements `kernel` (a folder beside this file) for tensors on `device`.
-
-    With backend="gpu" torch computes, on the device, what has no kernel in Triton.
-    """
+    """The module that implements `kernel` (a folder beside this file) for tensors on `device`."""
     name = resolve(backend, device)
     if name == "gpu" and not has(kernel, name):
         name = "reference"
@@ -96,16 +98,39 @@ def implementation(kernel: str, backend: str, device: torch.device) -> ModuleTyp
     return _load(f"methods.kernels.{kernel}.{name}")
 
 
-def serves_many_threads(backend: str, device: torch.device) -> bool:
-    """Whether several threads may call kernels of `backend` at once."""
-    if resolve(backend, device) != "cpu":
-        return True
-    return bool(_load("methods.kernels.cpu").serves_many_threads())
+def description(backend: str, device: torch.device | str, kernels: Iterable[str]) -> str:
+    """What computes `kernels` on `device`: the name of the backend and, where it has no version of
+    some of them, the names of these: "gpu, reference: adam, spherical"."""
+    name = resolve(backend, device)
+    others = [kernel for kernel in kernels if not has(kernel, name)]
+    return f"{name}, reference: {', '.join(sorted(others))}" if others else name
+
+
+def used_by(thing: type) -> list[str]:
+    """The names of the kernels that a class stands on, by its imports."""
+    folders = {path.parent for path in sources(thing).values()}
+    return sorted(folder.name for folder in folders if folder.parent == Path(__file__).parent)
 
 
 def has(kernel: str, backend: str) -> bool:
-    """Whether `backend` has an implementation of its own of `kernel`."""
+    """Whether `backend` has its own version of `kernel`."""
     return (Path(__file__).parent / kernel / f"{backend}.py").exists()
+
+
+def served(kernel: str) -> list[str]:
+    """The backends that have their own version of `kernel`."""
+    return [name for name in BACKENDS if has(kernel, name)]
+
+
+def compiled(device: str) -> list[str]:
+    """The backends that compute on `device` here at full speed: an interpreted one does not."""
+    usable = []
+    for name in BACKENDS:
+        try:
+            usable.append(resolve(name, device))
+        except Unavailable:
+            continue
+    return [name for name in usable if not (name == "gpu" and interpreted())]
 
 
 # Imported when first used: numba and Triton are heavy, and not every machine has both.

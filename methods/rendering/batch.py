@@ -35,29 +35,16 @@ def render_batch(
         jitter: [R] phase of the samples of each ray, in [0, 1); None: as `rays.render_rays`.
         background: [K] or [R, K]; None: not composited on any.
     """
-    samples = march(
-        rays.origins, rays.directions, occupancy, how.step, jitter=jitter, backend=field.backend
-    )
+    samples = march(rays, occupancy, how.step, jitter=jitter, backend=field.backend)
     with torch.no_grad():
         parts = pad(samples.positions).split(CHUNK_SAMPLES)
         sigma = torch.cat([field.density(part)[0] for part in parts])[: len(samples)]
-        counts = visible_counts(
-            sigma, samples.delta, samples.offsets, stop=how.stop, backend=field.backend
-        )
+        counts = visible_counts(sigma, samples, stop=how.stop, backend=field.backend)
     samples = samples.front(counts)
     encoded = field.encode_directions(rays.directions)
     sigma, values = query(field, samples.positions, samples.ray, encoded)
-    pixels = composite(
-        sigma,
-        values,
-        samples.t,
-        samples.delta,
-        samples.offsets,
-        background=background,
-        stop=how.stop,
-        backend=field.backend,
-    )
-    return pixels, len(samples)
+    pixels = composite(sigma, values, samples, stop=how.stop, backend=field.backend)
+    return pixels if background is None else pixels.over(background), len(samples)
 
 
 def opacity_entropy(opacity: Tensor) -> Tensor:

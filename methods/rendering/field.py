@@ -18,7 +18,7 @@ LOG_DENSITY_CLAMP = 15.0
 
 
 class Field(Protocol):
-    """A density and K features of a position and a view direction (SteerNeRF Eq. 1, 2).
+    """A density and K features of a position and a view direction (SteerNeRF Eq. 4).
 
     Attributes:
         channels: K; the first three features are RGB.

@@ -46,8 +46,7 @@ def render_rays(
             with probe.stage("march"):
                 some = rays.take(open_)
                 samples = march(
-                    some.origins,
-                    some.directions,
+                    some,
                     occupancy,
                     how.step,
                     window=None if how.window is None else how.window[open_],
@@ -62,14 +61,7 @@ def render_rays(
             sigma, values = _evaluated(field, samples, some.directions, front, how, probe)
             with probe.stage("composite"):
                 pixels = composite(
-                    sigma,
-                    values,
-                    samples.t,
-                    samples.delta,
-                    samples.offsets,
-                    stop=how.stop,
-                    carry=front,
-                    backend=field.backend,
+                    sigma, values, samples, stop=how.stop, carry=front, backend=field.backend
                 )
                 canvas.put(open_, pixels)
                 left = (samples.resume >= 0) & (1 - pixels.alpha > how.stop)
@@ -85,8 +77,8 @@ def _evaluated(
     with probe.stage("field"):
         sigma, geometry = field.density(pad(samples.positions))
         sigma = sigma[: len(samples)]
-        along = (sigma, samples.delta, samples.offsets)
-        weight = weights(*along, stop=how.stop, front=1 - front.alpha, backend=field.backend)
+        through = 1 - front.alpha
+        weight = weights(sigma, samples, stop=how.stop, front=through, backend=field.backend)
         seen = (weight > how.least_weight).nonzero().squeeze(1)
         encoded = field.encode_directions(directions)
         index = pad(seen)

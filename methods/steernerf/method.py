@@ -90,9 +90,9 @@ class SteerNerf:
 
     def settings(self) -> dict[str, str]:
         """See `bench.types.Method.settings`; engine and precision are those of the 2D renderer."""
-        return self.setup.settings() | {
+        return self.setup.settings(type(self)) | {
             "engine": self.engine.name,
-            "precision": self.engine.precision,
+            "precision": self.engine.computed(self.setup.device),
         }
 
     def _build_network(self, second: TrainedPipeline, scene: Scene, log: Log) -> None:

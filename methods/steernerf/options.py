@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 from methods.kernels.composite import check_stop
@@ -124,7 +124,7 @@ class Rendering:
     overlap: float = 0.0
     refined: float = 0.0
     refined_step: float = 1.0
-    skip: Skips = field(default_factory=Skips)
+    skip: Skips = Skips()
 
     def __post_init__(self) -> None:
         check_step("step", self.step)

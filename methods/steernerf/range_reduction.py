@@ -16,7 +16,7 @@ def depth_interval(
 ) -> Tensor:
     """[h, w, 2]: the interval [D - epsilon, D + epsilon] of z-depth in which each pixel of
     `camera`, a low-resolution one, looks; [0, inf) where no point of `cloud` falls."""
-    index, depth = cloud.splat(camera, how, backend)  # Eq. 6 to 8
+    index, depth = cloud.splat(camera, how, backend)  # Eq. 7, 8; Eq. 6 made the cloud
     reprojected = at_pixels(depth, index, torch.inf)  # D, t' -> t
     known = index >= 0
     return torch.stack(

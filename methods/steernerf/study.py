@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from bench.study import Axis, Study, Variant
 
@@ -36,8 +36,22 @@ PARTS = {
     "finish": "finish",
 }
 
+SKIPS = {
+    "empty space": "method.rendering.skip.empty",
+    "hidden samples": "method.rendering.skip.hidden",
+}
+
+
+def not_skipped(skips: Mapping[str, str]) -> list[Variant]:
+    """Each of `skips` switched off alone."""
+    return [
+        Variant(f"{name} not skipped", (f"{setting}=false",)) for name, setting in skips.items()
+    ]
+
+
 STUDY = Study(
     knobs={
+        "skips": not_skipped(SKIPS),
         "step length": turned("step", "method.rendering.step", (1.5, 2, 3)),
         "stop": turned("stop", "method.rendering.stop", ("1e-1", "3e-2", "1e-3", "1e-4")),
         "range reduction": [
@@ -59,10 +73,7 @@ STUDY = Study(
         "method.rendering.step=1",
         "method.rendering.skip.hidden=false",
     ),
-    skips={
-        "empty space": "method.rendering.skip.empty",
-        "hidden samples": "method.rendering.skip.hidden",
-    },
+    skips=SKIPS,
     savings=(Variant("and a window of depths", ("method.rendering.range.mode=window",)),),
     axes={
         "L": Axis("L = {}", "method.model.frames", (0, 1, 2, 3)),
@@ -75,5 +86,7 @@ STUDY = Study(
         ),
     },
     parts=PARTS,
+    network_stage="renderer2d/network",
+    network_size="renderer2d",
     beside={"Instant-NGP": ("method=ngp",)},
 )

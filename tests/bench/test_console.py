@@ -12,7 +12,7 @@ from bench.types import SteerbenchError
 
 
 class Clock:
-    """Seconds that pass when told to."""
+    """A clock that a test sets."""
 
     def __init__(self) -> None:
         self.now = 1000.0

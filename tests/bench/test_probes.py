@@ -21,7 +21,7 @@ def clock_reading(times: Iterable[int]) -> StageClock:
     return StageClock("cpu", clock=lambda: next(readings))
 
 
-def test_own_times_of_nested_and_repeated_stages_are_told_apart():
+def test_own_times_of_nested_and_repeated_stages_are_kept_apart():
     clock = clock_reading([100, 101, 103, 107, 115, 131, 163, 227])
     with clock.frame():  # 100
         with clock.stage("field"), clock.stage("encode"):  # 101, 103; 107, 115
@@ -65,7 +65,7 @@ def test_stages_and_other_add_up_to_the_frame_whatever_the_nesting(tree, steps):
     assert all(ns >= 0 for ns in frame.stages_ns.values())
 
 
-def test_counters_add_up_within_a_frame_and_begin_anew_in_the_next():
+def test_counters_add_up_within_a_frame_and_start_at_0_in_the_next():
     clock = clock_reading(itertools.count())
     with clock.frame():
         clock.count("samples", 3, dense=10)

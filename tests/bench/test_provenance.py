@@ -1,4 +1,4 @@
-"""The commit follows the checkout; the machine is described so that two can be told apart."""
+"""The commit follows the checkout; the machine is described so that two can be distinguished."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_the_machine_record_is_json_and_names_what_matters():
         ("CPU implementer\t: 0x41\nCPU part\t: 0xd40\n", "(CPU implementer 0x41, CPU part 0xd40)"),
     ],
 )
-def test_processors_of_one_name_are_told_apart(text, name, monkeypatch):
+def test_processors_of_one_name_are_distinguished(text, name, monkeypatch):
     monkeypatch.setattr(Path, "read_text", lambda path, *more, **options: text)
     assert provenance.machine()["cpu"].endswith(name)
 

@@ -19,7 +19,7 @@ WHITE = torch.ones(3)
 
 def scores(scene, trajectory: Trajectory, protocol=QUICK, levels=None) -> list[dict]:
     """Of frames of one grey level each: darker from one to the next, unless said otherwise."""
-    scoring = Scoring(scene, trajectory, protocol, {}, pictures=0)
+    scoring = Scoring(scene, trajectory, protocol, {})
     return [
         scoring.score(index, step, torch.full((step.camera.height, step.camera.width, 3), level))
         for index, (step, level) in enumerate(
@@ -87,7 +87,7 @@ def test_the_exact_picture_of_a_scene_serves_flicker_when_the_protocol_asks(tiny
 
 def test_a_prediction_equal_to_the_truth_does_not_flicker(tiny_scene):
     trajectory = from_split(tiny_scene)
-    scoring = Scoring(tiny_scene, trajectory, replace(QUICK, rounding="none"), {}, pictures=0)
+    scoring = Scoring(tiny_scene, trajectory, replace(QUICK, rounding="none"), {})
     for index, step in enumerate(trajectory.steps):
         truth = composite(tiny_scene.splits["test"].images[index], WHITE)
         figures = scoring.score(index, step, truth)

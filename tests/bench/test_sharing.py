@@ -34,7 +34,7 @@ with missing(path, Printed(path.parent)) as to_make:
 
 
 class Told(ConsoleLog):
-    """A log that keeps what it is told."""
+    """A log that keeps its messages."""
 
     def __init__(self) -> None:
         super().__init__(Path(), quiet=True)
@@ -46,7 +46,7 @@ class Told(ConsoleLog):
 
 @pytest.fixture
 def maker(tmp_path: Path) -> Callable[[], subprocess.Popen[str]]:
-    """Start a process that makes a file of `tmp_path`, once it is told to go on."""
+    """Start a process that makes a file of `tmp_path`, after a signal to go on."""
     command = [sys.executable, "-c", MAKER, str(tmp_path / "made")]
     return lambda: subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True

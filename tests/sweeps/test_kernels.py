@@ -8,6 +8,7 @@ import json
 import pytest
 from sweeps.turns import lock_file
 
+from bench.case import Case
 from bench.types import Log
 
 RIGHT = {
@@ -21,23 +22,28 @@ WRONG = {
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
-    """What the benchmark was asked for; it finds `RIGHT` and `WRONG`, by their names."""
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], int]]:
+    """The subjects that were timed, and how often; the rows are `RIGHT` and `WRONG`, by subject."""
     calls = []
 
-    def main_rows(name_filter: str, repeats: int, log: Log) -> list[dict]:
-        calls.append((name_filter, repeats))
+    def timed_rows(cases, device, backends, repeats: int, log: Log) -> list[dict]:
+        calls.append(([case.subject for case in cases], repeats))
+        assert {"reference", "cpu"} & set(backends)
         with lock_file("auto").open() as file, pytest.raises(BlockingIOError):  # it is its turn
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return [row for row in (RIGHT, WRONG) if name_filter in row["kernel"]]
+        return [row for row in (RIGHT, WRONG) if row["kernel"] in calls[-1][0]]
 
-    monkeypatch.setattr("methods.kernels.benchmark.main_rows", main_rows)
+    def case(subject: str) -> Case:
+        return Case(subject, "view", "", "", {}, lambda *cell: 0.0)
+
+    monkeypatch.setattr("methods.checks.found", lambda name: [case("encode"), case("march")])
+    monkeypatch.setattr("sweeps.kernels.timed_rows", timed_rows)
     return calls
 
 
 def test_the_last_line_is_json_of_what_the_table_shows(steerbench, asked):
     outcome = steerbench("kernels", "--filter", "enc", "--repeats", "3")
-    assert asked == [("enc", 3)]
+    assert asked == [(["encode"], 3)]
     assert outcome.status == 0
     for text in ("encode", "1.0e-07", "1.0e-06", "12.50", "10.40", "31.0x"):
         assert text in outcome.out

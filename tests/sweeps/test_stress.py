@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from bench.stress import StressCase
+from bench.case import Case
 from bench.types import Unavailable
 
 
@@ -14,11 +14,12 @@ from bench.types import Unavailable
 def two_cases(monkeypatch: pytest.MonkeyPatch) -> None:
     """One that holds, about sums, and one that does not, about products."""
 
-    def case(subject: str, error: float) -> StressCase:
+    def case(subject: str, error: float) -> Case:
         cells = {("reference", "fp32"): 1e-6}
-        return StressCase(subject, "long", "all is there", "u", cells, lambda *cell: error)
+        return Case(subject, "long", "all is there", "u", cells, lambda *cell: error)
 
-    monkeypatch.setattr("methods.stress.all_cases", lambda: [case("sum", 5e-7), case("product", 2)])
+    cases = [case("sum", 5e-7), case("product", 2)]
+    monkeypatch.setattr("methods.checks.found", lambda name: cases)
 
 
 def test_the_last_line_is_json_of_what_the_table_shows(steerbench):
@@ -52,8 +53,8 @@ def test_on_a_page_the_cell_nearest_to_its_tolerance_stands_for_a_case(steerbenc
             raise seen[backend]
         return seen[backend]
 
-    case = StressCase("sum", "long", "all is there", "of rounding", cells, worst)
-    monkeypatch.setattr("methods.stress.all_cases", lambda: [case])
+    case = Case("sum", "long", "all is there", "of rounding", cells, worst)
+    monkeypatch.setattr("methods.checks.found", lambda name: [case])
     lines = steerbench("stress", "--format", "markdown").out.splitlines()
     figures = "3 | reference fp32 | 4.0e-07 | 5.0e-07 | ok | of rounding"
     assert lines[2] == f"| sum | long | all is there | {figures} |"

@@ -1,4 +1,4 @@
-"""Adam that leaves alone what got no gradient (Kingma & Ba 2015; sparse as in tiny-cuda-nn).
+"""Adam that skips entries without gradient (Kingma & Ba 2015; sparse as in tiny-cuda-nn).
 
 A table entry none of whose features got a gradient keeps its value and moments: dense Adam would
 go on moving it by momentum, and would read and write the whole table every step.
@@ -13,6 +13,9 @@ from torch import Tensor
 
 from bench.types import check_shape
 from methods.kernels.dispatch import implementation
+
+BETAS = (0.9, 0.99)
+EPS = 1e-15
 
 
 @dataclass
@@ -39,8 +42,6 @@ def sparse_adam_(
     state: AdamState,
     rate: float,
     *,
-    betas: tuple[float, float] = (0.9, 0.99),
-    eps: float = 1e-15,
     packed: Tensor | None = None,
     backend: str = "auto",
 ) -> None:
@@ -56,6 +57,4 @@ def sparse_adam_(
     if packed is not None:
         check_shape("packed", packed, entries)
         check_shape("table, to be packed,", table, None, 2)
-    implementation("adam", backend, table.device).sparse_adam_(
-        table, grad, state, rate, betas, eps, packed
-    )
+    implementation("adam", backend, table.device).sparse_adam_(table, grad, state, rate, packed)

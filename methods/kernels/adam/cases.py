@@ -1,30 +1,59 @@
-"""Cases of the sparse Adam step."""
+"""Cases of the sparse Adam step: agreement of the backends, the first step in closed form."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from functools import partial
 
 import torch
 from torch import Tensor
 
+from bench.case import U16, U32, Agreement, Case, on_backends
 from methods.kernels.adam import AdamState, sparse_adam_
-from methods.kernels.case import U16, U32, Case, Prepared
+from methods.kernels.dispatch import served
 from methods.kernels.encode import pack
 
 STEPS = 3
 RATE = 1e-2
+LARGE = 1 << 20
 
 
 def cases() -> list[Case]:
-    """Tables none, some and all of whose entries got a gradient."""
-    kinds = ((0, 0.5), (1, 1.0), (5000, 0.0), (5000, 0.3), (5000, 1.0))
+    """Tables none, some and all of whose entries got a gradient; tiny and huge gradients."""
+    kernel = Agreement(
+        "adam",
+        served("adam"),
+        "moments of gradients below 6 are sums of products below 36; the table, at most 1 + 3 "
+        "rates, is off by a few roundings a step, its bfloat16 copy by an ulp above 1",
+    )
+    tolerance = STEPS * 4 * 36 * U32 + 2 * U16
+    kinds = ((0, 0.5), (1, 1.0), (5000, 0.0), (5000, 0.3), (5000, 1.0), (LARGE, 0.3))
     return [
-        Case("adam", f"{share:.0%} of {count:,}", "fp32", count, partial(_prepare, count, share))
-        for count, share in kinds
-    ] + [Case("adam", "30% of 1,048,576", "fp32", 1 << 20, partial(_prepare, 1 << 20, 0.3), True)]
+        *(
+            kernel.case(
+                f"{share:.0%} of {count:,}",
+                partial(_prepare, count, share),
+                tolerance,
+                items=count if count == LARGE else None,
+            )
+            for count, share in kinds
+        ),
+        *(
+            Case(
+                "adam",
+                f"first gradient {gradient:g}",
+                "the step is that of the closed form",
+                "moments, corrections, root, quotient and sum: 16 u of rates of 1",
+                on_backends(16),
+                partial(_first_step_error, gradient),
+            )
+            for gradient in (0.0, 1e-40, 1e-30, 1e-15, 1.0, 1e15)
+        ),
+    ]
 
 
-def _prepare(count: int, share: float, device: str) -> Prepared:
+def _prepare(count: int, share: float, device: str) -> Callable[[str], tuple[Tensor, ...]]:
     generator = torch.Generator().manual_seed(count)
     table = torch.rand(count, 2, generator=generator) * 2 - 1
     grads = [
@@ -42,6 +71,14 @@ def _prepare(count: int, share: float, device: str) -> Prepared:
         unpacked = packed[:, None].view(torch.bfloat16).float()
         return trained, state.first, state.second, state.steps, unpacked
 
-    # Moments of gradients below 6 are sums of products below 36; the table, at most 1 + 3 RATE, is
-    # off by a few roundings a step, and its bfloat16 copy by an ulp above 1.
-    return Prepared(call, STEPS * 4 * 36 * U32 + 2 * U16)
+    return call
+
+
+def _first_step_error(gradient: float, backend: str, device: str, precision: str) -> float:
+    table = torch.zeros(3, 2, device=device)
+    grad = torch.full_like(table, gradient)
+    exact = grad[0, 0].item()  # as float32 has it
+    sparse_adam_(table, grad, AdamState.like(table), 1.0, backend=backend)
+    want = -exact / (abs(exact) + 1e-15)
+    error = (table.double() - want).abs().max().item()
+    return math.inf if math.isnan(error) else error

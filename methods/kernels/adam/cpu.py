@@ -10,7 +10,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from methods.kernels.adam import AdamState
+from methods.kernels.adam import BETAS, EPS, AdamState
 from methods.kernels.cpu import f32, pack_bf16
 
 CHUNK = 4096  # entries
@@ -22,8 +22,6 @@ def sparse_adam_(
     grad: Tensor,
     state: AdamState,
     rate: float,
-    betas: tuple[float, float],
-    eps: float,
     packed: Tensor | None,
 ) -> None:
     """See `methods.kernels.adam.sparse_adam_`."""
@@ -37,12 +35,12 @@ def sparse_adam_(
         state.second.numpy(),
         state.steps.numpy(),
         words,
-        _corrections(betas[0]),
-        _corrections(betas[1]),
+        _corrections(BETAS[0]),
+        _corrections(BETAS[1]),
         f32(rate),
-        f32(betas[0]),
-        f32(betas[1]),
-        f32(eps),
+        f32(BETAS[0]),
+        f32(BETAS[1]),
+        f32(EPS),
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from methods.kernels.adam import AdamState
+from methods.kernels.adam import BETAS, EPS, AdamState
 from methods.kernels.encode import pack
 
 
@@ -15,8 +15,6 @@ def sparse_adam_(
     grad: Tensor,
     state: AdamState,
     rate: float,
-    betas: tuple[float, float],
-    eps: float,
     packed: Tensor | None,
 ) -> None:
     """See `methods.kernels.adam.sparse_adam_`."""
@@ -24,11 +22,11 @@ def sparse_adam_(
     gradient = grad[touched]
     state.steps[touched] += 1
     steps = state.steps[touched, None].to(table.dtype)
-    first = betas[0] * state.first[touched] + (1 - betas[0]) * gradient
-    second = betas[1] * state.second[touched] + (1 - betas[1]) * gradient * gradient
+    first = BETAS[0] * state.first[touched] + (1 - BETAS[0]) * gradient
+    second = BETAS[1] * state.second[touched] + (1 - BETAS[1]) * gradient * gradient
     state.first[touched], state.second[touched] = first, second
-    unbiased = first / (1 - betas[0] ** steps)
-    scale = (second / (1 - betas[1] ** steps)).sqrt() + eps
+    unbiased = first / (1 - BETAS[0] ** steps)
+    scale = (second / (1 - BETAS[1] ** steps)).sqrt() + EPS
     table[touched] -= rate * unbiased / scale
     grad.zero_()
     if packed is not None:

@@ -1,7 +1,7 @@
 """Volume rendering of samples into pixels (Max 1995; SteerNeRF Eq. 2 and 3).
 
 alpha_i = 1 - exp(-sigma_i delta_i),  T_i = prod_{j<i} (1 - alpha_j),  w_i = T_i alpha_i
-values = sum w_i f_i + (1 - sum w_i) background,  depth_sum = sum w_i t_i,  alpha = sum w_i
+values = sum w_i f_i,  depth_sum = sum w_i t_i,  alpha = sum w_i
 """
 
 from __future__ import annotations
@@ -25,6 +25,21 @@ def check_stop(stop: float) -> None:
 
 
 @dataclass(frozen=True)
+class Intervals:
+    """Where samples lie on R rays, ray by ray, front to back.
+
+    Attributes:
+        t: [S] position along the ray (z-depth for rays of `bench.cameras.cast`).
+        delta: [S] length of the interval a sample represents, scene units.
+        offsets: [R + 1] int64, ray r owns samples offsets[r] to offsets[r + 1].
+    """
+
+    t: Tensor
+    delta: Tensor
+    offsets: Tensor
+
+
+@dataclass(frozen=True)
 class Pixels:
     """Composited rays: `values` [R, K], `depth_sum` [R] (sum w t, not divided), `alpha` [R]."""
 
@@ -34,7 +49,7 @@ class Pixels:
 
     @classmethod
     def blank(cls, rays: int, channels: int, device: torch.device | str = "cpu") -> Pixels:
-        """Rays in front of which nothing lies yet."""
+        """Rays that no sample was composited on yet."""
         return cls(
             torch.zeros(rays, channels, device=device),
             torch.zeros(rays, device=device),
@@ -51,54 +66,48 @@ class Pixels:
         self.depth_sum[index] = pixels.depth_sum
         self.alpha[index] = pixels.alpha
 
+    def over(self, background: Tensor) -> Pixels:
+        """The same rays on a `background` [K] or [R, K], which shines through with 1 - alpha."""
+        shine = (1 - self.alpha)[:, None] * background
+        return Pixels(self.values + shine, self.depth_sum, self.alpha)
+
 
 def composite(
     sigma: Tensor,
     values: Tensor,
-    t: Tensor,
-    delta: Tensor,
-    offsets: Tensor,
+    intervals: Intervals,
     *,
-    background: Tensor | None = None,
     stop: float = STOP,
     carry: Pixels | None = None,
     backend: str = "auto",
 ) -> Pixels:
-    """Composite samples of R rays (ray by ray, front to back; see `march.Samples`).
+    """Composite the samples of R rays.
 
     Differentiable in `sigma` and `values`.
 
     Args:
         sigma: [S] density, not negative.
         values: [S, K] colour or features.
-        t, delta: [S] position and interval of the samples.
-        offsets: [R + 1] int64.
-        background: [K] or [R, K], shines through with 1 - alpha; None: black.
+        intervals: where the samples lie; `march.Samples` for example.
         stop: samples behind a transmittance of at most `stop` have no weight; 0 uses all.
-        carry: what lies in front of these samples, composited without a background. Constant:
-            no gradient flows into it.
+        carry: pixels of the samples in front of these. Constant: no gradient flows into it.
     """
-    _check_samples(sigma, delta, offsets)
+    _check_samples(sigma, intervals)
     check_shape("values", values, len(sigma), None)
-    check_shape("t", t, len(sigma))
+    check_shape("t", intervals.t, len(sigma))
     if carry is not None:
-        rays, channels = len(offsets) - 1, values.shape[1]
+        rays, channels = len(intervals.offsets) - 1, values.shape[1]
         check_shape("carry.values", carry.values, rays, channels)
         check_shape("carry.depth_sum", carry.depth_sum, rays)
         check_shape("carry.alpha", carry.alpha, rays)
-    pixels = implementation("composite", backend, sigma.device).composite(
-        sigma, values, t, delta, offsets, stop, carry
+    return implementation("composite", backend, sigma.device).composite(
+        sigma, values, intervals, stop, carry
     )
-    if background is None:
-        return pixels
-    shine = (1 - pixels.alpha)[:, None] * background
-    return Pixels(pixels.values + shine, pixels.depth_sum, pixels.alpha)
 
 
 def weights(
     sigma: Tensor,
-    delta: Tensor,
-    offsets: Tensor,
+    intervals: Intervals,
     *,
     stop: float = STOP,
     front: Tensor | None = None,
@@ -109,36 +118,33 @@ def weights(
     Args:
         front: [R] transmittance in front of each ray's first sample; None: 1.
     """
-    _check_samples(sigma, delta, offsets)
+    _check_samples(sigma, intervals)
+    rays = len(intervals.offsets) - 1
     if front is None:
-        front = sigma.new_ones(len(offsets) - 1)
-    check_shape("front", front, len(offsets) - 1)
+        front = sigma.new_ones(rays)
+    check_shape("front", front, rays)
     return implementation("composite", backend, sigma.device).weights(
-        sigma.detach(), delta, offsets, stop, front
+        sigma.detach(), intervals, stop, front
     )
 
 
 def visible_counts(
-    sigma: Tensor,
-    delta: Tensor,
-    offsets: Tensor,
-    *,
-    stop: float = STOP,
-    backend: str = "auto",
+    sigma: Tensor, intervals: Intervals, *, stop: float = STOP, backend: str = "auto"
 ) -> Tensor:
     """How many samples of each ray `composite` would give a weight: [R] int64. No gradient.
 
-    They are the first ones of the ray; what lies behind has neither weight nor gradient.
+    They are the first ones of the ray; those behind have neither weight nor gradient.
     """
-    _check_samples(sigma, delta, offsets)
+    _check_samples(sigma, intervals)
     return implementation("composite", backend, sigma.device).visible_counts(
-        sigma.detach(), delta, offsets, stop
+        sigma.detach(), intervals, stop
     )
 
 
-def _check_samples(sigma: Tensor, delta: Tensor, offsets: Tensor) -> None:
+def _check_samples(sigma: Tensor, intervals: Intervals) -> None:
+    offsets = intervals.offsets
     check_shape("sigma", sigma, None)
-    check_shape("delta", delta, len(sigma))
+    check_shape("delta", intervals.delta, len(sigma))
     check_shape("offsets", offsets, None)
     if len(offsets) < 1 or int(offsets[-1]) != len(sigma):
         raise ValueError(f"offsets: expected to end at the {len(sigma)} samples, got {offsets}")

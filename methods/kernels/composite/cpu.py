@@ -13,7 +13,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from methods.kernels.composite import Pixels
+from methods.kernels.composite import Intervals, Pixels
 from methods.kernels.cpu import f32
 
 CHUNK = 64  # rays
@@ -21,13 +21,7 @@ f64 = np.float64
 
 
 def composite(
-    sigma: Tensor,
-    values: Tensor,
-    t: Tensor,
-    delta: Tensor,
-    offsets: Tensor,
-    stop: float,
-    carry: Pixels | None,
+    sigma: Tensor, values: Tensor, intervals: Intervals, stop: float, carry: Pixels | None
 ) -> Pixels:
     """See `methods.kernels.composite.composite`."""
     if not sigma.dtype == values.dtype == torch.float32:
@@ -35,21 +29,23 @@ def composite(
             f"backend 'cpu' composites float32, got sigma {sigma.dtype}, values {values.dtype}: "
             "use backend='reference'"
         )
-    return Pixels(*_Composite.apply(sigma, values, t, delta, offsets, stop, carry))
+    samples = intervals.t, intervals.delta, intervals.offsets
+    return Pixels(*_Composite.apply(sigma, values, *samples, stop, carry))
 
 
-def weights(sigma: Tensor, delta: Tensor, offsets: Tensor, stop: float, front: Tensor) -> Tensor:
+def weights(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> Tensor:
     """See `methods.kernels.composite.weights`."""
     weight = torch.empty_like(sigma, memory_format=torch.contiguous_format)
-    samples = (x.contiguous().numpy() for x in (sigma, delta, offsets))
+    samples = (x.contiguous().numpy() for x in (sigma, intervals.delta, intervals.offsets))
     _weights(*samples, f32(stop), front.contiguous().numpy(), weight.numpy())
     return weight
 
 
-def visible_counts(sigma: Tensor, delta: Tensor, offsets: Tensor, stop: float) -> Tensor:
+def visible_counts(sigma: Tensor, intervals: Intervals, stop: float) -> Tensor:
     """See `methods.kernels.composite.visible_counts`."""
+    delta, offsets = intervals.delta.numpy(), intervals.offsets.numpy()
     counts = torch.empty(len(offsets) - 1, dtype=torch.int64)
-    _visible(sigma.contiguous().numpy(), delta.numpy(), offsets.numpy(), f32(stop), counts.numpy())
+    _visible(sigma.contiguous().numpy(), delta, offsets, f32(stop), counts.numpy())
     return counts
 
 

@@ -19,7 +19,8 @@ import torch
 from torch import Tensor
 
 from bench.accuracy import Experiment, Trial
-from methods.kernels.composite import composite
+from bench.types import Rays
+from methods.kernels.composite import Intervals, composite
 from methods.kernels.march import Occupancy, march
 
 Quantity = Literal["alpha", "depth_sum"]
@@ -140,13 +141,13 @@ def _ray_heights() -> Tensor:
 def render(medium: Medium, quantity: Quantity, y: Tensor, step: float, phase: float) -> Tensor:
     """Opacity or depth [R] of the rays at `y` [R], by march and compositing, without a stop."""
     origins = torch.stack((torch.zeros_like(y), y, torch.full_like(y, 0.5)), dim=1)
-    directions = torch.eye(3)[:1].expand(len(y), 3)
+    rays = Rays(origins, torch.eye(3)[:1].expand(len(y), 3))
     occupancy = Occupancy(torch.ones(16, 16, 16))
     jitter = torch.full_like(y, phase)
-    samples = march(origins, directions, occupancy, step, jitter=jitter)
+    samples = march(rays, occupancy, step, jitter=jitter)
     sigma = medium.sigma(samples.positions[:, 0], samples.positions[:, 1])
     values = torch.zeros(len(samples), 1)
-    pixels = composite(sigma, values, samples.t, samples.delta, samples.offsets, stop=0.0)
+    pixels = composite(sigma, values, samples, stop=0.0)
     return getattr(pixels, quantity)
 
 
@@ -194,4 +195,5 @@ def _opacity(
     sigma: Tensor, delta: Tensor, offsets: Tensor, stop: float, backend: str = "auto"
 ) -> Tensor:
     nothing = torch.zeros(len(sigma), 1, dtype=sigma.dtype)
-    return composite(sigma, nothing, delta, delta, offsets, stop=stop, backend=backend).alpha
+    intervals = Intervals(delta, delta, offsets)
+    return composite(sigma, nothing, intervals, stop=stop, backend=backend).alpha

@@ -11,7 +11,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from methods.kernels.composite import Pixels
+from methods.kernels.composite import Intervals, Pixels
 from methods.kernels.gpu import check_types, launch
 
 BLOCK = 64  # samples
@@ -20,33 +20,28 @@ OPAQUE = tl.constexpr(128.0)
 
 
 def composite(
-    sigma: Tensor,
-    values: Tensor,
-    t: Tensor,
-    delta: Tensor,
-    offsets: Tensor,
-    stop: float,
-    carry: Pixels | None,
+    sigma: Tensor, values: Tensor, intervals: Intervals, stop: float, carry: Pixels | None
 ) -> Pixels:
     """See `methods.kernels.composite.composite`."""
+    t, delta = intervals.t, intervals.delta
     check_types(torch.float32, sigma=sigma, values=values, t=t, delta=delta)
-    return Pixels(*_Composite.apply(sigma, values, t, delta, offsets, stop, carry))
+    return Pixels(*_Composite.apply(sigma, values, t, delta, intervals.offsets, stop, carry))
 
 
-def weights(sigma: Tensor, delta: Tensor, offsets: Tensor, stop: float, front: Tensor) -> Tensor:
+def weights(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> Tensor:
     """See `methods.kernels.composite.weights`."""
-    check_types(torch.float32, sigma=sigma, delta=delta, front=front)
+    check_types(torch.float32, sigma=sigma, delta=intervals.delta, front=front)
     weight = torch.zeros_like(sigma, memory_format=torch.contiguous_format)
-    samples = (x.contiguous() for x in (sigma, delta, offsets, front))
+    samples = (x.contiguous() for x in (sigma, intervals.delta, intervals.offsets, front))
     launch(_weights, (len(front),), *samples, stop, weight, BLOCK=BLOCK, num_warps=1)
     return weight
 
 
-def visible_counts(sigma: Tensor, delta: Tensor, offsets: Tensor, stop: float) -> Tensor:
+def visible_counts(sigma: Tensor, intervals: Intervals, stop: float) -> Tensor:
     """See `methods.kernels.composite.visible_counts`."""
-    check_types(torch.float32, sigma=sigma, delta=delta)
-    counts = offsets.new_zeros(len(offsets) - 1)
-    samples = (x.contiguous() for x in (sigma, delta, offsets))
+    check_types(torch.float32, sigma=sigma, delta=intervals.delta)
+    counts = intervals.offsets.new_zeros(len(intervals.offsets) - 1)
+    samples = (x.contiguous() for x in (sigma, intervals.delta, intervals.offsets))
     launch(_visible, (len(counts),), *samples, stop, counts, BLOCK=BLOCK, num_warps=1)
     return counts
 

@@ -5,25 +5,19 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from methods.kernels.composite import Pixels
+from methods.kernels.composite import Intervals, Pixels
 
 
 def composite(
-    sigma: Tensor,
-    values: Tensor,
-    t: Tensor,
-    delta: Tensor,
-    offsets: Tensor,
-    stop: float,
-    carry: Pixels | None,
+    sigma: Tensor, values: Tensor, intervals: Intervals, stop: float, carry: Pixels | None
 ) -> Pixels:
     """See `methods.kernels.composite.composite`."""
-    slots = _padded_rays(offsets)
-    front = sigma.new_ones(len(offsets) - 1) if carry is None else 1 - carry.alpha
-    weight = _padded_weights(sigma, delta, slots, stop, front)
+    slots = _padded_rays(intervals.offsets)
+    front = sigma.new_ones(len(slots[0])) if carry is None else 1 - carry.alpha
+    weight = _padded_weights(sigma, intervals.delta, slots, stop, front)
     rays = Pixels(
         (weight[..., None] * _padded(values, slots)).sum(dim=1),
-        (weight * _padded(t, slots)).sum(dim=1),
+        (weight * _padded(intervals.t, slots)).sum(dim=1),
         weight.sum(dim=1),
     )
     if carry is None:
@@ -33,18 +27,18 @@ def composite(
     )
 
 
-def weights(sigma: Tensor, delta: Tensor, offsets: Tensor, stop: float, front: Tensor) -> Tensor:
+def weights(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> Tensor:
     """See `methods.kernels.composite.weights`."""
-    slots = _padded_rays(offsets)
-    return _padded_weights(sigma, delta, slots, stop, front)[slots[0]]
+    slots = _padded_rays(intervals.offsets)
+    return _padded_weights(sigma, intervals.delta, slots, stop, front)[slots[0]]
 
 
-def visible_counts(sigma: Tensor, delta: Tensor, offsets: Tensor, stop: float) -> Tensor:
+def visible_counts(sigma: Tensor, intervals: Intervals, stop: float) -> Tensor:
     """See `methods.kernels.composite.visible_counts`."""
-    present, index = _padded_rays(offsets)
+    present, index = _padded_rays(intervals.offsets)
     if not len(sigma):
-        return offsets.diff()
-    tau = torch.where(present, _thickness(sigma, delta)[index], 0)
+        return intervals.offsets.diff()
+    tau = torch.where(present, _thickness(sigma, intervals.delta)[index], 0)
     return ((_transmittance(tau) > stop) & present).sum(dim=1)
 
 

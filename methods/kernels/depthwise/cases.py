@@ -1,24 +1,26 @@
 """Cases of the depthwise convolution of cells.
 
-Forward, inputs are any numbers: what a backend may round is bounded. Backward, they are few digits
-long: nothing is rounded, in whatever order the gradient of the weights is added up.
+Forward, inputs are any numbers. Backward, they are few digits long: nothing is rounded, in whatever
+order the gradient of the weights is added up.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from methods.kernels.case import U32, Case, Prepared
+from bench.case import U32, Agreement, Case
 from methods.kernels.depthwise import TAPS, depthwise, neighbours_of
+from methods.kernels.dispatch import served
 
 LOW = 200
 """Side of the frame that is timed, in cells."""
 
 SHARE = 0.25
-"""Of the cells of the frame that are there: matter, and what surrounds it."""
+"""Of the cells of the frame that contain something."""
 
 WIDTH = 64
 """Channels of the trunk of the lean renderer."""
@@ -30,6 +32,7 @@ STEPS = 16
 
 def cases() -> list[Case]:
     """No, one and all cells; lines; scattered ones; several pictures; a frame, timed."""
+    frame = f"a quarter of {LOW} x {LOW}, {WIDTH} channels"
     kinds: list[tuple[str, Tensor, int]] = [
         ("no cell", torch.zeros(1, 4, 5, dtype=torch.bool), 8),
         ("one pixel", torch.ones(1, 1, 1, dtype=torch.bool), 8),
@@ -40,16 +43,22 @@ def cases() -> list[Case]:
         ("three pictures", _scattered(3, 11, 6), 8),
         ("one channel", _scattered(1, 30, 20), 1),
         ("thirteen channels", _scattered(1, 30, 20), 13),
+        (frame, _disc(LOW), WIDTH),
     ]
+    forward = Agreement(
+        "depthwise",
+        served("depthwise"),
+        "nine products of at most 1, each rounded once and in at most 8 sums, twice: 162 u",
+    )
+    exact = Agreement("depthwise backward", served("depthwise"), "short numbers: 0")
     found = []
-    for kernel, make in (("depthwise", _forward), ("depthwise backward", _backward)):
-        for name, cells, channels in kinds:
-            count = int(cells.sum())
-            found.append(Case(kernel, name, "fp32", count, partial(make, cells, channels)))
-        frame = _disc(LOW)
-        timed = partial(make, frame, WIDTH)
-        name = f"a quarter of {LOW} x {LOW}, {WIDTH} channels"
-        found.append(Case(kernel, name, "fp32", int(frame.sum()), timed, timed=True))
+    for name, cells, channels in kinds:
+        items = int(cells.sum()) if name == frame else None
+        make = partial(_forward, cells, channels)
+        found += [
+            forward.case(name, make, 2 * TAPS * TAPS * U32, items=items),
+            exact.case(name, partial(_backward, cells, channels), 0.0, items=items),
+        ]
     return found
 
 
@@ -59,26 +68,22 @@ def _scattered(batch: int, height: int, width: int) -> Tensor:
 
 
 def _disc(side: int) -> Tensor:
-    """A round thing in the middle of a picture."""
+    """A disc in the middle of a picture."""
     away = (torch.arange(side) + 0.5) / side - 0.5
     return (away[:, None] ** 2 + away**2 < SHARE / torch.pi)[None]
 
 
-def _forward(cells: Tensor, channels: int, device: str) -> Prepared:
+def _forward(cells: Tensor, channels: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
     generator = torch.Generator().manual_seed(channels)
     neighbours = neighbours_of(cells.to(device))
     x = 2 * torch.rand(len(neighbours), channels, generator=generator) - 1
     weight = 2 * torch.rand(TAPS, channels, generator=generator) - 1
     x, weight = x.to(device), weight.to(device)
 
-    def call(backend: str) -> tuple[Tensor, ...]:
-        return (depthwise(x, neighbours, weight, backend=backend),)
-
-    # Nine products of size 1 at most, each rounded once alone and in at most eight sums.
-    return Prepared(call, 2 * TAPS * TAPS * U32)
+    return lambda backend: (depthwise(x, neighbours, weight, backend=backend),)
 
 
-def _backward(cells: Tensor, channels: int, device: str) -> Prepared:
+def _backward(cells: Tensor, channels: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
     generator = torch.Generator().manual_seed(channels)
     neighbours = neighbours_of(cells.to(device))
 
@@ -93,4 +98,4 @@ def _backward(cells: Tensor, channels: int, device: str) -> Prepared:
         out = depthwise(x, neighbours, weight, backend=backend)
         return torch.autograd.grad(out, (x, weight), grad)
 
-    return Prepared(call, 0.0)
+    return call

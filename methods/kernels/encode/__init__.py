@@ -82,11 +82,6 @@ class HashGrid:
         """Entries of the whole table."""
         return self.offsets[-1]
 
-    def check_levels(self, levels: int) -> None:
-        """Raise `ValueError` unless the coarsest `levels` can be read."""
-        if not 1 <= levels <= self.levels:
-            raise ValueError(f"levels: expected 1 to {self.levels}, got {levels}")
-
     @property
     def channels(self) -> int:
         """Channels of an encoded position, level by level."""
@@ -98,20 +93,18 @@ def encode(
     table: Tensor,
     grid: HashGrid,
     *,
-    levels: int | None = None,
     packed: Tensor | None = None,
     grad_buffer: Tensor | None = None,
     backend: str = "auto",
 ) -> Tensor:
     """Encode `positions` [N, 3] with `table` [entries, F]: [N, levels * F], level by level.
 
-    Positions are clamped to [0, 1]. One with a NaN has features that are all NaN, changes no other
-    and has no part in the gradient. Differentiable in `table`; in `positions` only with
+    Positions are clamped to [0, 1]. The features of a position with a NaN are all NaN; it changes
+    no other features and no gradient. Differentiable in `table`; in `positions` only with
     backend="reference".
 
     Args:
-        levels: how many are read, the coarsest first; None: all.
-        packed: `pack(table)`, read in place of `table` when given (half the memory traffic;
+        packed: `pack(table)`, read instead of `table` when given (half the memory traffic;
             F = 2 only). The output is then bfloat16; its gradient goes to `table`.
         grad_buffer: [entries, F]; when given, the gradient of `table` is added to it in place,
             and autograd sees none: a training step then neither allocates nor clears a second
@@ -119,8 +112,6 @@ def encode(
     """
     check_shape("positions", positions, None, 3)
     check_shape("table", table, grid.entries, grid.features)
-    levels = grid.levels if levels is None else levels
-    grid.check_levels(levels)
     if packed is not None:
         if grid.features != 2:
             raise ValueError(f"packed tables hold 2 features an entry, the grid has {grid}")
@@ -128,9 +119,9 @@ def encode(
     if grad_buffer is not None:
         check_shape("grad_buffer", grad_buffer, grid.entries, grid.features)
     features = implementation("encode", backend, positions.device).encode(
-        positions, table, grid, levels=levels, packed=packed, grad_buffer=grad_buffer
+        positions, table, grid, packed=packed, grad_buffer=grad_buffer
     )
-    if positions.sum().isnan():  # hardly ever, and one sum tells
+    if positions.sum().isnan():  # hardly ever: one sum is cheap to test
         features = torch.where(positions.isnan().any(dim=1, keepdim=True), torch.nan, features)
     return features
 

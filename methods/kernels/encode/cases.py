@@ -1,68 +1,101 @@
-"""Cases of the hash-grid encoding."""
+"""Cases of the hash-grid encoding: agreement of the backends, ends of the cube, largest tables."""
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Callable
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from methods.kernels.case import U16, U32, Case, Prepared
-from methods.kernels.encode import HashGrid, encode, pack
+from bench.case import (
+    DTYPES,
+    U16,
+    U32,
+    Agreement,
+    Case,
+    Cell,
+    Prepare,
+    largest_error,
+    on_backends,
+)
+from methods.kernels.dispatch import served
+from methods.kernels.encode import PRIMES, HashGrid, encode, pack
 from methods.kernels.encode.reference import corners
 
 SMALL = HashGrid(levels=4, log2_table=10, n_min=4, n_max=40)
 ODD = HashGrid(levels=3, features=3, log2_table=8, n_min=3, n_max=17)
 LARGE = HashGrid(log2_table=19, n_max=2048)
 VIEW = 1 << 17
+"""Samples of one view, for which the throughput is stated."""
+
+GRID = HashGrid(levels=8, log2_table=12, n_min=4, n_max=512)
+LARGEST = HashGrid(levels=17, features=8, log2_table=24, n_min=512, n_max=4096)
+"""More than 2^31 numbers, all levels hashed."""
+
+BELOW_1 = 1 - 2.0**-24
+"""The float32 before 1."""
+
+FEATURES = (
+    "a position is off by 2 u N_max along each of 3 axes, where values of at most 1 differ by 2; a "
+    "blend of 8 corners has 11 roundings: 12 N_max + 11 u; bf16: half an ulp more"
+)
+SUMS = (
+    "an entry sums gradients of at most 1 over n samples; a weight is off by its 3 fractions, a "
+    "partial sum by n u; 2 n independent roundings add up to 6 sqrt(n) of them but for one case in "
+    "10^8 (Higham, Mary 2019)"
+)
 
 
 def cases() -> list[Case]:
-    """Shapes that hurt, and the 131,072 samples of one view that the throughput is stated for."""
+    """Shapes that hurt; one view; positions at ends, on grid lines and outside; a huge table."""
+    return [*_agreements(), *_extremes()]
+
+
+def _agreements() -> list[Case]:
+    backends = served("encode")
+    forward = Agreement("encode", backends, FEATURES)
+    backward = Agreement("encode backward", backends, SUMS)
+    shapes: list[tuple[str, HashGrid, Tensor]] = [
+        ("no sample", SMALL, _random(0)),
+        ("one sample", SMALL, _random(1)),
+        ("257 samples", SMALL, _random(257)),
+        ("three features", ODD, _random(1000)),
+    ]
     found = []
-    for name, count, grid in (
-        ("no sample", 0, SMALL),
-        ("one sample", 1, SMALL),
-        ("257 samples", 257, SMALL),
-        ("three features", 1000, ODD),
-    ):
-        found.append(Case("encode", name, "fp32", count, partial(_forward, count, grid)))
-        found.append(Case("encode backward", name, "fp32", count, partial(_backward, count, grid)))
-    found.append(Case("encode", "corners", "fp32", 27, partial(_forward, -1, SMALL)))
-    found.append(Case("encode", "257 samples", "bf16", 257, partial(_packed, 257, SMALL)))
-    coarse = partial(_forward, 257, SMALL, levels=2)
-    found.append(Case("encode", "the two coarsest levels", "fp32", 257, coarse))
-    learned = partial(_backward, 257, SMALL, packed=True)
-    found.append(Case("encode backward", "257 samples", "bf16", 257, learned))
-    for name, view in (("view", True), ("random", False)):
+    for name, grid, positions in shapes:
         found += [
-            Case("encode", name, "fp32", VIEW, partial(_forward, VIEW, LARGE, view=view), True),
-            Case("encode", name, "bf16", VIEW, partial(_packed, VIEW, LARGE, view=view), True),
-            Case(
-                "encode backward",
-                name,
-                "fp32",
-                VIEW,
-                partial(_backward, VIEW, LARGE, view=view),
-                True,
-            ),
+            forward.case(name, _features(positions, grid), _units(grid) * U32),
+            backward.case(name, _gradient(positions, grid), _sum_error(positions, grid)),
         ]
+    edges = _product(0.0, 0.5, 1.0).float()
+    found.append(forward.case("corners", _features(edges, SMALL), _units(SMALL) * U32))
+    for name, grid, positions, items in (
+        ("257 samples", SMALL, _random(257), None),
+        ("view", LARGE, _view(VIEW), VIEW),
+        ("random", LARGE, _random(VIEW), VIEW),
+    ):
+        if items:
+            tolerance = _sum_error(positions, grid)
+            found += [
+                forward.case(name, _features(positions, grid), _units(grid) * U32, items=items),
+                backward.case(name, _gradient(positions, grid), tolerance, items=items),
+            ]
+        packed, tolerance = _features(positions, grid, packed=True), _units(grid) * U32 + U16
+        found.append(
+            forward.case(f"{name}, packed", packed, tolerance, precision="bf16", items=items)
+        )
+    packed = _gradient(_random(257), SMALL, packed=True)
+    tolerance = _sum_error(_random(257), SMALL)
+    found.append(backward.case("257 samples, packed", packed, tolerance, precision="bf16"))
     return found
 
 
-def _inputs(count: int, grid: HashGrid, view: bool, device: str) -> tuple[Tensor, Tensor]:
-    """Positions and a table whose values are at most 1."""
-    generator = torch.Generator().manual_seed(count)
-    if count == -1:
-        edges = torch.tensor([0.0, 0.5, 1.0])
-        positions = torch.cartesian_prod(edges, edges, edges)
-    elif view:
-        positions = _view(count)
-    else:
-        positions = torch.rand(count, 3, generator=generator)
-    table = torch.rand(grid.entries, grid.features, generator=generator) * 2 - 1
-    return positions.to(device), table.to(device)
+def _random(count: int) -> Tensor:
+    return torch.rand(count, 3, generator=torch.Generator().manual_seed(count))
 
 
 def _view(count: int) -> Tensor:
@@ -76,58 +109,195 @@ def _view(count: int) -> Tensor:
     return (origin[..., None, :] + t[:, None] * direction[..., None, :]).reshape(-1, 3)
 
 
-def _fraction_error(grid: HashGrid) -> float:
-    """Of a trilinear fraction: p = scale x + 1/2 is rounded once or twice, at sizes up to N_max."""
-    return 2 * U32 * grid.n_max
+def _units(grid: HashGrid) -> float:
+    """u by which a feature may be off; see `FEATURES`."""
+    return 12 * grid.n_max + 11
 
 
-def _forward(
-    count: int, grid: HashGrid, device: str, view: bool = False, levels: int | None = None
-) -> Prepared:
-    positions, table = _inputs(count, grid, view, device)
-    # Values of at most 1 differ by at most 2 along each of 3 axes; 11 roundings in the blend.
-    tolerance = 3 * 2 * _fraction_error(grid) + 11 * U32
-    return Prepared(
-        lambda backend: (encode(positions, table, grid, levels=levels, backend=backend),), tolerance
+def _sum_error(positions: Tensor, grid: HashGrid) -> float:
+    """By how much a gradient may be off; see `SUMS`. Most samples share an entry of the coarsest
+    level."""
+    entries, _ = corners(positions, grid, 0)
+    touched = int(entries.flatten().bincount().max()) if len(positions) else 0
+    return 6 * math.sqrt(touched) * (3 * 2 * U32 * grid.n_max + touched * U32)
+
+
+def _random_table(count: int, grid: HashGrid, device: str) -> Tensor:
+    """Values of at most 1."""
+    generator = torch.Generator().manual_seed(count)
+    return (torch.rand(grid.entries, grid.features, generator=generator) * 2 - 1).to(device)
+
+
+def _features(positions: Tensor, grid: HashGrid, *, packed: bool = False) -> Prepare:
+    def prepare(device: str) -> Callable[[str], tuple[Tensor, ...]]:
+        placed, table = positions.to(device), _random_table(len(positions), grid, device)
+        words = pack(table) if packed else None
+        return lambda backend: (encode(placed, table, grid, packed=words, backend=backend),)
+
+    return prepare
+
+
+def _gradient(positions: Tensor, grid: HashGrid, *, packed: bool = False) -> Prepare:
+    def prepare(device: str) -> Callable[[str], tuple[Tensor, ...]]:
+        placed, table = positions.to(device), _random_table(len(positions), grid, device)
+        words = pack(table) if packed else None
+        table.requires_grad_()
+        generator = torch.Generator().manual_seed(1)
+        grad = (torch.rand(len(positions), grid.channels, generator=generator) * 2 - 1).to(device)
+        grad = grad.bfloat16() if packed else grad
+
+        def call(backend: str) -> tuple[Tensor, ...]:
+            buffer = torch.zeros_like(table)
+            encode(placed, table, grid, packed=words, grad_buffer=buffer, backend=backend).backward(
+                grad
+            )
+            return (buffer,)
+
+        return call
+
+    return prepare
+
+
+def _extremes() -> list[Case]:
+    packed = {(backend, "bf16"): _units(GRID) * U32 + U16 for backend in ("reference", "cpu")}
+    kinds = {
+        "at 0": _product(0.0),
+        "at 1": _product(1.0),
+        "at 1 less an ulp": _product(BELOW_1),
+        "at 0, at 1 and next to them": _product(0.0, 2.0**-149, 1e-30, 0.5, BELOW_1, 1.0),
+        "on grid lines": _grid_lines(),
+        "beyond the cube": _product(-math.inf, -1e30, -0.0, 1.5, 1e30, math.inf),
+    }
+    found = [
+        Case(
+            "encode",
+            name,
+            "features are those of the closed form at the nearest position in the cube",
+            FEATURES,
+            on_backends(_units(GRID), "fp64") | packed,
+            partial(_feature_error, positions),
+        )
+        for name, positions in kinds.items()
+    ]
+    exact: dict[Cell, float] = dict.fromkeys([*on_backends(0), *packed], 0.0)
+    found.append(
+        Case(
+            "encode",
+            "NaN",
+            "its own features are NaN; no others change, nor any gradient",
+            "the same arithmetic for all other positions: 0",
+            exact,
+            _spread_of_nan,
+        )
+    )
+    found.append(
+        Case(
+            "encode",
+            "2^31 numbers in the table",
+            "features are those of the closed form",
+            FEATURES,
+            on_backends(_units(LARGEST)),
+            _largest_table_error,
+            slow=True,  # reserves, though it does not fill, 9 GB
+        )
+    )
+    return found
+
+
+def _product(*edges: float) -> Tensor:
+    return torch.tensor(list(itertools.product(edges, repeat=3)), dtype=torch.float64)
+
+
+def _grid_lines() -> Tensor:
+    """Where scale x + 1/2 is whole along some axes, of every level."""
+    lines = [(k + 0.5) / scale for scale in GRID.scales for k in (0, 1, int(scale) // 2)]
+    return torch.tensor([(x, y, 0.3) for x in lines for y in lines], dtype=torch.float64)
+
+
+def _value(entry: int, feature: int) -> float:
+    """What stands in a table, a multiple of 1/64 from -1 to 1."""
+    return (entry * 31 + feature * 17) % 129 / 64 - 1
+
+
+def _corners(position: list[float], grid: HashGrid, level: int) -> list[tuple[int, float]]:
+    """Entries around a place in the cube and their weights, in Python's own numbers."""
+    places = [x * grid.scales[level] + 0.5 for x in position]
+    found = []
+    for bits in itertools.product((0, 1), repeat=3):
+        x, y, z = (math.floor(p) + bit for p, bit in zip(places, bits, strict=True))
+        weight = math.prod(
+            p - math.floor(p) if bit else 1 - (p - math.floor(p))
+            for p, bit in zip(places, bits, strict=True)
+        )
+        if grid.dense[level]:
+            res = grid.resolutions[level]
+            index = (x + y * res + z * res * res) % grid.sizes[level]
+        else:
+            index = x ^ y * PRIMES[1] % 2**32 ^ z * PRIMES[2] % 2**32
+            index %= grid.sizes[level]
+        found.append((grid.offsets[level] + index, weight))
+    return found
+
+
+def _exact(positions: Tensor, grid: HashGrid) -> Tensor:
+    return torch.tensor(
+        [
+            [
+                math.fsum(w * _value(e, f) for e, w in _corners(position, grid, level))
+                for level in range(grid.levels)
+                for f in range(grid.features)
+            ]
+            for position in positions.double().clamp(0, 1).tolist()
+        ],
+        dtype=torch.float64,
     )
 
 
-def _packed(count: int, grid: HashGrid, device: str, view: bool = False) -> Prepared:
-    positions, table = _inputs(count, grid, view, device)
-    words = pack(table)
-    # As above, then rounded to bfloat16 at a size of at most 1.
-    tolerance = 3 * 2 * _fraction_error(grid) + 11 * U32 + U16
-    return Prepared(
-        lambda backend: (encode(positions, table, grid, packed=words, backend=backend),), tolerance
-    )
+def _table() -> Tensor:
+    return torch.tensor([[_value(e, f) for f in (0, 1)] for e in range(GRID.entries)])
 
 
-def _backward(
-    count: int, grid: HashGrid, device: str, view: bool = False, packed: bool = False
-) -> Prepared:
-    positions, table = _inputs(count, grid, view, device)
-    table.requires_grad_()
-    generator = torch.Generator().manual_seed(1)
-    grad = (torch.rand(count, grid.channels, generator=generator) * 2 - 1).to(device)
-    words = pack(table) if packed else None
-    grad = grad.bfloat16() if packed else grad
-
-    def call(backend: str) -> tuple[Tensor, ...]:
-        buffer = torch.zeros_like(table)
-        features = encode(positions, table, grid, packed=words, grad_buffer=buffer, backend=backend)
-        features.backward(grad)
-        return (buffer,)
-
-    # An entry sums |grad| <= 1 over the n samples that touch it. Each weight is off by its three
-    # fractions' errors, each partial sum, of size n at most, by u: 2 n roundings, which as
-    # independent errors add up to 6 sqrt(n) of them but for one case in 10^8 (Higham, Mary 2019).
-    touched = _most_touched(positions, grid) if count else 0
-    return Prepared(call, 6 * math.sqrt(touched) * (3 * _fraction_error(grid) + touched * U32))
+def _encoded(positions: Tensor, table: Tensor, precision: str, backend: str) -> Tensor:
+    words = pack(table) if precision == "bf16" else None
+    return encode(positions, table, GRID, packed=words, backend=backend)
 
 
-def _most_touched(positions: Tensor, grid: HashGrid) -> int:
-    """How many samples share the entry that is shared most."""
-    return max(
-        int(corners(positions, grid, level)[0].flatten().bincount().max())
-        for level in range(grid.levels)
-    )
+def _feature_error(positions: Tensor, backend: str, device: str, precision: str) -> float:
+    dtype = torch.float32 if precision == "bf16" else DTYPES[precision]
+    places = positions.to(dtype)
+    got = _encoded(places.to(device), _table().to(device, dtype), precision, backend)
+    return largest_error((got.cpu(),), (_exact(places, GRID),))
+
+
+def _spread_of_nan(backend: str, device: str, precision: str) -> float:
+    """Difference that NaN in every 7th place makes to others, and to a gradient that it has no
+    part in; infinite where it is not reported."""
+    generator = torch.Generator().manual_seed(0)
+    positions = torch.rand(700, 3, generator=generator).to(device)
+    bad = torch.arange(700, device=device) % 7 == 0
+    spoiled = positions.clone()
+    spoiled[bad, 1] = torch.nan
+    table = _table().to(device)
+    features, grads = [], []
+    for places in (spoiled, positions):
+        learned = table.clone().requires_grad_()
+        found = _encoded(places, learned, precision, backend)
+        (grad,) = torch.autograd.grad(torch.where(bad[:, None], 0, found).sum(), learned)
+        features.append(found.detach())
+        grads.append(grad)
+    if not features[0][bad].isnan().all():
+        return math.inf
+    return largest_error((features[0][~bad], grads[0]), (features[1][~bad], grads[1]))
+
+
+def _largest_table_error(backend: str, device: str, precision: str) -> float:
+    generator = torch.Generator().manual_seed(0)
+    positions = torch.rand(16, 3, generator=generator)
+    # Pages that nobody writes to take no memory.
+    table = torch.from_numpy(np.zeros((LARGEST.entries, LARGEST.features), np.float32))
+    for position in positions.tolist():
+        for level in range(LARGEST.levels):
+            for entry, _ in _corners(position, LARGEST, level):
+                table[entry] = torch.tensor([_value(entry, f) for f in range(LARGEST.features)])
+    got = encode(positions.to(device), table.to(device), LARGEST, backend=backend)
+    return largest_error((got.cpu(),), (_exact(positions, LARGEST),))

@@ -33,7 +33,6 @@ def encode(
     table: Tensor,
     grid: HashGrid,
     *,
-    levels: int,
     packed: Tensor | None = None,
     grad_buffer: Tensor | None = None,
 ) -> Tensor:
@@ -45,20 +44,20 @@ def encode(
             f"backend 'cpu' encodes float32, got positions {positions.dtype} and table "
             f"{table.dtype}: use backend='reference'"
         )
-    return _Encode.apply(positions.contiguous(), table, grid, levels, packed, grad_buffer)
+    return _Encode.apply(positions.contiguous(), table, grid, packed, grad_buffer)
 
 
 class _Encode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, positions, table, grid, levels, packed, grad_buffer):
+    def forward(ctx, positions, table, grid, packed, grad_buffer):
         ctx.save_for_backward(positions)
-        ctx.grid, ctx.levels, ctx.grad_buffer = grid, levels, grad_buffer
-        shapes = _level_arrays(grid, levels)
+        ctx.grid, ctx.grad_buffer = grid, grad_buffer
+        shapes = _level_arrays(grid)
         if packed is None:
-            features = torch.empty(len(positions), levels * grid.features)
+            features = torch.empty(len(positions), grid.channels)
             _encode_float(positions.numpy(), table.detach().numpy(), *shapes, features.numpy())
             return features
-        words = torch.empty(len(positions), levels, dtype=torch.int32)
+        words = torch.empty(len(positions), grid.levels, dtype=torch.int32)
         _encode_packed(positions.numpy(), _unsigned(packed), *shapes, _unsigned(words))
         return words.view(torch.bfloat16)
 
@@ -70,25 +69,25 @@ class _Encode(torch.autograd.Function):
         _scatter(
             positions.numpy(),
             grad.T.contiguous().float().numpy(),  # a level then reads only its own channels
-            *_level_arrays(grid, ctx.levels),
+            *_level_arrays(grid),
             target.numpy(),
             get_num_threads(),
         )
-        return None, target if buffer is None else None, None, None, None, None
+        return None, target if buffer is None else None, None, None, None
 
 
 def _unsigned(words: Tensor) -> np.ndarray:
     return words.numpy().view(np.uint32)
 
 
-def _level_arrays(grid: HashGrid, levels: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Scale, vertices along an axis (0: hashed) and first entry of each of the first `levels`, and
-    the entry behind them."""
+def _level_arrays(grid: HashGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Scale, vertices along an axis (0: hashed) and first entry of each level, and the number of
+    all entries."""
     strides = [res if dense else 0 for res, dense in zip(grid.resolutions, grid.dense, strict=True)]
     return (
-        np.array(grid.scales[:levels], np.float32),
-        np.array(strides[:levels], np.uint32),
-        np.array(grid.offsets[: levels + 1], np.int64),
+        np.array(grid.scales, np.float32),
+        np.array(strides, np.uint32),
+        np.array(grid.offsets, np.int64),
     )
 
 

@@ -28,7 +28,6 @@ def encode(
     table: Tensor,
     grid: HashGrid,
     *,
-    levels: int,
     packed: Tensor | None = None,
     grad_buffer: Tensor | None = None,
 ) -> Tensor:
@@ -38,35 +37,35 @@ def encode(
         raise ValueError("backend 'gpu' gives no gradient for positions: use backend='reference'")
     check_types(torch.float32, positions=positions)
     check_types(torch.float32, torch.float16, torch.bfloat16, table=table)
-    return _Encode.apply(positions.contiguous(), table, grid, levels, packed, grad_buffer)
+    return _Encode.apply(positions.contiguous(), table, grid, packed, grad_buffer)
 
 
 class _Encode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, positions, table, grid, levels, packed, grad_buffer):
+    def forward(ctx, positions, table, grid, packed, grad_buffer):
         ctx.save_for_backward(positions)
-        ctx.grid, ctx.levels, ctx.grad_buffer, ctx.dtype = grid, levels, grad_buffer, table.dtype
+        ctx.grid, ctx.grad_buffer, ctx.dtype = grid, grad_buffer, table.dtype
         read = table.detach() if packed is None else packed.view(torch.bfloat16).view(-1, 2)
-        features = read.new_empty(len(positions), levels * grid.features)
-        _launch(_forward, positions, read.contiguous(), grid, levels, features)
+        features = read.new_empty(len(positions), grid.channels)
+        _launch(_forward, positions, read.contiguous(), grid, features)
         return features
 
     @staticmethod
     def backward(ctx, grad):
         (positions,) = ctx.saved_tensors
-        grid, levels, buffer = ctx.grid, ctx.levels, ctx.grad_buffer
+        grid, buffer = ctx.grid, ctx.grad_buffer
         target = buffer
         if buffer is None or buffer.dtype != torch.float32 or not buffer.is_contiguous():
             target = grad.new_zeros(grid.entries, grid.features, dtype=torch.float32)
         if torch.are_deterministic_algorithms_enabled():
-            _scatter_sorted(positions, grad.float(), grid, levels, target)
+            _scatter_sorted(positions, grad.float(), grid, target)
         else:
-            _launch(_scatter, positions, target, grid, levels, grad.contiguous())
+            _launch(_scatter, positions, target, grid, grad.contiguous())
         if buffer is None:
-            return None, target.to(ctx.dtype), None, None, None, None
+            return None, target.to(ctx.dtype), None, None, None
         if target is not buffer:
             buffer += target
-        return None, None, None, None, None, None
+        return None, None, None, None, None
 
 
 def _launch(
@@ -74,16 +73,15 @@ def _launch(
     positions: Tensor,
     table: Tensor,
     grid: HashGrid,
-    levels: int,
     features: Tensor,
 ) -> None:
     """Run `kernel`, which reads or adds to one of `table` and `features`, for the other."""
     launch(
         kernel,
-        (triton.cdiv(len(positions), BLOCK), levels),
+        (triton.cdiv(len(positions), BLOCK), grid.levels),
         positions,
         table,
-        *_level_arrays(grid, levels, positions.device),
+        *_level_arrays(grid, positions.device),
         features,
         len(positions),
         features.shape[1],
@@ -93,23 +91,21 @@ def _launch(
 
 
 @cache
-def _level_arrays(grid: HashGrid, levels: int, device: torch.device) -> tuple[Tensor, Tensor]:
+def _level_arrays(grid: HashGrid, device: torch.device) -> tuple[Tensor, Tensor]:
     """Scale [levels] of each level; its vertices along an axis (0: hashed), first entry and number
     of entries [levels, 3]. To copy them to the device again would wait for it."""
     strides = [res if dense else 0 for res, dense in zip(grid.resolutions, grid.dense, strict=True)]
-    shapes = list(zip(strides, grid.offsets, grid.sizes, strict=False))[:levels]
+    shapes = list(zip(strides, grid.offsets, grid.sizes, strict=False))
     return (
-        torch.tensor(grid.scales[:levels], dtype=torch.float32, device=device),
+        torch.tensor(grid.scales, dtype=torch.float32, device=device),
         torch.tensor(shapes, dtype=torch.int64, device=device),
     )
 
 
-def _scatter_sorted(
-    positions: Tensor, grad: Tensor, grid: HashGrid, levels: int, target: Tensor
-) -> None:
+def _scatter_sorted(positions: Tensor, grad: Tensor, grid: HashGrid, target: Tensor) -> None:
     """Add to `target` in the same order every time."""
     inside = torch.where(positions > 0, positions, 0).clamp(max=1)
-    for level in range(levels):
+    for level in range(grid.levels):
         entries, weights = corners(inside, grid, level)
         of_level = grad[:, level * grid.features : (level + 1) * grid.features]
         shares = weights[..., None] * of_level[:, None]  # [N, 8, F]

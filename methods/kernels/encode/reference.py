@@ -13,7 +13,6 @@ def encode(
     table: Tensor,
     grid: HashGrid,
     *,
-    levels: int,
     packed: Tensor | None = None,
     grad_buffer: Tensor | None = None,
 ) -> Tensor:
@@ -23,7 +22,7 @@ def encode(
         table.register_hook(grad_buffer.add_)
     inside = torch.where(positions > 0, positions, 0).clamp(max=1)
     found = []
-    for level in range(levels):
+    for level in range(grid.levels):
         entries, weights = corners(inside, grid, level)
         values = table[entries]  # [N, 8, F]
         if packed is not None:

@@ -17,14 +17,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.types import check_shape
+from bench.types import Rays, check_shape
+from methods.kernels.composite import Intervals
 from methods.kernels.dispatch import implementation
 
 MAX_SAMPLES = 1024
 """Samples with which a ray crosses the unit cube at the usual step, sqrt(3) / 1024."""
 
 PARALLEL = 2.0**-127
-"""A direction below this lies in the planes of its axis: its reciprocal is no float32."""
+"""A component of a direction below this counts as 0: its reciprocal overflows float32."""
 
 BRICK = 4
 """Cells along the side of a brick, the 64 cells of one word of `Occupancy.words`."""
@@ -89,22 +90,16 @@ def _pack_bricks(bits: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Samples:
+class Samples(Intervals):
     """Samples of R rays, ray by ray, front to back.
 
     Attributes:
-        offsets: [R + 1] int64, ray r owns samples offsets[r] to offsets[r + 1].
         ray: [S] int32, the ray a sample belongs to.
-        t: [S] position along the ray (z-depth for rays of `bench.cameras.cast`).
-        delta: [S] length of the interval a sample stands for, scene units.
         positions: [S, 3] in the unit cube.
         resume: [R] int32, the step to go on from; -1 where the ray has no more samples.
     """
 
-    offsets: Tensor
     ray: Tensor
-    t: Tensor
-    delta: Tensor
     positions: Tensor
     resume: Tensor
 
@@ -117,18 +112,39 @@ class Samples:
         shift = (self.offsets - offsets)[:-1].repeat_interleave(counts)
         kept = torch.arange(len(shift), device=shift.device) + shift
         return Samples(
-            offsets,
-            self.ray[kept],
             self.t[kept],
             self.delta[kept],
+            offsets,
+            self.ray[kept],
             self.positions[kept],
             torch.full_like(self.resume, -1),
         )
 
 
+@dataclass(frozen=True)
+class Segments:
+    """The parts of R rays that are sampled; see `march`.
+
+    Attributes:
+        rays: R of them.
+        window: [R, 2] nearest and farthest t, the latter excluded.
+        jitter: [R] phase of the samples.
+        start: [R] int32 step to begin with; negative: none.
+    """
+
+    rays: Rays
+    window: Tensor
+    jitter: Tensor
+    start: Tensor
+
+    def take(self, index: slice) -> Segments:
+        """Those at `index`."""
+        rays = Rays(self.rays.origins[index], self.rays.directions[index])
+        return Segments(rays, self.window[index], self.jitter[index], self.start[index])
+
+
 def march(
-    origins: Tensor,
-    directions: Tensor,
+    rays: Rays,
     occupancy: Occupancy,
     step: float,
     *,
@@ -138,10 +154,10 @@ def march(
     limit: int | None = None,
     backend: str = "auto",
 ) -> Samples:
-    """Sample rays `origins` + t `directions` ([R, 3] each) inside the unit cube.
+    """Sample R `rays` inside the unit cube. Not differentiable.
 
-    Not differentiable. A ray that misses the cube, has no direction, or one too short for
-    its t to be numbers, or is not finite, gets none.
+    A ray has no samples if it misses the cube, is not finite, has no direction or one so short that
+    t overflows.
 
     Args:
         step: world length of a step, scene units.
@@ -151,24 +167,23 @@ def march(
             a negative one ends the ray; None: 0.
         limit: at most so many samples a ray; None: all.
     """
-    rays = len(origins)
+    origins, count = rays.origins, len(rays.origins)
     check_shape("origins", origins, None, 3)
-    check_shape("directions", directions, rays, 3)
+    check_shape("directions", rays.directions, count, 3)
     if window is None:
-        window = origins.new_tensor((0.0, torch.inf)).expand(rays, 2)
+        window = origins.new_tensor((0.0, torch.inf)).expand(count, 2)
     if jitter is None:
-        jitter = origins.new_full((1,), 0.5).expand(rays)
+        jitter = origins.new_full((1,), 0.5).expand(count)
     if start is None:
-        start = torch.zeros(1, dtype=torch.int32, device=origins.device).expand(rays)
-    check_shape("window", window, rays, 2)
-    check_shape("jitter", jitter, rays)
-    check_shape("start", start, rays)
+        start = torch.zeros(1, dtype=torch.int32, device=origins.device).expand(count)
+    check_shape("window", window, count, 2)
+    check_shape("jitter", jitter, count)
+    check_shape("start", start, count)
     if not step > 0:
         raise ValueError(f"step: expected a positive length, got {step}")
     if limit is None:
         limit = math.ceil(math.sqrt(3) / step) + 1  # the cube's diagonal, and what rounding adds
     if limit < 1:
         raise ValueError(f"limit: expected 1 or more, got {limit}")
-    return implementation("march", backend, origins.device).march(
-        origins, directions, occupancy, step, window, jitter, start, limit
-    )
+    segments = Segments(rays, window, jitter, start)
+    return implementation("march", backend, origins.device).march(segments, occupancy, step, limit)

@@ -1,23 +1,41 @@
-"""Cases of the ray march. All backends return the same samples to the last bit: tolerance 0."""
+"""Cases of the ray march: the same samples by all backends, to the last bit; rays that meet faces,
+edges and corners, or come from very far."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from methods.kernels.case import Case, Prepared
+from bench.case import DTYPES, U32, Agreement, Case
+from bench.types import Rays
+from methods.kernels.dispatch import served
 from methods.kernels.march import MAX_SAMPLES, Occupancy, march
 
 STEP = math.sqrt(3) / MAX_SAMPLES
+AXES = torch.cat((torch.eye(3), -torch.eye(3)))
+ALL = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * 3)  # [27, 3], one is 0
+
+SIZE = 16
+CELL = (3, 12, 8)
+"""The one cell of a grid that is empty elsewhere."""
+
+FINE = 1e-4
+"""A step at which a ray takes more than `MAX_SAMPLES` samples."""
 
 
 def cases() -> list[Case]:
-    """Every kind of ray, grid, window, phase and limit; and rays around a hollow sphere, timed."""
-    kinds: list[tuple[str, int, dict]] = [
+    """Every kind of ray, grid, window, phase and limit."""
+    return [*_agreements(), *_ways()]
+
+
+def _agreements() -> list[Case]:
+    kinds: list[tuple[str, int, dict[str, Any]]] = [
         ("no ray", 0, {}),
         ("one ray", 1, {}),
         ("inside and outside", 129, {}),
@@ -33,12 +51,10 @@ def cases() -> list[Case]:
         ("scattered cells", 65, {"grid": "dust"}),
         ("axes, planes and corners", 0, {"special": True}),
     ]
-    found = [
-        Case("march", name, "fp32", count, partial(_prepare, count, options))
-        for name, count, options in kinds
-    ]
+    kernel = Agreement("march", served("march"), "the same operations in the same order: 0")
+    found = [kernel.case(name, partial(_prepare, rays, kind), 0.0) for name, rays, kind in kinds]
     timed = partial(_prepare, 1 << 13, {"grid": "shell"})
-    return [*found, Case("march", "hollow sphere", "fp32", 1 << 13, timed, timed=True)]
+    return [*found, kernel.case("hollow sphere", timed, 0.0, items=1 << 13)]
 
 
 def _grid(kind: str, device: str) -> Occupancy:
@@ -57,54 +73,160 @@ def _grid(kind: str, device: str) -> Occupancy:
     return Occupancy(cells.to(device))
 
 
-def _rays(count: int) -> tuple[Tensor, Tensor]:
+def _rays(count: int) -> Rays:
     """Rays towards the cube from a sphere around it, every fourth from inside."""
     generator = torch.Generator().manual_seed(count)
     outside = normalize(torch.randn(count, 3, generator=generator), dim=-1) * 1.5 + 0.5
     inside = torch.rand(count, 3, generator=generator)
     origins = torch.where(torch.arange(count)[:, None] % 4 == 3, inside, outside)
-    return origins, torch.rand(count, 3, generator=generator) - origins
+    return Rays(origins, torch.rand(count, 3, generator=generator) - origins)
 
 
-def _special_rays() -> tuple[Tensor, Tensor]:
+def _special_rays() -> Rays:
     """Rays along axes, diagonals, grid planes, through corners, without direction, not finite."""
-    directions = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * 3)  # [27, 3], one is 0
     targets = torch.tensor([[0.5, 0.5, 0.5], [0.0, 0.0, 0.0], [1.0, 1.0, 0.5], [0.25, 0.3, 0.75]])
-    far = targets[:, None] - 2 * directions
+    far = targets[:, None] - 2 * ALL
     near = targets[:, None].expand_as(far)
     bad = torch.tensor([[torch.nan, 0.5, 0.5], [0.5, torch.inf, 0.5], [0.5, 0.5, -1e30]])
     origins = torch.cat((far.reshape(-1, 3), near.reshape(-1, 3), bad))
-    ahead = directions.expand(4, 27, 3).reshape(-1, 3)
-    return origins, torch.cat((ahead, ahead, torch.ones(3, 3)))
+    ahead = ALL.expand(4, 27, 3).reshape(-1, 3)
+    return Rays(origins, torch.cat((ahead, ahead, torch.ones(3, 3))))
 
 
-def _prepare(count: int, options: dict, device: str) -> Prepared:
-    origins, directions = _special_rays() if options.get("special") else _rays(count)
-    rays, generator = len(origins), torch.Generator().manual_seed(4)
-    arguments: dict[str, Tensor | int] = {}
-    if options.get("jitter"):
-        arguments["jitter"] = torch.rand(rays, generator=generator).to(device)
-    if options.get("window"):
-        near = torch.rand(rays, generator=generator)
-        arguments["window"] = torch.stack((near, near + 0.5), dim=1).to(device)
-    if options.get("unbounded"):
-        arguments["window"] = torch.tensor([-torch.inf, torch.inf]).expand(rays, 2).to(device)
-    if options.get("resumed"):
-        arguments["start"] = torch.randint(-1, 400, (rays,), generator=generator).int().to(device)
-    if "limit" in options:
-        arguments["limit"] = options["limit"]
-    grid = _grid(options.get("grid", "dust"), device)
-    origins, directions = origins.to(device), directions.to(device)
+def _prepare(count: int, kind: dict[str, Any], device: str) -> Callable[[str], tuple[Tensor, ...]]:
+    rays = _special_rays() if kind.get("special") else _rays(count)
+    count, generator = len(rays.origins), torch.Generator().manual_seed(4)
+    options: dict[str, Any] = {}
+    if kind.get("jitter"):
+        options["jitter"] = torch.rand(count, generator=generator).to(device)
+    if kind.get("window"):
+        near = torch.rand(count, generator=generator)
+        options["window"] = torch.stack((near, near + 0.5), dim=1).to(device)
+    if kind.get("unbounded"):
+        options["window"] = torch.tensor([-torch.inf, torch.inf]).expand(count, 2).to(device)
+    if kind.get("resumed"):
+        options["start"] = torch.randint(-1, 400, (count,), generator=generator).int().to(device)
+    if "limit" in kind:
+        options["limit"] = kind["limit"]
+    grid = _grid(kind.get("grid", "dust"), device)
+    rays = Rays(rays.origins.to(device), rays.directions.to(device))
 
     def call(backend: str) -> tuple[Tensor, ...]:
-        samples = march(origins, directions, grid, STEP, backend=backend, **arguments)  # type: ignore[arg-type]
-        return (
-            samples.offsets,
-            samples.ray,
-            samples.t,
-            samples.delta,
-            samples.positions,
-            samples.resume,
-        )
+        found = march(rays, grid, STEP, backend=backend, **options)
+        return found.offsets, found.ray, found.t, found.delta, found.positions, found.resume
 
-    return Prepared(call, 0.0)
+    return call
+
+
+def _ways() -> list[Case]:
+    """Every kind of ray through a full grid, an empty one, and one with a single cell."""
+    some = ALL[ALL.any(dim=1)]
+    middle, corner, far = torch.full((3,), 0.5), torch.zeros(3), 1e6
+    kinds: dict[str, tuple[Tensor, Tensor]] = {
+        "along axes": (middle - 2 * AXES, AXES),
+        "along diagonals": (middle - 2 * some, some),
+        "in planes of the grid": (torch.tensor([[-1.0, 0.25, 0.5]]), AXES[:1]),
+        "through a corner of the cube": (corner - 2 * some, some),
+        "through an edge of the cube": (torch.tensor([0.0, 0.0, 0.5]) - 2 * some, some),
+        "from inside": (middle.expand(26, 3), some),
+        "from a face": (torch.tensor([0.0, 0.5, 0.5]).expand(26, 3), some),
+        "from a corner": (corner.expand(26, 3), some),
+        "away from the cube": (middle + 2 * AXES, AXES),
+        "past the cube": (middle - 2 * AXES + 3 * AXES.roll(1, dims=1), AXES),
+        "without direction": (middle.expand(1, 3), torch.zeros(1, 3)),
+        "from 1e6 away": (middle - far * some, some),
+        "of direction 1e-30": (middle - 2 * some, 1e-30 * some),
+        "of direction 1e-40": (middle - 2 * some, 1e-40 * some),
+        "from inside, of direction 1e-40": (middle.expand(26, 3), 1e-40 * some),
+        "of direction 1e30": (middle - 2 * some, 1e30 * some),
+        "of directions 1 and 1e-40": (middle - 2 * AXES, AXES + 1e-40 * AXES.roll(1, dims=1)),
+        "along an edge, off it by 1e-40": (corner.expand(6, 3), AXES.abs() + 1e-40),
+        "along an edge, off it by 1e-30": (corner.expand(6, 3), AXES.abs() + 1e-30),
+    }
+    found = []
+    for grid, holds in (
+        ("full grid", "samples add up to the way through the cube, and lie on it"),
+        ("one cell", "samples add up to the way through the cell, and lie on it"),
+        ("empty grid", "no samples"),
+    ):
+        for kind, rays in kinds.items():
+            if "1e6" in kind and grid == "one cell":
+                continue  # t is rounded there by as much as the cell measures
+            size = rays[0].abs().max().item() + 1
+            # An end of the way is rounded to a sample: half a step in the cube, where the first
+            # sample lies half a step behind it, a step in the cell, at both ends.
+            steps = {"full grid": 0.5, "one cell": 1.0, "empty grid": 0.0}[grid]
+            rounding = 0.0 if grid == "empty grid" else 4 * math.sqrt(3) * size * U32
+            cells = {(backend, "fp32"): steps * STEP + rounding for backend in ("reference", "cpu")}
+            found.append(
+                Case(
+                    "march",
+                    f"{kind}, {grid}",
+                    holds,
+                    f"{steps} steps, and t rounded 4 times at the size of the origin: 4 √3 |o| u",
+                    cells,
+                    partial(_way_error, grid, Rays(*rays), STEP),
+                )
+            )
+    found.append(
+        Case(
+            "march",
+            "1024 samples reached",
+            "going on from where a ray was left gives the rest of the way",
+            "half a step, and t rounded 4 times at the size of the origin: 4 √3 |o| u",
+            {(b, "fp32"): FINE / 2 + 12 * math.sqrt(3) * U32 for b in ("reference", "cpu")},
+            partial(_way_error, "full grid", Rays(*kinds["along diagonals"]), FINE),
+        )
+    )
+    return found
+
+
+def _one_or_all(kind: str, device: str) -> Occupancy:
+    cells = torch.full((SIZE, SIZE, SIZE), kind == "full grid")
+    if kind == "one cell":
+        cells[CELL] = True
+    return Occupancy(cells.to(device))
+
+
+def _way(kind: str, rays: Rays) -> Tensor:
+    """World length of rays in occupied cells, by the slab test in float64; 0 where t overflows."""
+    origins, directions = rays.origins.cpu(), rays.directions.cpu()
+    if kind == "empty grid":
+        return torch.zeros(len(origins), dtype=torch.float64)
+    lower, upper = torch.zeros(3).double(), torch.ones(3).double()
+    if kind == "one cell":
+        lower = torch.tensor(CELL).double() / SIZE
+        upper = lower + 1 / SIZE
+    o, d = origins.double(), directions.double()
+    ends = torch.stack(((lower - o) / d, (upper - o) / d))
+    between = (o >= lower) & (o < upper) | (d != 0)
+    enter = torch.where(d == 0, -torch.inf, ends.amin(0)).amax(1).clamp(min=0)
+    leave = torch.where(d == 0, torch.inf, ends.amax(0)).amin(1)
+    way = (leave - enter).clamp(min=0) * d.norm(dim=1)
+    known = (o.abs().amax(1) + 1) / d.abs().amax(1) < torch.finfo(origins.dtype).max
+    return torch.where(between.all(1) & known, way, 0)
+
+
+def _way_error(
+    grid: str, rays: Rays, step: float, backend: str, device: str, precision: str
+) -> float:
+    """Difference between the way that the samples cover, taken in as many calls as needed, and the
+    exact one."""
+    dtype = DTYPES[precision]
+    rays = Rays(rays.origins.to(device, dtype), rays.directions.to(device, dtype))
+    occupancy, count = _one_or_all(grid, device), len(rays.origins)
+    start = torch.zeros(count, dtype=torch.int32, device=device)
+    counts = torch.zeros(count, dtype=torch.int64, device=device)
+    outside = 0.0
+    for _ in range(math.ceil(math.sqrt(3) / step / MAX_SAMPLES) + 1):
+        samples = march(rays, occupancy, step, start=start, limit=MAX_SAMPLES, backend=backend)
+        counts += samples.offsets.diff()
+        start = samples.resume
+        if len(samples):
+            outside = max(outside, (samples.positions - 0.5).abs().max().item() - 0.5)
+            same = samples.ray[1:] == samples.ray[:-1]
+            if (samples.t.diff()[same] < 0).any():
+                return math.inf
+    if (start >= 0).any():
+        return math.inf
+    return max((counts.cpu() * step - _way(grid, rays)).abs().max().item(), outside)

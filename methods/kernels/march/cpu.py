@@ -12,10 +12,9 @@ import math
 import numpy as np
 import torch
 from numba import njit, prange
-from torch import Tensor
 
 from methods.kernels.cpu import f32
-from methods.kernels.march import PARALLEL, Occupancy, Samples
+from methods.kernels.march import PARALLEL, Occupancy, Samples, Segments
 
 CHUNK = 64  # rays
 f64 = np.float64
@@ -23,20 +22,13 @@ INF = f32(np.inf)
 UNIT_CUBE = np.array([[0, 0, 0], [1, 1, 1]], np.float32)
 
 
-def march(
-    origins: Tensor,
-    directions: Tensor,
-    occupancy: Occupancy,
-    step: float,
-    window: Tensor,
-    jitter: Tensor,
-    start: Tensor,
-    limit: int,
-) -> Samples:
+def march(segments: Segments, occupancy: Occupancy, step: float, limit: int) -> Samples:
     """See `methods.kernels.march.march`."""
+    origins, directions = (
+        x.contiguous() for x in (segments.rays.origins, segments.rays.directions)
+    )
     if origins.dtype != torch.float32:
         raise ValueError(f"backend 'cpu' marches float32, got {origins.dtype}")
-    origins, directions = origins.contiguous(), directions.contiguous()
     rays = len(origins)
     most = min(limit, math.ceil(math.sqrt(3) / step) + 1)
     scratch = torch.empty(-(-rays // CHUNK) * CHUNK * most)
@@ -49,9 +41,9 @@ def march(
         occupancy.clearance.numpy(),
         occupancy.bounds.numpy(),
         f32(step),
-        window.contiguous().numpy(),
-        jitter.contiguous().numpy(),
-        start.contiguous().numpy(),
+        segments.window.contiguous().numpy(),
+        segments.jitter.contiguous().numpy(),
+        segments.start.contiguous().numpy(),
         most,
         scratch.numpy(),
         counts.numpy(),
@@ -72,7 +64,7 @@ def march(
         positions.numpy(),
         ray.numpy(),
     )
-    return Samples(offsets, ray, t, torch.full((total,), step), positions, resume)
+    return Samples(t, torch.full((total,), step), offsets, ray, positions, resume)
 
 
 @njit(cache=True)

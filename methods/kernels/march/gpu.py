@@ -9,29 +9,21 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
 from methods.kernels.gpu import check_types, launch
-from methods.kernels.march import BRICK, PARALLEL, Occupancy, Samples
+from methods.kernels.march import BRICK, PARALLEL, Occupancy, Samples, Segments
 from methods.kernels.march.reference import clip
 
 BLOCK = 32  # rays: those of a warp, which waits for the longest of them
 
 
-def march(
-    origins: Tensor,
-    directions: Tensor,
-    occupancy: Occupancy,
-    step: float,
-    window: Tensor,
-    jitter: Tensor,
-    start: Tensor,
-    limit: int,
-) -> Samples:
+def march(segments: Segments, occupancy: Occupancy, step: float, limit: int) -> Samples:
     """See `methods.kernels.march.march`."""
+    origins, directions = segments.rays.origins, segments.rays.directions
+    window, jitter, start = segments.window, segments.jitter, segments.start
     check_types(torch.float32, origins=origins, directions=directions, window=window, jitter=jitter)
     rays, device = len(origins), origins.device
-    near, far, step_t, alive = clip(origins, directions, step, window[:, 1])
+    near, far, step_t, alive = clip(segments.rays, step, window[:, 1])
     parallel = directions.abs() < PARALLEL
     slopes = torch.where(parallel, 0, 1 / torch.where(parallel, 1, directions))
     counts = torch.zeros(rays, dtype=torch.int64, device=device)
@@ -55,7 +47,7 @@ def march(
     ray = torch.empty(total, dtype=torch.int32, device=device)
     t, positions = (torch.empty(*shape, device=device) for shape in ((total,), (total, 3)))
     launch(_march, grid, *arguments, counts, resume, offsets, ray, t, positions, **options)
-    return Samples(offsets, ray, t, torch.full_like(t, step), positions, resume)
+    return Samples(t, torch.full_like(t, step), offsets, ray, positions, resume)
 
 
 @triton.jit

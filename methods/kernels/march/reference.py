@@ -5,58 +5,37 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from methods.kernels.march import PARALLEL, Occupancy, Samples
+from bench.types import Rays
+from methods.kernels.march import PARALLEL, Occupancy, Samples, Segments
 
 BLOCK = 1 << 12
 """Rays whose steps are tested at once: [BLOCK, 1024, 3] positions are 50 MB."""
 
 
-def march(
-    origins: Tensor,
-    directions: Tensor,
-    occupancy: Occupancy,
-    step: float,
-    window: Tensor,
-    jitter: Tensor,
-    start: Tensor,
-    limit: int,
-) -> Samples:
+def march(segments: Segments, occupancy: Occupancy, step: float, limit: int) -> Samples:
     """See `methods.kernels.march.march`."""
-    rays = len(origins)
-    parts = []
-    for first in range(0, max(rays, 1), BLOCK):
-        o, d, near_far, phase, begin = (
-            x[first : first + BLOCK] for x in (origins, directions, window, jitter, start)
-        )
-        parts.append(_march_block(o, d, occupancy, step, near_far, phase, begin, limit))
+    rays = len(segments.start)
+    parts = [
+        _march_block(segments.take(slice(first, first + BLOCK)), occupancy, step, limit)
+        for first in range(0, max(rays, 1), BLOCK)
+    ]
     t, positions, per_ray, resume = (torch.cat(column) for column in zip(*parts, strict=True))
-    ray = torch.arange(rays, device=origins.device).repeat_interleave(per_ray)
-    return Samples(
-        offsets=torch.cat((per_ray.new_zeros(1), per_ray.cumsum(dim=0))),
-        ray=ray.int(),
-        t=t,
-        delta=torch.full_like(t, step),
-        positions=positions,
-        resume=resume,
-    )
+    ray = torch.arange(rays, device=t.device).repeat_interleave(per_ray)
+    offsets = torch.cat((per_ray.new_zeros(1), per_ray.cumsum(dim=0)))
+    return Samples(t, torch.full_like(t, step), offsets, ray.int(), positions, resume)
 
 
 def _march_block(
-    origins: Tensor,
-    directions: Tensor,
-    occupancy: Occupancy,
-    step: float,
-    window: Tensor,
-    jitter: Tensor,
-    start: Tensor,
-    limit: int,
+    segments: Segments, occupancy: Occupancy, step: float, limit: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """t [S] and positions [S, 3] of the samples, how many a ray has [R], where to resume [R]."""
-    near, far, step_t, alive = clip(origins, directions, step, window[:, 1])
+    origins, directions = segments.rays.origins, segments.rays.directions
+    window, start = segments.window, segments.start
+    near, far, step_t, alive = clip(segments.rays, step, window[:, 1])
     alive &= start >= 0
     count = torch.where(alive, (far - near) / step_t, 0).ceil().clamp(min=0)
     k = torch.arange(int(count.max()) if len(count) else 0, device=origins.device)
-    t = near[:, None] + (k + jitter[:, None]) * step_t[:, None]  # [R, K]
+    t = near[:, None] + (k + segments.jitter[:, None]) * step_t[:, None]  # [R, K]
     positions = origins[:, None] + t[..., None] * directions[:, None]  # [R, K, 3]
     candidate = alive[:, None] & (t >= window[:, :1]) & (t < far[:, None]) & (k >= start[:, None])
     candidate &= _occupied(torch.where(candidate[..., None], positions, 0), occupancy)
@@ -69,15 +48,13 @@ def _march_block(
     return t[kept], positions[kept], per_ray, torch.where(full, last, -1).int()
 
 
-def clip(
-    origins: Tensor, directions: Tensor, step: float, farthest: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def clip(rays: Rays, step: float, farthest: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The t between which rays are inside the cube and nearer than `farthest`, their step in t, and
     whether there is anything to march, each [R]."""
-    entry, leave = _cross_unit_cube(origins, directions)
+    entry, leave = _cross_unit_cube(rays.origins, rays.directions)
     near, far = entry.clamp(min=0), torch.minimum(leave, farthest)
     # In float64, where every backend rounds to the same float32.
-    length = directions.double().norm(dim=-1).to(directions.dtype)
+    length = rays.directions.double().norm(dim=-1).to(rays.directions.dtype)
     # A true division: `step / length` would multiply by the reciprocal, an ulp away.
     step_t = torch.full_like(length, step) / length
     return near, far, step_t, (near < far) & far.isfinite() & step_t.isfinite()

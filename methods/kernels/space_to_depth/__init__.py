@@ -1,8 +1,8 @@
-"""What a network on cells is told of each, and the pixels that its answer makes.
+"""All that is known of a cell of s x s pixels in one row, and a network's rows made into pixels.
 
-`lift` brings all that is known of a cell of s x s pixels into one row: the present low-resolution
-sample, the features of preceding frames, the preceding picture, the surface. `draw` makes pixels of
-what the network answers. Colours are told and drawn less their background, so that nothing is 0.
+`space_to_depth` brings what is known of a cell into one row: the present low-resolution sample, the
+features of preceding frames, the preceding picture, the surface. `depth_to_space` makes pixels of
+the network's output. Colours are relative to the background, so that empty space is 0.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from methods.kernels.dispatch import implementation
 TAPS = 9
 """Low-resolution samples that a pixel's base is made of."""
 
-Told = tuple[Tensor, Tensor]
+Pair = tuple[Tensor, Tensor]
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Layout:
 
     @cached_property
     def groups(self) -> list[tuple[str, int, int]]:
-        """Name, slots, features a slot: colour, how far something is there, the rest."""
+        """Name, slots, features a slot: colour, opacity or validity, the rest."""
         cell, features = self.scale**2, self.channels + 1
         return [
             ("present", 1, features),
@@ -67,42 +67,70 @@ class Layout:
         return sum(slots * features for _, slots, features in self.groups)
 
 
-def lift(
-    values: Tensor,
-    alpha: Tensor,
-    background: Tensor,
-    cells: Tensor,
-    preceding: Sequence[Told],
-    history: Told | None,
-    surface: Told | None,
-    layout: Layout,
-    phase: tuple[float, float] = (0.0, 0.0),
-    *,
-    multiple: int = 1,
-    backend: str = "auto",
-) -> tuple[Tensor, Tensor]:
-    """The rows of some cells, and the base that a network corrects there.
+@dataclass(frozen=True)
+class CellInputs:
+    """All that is known of some cells.
 
-    The base is the present RGB enlarged bilinearly; beyond the frame its border goes on. Colours of
-    history and surface are told less the base.
-
-    Differentiable in `values`, `alpha` and what `preceding` and `surface` have, not in `history`.
-
-    Args:
+    Attributes:
         values: [h, w, K] features of the present low-resolution frame.
         alpha: [h, w] opacity.
         background: [K] that features are composited on.
         cells: [N] int64 low-resolution pixels, counted row by row, 0 to h w - 1.
-        preceding: newest first, no more than `layout.frames`: features [P, K] of points and the
-            index [h s, w s] int32 of the one that each pixel shows, -1 for none; columns of frames
-            that are missing are 0.
-        history: preceding picture [N, s^2, 3] in the cells, and where it is known, [N, s^2] in
+        preceding: newest first, no more than `Layout.frames`: features [P, K] of points and the
+            index [h s, w s] int32 of the one that each pixel shows, -1 for none; columns of missing
+            frames are 0.
+        history: preceding picture [N, s^2, 3] in the cells, and where it is valid, [N, s^2] in
             {0, 1}; None: columns of 0.
         surface: features and, last, opacity [P, K + 1], and the index [N, s^2] int32 of the one
             that each pixel shows, -1 for none; None: columns of 0.
+    """
+
+    values: Tensor
+    alpha: Tensor
+    background: Tensor
+    cells: Tensor
+    preceding: Sequence[Pair] = ()
+    history: Pair | None = None
+    surface: Pair | None = None
+
+    def check(self, layout: Layout) -> None:
+        """Raise `ValueError` unless all shapes are those of `layout`."""
+        height, width, count, pixels = *self.values.shape[:2], len(self.cells), layout.scale**2
+        history, surface = self.history, self.surface
+        check_shape("values", self.values, None, None, layout.channels)
+        check_shape("alpha", self.alpha, height, width)
+        check_shape("background", self.background, layout.channels)
+        check_shape("cells", self.cells, None)
+        if len(self.preceding) > layout.frames:
+            raise ValueError(
+                f"preceding: expected at most {layout.frames}, got {len(self.preceding)}"
+            )
+        if (history and not layout.history) or (surface and not layout.surface):
+            raise ValueError(f"history, surface: expected None without their columns, got {layout}")
+        for points, index in self.preceding:
+            check_shape("preceding values", points, None, layout.channels)
+            check_shape("preceding index", index, height * layout.scale, width * layout.scale)
+        if history is not None:
+            check_shape("history values", history[0], count, pixels, 3)
+            check_shape("history valid", history[1], count, pixels)
+        if surface is not None:
+            check_shape("surface values", surface[0], None, layout.channels + 1)
+            check_shape("surface index", surface[1], count, pixels)
+
+
+def space_to_depth(
+    inputs: CellInputs, layout: Layout, *, multiple: int = 1, backend: str = "auto"
+) -> Pair:
+    """The base of some cells, which a network corrects, and their rows.
+
+    The base is the present RGB enlarged bilinearly, the border repeated. Colours of history and
+    surface are relative to the base.
+
+    Differentiable in `values`, `alpha` and the features of `preceding` and `surface`, not in
+    `history`.
+
+    Args:
         layout: of the rows.
-        phase: (u, v) in full-resolution pixels of the samples of the frame beside the middle of
-            their cell.
         multiple: rows of 0 follow up to a multiple, 1 or more, of this.
 
     Returns:
@@ -111,54 +139,34 @@ def lift(
     Raises:
         ValueError: a shape is wrong, or an index names no point.
     """
-    height, width, count, pixels = *values.shape[:2], len(cells), layout.scale**2
-    check_shape("values", values, None, None, layout.channels)
-    check_shape("alpha", alpha, height, width)
-    check_shape("background", background, layout.channels)
-    check_shape("cells", cells, None)
-    if len(preceding) > layout.frames:
-        raise ValueError(f"preceding: expected at most {layout.frames}, got {len(preceding)}")
-    if (history is not None and not layout.history) or (surface is not None and not layout.surface):
-        raise ValueError(f"history, surface: expected None without their columns, got {layout}")
-    for points, index in preceding:
-        check_shape("preceding values", points, None, layout.channels)
-        check_shape("preceding index", index, height * layout.scale, width * layout.scale)
-    if history is not None:
-        check_shape("history values", history[0], count, pixels, 3)
-        check_shape("history valid", history[1], count, pixels)
-    if surface is not None:
-        check_shape("surface values", surface[0], None, layout.channels + 1)
-        check_shape("surface index", surface[1], count, pixels)
-    across, down = (_tent(layout.scale, shift) for shift in phase)
-    taps = (down[:, None, :, None] * across[None, :, None, :]).reshape(-1, TAPS).to(values)
-    kernel = implementation("lift", backend, values.device)
+    inputs.check(layout)
+    values, count = inputs.values, len(inputs.cells)
+    tent = _tent(layout.scale)
+    taps = (tent[:, None, :, None] * tent[None, :, None, :]).reshape(-1, TAPS).to(values)
+    kernel = implementation("space_to_depth", backend, values.device)
     rows = multiple * -(-count // multiple)
     with torch.autocast(values.device.type, enabled=False):
-        return kernel.lift(
-            values, alpha, background, cells, preceding, history, surface, layout, taps, rows
-        )
+        return kernel.space_to_depth(inputs, layout, taps, rows)
 
 
-def draw(
+def depth_to_space(
     base: Tensor,
     rows: Tensor,
-    answer: Tensor,
+    output: Tensor,
     matrix: Tensor | None,
     layout: Layout,
     *,
     backend: str = "auto",
 ) -> Tensor:
-    """Pixels [N, s^2, 3], less the background, of cells of which `lift` told `base` and `rows`.
+    """Pixels [N, s^2, 3], relative to the background, of cells with `base` and `rows`.
 
     base + correction + share * (preceding picture - base) + matrix [surface less base, opacity,
-    rest], the colours of the surface weighed by its opacity.
-
-    Differentiable in all.
+    rest], the colours of the surface weighted by its opacity. Differentiable in all.
 
     Args:
-        base: [N, s^2, 3].
-        rows: [R, layout.width], R at least N; of what is more nothing is drawn.
-        answer: [R, s^2 (3 + layout.history)] of each pixel, correction and logit of the share.
+        base: [N, s^2, 3] of `space_to_depth`.
+        rows: [R, layout.width] of `space_to_depth`, R at least N; the others are ignored.
+        output: [R, s^2 (3 + layout.history)] of each pixel, correction and logit of the share.
         matrix: [R, 3 (K + 1)] that the pixels of a cell share; None without surface.
 
     Raises:
@@ -169,17 +177,17 @@ def draw(
     check_shape("rows", rows, None, layout.width)
     if count < len(base):
         raise ValueError(f"rows: expected one for each of {len(base)} cells, got {count}")
-    check_shape("answer", answer, count, pixels * (3 + layout.history))
+    check_shape("output", output, count, pixels * (3 + layout.history))
     if (matrix is None) == layout.surface:
         raise ValueError("matrix: expected one with layout.surface, None without")
     if matrix is not None:
         check_shape("matrix", matrix, count, 3 * (layout.channels + 1))
-    kernel = implementation("lift", backend, base.device)
+    kernel = implementation("space_to_depth", backend, base.device)
     with torch.autocast(base.device.type, enabled=False):
-        return kernel.draw(base, rows, answer, matrix, layout)
+        return kernel.depth_to_space(base, rows, output, matrix, layout)
 
 
-def _tent(scale: int, shift: float) -> Tensor:
+def _tent(scale: int) -> Tensor:
     """[s, 3] weights of the samples at -1, 0, 1 for the s pixels between -1/2 and 1/2."""
-    place = (torch.arange(scale) + 0.5 - shift) / scale - 0.5
+    place = (torch.arange(scale) + 0.5) / scale - 0.5
     return (1 - (place[:, None] - torch.tensor((-1.0, 0.0, 1.0))).abs()).clamp(min=0)

@@ -1,28 +1,41 @@
-"""Cases of what a network on cells is told and draws.
+"""Cases of the rows and pixels of cells.
 
-Inputs of `lift` are few digits long, and so are the weights of its base where s is a power of 2:
-nothing is rounded there, in whatever order the gradients of shared samples are added up.
+Inputs of `space_to_depth` are few digits long, and so are the weights of its base where s is a
+power of 2: nothing is rounded there, in whatever order the gradients of shared samples are added
+up.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from methods.kernels.case import U32, Case, Prepared
-from methods.kernels.space_to_depth import Layout, Told, draw, lift
+from bench.case import U32, Agreement, Case
+from methods.kernels.dispatch import served
+from methods.kernels.space_to_depth import (
+    CellInputs,
+    Layout,
+    Pair,
+    depth_to_space,
+    space_to_depth,
+)
 
 STEPS = 16
 """Numbers are multiples of 1/16 from -1 to 1. With weights in multiples of 1/64 a product has 11
 bits, and a sum of 2^13 of them is exact."""
 
-ROUNDED_BASE = 2 * 32 * U32
-"""Where s is no power of 2: both backends add nine products, of weights that add up to 1 and
-numbers of at most 2, and take two more numbers of at most 3 away."""
+BASE = (
+    "s a power of 2: short numbers, 0; else nine products, of weights that add up to 1 and numbers "
+    "of at most 2, and two more numbers of at most 3"
+)
+BASE_GRADIENT = (
+    "s a power of 2: short numbers, 0; else rounded weights, and a sample in the base of up to 9 "
+    "cells of 9 pixels, each with a gradient of up to 1 + 2"
+)
 
 
 @dataclass(frozen=True)
@@ -34,8 +47,19 @@ class Size:
     layout: Layout
     share: float = 0.3
     preceding: int = 2
-    phase: tuple[float, float] = (0.0, 0.0)
     multiple: int = 1
+
+    @property
+    def cells(self) -> Tensor:
+        """Those that are drawn."""
+        generator = torch.Generator().manual_seed(1)
+        shown = torch.rand(self.height * self.width, generator=generator) < self.share
+        return shown.nonzero().squeeze(1)
+
+    @property
+    def rows(self) -> int:
+        """Rows of cells, and of what fills up their number."""
+        return self.multiple * -(-len(self.cells) // self.multiple)
 
 
 LEAN = Layout(6, 2, 4, True, True)
@@ -48,31 +72,44 @@ SIZES = {
     "all cells": Size(5, 4, LEAN, share=1.0),
     "scattered": Size(20, 13, LEAN),
     "cold start": Size(9, 8, LEAN, preceding=0),
-    "another phase": Size(9, 8, LEAN, phase=(1.5, -0.5)),
     "scale 2, one frame": Size(9, 8, Layout(3, 1, 2, True, True)),
     "scale 3": Size(9, 8, Layout(4, 1, 3, True, True)),
     "no surface": Size(9, 8, Layout(6, 2, 4, True, False)),
     "neither": Size(9, 8, Layout(6, 0, 4, False, False)),
+    "a quarter of 200 x 200": Size(200, 200, LEAN, share=0.25),
 }
-
-FRAME = "a quarter of 200 x 200"
 
 
 def cases() -> list[Case]:
     """Sizes, layouts, a cold start; a frame, timed."""
+    backends = served("space_to_depth")
+    rows = Agreement("space_to_depth", backends, BASE)
+    rows_back = Agreement("space_to_depth backward", backends, BASE_GRADIENT)
+    pixels = Agreement(
+        "depth_to_space",
+        backends,
+        "ten terms of at most 4, and a logistic function, off by a few u, times 1: 328 u",
+    )
+    pixels_back = Agreement(
+        "depth_to_space backward",
+        backends,
+        "an entry of the matrix has a sum over the p pixels of a cell, each term at most 1: "
+        "2 (p^2 + 16) u",
+    )
     found = []
-    for kernel, make in (
-        ("lift", _lift),
-        ("lift backward", _lift_backward),
-        ("lift draw", _draw),
-        ("lift draw backward", _draw_backward),
-    ):
-        for name, size in SIZES.items():
-            count = int(_cells(size).shape[0])
-            found.append(Case(kernel, name, "fp32", count, partial(make, size)))
-        frame = Size(200, 200, LEAN, share=0.25)
-        timed = partial(make, frame)
-        found.append(Case(kernel, FRAME, "fp32", len(_cells(frame)), timed, timed=True))
+    for name, size in SIZES.items():
+        items = len(size.cells) if size.height == 200 else None
+        rounded, p = size.layout.scale == 3, size.layout.scale**2
+        found += [
+            rows.case(name, partial(_rows, size), 2 * 32 * U32 * rounded, items=items),
+            rows_back.case(
+                name, partial(_rows_back, size), 2 * 81 * 81 * 3 * U32 * rounded, items=items
+            ),
+            pixels.case(name, partial(_pixels, size), 2 * (10 * 16 + 4) * U32, items=items),
+            pixels_back.case(
+                name, partial(_pixels_back, size), 2 * (p * p + 16) * U32, items=items
+            ),
+        ]
     return found
 
 
@@ -80,120 +117,102 @@ def _short(generator: torch.Generator, *shape: int) -> Tensor:
     return torch.randint(-STEPS, STEPS + 1, shape, generator=generator) / STEPS
 
 
-def _cells(size: Size) -> Tensor:
-    generator = torch.Generator().manual_seed(1)
-    shown = torch.rand(size.height * size.width, generator=generator) < size.share
-    return shown.nonzero().squeeze(1)
-
-
-def _rows(size: Size) -> int:
-    return size.multiple * -(-len(_cells(size)) // size.multiple)
-
-
-def _told(size: Size, device: str) -> tuple[dict[str, Any], list[Tensor]]:
-    """Arguments of `lift`, and those of them that it is differentiable in."""
+def _inputs(size: Size, device: str) -> tuple[CellInputs, list[Tensor]]:
+    """Inputs of `space_to_depth`, and those of them that it is differentiable in."""
     layout, generator = size.layout, torch.Generator().manual_seed(2)
-    short = partial(_short, generator)
-    cells, pixels = _cells(size), layout.scale**2
+    cells, pixels = size.cells, layout.scale**2
+
+    def short(*shape: int) -> Tensor:
+        return _short(generator, *shape).to(device)
+
+    def index(points: int, *shape: int) -> Tensor:
+        entries = torch.randint(-1, points, shape, generator=generator, dtype=torch.int32)
+        return entries.to(device)
+
+    values = short(size.height, size.width, layout.channels).requires_grad_()
+    alpha = short(size.height, size.width).requires_grad_()
     full = size.height * layout.scale, size.width * layout.scale
-    values = short(size.height, size.width, layout.channels).to(device).requires_grad_()
-    alpha = short(size.height, size.width).to(device).requires_grad_()
-    learned, preceding = [values, alpha], []
-    history: Told | None = None
-    surface: Told | None = None
-    for _ in range(min(size.preceding, layout.frames)):
-        points = short(30, layout.channels).to(device).requires_grad_()
-        index = torch.randint(-1, 30, full, generator=generator, dtype=torch.int32)
-        preceding.append((points, index.to(device)))
-        learned.append(points)
+    preceding = [
+        (short(30, layout.channels).requires_grad_(), index(30, *full))
+        for _ in range(min(size.preceding, layout.frames))
+    ]
+    history: Pair | None = None
+    surface: Pair | None = None
     if layout.history and size.preceding:
         valid = torch.randint(0, 2, (len(cells), pixels), generator=generator).float()
-        history = short(len(cells), pixels, 3).to(device), valid.to(device)
+        history = short(len(cells), pixels, 3), valid.to(device)
+    learned = [values, alpha, *(points for points, _ in preceding)]
     if layout.surface:
-        points = short(50, layout.channels + 1).to(device).requires_grad_()
-        index = torch.randint(-1, 50, (len(cells), pixels), generator=generator, dtype=torch.int32)
-        surface = points, index.to(device)
-        learned.append(points)
-    arguments = {
-        "values": values,
-        "alpha": alpha,
-        "background": short(layout.channels).to(device),
-        "cells": cells.to(device),
-        "preceding": preceding,
-        "history": history,
-        "surface": surface,
-        "layout": layout,
-        "phase": size.phase,
-        "multiple": size.multiple,
-    }
-    return arguments, learned
+        surface = short(50, layout.channels + 1).requires_grad_(), index(50, len(cells), pixels)
+        learned.append(surface[0])
+    background = short(layout.channels)
+    inputs = CellInputs(values, alpha, background, cells.to(device), preceding, history, surface)
+    return inputs, learned
 
 
-def _lift(size: Size, device: str) -> Prepared:
-    arguments, _ = _told(size, device)
+def _rows(size: Size, device: str) -> Callable[[str], tuple[Tensor, ...]]:
+    inputs, _ = _inputs(size, device)
+    layout, multiple = size.layout, size.multiple
 
     def call(backend: str) -> tuple[Tensor, ...]:
         with torch.no_grad():
-            return lift(**arguments, backend=backend)
+            return space_to_depth(inputs, layout, multiple=multiple, backend=backend)
 
-    return Prepared(call, 0.0 if size.layout.scale in (2, 4) else ROUNDED_BASE)
+    return call
 
 
-def _lift_backward(size: Size, device: str) -> Prepared:
-    arguments, learned = _told(size, device)
-    generator = torch.Generator().manual_seed(3)
-    count, pixels = len(arguments["cells"]), size.layout.scale**2
+def _rows_back(size: Size, device: str) -> Callable[[str], tuple[Tensor, ...]]:
+    inputs, learned = _inputs(size, device)
+    generator, layout = torch.Generator().manual_seed(3), size.layout
     grads = (
-        _short(generator, count, pixels, 3).to(device),
-        _short(generator, _rows(size), size.layout.width).to(device),
+        _short(generator, len(size.cells), layout.scale**2, 3).to(device),
+        _short(generator, size.rows, layout.width).to(device),
     )
 
     def call(backend: str) -> tuple[Tensor, ...]:
-        return torch.autograd.grad(lift(**arguments, backend=backend), learned, grads)
+        found = space_to_depth(inputs, layout, multiple=size.multiple, backend=backend)
+        return torch.autograd.grad(found, learned, grads)
 
-    # Weights of s = 3 are rounded, and their products; a sample is in the base of up to 9 cells of
-    # 9 pixels, each with a gradient of up to 1 + 2.
-    return Prepared(call, 0.0 if size.layout.scale in (2, 4) else 2 * 81 * 81 * 3 * U32)
+    return call
 
 
-def _answered(size: Size, device: str) -> tuple[list[Tensor], Layout]:
+def _outputs(size: Size, device: str) -> list[Tensor]:
+    """Base, rows, output and, if there is one, matrix."""
     layout, generator = size.layout, torch.Generator().manual_seed(4)
-    short, count, pixels = partial(_short, generator), len(_cells(size)), size.layout.scale**2
-    rows = _rows(size)
+    short, pixels = partial(_short, generator), size.layout.scale**2
     parts = [
-        short(count, pixels, 3),
-        short(rows, layout.width),
-        4 * short(rows, pixels * (3 + layout.history)),
+        short(len(size.cells), pixels, 3),
+        short(size.rows, layout.width),
+        4 * short(size.rows, pixels * (3 + layout.history)),
     ]
     if layout.surface:
-        parts.append(short(rows, 3 * (layout.channels + 1)))
-    return [part.to(device).requires_grad_() for part in parts], layout
+        parts.append(short(size.rows, 3 * (layout.channels + 1)))
+    return [part.to(device).requires_grad_() for part in parts]
 
 
-def _draw(size: Size, device: str) -> Prepared:
-    parts, layout = _answered(size, device)
+def _pixels(size: Size, device: str) -> Callable[[str], tuple[Tensor, ...]]:
+    parts = _outputs(size, device)
 
     def call(backend: str) -> tuple[Tensor, ...]:
         with torch.no_grad():
-            return (_drawn(parts, layout, backend),)
+            return (_drawn(parts, size.layout, backend),)
 
-    # Ten terms of at most 4, and a logistic function, off by no more than a few u, times 1.
-    return Prepared(call, 2 * (10 * 16 + 4) * U32)
+    return call
 
 
-def _draw_backward(size: Size, device: str) -> Prepared:
-    parts, layout = _answered(size, device)
+def _pixels_back(size: Size, device: str) -> Callable[[str], tuple[Tensor, ...]]:
+    parts = _outputs(size, device)
     grad = _short(torch.Generator().manual_seed(5), *parts[0].shape).to(device)
 
     def call(backend: str) -> tuple[Tensor, ...]:
-        pixels = _drawn(parts, layout, backend)
+        pixels = _drawn(parts, size.layout, backend)
         return torch.autograd.grad(pixels, parts, grad, materialize_grads=True)
 
-    # An entry of the matrix has a sum over the pixels of a cell, each term at most 1.
-    pixels = layout.scale**2
-    return Prepared(call, 2 * (pixels * pixels + 16) * U32)
+    return call
 
 
 def _drawn(parts: list[Tensor], layout: Layout, backend: str) -> Tensor:
-    base, rows, answer, *matrix = parts
-    return draw(base, rows, answer, matrix[0] if matrix else None, layout, backend=backend)
+    base, rows, output, *matrix = parts
+    return depth_to_space(
+        base, rows, output, matrix[0] if matrix else None, layout, backend=backend
+    )

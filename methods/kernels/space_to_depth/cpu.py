@@ -1,4 +1,4 @@
-"""Rows and pixels of cells with numba: a cell at a time, one pass over what it is told.
+"""Rows and pixels of cells with numba: a cell at a time, one pass over its inputs.
 
 Gradients of what several cells share (samples, points) are added up by a single thread: the same
 sums every time. It takes as long to read what is added as to add it.
@@ -7,45 +7,34 @@ sums every time. It takes as long to read what is added as to add it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
 from numba import njit, prange
 from torch import Tensor
 
 from methods.kernels.cpu import f32
-from methods.kernels.space_to_depth import TAPS, Layout, Told
+from methods.kernels.space_to_depth import TAPS, CellInputs, Layout, Pair
 
 FAST = {"contract", "reassoc", "nsz"}
 
 
-def lift(
-    values: Tensor,
-    alpha: Tensor,
-    background: Tensor,
-    cells: Tensor,
-    preceding: Sequence[Told],
-    history: Told | None,
-    surface: Told | None,
-    layout: Layout,
-    taps: Tensor,
-    count: int,
-) -> tuple[Tensor, Tensor]:
-    """See `methods.kernels.space_to_depth.lift`."""
-    _check_float32(values)
-    points = [part for pair in preceding for part in pair]
-    layers = history, *(surface or (None, None)), *points
-    return _Lift.apply(layout, count, values, alpha, background, cells, taps, *layers)
+def space_to_depth(inputs: CellInputs, layout: Layout, taps: Tensor, count: int) -> Pair:
+    """See `methods.kernels.space_to_depth.space_to_depth`."""
+    _check_float32(inputs.values)
+    frame = inputs.values, inputs.alpha, inputs.background, inputs.cells, taps
+    points = [part for pair in inputs.preceding for part in pair]
+    layers = inputs.history, *(inputs.surface or (None, None)), *points
+    return _SpaceToDepth.apply(layout, count, *frame, *layers)
 
 
-def draw(
-    base: Tensor, rows: Tensor, answer: Tensor, matrix: Tensor | None, layout: Layout
+def depth_to_space(
+    base: Tensor, rows: Tensor, output: Tensor, matrix: Tensor | None, layout: Layout
 ) -> Tensor:
-    """See `methods.kernels.space_to_depth.draw`."""
+    """See `methods.kernels.space_to_depth.depth_to_space`."""
     _check_float32(base)
     if matrix is None:
         matrix = base.new_zeros(len(rows), 0)
-    return _Draw.apply(layout, base, rows, answer.float(), matrix.float())
+    return _DepthToSpace.apply(layout, base, rows, output.float(), matrix.float())
 
 
 def _check_float32(x: Tensor) -> None:
@@ -53,7 +42,7 @@ def _check_float32(x: Tensor) -> None:
         raise ValueError(f"backend 'cpu' takes float32, got {x.dtype}: use backend='reference'")
 
 
-class _Lift(torch.autograd.Function):
+class _SpaceToDepth(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx,
@@ -82,9 +71,9 @@ class _Lift(torch.autograd.Function):
             if age >= len(pairs):
                 rows[:, begin : begin + scale**2 * (layout.channels + 1)] = 0
                 continue
-            told, index = pairs[age][0].detach().contiguous(), pairs[age][1].contiguous()
+            features, index = (x.detach().contiguous() for x in pairs[age])
             where = (index.numpy(), cells.numpy(), width, scale, begin)
-            _check(_preceding(told.numpy(), background.numpy(), *where, rows.numpy()), told)
+            _check(_preceding(features.numpy(), background.numpy(), *where, rows.numpy()), features)
         if layout.history:
             begin = begins["history"]
             if history is None:
@@ -97,10 +86,10 @@ class _Lift(torch.autograd.Function):
             if surface is None:
                 rows[:, begin:] = 0
             else:
-                told = surface.detach().contiguous()
+                features = surface.detach().contiguous()
                 index = at_surface.contiguous()
-                known = (told.numpy(), background.numpy(), index.numpy(), base.numpy())
-                _check(_surface(*known, begin, rows.numpy()), told)
+                arrays = (x.numpy() for x in (features, background, index, base))
+                _check(_surface(*arrays, begin, rows.numpy()), features)
         ctx.layout, ctx.shape, ctx.counts = layout, values.shape, [len(x) for x in points[::2]]
         ctx.surfaces = None if surface is None else len(surface)
         valid = None if history is None else history[1].contiguous()
@@ -135,23 +124,23 @@ class _Lift(torch.autograd.Function):
         return None, None, *frame_grads, None, None, None, None, grad_surface, None, *grad_points
 
 
-class _Draw(torch.autograd.Function):
+class _DepthToSpace(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, layout, base, rows, answer, matrix):
-        parts = [x.detach().contiguous() for x in (base, rows, answer, matrix)]
+    def forward(ctx, layout, base, rows, output, matrix):
+        parts = [x.detach().contiguous() for x in (base, rows, output, matrix)]
         pixels = torch.empty_like(base)
-        _draw(*(x.numpy() for x in parts), *_columns(layout), pixels.numpy())
+        _pixels(*(x.numpy() for x in parts), *_columns(layout), pixels.numpy())
         ctx.layout = layout
         ctx.save_for_backward(*parts[1:])
         return pixels
 
     @staticmethod
     def backward(ctx, grad):
-        rows, answer, matrix = ctx.saved_tensors
+        rows, output, matrix = ctx.saved_tensors
         grad = grad.contiguous()
-        grads = [torch.zeros_like(x) for x in (rows, answer, matrix)]
-        arrays = (x.numpy() for x in (rows, answer, matrix, grad, *grads))
-        _draw_back(*arrays, *_columns(ctx.layout))
+        grads = [torch.zeros_like(x) for x in (rows, output, matrix)]
+        arrays = (x.numpy() for x in (rows, output, matrix, grad, *grads))
+        _pixels_back(*arrays, *_columns(ctx.layout))
         return None, grad, *grads
 
 
@@ -169,11 +158,11 @@ def _check(wrong: int, values: Tensor) -> None:
 
 
 @njit(cache=True)
-def _put(row, column, values, background, known):
-    """Features less their background from `column` on, `known` behind the colours."""
+def _put(row, column, values, background, opacity):
+    """Features less their background from `column` on, `opacity` behind the colours."""
     for c in range(3):
         row[column + c] = values[c] - background[c]
-    row[column + 3] = known
+    row[column + 3] = opacity
     for c in range(3, len(background)):
         row[column + 1 + c] = values[c] - background[c]
 
@@ -235,8 +224,8 @@ def _surface(values, background, index, base, begin, rows):
         for sub in range(base.shape[1]):
             column, point = begin + sub * features, index[n, sub]
             if 0 <= point < len(values):
-                told = values[point]
-                _put(rows[n], column, told, background, told[features - 1])
+                opacity = values[point, features - 1]
+                _put(rows[n], column, values[point], background, opacity)
                 for c in range(3):
                     rows[n, column + c] -= base[n, sub, c]
             else:
@@ -298,16 +287,16 @@ def _present_back(grad_rows, grad_base, height, width, cells, taps, grad_values,
 
 
 @njit(cache=True, parallel=True, fastmath=FAST)
-def _draw(base, rows, answer, matrix, channels, history, surface, pixels):
+def _pixels(base, rows, output, matrix, channels, history, surface, pixels):
     features = channels + 1
-    outputs = answer.shape[1] // base.shape[1]
+    outputs = output.shape[1] // base.shape[1]
     for n in prange(len(base)):
         for sub in range(base.shape[1]):
             for c in range(3):
-                pixels[n, sub, c] = base[n, sub, c] + answer[n, sub * outputs + c]
+                pixels[n, sub, c] = base[n, sub, c] + output[n, sub * outputs + c]
             if history >= 0:
                 column = history + 4 * sub
-                share = _sigmoid(answer[n, sub * outputs + 3]) * rows[n, column + 3]
+                share = _sigmoid(output[n, sub * outputs + 3]) * rows[n, column + 3]
                 for c in range(3):
                     pixels[n, sub, c] += share * rows[n, column + c]
             if surface >= 0:
@@ -322,37 +311,37 @@ def _draw(base, rows, answer, matrix, channels, history, surface, pixels):
 
 
 @njit(cache=True, parallel=True, fastmath=FAST)
-def _draw_back(
-    rows, answer, matrix, grad, grad_rows, grad_answer, grad_matrix, channels, history, surface
+def _pixels_back(
+    rows, output, matrix, grad, grad_rows, grad_output, grad_matrix, channels, history, surface
 ):
     features = channels + 1
-    outputs = answer.shape[1] // grad.shape[1]
+    outputs = output.shape[1] // grad.shape[1]
     for n in prange(len(grad)):
         for sub in range(grad.shape[1]):
             for c in range(3):
-                grad_answer[n, sub * outputs + c] = grad[n, sub, c]
+                grad_output[n, sub * outputs + c] = grad[n, sub, c]
             if history >= 0:
                 column = history + 4 * sub
-                share, known = _sigmoid(answer[n, sub * outputs + 3]), rows[n, column + 3]
+                share, known = _sigmoid(output[n, sub * outputs + 3]), rows[n, column + 3]
                 along = f32(0)
                 for c in range(3):
                     grad_rows[n, column + c] = share * known * grad[n, sub, c]
                     along += grad[n, sub, c] * rows[n, column + c]
                 grad_rows[n, column + 3] = share * along
-                grad_answer[n, sub * outputs + 3] = share * (f32(1) - share) * known * along
+                grad_output[n, sub * outputs + 3] = share * (f32(1) - share) * known * along
             if surface >= 0:
                 column = surface + features * sub
                 opacity = rows[n, column + 3]
                 for i in range(features):
-                    told = rows[n, column + i]
+                    value = rows[n, column + i]
                     weight = opacity if i < 3 else f32(1)
                     along = f32(0)
                     for c in range(3):
                         along += matrix[n, c * features + i] * grad[n, sub, c]
-                        grad_matrix[n, c * features + i] += weight * told * grad[n, sub, c]
+                        grad_matrix[n, c * features + i] += weight * value * grad[n, sub, c]
                     grad_rows[n, column + i] += weight * along
                     if i < 3:
-                        grad_rows[n, column + 3] += told * along
+                        grad_rows[n, column + 3] += value * along
 
 
 @njit(cache=True)

@@ -2,75 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from methods.kernels.space_to_depth import Layout, Told
+from methods.kernels.space_to_depth import CellInputs, Layout, Pair
 
 
-def lift(
-    values: Tensor,
-    alpha: Tensor,
-    background: Tensor,
-    cells: Tensor,
-    preceding: Sequence[Told],
-    history: Told | None,
-    surface: Told | None,
-    layout: Layout,
-    taps: Tensor,
-    count: int,
-) -> tuple[Tensor, Tensor]:
-    """See `methods.kernels.space_to_depth.lift`."""
-    pixels, missing = layout.scale**2, layout.frames - len(preceding)
+def space_to_depth(inputs: CellInputs, layout: Layout, taps: Tensor, count: int) -> Pair:
+    """See `methods.kernels.space_to_depth.space_to_depth`."""
+    values, background, cells = inputs.values, inputs.background, inputs.cells
+    pixels, missing = layout.scale**2, layout.frames - len(inputs.preceding)
     base = _enlarged(values[..., :3] - background[:3], cells, taps)
     present = values.flatten(0, 1)[cells] - background
-    parts = [_tell(present, alpha.flatten()[cells, None])]
-    for points, index in preceding:
+    parts = [_with_opacity(present, inputs.alpha.flatten()[cells, None])]
+    for points, index in inputs.preceding:
         less = points - background
-        told = _tell(less, torch.ones_like(less[:, :1]))
-        parts.append(_shown(told, _in_cells(index, cells, layout.scale)))
+        features = _with_opacity(less, torch.ones_like(less[:, :1]))
+        parts.append(_shown(features, _in_cells(index, cells, layout.scale)))
     parts += [base.new_zeros(len(cells), pixels * (layout.channels + 1))] * missing
     if layout.history:
-        if history is None:
+        if inputs.history is None:
             parts.append(base.new_zeros(len(cells), pixels * 4))
         else:
-            known = history[1][..., None]
-            recent = (history[0] - background[:3] - base) * known
-            parts.append(torch.cat((recent, known), dim=-1))
+            picture, valid = inputs.history[0], inputs.history[1][..., None]
+            recent = (picture - background[:3] - base) * valid
+            parts.append(torch.cat((recent, valid), dim=-1))
     if layout.surface:
-        if surface is None:
+        if inputs.surface is None:
             parts.append(base.new_zeros(len(cells), pixels * (layout.channels + 1)))
         else:
-            points, index = surface
-            told = _shown(_tell(points[:, :-1] - background, points[:, -1:]), index)
+            points, index = inputs.surface
+            features = _shown(_with_opacity(points[:, :-1] - background, points[:, -1:]), index)
             less = base * (index >= 0)[..., None]
-            parts.append(told - functional.pad(less, (0, layout.channels - 2)))
+            parts.append(features - functional.pad(less, (0, layout.channels - 2)))
     rows = torch.cat([part.flatten(start_dim=1) for part in parts], dim=1)
     return base, functional.pad(rows, (0, 0, 0, count - len(rows)))
 
 
-def draw(
-    base: Tensor, rows: Tensor, answer: Tensor, matrix: Tensor | None, layout: Layout
+def depth_to_space(
+    base: Tensor, rows: Tensor, output: Tensor, matrix: Tensor | None, layout: Layout
 ) -> Tensor:
-    """See `methods.kernels.space_to_depth.draw`."""
+    """See `methods.kernels.space_to_depth.depth_to_space`."""
     pixels, features = layout.scale**2, layout.channels + 1
-    rows, answer = rows[: len(base)], answer[: len(base)]
-    out = answer.unflatten(1, (pixels, -1))
-    drawn = base + out[..., :3]
+    rows, output = rows[: len(base)], output[: len(base)]
+    out = output.unflatten(1, (pixels, -1))
+    shown = base + out[..., :3]
     if layout.history:
         begin = layout.begins["history"]
         recent = rows[:, begin : begin + 4 * pixels].unflatten(1, (pixels, 4))
-        drawn = drawn + (out[..., 3:].sigmoid() * recent[..., 3:]) * recent[..., :3]
+        shown = shown + (out[..., 3:].sigmoid() * recent[..., 3:]) * recent[..., :3]
     if matrix is not None:
         begin = layout.begins["surface"]
-        told = rows[:, begin : begin + features * pixels].unflatten(1, (pixels, features))
-        weighed = torch.cat((told[..., :3] * told[..., 3:4], told[..., 3:]), dim=-1)
+        surface = rows[:, begin : begin + features * pixels].unflatten(1, (pixels, features))
+        weighted = torch.cat((surface[..., :3] * surface[..., 3:4], surface[..., 3:]), dim=-1)
         matrix = matrix[: len(base)].unflatten(1, (3, features))
-        drawn = drawn + weighed @ matrix.transpose(1, 2)
-    return drawn
+        shown = shown + weighted @ matrix.transpose(1, 2)
+    return shown
 
 
 def _enlarged(colours: Tensor, cells: Tensor, taps: Tensor) -> Tensor:
@@ -101,6 +89,6 @@ def _shown(values: Tensor, index: Tensor) -> Tensor:
     return functional.pad(values, (0, 0, 0, 1))[index.long()]
 
 
-def _tell(values: Tensor, known: Tensor) -> Tensor:
-    """`known` [N, 1] put behind the colours of `values` [N, K]."""
-    return torch.cat((values[:, :3], known, values[:, 3:]), dim=1)
+def _with_opacity(values: Tensor, opacity: Tensor) -> Tensor:
+    """`opacity` [N, 1] put behind the colours of `values` [N, K]."""
+    return torch.cat((values[:, :3], opacity, values[:, 3:]), dim=1)

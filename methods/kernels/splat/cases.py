@@ -1,31 +1,55 @@
-"""Cases of the splatting. Which point is shown is decided by comparisons alone: tolerance 0."""
+"""Cases of the splatting: agreement of the backends, frames into themselves, borders, ties.
+
+Which point is shown is decided by comparisons alone: tolerance 0.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from bench.cameras import pixel_grid
-from methods.kernels.case import U32, Case, Prepared
+from bench.cameras import pixel_grid, project, unproject
+from bench.case import DTYPES, U32, Agreement, Case, on_backends
+from bench.cases import CAMERAS, moved_by, random_motion
+from bench.types import Camera
+from methods.kernels.dispatch import served
 from methods.kernels.splat import Rule, gather, splat
 
 LOW, HIGH = 200, 800
-"""Side of the frame that is splatted and of the picture it lands in, in pixels."""
+"""Side of the frame that is splatted and of the picture it is splatted to, in pixels."""
+
+FRAME = f"{LOW} x {LOW} into {HIGH} x {HIGH}"
 
 CHANNELS = 6
 """Features of a point in SteerNeRF: a colour and three more."""
 
 WRONG = (math.nan, math.inf, -math.inf, 1e20, -1e20, 0.0, -0.0, 1e-20, -1e-20)
-"""Values that no picture has room for, or only just."""
+"""Coordinates and depths outside every picture, or only just inside."""
+
+WIDTH, HEIGHT = 7, 5
+
+TURNED = torch.diag(torch.tensor([-1.0, 1.0, -1.0]))
+ROLLED = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+
+NUMBERS = (-math.inf, -1.0, -1e-20, 0.0, 1e-20, 0.5, 1.0, 1e20, math.inf, math.nan)
+
+Points = Callable[[], tuple[Tensor, Tensor]]
+"""Makes pixels [N, 2] and depths [N]."""
 
 
 def cases() -> list[Case]:
+    """Splatting and gathering by all backends; frames and points whose pixels are known."""
+    return [*_splats(), *_gathers(), *_frames(), *_single_points()]
+
+
+def _splats() -> list[Case]:
     """No, one, many and crowded points; ties; points outside; thin pictures; a frame, timed."""
-    sizes: list[tuple[str, int, int, int, dict]] = [
+    sizes: list[tuple[str, int, int, int, dict[str, bool]]] = [
         ("no point", 0, 5, 4, {}),
         ("one pixel", 50, 1, 1, {}),
         ("sparse", 100, 67, 45, {}),
@@ -35,32 +59,87 @@ def cases() -> list[Case]:
         ("one wide row", 5000, 4097, 1, {}),
         ("three wide rows", 5000, 4097, 3, {}),
     ]
-    index_kinds: list[tuple[str, int, int, int]] = [
-        ("no point", 0, 20, CHANNELS),
-        ("no pixel", 10, 0, CHANNELS),
-        ("no channel", 10, 20, 0),
-        ("one channel", 300, 1001, 1),
-        ("few places for each point", 1000, 1001, CHANNELS),
-        ("many places for each point", 3, 1001, CHANNELS),
-    ]
     rules: tuple[tuple[str, Rule], ...] = (("splat", "nearest"), ("splat last", "last"))
-    directions = (("splat gather", _gather), ("splat gather backward", _gather_backward))
-    frame = f"{LOW} x {LOW} into {HIGH} x {HIGH}"
     found = []
-    for kernel, rule in rules:
+    for subject, rule in rules:
+        kernel = Agreement(subject, served("splat"), "decided by comparisons: 0")
         for name, count, width, height, options in sizes:
             points = partial(_points, count, width, height, **options)
-            prepare = partial(_splat, points, width, height, rule)
-            found.append(Case(kernel, name, "fp32", count, prepare))
-        timed = partial(_splat, _frame, HIGH, HIGH, rule)
-        found.append(Case(kernel, frame, "fp32", LOW**2, timed, timed=True))
-    for kernel, make in directions:
-        for name, count, pixels, channels in index_kinds:
-            prepare = partial(make, partial(_index, count, pixels), count, channels)
-            found.append(Case(kernel, name, "fp32", pixels, prepare))
-        timed = partial(make, _frame_index, LOW**2, CHANNELS)
-        found.append(Case(kernel, frame, "fp32", HIGH**2, timed, timed=True))
+            found.append(kernel.case(name, partial(_splat, points, (width, height), rule), 0.0))
+        timed = partial(_splat, _seen_aside, (HIGH, HIGH), rule)
+        found.append(kernel.case(FRAME, timed, 0.0, items=LOW**2))
     return found
+
+
+def _gathers() -> list[Case]:
+    """No pixel, no channel, points at no, one and many pixels; a frame, timed."""
+    kinds = [
+        ("no point", _index(0, 20), 0, CHANNELS),
+        ("no pixel", _index(10, 0), 10, CHANNELS),
+        ("no channel", _index(10, 20), 10, 0),
+        ("one channel", _index(300, 1001), 300, 1),
+        ("few places for each point", _index(1000, 1001), 1000, CHANNELS),
+        ("many places for each point", _index(3, 1001), 3, CHANNELS),
+        (FRAME, splat(*_seen_aside(), HIGH, HIGH, backend="reference"), LOW**2, CHANNELS),
+    ]
+    backends = served("splat")
+    forward = Agreement("splat gather", backends, "nothing is computed: 0")
+    backward = Agreement(
+        "splat gather backward",
+        backends,
+        "of n places, n - 1 sums of at most n, off by n u in each backend: 2 n (n - 1) u",
+    )
+    found = []
+    for name, index, points, channels in kinds:
+        places = int(torch.bincount(index[index >= 0], minlength=1).max())
+        tolerance, items = 2 * max(places - 1, 0) * places * U32, None
+        if name == FRAME:
+            items = HIGH**2
+        inputs = index, points, channels
+        found += [
+            forward.case(name, partial(_gather, *inputs), 0.0, items=items),
+            backward.case(name, partial(_gather_backward, *inputs), tolerance, items=items),
+        ]
+    return found
+
+
+def _frames() -> list[Case]:
+    """A frame seen by its own camera, by a turned and a rolled one, and after a rigid motion."""
+    here = CAMERAS["looking at the cube"]
+    turned, rolled = rotated(here, TURNED), rotated(here, ROLLED)
+    itself = "every pixel shows itself"
+    kinds: list[tuple[str, str, Callable[[str, str, str], float]]] = [
+        *(
+            (f"same pose, {name}", itself, partial(_frame_error, camera, camera, lambda own: own))
+            for name, camera in CAMERAS.items()
+        ),
+        (
+            "turned by 180 degrees",
+            "nothing is seen",
+            partial(_frame_error, here, turned, lambda own: -torch.ones_like(own)),
+        ),
+        (
+            "rolled by 180 degrees",
+            "every pixel is opposite",
+            partial(_frame_error, here, rolled, lambda own: own.flip(0, 1)),
+        ),
+        ("rigid motion of scene and cameras", itself, partial(_moved_frame_error, 0)),
+    ]
+    return [_case(*kind) for kind in kinds]
+
+
+def _single_points() -> list[Case]:
+    """Points at borders, in ties, with extreme depths and coordinates."""
+    return [
+        _case(f"{name}, {rule}", "each pixel as of a loop", partial(_points_error, points, rule))
+        for name, points in (
+            ("borders, to the last bit", _borders),
+            ("depth 0, negative, 1e-20, 1e20, inf, NaN", _depths),
+            ("places inf and NaN", _places),
+            ("ties in depth, in u, in all", _ties),
+        )
+        for rule in ("nearest", "last")
+    ]
 
 
 def _points(
@@ -80,7 +159,7 @@ def _points(
     return pixels, depth
 
 
-def _frame() -> tuple[Tensor, Tensor]:
+def _seen_aside() -> tuple[Tensor, Tensor]:
     """A frame seen from a little aside: its pixels scattered by half a pixel of the picture."""
     generator = torch.Generator().manual_seed(0)
     pixels = HIGH / LOW * pixel_grid(LOW, LOW) + torch.tensor([5.0, -3.0])
@@ -93,19 +172,12 @@ def _index(points: int, pixels: int) -> Tensor:
     return torch.randint(-1, points, (pixels,), generator=generator, dtype=torch.int32)
 
 
-def _frame_index() -> Tensor:
-    return splat(*_frame(), HIGH, HIGH, backend="reference")
-
-
 def _splat(
-    points: Callable[[], tuple[Tensor, Tensor]], width: int, height: int, rule: Rule, device: str
-) -> Prepared:
+    points: Points, size: tuple[int, int], rule: Rule, device: str
+) -> Callable[[str], tuple[Tensor, ...]]:
     pixels, depth = (tensor.to(device) for tensor in points())
 
-    def call(backend: str) -> tuple[Tensor, ...]:
-        return (splat(pixels, depth, width, height, rule=rule, backend=backend),)
-
-    return Prepared(call, 0.0)
+    return lambda backend: (splat(pixels, depth, *size, rule=rule, backend=backend),)
 
 
 def _rows(points: int, channels: int, device: str) -> Tensor:
@@ -113,25 +185,121 @@ def _rows(points: int, channels: int, device: str) -> Tensor:
     return torch.rand(points, channels, generator=generator).to(device)
 
 
-def _gather(make_index: Callable[[], Tensor], points: int, channels: int, device: str) -> Prepared:
-    index, values = make_index().to(device), _rows(points, channels, device)
-
-    def call(backend: str) -> tuple[Tensor, ...]:
-        return (gather(values, index, backend=backend),)
-
-    return Prepared(call, 0.0)
+def _gather(
+    index: Tensor, points: int, channels: int, device: str
+) -> Callable[[str], tuple[Tensor, ...]]:
+    index, values = index.to(device), _rows(points, channels, device)
+    return lambda backend: (gather(values, index, backend=backend),)
 
 
 def _gather_backward(
-    make_index: Callable[[], Tensor], points: int, channels: int, device: str
-) -> Prepared:
-    index, values = make_index().to(device), _rows(points, channels, device).requires_grad_()
+    index: Tensor, points: int, channels: int, device: str
+) -> Callable[[str], tuple[Tensor, ...]]:
+    index, values = index.to(device), _rows(points, channels, device).requires_grad_()
     grad = torch.rand(*index.shape, channels, generator=torch.Generator().manual_seed(1)).to(device)
 
     def call(backend: str) -> tuple[Tensor, ...]:
         return torch.autograd.grad(gather(values, index, backend=backend), values, grad)
 
-    # The gradient of a point at n places is a sum of n terms below 1, made in either backend by
-    # n - 1 additions whose results are at most n, each off by n u. A single term is exact.
-    places = int(torch.bincount(index[index >= 0], minlength=1).max())
-    return Prepared(call, 2 * max(places - 1, 0) * places * U32)
+    return call
+
+
+def _case(name: str, holds: str, error: Callable[[str, str, str], float]) -> Case:
+    return Case(
+        "splat",
+        name,
+        holds,
+        "decided by comparisons, half a pixel from where they turn: 0 wrong",
+        on_backends(0, "fp64"),
+        error,
+    )
+
+
+def rotated(camera: Camera, rotation: Tensor) -> Camera:
+    """The camera turned about its own axes."""
+    c2w = torch.cat((camera.c2w[:, :3] @ rotation, camera.c2w[:, 3:]), dim=1)
+    return replace(camera, c2w=c2w)
+
+
+def _frame(camera: Camera, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """The pixels of a frame of random depth, as points; their indices as a picture."""
+    pixels = pixel_grid(camera.width, camera.height).to(dtype)
+    depth = 10 ** torch.empty(len(pixels)).uniform_(
+        -1, 3, generator=torch.Generator().manual_seed(0)
+    ).to(dtype)
+    own = torch.arange(len(pixels)).view(camera.height, camera.width)
+    return unproject(camera, pixels, depth), own
+
+
+def _wrong(points: Tensor, camera: Camera, want: Tensor, backend: str, device: str) -> float:
+    pixels, depth = project(replace(camera, c2w=camera.c2w.to(device)), points.to(device))
+    index = splat(pixels, depth, camera.width, camera.height, backend=backend)
+    return float((index.cpu() != want).sum())
+
+
+def _frame_error(
+    source: Camera,
+    camera: Camera,
+    expected: Callable[[Tensor], Tensor],
+    backend: str,
+    device: str,
+    precision: str,
+) -> float:
+    """How many pixels show something else."""
+    points, own = _frame(source, DTYPES[precision])
+    return _wrong(points, camera, expected(own), backend, device)
+
+
+def _moved_frame_error(seed: int, backend: str, device: str, precision: str) -> float:
+    rotation, translation = random_motion(seed)
+    camera, dtype = CAMERAS["looking at the cube"], DTYPES[precision]
+    points, own = _frame(camera, dtype)
+    moved = (points.double() @ rotation.T + translation).to(dtype)
+    return _wrong(moved, moved_by(camera, rotation, translation), own, backend, device)
+
+
+def _borders() -> tuple[Tensor, Tensor]:
+    """Around each border of the picture, the number before it, it, and the number after it."""
+    edges = []
+    for edge in (0.0, 1.0, WIDTH - 1.0, WIDTH, HEIGHT - 1.0, HEIGHT):
+        at = torch.tensor(edge)
+        edges += [at.nextafter(torch.tensor(-math.inf)), at, at.nextafter(torch.tensor(math.inf))]
+    places = torch.stack(edges)
+    return torch.cartesian_prod(places, places), torch.ones(len(places) ** 2)
+
+
+def _depths() -> tuple[Tensor, Tensor]:
+    depth = torch.tensor(NUMBERS)
+    return torch.full((len(depth), 2), 2.5), depth
+
+
+def _places() -> tuple[Tensor, Tensor]:
+    places = torch.cartesian_prod(torch.tensor(NUMBERS), torch.tensor(NUMBERS))
+    return places, torch.ones(len(places))
+
+
+def _ties() -> tuple[Tensor, Tensor]:
+    """All of them in one pixel or the next."""
+    u, v = torch.tensor([2.25, 2.5, 3.0]), torch.tensor([1.0, 1.5])
+    corners = torch.cartesian_prod(u, v, torch.tensor([1.0, 1.0 + 2**-23]))
+    points = torch.cat((corners, corners.flip(0), corners))
+    return points[:, :2], points[:, 2]
+
+
+def _points_error(make: Points, rule: str, backend: str, device: str, precision: str) -> float:
+    """How many pixels show another point than in a loop over all points."""
+    pixels, depth = (x.to(DTYPES[precision]) for x in make())
+    shown: dict[tuple[int, int], int] = {}
+    for point, ((u, v), z) in enumerate(zip(pixels.tolist(), depth.tolist(), strict=True)):
+        if 0 <= u < WIDTH and 0 <= v < HEIGHT and 0 < z < math.inf:
+            cell = int(v), int(u)
+            before = shown.get(cell)
+            hidden = before is not None and rule == "nearest"
+            if not hidden or (z, u, v) < (depth[before].item(), *pixels[before].tolist()):
+                shown[cell] = point
+    want = torch.full((HEIGHT, WIDTH), -1)
+    for cell, point in shown.items():
+        want[cell] = point
+    pixels, depth = pixels.to(device), depth.to(device)
+    got = splat(pixels, depth, WIDTH, HEIGHT, rule=rule, backend=backend)  # type: ignore[arg-type]
+    return float((got.cpu() != want).sum())

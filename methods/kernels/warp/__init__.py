@@ -6,9 +6,8 @@ averaged bilinearly over those of the four nearest low-resolution pixels that ha
 deeper than `TOLERANCE` behind the nearest of the four: what moves with the front surface hides what
 is behind it.
 
-The pixels of a picture are grouped for a network at low resolution: the s x s pixels of a
-low-resolution pixel, its cell, stand beside each other, and only cells that are asked for are
-looked at.
+The s x s pixels of a low-resolution pixel, its cell, stand beside each other. Only the given cells
+are warped.
 """
 
 from __future__ import annotations
@@ -23,25 +22,17 @@ TOLERANCE = 0.02
 """Scene units along z by which a depth may lie behind the nearest one and still be averaged."""
 
 
-def enlarge(
-    depth: Tensor,
-    cells: Tensor,
-    scale: int,
-    phase: tuple[float, float] = (0.0, 0.0),
-    *,
-    backend: str = "auto",
-) -> Tensor:
+def enlarge(depth: Tensor, cells: Tensor, scale: int, *, backend: str = "auto") -> Tensor:
     """Depth of the s x s pixels of some cells, row by row: [N, s^2], inf for none.
 
     Args:
-        depth: [h, w] z-depth at low resolution, not finite where there is none. Pixel (i, j) of it
-            is sampled at (s (i + 1/2), s (j + 1/2)) + `phase` in the full-resolution picture.
+        depth: [h, w] z-depth at low resolution, not finite where there is none.
         cells: [N] int64 low-resolution pixels, counted row by row.
         scale: s.
     """
     check_shape("depth", depth, None, None)
     check_shape("cells", cells, None)
-    return implementation("warp", backend, depth.device).enlarge(depth, cells, scale, phase)
+    return implementation("warp", backend, depth.device).enlarge(depth, cells, scale)
 
 
 def warp(
@@ -58,14 +49,14 @@ def warp(
     differentiable.
 
     Args:
-        depth: [N, s^2] z-depth of the pixels of `cells`, as of `enlarge`; nothing is known where it
-            is not positive and finite.
+        depth: [N, s^2] z-depth of the pixels of `cells`, as of `enlarge`; a pixel is valid only
+            where it is positive and finite.
         cells: [N] int64 cells of s x s pixels, counted row by row.
         camera: the view, of whole cells.
         scale: s.
 
     Returns:
-        values [N, s^2, C], zero where nothing is known, and valid [N, s^2] in {0, 1}.
+        values [N, s^2, C], zero where not valid, and valid [N, s^2] in {0, 1}.
 
     Raises:
         ValueError: a size is wrong.
@@ -78,14 +69,13 @@ def warp(
             f"camera: expected cells of {scale} x {scale} pixels, got {camera.width} x "
             f"{camera.height} pixels"
         )
-    matrix, offset = _source_from_camera(source, camera)
     return implementation("warp", backend, picture.device).warp(
-        picture, depth, cells, camera.width // scale, scale, matrix, offset
+        picture, depth, cells, camera.width // scale, scale, source_from_camera(source, camera)
     )
 
 
-def _source_from_camera(source: Camera, camera: Camera) -> tuple[Tensor, Tensor]:
-    """M [3, 3] and m [3]: homogeneous source pixel = z M (u, v, 1) + m, in float64 on the CPU."""
+def source_from_camera(source: Camera, camera: Camera) -> tuple[Tensor, Tensor]:
+    """M [3, 3], m [3]: homogeneous source pixel = z M (u, v, 1) + m; in float64 on the CPU."""
     to, of = source.c2w.double().cpu(), camera.c2w.double().cpu()
     rotation = to[:, :3].T @ of[:, :3]
     offset = to[:, :3].T @ (of[:, 3] - to[:, 3])

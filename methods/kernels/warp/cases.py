@@ -1,28 +1,32 @@
-"""Cases of the backward warping.
+"""Cases of the backward warping: agreement of the backends, same and opposite views, a long walk.
 
 Whether a pixel is valid depends on which side of the source picture's border it falls, which
-rounding may decide: a case looks only at the pixels that it cannot move over the border. Depths
-differ by much less or much more than `TOLERANCE`, so that rounding decides nothing else.
+rounding may decide: an agreement compares only the pixels that rounding cannot move over the
+border. Depths differ by much less or much more than `TOLERANCE`, so that rounding decides nothing
+else.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from bench.cameras import pixel_grid, project, scale_camera, unproject
+from bench.cameras import look_at, pixel_grid, project, scale_camera, unproject
+from bench.case import DTYPES, U32, Agreement, Case, Prepare, on_backends
+from bench.cases import CAMERAS
 from bench.types import Camera
-from methods.kernels.case import U32, Case, Prepared
-from methods.kernels.warp import _source_from_camera, enlarge, warp
+from methods.kernels.dispatch import served
+from methods.kernels.splat.cases import ROLLED, TURNED, rotated
+from methods.kernels.warp import enlarge, source_from_camera, warp
 
 LOW, HIGH = 200, 800
 """Side of the depth and of the picture, in pixels."""
 
-CHANNELS = 3
 MIDDLE = 2.0
 """Depth of the wall that most cases look at."""
 
@@ -34,140 +38,174 @@ ROUNDINGS = 8 + MEAN_ROUNDINGS
 """The same from the inputs to a coordinate's numerator and denominator: two for a matrix entry, six
 for the sum of products, and those of the mean depth."""
 
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Inputs of an agreement.
+
+    Attributes:
+        width, height: of the depth.
+        scale: s.
+        turn: rotation vector of the source, in radians.
+        move: offset of the source along the axes of the camera.
+        zoom: focal length of the source over the camera's.
+        holes: some pixels have no depth.
+        edge: how much farther the right half of the depth and a row lie.
+        channels: of the picture.
+        every: only every so many-th cell is warped; 0: none.
+    """
+
+    width: int
+    height: int
+    scale: int
+    turn: Vector = (0.0, 0.0, 0.0)
+    move: Vector = (0.0, 0.0, 0.0)
+    zoom: float = 1.0
+    holes: bool = False
+    edge: float = 0.0
+    channels: int = 3
+    every: int = 1
+
+    @property
+    def camera(self) -> Camera:
+        """The view, at the origin."""
+        width, height = self.width * self.scale, self.height * self.scale
+        pose = torch.eye(3, 4)
+        return Camera(pose, 1.2 * width, 1.2 * width, width / 2, height / 2, width, height)
+
+    @property
+    def source(self) -> Camera:
+        """The camera, turned about its axes, then moved along them."""
+        (x, y, z), camera = self.turn, self.camera
+        skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+        move = torch.tensor(self.move, dtype=torch.float64)
+        c2w = torch.cat((torch.linalg.matrix_exp(skew), move[:, None]), dim=1).float()
+        return replace(camera, c2w=c2w, fx=self.zoom * camera.fx, fy=self.zoom * camera.fy)
+
+    @property
+    def depth(self) -> Tensor:
+        """A wavy wall with its edge and holes."""
+        row, column = torch.arange(self.height)[:, None], torch.arange(self.width)
+        depth = MIDDLE + 0.005 * torch.sin(0.9 * row + 0.7 * column)
+        if self.edge:
+            behind = (column >= self.width // 2) | (row == self.height // 3)
+            depth = torch.where(behind, depth + self.edge, depth)
+        if self.holes:
+            missing = (3 * row + column) % 7
+            depth = torch.where(missing == 0, torch.inf, depth)
+            depth = torch.where((missing == 3) & (row % 4 == 0), torch.nan, depth)
+        return depth
+
+    @property
+    def cells(self) -> Tensor:
+        """The cells that are warped."""
+        cells = torch.arange(self.width * self.height)
+        return cells[:: self.every] if self.every else cells[:0]
+
+
+KINDS = {
+    "one pixel": Kind(1, 1, 1),
+    "one channel": Kind(9, 7, 4, move=(0.02, 0.01, 0.0), channels=1),
+    "seven channels": Kind(9, 7, 3, move=(0.02, 0.01, 0.0), channels=7),
+    "turned": Kind(24, 17, 4, turn=(0.05, -0.04, 0.02), move=(-0.05, 0.1, 0.05)),
+    "rolled": Kind(24, 17, 4, turn=(0.0, 0.0, 0.5 * math.pi)),
+    "holes": Kind(24, 17, 4, move=(0.03, 0.0, 0.1), holes=True),
+    "edges": Kind(24, 17, 4, move=(0.03, 0.0, 0.1), edge=0.5),
+    "edges and holes": Kind(24, 17, 4, edge=0.5, holes=True),
+    "leaving the picture": Kind(24, 17, 4, turn=(0.0, 0.2, 0.0), zoom=2.0),
+    "behind the source": Kind(24, 17, 4, turn=(0.0, math.pi, 0.0)),
+    "partly behind the source": Kind(24, 17, 4, move=(0.0, 0.0, 2.25), edge=2.0),
+    "half of it empty": Kind(24, 17, 4, edge=math.inf),
+    "no depth": Kind(1, 17, 4, edge=math.inf),
+    "some cells": Kind(24, 17, 4, move=(0.03, 0.0, 0.1), every=5),
+}
+
+ENLARGED = {
+    "one pixel": Kind(1, 1, 4),
+    "one of one": Kind(9, 7, 1),
+    "three by three": Kind(9, 7, 3),
+    "holes": Kind(24, 17, 4, holes=True),
+    "edges and holes": Kind(24, 17, 4, edge=0.5, holes=True),
+    "half of it empty": Kind(24, 17, 4, edge=math.inf),
+    "no depth": Kind(1, 17, 4, edge=math.inf),
+    "some cells": Kind(24, 17, 4, every=5),
+    "no cell": Kind(24, 17, 4, every=0),
+}
+
+TIMED = Kind(LOW, LOW, HIGH // LOW, turn=(0.02, -0.01, 0.0), move=(0.02, 0.0, 0.0), holes=True)
+
+BACK = "x, y and w rounded 6 times at the size of the picture, looked up twice: 24 reach + 8 u"
+
 
 def cases() -> list[Case]:
-    """Cameras that rest, move, turn and roll; holes, edges, phases; what cannot be seen; a frame.
+    """Warping and enlarging by all backends; views whose pictures are known; a walk."""
+    return [*_agreements(), *_same_poses(), *_known_views(), *_walks()]
 
-    A kind has the size of its depth, the scale and options: `turn`, a rotation vector of the
-    source, in radians; `move`, its offset along the axes of the camera; `zoom`, its focal length
-    over the camera's; `holes` and `edge` in the depth; `phase`; `channels`; `every`: only every
-    so many-th cell is looked at, 0: none.
-    """
-    kinds: list[tuple[str, int, int, int, dict]] = [
-        ("one pixel", 1, 1, 1, {}),
-        ("one channel", 9, 7, 4, {"move": (0.02, 0.01, 0.0), "channels": 1}),
-        ("seven channels", 9, 7, 3, {"move": (0.02, 0.01, 0.0), "channels": 7}),
-        ("turned", 24, 17, 4, {"turn": (0.05, -0.04, 0.02), "move": (-0.05, 0.1, 0.05)}),
-        ("rolled", 24, 17, 4, {"turn": (0.0, 0.0, 0.5 * math.pi)}),
-        ("phase", 24, 17, 4, {"move": (0.03, 0.0, 0.0), "phase": (1.5, -0.5)}),
-        ("phase of a whole pixel", 24, 17, 3, {"move": (0.03, 0.0, 0.0), "phase": (-3.0, 3.0)}),
-        ("holes", 24, 17, 4, {"move": (0.03, 0.0, 0.1), "holes": True}),
-        ("holes and a phase", 24, 17, 4, {"move": (0.03, 0, 0), "holes": True, "phase": (-1.5, 0)}),
-        ("edges", 24, 17, 4, {"move": (0.03, 0.0, 0.1), "edge": 0.5}),
-        ("edges and a phase", 24, 17, 4, {"edge": 0.5, "holes": True, "phase": (0.5, 1.5)}),
-        ("leaving the picture", 24, 17, 4, {"turn": (0.0, 0.2, 0.0), "zoom": 2.0}),
-        ("behind the source", 24, 17, 4, {"turn": (0.0, math.pi, 0.0)}),
-        ("partly behind the source", 24, 17, 4, {"move": (0.0, 0.0, 2.25), "edge": 2.0}),
-        ("half of it empty", 24, 17, 4, {"edge": math.inf}),
-        ("nothing known", 1, 17, 4, {"edge": math.inf}),
-        ("some cells", 24, 17, 4, {"move": (0.03, 0.0, 0.1), "every": 5}),
-    ]
-    depth_kinds: list[tuple[str, int, int, int, dict]] = [
-        ("one pixel", 1, 1, 4, {}),
-        ("one of one", 9, 7, 1, {}),
-        ("three by three", 9, 7, 3, {}),
-        ("phase", 24, 17, 4, {"phase": (1.5, -0.5)}),
-        ("phase of a whole pixel", 24, 17, 3, {"phase": (-3.0, 3.0)}),
-        ("holes and a phase", 24, 17, 4, {"holes": True, "phase": (-1.5, 0)}),
-        ("edges and holes", 24, 17, 4, {"edge": 0.5, "holes": True}),
-        ("half of it empty", 24, 17, 4, {"edge": math.inf}),
-        ("nothing known", 1, 17, 4, {"edge": math.inf}),
-        ("some cells", 24, 17, 4, {"every": 5}),
-        ("no cell", 24, 17, 4, {"every": 0}),
-    ]
-    found = [
-        Case(
-            kernel,
-            name,
-            "fp32",
-            len(_cells(width, height, options)) * scale**2,
-            partial(prepare, width, height, scale, options),
-        )
-        for kernel, prepare, some in (
-            ("warp", _prepare, kinds),
-            ("warp enlarge", _prepare_enlarge, depth_kinds),
-        )
-        for name, width, height, scale, options in some
-    ]
-    moved = {"turn": (0.02, -0.01, 0.0), "move": (0.02, 0.0, 0.0), "holes": True}
+
+def _agreements() -> list[Case]:
+    """Cameras that rest, move, turn and roll; holes, edges; what cannot be seen; a frame."""
+    warped = Agreement(
+        "warp",
+        served("warp"),
+        "a place is off by 16 u of the sizes of its sums, in each backend; neighbours differ by at "
+        "most 1, so a value by no more than its place along each axis; 8 roundings of its own",
+    )
+    enlarged = Agreement(
+        "warp enlarge",
+        served("warp"),
+        "a mean of depths has 8 roundings in each backend, at the size of the farthest",
+    )
     frame = f"{LOW} x {LOW} to {HIGH} x {HIGH}"
-    for kernel, prepare in (("warp", _prepare), ("warp enlarge", _prepare_enlarge)):
-        timed = partial(prepare, LOW, LOW, HIGH // LOW, moved)
-        found.append(Case(kernel, frame, "fp32", HIGH**2, timed, timed=True))
-    return found
+    return [
+        *(warped.case(name, *_warping(kind)) for name, kind in KINDS.items()),
+        warped.case(frame, *_warping(TIMED), items=HIGH**2),
+        *(enlarged.case(name, *_enlarging(kind)) for name, kind in ENLARGED.items()),
+        enlarged.case(frame, *_enlarging(TIMED), items=HIGH**2),
+    ]
 
 
-def _camera(width: int, height: int) -> Camera:
-    pose = torch.eye(3, 4)
-    return Camera(pose, 1.2 * width, 1.2 * width, width / 2, height / 2, width, height)
+def _warping(kind: Kind) -> tuple[Prepare, float]:
+    """What is computed, and its tolerance."""
+    shift = _position_error(kind)
+
+    def prepare(device: str) -> Callable[[str], tuple[Tensor, ...]]:
+        camera, source, scale = kind.camera, kind.source, kind.scale
+        shape = camera.height, camera.width, kind.channels
+        picture = torch.rand(shape, generator=torch.Generator().manual_seed(kind.width + scale))
+        sure = _sure(kind, shift).to(device)
+        picture, depth, cells = (x.to(device) for x in (picture, kind.depth, kind.cells))
+
+        def call(backend: str) -> tuple[Tensor, ...]:
+            fine = enlarge(depth, cells, scale, backend=backend)
+            values, valid = warp(picture, source, fine, cells, camera, scale, backend=backend)
+            return values * sure[..., None], valid * sure
+
+        return call
+
+    return prepare, 2 * shift + 16 * U32
 
 
-def _source(camera: Camera, options: dict) -> Camera:
-    """The camera, turned by a rotation vector about its axes, then moved along them."""
-    x, y, z = options.get("turn", (0.0, 0.0, 0.0))
-    skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
-    move = torch.tensor(options.get("move", (0.0, 0.0, 0.0)), dtype=torch.float64)
-    c2w = torch.cat((torch.linalg.matrix_exp(skew), move[:, None]), dim=1).float()
-    zoom = options.get("zoom", 1.0)
-    return replace(camera, c2w=c2w, fx=zoom * camera.fx, fy=zoom * camera.fy)
-
-
-def _depth(width: int, height: int, options: dict) -> Tensor:
-    """A wavy wall; its right half and a row lie `edge` farther; some pixels have no depth."""
-    row, column = torch.arange(height)[:, None], torch.arange(width)
-    depth = MIDDLE + 0.005 * torch.sin(0.9 * row + 0.7 * column)
-    if "edge" in options:
-        behind = (column >= width // 2) | (row == height // 3)
-        depth = torch.where(behind, depth + options["edge"], depth)
-    if options.get("holes"):
-        missing = (3 * row + column) % 7
-        depth = torch.where(missing == 0, torch.inf, depth)
-        depth = torch.where((missing == 3) & (row % 4 == 0), torch.nan, depth)
-    return depth
-
-
-def _cells(width: int, height: int, options: dict) -> Tensor:
-    every = options.get("every", 1)
-    return torch.arange(width * height)[::every] if every else torch.arange(0)
-
-
-def _prepare(width: int, height: int, scale: int, options: dict, device: str) -> Prepared:
-    camera = _camera(width * scale, height * scale)
-    source = _source(camera, options)
-    depth, phase = _depth(width, height, options), options.get("phase", (0.0, 0.0))
-    shape = camera.height, camera.width, options.get("channels", CHANNELS)
-    picture = torch.rand(shape, generator=torch.Generator().manual_seed(width + scale))
-    shift = _position_error(source, camera, depth, scale)
-    cells = _cells(width, height, options)
-    sure = _sure(source, camera, depth, cells, scale, phase, shift).to(device)
-    picture, depth, cells = picture.to(device), depth.to(device), cells.to(device)
-
-    def call(backend: str) -> tuple[Tensor, ...]:
-        fine = enlarge(depth, cells, scale, phase, backend=backend)
-        values, valid = warp(picture, source, fine, cells, camera, scale, backend=backend)
-        return values * sure[..., None], valid * sure
-
-    # Neighbours differ by 1 at most, so a value by no more than its place along each axis; and it
-    # is a sum of products, 8 roundings in either backend.
-    return Prepared(call, 2 * shift + 16 * U32)
-
-
-def _prepare_enlarge(width: int, height: int, scale: int, options: dict, device: str) -> Prepared:
-    depth = _depth(width, height, options)
-    known = depth[depth.isfinite()]
+def _enlarging(kind: Kind) -> tuple[Prepare, float]:
+    """What is computed, and its tolerance."""
+    known = kind.depth[kind.depth.isfinite()]
     farthest = known.max().item() if len(known) else 0.0
-    depth, phase = depth.to(device), options.get("phase", (0.0, 0.0))
-    cells = _cells(width, height, options).to(device)
 
-    def call(backend: str) -> tuple[Tensor, ...]:
-        # No depth is 0: a finite number in its place can be compared.
-        z = enlarge(depth, cells, scale, phase, backend=backend)
-        return (z.nan_to_num(nan=-1.0, posinf=0.0),)
+    def prepare(device: str) -> Callable[[str], tuple[Tensor, ...]]:
+        depth, cells = kind.depth.to(device), kind.cells.to(device)
 
-    return Prepared(call, 2 * MEAN_ROUNDINGS * U32 * farthest)
+        def call(backend: str) -> tuple[Tensor, ...]:
+            # No depth is 0: a finite number instead of inf can be compared.
+            z = enlarge(depth, cells, kind.scale, backend=backend)
+            return (z.nan_to_num(nan=-1.0, posinf=0.0),)
+
+        return call
+
+    return prepare, 2 * MEAN_ROUNDINGS * U32 * farthest
 
 
-def _position_error(source: Camera, camera: Camera, depth: Tensor, scale: int) -> float:
+def _position_error(kind: Kind) -> float:
     """How far apart, in pixels, two backends may look up the same pixel.
 
     A coordinate is x = n / w. Each of the two is a sum of products, off by `ROUNDINGS` u of the sum
@@ -175,6 +213,7 @@ def _position_error(source: Camera, camera: Camera, depth: Tensor, scale: int) -
     in the last corner of the picture at the largest depth, but for w, which is as small as at any
     pixel.
     """
+    source, camera, depth, scale = kind.source, kind.camera, kind.depth, kind.scale
     low = scale_camera(camera, depth.shape[1], depth.shape[0])
     known = depth.flatten().isfinite()
     points = unproject(low, pixel_grid(low.width, low.height)[known], depth.flatten()[known])
@@ -182,7 +221,7 @@ def _position_error(source: Camera, camera: Camera, depth: Tensor, scale: int) -
     ahead = ahead[ahead > 0].double()
     if len(ahead) == 0:
         return 0.0
-    matrix, offset = (part.abs() for part in _source_from_camera(source, camera))
+    matrix, offset = (part.abs() for part in source_from_camera(source, camera))
     farthest = depth[depth.isfinite()].max()
     corner = torch.tensor((camera.width, camera.height, 1.0), dtype=torch.float64)
     across, down, along = farthest * (matrix @ corner) + offset
@@ -192,29 +231,216 @@ def _position_error(source: Camera, camera: Camera, depth: Tensor, scale: int) -
     return 2 * ROUNDINGS * U32 * (worst / least).item()
 
 
-def _sure(
-    source: Camera,
-    camera: Camera,
-    depth: Tensor,
-    cells: Tensor,
-    scale: int,
-    phase: tuple[float, float],
-    margin: float,
-) -> Tensor:
-    """[N, s^2] pixels that stay valid, or not, when the source picture shifts by `margin`."""
+def _sure(kind: Kind, margin: float) -> Tensor:
+    """[N, s^2] pixels whose validity does not change when the source picture shifts by `margin`."""
+    source, cells, scale = kind.source, kind.cells, kind.scale
     picture = torch.ones(source.height, source.width, 1, dtype=torch.float64)
-    fine = enlarge(depth.double(), cells, scale, phase, backend="reference")
-    shifts = [(margin, 0.0), (-margin, 0.0), (0.0, margin), (0.0, -margin)]
-    valid = [
-        warp(
-            picture,
-            replace(source, cx=source.cx + right, cy=source.cy + down),
-            fine,
-            cells,
-            camera,
-            scale,
-            backend="reference",
-        )[1]
-        for right, down in shifts
-    ]
+    fine = enlarge(kind.depth.double(), cells, scale, backend="reference")
+    valid = []
+    for right, down in ((margin, 0.0), (-margin, 0.0), (0.0, margin), (0.0, -margin)):
+        moved = replace(source, cx=source.cx + right, cy=source.cy + down)
+        given = picture, moved, fine, cells, kind.camera, scale
+        valid.append(warp(*given, backend="reference")[1])
     return (torch.stack(valid) == valid[0]).all(dim=0).float()
+
+
+def _same_poses() -> list[Case]:
+    return [
+        Case(
+            "warp",
+            f"same pose, {name}, depth {depth:g}",
+            "the picture is unchanged",
+            BACK,
+            on_backends(
+                24 * max(abs(camera.cx), abs(camera.cy), camera.width, camera.height) + 8,
+                *(() if camera.c2w[:, 3].any() else ("fp64",)),  # where the pose is exact
+            ),
+            partial(_same_error, camera, camera, depth),
+        )
+        for name, camera in CAMERAS.items()
+        for depth in (1e-20, 1.0, 1e20)
+    ]
+
+
+def _known_views() -> list[Case]:
+    here, origin = CAMERAS["looking at the cube"], CAMERAS["at the origin"]
+    rolled, in_fp64 = rotated(here, ROLLED), on_backends(24 * 32 + 8, "fp64")
+    nothing = [
+        Case(
+            "warp",
+            name,
+            "nothing is valid",
+            "comparisons: 0",
+            on_backends(0, "fp64"),
+            partial(_seen, camera, depth),
+        )
+        for name, camera, depth in (
+            ("turned by 180 degrees", rotated(here, TURNED), 1.0),
+            ("depth inf", here, math.inf),
+            ("depth NaN", here, math.nan),
+            ("depth 0", here, 0.0),
+            ("depth 0, seen from behind", _ahead(here), 0.0),
+            ("depth -1, seen from behind", _ahead(here), -1.0),
+            ("depth -inf", here, -math.inf),
+        )
+    ]
+    return [
+        Case(
+            "warp",
+            "rolled by 180 degrees",
+            "the picture is upside down",
+            BACK,
+            on_backends(24 * 32 + 8),
+            partial(_same_error, here, rolled, 1.0),
+        ),
+        Case(
+            "warp",
+            "depth 1e38, of which products are infinite",
+            "what is valid is unchanged",
+            BACK,
+            in_fp64,
+            partial(_known_error, origin, 1e38),
+        ),
+        *nothing,
+        Case(
+            "warp",
+            "camera inside the object",
+            "what is valid is what float64 gives",
+            "24 reach u as at the same pose, twice with an offset as large as what it is added to, "
+            "in a picture that rises by 1 over its width, and looked up: 56 u",
+            on_backends(56, "fp64"),
+            _inside_error,
+        ),
+        Case(
+            "warp",
+            "enlarged depth of inf, NaN, 1e20 and 1",
+            "finite only where a neighbour is, and one of them",
+            "depths that far apart do not mix; a mean of one has 8 roundings: 8 u",
+            on_backends(8, "fp64"),
+            _enlarged_error,
+        ),
+    ]
+
+
+def _walks() -> list[Case]:
+    return [
+        Case(
+            "warp",
+            f"{frames:,} frames there and back",
+            "a constant is unchanged, and the rest stays within its range",
+            "a look-up has 4 roundings, all of which may point the same way: 4 n u",
+            on_backends(4 * frames, "fp64"),
+            partial(_walk_error, frames),
+            slow=frames > 1000,
+        )
+        for frames in (300, 10_000)
+    ]
+
+
+def _ahead(camera: Camera) -> Camera:
+    """The camera, 3 units nearer to what it looks at."""
+    centre = camera.c2w[:, 3:] + 3 * camera.c2w[:, 2:3]
+    return replace(camera, c2w=torch.cat((camera.c2w[:, :3], centre), dim=1))
+
+
+def _picture(camera: Camera, dtype: torch.dtype) -> Tensor:
+    generator = torch.Generator().manual_seed(0)
+    return torch.rand(camera.height, camera.width, 3, generator=generator).to(dtype)
+
+
+def _warped(
+    source: Camera, camera: Camera, depth: Tensor, picture: Tensor, backend: str, device: str
+) -> tuple[Tensor, Tensor]:
+    """Values [H, W, C] and validity [H, W] of the view of `camera`; cells are pixels."""
+    cells = torch.arange(depth.numel(), device=device)
+    size = camera.height, camera.width
+    values, valid = warp(
+        picture.to(device), source, depth.view(-1, 1).to(device), cells, camera, 1, backend=backend
+    )
+    return values.view(*size, -1).cpu(), valid.view(size).cpu()
+
+
+def _at_depth(
+    cameras: tuple[Camera, Camera], depth: float, cell: tuple[str, str], device: str
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The picture of the first camera, and `_warped` to the second, all of whose pixels have the
+    same depth."""
+    (source, camera), (backend, precision) = cameras, cell
+    picture = _picture(source, DTYPES[precision])
+    z = torch.full((camera.height * camera.width,), depth, dtype=picture.dtype)
+    return picture, *_warped(source, camera, z, picture, backend, device)
+
+
+def _same_error(
+    source: Camera, camera: Camera, depth: float, backend: str, device: str, precision: str
+) -> float:
+    picture, values, valid = _at_depth((source, camera), depth, (backend, precision), device)
+    want = picture if camera is source else picture.flip(0, 1)
+    return (values - want).abs().max().item() if valid.all() else math.inf
+
+
+def _known_error(camera: Camera, depth: float, backend: str, device: str, precision: str) -> float:
+    picture, values, valid = _at_depth((camera, camera), depth, (backend, precision), device)
+    return (values - picture * valid[..., None]).abs().max().item()
+
+
+def _seen(camera: Camera, depth: float, backend: str, device: str, precision: str) -> float:
+    """Largest validity and value."""
+    cameras = CAMERAS["looking at the cube"], camera
+    _, values, valid = _at_depth(cameras, depth, (backend, precision), device)
+    return max(values.abs().max().item(), valid.max().item())
+
+
+def _inside_error(backend: str, device: str, precision: str) -> float:
+    """A step of 0.1 to the side, surfaces as near as that, a picture that is linear in u and v."""
+    camera = CAMERAS["at the origin"]
+    c2w = camera.c2w.clone()
+    c2w[0, 3] = 0.1
+    source, dtype = replace(camera, c2w=c2w), DTYPES[precision]
+    pixels = pixel_grid(camera.width, camera.height).double()
+    picture = (pixels / 32).view(camera.height, camera.width, 2).to(dtype)
+    z = torch.rand(len(pixels), generator=torch.Generator().manual_seed(0)).to(dtype)
+    values, valid = _warped(source, camera, z, picture, backend, device)
+    if not valid.any():
+        return math.inf
+    u = pixels[:, 0] - source.fx * source.c2w[0, 3].double() / z.double()
+    u = u.clamp(0.5, camera.width - 0.5)  # the border is repeated
+    want = torch.stack((u, pixels[:, 1]), dim=1).view(camera.height, camera.width, 2) / 32
+    apart = (values - want).abs().amax(dim=2) * (valid > 0)
+    return apart.max().item()
+
+
+def _enlarged_error(backend: str, device: str, precision: str) -> float:
+    dtype = DTYPES[precision]
+    depth = torch.full((5, 5), torch.inf, dtype=dtype)
+    depth[1, 1], depth[1, 2], depth[3, 3], depth[4, 0] = 1.0, 1e20, 1e20, torch.nan
+    cells = torch.arange(25, device=device)
+    got = enlarge(depth.to(device), cells, 4, backend=backend).cpu()
+    known = got[got < torch.inf].double()
+    if got.isnan().any() or not len(known):
+        return math.inf
+    return torch.minimum((known - 1).abs(), (known / depth[1, 2].double() - 1).abs()).max().item()
+
+
+def _walk_error(frames: int, backend: str, device: str, precision: str) -> float:
+    """Around a quarter of the scene and back, 50 frames each way, each frame from the last."""
+    start = Camera(torch.eye(4)[:3], 8.0, 8.0, 4.0, 4.0, 8, 8)
+    up, middle = torch.tensor([0.0, 0.0, 1.0]), torch.full((3,), 0.5)
+    first = torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(0)).to(DTYPES[precision])
+    first[..., 0] = 0.7
+    picture, before, worst = first, None, 0.0
+    z = torch.full((64,), 1.5, dtype=first.dtype)
+    for frame in range(frames):
+        angle = 0.03 * (50 - abs(frame % 100 - 50))
+        eye = middle + 1.5 * torch.tensor([math.cos(angle), math.sin(angle), 0.2])
+        camera = replace(start, c2w=look_at(eye, middle, up))
+        if before is not None:
+            values, valid = _warped(before, camera, z, picture, backend, device)
+            if not valid.any():
+                return math.inf
+            picture = torch.where(valid[..., None] > 0, values, first)
+        before = camera
+        drift = (picture[..., 0] - 0.7).abs().max().item()
+        beyond = (picture - 0.5).abs().max().item() - 0.5
+        worst = max(worst, drift, beyond) if picture.isfinite().all() else math.inf
+    return worst

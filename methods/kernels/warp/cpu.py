@@ -12,7 +12,7 @@ from methods.kernels.cpu import f32
 from methods.kernels.warp import TOLERANCE
 
 
-def enlarge(depth: Tensor, cells: Tensor, scale: int, phase: tuple[float, float]) -> Tensor:
+def enlarge(depth: Tensor, cells: Tensor, scale: int) -> Tensor:
     """See `methods.kernels.warp.enlarge`."""
     if depth.dtype != torch.float32:
         raise ValueError(
@@ -23,8 +23,6 @@ def enlarge(depth: Tensor, cells: Tensor, scale: int, phase: tuple[float, float]
         depth.contiguous().numpy(),
         cells.numpy(),
         scale,
-        f32(phase[0]),
-        f32(phase[1]),
         f32(TOLERANCE),
         out.numpy(),
     )
@@ -37,8 +35,7 @@ def warp(
     cells: Tensor,
     width: int,
     scale: int,
-    matrix: Tensor,
-    offset: Tensor,
+    projection: tuple[Tensor, Tensor],
 ) -> tuple[Tensor, Tensor]:
     """See `methods.kernels.warp.warp`."""
     if not picture.dtype == depth.dtype == torch.float32:
@@ -53,8 +50,7 @@ def warp(
         cells.numpy(),
         width,
         scale,
-        matrix.float().numpy(),
-        offset.float().numpy(),
+        *(x.float().numpy() for x in projection),
         values.numpy(),
         valid.numpy(),
     )
@@ -62,7 +58,7 @@ def warp(
 
 
 @njit(cache=True, parallel=True)
-def _enlarge(depth, cells, scale, phase_u, phase_v, tolerance, out):
+def _enlarge(depth, cells, scale, tolerance, out):
     width = depth.shape[1]
     for n in prange(len(cells)):
         row, column = cells[n] // width, cells[n] % width
@@ -74,8 +70,8 @@ def _enlarge(depth, cells, scale, phase_u, phase_v, tolerance, out):
             u = f32(column * scale + sub % scale) + f32(0.5)
             out[n, sub] = _depth_at(
                 depth,
-                (v - phase_v) / f32(scale) - f32(0.5),
-                (u - phase_u) / f32(scale) - f32(0.5),
+                v / f32(scale) - f32(0.5),
+                u / f32(scale) - f32(0.5),
                 tolerance,
             )
 
@@ -104,7 +100,6 @@ def _warp(picture, depth, cells, width, scale, matrix, offset, values, valid):
 
 @njit(cache=True)
 def _anything_near(depth, row, column):
-    # With a phase of up to a whole pixel a block reaches into its 8 neighbours.
     for y in range(max(row - 1, 0), min(row + 2, depth.shape[0])):
         for x in range(max(column - 1, 0), min(column + 2, depth.shape[1])):
             if -math.inf < depth[y, x] < math.inf:

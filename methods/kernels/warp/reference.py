@@ -8,10 +8,10 @@ from torch import Tensor
 from methods.kernels.warp import TOLERANCE
 
 
-def enlarge(depth: Tensor, cells: Tensor, scale: int, phase: tuple[float, float]) -> Tensor:
+def enlarge(depth: Tensor, cells: Tensor, scale: int) -> Tensor:
     """See `methods.kernels.warp.enlarge`."""
     v, u = (place.to(depth) for place in _pixels(cells, depth.shape[1], scale))
-    rows, columns = (v - phase[1]) / scale - 0.5, (u - phase[0]) / scale - 0.5
+    rows, columns = v / scale - 0.5, u / scale - 0.5
     corners = []
     for down in (0, 1):
         for right in (0, 1):
@@ -35,11 +35,10 @@ def warp(
     cells: Tensor,
     width: int,
     scale: int,
-    matrix: Tensor,
-    offset: Tensor,
+    projection: tuple[Tensor, Tensor],
 ) -> tuple[Tensor, Tensor]:
     """See `methods.kernels.warp.warp`."""
-    matrix, offset, z = matrix.to(picture), offset.to(picture), depth.to(picture)
+    matrix, offset, z = (x.to(picture) for x in (*projection, depth))
     v, u = (place.to(picture) for place in _pixels(cells, width, scale))
     known = (z > 0) & (z < torch.inf)
     pixel = torch.stack((u, v, torch.ones_like(u)), dim=-1)

@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from bench.types import Probe
 from methods.kernels.depthwise import neighbours_of
-from methods.kernels.space_to_depth import Layout, draw, lift
+from methods.kernels.space_to_depth import CellInputs, Layout, depth_to_space, space_to_depth
 from methods.steernerf.beyond.cell_network import CellNetwork
 from methods.steernerf.beyond.cells import number, paint
 from methods.steernerf.options import check_size
@@ -87,25 +87,21 @@ class LeanRenderer(Renderer2d):
 
     def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Drawing:
         """See `Renderer2d`."""
-        base, rows = self._lift(observations)
+        base, rows = self._rows(observations)
         neighbours, backend = self._neighbours(observations, len(rows)), observations[0].backend
         self.network.backend = backend
-        answer, error, *matrix = (x.to(base) for x in self.run(probe, rows, neighbours))
-        drawn = draw(base, rows, answer, next(iter(matrix), None), self.layout, backend=backend)
+        output, error, *matrix = (x.to(base) for x in self.run(probe, rows, neighbours))
+        drawn = depth_to_space(
+            base, rows, output, next(iter(matrix), None), self.layout, backend=backend
+        )
         return Drawing(self._paint(observations, drawn), error[: len(base), 0])
 
     def base(self, observations: Sequence[Observation]) -> Tensor:
         """See `Renderer2d`."""
         alone = Layout(self.channels, 0, self.scale, history=False, surface=False)
         parts = [
-            lift(
-                o.frame.values,
-                o.frame.alpha,
-                o.background,
-                o.cells,
-                [],
-                None,
-                None,
+            space_to_depth(
+                CellInputs(o.frame.values, o.frame.alpha, o.background, o.cells),
                 alone,
                 backend=o.backend,
             )[0]
@@ -113,28 +109,28 @@ class LeanRenderer(Renderer2d):
         ]
         return self._paint(observations, torch.cat(parts))
 
-    def _lift(self, observations: Sequence[Observation]) -> tuple[Tensor, Tensor]:
-        """The base and the rows of all their cells, rows of 0 behind them; see `lift`.
+    def _rows(self, observations: Sequence[Observation]) -> tuple[Tensor, Tensor]:
+        """The base and the rows of all their cells, rows of 0 behind them; see `space_to_depth`.
 
         The library behind the products prepares code for every new size, which takes longer than
         the product itself: it sees few sizes.
         """
         alone = len(observations) == 1
         quantum = self.network.quantum
-        parts = [self._lift_one(o, quantum if alone else 1) for o in observations]
+        parts = [self._cells_of(o, quantum if alone else 1) for o in observations]
         if alone:
             return parts[0]
         base, rows = (torch.cat(some) for some in zip(*parts, strict=True))
         return base, functional.pad(rows, (0, 0, 0, -len(rows) % quantum))
 
-    def _lift_one(self, observation: Observation, multiple: int) -> tuple[Tensor, Tensor]:
+    def _cells_of(self, observation: Observation, multiple: int) -> tuple[Tensor, Tensor]:
         o, layout = observation, self.layout
         history = surface = None
         if o.history is not None and layout.history:
             history = o.history.values, o.history.valid
         if o.surface is not None and layout.surface:
             surface = o.surface.values, o.surface.index
-        return lift(
+        inputs = CellInputs(
             o.frame.values,
             o.frame.alpha,
             o.background,
@@ -142,10 +138,8 @@ class LeanRenderer(Renderer2d):
             [(points.values, points.index) for points in o.preceding],
             history,
             surface,
-            layout,
-            multiple=multiple,
-            backend=o.backend,
         )
+        return space_to_depth(inputs, layout, multiple=multiple, backend=o.backend)
 
     def _neighbours(self, observations: Sequence[Observation], rows: int) -> Tensor:
         """Of all cells, and of as many more as make `rows`, which have none: [R, 9]."""

@@ -10,9 +10,10 @@ from bench.study import Variant
 from bench.types import Budget, Log, Scene
 from methods.steernerf.beyond.pretraining import pretrain_renderer
 from methods.steernerf.method import SteerNerf
-from methods.steernerf.study import STUDY, ranges, turned
+from methods.steernerf.study import STUDY, not_skipped, ranges, turned
 
 SHARES = (0, 0.06, 0.25, 0.5, 1)
+SKIPS = {**STUDY.skips, "background cells": "method.rendering.skip.background"}
 
 
 def _both(one: Variant, other: Variant) -> Variant:
@@ -43,6 +44,7 @@ class SteerNerfLean(SteerNerf):
         STUDY,
         knobs={
             **STUDY.knobs,
+            "skips": not_skipped(SKIPS),
             "step length": turned("step", "method.rendering.step", (1, 1.5, 3, 4)),
             "refined step length": _refined_steps((1.5, 2, 3)),
             "refined share": _refined((0, 0.03, 0.06, 0.25, 0.5, 1)),
@@ -60,7 +62,8 @@ class SteerNerfLean(SteerNerf):
             "method.rendering.refined=1",
             "method.rendering.skip.background=false",
         ),
-        skips={**STUDY.skips, "background cells": "method.rendering.skip.background"},
+        skips=SKIPS,
+        skips_with=("method.rendering.refined=0",),  # refinement takes a share of the cells drawn
         beside={
             **STUDY.beside,
             # What its U-Net has learned does not change what it costs.

@@ -44,8 +44,6 @@ class JointOptions:
         final_rate: share of both left at the end of the cosine schedule.
         patch: side of a patch, low-resolution pixels.
         batch: patches of a step.
-        precision: of the 2D renderer's convolutions while it is trained. Where the device has no
-            products of bfloat16, "bf16" is "fp32".
         opacity_entropy: weight of -o ln o of the rays.
         error_weight: of the squared error of the estimated error, in log.
         refined: share of the cells that are refined while it is trained.
@@ -64,7 +62,6 @@ class JointOptions:
     final_rate: float = 0.01
     patch: int = 32
     batch: int = 2
-    precision: Literal["bf16", "fp32"] = "bf16"
     opacity_entropy: float = 1e-3
     error_weight: float = 1e-4
     refined: float = 0.2
@@ -144,8 +141,7 @@ class RendererTraining:
         """
         batch = self.patches.draw(self.options.batch)
         kind = batch.truth.device.type
-        half = self.options.precision == "bf16" and multiplies_bf16(kind)
-        with torch.autocast(kind, torch.bfloat16, enabled=half):
+        with torch.autocast(kind, torch.bfloat16, enabled=multiplies_bf16(kind)):
             drawing = self.renderer(batch.observations)
         loss = functional.mse_loss(drawing.pictures, batch.truth)
         (loss + self._error_loss(batch, drawing) + self._field_loss(batch, drawing)).backward()

@@ -1,4 +1,4 @@
-"""A log that remembers what it was told, and a small NeRF-Synthetic folder to break."""
+"""A log that keeps its messages, and a small NeRF-Synthetic folder to break."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class RememberingLog:
 
 @pytest.fixture
 def log() -> RememberingLog:
-    """Remembers what it was told."""
+    """A log that keeps its messages."""
     return RememberingLog()
 
 

@@ -12,9 +12,10 @@ import torch
 
 from bench.cameras import move_camera, unproject
 from bench.scenes import analytic
-from bench.scenes.analytic import exact_frame, find, orbit_poses, render_exact, train_poses
+from bench.scenes.analytic import find, orbit_poses, train_poses
 from bench.scenes.models import MODELS
-from bench.types import Camera, SteerbenchError, Unavailable
+from bench.scenes.raytrace import render
+from bench.types import Camera, Frame, Scene, SteerbenchError, Unavailable
 
 SMALL = {"width": 32, "height": 24, "train": 6, "test": 3}
 
@@ -23,6 +24,13 @@ SMALL = {"width": 32, "height": 24, "train": 6, "test": 3}
 def name(request: pytest.FixtureRequest) -> str:
     """Every embedded scene in turn."""
     return request.param
+
+
+def exact_frame(scene: Scene, camera: Camera, samples: int) -> Frame:
+    """What is really there, with `camera` and depth in scene units."""
+    in_model = move_camera(camera, scene.unit_length, scene.origin)
+    frame = render(find(scene.name), in_model, scene.background, samples)
+    return Frame(frame.rgb, frame.depth / scene.unit_length, frame.alpha)
 
 
 def test_the_layout_is_that_of_nerf_synthetic(tmp_path, log) -> None:
@@ -90,7 +98,7 @@ def test_cameras_come_back_as_they_were_made(tmp_path, log) -> None:
 def test_pictures_are_the_exact_frames(tmp_path, log, name) -> None:
     scene = analytic.load(name, **SMALL, root=tmp_path, bounds="full", log=log)
     split = scene.splits["test"]
-    frame = exact_frame(scene, split.cameras[1])
+    frame = exact_frame(scene, split.cameras[1], samples=16)
     image = split.images[1].float() / 255
     shown = image[..., :3] * image[..., 3:] + 1 - image[..., 3:]
     # Colour and opacity are rounded to 8 bits, half a level each; a sample that grazes an edge may
@@ -113,17 +121,6 @@ def test_a_scene_knows_its_picture_at_any_camera_as_its_splits_have_it(tmp_path,
         assert differing <= 3
 
 
-def test_exact_frames_are_in_scene_units(tmp_path, log) -> None:
-    scene = analytic.load("totem", **SMALL, root=tmp_path, log=log)
-    camera = scene.splits["test"].cameras[1]
-    frame = exact_frame(scene, camera, samples=1)
-    model = render_exact("totem", move_camera(camera, scene.unit_length, scene.origin), samples=1)
-    seen = frame.depth.isfinite()
-    torch.testing.assert_close(
-        scene.unit_length * frame.depth[seen], model.depth[seen], rtol=1e-5, atol=0
-    )
-
-
 def test_no_surface_point_is_outside_the_bounds(tmp_path, log, name) -> None:
     options = {"width": 40, "train": 10, "test": 2}
     scene = analytic.load(name, **options, root=tmp_path, log=log)
@@ -143,7 +140,7 @@ def test_models_lie_in_their_cube(name) -> None:
 def test_the_totem_fills_but_does_not_leave_its_pictures() -> None:
     for pose in orbit_poses(24)[::6]:
         camera = Camera(pose.float(), 139.0, 139.0, 50, 50, 100, 100)
-        alpha = render_exact("totem", camera, samples=4).alpha
+        alpha = render(find("totem"), camera, torch.ones(3), samples=4).alpha
         border = torch.cat((alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]))
         assert (border == 0).all()
         assert alpha.mean() > 0.2
@@ -179,7 +176,7 @@ def test_a_broken_write_leaves_nothing(tmp_path, monkeypatch, log, fault) -> Non
     def fail(*args: object, **kwargs: object) -> None:
         raise fault
 
-    monkeypatch.setattr(analytic, "to_rgba", fail)
+    monkeypatch.setattr(analytic, "picture", fail)
     with pytest.raises((KeyboardInterrupt, SteerbenchError)):
         analytic.load("void", **SMALL, root=tmp_path, log=log)
     assert list(tmp_path.iterdir()) == []
@@ -207,7 +204,7 @@ def test_bad_options(tmp_path, log, options, message) -> None:
 
 
 def test_unknown_names_are_refused(tmp_path, log) -> None:
-    for name in ("tower", "medley", "medley-", "medley--1", "medley-07", "medley-1.5"):
+    for name in ("tower", "medley-", "medley--1", "medley-07", "medley-1.5"):
         with pytest.raises(
             Unavailable,
             match=f"one of totem, wires, cloud, void, medley-0, medley-1 and so on, got '{name}'",
@@ -218,7 +215,7 @@ def test_unknown_names_are_refused(tmp_path, log) -> None:
 
 def test_variants_of_medley_are_scenes_of_their_own(tmp_path, log) -> None:
     scenes = [
-        analytic.load_medley(variant=variant, **SMALL, root=tmp_path, log=log)
+        analytic.load("medley", variant=variant, **SMALL, root=tmp_path, log=log)
         for variant in (7, 8, 7)
     ]
     assert [scene.name for scene in scenes] == ["medley-7", "medley-8", "medley-7"]
@@ -227,23 +224,13 @@ def test_variants_of_medley_are_scenes_of_their_own(tmp_path, log) -> None:
     assert scenes[0].digest == scenes[2].digest != scenes[1].digest
 
 
-def test_medley_hands_every_option_on(tmp_path, log, monkeypatch) -> None:
-    given = {
-        **SMALL,
-        "seed": 3,
-        "downscale": 2,
-        "background": "black",
-        "bounds": "full",
-        "root": tmp_path,
-        "log": log,
-    }
-    seen = {}
-    monkeypatch.setattr(analytic, "load", lambda name, **options: seen.update(options, name=name))
-    analytic.load_medley(variant=5, **given)
-    assert seen == {"name": "medley-5", **given}
+def test_no_other_scene_has_variants(tmp_path, log) -> None:
+    for name in ("totem", "medley-3"):
+        with pytest.raises(SteerbenchError, match=f"variant: expected none, {name} has no .*got 1"):
+            analytic.load(name, variant=1, root=tmp_path, log=log)
 
 
-@pytest.mark.parametrize("variant", [-1, 1.5, True, "7"])
+@pytest.mark.parametrize("variant", [None, -1, 1.5, True, "7"])
 def test_a_variant_is_a_whole_number(tmp_path, log, variant) -> None:
     with pytest.raises(SteerbenchError, match="variant: expected a whole number from 0 on"):
-        analytic.load_medley(variant=variant, root=tmp_path, log=log)
+        analytic.load("medley", variant=variant, root=tmp_path, log=log)

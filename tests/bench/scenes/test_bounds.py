@@ -7,10 +7,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.scenes.analytic import pose_on_sphere, to_rgba, train_poses
+from bench.scenes.analytic import picture, pose_on_sphere, train_poses
 from bench.scenes.bounds import Box, cube, hull_box
 from bench.scenes.opaque import Part, Solids
-from bench.scenes.raytrace import render
 from bench.scenes.solids import Ellipsoid
 from bench.scenes.textures import plain
 from bench.types import Camera
@@ -24,7 +23,7 @@ def camera(pose) -> Camera:
 
 def pictures_of(model: Solids, poses: list) -> tuple[list[Camera], list[torch.Tensor]]:
     cameras = [camera(pose) for pose in poses]
-    return cameras, [to_rgba(render(model, c, torch.zeros(3), 16)) for c in cameras]
+    return cameras, [picture(model, c) for c in cameras]
 
 
 @given(

@@ -1,7 +1,7 @@
 """TensorRT as `methods.engines.tensorrt_engine` uses it, on the CPU by ONNX Runtime.
 
 Names and arguments are those of the Python bindings of TensorRT 11.4. A plan is the ONNX model with
-the sizes that it is good for in front; memory is read and written at the addresses that are told.
+the sizes that it is good for in front; memory is read and written at the given addresses.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ class Network:
         return len(self._inputs)
 
     def get_input(self, index: int) -> SimpleNamespace:
-        told = self._inputs[index]
-        axes = told.type.tensor_type.shape.dim
+        tensor = self._inputs[index]
+        axes = tensor.type.tensor_type.shape.dim
         return SimpleNamespace(
-            name=told.name, shape=tuple(-1 if axis.dim_param else axis.dim_value for axis in axes)
+            name=tensor.name, shape=tuple(-1 if axis.dim_param else axis.dim_value for axis in axes)
         )
 
 
@@ -155,20 +155,20 @@ class ExecutionContext:
         return True
 
     def get_tensor_shape(self, name: str) -> tuple[int, ...]:
-        told = {
+        arrays = {
             x.name: np.zeros(self._shapes[x.name], ONNX_TYPES[x.type])
             for x in self._engine.session.get_inputs()
         }
-        return self._engine.session.run([name], told)[0].shape
+        return self._engine.session.run([name], arrays)[0].shape
 
     def execute_async_v3(self, stream_handle: int) -> bool:
         session = self._engine.session
-        told = {
+        arrays = {
             x.name: self._memory(x.name, self._shapes[x.name], ONNX_TYPES[x.type])
             for x in session.get_inputs()
         }
         names = [x.name for x in session.get_outputs()]
-        for name, value in zip(names, session.run(names, told), strict=True):
+        for name, value in zip(names, session.run(names, arrays), strict=True):
             self._memory(name, value.shape, value.dtype)[...] = value
         return True
 

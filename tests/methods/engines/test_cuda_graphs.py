@@ -1,4 +1,4 @@
-"""CUDA graphs: every size of inputs is recorded once, and what comes is told to its recording."""
+"""CUDA graphs: every size of inputs is recorded once, and replayed for what comes."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ class Recorder:
 
     def __call__(self, run: Callable[[], Inputs]) -> tuple[Callable[[], None], Inputs]:
         self.recorded += 1
-        said = tuple(torch.full_like(x, torch.nan) for x in run())
+        outputs = tuple(torch.full_like(x, torch.nan) for x in run())
 
         def replay() -> None:
-            for held, x in zip(said, run(), strict=True):
+            for held, x in zip(outputs, run(), strict=True):
                 held.copy_(x)
 
-        return replay, said
+        return replay, outputs
 
 
-def test_a_replay_says_what_the_network_says_of_what_it_is_told() -> None:
+def test_a_replay_gives_the_outputs_of_the_network() -> None:
     network, _ = lean()
     recorder = Recorder()
     replayed = Replayed(network, recorder)
     for count, seed in ((64, 0), (100, 1), (64, 2), (100, 3)):
-        told = cells(count, seed)
-        for got, want in zip(replayed(*told), network(*told), strict=True):
+        given = cells(count, seed)
+        for got, want in zip(replayed(*given), network(*given), strict=True):
             assert torch.equal(got, want)
     assert recorder.recorded == 2  # sizes
 
 
-def test_what_it_was_told_stays_as_it_was() -> None:
+def test_its_inputs_stay_as_they_were() -> None:
     network, _ = lean()
     replayed = Replayed(network, Recorder())
-    told = cells(64)
-    replayed(*told)
+    given = cells(64)
+    replayed(*given)
     replayed(*cells(64, seed=1))
-    assert all(torch.equal(x, held) for x, held in zip(told, cells(64), strict=True))
+    assert all(torch.equal(x, held) for x, held in zip(given, cells(64), strict=True))
 
 
 def test_of_nothing_nothing_is_recorded() -> None:
@@ -60,13 +60,13 @@ def test_of_nothing_nothing_is_recorded() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="for a machine with a GPU")
 @pytest.mark.parametrize("precision", TorchEngine.precisions)
 @pytest.mark.parametrize("make", [lean, unet])
-def test_a_gpu_replays_what_the_network_says(precision, make, tmp_path, quiet_log) -> None:
+def test_a_gpu_replays_the_outputs_of_the_network(precision, make, tmp_path, quiet_log) -> None:
     network, inputs = make()
     wanted = [network(*some) for some in inputs]
     there = network.to("cuda")
     seen = [tuple(x.cuda() for x in some) for some in inputs]
     built = TorchEngine(precision).build(there, lambda: seen, lambda: tmp_path, quiet_log)
     for some, want in zip(seen, wanted, strict=True):
-        for got, said in zip(built.run(*some), want, strict=True):
-            error = (got.cpu().float() - said).square().mean().sqrt()
-            assert error < TOLERANCE.get(precision, 0.03) * said.square().mean().sqrt()
+        for got, outputs in zip(built.run(*some), want, strict=True):
+            error = (got.cpu().float() - outputs).square().mean().sqrt()
+            assert error < TOLERANCE.get(precision, 0.03) * outputs.square().mean().sqrt()

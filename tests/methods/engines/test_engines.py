@@ -17,8 +17,8 @@ from methods.engines.onnxruntime_engine import OnnxRuntime
 from methods.engines.openvino_engine import OpenVino, _capabilities
 from methods.engines.torch_engine import TorchEngine
 from methods.kernels.depthwise import neighbours_of
-from methods.steernerf.beyond.lean_renderer import SpaceToDepth
-from methods.steernerf.unet import UnetRelease
+from methods.steernerf.beyond.lean_renderer import LeanRenderer
+from methods.steernerf.unet import UNet
 from tests.methods.observations import shaken
 
 NO_BF16 = "BF16" not in _capabilities(required("openvino", "openvino", "openvino"))
@@ -33,14 +33,14 @@ ENGINES = [
 ]
 
 TOLERANCE = {"fp32": 1e-5, "bf16": 0.03, "int8": 0.1}
-"""Of the root mean square of what the network says. fp32: sums of a few hundred products in another
+"""Of the root mean square of the network's outputs. fp32: sums of a few hundred products in another
 order. Below, a number is rounded by 2^-8 (bf16), or by half of 1/255 of the range that it
 was seen in (int8), before each of half a dozen layers; single layers are kept higher."""
 
 
 def cells(count: int, seed: int = 0) -> Inputs:
     """Rows and neighbours of `count` cells in a square."""
-    renderer = SpaceToDepth(6, 2, 4, init="scratch")
+    renderer = LeanRenderer(6, 2, 4, init="scratch")
     generator = torch.Generator().manual_seed(seed)
     side = round(count**0.5)
     neighbours = neighbours_of(torch.ones(1, side, side, dtype=torch.bool))
@@ -50,7 +50,7 @@ def cells(count: int, seed: int = 0) -> Inputs:
 def lean() -> tuple[Network, list[Inputs]]:
     """The lean network, and inputs of three sizes."""
     torch.manual_seed(1000)  # other numbers than those of the inputs
-    renderer = shaken(SpaceToDepth(6, 2, 4, init="scratch")).requires_grad_(False)
+    renderer = shaken(LeanRenderer(6, 2, 4, init="scratch")).requires_grad_(False)
     return renderer.network, [cells(count, seed) for seed, count in enumerate((64, 100, 64, 144))]
 
 
@@ -66,7 +66,7 @@ def test_a_view_of_nothing_has_no_cells(
 
 def unet() -> tuple[Network, list[Inputs]]:
     torch.manual_seed(1000)
-    renderer = shaken(UnetRelease(6, 1, 4)).requires_grad_(False)
+    renderer = shaken(UNet(6, 1, 4)).requires_grad_(False)
     generator = torch.Generator().manual_seed(0)
     return renderer.network, [(torch.rand(1, 12, 36, 44, generator=generator),) for _ in range(3)]
 
@@ -142,6 +142,30 @@ def test_openvino_refuses_a_bfloat16_that_it_would_compute_in_float32(
     )
     with pytest.raises(Unavailable, match="openvino has no bfloat16 on this CPU, use precision=f"):
         OpenVino("bf16")
+
+
+@pytest.mark.parametrize(("capabilities", "rest"), [(["BF16", "INT8"], "bf16"), (["INT8"], "fp32")])
+def test_rows_say_what_openvino_computes_beside_int8(
+    capabilities: list[str], rest: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "methods.engines.openvino_engine._capabilities", lambda openvino: capabilities
+    )
+    assert OpenVino("int8").computed(torch.device("cpu")) == f"int8+{rest}"
+    assert OpenVino("fp32").computed(torch.device("cpu")) == "fp32"
+
+
+@pytest.mark.parametrize(("products", "computed"), [(True, "bf16"), (False, "bf16 in fp32")])
+def test_rows_say_what_torch_multiplies_in_bfloat16(
+    products: bool, computed: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("methods.engines.torch_engine.multiplies_bf16", lambda kind: products)
+    assert TorchEngine("bf16").computed(torch.device("cpu")) == computed
+    assert TorchEngine("fp32").computed(torch.device("cpu")) == "fp32"
+
+
+def test_rows_say_what_onnx_runtime_computes_beside_int8() -> None:
+    assert OnnxRuntime("int8").computed(torch.device("cpu")) == "int8+fp32"
 
 
 def test_half_precision_without_a_gpu_is_refused() -> None:

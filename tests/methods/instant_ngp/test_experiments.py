@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from bench.case import U16, U32
 from methods.instant_ngp.experiments import GRID, experiments
-from methods.kernels.case import U16, U32
 
 TABLE, NETWORKS = (
     "encoding: features, entries of -1 to 1",

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import os
+from pathlib import Path
 from typing import Any
 
 import triton
@@ -15,8 +16,8 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 import methods.kernels.gpu
-from methods.kernels.benchmark import all_cases
-from methods.kernels.dispatch import has
+from bench.case import Difference
+from methods.checks import found
 
 HOPPER = GPUTarget("cuda", 90, 32)
 TYPES = {
@@ -70,11 +71,10 @@ def compile_for_hopper(
 
 seen: set[str] = set()
 methods.kernels.gpu.launch = compile_for_hopper
-folders = {case.kernel.partition(" ")[0] for case in all_cases()}
-served = {folder for folder in folders if has(folder, "gpu")}
-for folder in served:
-    importlib.import_module(f"methods.kernels.{folder}.gpu")
+for path in Path(methods.kernels.gpu.__file__).parent.glob("*/gpu.py"):
+    importlib.import_module(f"methods.kernels.{path.parent.name}.gpu")
 os.environ["TRITON_INTERPRET"] = "1"  # so that CPU tensors are taken; too late for a kernel
-for case in all_cases():
-    if case.kernel.partition(" ")[0] in served and not case.timed:
-        case.prepare("cpu").call("gpu")
+for case in found("cases"):
+    by_gpu = any(backend == "gpu" for backend, _ in case.tolerances)
+    if isinstance(case.error, Difference) and by_gpu and not case.timed:
+        case.error.prepare("cpu")("gpu")

@@ -8,9 +8,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from methods.kernels.composite import Pixels, composite, visible_counts, weights
+from methods.kernels.composite import Intervals, Pixels, visible_counts, weights
+from methods.kernels.composite import composite as composite_samples
 
 BACKENDS = ["reference", "cpu"]
+
+
+def composite(
+    sigma: Tensor, values: Tensor, t: Tensor, delta: Tensor, offsets: Tensor, **options
+) -> Pixels:
+    return composite_samples(sigma, values, Intervals(t, delta, offsets), **options)
+
+
+def intervals(inputs: dict) -> Intervals:
+    return Intervals(inputs["t"], inputs["delta"], inputs["offsets"])
 
 
 def samples(counts: list[int], channels: int = 3, dtype: torch.dtype = torch.float32) -> dict:
@@ -68,7 +79,7 @@ def test_gradients_in_float64() -> None:
 
     def outputs(sigma: Tensor, values: Tensor) -> tuple[Tensor, ...]:
         changed = inputs | {"sigma": sigma, "values": values}
-        pixels = composite(**changed, background=background, stop=0.0, backend="reference")
+        pixels = composite(**changed, stop=0.0, backend="reference").over(background)
         return pixels.values, pixels.depth_sum, pixels.alpha
 
     assert torch.autograd.gradcheck(outputs, (sigma, values))
@@ -84,7 +95,7 @@ def test_a_homogeneous_medium_has_the_opacity_of_beer_lambert(backend: str) -> N
         "delta": torch.full((count,), 1 / count),
         "offsets": torch.tensor([0, count]),
     }
-    pixels = composite(**inputs, background=torch.ones(1), stop=0.0, backend=backend)
+    pixels = composite(**inputs, stop=0.0, backend=backend).over(torch.ones(1))
     opacity = 1 - math.exp(-sigma)
     assert pixels.alpha.item() == pytest.approx(opacity, abs=1e-5)
     assert pixels.values.item() == pytest.approx(0.25 * opacity + 1 - opacity, abs=1e-5)
@@ -125,9 +136,7 @@ def test_the_early_stop_changes_a_pixel_by_less_than_its_threshold(
 def test_visible_samples_are_those_with_a_gradient(backend: str) -> None:
     inputs = samples([40, 0, 1, 25])
     stop = 0.05
-    counts = visible_counts(
-        inputs["sigma"], inputs["delta"], inputs["offsets"], stop=stop, backend=backend
-    )
+    counts = visible_counts(inputs["sigma"], intervals(inputs), stop=stop, backend=backend)
     values = inputs["values"].requires_grad_()
     pixels = composite(**inputs | {"values": values}, stop=stop, backend=backend)
     (grad,) = torch.autograd.grad(pixels.values.sum(), values)
@@ -146,14 +155,7 @@ def test_weights_are_the_gradients_of_the_values(backend: str) -> None:
     values = inputs["values"].requires_grad_()
     pixels = composite(**inputs | {"values": values}, stop=0.05, carry=carry, backend=backend)
     (gradient,) = torch.autograd.grad(pixels.values.sum(), values)
-    found = weights(
-        inputs["sigma"],
-        inputs["delta"],
-        inputs["offsets"],
-        stop=0.05,
-        front=1 - alpha,
-        backend=backend,
-    )
+    found = weights(inputs["sigma"], intervals(inputs), stop=0.05, front=1 - alpha, backend=backend)
     torch.testing.assert_close(found, gradient[:, 0], rtol=1e-5, atol=1e-7)
     assert (found == 0).any()
     assert (found > 0.05).any()

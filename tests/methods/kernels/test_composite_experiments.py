@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy import integrate
 
-from methods.kernels.case import U32
+from bench.case import U32
 from methods.kernels.composite.experiments import (
     CUT,
     HOMOGENEOUS,

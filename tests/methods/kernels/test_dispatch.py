@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
+from functools import partial
 
 import pytest
 import torch
@@ -45,20 +45,26 @@ def test_cpu_backend_refuses_tensors_of_another_device() -> None:
         resolve("cpu", "cuda")
 
 
-def test_threads_of_numbas_own_serve_one_thread_at_a_time() -> None:
-    program = """
-import torch
-from methods.kernels import serves_many_threads
+def test_a_description_names_the_kernels_that_torch_computes_for_the_gpu(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(dispatch, "resolve", lambda backend, device: backend)
+    described = partial(dispatch.description, "gpu", "cuda")
+    assert described(["encode", "march"]) == "gpu"
+    assert described(["spherical", "encode", "adam"]) == "gpu, reference: adam, spherical"
 
-print([serves_many_threads(backend, torch.device("cpu")) for backend in ("reference", "cpu")])
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        env={**os.environ, "NUMBA_THREADING_LAYER": "workqueue"},
-        capture_output=True,
-        text=True,
-    )
-    assert (done.returncode, done.stdout) == (0, "[True, False]\n"), done.stderr
+
+def test_a_description_is_of_the_backend_that_computes() -> None:
+    assert dispatch.description("auto", "cpu", ["adam", "spherical"]) == "cpu"
+    assert dispatch.description("reference", "cpu", ["adam"]) == "reference"
+
+
+def test_an_interpreted_backend_is_not_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dispatch, "resolve", lambda backend, device: backend)
+    monkeypatch.setenv("TRITON_INTERPRET", "1")
+    assert dispatch.compiled("cpu") == ["reference", "cpu"]
+    monkeypatch.delenv("TRITON_INTERPRET")
+    assert dispatch.compiled("cpu") == ["reference", "cpu", "gpu"]
 
 
 def test_torch_keeps_its_threads_when_the_first_kernel_starts_its_own() -> None:

@@ -139,22 +139,6 @@ def test_the_gradient_goes_to_the_table_or_is_added_to_the_buffer(
     assert table.grad.sum().item() == pytest.approx(100 * GRID.channels, rel=1e-4)
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
-@pytest.mark.parametrize("packed", [False, True])
-def test_the_coarsest_levels_are_the_first_channels_of_all(backend: str, packed: bool) -> None:
-    table = random_table(GRID, torch.float32).requires_grad_()
-    words = pack(table) if packed else None
-    positions = torch.rand(300, 3, generator=torch.Generator().manual_seed(0))
-    some = encode(positions, table, GRID, levels=2, packed=words, backend=backend)
-    every = encode(positions, table, GRID, packed=words, backend=backend)
-    torch.testing.assert_close(some, every[:, :4], rtol=0, atol=0)
-    gradients = [
-        torch.autograd.grad(features.sum(dtype=torch.float32), table)[0]
-        for features in (some, every[:, :4])
-    ]
-    torch.testing.assert_close(*gradients, rtol=1e-6, atol=1e-6)
-
-
 def test_the_backward_pass_gives_the_same_bits_twice() -> None:
     table = random_table(GRID, torch.float32)
     positions = torch.rand(5000, 3, generator=torch.Generator().manual_seed(0))
@@ -171,9 +155,6 @@ def test_wrong_arguments_are_named() -> None:
         encode(torch.zeros(4, 2), table, GRID)
     with pytest.raises(ValueError, match="table: expected shape"):
         encode(torch.zeros(4, 3), table[1:], GRID)
-    for levels in (0, 5):
-        with pytest.raises(ValueError, match=f"levels: expected 1 to 4, got {levels}"):
-            encode(torch.zeros(4, 3), table, GRID, levels=levels)
     with pytest.raises(ValueError, match="float32"):
         encode(torch.zeros(4, 3), table.double(), GRID, backend="cpu")
     with pytest.raises(ValueError, match="no gradient for positions"):

@@ -1,4 +1,4 @@
-"""The kernels of the GPU against the reference: on a GPU, else in Triton's interpreter."""
+"""The kernels of the GPU where their cases say nothing: on a GPU, else in Triton's interpreter."""
 
 from __future__ import annotations
 
@@ -14,35 +14,16 @@ import torch
 from torch import Tensor
 
 import methods.kernels
+from bench.case import U32, largest_error
 from methods.kernels import availability
-from methods.kernels.benchmark import all_cases
-from methods.kernels.case import U32, Case, largest_error
-from methods.kernels.composite import composite, visible_counts, weights
-from methods.kernels.dispatch import has
+from methods.kernels.composite import Intervals, composite, visible_counts, weights
 from methods.kernels.encode import HashGrid, encode
 from methods.kernels.splat import gather, splat
 
 pytestmark = pytest.mark.skipif(
     bool(availability()["gpu"]), reason="Triton has no build for this platform"
 )
-CASES = [
-    case for case in all_cases() if not case.timed and has(case.kernel.partition(" ")[0], "gpu")
-]
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
-
-
-@pytest.fixture(autouse=True)
-def wide_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is interpreted costs the same for a block of any size."""
-    if DEVICE == "cpu":
-        monkeypatch.setattr("methods.kernels.march.gpu.BLOCK", 256)
-
-
-@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.kernel}: {case.name}")
-def test_the_gpu_agrees_with_the_reference(case: Case) -> None:
-    prepared = case.prepare(DEVICE)
-    got = tuple(result.cpu() for result in prepared.call("gpu"))
-    assert largest_error(got, case.prepare("cpu").call("reference")) <= prepared.tolerance
 
 
 def test_a_table_of_half_precision_gives_features_of_its_type() -> None:
@@ -100,7 +81,7 @@ def test_what_is_not_a_number_shows_and_what_is_behind_it_does_not() -> None:
     delta = torch.full_like(sigma, 0.5)
     offsets = torch.tensor([0, 1, 3, 5], device=DEVICE)
     ones = torch.ones(5, 1, device=DEVICE)
-    pixels = composite(sigma, ones, ones[:, 0], delta, offsets, backend="gpu")
+    pixels = composite(sigma, ones, Intervals(ones[:, 0], delta, offsets), backend="gpu")
     thin = -torch.expm1(torch.tensor(-0.5)).item()
     assert pixels.alpha[0].item() == pytest.approx(thin, abs=4 * U32)
     assert pixels.alpha[1].isnan()
@@ -112,11 +93,12 @@ def test_behind_what_is_not_a_number_a_long_ray_has_no_weights() -> None:
     sigma = torch.full((200,), 0.01, device=DEVICE)
     sigma[10] = torch.nan
     offsets = torch.tensor([0, 200], device=DEVICE)
-    found = weights(sigma, torch.ones_like(sigma), offsets, backend="gpu").cpu()
+    intervals = Intervals(sigma, torch.ones_like(sigma), offsets)
+    found = weights(sigma, intervals, backend="gpu").cpu()
     assert (found[:10] > 0).all()
     assert found[10].isnan()
     assert not found[11:].any()
-    counts = visible_counts(sigma, torch.ones_like(sigma), offsets, backend="gpu")
+    counts = visible_counts(sigma, intervals, backend="gpu")
     assert counts.tolist() == [11]
 
 
@@ -148,7 +130,8 @@ def test_a_thin_haze_keeps_its_light_to_the_last_digits() -> None:
     """1 - exp(-tau) of a tau far below 1, which a difference of float32 numbers does not have."""
     sigma = torch.logspace(-30, 0, 61, device=DEVICE)
     offsets = torch.arange(62, device=DEVICE)
-    found = weights(sigma, torch.full_like(sigma, 0.25), offsets, backend="gpu").double().cpu()
+    intervals = Intervals(sigma, torch.full_like(sigma, 0.25), offsets)
+    found = weights(sigma, intervals, backend="gpu").double().cpu()
     exact = -torch.expm1(-(0.25 * sigma.double())).cpu()
     # The series has twelve operations; 1 - exp is off by itself and 2 ulp of an exp below 1.
     assert ((found - exact).abs() / exact).max() <= (12 + 3 / 0.06) * U32

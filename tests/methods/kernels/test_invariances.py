@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.camera_stress import U32, motion_error
-from methods.kernels.composite.stress import CHANGES, change_error, random_rays
+from bench.case import U32
+from bench.cases import MOTION_UNITS, motion_error
+from methods.kernels.composite.cases import CHANGES, change_error, random_rays
 
 SEEDS = st.integers(0, 2**32 - 1)
 BACKENDS = ("reference", "cpu")
@@ -24,4 +25,4 @@ def test_pixels_under_a_change(change: tuple, backend: str, seed: int, rays: int
 
 @given(SEEDS)
 def test_a_rigid_motion_of_scene_and_camera_moves_no_pixel(seed: int) -> None:
-    assert motion_error(seed, "cpu") <= 64 * (32 + 42) * U32
+    assert motion_error(seed, "cpu") <= MOTION_UNITS * U32

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from bench.types import Rays
 from methods.kernels.march import Occupancy, march
 
 STEP = math.sqrt(3) / 1024
@@ -23,10 +24,10 @@ def dust(seed: int) -> Occupancy:
     return Occupancy(torch.rand(32, 32, 32, generator=generator) < 0.05)
 
 
-def rays_through_the_cube(count: int) -> tuple[Tensor, Tensor]:
+def rays_through_the_cube(count: int) -> Rays:
     generator = torch.Generator().manual_seed(5)
     origins = torch.rand(count, 3, generator=generator) * 3 - 1
-    return origins, torch.rand(count, 3, generator=generator) - origins
+    return Rays(origins, torch.rand(count, 3, generator=generator) - origins)
 
 
 def plain_march(origin: list[float], direction: list[float], grid: Occupancy) -> list[float]:
@@ -48,8 +49,9 @@ def plain_march(origin: list[float], direction: list[float], grid: Occupancy) ->
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_samples_are_the_steps_in_occupied_cells(backend: str) -> None:
     grid = dust(0)
-    origins, directions = rays_through_the_cube(40)
-    samples = march(origins, directions, grid, STEP, backend=backend)
+    rays = rays_through_the_cube(40)
+    origins, directions = rays.origins, rays.directions
+    samples = march(rays, grid, STEP, backend=backend)
     differing = 0
     for ray in range(40):
         got = samples.t[samples.offsets[ray] : samples.offsets[ray + 1]].tolist()
@@ -65,8 +67,9 @@ def test_samples_are_the_steps_in_occupied_cells(backend: str) -> None:
 @pytest.mark.parametrize("step", [STEP, STEP / 4])
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_full_grid_is_sampled_along_the_whole_chord(backend: str, step: float) -> None:
-    origins, directions = rays_through_the_cube(200)
-    samples = march(origins, directions, full(), step, backend=backend)
+    rays = rays_through_the_cube(200)
+    origins, directions = rays.origins, rays.directions
+    samples = march(rays, full(), step, backend=backend)
     inverse = 1 / directions
     first, second = -origins * inverse, (1 - origins) * inverse
     near = torch.minimum(first, second).amax(dim=1).clamp(min=0)
@@ -80,8 +83,9 @@ def test_a_full_grid_is_sampled_along_the_whole_chord(backend: str, step: float)
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_positions_lie_on_their_ray_in_an_occupied_cell(backend: str) -> None:
     grid = dust(1)
-    origins, directions = rays_through_the_cube(100)
-    samples = march(origins, directions, grid, STEP, backend=backend)
+    rays = rays_through_the_cube(100)
+    origins, directions = rays.origins, rays.directions
+    samples = march(rays, grid, STEP, backend=backend)
     ray = samples.ray.long()
     assert torch.equal(samples.positions, origins[ray] + samples.t[:, None] * directions[ray])
     cell = (samples.positions * 32).long().clamp(0, 31)
@@ -93,12 +97,12 @@ def test_positions_lie_on_their_ray_in_an_occupied_cell(backend: str) -> None:
 @pytest.mark.parametrize("limit", [1, 3, 50])
 def test_rounds_give_the_samples_of_one_go(backend: str, limit: int) -> None:
     grid = dust(2)
-    origins, directions = rays_through_the_cube(60)
-    whole = march(origins, directions, grid, STEP, backend=backend)
+    rays = rays_through_the_cube(60)
+    whole = march(rays, grid, STEP, backend=backend)
     start: Tensor | None = None
     parts: list[list[float]] = [[] for _ in range(60)]
     while start is None or (start >= 0).any():
-        part = march(origins, directions, grid, STEP, start=start, limit=limit, backend=backend)
+        part = march(rays, grid, STEP, start=start, limit=limit, backend=backend)
         assert (part.offsets.diff() <= limit).all()
         for ray, t in zip(part.ray.tolist(), part.t.tolist(), strict=True):
             parts[ray].append(t)
@@ -111,7 +115,7 @@ def test_a_window_narrows_the_range(backend: str) -> None:
     origins = torch.tensor([[0.5, 0.5, -1.0]]).expand(2, 3)
     directions = torch.tensor([[0.0, 0.0, 2.0]]).expand(2, 3)
     window = torch.tensor([[0.6, 0.7], [0.9, 5.0]])
-    samples = march(origins, directions, full(), STEP, window=window, backend=backend)
+    samples = march(Rays(origins, directions), full(), STEP, window=window, backend=backend)
     first, second = samples.t.split(samples.offsets.diff().tolist())
     assert 0.6 < first.min() < first.max() < 0.7
     assert 0.9 < second.min() < second.max() < 1.0
@@ -122,21 +126,20 @@ def test_a_window_narrows_the_range(backend: str) -> None:
 @pytest.mark.parametrize("limit", [40, 1024])
 def test_a_window_leaves_samples_out_and_moves_none(backend: str, limit: int) -> None:
     grid = dust(4)
-    origins, directions = rays_through_the_cube(80)
+    rays = rays_through_the_cube(80)
     generator = torch.Generator().manual_seed(6)
     jitter = torch.rand(80, generator=generator)
     near = torch.rand(80, generator=generator) * 2 - 0.5
     far = near + torch.rand(80, generator=generator) * 1.5 - 0.1  # some are empty
     far[::7], near[::5] = torch.inf, 0.0
-    whole = march(origins, directions, grid, STEP, jitter=jitter, backend=backend)
+    whole = march(rays, grid, STEP, jitter=jitter, backend=backend)
     near[3], far[4] = whole.t[whole.ray == 3][2], whole.t[whole.ray == 4][-1]  # the latter excluded
     window, start = torch.stack((near, far), dim=1), None
     parts = []
     while start is None or (start >= 0).any():
         parts.append(
             march(
-                origins,
-                directions,
+                rays,
                 grid,
                 STEP,
                 window=window,
@@ -162,7 +165,7 @@ def test_the_jitter_shifts_the_samples_by_its_share_of_a_step(backend: str) -> N
     origins, directions = torch.tensor([[0.5, 0.5, -1.0]]), torch.tensor([[0.0, 0.0, 1.0]])
     for phase in (0.0, 0.25, 0.875):
         jitter = torch.tensor([phase])
-        samples = march(origins, directions, full(), STEP, jitter=jitter, backend=backend)
+        samples = march(Rays(origins, directions), full(), STEP, jitter=jitter, backend=backend)
         assert samples.t[0].item() == pytest.approx(1 + phase * STEP, abs=1e-6)
 
 
@@ -171,14 +174,14 @@ def test_rays_that_miss_or_make_no_sense_have_no_samples(backend: str) -> None:
     nan, inf = math.nan, math.inf
     origins = torch.tensor([[2.0, 2, 2], [0.5, 0.5, 0.5], [nan, 0, 0], [0.5, 0.5, 0.5], [0.5] * 3])
     directions = torch.tensor([[1.0, 0, 0], [0, 0, 0], [1, 0, 0], [nan, 1, 0], [inf, 1, 0]])
-    samples = march(origins, directions, full(), STEP, backend=backend)
+    samples = march(Rays(origins, directions), full(), STEP, backend=backend)
     assert len(samples) == 0
     assert samples.resume.tolist() == [-1] * 5
 
 
 def test_the_front_of_a_ray_is_its_first_samples() -> None:
-    origins, directions = rays_through_the_cube(30)
-    samples = march(origins, directions, dust(3), STEP)
+    rays = rays_through_the_cube(30)
+    samples = march(rays, dust(3), STEP)
     counts = torch.minimum(samples.offsets.diff(), torch.arange(30) % 5)
     front = samples.front(counts)
     assert torch.equal(front.offsets.diff(), counts)
@@ -216,17 +219,17 @@ def test_the_last_bit_of_a_word_is_a_cell_too() -> None:
     cells = torch.zeros(16, 16, 16, dtype=torch.bool)
     cells[3, 3, 3] = True  # bit 63, the sign
     origins, directions = torch.tensor([[-1.0, 3.5 / 16, 3.5 / 16]]), torch.tensor([[1.0, 0, 0]])
-    samples = march(origins, directions, Occupancy(cells), STEP, backend="cpu")
+    samples = march(Rays(origins, directions), Occupancy(cells), STEP, backend="cpu")
     assert len(samples) == pytest.approx(1 / 16 / STEP, abs=1)
 
 
 def test_wrong_arguments_are_named() -> None:
     origins = torch.zeros(2, 3)
     with pytest.raises(ValueError, match="directions: expected shape"):
-        march(origins, torch.zeros(3, 3), full(), STEP)
+        march(Rays(origins, torch.zeros(3, 3)), full(), STEP)
     with pytest.raises(ValueError, match="step: expected a positive length, got 0"):
-        march(origins, origins, full(), 0.0)
+        march(Rays(origins, origins), full(), 0.0)
     with pytest.raises(ValueError, match="limit: expected 1 or more, got 0"):
-        march(origins, origins, full(), STEP, limit=0)
+        march(Rays(origins, origins), full(), STEP, limit=0)
     with pytest.raises(ValueError, match="multiple of 16, got 24"):
         Occupancy(torch.zeros(24, 24, 24))

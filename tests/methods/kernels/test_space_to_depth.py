@@ -1,6 +1,6 @@
-"""What a network on cells is told and draws: gradients by finite differences, what it refuses.
+"""Rows and pixels of cells: gradients by finite differences, wrong inputs.
 
-Its values are compared with a dense network in `tests/methods/test_space_to_depth.py`.
+Its values are compared with a dense network in `tests/methods/steernerf/beyond/test_lean_renderer.py`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from methods.kernels.space_to_depth import Layout, draw, lift
+from methods.kernels.space_to_depth import CellInputs, Layout, depth_to_space, space_to_depth
 
 LAYOUT = Layout(channels=4, frames=1, scale=2, history=True, surface=True)
 CELLS = torch.tensor([0, 1, 5, 4])
@@ -29,10 +29,10 @@ def entries(*shape: int, below: int) -> Tensor:
     return torch.randint(-1, below, shape, generator=generator, dtype=torch.int32)
 
 
-def told(values: Tensor, alpha: Tensor, points: Tensor, surface: Tensor, **options):
+def rows_of(values: Tensor, alpha: Tensor, points: Tensor, surface: Tensor, **options):
     dtype = values.dtype
     history = numbers(4, 4, 3, dtype=dtype), entries(4, 4, below=1).to(dtype) + 1
-    return lift(
+    inputs = CellInputs(
         values,
         alpha,
         numbers(4, seed=2, dtype=dtype),
@@ -40,10 +40,8 @@ def told(values: Tensor, alpha: Tensor, points: Tensor, surface: Tensor, **optio
         [(points, entries(4, 6, below=POINTS))],
         history,
         (surface, entries(4, 4, below=SURFACE)),
-        LAYOUT,
-        (0.5, -0.5),
-        **options,
     )
+    return space_to_depth(inputs, LAYOUT, **options)
 
 
 def inputs(dtype: torch.dtype = torch.float64) -> list[Tensor]:
@@ -51,16 +49,16 @@ def inputs(dtype: torch.dtype = torch.float64) -> list[Tensor]:
     return [numbers(*shape, seed=i, dtype=dtype) for i, shape in enumerate(shapes)]
 
 
-def test_gradients_of_what_is_told_are_finite_differences() -> None:
+def test_gradients_of_rows_are_finite_differences() -> None:
     learned = [x.requires_grad_() for x in inputs()]
-    assert torch.autograd.gradcheck(partial(told, backend="reference"), learned)
+    assert torch.autograd.gradcheck(partial(rows_of, backend="reference"), learned)
 
 
-def test_gradients_of_what_is_drawn_are_finite_differences() -> None:
+def test_gradients_of_pixels_are_finite_differences() -> None:
     parts = [numbers(4, 4, 3), numbers(6, LAYOUT.width), numbers(6, 16), numbers(6, 15)]
     learned = [x.requires_grad_() for x in parts]
     assert torch.autograd.gradcheck(
-        lambda *x: draw(*x, layout=LAYOUT, backend="reference"), learned
+        lambda *x: depth_to_space(*x, layout=LAYOUT, backend="reference"), learned
     )
 
 
@@ -74,17 +72,17 @@ def test_an_index_that_names_no_point_is_refused(backend: str, wrong: int) -> No
     else:
         at_surface[2, 1] = wrong
     seen = (values, alpha, numbers(4, dtype=torch.float32), CELLS)
-    rest = (None, (surface, at_surface), LAYOUT)
+    given = CellInputs(*seen, [(points, index)], None, (surface, at_surface))
     with pytest.raises(ValueError, match="index: expected -1 to"):
-        lift(*seen, [(points, index)], *rest, backend=backend)
+        space_to_depth(given, LAYOUT, backend=backend)
 
 
 def test_columns_that_do_not_fit_the_layout_are_refused() -> None:
     values, alpha, points, surface = inputs()
     with pytest.raises(ValueError, match="surface values"):
-        told(values, alpha, points, surface[:, :-1])
+        rows_of(values, alpha, points, surface[:, :-1])
     drawn = numbers(4, 4, 3), numbers(4, LAYOUT.width), numbers(4, 16)
     with pytest.raises(ValueError, match="matrix"):
-        draw(*drawn, None, LAYOUT)
+        depth_to_space(*drawn, None, LAYOUT)
     with pytest.raises(ValueError, match="rows: expected one for each of 4 cells, got 3"):
-        draw(drawn[0], drawn[1][:3], drawn[2][:3], numbers(3, 15), LAYOUT)
+        depth_to_space(drawn[0], drawn[1][:3], drawn[2][:3], numbers(3, 15), LAYOUT)

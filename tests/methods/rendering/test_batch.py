@@ -32,10 +32,10 @@ def test_leaving_out_hidden_samples_changes_no_gradient(
     grads = [p.grad.clone() for p in field.parameters() if p.grad is not None]
     field.zero_grad()
 
-    samples = march(rays.origins, rays.directions, occupancy, STEP, jitter=jitter)
+    samples = march(rays, occupancy, STEP, jitter=jitter)
     sigma, geometry = field.density(samples.positions)
     values = field.features(geometry, field.encode_directions(rays.directions)[samples.ray])
-    whole = composite(sigma, values, samples.t, samples.delta, samples.offsets, background=white)
+    whole = composite(sigma, values, samples).over(white)
     whole.values.square().sum().backward()
 
     assert used < 0.9 * len(samples)

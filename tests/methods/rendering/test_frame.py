@@ -25,13 +25,13 @@ def test_no_ray_that_has_samples_is_left_out(
     occupancy = Occupancy(cloud[1].cells.cpu())
     camera = look_at_the_middle(turn, lift)
     pixels, rays = rays_at_matter(camera, occupancy)
-    everywhere = cast(camera)
-    counts = march(everywhere.origins, everywhere.directions, occupancy, STEP).offsets.diff()
+    every_ray = cast(camera)
+    counts = march(every_ray, occupancy, STEP).offsets.diff()
     left_out = torch.ones(len(counts), dtype=torch.bool)
     left_out[pixels] = False
     assert not counts[left_out].any()
     assert 0 < len(pixels) < len(counts)
-    torch.testing.assert_close(rays.directions, everywhere.directions[pixels])
+    torch.testing.assert_close(rays.directions, every_ray.directions[pixels])
 
 
 def test_a_camera_inside_the_matter_sees_it_in_all_pixels() -> None:

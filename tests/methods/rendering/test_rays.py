@@ -60,7 +60,7 @@ def test_faint_samples_are_black_and_not_looked_at(cloud: tuple[HashField, Occup
     seen = render_rays(field, rays, occupancy, NullProbe(), March(stop=stop))
     torch.testing.assert_close(seen.alpha, rendered.alpha, rtol=0, atol=0)
     missing = seen.alpha - seen.values[:, 0]
-    samples = march(rays.origins, rays.directions, occupancy, STEP).offsets.diff()
+    samples = march(rays, occupancy, STEP).offsets.diff()
     assert missing.min() > -1e-5
     assert (missing <= samples * FAINT * stop + 1e-5).all()
     assert missing.max() > 0

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -19,11 +21,8 @@ from bench.cameras import (
     scale_camera,
     unproject,
 )
-from bench.stress import StressCase
+from bench.case import U32, Case
 from bench.types import Camera
-
-U32 = 2.0**-24
-"""Unit roundoff of float32."""
 
 IDENTITY = torch.eye(4)[:3]
 ROLL = torch.tensor([[-1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0]])
@@ -43,75 +42,93 @@ CAMERAS = {
 }
 
 DEPTHS = (1e-20, 1e-3, 1.0, 1e6, 1e20)
-CELL = {("torch", "fp32"): 0.0}
+
+MOTION_UNITS = 64 * (32 + 42)
 
 
-def cases() -> list[StressCase]:
-    """There and back; planes of the camera; scales of scenes; motions."""
-    found = []
-    for name, camera in CAMERAS.items():
-        reach = max(abs(camera.cx), abs(camera.cy), camera.width, camera.height)
-        for depth in DEPTHS:
-            distance, units = _distance(camera), 8 * reach
-            if distance and depth < 1:
-                continue  # nearer than the roundings of where the camera is
-            if distance:
-                units += 8 * reach + 8 * max(camera.fx, camera.fy) * (1 + distance / depth)
-            found.append(
-                StressCase(
-                    "projection",
-                    f"{name}, depth {depth:g}",
-                    "a pixel unprojected and projected is where it was",
-                    "(u - c) / f and back, 4 roundings each at the size of the picture: 8 reach u; "
-                    "turned, as many more; away from the origin by r, 8 f (1 + r / z) u more",
-                    {("torch", "fp32"): units * U32},
-                    partial(_round_trip, camera, depth),
-                )
+def cases() -> list[Case]:
+    """Points projected and unprojected, at all scales; rigid motions."""
+    front = "its depth is not positive, its pixel finite"
+    return [
+        *(_round_trip(*kind) for kind in product(CAMERAS.items(), DEPTHS) if _resolved(*kind)),
+        _case(
+            "projection",
+            "behind the camera",
+            front,
+            ("comparisons: 0", 0),
+            partial(_not_in_front, (-1e20, -1.0, -1e-20)),
+        ),
+        _case(
+            "projection",
+            "on the camera's plane",
+            front,
+            ("comparisons: 0", 0),
+            partial(_not_in_front, (0.0, -0.0)),
+        ),
+        *(
+            _case(
+                "normalisation",
+                f"a scene {side:g} wide",
+                "rays of the unit cube go through the pixels of the data set's",
+                ("the camera's position rounded, projected: 16 (reach + f) u", 16 * (32 + 42)),
+                partial(_normalisation_error, side),
             )
-    for name, depths in (
-        ("behind the camera", (-1e20, -1.0, -1e-20)),
-        ("on the camera's plane", (0.0, -0.0)),
-    ):
-        found.append(
-            StressCase(
-                "projection",
-                name,
-                "its depth is not positive, its pixel finite",
-                "comparisons: 0",
-                CELL,
-                partial(_not_in_front, depths),
-            )
-        )
-    found += [
-        StressCase(
-            "normalisation",
-            f"a scene {side:g} wide",
-            "rays of the unit cube go through the pixels of the data set's",
-            "the camera's position rounded, projected: 16 (reach + f) u",
-            {("torch", "fp32"): 16 * (32 + 42) * U32},
-            partial(_normalisation_error, side),
-        )
-        for side in (1e-6, 1e6)
-    ]
-    found += [
-        StressCase(
+            for side in (1e-6, 1e6)
+        ),
+        _case(
             "cameras",
             "a quarter and back",
-            "intrinsics are what they were",
-            "powers of 2: 0",
-            CELL,
+            "intrinsics are unchanged",
+            ("powers of 2: 0", 0),
             _scaling_error,
         ),
-        StressCase(
+        _case(
             "cameras",
             "rigid motion of scene and camera",
-            "pixels stay where they are",
-            "points of size 3 in a rotation of 3 products, twice: 64 (reach + f) u",
-            {("torch", "fp32"): 64 * (32 + 42) * U32},
+            "pixels do not move",
+            (
+                "points of size 3 in a rotation of 3 products, twice: 64 (reach + f) u",
+                MOTION_UNITS,
+            ),
             _fixed_motion,
         ),
     ]
-    return found
+
+
+def _case(
+    subject: str,
+    name: str,
+    holds: str,
+    bound: tuple[str, float],
+    error: Callable[[str, str, str], float],
+) -> Case:
+    """`bound`: the derivation of the tolerance, and the tolerance in u."""
+    derivation, units = bound
+    return Case(subject, name, holds, derivation, {("torch", "fp32"): units * U32}, error)
+
+
+def _resolved(named: tuple[str, Camera], depth: float) -> bool:
+    """Whether a depth is larger than the roundings of the camera's position."""
+    return depth >= 1 or not _distance(named[1])
+
+
+def _round_trip(named: tuple[str, Camera], depth: float) -> Case:
+    name, camera = named
+    reach = max(abs(camera.cx), abs(camera.cy), camera.width, camera.height)
+    distance, units = _distance(camera), 8 * reach
+    if distance:
+        units += 8 * reach + 8 * max(camera.fx, camera.fy) * (1 + distance / depth)
+    return _case(
+        "projection",
+        f"{name}, depth {depth:g}",
+        "a pixel unprojected and projected is the same pixel",
+        (
+            "(u - c) / f and back, 4 roundings each at the size of the picture: 8 reach u; "
+            "turned, as many more; away from the origin by r, 8 f (1 + r / z) u more",
+            units,
+        ),
+        partial(_round_trip_error, camera, depth),
+    )
 
 
 def _distance(camera: Camera) -> float:
@@ -123,7 +140,9 @@ def _apart(got: Tensor, want: Tensor) -> float:
     return (got.double() - want.double()).abs().nan_to_num(nan=math.inf).max().item()
 
 
-def _round_trip(camera: Camera, depth: float, backend: str, device: str, precision: str) -> float:
+def _round_trip_error(
+    camera: Camera, depth: float, backend: str, device: str, precision: str
+) -> float:
     camera = place_camera(camera, device)
     pixels = pixel_grid(camera.width, camera.height, device)
     points = unproject(camera, pixels, torch.full_like(pixels[:, 0], depth))
@@ -180,7 +199,7 @@ def moved_by(camera: Camera, rotation: Tensor, translation: Tensor) -> Camera:
 
 
 def motion_error(seed: int, device: str) -> float:
-    """By how many pixels points of the unit cube move when they and the camera do together."""
+    """Pixels by which points of the unit cube move in the picture, moved with the camera."""
     rotation, translation = random_motion(seed)
     camera = CAMERAS["looking at the cube"]
     camera = place_camera(camera, device)

@@ -1,4 +1,4 @@
-"""The runner of stress cases: what counts as a fail, and that a crash is one."""
+"""The runner of cases: what counts as a fail, that a crash is one, that what is wrong has no time."""
 
 from __future__ import annotations
 
@@ -6,15 +6,17 @@ import math
 from collections.abc import Callable
 
 import pytest
+import torch
 
-from bench.stress import StressCase, failed, run_cases
+from bench.case import Agreement, Case, largest_error
+from bench.checking import failed, run_cases, timed_rows
 from bench.types import Log, Unavailable
 
 CELLS = {("cpu", "fp32"): 1e-6, ("reference", "fp64"): 1e-15}
 
 
-def case(worst: Callable[[str, str, str], float]) -> StressCase:
-    return StressCase("sum", "long", "nothing is lost", "u", CELLS, worst)
+def case(worst: Callable[[str, str, str], float]) -> Case:
+    return Case("sum", "long", "nothing is lost", "u", CELLS, worst)
 
 
 def raising(error: Exception) -> Callable[[str, str, str], float]:
@@ -64,3 +66,35 @@ def test_every_cell_of_every_case_gets_a_row(quiet_log: Log):
     assert asked == 2 * [("cpu", "cuda", "fp32"), ("reference", "cuda", "fp64")]
     assert [(row["backend"], row["precision"]) for row in rows] == 2 * list(CELLS)
     assert [row["tolerance"] for row in rows] == 2 * list(CELLS.values())
+
+
+def test_a_nan_is_an_infinite_error() -> None:
+    assert largest_error((torch.tensor([torch.nan]),), (torch.ones(1),)) == torch.inf
+
+
+@pytest.mark.parametrize("items", [None, 10])
+def test_a_backend_that_is_wrong_on_any_case_of_a_kernel_gets_no_time(items, quiet_log: Log):
+    def wrong(device: str):
+        return lambda backend: (torch.tensor([float(backend == "cpu")]),)
+
+    def right(device: str):
+        return lambda backend: (torch.zeros(1),)
+
+    kernel = Agreement("fake", ("reference", "cpu", "gpu"), "")
+    other = Agreement("other", ("reference", "cpu"), "")
+    cases = [
+        kernel.case("large", right, 0.5, items=1000),
+        kernel.case("no sample", wrong, 0.5, items=items),
+        other.case("large", right, 0.5, items=1000),
+        Agreement("never timed", ("cpu",), "").case("small", wrong, 0.5),
+    ]
+    found = timed_rows(cases, "cpu", ("reference", "cpu"), 2, quiet_log)
+    rows = {(row["kernel"], row["backend"]): row for row in found if row["case"] == "large"}
+    assert rows["fake", "reference"]["status"] == "ok"
+    assert rows["fake", "reference"]["ratio"] == 1
+    assert rows["fake", "cpu"]["status"] == "wrong: no sample"
+    assert "ms" not in rows["fake", "cpu"]
+    assert rows["other", "cpu"]["status"] == "ok"
+    assert rows["other", "cpu"]["mitems_s"] > 0
+    assert {row["backend"] for row in found} == {"reference", "cpu"}
+    assert {row["kernel"] for row in found} == {"fake", "other"}

@@ -1,4 +1,4 @@
-"""Engines on constants, on what they never saw, and on what is no number."""
+"""Cases of the engines: constants, numbers outside the calibration, NaN."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from bench.case import Case, Cell
 from bench.console import ConsoleLog
-from bench.stress import Cell, StressCase
 from methods.engines import Engine, Inputs, Precision
 from methods.engines.onnxruntime_engine import OnnxRuntime
 from methods.engines.openvino_engine import OpenVino
@@ -37,33 +37,33 @@ SIDE, BLOCKS = 16, 6
 """Cells along a side of the view; blocks of the network, each of which reaches a cell further."""
 
 
-def cases() -> list[StressCase]:
-    """Constants, numbers far beyond those an engine was calibrated on, a cell of NaN."""
+def cases() -> list[Case]:
+    """Constants, numbers far outside the calibration, a cell of NaN."""
     shares = {cell: TOLERANCE[cell[1]] for cell in CELLS}
     rounded = {cell: share for cell, share in shares.items() if cell[1] != "int8"}
     counted = {cell: 0.0 for cell in CELLS if cell[1] == "int8"}
-    same = "it says what the network says"
+    same = "the output is that of the network"
     return [
         _case("all inputs 0", same, SHARE, shares, partial(_error, 0.0)),
         # In int8 it saturates, layer by layer: no random view is as bright inside.
         _case("all inputs 1/2", same, SHARE, rounded, partial(_error, 0.5)),
         _case(
             "inputs up to 1e4",
-            "what it says is finite",
+            "the output is finite",
             "it is, or is not: 0",
             dict.fromkeys(CELLS, 0.0),
             _not_finite,
         ),
         _case(
-            "inputs 8 times as large as those seen",
-            "int8 saturates: twice as large, they say the same, number by number",
+            "inputs 8 times as large as in the calibration",
+            "int8 saturates: twice as large, they give the same output, number by number",
             "numbers that differ are counted: 0",
             counted,
             _not_saturated,
         ),
         _case(
             "a cell of NaN",
-            "it is reported, but in int8, and cells out of its reach say what they said",
+            "its output is NaN, but in int8; cells out of its reach are unchanged",
             SHARE,
             shares,
             _spread_of_nan,
@@ -77,9 +77,9 @@ def _case(
     derivation: str,
     tolerances: Mapping[Cell, float],
     worst: Callable[[str, str, str], float],
-) -> StressCase:
+) -> Case:
     # Engines take seconds to build.
-    return StressCase("engine", name, holds, derivation, tolerances, worst, slow=True)
+    return Case("engine", name, holds, derivation, tolerances, worst, slow=True)
 
 
 @cache
@@ -89,13 +89,13 @@ def _renderer() -> LeanRenderer:
 
 
 def _placed(rows: Tensor, device: str) -> Inputs:
-    """The network's inputs: `rows` and who is beside whom."""
+    """The network's inputs: `rows` and the neighbours of each."""
     neighbours = neighbours_of(torch.ones(1, SIDE, SIDE, dtype=torch.bool))
     return rows.to(device), neighbours.to(device)
 
 
 def _random_rows(seed: int) -> Tensor:
-    """What a view of 16 x 16 cells may look like."""
+    """Rows of a random view of 16 x 16 cells."""
     generator = torch.Generator().manual_seed(seed)
     return torch.rand(SIDE**2, _renderer().layout.width, generator=generator) - 0.5
 
@@ -105,7 +105,7 @@ def _built(engine: str, device: str, precision: Precision) -> Callable[..., Inpu
     """The network as an engine runs it, calibrated on random views.
 
     Raises:
-        Unavailable: the engine, or its precision, cannot be had on `device`.
+        Unavailable: the engine, or its precision, does not exist on `device`.
     """
     chosen = next(kind for kind in ENGINES if kind.name == engine)(precision)
     chosen.check(torch.device(device))
@@ -116,8 +116,8 @@ def _built(engine: str, device: str, precision: Precision) -> Callable[..., Inpu
         return chosen.build(network, lambda: views, lambda: Path(folder), log).run
 
 
-def _said(engine: str, device: str, precision: str, rows: Tensor) -> list[Tensor]:
-    """All that the engine says of `rows`, in float64."""
+def _outputs(engine: str, device: str, precision: str, rows: Tensor) -> list[Tensor]:
+    """All outputs of the engine for `rows`, in float64."""
     run = _built(engine, device, precision)
     with torch.no_grad():
         return [x.cpu().double().clone() for x in run(*_placed(rows, device))]
@@ -136,27 +136,27 @@ def _error(value: float, engine: str, device: str, precision: str) -> float:
     rows = torch.full_like(_random_rows(0), value)
     with torch.no_grad():
         want = [x.double() for x in _renderer().network(*_placed(rows, "cpu"))]
-    return _apart(_said(engine, device, precision, rows), want)
+    return _apart(_outputs(engine, device, precision, rows), want)
 
 
 def _not_finite(engine: str, device: str, precision: str) -> float:
-    """How many of the numbers said are not finite."""
-    said = _said(engine, device, precision, 2e4 * _random_rows(0))
-    return float(sum((~x.isfinite()).sum() for x in said))
+    """How many numbers of the output are not finite."""
+    outputs = _outputs(engine, device, precision, 2e4 * _random_rows(0))
+    return float(sum((~x.isfinite()).sum() for x in outputs))
 
 
 def _not_saturated(engine: str, device: str, precision: str) -> float:
-    """How many of the numbers said still change when inputs out of range double."""
+    """How many numbers of the output change when inputs out of range double."""
     rows = _random_rows(0).sign() * 4
-    once, twice = (_said(engine, device, precision, factor * rows) for factor in (1, 2))
+    once, twice = (_outputs(engine, device, precision, factor * rows) for factor in (1, 2))
     return float(sum((a != b).sum() for a, b in zip(once, twice, strict=True)))
 
 
 def _spread_of_nan(engine: str, device: str, precision: str) -> float:
     rows = _random_rows(0)
-    want = _said(engine, device, precision, rows)
+    want = _outputs(engine, device, precision, rows)
     rows[0] = torch.nan
-    got = _said(engine, device, precision, rows)
+    got = _outputs(engine, device, precision, rows)
     if precision != "int8" and not all(x[0].isnan().all() for x in got):
         return math.inf
     cell = torch.arange(SIDE**2)

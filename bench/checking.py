@@ -1,0 +1,103 @@
+"""Runs cases: all cells of each, and throughput where nothing is wrong."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from itertools import product
+from typing import Any
+
+import torch
+
+from bench.case import Case, Timed
+from bench.types import Log
+
+
+def run_cases(cases: Sequence[Case], devices: Sequence[str], log: Log) -> Iterator[dict[str, Any]]:
+    """The rows of all cells of `cases` on all `devices`, case by case; see `Case.check`."""
+    cells = sum(len(case.tolerances) for case in cases)
+    with log.progress("stress", cells * len(devices)) as progress:
+        for case, device in product(cases, devices):
+            for cell in case.tolerances:
+                progress.advance(0, note=f"{case.subject}, {case.name}: {' '.join(cell)}")
+                yield case.check(cell, device)
+                progress.advance(note="")
+
+
+def failed(row: Mapping[str, Any]) -> bool:
+    """Whether what must hold does not."""
+    return row["status"].startswith("failed")
+
+
+def timed_rows(
+    cases: Sequence[Case], device: str, backends: Collection[str], repeats: int, log: Log
+) -> list[dict[str, Any]]:
+    """One row for each timed case and each of the `backends` that it is for.
+
+    A row holds kernel, case, backend, dtype, error and tolerance (absolute, error None where it is
+    not finite), status ("ok", or which cases of the kernel the backend fails, timed or not), ms
+    (median of `repeats`), mitems_s (million items a second) and ratio (time of the reference over
+    that of this backend, the two timed in turn). A backend that fails any case of a kernel gets no
+    time.
+    """
+    subjects = {case.subject for case in cases if case.timed}
+    checked = [case for case in cases if case.subject in subjects and not case.slow]
+    results: list[tuple[Case, Timed, list[dict[str, Any]]]] = []
+    wrong: dict[tuple[str, str], list[str]] = {}
+    with log.progress("kernels", len(checked) + sum(bool(c.timed) for c in checked)) as progress:
+        for case in checked:
+            checks = [case.check(cell, device) for cell in case.tolerances if cell[0] in backends]
+            for check in filter(failed, checks):
+                wrong.setdefault((case.subject, check["backend"]), []).append(case.name)
+            if case.timed:
+                results.append((case, case.timed, checks))
+            progress.advance(note=f"{case.subject}, {case.name}")
+        rows = []
+        for case, timed, checks in results:
+            for check in checks:
+                if names := wrong.get((case.subject, check["backend"])):
+                    check["status"] = f"wrong: {', '.join(names)}"
+            correct = [check["backend"] for check in checks if check["status"] == "ok"]
+            times = _times_ms(timed, correct, repeats, device)
+            rows += [_row(case.name, timed, check, times) for check in checks]
+            progress.advance(note=f"timed: {case.subject}, {case.name}")
+    return rows
+
+
+def _row(
+    name: str, timed: Timed, check: Mapping[str, Any], times: Mapping[str, float]
+) -> dict[str, Any]:
+    backend = check["backend"]
+    row = {
+        "kernel": check["subject"],
+        "case": name,
+        "backend": backend,
+        "dtype": check["precision"],
+        **{key: check[key] for key in ("error", "tolerance", "status")},
+    }
+    if backend in times:
+        row["ms"] = times[backend]
+        row["mitems_s"] = timed.items / times[backend] / 1e3
+        if "reference" in times:
+            row["ratio"] = times["reference"] / times[backend]
+    return row
+
+
+def _times_ms(timed: Timed, backends: Sequence[str], repeats: int, device: str) -> dict[str, float]:
+    """Median milliseconds of each backend; they take turns, so that a drifting clock hits all."""
+    compute = timed.prepare(device)
+    times: dict[str, list[float]] = {name: [] for name in backends}
+    for _ in range(repeats):
+        for name in backends:
+            _synchronise(device)
+            begun = time.perf_counter()
+            compute(name)
+            _synchronise(device)
+            times[name].append(1e3 * (time.perf_counter() - begun))
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def _synchronise(device: str) -> None:
+    if device == "cuda":
+        torch.cuda.synchronize()
