@@ -24,6 +24,8 @@ SCHEMA = 1
 
 def main(options: argparse.Namespace) -> int:
     """Compare the store with a baseline, or write one; 1 if anything is worse or missing."""
+    if options.command == "compare":
+        return _compare(options)
     found = _by_command(Store(options.outputs))
     if options.record:
         _record(options.baseline, found)
@@ -48,7 +50,7 @@ def main(options: argparse.Namespace) -> int:
     return int(failed > 0)
 
 
-def compare(options: argparse.Namespace) -> int:
+def _compare(options: argparse.Namespace) -> int:
     """Print what the second of two runs of the store is, less the first; 1 if it is worse."""
     store = Store(options.outputs)
     keys = [_whole(store, key) for key in (options.old, options.new)]

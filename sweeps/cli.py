@@ -89,11 +89,11 @@ def dispatch(argv: Sequence[str]) -> int:
     if unread:
         known = re.findall(r"--[\w-]+", options.parser.format_help())
         raise unknown("argument", unread[0], set(known))
-    if options.module is None:
+    if options.command is None:
         parser.print_help()
         return 0
-    module = importlib.import_module(f"sweeps.{options.module}")
-    return getattr(module, options.function)(options)
+    module = COMMANDS[options.command].get("module", options.command)
+    return importlib.import_module(f"sweeps.{module}").main(options)
 
 
 def _parser() -> Parser:

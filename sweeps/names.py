@@ -50,7 +50,8 @@ def unknown(kind: str, name: str, existing: Iterable[str]) -> SteerbenchError:
     if old in REMOVED:
         return SteerbenchError(f"{kind} '{name}' was removed; its figures are in docs/log.md")
     if old:
-        return SteerbenchError(f"{kind} '{name}' was renamed; use {RENAMED[old]}{below}")
+        new = RENAMED[old] if " " in RENAMED[old] else f"{RENAMED[old]}{below}"
+        return SteerbenchError(f"{kind} '{name}' was renamed; use {new}")
     names = sorted(existing)
     near = _nearest(name, names)
     guess = f" Did you mean {' or '.join(near)}?" if near else ""

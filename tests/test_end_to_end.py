@@ -12,13 +12,12 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-import torch
 
 from bench.results import Store
-from sweeps import breakdown
+from sweeps.studies.breakdown import DENSE
 
 SMALL = ["scene.width=64", "scene.train=6", "scene.test=3", "budget=tiny", "budget.frames=0"]
-METHODS = ("ngp", "steernerf", "steernerf_paper")
+METHODS = ("ngp", "steernerf_lean", "steernerf")
 MEASURED_ANEW = ("frame_ms", "fps", "stage_ms", "train_s", "peak_bytes")
 """Metrics that differ from one run to the next on any machine."""
 
@@ -135,7 +134,7 @@ SMALLEST = [
     *("scene=totem", "scene.width=24", "scene.train=3", "scene.test=1"),
     *("budget=tiny", "budget.steps=16", "budget.samples=512", "budget.renderer_steps=8"),
     *("budget.frames=1", "protocol.name=quick", "protocol.lpips=[]", "protocol.warmup=0"),
-    *("method.grid.levels=4", "method.grid.log2_table=10", "method.pipeline.refined=0"),
+    *("method.grid.levels=4", "method.grid.log2_table=10", "method.rendering.refined=0"),
     *("method.joint.refined=0", "method.joint.patch=6", "method.joint.distilled_views=1"),
     *("method.joint.motion.pool=2", "method.joint.motion.uses=3"),
 ]
@@ -199,7 +198,7 @@ def test_skips_lists_the_work_of_a_frame_with_and_without_each_switch(
     assert dense["cells"] == 16 * 16
     assert found["empty space"]["samples"] < dense["samples"]
     assert found["all of these"]["samples"] <= found["empty space"]["samples"]
-    assert found["and rays taken over"]["rays"] <= found["all of these"]["rays"]
+    assert found["and a window of depths"]["samples"] <= found["all of these"]["samples"]
 
 
 def test_breakdown_divides_the_frame_and_names_every_line(first: tuple[Path, str]) -> None:
@@ -210,18 +209,13 @@ def test_breakdown_divides_the_frame_and_names_every_line(first: tuple[Path, str
     assert done.returncode == 0, done.stderr
     assert "torch, fp16: " in done.stderr  # and why it cannot be had
     found = {row["line"]: row for row in json.loads(done.stdout.splitlines()[-1])}
-    endings = ("", breakdown.AHEAD, breakdown.DENSE, breakdown.UNET)
-    lines = [f"torch, {precision}{ending}" for ending in endings for precision in ("fp32", "bf16")]
-    assert list(found) == [*lines, "Instant-NGP"]
+    precisions = ("torch, fp32", "torch, bf16")
+    endings = ("", DENSE, ", the paper's")
+    lines = [f"{precision}{ending}" for ending in endings for precision in precisions]
+    assert [line for line in found if "Instant-NGP" not in line] == lines
+    assert "Instant-NGP" in found
     for row in found.values():
-        assert sum(row[part] for part in breakdown.PARTS) == pytest.approx(row["frame_ms"])
-        if not row["line"].endswith(breakdown.AHEAD):
-            assert row["latency_ms"] == pytest.approx(row["frame_ms"])
-            assert row["lookahead"] == 0
-    usual, ahead = (found["torch, fp32" + ending] for ending in ("", breakdown.AHEAD))
-    assert ahead["psnr"] == usual["psnr"]
-    if torch.get_num_threads() > 1:
-        assert ahead["latency_ms"] > ahead["frame_ms"]
-        assert ahead["lookahead"] > 0
-    assert found["torch, fp32" + breakdown.UNET]["psnr"] is None  # it has hardly been trained
-    assert found["Instant-NGP"]["network"] == 0
+        assert sum(row["parts"].values()) == pytest.approx(row["frame_ms"])
+    assert {"field", "network", "surface"} <= set(found["torch, fp32"]["parts"])
+    assert found["torch, fp32, the paper's"]["psnr"] is None
+    assert found["Instant-NGP"]["psnr"] is not None

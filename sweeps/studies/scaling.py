@@ -46,8 +46,7 @@ class Point:
         value: what the value amounts to, for the fit.
         label: the value as it is shown.
         settings: the words that make it, as of `steerbench run`.
-        size: width and height of the frames; None: those of the trajectory.
-        threads: None: the default.
+        size: width and height of the frames; None: as the trajectory has them.
     """
 
     axis: str
@@ -55,14 +54,14 @@ class Point:
     label: str
     settings: tuple[str, ...] = ()
     size: tuple[int, int] | None = None
-    threads: int | None = None
 
 
 def _points(study: Study) -> Iterator[Point]:
     for width, height in SIZES:
         yield Point("pixels", width * height, f"{width} x {height}", size=(width, height))
     for threads in range(1, torch.get_num_threads() + 1):
-        yield Point("threads", threads, f"{threads} thread{'s' * (threads > 1)}", threads=threads)
+        label = f"{threads} thread{'s' * (threads > 1)}"
+        yield Point("threads", threads, label, (f"threads={threads}",))
     for name, axis in study.axes.items():
         for value, size in zip(axis.values, axis.size or axis.values, strict=True):
             yield Point(name, size, axis.label.format(value), (f"{axis.setting}={value}",))
@@ -130,15 +129,17 @@ def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) 
         )
     if point.size:
         cameras = [frame_camera(camera, *point.size) for camera in cameras]
-    with torch_threads(point.threads or torch.get_num_threads()):  # trained with the default
+    with torch_threads(config.threads or torch.get_num_threads()):  # trained with the default
         records, peak_bytes = _render(method, cameras, log)
     counters = dict.fromkeys(name for record in records for name in record.done)
+    frame_ms = statistics.mean(record.total_ns for record in records) / 1e6
     return {
         "axis": point.axis,
         "label": point.label,
         "value": point.value,
         "frames": len(records),
-        "frame_ms": statistics.mean(record.total_ns for record in records) / 1e6,
+        "frame_ms": frame_ms,
+        "fps": 1e3 / frame_ms,
         "p99_to_p50": p99_to_p50(records),
         **{
             f"work.{name}": statistics.mean(record.done.get(name, 0) for record in records)
@@ -174,6 +175,7 @@ def _table(title: str, axes: Mapping[str, Sequence[Row]]) -> Table:
     figures = {
         "frame_ms": ("ms / frame ↓", lambda ms: decimal(ms, 1)),
         "p99_to_p50": ("p99 / p50 ↓", lambda ratio: decimal(ratio, 2)),
+        "fps": ("FPS ↑", lambda fps: decimal(fps, 2)),
         **{name: (name.removeprefix("work.").replace("_", " "), amount) for name in counters},
         "peak_bytes": ("peak, MB ↓", megabytes),
         "size_bytes": ("model, MB ↓", megabytes),
@@ -184,7 +186,8 @@ def _table(title: str, axes: Mapping[str, Sequence[Row]]) -> Table:
             cells = (write(row.get(name, 0)) for name, (_, write) in figures.items())
             lines.append((row["label"], *cells))
         powers = (
-            "" if name == "p99_to_p50" else decimal(growth(rows, name), 2) for name in figures
+            "" if name in ("p99_to_p50", "fps") else decimal(growth(rows, name), 2)
+            for name in figures
         )
         lines.append((f"exponent of {axis}", *powers))
     return Table(title, ("", *(label for label, _ in figures.values())), tuple(lines))

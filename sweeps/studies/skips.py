@@ -7,30 +7,21 @@ from collections.abc import Iterator
 
 from bench.errors import SteerbenchError
 from bench.study import Study, Variant
-from reports.tables import Table, decimal, share
+from reports.tables import Table, share
 from sweeps.overrides import composed
 from sweeps.studies.variants import (
+    COMPARED,
     METHOD,
-    Rendered,
     Row,
     amount,
-    apart_text,
+    compared,
+    compared_cells,
     declared,
     print_rows,
-    range_text,
     render_variants,
     settings_of,
 )
 from sweeps.terminal import show
-
-COLUMNS = (
-    "skipped",
-    "PSNR to nothing skipped, dB ↑",
-    "PSNR, dB ↑",
-    "lost, dB ↓",
-    "frame, ms ↓",
-    "of rounds",
-)
 
 
 def main(options: argparse.Namespace) -> int:
@@ -46,11 +37,13 @@ def main(options: argparse.Namespace) -> int:
     # What was typed comes last, so that it counts.
     words = [*words[:2], *study.skips_with, *options.overrides]
     found = render_variants(settings_of(words, _variants(study)), options.frames, options.repeats)
-    rows = [_row(one, found[0]) for one in found]
-    work = list(found[0].work())
+    work = found[0].work()
+    none = dict.fromkeys(work, 0.0)
+    rows = [{"skipped": one.name, **compared(one, found[0]), **none, **one.work()} for one in found]
     title = f"{found[0].method.name}, {found[0].frames} frames: mean work of a frame, and its share"
-    lines = tuple(_line(row, rows[0], work) for row in rows)
-    show(Table(title, (*COLUMNS, *(name.replace("_", " ") for name in work)), lines))
+    columns = ("skipped", *COMPARED, *(name.replace("_", " ") for name in work))
+    lines = tuple(_line(row, rows[0], list(work)) for row in rows)
+    show(Table(title, columns, lines))
     print_rows(rows)
     return 0
 
@@ -70,27 +63,6 @@ def _variants(study: Study) -> Iterator[Variant]:
     yield from study.savings
 
 
-def _row(one: Rendered, standard: Rendered) -> Row:
-    values = one.values
-    return {
-        "skipped": one.name,
-        "apart": values["psnr_to_first"],
-        "psnr": values["psnr"],
-        "lost": standard.values["psnr"] - values["psnr"],
-        "frame_ms": values["ms"],
-        **{name: values[name] for name in ("ms_lo", "ms_hi")},
-        **dict.fromkeys(standard.work(), 0.0),
-        **one.work(),
-    }
-
-
 def _line(row: Row, dense: Row, work: list[str]) -> tuple[str, ...]:
-    return (
-        row["skipped"],
-        apart_text(row["apart"]),
-        decimal(row["psnr"], 2),
-        decimal(row["lost"], 3),
-        decimal(row["frame_ms"], 1),
-        range_text(row),
-        *(f"{amount(row[name])} ({share(row[name], dense[name])})" for name in work),
-    )
+    shares = (f"{amount(row[name])} ({share(row[name], dense[name])})" for name in work)
+    return row["skipped"], *compared_cells(row), *shares

@@ -102,9 +102,8 @@ def render_variants(
         fit_each(methods, configs, scene, path, log)
         rows = render_in_turns(methods, scene, path, protocol, repeats, log)
     return [
-        Rendered(name, declared(configs[name]), methods[name], scene, path, row)
-        for row in rows
-        for name in [row["setting"]]
+        Rendered(name, declared(configs[name]), method, scene, path, row)
+        for (name, method), row in zip(methods.items(), rows, strict=True)
     ]
 
 
@@ -217,9 +216,38 @@ def finite(row: Mapping[str, Any]) -> Row:
     }
 
 
-def apart_text(psnr: float) -> str:
-    """PSNR between two pictures for a table."""
-    return f"{psnr:.1f}" if math.isfinite(psnr) else "the same"
+COMPARED = (
+    "PSNR to the first, dB ↑",
+    "PSNR, dB ↑",
+    "lost, dB ↓",
+    "frame, ms ↓",
+    "of rounds",
+)
+"""The columns of `compared_cells`."""
+
+
+def compared(one: Rendered, first: Rendered) -> Row:
+    """The error and the time of a variant beside the first."""
+    values = one.values
+    return {
+        "apart": values["psnr_to_first"],
+        "psnr": values["psnr"],
+        "lost": first.values["psnr"] - values["psnr"],
+        "frame_ms": values["ms"],
+        **{name: values[name] for name in ("ms_lo", "ms_hi", "p99_to_p50")},
+    }
+
+
+def compared_cells(row: Row) -> tuple[str, ...]:
+    """The same for a table."""
+    apart = row["apart"]
+    return (
+        decimal(apart, 1) if math.isfinite(apart) else "the same",
+        decimal(row["psnr"], 2),
+        decimal(row["lost"], 3),
+        decimal(row["frame_ms"], 1),
+        range_text(row),
+    )
 
 
 def range_text(values: Mapping[str, Any]) -> str:

@@ -126,7 +126,8 @@ def unread(outputs: Path, stored_run: str) -> str:
     """The key of a second run beside the first, which an older version stored."""
     key = f"0{stored_run[1:]}"
     record = shutil.copytree(outputs / "runs" / stored_run, outputs / "runs" / key) / "record.json"
-    record.write_text(record.read_text().replace('"schema_version": 3', '"schema_version": 1'))
+    held = json.loads(record.read_text())
+    record.write_text(json.dumps(held | {"schema_version": 1}))
     return key
 
 

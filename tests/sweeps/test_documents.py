@@ -1,26 +1,50 @@
-"""What the documents tell a reader to write and to type does what they say."""
+"""What the documents tell a reader to write, to type and to open exists and does what they say."""
 
 from __future__ import annotations
 
+import ast
 import re
 import shlex
 import shutil
+import sys
+from argparse import Namespace
+from collections.abc import Iterator
 from pathlib import Path
 from textwrap import dedent
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import pytest
+from omegaconf import OmegaConf
 
 from reports import paper_tables
-from sweeps import overrides
+from sweeps import arguments, cli, overrides
+from sweeps.overrides import choices, composed, swept
 from sweeps.plan import chosen, plan
+from sweeps.studies.variants import METHOD
 
-DOCS = Path(__file__).parents[2] / "docs"
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
 
 SHOWN = re.compile(
     r"(?<=\n\n)(?:\d\. )?`([\w/]+\.(?:py|yaml|toml))`(?:(?!```).)*?\n *```\w+\n(.*?)\n *```\n",
     re.DOTALL,
 )
 """A paragraph that begins with the name of a file, and the block below it."""
+
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *DOCS.glob("*.md")])
+OLD = {"CHANGELOG.md", "RESULTS.md", "RESULTS-mic.md", "log.md"}
+"""Documents that keep the names of their time."""
+
+PRESENT = [path for path in DOCUMENTS if path.name not in OLD]
+
+ELSEWHERE = ("hydra", "--config-dir")
+"""What the words of a command begin with that need something that is not installed here."""
+
+
+def named(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
 
 
 def write_files(document: str, folder: Path) -> set[str]:
@@ -32,36 +56,237 @@ def write_files(document: str, folder: Path) -> set[str]:
     return {name for name, _ in shown}
 
 
-def test_the_method_and_the_scene_of_the_document_are_measured_from_outside_the_package(
-    steerbench, tmp_path, monkeypatch
-):
+# The examples of extending.md
+
+
+@pytest.fixture
+def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder that extending.md makes, with views of two greys."""
     written = write_files("extending.md", tmp_path)
-    assert {"mean_colour.py", "npz.py", "configs/method/mean_colour.yaml"} <= written
+    assert {"mean_colour/method.py", "mean_colour/average.py", "npz.py"} <= written
+    assert {"configs/method/mean_colour.yaml", "configs/scene/npz.yaml"} <= written
     # Half of the views to learn from, of the value 102; the others are off by 26.
     pictures = np.full((4, 32, 40, 3), 102, np.uint8)
     pictures[2:] = 128
     poses = np.broadcast_to(np.eye(4)[:3], (4, 3, 4))
     np.savez(tmp_path / "views.npz", pictures=pictures, poses=poses, focal=40.0)
     monkeypatch.syspath_prepend(tmp_path)  # PYTHONPATH=.
-    (typed,) = re.findall(r"PYTHONPATH=\. steerbench (.*)", (DOCS / "extending.md").read_text())
-    without_lpips = ("protocol.lpips=[]", "protocol.name=quick")
-    measured = steerbench(*shlex.split(typed), *without_lpips)
+    for name in ("mean_colour", "mean_colour.method", "mean_colour.average", "npz"):
+        monkeypatch.delitem(sys.modules, name, raising=False)  # of another test's folder
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def typed(command: str) -> list[str]:
+    """The words of the one command in extending.md that is `steerbench {command}`."""
+    text = (DOCS / "extending.md").read_text()
+    (line,) = re.findall(rf"PYTHONPATH=\. steerbench ({command} .*)", text)
+    return shlex.split(line)
+
+
+WITHOUT_LPIPS = ("protocol.lpips=[]", "protocol.name=quick")
+
+
+def test_the_method_and_the_scene_of_the_document_are_measured_from_outside_the_package(
+    steerbench, mine
+):
+    measured = steerbench(*typed("run"), *WITHOUT_LPIPS)
     assert measured.status == 0, measured.err
     assert "19.83" in measured.out  # 20 log10(255 / 26)
     assert "paint" in measured.out
-    with (tmp_path / "mean_colour.py").open("a") as file:
-        file.write("# changed\n")
-    steerbench(*shlex.split(typed), *without_lpips)
-    assert len(list(tmp_path.glob("outputs/runs/*/record.json"))) == 2
-    refused = steerbench(*shlex.split(typed), *without_lpips, "method.shade=2.0")
+    refused = steerbench(*typed("run"), *WITHOUT_LPIPS, "method.shade=2.0")
     assert refused.err.endswith("method: shade: expected 0 to 1, got 2.0\n")
+
+
+@pytest.mark.parametrize("module", ["method.py", "average.py"])
+def test_a_change_in_any_module_of_the_document_is_a_new_run(steerbench, mine, module):
+    steerbench(*typed("run"), *WITHOUT_LPIPS)
+    with (mine / "mean_colour" / module).open("a") as file:
+        file.write("# changed\n")
+    steerbench(*typed("run"), *WITHOUT_LPIPS)
+    assert len(list(mine.glob("outputs/runs/*/record.json"))) == 2
+
+
+def test_the_method_of_the_document_is_listed(steerbench, mine):
+    assert "The mean colour of the training pictures." in steerbench(*typed("list")).out
+
+
+def test_the_method_of_the_document_is_studied(steerbench, mine, monkeypatch):
+    monkeypatch.setattr("methods.checks.found", lambda name: [])  # no kernels
+    studied = steerbench(*typed("accuracy"), "--repeats", "1")
+    assert studied.status == 0, studied.err
+    assert "shade 0.9" in studied.out
+
+
+def test_the_method_of_the_document_has_a_line_in_a_table(mine, monkeypatch):
+    seen = captured(monkeypatch, typed("paper"))
+    (table,) = chosen(seen.table, seen.methods)
+    assert "mean_colour" in [job.line for job in plan(table, seen.overrides)]
+    assert captured(monkeypatch, typed("report")).methods == seen.methods
 
 
 def test_the_table_of_the_document_is_planned(tmp_path, monkeypatch):
     for part in (overrides.CONFIGS, paper_tables.FOLDER):
-        shutil.copytree(part, tmp_path / part.relative_to(DOCS.parent))
-    assert len(write_files("experiments.md", tmp_path)) == 2
+        shutil.copytree(part, tmp_path / part.relative_to(ROOT))
+    tables = {name for name in write_files("extending.md", tmp_path) if "table7" in name}
+    assert len(tables) == 2
     monkeypatch.setattr(overrides, "CONFIGS", tmp_path / "sweeps" / "configs")
     monkeypatch.setattr(paper_tables, "FOLDER", tmp_path / "reports" / "paper")
-    (table,) = chosen("table7")
+    (table,) = chosen("table7", [])
     assert [job.line for job in plan(table, [])] == [line.label for line in table.lines]
+
+
+# All documents
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text().split()) <= 1000
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=named)
+def test_every_link_of_a_document_leads_somewhere(path):
+    for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text()):
+        file, _, heading = target.partition("#")
+        if not re.match(r"https?:", target):
+            there = path.parent / file if file else path
+            assert there.exists(), f"{target}: no such file"
+            assert not heading or heading in headings(there), f"{target}: no such heading"
+
+
+def headings(path: Path) -> set[str]:
+    """The anchors of the headings of a document, as GitHub makes them."""
+    lines = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", line.lower()).replace(" ", "-") for line in lines}
+
+
+def commands(path: Path) -> list[list[str]]:
+    """The words of every `steerbench` command in the shell blocks of a document."""
+    blocks = re.findall(r"```sh\n(.*?)```", path.read_text(), re.DOTALL)
+    lines = re.sub(r"\\\n\s*", " ", "".join(blocks)).splitlines()
+    words = [shlex.split(line, comments=True) for line in lines]
+    return [line[1:] for line in words if line[:1] == ["steerbench"]]
+
+
+COMMANDS = [(named(path), words) for path in PRESENT for words in commands(path)]
+
+
+def captured(monkeypatch: pytest.MonkeyPatch, words: list[str]) -> Namespace:
+    """What the command of `words` would be called with."""
+    seen: list[Namespace] = []
+
+    def note(options: Namespace) -> int:
+        seen.append(options)
+        return 0
+
+    with monkeypatch.context() as patch:
+        imported = SimpleNamespace(main=note, compare=note)
+        patch.setattr(cli.importlib, "import_module", lambda name: imported)
+        assert cli.dispatch(words) == 0
+    return seen[0]
+
+
+@pytest.mark.parametrize(
+    ("document", "words"), COMMANDS, ids=lambda x: x if isinstance(x, str) else " ".join(x)
+)
+def test_every_command_of_a_document_can_be_typed(document, words, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    if words[0] == "run":
+        settings = [word for word in words[1:] if "=" in word and not word.startswith("-")]
+        if "-sc" in words:
+            return
+    else:
+        options = captured(monkeypatch, words)
+        usual = [METHOD] if words[0] in arguments.GROUPS[arguments.STUDIES] else []
+        settings = [*usual, *getattr(options, "overrides", [])]
+    settings = [word for word in settings if not word.startswith(ELSEWHERE)]
+    several = swept(settings)
+    settings = [word for word in settings if word.partition("=")[0] not in several]
+    first = [f"{name}={values[0]}" for name, values in several.items()]
+    if settings or first:
+        assert composed([*settings, *first]).method
+
+
+def test_there_are_commands_to_look_at():
+    assert len(COMMANDS) > 30
+    assert {words[0] for _, words in COMMANDS} >= {"run", "paper", "accuracy", "kernels", "check"}
+
+
+GROUPS = ("method", "scene", "trajectory", "protocol", "budget", "engine")
+
+
+def settings_there_are() -> set[str]:
+    """Every setting, and every group of settings, of any choice."""
+    found = set()
+    for group in GROUPS:
+        for name, path in choices(group).items():
+            inherits = group == "method"
+            node = composed([f"method={name}"]).method if inherits else OmegaConf.load(path)
+            settings: Any = OmegaConf.to_container(node, resolve=False)
+            for leaf in overrides.leaves(settings, f"{group}."):
+                parts = leaf.split(".")
+                found |= {".".join(parts[:n]) for n in range(1, len(parts) + 1)}
+    return found
+
+
+def test_every_setting_of_a_document_exists():
+    there = settings_there_are()
+    pattern = re.compile(rf"`((?:{'|'.join(GROUPS)})\.[a-z_0-9.]+)[`=]")
+    for path in PRESENT:
+        for name in pattern.findall(path.read_text()):
+            assert name in there, f"{named(path)}: {name}"
+
+
+def test_every_choice_of_a_document_exists():
+    pattern = re.compile(rf"`({'|'.join(GROUPS)})=(\w[\w-]*)[`\s]")
+    for path in PRESENT:
+        for group, name in pattern.findall(path.read_text()):
+            if name not in {"my_engine", "mine"}:
+                assert name in choices(group), f"{named(path)}: {group}={name}"
+
+
+FILE = re.compile(r"`((?:[\w.-]+/)*[\w-]+\.(?:py|yaml|toml|txt|md|safetensors))`")
+BESIDE = (".", "methods", "docs", "sweeps/configs", "methods/steernerf/training")
+"""Folders that names of files in documents are relative to."""
+
+
+@pytest.mark.parametrize("path", [p for p in PRESENT if p.name != "extending.md"], ids=named)
+def test_every_file_of_a_document_exists(path):
+    for name in FILE.findall(path.read_text()):
+        if "/" in name and not name.startswith("outputs/"):
+            assert any((ROOT / folder / name).exists() for folder in BESIDE), name
+
+
+def test_the_functions_that_implement_the_paper_are_where_the_document_says():
+    pairs = re.findall(r"`([\w/]+\.py)`: `([\w.]+)`", (DOCS / "steernerf.md").read_text())
+    assert len(pairs) > 15
+    for file, name in pairs:
+        (source,) = [
+            path
+            for folder in ("methods", "methods/steernerf/training")
+            if (path := ROOT / folder / file).exists()
+        ]
+        assert name in set(definitions(ast.parse(source.read_text()))), f"{file}: {name}"
+
+
+def definitions(node: ast.AST, prefix: str = "") -> Iterator[str]:
+    """The classes and functions in a module, and the methods of its classes."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.ClassDef | ast.FunctionDef):
+            yield f"{prefix}{child.name}"
+            yield from definitions(child, f"{prefix}{child.name}.")
+
+
+def test_every_equation_of_the_paper_has_a_place():
+    text = (DOCS / "steernerf.md").read_text()
+    numbers = re.findall(r"^\| (\d+) \|.*\| `[\w/]+\.py`: `", text, re.MULTILINE)
+    assert [int(number) for number in numbers] == list(range(1, 12))
+
+
+def test_the_citation_names_the_version_and_the_paper():
+    text = (ROOT / "CITATION.cff").read_text()
+    project = (ROOT / "pyproject.toml").read_text()
+    (version,) = re.findall(r'^version = "(.*)"$', project, re.MULTILINE)
+    citation: Any = OmegaConf.to_container(OmegaConf.create(text))
+    assert citation["version"] == version
+    assert citation["license"] == "MIT"
+    assert "2212.08476" in text

@@ -11,8 +11,13 @@ from bench.study import Study, Variant
 from sweeps.overrides import choices, composed
 from sweeps.studies.variants import declared
 
-METHODS = list(choices("method"))
-AFTERWARDS = ("rendering", "engine")
+OF_CLASS = {
+    composed([f"method={name}"]).method._target_: name for name in reversed(choices("method"))
+}
+METHODS = sorted(OF_CLASS.values())
+"""One method of every class: those of one class declare the same."""
+
+AFTERWARDS = ("rendering", "engine", "stop")
 """Settings of a method that a training does not depend on."""
 
 
