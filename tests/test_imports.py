@@ -17,7 +17,7 @@ MAY_IMPORT = {
     "sweeps": {"bench", "reports", "sweeps"},
 }
 REACHES = {
-    "sweeps/accuracy.py": "methods.checks.",
+    "sweeps/studies/accuracy.py": "methods.checks.",
     "sweeps/kernels.py": ("methods.checks.", "methods.kernels."),
     "sweeps/catalogue.py": "methods.kernels.",
     "sweeps/stress.py": "methods.checks.",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -35,8 +36,7 @@ def small_model(**others: Any) -> Model:
 
 def small_rendering(**others: Any) -> Rendering:
     """As `small_model()` is trained, but without refinement; `others` replace fields."""
-    fields: dict[str, Any] = {"step": 8.0, "stop": STOP}
-    return Rendering(**fields | others)
+    return replace(Rendering.in_training(small_model(), refined=0.0), **others)
 
 
 def shell() -> Occupancy:

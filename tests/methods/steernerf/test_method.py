@@ -197,8 +197,10 @@ def test_no_field_of_a_rendering_is_in_the_key_of_a_training(name: str) -> None:
 
 
 def test_training_renders_everywhere_whatever_is_chosen_afterwards() -> None:
-    model = small_model(step=2.0, stop=1e-2)
-    assert Rendering.in_training(model, 0.2) == Rendering(2.0, 1e-2, refined=0.2)
+    rendering = Rendering.in_training(small_model(step=2.0, stop=1e-2), refined=0.2)
+    assert (rendering.step, rendering.stop, rendering.refined) == (2.0, 1e-2, 0.2)
+    assert (rendering.range.mode, rendering.overlap, rendering.refined_step) == ("off", 0.0, 1.0)
+    assert rendering.skip == Skips()
 
 
 def refused(**others: Any) -> SteerNerf:
