@@ -17,13 +17,27 @@ MAY_IMPORT = {
     "sweeps": {"bench", "reports", "sweeps"},
 }
 REACHES = {
-    "sweeps/accuracy.py": "methods.checks.",
+    "sweeps/studies/accuracy.py": "methods.checks.",
     "sweeps/kernels.py": ("methods.checks.", "methods.kernels."),
     "sweeps/catalogue.py": "methods.kernels.",
     "sweeps/stress.py": "methods.checks.",
 }
 """What measures and lists parts of methods reaches them directly; methods only through
 `_target_`."""
+
+STANDS_ON = {
+    "kernels": set(),
+    "engines": {"kernels"},
+    "rendering": {"kernels"},
+    "training": {"kernels"},
+    "instant_ngp": {"kernels", "rendering", "training"},
+    "steernerf": {"kernels", "engines", "rendering", "training", "instant_ngp"},
+}
+"""The folders of `methods` from which each may import, beside itself; `methods/checks.py` stands
+above them all."""
+
+IMPLEMENTATIONS = {"reference", "cpu", "gpu"}
+"""Files of a kernel's folder that the kernel alone knows: all others call its interface."""
 
 SOURCES = sorted(
     path.relative_to(ROOT) for name in PACKAGES for path in (ROOT / name).rglob("*.py")
@@ -49,6 +63,31 @@ def test_a_module_imports_only_from_packages_below_it(path):
         if target in PACKAGES and target not in MAY_IMPORT[package]:
             assert str(path) in REACHES, f"{path} imports {name}"
             assert name.startswith(REACHES[str(path)]), f"{path} imports {name}"
+
+
+METHODS = [path for path in SOURCES if path.parts[0] == "methods" and len(path.parts) > 2]
+
+
+@pytest.mark.parametrize("path", METHODS, ids=str)
+def test_a_method_stands_on_the_floors_below_it(path):
+    folder = path.parts[1]
+    for name, _ in imports(path):
+        package, *rest = name.split(".")
+        if package == "methods" and rest[0] != folder:
+            assert rest[0] in STANDS_ON[folder], f"{path} imports {name}"
+
+
+def test_no_floor_stands_on_one_above_it():
+    for folder, below in STANDS_ON.items():
+        assert all(STANDS_ON[other] < below for other in below), folder
+
+
+@pytest.mark.parametrize("path", METHODS, ids=str)
+def test_an_implementation_of_a_kernel_is_known_to_that_kernel_alone(path):
+    for name, _ in imports(path):
+        parts = name.split(".")
+        if parts[:2] == ["methods", "kernels"] and IMPLEMENTATIONS & set(parts[3:]):
+            assert path.parts[:3] == (*parts[:3],), f"{path} imports {name}"
 
 
 @pytest.mark.parametrize(("library", "home"), [("numba", "cpu.py"), ("triton", "gpu.py")])

@@ -120,11 +120,11 @@ class Rendering:
 
     step: float
     stop: float
-    range: RangeReduction = RangeReduction()
-    overlap: float = 0.0
-    refined: float = 0.0
-    refined_step: float = 1.0
-    skip: Skips = Skips()
+    range: RangeReduction
+    overlap: float
+    refined: float
+    refined_step: float
+    skip: Skips
 
     def __post_init__(self) -> None:
         check_step("step", self.step)
@@ -138,7 +138,15 @@ class Rendering:
     def in_training(cls, model: Model, refined: float) -> Rendering:
         """How `model` is rendered while it is trained: rays look everywhere, so that one training
         serves all choices; a share `refined` of the cells is refined."""
-        return cls(model.step, model.stop, refined=refined)
+        return cls(
+            model.step,
+            model.stop,
+            RangeReduction(mode="off"),
+            overlap=0.0,
+            refined=refined,
+            refined_step=1.0,
+            skip=Skips(),
+        )
 
     @property
     def march(self) -> March:

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from methods.rendering.batch import FeatureFrame
-from methods.steernerf.beyond.lean_renderer import SpaceToDepth
+from methods.rendering.frame import FeatureFrame
+from methods.steernerf.beyond.lean_renderer import LeanRenderer
 from methods.steernerf.renderer import Detail, Observation, Points, Renderer2d, cells_at_matter
 from tests.methods.conftest import look_at_the_middle
 
@@ -40,12 +40,11 @@ def observe(
     matter: Tensor | None = None,
     history: bool = True,
     surface: bool = True,
-    phase: tuple[float, float] = (0.0, 0.0),
     seed: int = 0,
 ) -> Observation:
     """Random features in steps of 1/256 where there is `matter` [h, w], the background elsewhere.
 
-    Preceding points land on a third of the pixels of cells with matter; the preceding picture, and
+    Preceding points are on a third of the pixels of cells with matter; the preceding picture, and
     the surface, are known in two thirds of them. Points of the surface have an opacity, too.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -56,18 +55,18 @@ def observe(
     values = torch.where(matter[..., None], values, background)
     fine = matter.repeat_interleave(scale, 0).repeat_interleave(scale, 1)
 
-    def land(share: float, features: int) -> Points:
+    def scattered(share: float, features: int) -> Points:
         points = torch.rand(POINTS, features, generator=generator)
         index = torch.randint(POINTS, fine.shape, generator=generator, dtype=torch.int32)
         shown = fine & (torch.rand(fine.shape, generator=generator) < share)
         return Points(points, torch.where(shown, index, -1))
 
-    preceding = [land(0.33, channels) for _ in range(frames)]
+    preceding = [scattered(0.33, channels) for _ in range(frames)]
     cells = cells_at_matter(matter.float(), preceding)
     valid = torch.rand(height, width, scale**2, generator=generator) < 0.66
     valid = (valid & matter[..., None]).float()
     picture = torch.rand(height, width, scale**2, 3, generator=generator) * valid[..., None]
-    at_surface = land(0.66, channels + 1)
+    at_surface = scattered(0.66, channels + 1)
     index = to_blocks(at_surface.index[..., None], scale).squeeze(-1)
     frame = FeatureFrame(CAMERA, values, torch.where(matter, 1.5, torch.inf), matter.float())
     return Observation(
@@ -77,7 +76,6 @@ def observe(
         cells,
         Detail(picture.flatten(0, 1)[cells], valid.flatten(0, 1)[cells]) if history else None,
         Points(at_surface.values, index.flatten(0, 1)[cells]) if surface else None,
-        phase,
     )
 
 
@@ -167,8 +165,8 @@ def features_of(observation: Observation) -> Iterator[Tensor]:
 
 def new_renderer(
     channels: int = 6, frames: int = 2, scale: int = 4, *, width: int = 16, blocks: int = 2, **rest
-) -> SpaceToDepth:
-    return SpaceToDepth(channels, frames, scale, width=width, blocks=blocks, init="scratch", **rest)
+) -> LeanRenderer:
+    return LeanRenderer(channels, frames, scale, width=width, blocks=blocks, init="scratch", **rest)
 
 
 def to_picture(blocks: Tensor, scale: int) -> Tensor:
@@ -200,7 +198,7 @@ def before(observation: Observation, scale: int) -> tuple[Tensor, Tensor]:
 
 
 def enlarged(observation: Observation, scale: int) -> Tensor:
-    """[H, W, 3], at a phase of 0."""
+    """[H, W, 3]: the present colours, bilinear, the corners at the centres of corner pixels."""
     rgb = observation.frame.values[..., :3].permute(2, 0, 1)[None]
     large = functional.interpolate(rgb, scale_factor=scale, mode="bilinear", align_corners=False)
     return large[0].permute(1, 2, 0)

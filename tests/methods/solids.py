@@ -22,13 +22,16 @@ class Solid:
 
     def __init__(self, *shapes: Shape, density: float = DENSITY, channels: int = 4) -> None:
         self.shapes, self.solid, self.channels = shapes, density, channels
-        self.table = torch.zeros(1)
+
+    @property
+    def device(self) -> torch.device:
+        return torch.device("cpu")
 
     def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         inside = torch.stack([shape(positions) > 0 for shape in self.shapes]).any(dim=0)
         return self.solid * inside, positions
 
-    def features(self, geometry: Tensor, directions: Tensor) -> Tensor:
+    def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
         values = torch.cat((geometry.clamp(0, 1), torch.full_like(geometry[:, :1], 0.25)), dim=1)
         return values[:, : self.channels]
 

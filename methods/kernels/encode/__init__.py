@@ -37,7 +37,7 @@ class HashGrid:
 
     levels: int = 16
     features: int = 2
-    log2_table: int = 19
+    log2_table: int = 17
     n_min: int = 16
     n_max: int = 1024
 

@@ -91,35 +91,23 @@ def test_the_gradient_of_a_huge_density_is_clamped() -> None:
     torch.testing.assert_close(log_density.grad, torch.stack((1 / edge, edge / edge, edge)))
 
 
-@pytest.mark.parametrize("levels", [1, 3, 4])
-def test_the_work_of_a_field_is_what_torch_counts(levels: int) -> None:
-    made, work = field("fp32", channels=6).coarse(levels), Work()
+def test_the_work_of_a_field_is_what_torch_counts() -> None:
+    made, work = field("fp32", channels=6), Work()
     made.count(work, 200, 200)
     with FlopCounterMode(display=False) as counter:
         evaluate(made)
     assert 2 * work.done["products"] == counter.get_total_flops()
-    assert work.done["table_reads"] == 200 * levels * 8
+    assert work.done["table_reads"] == 200 * GRID.levels * 8
 
 
-@pytest.mark.parametrize("precision", ["bf16", "fp32"])
-def test_a_coarse_field_is_one_whose_finer_levels_hold_nothing(precision: str) -> None:
-    whole, emptied = field(precision), field(precision)
-    with torch.no_grad():
-        emptied.table[GRID.offsets[2] :] = 0
-    emptied.repack()
-    for got, want in zip(evaluate(whole.coarse(2)), evaluate(emptied), strict=True):
-        torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-6)
-
-
-def test_what_a_coarse_field_learns_the_field_has_learned() -> None:
-    whole = field("fp32")
-    coarse = whole.coarse(2)
-    sigma, features = evaluate(coarse)
-    (sigma.sum() + features.sum()).backward()
-    assert coarse.table is whole.table
-    gradient = whole.table.grad
-    assert gradient is not None
-    assert gradient[: GRID.offsets[2]].any()
-    assert not gradient[GRID.offsets[2] :].any()
-    whole.widen(6)
-    assert coarse.layers["feature_out"] is whole.layers["feature_out"]
+def test_features_that_are_appended_are_one_half_everywhere() -> None:
+    made = field("fp32")
+    before = evaluate(made)
+    made.widen(6)
+    sigma, features = evaluate(made)
+    assert made.channels == 6
+    assert torch.equal(sigma, before[0])
+    torch.testing.assert_close(features[:, :3], before[1], rtol=0, atol=1e-6)
+    assert (features[:, 3:] == 0.5).all()
+    with pytest.raises(ValueError, match="channels: expected at least 6, got 5"):
+        made.widen(5)

@@ -8,13 +8,8 @@ import torch
 from bench.metrics import psnr
 from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene
 from methods.instant_ngp.method import InstantNgp
-from methods.instant_ngp.stage1 import Pretrained
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.encode import HashGrid
-from methods.kernels.march import Occupancy
-from methods.steernerf.range_reduction import KEPT_ALPHA, RangeReduction
-from tests.methods.conftest import Work, look_at_the_middle
-from tests.methods.solids import Solid, ball
 
 GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
 
@@ -69,40 +64,21 @@ def test_frames_do_not_depend_on_one_another(ball_scene: Scene, quiet_log: Log) 
     assert torch.equal(method.render(first, NullProbe()).rgb, alone)
 
 
-def of_a_ball(**options) -> InstantNgp:
-    """A method whose field is a solid ball, with some space around it to look through."""
-    method = InstantNgp(grid=GRID, training=TrainingOptions(), device="cpu", **options)
-    axis = (torch.arange(32) + 0.5) / 32
-    cells = torch.cartesian_prod(axis, axis, axis).view(32, 32, 32, 3)
-    occupancy = Occupancy((cells - 0.5).norm(dim=-1) < 0.45)
-    method.trained = Pretrained(Solid(ball(), channels=3), occupancy, 0.0)  # type: ignore[arg-type]
-    method.background = torch.ones(3)
-    return method
-
-
-def test_a_guided_frame_is_much_like_one_that_stands_alone() -> None:
-    alone, guided = of_a_ball(), of_a_ball(range=RangeReduction(epsilon=0.06))
-    assert (alone.memory, guided.memory) == (0, 1)
-    first, second = look_at_the_middle(0.2, 0.3), look_at_the_middle(0.203, 0.3)
-    counts = []
-    for method in (alone, guided):
-        method.reset()
-        cold, warm = Work(), Work()
-        frames = [method.render(first, cold), method.render(second, warm)]
-        counts.append((cold.done["samples"], warm.done["samples"], frames))
-    (cold_alone, all_samples, whole), (cold_guided, fewer, narrowed) = counts
-    # The first frame of a sequence has nothing to be guided by.
-    assert cold_guided == cold_alone
-    assert torch.equal(narrowed[0].rgb, whole[0].rgb)
-    # Rays end at KEPT_ALPHA of what is expected: that share of their colour, in [0, 1], is
-    # missing.
-    missing = 1 - KEPT_ALPHA + 1e-4
-    torch.testing.assert_close(narrowed[1].rgb, whole[1].rgb, rtol=0, atol=missing)
-    assert fewer < 0.9 * all_samples
-
-    guided.reset()
-    again = guided.render(second, NullProbe())
-    assert torch.equal(again.rgb, whole[1].rgb)
+@pytest.mark.parametrize(
+    ("has_products", "precision", "said"),
+    [
+        (True, "bf16", "bf16"),
+        (False, "bf16", "bf16 in fp32"),
+        (True, "fp32", "fp32"),
+        (False, "fp32", "fp32"),
+    ],
+)
+def test_settings_say_in_which_precision_a_field_is_multiplied(
+    monkeypatch: pytest.MonkeyPatch, has_products: bool, precision: str, said: str
+) -> None:
+    monkeypatch.setattr("methods.instant_ngp.stage1.multiplies_bf16", lambda kind: has_products)
+    method = InstantNgp(grid=GRID, training=TrainingOptions(), device="cpu", precision=precision)
+    assert method.settings()["precision"] == said
 
 
 def test_a_packed_table_needs_two_features() -> None:

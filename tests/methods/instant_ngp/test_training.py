@@ -13,29 +13,28 @@ from bench.console import ConsoleLog
 from bench.sharing import locked
 from bench.types import Budget, Log, Scene, Split, SteerbenchError
 from methods.instant_ngp.field import HashField
-from methods.instant_ngp.training import (
-    MIN_RAYS,
-    FieldTraining,
-    PixelBatches,
-    TrainingOptions,
-    train_field,
-)
+from methods.instant_ngp.stage1 import Setup, train_field
+from methods.instant_ngp.training import MIN_RAYS, FieldTraining, PixelBatches, TrainingOptions
 from methods.kernels.encode import HashGrid
 from methods.training import checkpoint, loop
 
 GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
 BUDGET = Budget("test", steps=40, samples=4096)
+SETUP = Setup.resolved(GRID, TrainingOptions(), "bf16", "auto", "cpu", seed=0)
 
 
 def new_field() -> HashField:
     return HashField(GRID, generator=torch.Generator().manual_seed(0))
 
 
-def trained(scene: Scene, folder: Path, log: Log) -> HashField:
-    field = new_field()
-    folder.mkdir(parents=True, exist_ok=True)
-    train_field(field, scene, BUDGET, TrainingOptions(), 0, folder, log)
-    return field
+def trained(scene: Scene, root: Path) -> HashField:
+    """The field that is trained with `root` as the folder of all results."""
+    return train_field(SETUP, scene, BUDGET, ConsoleLog(root, quiet=True)).field
+
+
+def stage(scene: Scene, root: Path) -> Path:
+    """Where that field is kept."""
+    return ConsoleLog(root, quiet=True).stage_dir("field", SETUP.key(scene, BUDGET))
 
 
 def test_rays_go_through_the_pixels_whose_colours_they_carry(ball_scene: Scene) -> None:
@@ -75,19 +74,17 @@ def test_the_learning_rate_falls_from_the_first_to_the_last_step(ball_scene: Sce
     assert rates[-1] == pytest.approx(1e-2 / 30)
 
 
-def test_the_same_seed_gives_the_same_bits(
-    ball_scene: Scene, tmp_path: Path, quiet_log: Log
-) -> None:
-    first = trained(ball_scene, tmp_path / "first", quiet_log)
-    second = trained(ball_scene, tmp_path / "second", quiet_log)
+def test_the_same_seed_gives_the_same_bits(ball_scene: Scene, tmp_path: Path) -> None:
+    first = trained(ball_scene, tmp_path / "first")
+    second = trained(ball_scene, tmp_path / "second")
     assert torch.equal(first.table, second.table)
     assert all(torch.equal(first.layers[n], second.layers[n]) for n in first.layers)
 
 
 def test_a_killed_training_ends_as_if_it_had_never_stopped(
-    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+    ball_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = trained(ball_scene, tmp_path / "whole", quiet_log)
+    whole = trained(ball_scene, tmp_path / "whole")
 
     monkeypatch.setattr(loop, "CHECKPOINT_S", -1.0)  # after every step
     advance = FieldTraining.advance
@@ -98,54 +95,59 @@ def test_a_killed_training_ends_as_if_it_had_never_stopped(
         return advance(training)
 
     monkeypatch.setattr(FieldTraining, "advance", killed_at_23)
-    folder = tmp_path / "killed"
+    root = tmp_path / "killed"
     with pytest.raises(KeyboardInterrupt):
-        trained(ball_scene, folder, quiet_log)
+        trained(ball_scene, root)
+    folder = stage(ball_scene, root)
     assert {path.name for path in folder.iterdir()} == {"checkpoint.safetensors", "lock"}
 
     monkeypatch.setattr(FieldTraining, "advance", advance)
-    resumed = trained(ball_scene, folder, quiet_log)
+    resumed = trained(ball_scene, root)
     assert torch.equal(resumed.table, whole.table)
     assert {path.name for path in folder.iterdir()} == {"field.safetensors", "lock"}
 
 
-def test_a_finished_training_is_loaded(ball_scene: Scene, tmp_path: Path, quiet_log: Log) -> None:
-    first = trained(ball_scene, tmp_path, quiet_log)
-    written = (tmp_path / "field.safetensors").stat().st_mtime_ns
-    second = trained(ball_scene, tmp_path, quiet_log)
+def test_a_finished_training_is_loaded(
+    ball_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = trained(ball_scene, tmp_path)
+    written = (stage(ball_scene, tmp_path) / "field.safetensors").stat().st_mtime_ns
+    monkeypatch.delattr(FieldTraining, "advance")
+    second = trained(ball_scene, tmp_path)
     assert torch.equal(first.table, second.table)
     assert torch.equal(first.packed, second.packed)
-    assert (tmp_path / "field.safetensors").stat().st_mtime_ns == written
+    assert (stage(ball_scene, tmp_path) / "field.safetensors").stat().st_mtime_ns == written
 
 
 def test_who_finds_the_same_training_under_way_waits_and_loads_its_result(
     ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = trained(ball_scene, tmp_path / "first", quiet_log)
+    first = trained(ball_scene, tmp_path / "first")
     monkeypatch.delattr(FieldTraining, "advance")
-    folder = tmp_path / "shared"
-    folder.mkdir()
+    made = stage(ball_scene, tmp_path / "first") / "field.safetensors"
+    folder = stage(ball_scene, tmp_path / "shared")
 
-    class Told(ConsoleLog):
+    class Waiting(ConsoleLog):
         """A log whose first line, that of waiting, lets the other one end."""
 
         def info(self, message: str) -> None:
             said.append(message)
             if len(said) == 1:
-                (tmp_path / "first" / "field.safetensors").rename(folder / "field.safetensors")
+                made.rename(folder / "field.safetensors")
                 other.close()
 
     said: list[str] = []
     other = ExitStack()
     other.enter_context(locked(folder / "lock", "", quiet_log))
-    second = trained(ball_scene, folder, Told(tmp_path, quiet=True))
+    log = Waiting(tmp_path / "shared", quiet=True)
+    second = train_field(SETUP, ball_scene, BUDGET, log).field
     assert f"waits for another process that makes the same: {folder}" in said[0]
     assert torch.equal(first.table, second.table)
     assert torch.equal(first.packed, second.packed)
 
 
 def test_a_loss_that_is_no_number_stops_and_keeps_the_last_good_checkpoint(
-    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+    ball_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(loop, "CHECKPOINT_S", -1.0)
     advance = FieldTraining.advance
@@ -158,15 +160,15 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_last_good_checkpoint(
 
     monkeypatch.setattr(FieldTraining, "advance", spoiled_at_10)
     with pytest.raises(SteerbenchError, match=r"step 10.*feature_mid.*last good checkpoint"):
-        trained(ball_scene, tmp_path, quiet_log)
+        trained(ball_scene, tmp_path)
     training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
-    loop.resume(training, tmp_path / "checkpoint.safetensors")
+    loop.resume(training, stage(ball_scene, tmp_path) / "checkpoint.safetensors")
     assert training.step == 10
     assert all(layer.isfinite().all() for layer in training.field.layers.values())
 
 
 def test_a_training_that_went_bad_in_its_last_step_is_not_finished(
-    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+    ball_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     update = FieldTraining._update
 
@@ -178,26 +180,25 @@ def test_a_training_that_went_bad_in_its_last_step_is_not_finished(
 
     monkeypatch.setattr(FieldTraining, "_update", spoiled)
     with pytest.raises(SteerbenchError, match=r"step 40: not finite: table"):
-        trained(ball_scene, tmp_path, quiet_log)
-    assert [path.name for path in tmp_path.iterdir()] == ["lock"]
+        trained(ball_scene, tmp_path)
+    assert [path.name for path in stage(ball_scene, tmp_path).iterdir()] == ["lock"]
 
 
-def test_a_damaged_field_is_named_with_what_to_do(
-    ball_scene: Scene, tmp_path: Path, quiet_log: Log
-) -> None:
-    (tmp_path / "field.safetensors").write_bytes(b"half a file")
+def test_a_damaged_field_is_named_with_what_to_do(ball_scene: Scene, tmp_path: Path) -> None:
+    (stage(ball_scene, tmp_path) / "field.safetensors").write_bytes(b"half a file")
     with pytest.raises(SteerbenchError, match=r"field\.safetensors.*remove it, and it is made"):
-        trained(ball_scene, tmp_path, quiet_log)
+        trained(ball_scene, tmp_path)
 
 
 @pytest.mark.parametrize("name", ["field", "checkpoint"])
 def test_a_file_of_another_training_is_named_with_what_to_do(
-    ball_scene: Scene, tmp_path: Path, quiet_log: Log, name: str
+    ball_scene: Scene, tmp_path: Path, name: str
 ) -> None:
-    checkpoint.write(tmp_path / f"{name}.safetensors", {"mean.weight": torch.zeros(3)}, {})
+    path = stage(ball_scene, tmp_path) / f"{name}.safetensors"
+    checkpoint.write(path, {"mean.weight": torch.zeros(3)}, {})
     message = rf"{name}\.safetensors: expected the file of this .*; remove it to train again"
     with pytest.raises(SteerbenchError, match=message):
-        trained(ball_scene, tmp_path, quiet_log)
+        trained(ball_scene, tmp_path)
 
 
 def test_no_step_has_more_rays_than_it_may(ball_scene: Scene) -> None:
@@ -239,10 +240,10 @@ def test_options_that_make_no_sense_are_refused(setting: dict) -> None:
 def test_a_checkpoint_that_cannot_be_written_says_so(
     ball_scene: Scene, tmp_path: Path, quiet_log: Log
 ) -> None:
-    with pytest.raises(SteerbenchError, match=r"cannot write to .*gone"):  # before it is trained
-        train_field(
-            new_field(), ball_scene, BUDGET, TrainingOptions(), 0, tmp_path / "gone", quiet_log
-        )
+    training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
+    with pytest.raises(SteerbenchError, match=r"cannot write to .*gone"):
+        loop.train(training, tmp_path / "gone" / "field.safetensors", "training", quiet_log)
+    assert training.step == 0  # before it is trained
     with pytest.raises(SteerbenchError, match=r"gone.*cannot write the checkpoint"):
         checkpoint.write(tmp_path / "gone" / "field.safetensors", {}, {})
 

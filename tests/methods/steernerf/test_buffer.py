@@ -1,4 +1,4 @@
-"""Preceding frames: what is kept of them, and where their pixels land in another view."""
+"""Preceding frames: what is kept of them, and which pixels of another view show their points."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from torch import Tensor
 
 from bench.cameras import pixel_grid, project, scale_camera, unproject
 from bench.types import EMPTY_ALPHA, Camera
-from methods.rendering.batch import FeatureFrame
-from methods.steernerf.buffer import SPLAT_ALPHA, Cloud, Remembered, RenderingBuffer, Reprojection
+from methods.rendering.frame import FeatureFrame
+from methods.steernerf.buffer import SPLAT_ALPHA, Cloud, Remembered, RenderingBuffer
+from methods.steernerf.options import Reprojection
 from tests.methods.conftest import look_at_the_middle
 
 EXACT = Reprojection()
@@ -47,31 +48,38 @@ def test_a_buffer_keeps_the_newest_frames_newest_first(length: int) -> None:
     buffer = RenderingBuffer(length)
     assert buffer.frames == ()
     for number in range(5):
-        assert buffer.turn == number
         buffer.push(remembered(number))
         shown = [int(frame.picture[0, 0, 0]) for frame in buffer.frames]
         assert shown == list(range(number, number - min(length, number + 1), -1))
 
 
-def test_a_reset_forgets_all_and_begins_to_count_anew() -> None:
-    buffer = RenderingBuffer(2, turn=7)
+def test_a_reset_forgets_all() -> None:
+    buffer = RenderingBuffer(2)
     buffer.push(remembered(0))
-    assert buffer.turn == 8
     buffer.reset()
     assert buffer.frames == ()
-    assert buffer.turn == 0
     for number in range(3):
         buffer.push(remembered(number))
     assert len(buffer.frames) == 2
 
 
+def test_a_copy_goes_on_by_itself() -> None:
+    buffer = RenderingBuffer(2)
+    buffer.push(remembered(0))
+    copy = buffer.copy()
+    assert copy.frames == buffer.frames
+    for number in (1, 2):
+        copy.push(remembered(number))
+    assert [len(some.frames) for some in (buffer, copy)] == [1, 2]
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("scale", [1, 2, 3, 4])
-def test_a_still_frame_lands_where_it_was_taken(scale: int, backend: str) -> None:
+def test_a_still_frame_is_shown_where_it_was_taken(scale: int, backend: str) -> None:
     low = low_camera(scale)
     full = scale_camera(low, 8 * scale, 6 * scale)
     cloud = Cloud.of(frame_of(low), EXACT)
-    index, depth = cloud.land(full, EXACT, backend)
+    index, depth = cloud.splat(full, EXACT, backend)
     # s odd: in the middle of s x s pixels. s even: on a border, where rounding may choose any of
     # the four pixels around it.
     row, column = torch.meshgrid(torch.arange(6), torch.arange(8), indexing="ij")
@@ -114,10 +122,10 @@ def test_empty_and_faint_pixels_become_no_points() -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_an_empty_frame_lands_nowhere(backend: str) -> None:
+def test_an_empty_frame_is_shown_nowhere(backend: str) -> None:
     low = low_camera(2)
     frame = frame_of(low, torch.full((6, 8), math.inf), alpha=0.0)
-    index, depth = Cloud.of(frame, EXACT).land(low, EXACT, backend)
+    index, depth = Cloud.of(frame, EXACT).splat(low, EXACT, backend)
     assert (index == -1).all()
     assert depth.shape == (0,)
 
@@ -131,12 +139,12 @@ def test_the_centres_of_the_release_are_off_by_a_constant(scale: int) -> None:
     exact, _ = project(full, Cloud.of(frame, EXACT).points)
     cloud = Cloud.of(frame, paper)
     corner, _ = project(full, cloud.points)
-    # s (i + 1/2) against s i + 1/2, which `land` counts from the first centre.
+    # s (i + 1/2) against s i + 1/2, which `splat` counts from the first centre.
     # A pixel is 9 s of a coordinate up to 2, rounded two dozen times.
     shift = exact - (corner + 0.5)
     expected = torch.full_like(shift, scale / 2 - 0.5)
     torch.testing.assert_close(shift, expected, rtol=0, atol=24 * 2 * 10 * scale * 2.0**-24)
-    index, _ = cloud.land(full, paper, "reference")
+    index, _ = cloud.splat(full, paper, "reference")
     assert torch.equal(index[::scale, ::scale].flatten(), torch.arange(48).int())
     assert (index >= 0).sum() == 48
 
@@ -170,13 +178,12 @@ def test_the_nearer_of_two_points_hides_the_other(backend: str) -> None:
         points,
         torch.zeros(4, 3),
         torch.ones(4),
-        torch.zeros(4, dtype=torch.uint8),
     )
-    index, seen = cloud.land(target, EXACT, backend)
+    index, seen = cloud.splat(target, EXACT, backend)
     assert (index[3, 4].item(), index[1, 1].item()) == (1, 2)
     assert (index >= 0).sum() == 2
     torch.testing.assert_close(seen, depth)
-    last, _ = cloud.land(target, Reprojection(rule="last"), backend)
+    last, _ = cloud.splat(target, Reprojection(rule="last"), backend)
     assert (last[3, 4].item(), last[1, 1].item()) == (1, 3)
 
 
@@ -187,7 +194,7 @@ def test_a_near_surface_hides_a_far_one_when_the_camera_moves(backend: str) -> N
     depth[:, 2] = 1.0
     moved = replace(camera, c2w=camera.c2w.clone())
     moved.c2w[0, 3] = -0.5  # 4 pixels at depth 1, one at depth 4
-    index, _ = Cloud.of(frame_of(camera, depth), EXACT).land(moved, EXACT, backend)
+    index, _ = Cloud.of(frame_of(camera, depth), EXACT).splat(moved, EXACT, backend)
     row = [-1, 0, 1, -1, 3, 4, 2, 6]
     assert index.tolist() == [[i + 8 * j if i >= 0 else -1 for i in row] for j in range(6)]
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import pytest
 import torch
 
 from bench.console import ConsoleLog
-from bench.types import SteerbenchError
+from bench.types import Scene, SteerbenchError
 from methods.engines import Inputs
-from methods.steernerf.training.calibration import kept_inputs
-
-CPU = torch.device("cpu")
+from methods.steernerf.calibration import Calibration
+from methods.steernerf.pipeline import Pipeline
+from tests.methods.models import new_pipeline, small_model, small_rendering
 
 FRAMES: list[Inputs] = [
     (torch.full((frame + 1, 2), float(frame)), torch.arange(frame + 1, dtype=torch.int32))
@@ -21,15 +23,24 @@ FRAMES: list[Inputs] = [
 """More than ten: by name, the eleventh must not come after the first."""
 
 
+def of(scene: Scene, pipeline: Pipeline | None = None, seed: int = 0) -> Calibration:
+    pipeline = pipeline or new_pipeline()
+    return Calibration(pipeline, small_rendering(), scene, (0.0, 2.0), seed)
+
+
+@pytest.fixture
+def known(ball_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> Calibration:
+    """What it records is `FRAMES`."""
+    monkeypatch.setattr(Calibration, "record", lambda self, count, log: FRAMES[:count])
+    return of(ball_scene)
+
+
 def test_what_was_recorded_is_found_again_in_its_order(
-    tmp_path: Path, quiet_log: ConsoleLog
+    known: Calibration, tmp_path: Path, quiet_log: ConsoleLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = kept_inputs(lambda: tmp_path, lambda: FRAMES, CPU, quiet_log)
-
-    def never() -> list[Inputs]:
-        raise AssertionError("they are not recorded again")
-
-    again = kept_inputs(lambda: tmp_path, never, CPU, quiet_log)
+    first = known.inputs(len(FRAMES), tmp_path, quiet_log)
+    monkeypatch.delattr(Calibration, "record")  # they are not recorded again
+    again = known.inputs(len(FRAMES), tmp_path, quiet_log)
     for found in (first, again):
         assert len(found) == len(FRAMES)
         for inputs, wanted in zip(found, FRAMES, strict=True):
@@ -37,23 +48,59 @@ def test_what_was_recorded_is_found_again_in_its_order(
             assert [x.dtype for x in inputs] == [x.dtype for x in wanted]
 
 
-def test_what_is_found_is_put_on_the_device(tmp_path: Path, quiet_log: ConsoleLog) -> None:
-    kept_inputs(lambda: tmp_path, lambda: FRAMES, CPU, quiet_log)
-    found = kept_inputs(lambda: tmp_path, lambda: FRAMES, torch.device("meta"), quiet_log)
+def test_what_is_found_is_put_on_the_device(
+    known: Calibration, tmp_path: Path, quiet_log: ConsoleLog
+) -> None:
+    class Elsewhere:
+        background = torch.zeros(3, device="meta")
+
+    known.inputs(2, tmp_path, quiet_log)
+    elsewhere = replace(known, pipeline=cast(Pipeline, Elsewhere()))
+    found = elsewhere.inputs(2, tmp_path, quiet_log)
     assert {x.device.type for inputs in found for x in inputs} == {"meta"}
 
 
-def test_what_cannot_be_recorded_leaves_nothing(tmp_path: Path, quiet_log: ConsoleLog) -> None:
-    def fails() -> list[Inputs]:
+def test_what_cannot_be_recorded_leaves_nothing(
+    ball_scene: Scene, tmp_path: Path, quiet_log: ConsoleLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*arguments: object) -> list[Inputs]:
         raise ArithmeticError
 
+    monkeypatch.setattr(Calibration, "record", fails)
     with pytest.raises(ArithmeticError):
-        kept_inputs(lambda: tmp_path, fails, CPU, quiet_log)
+        of(ball_scene).inputs(1, tmp_path, quiet_log)
     assert [path.name for path in tmp_path.iterdir() if path.name != "lock"] == []
 
 
-def test_a_damaged_file_is_named(tmp_path: Path, quiet_log: ConsoleLog) -> None:
-    kept_inputs(lambda: tmp_path, lambda: FRAMES, CPU, quiet_log)
+def test_a_damaged_file_is_named(known: Calibration, tmp_path: Path, quiet_log: ConsoleLog) -> None:
+    known.inputs(1, tmp_path, quiet_log)
     (tmp_path / "inputs.safetensors").write_bytes(b"torn")
     with pytest.raises(SteerbenchError, match=r"inputs\.safetensors: expected the file"):
-        kept_inputs(lambda: tmp_path, lambda: FRAMES, CPU, quiet_log)
+        known.inputs(1, tmp_path, quiet_log)
+
+
+def test_a_frame_is_recorded_behind_as_many_as_the_buffer_holds_and_one_more(
+    ball_scene: Scene, quiet_log: ConsoleLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pipeline, rendered = new_pipeline(small_model(frames=1)), []
+    render = Pipeline.render
+
+    def counted(self, camera, buffer, rendering, probe):
+        rendered.append((camera, len(buffer.frames)))
+        return render(self, camera, buffer, rendering, probe)
+
+    monkeypatch.setattr(Pipeline, "render", counted)
+    frames = of(ball_scene, pipeline).record(3, quiet_log)
+    assert [remembered for _, remembered in rendered] == 3 * [0, 1, 1]
+    train = ball_scene.splits["train"].cameras
+    assert [camera for camera, _ in rendered[2::3]] == [train[0], train[8], train[16]]
+    assert pipeline.renderer.engine is None
+    width = pipeline.renderer.layout.width
+    assert [rows.shape[1] for rows, _ in frames] == 3 * [width]
+    assert not torch.equal(frames[0][0], frames[1][0])
+
+
+def test_the_seed_decides_the_motions(ball_scene: Scene, quiet_log: ConsoleLog) -> None:
+    first, again, other = (of(ball_scene, seed=seed).record(1, quiet_log)[0] for seed in (0, 0, 1))
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    assert first[0].shape != other[0].shape or not torch.equal(first[0], other[0])

@@ -2,43 +2,49 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 from bench.console import ConsoleLog
 from bench.errors import Unavailable
-from bench.probes import StageClock
 from bench.types import Budget, NullProbe, Scene
 from methods.engines import Engine
 from methods.engines.openvino_engine import OpenVino
 from methods.engines.torch_engine import TorchEngine
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.encode import HashGrid
-from methods.steernerf.beyond.lean_renderer import SpaceToDepth
+from methods.steernerf.beyond.lean_renderer import LeanRenderer
 from methods.steernerf.method import SteerNerf
-from methods.steernerf.options import PipelineOptions
+from methods.steernerf.options import Model, RangeReduction, Rendering, Reprojection, Skips
 from methods.steernerf.training.joint import JointOptions
 from methods.steernerf.training.sequences import MotionOptions
-from tests.methods.conftest import look_at_the_middle
+from methods.steernerf.unet import UNet
+from tests.methods.models import small_model, small_rendering
 
 BUDGET = Budget("test", steps=40, samples=4096, renderer_steps=4)
+
+
+RENDERER = partial(LeanRenderer, width=8, blocks=1, init="scratch")
 
 
 def new_method(
     frames: int = 2,
     rate: float = 1e-3,
     engine: Engine | None = None,
-    refined: float = 0.0,
     device: str = "cpu",
+    **rendering: Any,
 ) -> SteerNerf:
     return SteerNerf(
         grid=HashGrid(levels=8, log2_table=12, n_min=8, n_max=64),
         training=TrainingOptions(),
-        pipeline=PipelineOptions(channels=5, frames=frames, steps=4, refined=refined),
-        renderer=partial(SpaceToDepth, width=8, blocks=1, init="scratch"),
+        model=small_model(channels=5, frames=frames, step=4.0),
+        rendering=small_rendering(**{"step": 4.0} | rendering),
+        renderer=RENDERER,
         joint=JointOptions(
             patch=4,
             rate=rate,
@@ -70,7 +76,7 @@ def test_what_was_trained_is_found_again_and_renders_the_same(
     first.fit(ball_scene, BUDGET, log)
     capsys.readouterr()
     second.fit(ball_scene, BUDGET, log)
-    assert "training steernerf: found in" in capsys.readouterr().err
+    assert "training the 2D renderer: found in" in capsys.readouterr().err
     assert stages(tmp_path) == ["distilled", "field", "steernerf"]
     assert second.train_s == first.train_s > 0
     for camera in ball_scene.splits["test"].cameras:
@@ -98,48 +104,10 @@ def test_reset_forgets(ball_scene: Scene, log: ConsoleLog) -> None:
     assert method.memory == 2
 
 
-def test_a_foreseen_frame_is_begun_before_unless_a_sequence_begins(
-    ball_scene: Scene, log: ConsoleLog
-) -> None:
-    method = new_method()
-    method.fit(ball_scene, BUDGET, log)
-    first, second = ball_scene.splits["test"].cameras[:2]
-    clock, threads = StageClock("cpu"), torch.get_num_threads()
-    pictures = []
-    try:
-        torch.set_num_threads(2)
-        for foreseen, reset in ((False, False), (True, False), (True, True)):
-            method.reset()
-            assert not foreseen or method.foresee(second)
-            method.render(first, NullProbe())
-            if reset:
-                method.reset()
-            with clock.frame():
-                pictures.append(method.render(second, clock).rgb)
-    finally:
-        torch.set_num_threads(threads)
-    assert ["field" in frame.stages_ns for frame in clock.frames] == [True, False, True]
-    assert torch.equal(pictures[0], pictures[1])
-    assert not torch.equal(pictures[0], pictures[2])  # which no frame precedes
-
-
-@pytest.mark.parametrize(("threads", "safe"), [(1, True), (2, False)])
-def test_where_two_threads_cannot_be_at_work_nothing_is_begun_before(
-    monkeypatch: pytest.MonkeyPatch, threads: int, safe: bool
-) -> None:
-    monkeypatch.setattr("torch.get_num_threads", lambda: threads)
-    monkeypatch.setattr(
-        "methods.steernerf.method.serves_many_threads", lambda backend, device: safe
-    )
-    method = new_method()
-    assert not method.foresee(look_at_the_middle(0.1, 0.3))
-    assert method.lookahead._upcoming is None
-
-
 def test_sizes_are_those_of_all_that_a_frame_needs(ball_scene: Scene, log: ConsoleLog) -> None:
     method = new_method()
     method.fit(ball_scene, BUDGET, log)
-    renderer = SpaceToDepth(5, 2, 4, width=8, blocks=1, init="scratch")
+    renderer = RENDERER(5, 2, 4)
     numbers = sum(p.numel() for p in renderer.parameters())
     assert method.sizes()["renderer2d"] == 4 * numbers
     assert set(method.sizes()) == {"hash_table", "field_networks", "occupancy", "renderer2d"}
@@ -148,15 +116,16 @@ def test_sizes_are_those_of_all_that_a_frame_needs(ball_scene: Scene, log: Conso
 def test_a_network_is_built_once_for_each_training_and_for_no_other(
     ball_scene: Scene, log: ConsoleLog, tmp_path: Path
 ) -> None:
-    def built(rate: float = 1e-3, refined: float = 0.0) -> int:
-        method = new_method(rate=rate, engine=OpenVino("int8"), refined=refined)
+    def built(rate: float = 1e-3, **rendering: Any) -> int:
+        method = new_method(rate=rate, engine=OpenVino("int8"), **rendering)
         method.fit(ball_scene, BUDGET, log)
         for camera in ball_scene.splits["test"].cameras:
             assert method.render(camera, NullProbe()).rgb.isfinite().all()
         return stages(tmp_path).count("network")
 
     assert built() == 1
-    assert built(refined=0.5) == 1  # not trained for, nor calibrated for
+    # Not trained for, nor calibrated for.
+    assert built(refined=0.5, range=RangeReduction("window"), overlap=0.9) == 1
     assert built(rate=3e-3) == 2
 
 
@@ -165,8 +134,114 @@ def test_an_engine_that_does_not_compute_on_the_device_is_refused() -> None:
         OpenVino("fp32").check(torch.device("cuda"))
 
 
-def test_what_begins_anew_more_often_has_a_use_for_more_distilled_views() -> None:
+def test_shorter_sequences_use_more_distilled_views() -> None:
     options = JointOptions(distilled_share=1.0, motion=MotionOptions(pool=2, uses=4, longer=0.75))
     # 2 sequences at the beginning, and 100 steps of 2 patches, 4 of a sequence.
     assert options.distilled(100, frames=2) == 2 + 50 / 4 // 1 + 1
     assert options.distilled(100, frames=0) == 2 + 50
+
+
+OTHERWISE: dict[str, Any] = {
+    "channels": 6,
+    "frames": 3,
+    "scale": 2,
+    "step": 2.0,
+    "stop": 1e-2,
+    "reprojection": Reprojection(rule="last"),
+    "feature_background": 1.0,
+    "history": False,
+    "surface": False,
+}
+"""Another value of every field of a model."""
+
+TURNED: dict[str, Any] = {
+    "step": 1.5,
+    "stop": 1e-1,
+    "range": RangeReduction("paper", 0.1),
+    "overlap": 0.5,
+    "refined": 0.25,
+    "refined_step": 2.0,
+    "skip": Skips(empty=False),
+}
+"""Another value of every field of a rendering."""
+
+
+def key_of(model: Model, rendering: Rendering) -> dict[str, object]:
+    method = SteerNerf(
+        grid=HashGrid(),
+        training=TrainingOptions(),
+        model=model,
+        rendering=rendering,
+        renderer=RENDERER,
+        joint=JointOptions(),
+        engine=TorchEngine(),
+        device="cpu",
+    )
+    return method.stage2.key(BUDGET)
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(Model)])
+def test_every_field_of_a_model_is_in_the_key_of_its_training(name: str) -> None:
+    usual = small_model()
+    other = replace(usual, **{name: OTHERWISE[name]})
+    assert other != usual
+    assert key_of(other, small_rendering()) != key_of(usual, small_rendering())
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(Rendering)])
+def test_no_field_of_a_rendering_is_in_the_key_of_a_training(name: str) -> None:
+    usual = small_rendering()
+    other = replace(usual, **{name: TURNED[name]})
+    assert other != usual
+    assert key_of(small_model(), other) == key_of(small_model(), usual)
+
+
+def test_training_renders_everywhere_whatever_is_chosen_afterwards() -> None:
+    rendering = Rendering.in_training(small_model(step=2.0, stop=1e-2), refined=0.2)
+    assert (rendering.step, rendering.stop, rendering.refined) == (2.0, 1e-2, 0.2)
+    assert (rendering.range.mode, rendering.overlap, rendering.refined_step) == ("off", 0.0, 1.0)
+    assert rendering.skip == Skips()
+
+
+def refused(**others: Any) -> SteerNerf:
+    parts: dict[str, Any] = {
+        "model": small_model(),
+        "rendering": small_rendering(),
+        "renderer": UNet,
+        "joint": JointOptions(refined=0.0),
+    }
+    return SteerNerf(
+        grid=HashGrid(),
+        training=TrainingOptions(),
+        engine=TorchEngine(),
+        device="cpu",
+        **parts | others,
+    )
+
+
+def test_a_renderer_that_does_not_estimate_its_error_cannot_be_refined() -> None:
+    refused()  # as it is, it is not
+    said = "UNet does not estimate its error, expected 0, got 0.1"
+    with pytest.raises(ValueError, match=rf"^rendering\.refined: {said}"):
+        refused(rendering=small_rendering(refined=0.1))
+    with pytest.raises(ValueError, match=rf"^joint\.refined: {said}"):
+        refused(joint=JointOptions(refined=0.1))
+
+
+@pytest.mark.parametrize("mode", ["paper", "window"])
+def test_without_preceding_frames_there_is_no_range_reduction(mode: str) -> None:
+    ranged = small_rendering(range=RangeReduction(mode))
+    refused(rendering=ranged)  # with them there is
+    with pytest.raises(ValueError, match=rf"range.mode: expected off without .* got {mode}"):
+        refused(model=small_model(frames=0), rendering=ranged)
+
+
+def test_a_rendering_may_be_exchanged_between_frames(ball_scene: Scene, log: ConsoleLog) -> None:
+    method = new_method(refined=1.0)
+    method.fit(ball_scene, BUDGET, log)
+    camera = ball_scene.splits["test"].cameras[0]
+    refined = method.render(camera, NullProbe()).rgb
+    method.reset()
+    method.rendering = replace(method.rendering, refined=0.0)
+    drawn = method.render(camera, NullProbe()).rgb
+    assert not torch.equal(drawn, refined)

@@ -9,13 +9,13 @@ import torch
 from torch.nn import functional
 from torch.utils.flop_counter import FlopCounterMode
 
-from methods.steernerf.unet import UnetRelease
+from methods.steernerf.unet import UNet
 from tests.methods.observations import ROUNDING, doubled, features_of, observe, shaken
 
 
 @pytest.mark.parametrize(("frames", "count"), [(0, 2_108_675), (1, 2_112_131), (2, 2_115_587)])
 def test_it_has_the_number_of_parameters_of_the_release(frames: int, count: int) -> None:
-    renderer = UnetRelease(6, frames, 4)
+    renderer = UNet(6, frames, 4)
     assert sum(parameter.numel() for parameter in renderer.parameters()) == count
 
 
@@ -27,7 +27,7 @@ def test_any_features_frames_and_sizes_are_taken(
     channels: int, frames: int, scale: int, height: int, width: int
 ) -> None:
     """Sides of the picture that are no multiple of 4 as well: of 15 x 9, 6 x 10 and 9 x 6."""
-    renderer = UnetRelease(channels, frames, scale)
+    renderer = UNet(channels, frames, scale)
     observations = [
         observe(height, width, channels=channels, frames=frames, scale=scale, seed=seed)
         for seed in range(2)
@@ -40,7 +40,7 @@ def test_any_features_frames_and_sizes_are_taken(
 
 @pytest.mark.parametrize(("height", "width"), [(8, 12), (9, 6)])
 def test_its_products_are_those_that_torch_counts(height: int, width: int) -> None:
-    network = UnetRelease(6, 2, 4).network
+    network = UNet(6, 2, 4).network
     inputs = torch.zeros(2, 18, height, width)
     with FlopCounterMode(display=False) as counter:
         network(inputs)
@@ -48,7 +48,7 @@ def test_its_products_are_those_that_torch_counts(height: int, width: int) -> No
 
 
 def test_frames_that_are_missing_after_a_cold_start_show_nothing() -> None:
-    renderer = shaken(UnetRelease(6, 2, 4)).double()
+    renderer = shaken(UNet(6, 2, 4)).double()
     warm = doubled(observe())
     empty = replace(warm.preceding[1], index=torch.full_like(warm.preceding[1].index, -1))
     pictures = renderer([replace(warm, preceding=warm.preceding[:1])]).pictures
@@ -60,21 +60,21 @@ def test_frames_that_are_missing_after_a_cold_start_show_nothing() -> None:
 
 
 def test_a_batch_of_two_is_one_after_the_other() -> None:
-    renderer = shaken(UnetRelease(6, 1, 4)).double()
+    renderer = shaken(UNet(6, 1, 4)).double()
     observations = [doubled(observe(frames=1, seed=seed)) for seed in range(2)]
     alone = torch.cat([renderer([observation]).pictures for observation in observations])
     torch.testing.assert_close(renderer(observations).pictures, alone, rtol=0, atol=ROUNDING)
 
 
 def test_neither_the_preceding_picture_nor_the_surface_is_looked_at() -> None:
-    renderer = shaken(UnetRelease(6, 1, 4))
+    renderer = shaken(UNet(6, 1, 4))
     observation = observe(frames=1)
     without = replace(observation, history=None, surface=None)
     assert torch.equal(renderer([observation]).pictures, renderer([without]).pictures)
 
 
 def test_gradients_reach_every_parameter_and_the_features_of_all_frames() -> None:
-    renderer = shaken(UnetRelease(6, 2, 4))
+    renderer = shaken(UNet(6, 2, 4))
     observation = observe(surface=False)
     features = [tensor.requires_grad_() for tensor in features_of(observation)]
     renderer([observation]).pictures.square().sum().backward()
@@ -92,7 +92,7 @@ def test_the_base_puts_the_corners_on_corners_or_centres(aligned: bool) -> None:
     observation = observe(height, width, frames=0)
     row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     observation.frame.values[..., 0], observation.frame.values[..., 1] = row / 8, column / 8
-    base = UnetRelease(6, 0, scale, aligned=aligned).base([observation])
+    base = UNet(6, 0, scale, aligned=aligned).base([observation])
     for channel, size in ((0, height), (1, width)):
         pixel = torch.arange(size * scale)
         if aligned:
@@ -104,7 +104,7 @@ def test_the_base_puts_the_corners_on_corners_or_centres(aligned: bool) -> None:
 
 
 def test_without_an_output_of_the_network_the_picture_is_the_base() -> None:
-    renderer = UnetRelease(6, 2, 4, aligned=True)
+    renderer = UNet(6, 2, 4, aligned=True)
     for layer in renderer.network.last[2].parameters():
         torch.nn.init.zeros_(layer)
     observation = observe()

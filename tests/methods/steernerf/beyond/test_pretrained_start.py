@@ -7,18 +7,17 @@ from pathlib import Path
 
 import pytest
 import torch
-from methods.steernerf.method.beyond import lean_renderer as space_to_depth
 from safetensors.torch import save_file
-from tests.methods.test_space_to_depth import new_renderer
 from torch import Tensor
 from torch.nn import functional
 
-from methods.steernerf.beyond.lean_renderer import SpaceToDepth
+from methods.steernerf.beyond import lean_renderer
+from methods.steernerf.beyond.lean_renderer import LeanRenderer
 from methods.steernerf.renderer import Observation
-from tests.methods.observations import ROUNDING, doubled, observe, shaken
+from tests.methods.observations import ROUNDING, doubled, new_renderer, observe, shaken
 
 
-def generic_renderer() -> SpaceToDepth:
+def pretrained() -> LeanRenderer:
     """What the weights that come with the package were trained as, but smaller."""
     return shaken(new_renderer(3, 2, 4), seed=1)
 
@@ -56,11 +55,11 @@ def widened(observation: Observation) -> Observation:
     ],
     ids=str,
 )
-def test_a_renderer_starts_as_the_generic_one_draws(channels: int, parts: dict) -> None:
+def test_a_renderer_starts_as_the_pretrained_one_draws(channels: int, parts: dict) -> None:
     """Of what both know: the same picture, whatever else it may be shown later."""
-    generic = generic_renderer()
+    start = pretrained()
     renderer = new_renderer(channels, scale=4, **parts)
-    renderer._start_from(generic.network.state_dict())
+    renderer._start_from(start.network.state_dict())
     known = doubled(
         observe(
             channels=3,
@@ -69,15 +68,15 @@ def test_a_renderer_starts_as_the_generic_one_draws(channels: int, parts: dict) 
             surface=renderer.layout.surface,
         )
     )
-    want = generic.double()([known]).pictures
+    want = start.double()([known]).pictures
     got = renderer.double()([widened(known) if channels == 6 else known]).pictures
     torch.testing.assert_close(got, want, rtol=0, atol=ROUNDING)
 
 
-def test_the_weights_of_what_the_generic_one_never_saw_stay() -> None:
+def test_the_weights_of_what_the_pretrained_one_never_saw_stay() -> None:
     renderer = new_renderer(4, 3)
     before = {name: x.clone() for name, x in renderer.network.state_dict().items()}
-    renderer._start_from(generic_renderer().network.state_dict())
+    renderer._start_from(pretrained().network.state_dict())
     stayed = {name: x == before[name] for name, x in renderer.network.state_dict().items()}
     cell = [False, False, False, False, True]  # the colour, whether it is known, a feature
     preceding = 2 * 16 * cell + 16 * [True] * 5
@@ -90,19 +89,21 @@ def test_the_weights_of_what_the_generic_one_never_saw_stay() -> None:
         assert not stayed[name].any(), name
 
 
-def test_generic_weights_are_read_from_their_file(
+def test_pretrained_weights_are_read_from_their_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    halves = {name: x.half() for name, x in generic_renderer().network.state_dict().items()}
-    save_file(halves, tmp_path / "generic.safetensors")
-    monkeypatch.setattr(space_to_depth, "GENERIC", tmp_path / "generic.safetensors")
-    renderer = SpaceToDepth(3, 2, 4, width=16, blocks=2)
+    halves = {name: x.half() for name, x in pretrained().network.state_dict().items()}
+    save_file(halves, tmp_path / "lean.safetensors")
+    monkeypatch.setattr(lean_renderer, "PRETRAINED", tmp_path / "lean.safetensors")
+    renderer = LeanRenderer(3, 2, 4, width=16, blocks=2)
     for name, weight in renderer.network.state_dict().items():
         assert torch.equal(weight, halves[name].float()), name
 
 
 @pytest.mark.parametrize("other", [{"width": 8}, {"blocks": 1}, {"blocks": 3}, {"scale": 2}])
-def test_generic_weights_of_another_shape_are_refused(other: dict[str, int]) -> None:
+def test_pretrained_weights_of_another_shape_are_refused(other: dict[str, int]) -> None:
     renderer = new_renderer(3, **other)
-    with pytest.raises(ValueError, match=r"renderer\.init=generic: .* use renderer\.init=scratch"):
-        renderer._start_from(generic_renderer().network.state_dict())
+    with pytest.raises(
+        ValueError, match=r"renderer\.init=pretrained: .* use renderer\.init=scratch"
+    ):
+        renderer._start_from(pretrained().network.state_dict())

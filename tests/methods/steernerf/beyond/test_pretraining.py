@@ -8,37 +8,36 @@ from pathlib import Path
 
 import pytest
 import torch
-from methods.steernerf.method.beyond import lean_renderer as space_to_depth
 from safetensors.torch import load_file
 from torch import Tensor
 
+from bench.console import ConsoleLog
 from bench.types import Budget, Log, Scene, SteerbenchError
 from methods.instant_ngp.stage1 import Setup
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.encode import HashGrid
-from methods.steernerf.beyond.lean_renderer import SpaceToDepth
-from methods.steernerf.beyond.pretraining import AnyOf, train_generic
-from methods.steernerf.options import PipelineOptions
-from methods.steernerf.training.joint import JointOptions
+from methods.steernerf.beyond import lean_renderer
+from methods.steernerf.beyond.lean_renderer import LeanRenderer
+from methods.steernerf.beyond.pretraining import AnyOf, pretrain_renderer
+from methods.steernerf.training.joint import JointOptions, RendererTraining
 from methods.steernerf.training.patches import Batch
 from methods.steernerf.training.sequences import MotionOptions
+from methods.steernerf.training.stage2 import Stage2
 from methods.training import checkpoint
+from tests.methods.models import small_model
 
 GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
 SETUP = Setup.resolved(GRID, TrainingOptions(), "bf16", "auto", "cpu", seed=0)
-OPTIONS = PipelineOptions(channels=3, frames=2, steps=4)
+MODEL = small_model(channels=3, step=4.0)
 JOINT = JointOptions(patch=4, motion=MotionOptions(pool=2, length=2))
 BUDGET = Budget("test", steps=40, samples=4096, renderer_steps=8)
-RENDERER = partial(SpaceToDepth, width=8, blocks=1)
+RENDERER = partial(LeanRenderer, width=8, blocks=1)
 
 
-def train(
-    scenes: list[Scene], output: Path, log: Log, options: PipelineOptions = OPTIONS
-) -> dict[str, Tensor]:
-    make = partial(RENDERER, init="scratch")
-    folder = output.with_suffix(".stage")
-    folder.mkdir(parents=True)
-    train_generic(SETUP, options, make, JOINT, scenes, BUDGET, folder, output, log)
+def train(scenes: list[Scene], output: Path, log: Log, channels: int = 3) -> dict[str, Tensor]:
+    model = replace(MODEL, channels=channels)
+    stage2 = Stage2(model, partial(RENDERER, init="scratch"), JOINT)
+    pretrain_renderer(SETUP, stage2, scenes, BUDGET, output, log)
     return load_file(output)
 
 
@@ -46,14 +45,14 @@ def test_the_weights_of_several_scenes_are_what_a_renderer_starts_from(
     ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     on_black = replace(ball_scene, name="on black", background=torch.zeros(3), digest="on black")
-    output = tmp_path / "new folder" / "generic.safetensors"
+    output = tmp_path / "new folder" / "lean.safetensors"
     written = train([ball_scene, on_black], output, quiet_log)
     assert checkpoint.read(output)[1] == {"scenes": 2, "steps": BUDGET.renderer_steps}
     assert {weight.dtype for weight in written.values()} == {torch.float16}
     for name in ("enter.weight", "leave.weight", "read.weight", "read.bias"):
         assert written[name].isfinite().all(), name
         assert written[name].any(), name  # the last three were 0 before the training
-    monkeypatch.setattr(space_to_depth, "GENERIC", output)
+    monkeypatch.setattr(lean_renderer, "PRETRAINED", output)
     started = RENDERER(3, 2, 4)
     assert started.network.state_dict().keys() == written.keys()
     for name, weight in started.network.state_dict().items():
@@ -63,12 +62,10 @@ def test_the_weights_of_several_scenes_are_what_a_renderer_starts_from(
         assert torch.equal(other.network.trunk[0].spread, started.network.trunk[0].spread)
 
 
-def test_the_same_training_results_in_the_same_weights(
-    ball_scene: Scene, tmp_path: Path, quiet_log: Log
-) -> None:
+def test_the_same_training_results_in_the_same_weights(ball_scene: Scene, tmp_path: Path) -> None:
     first, second = (
-        train([ball_scene], tmp_path / f"{name}.safetensors", quiet_log)
-        for name in ("first", "second")
+        train([ball_scene], tmp_path / f"{name}.safetensors", ConsoleLog(tmp_path / name, True))
+        for name in ("first", "second")  # logs of their own: nothing is found again
     )
     for name, weight in first.items():
         assert torch.equal(second[name], weight), name
@@ -78,10 +75,22 @@ def test_the_same_training_results_in_the_same_weights(
 def test_features_that_mean_something_else_in_every_scene_are_refused(
     ball_scene: Scene, tmp_path: Path, quiet_log: Log, channels: int
 ) -> None:
-    options, output = replace(OPTIONS, channels=channels), tmp_path / "generic.safetensors"
+    output = tmp_path / "lean.safetensors"
     with pytest.raises(SteerbenchError, match=rf"channels \(K\) of 3, got {channels}"):
-        train([ball_scene], output, quiet_log, options)
+        train([ball_scene], output, quiet_log, channels)
     assert not list(tmp_path.rglob("*.safetensors"))  # nothing was trained before
+
+
+def test_a_renderer_that_was_trained_on_the_same_scenes_is_found_again(
+    ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = train([ball_scene], tmp_path / "first.safetensors", quiet_log)
+    monkeypatch.delattr(RendererTraining, "advance")
+    again = train([ball_scene], tmp_path / "again.safetensors", quiet_log)
+    for name, weight in first.items():
+        assert torch.equal(again[name], weight), name
+    with pytest.raises(AttributeError, match="advance"):  # with other scenes, another training
+        train([ball_scene, ball_scene], tmp_path / "other.safetensors", quiet_log)
 
 
 class Source:

@@ -1,4 +1,4 @@
-"""Views that nobody photographed, as a field shows them: rendered once, found again."""
+"""Distilled views: as a field shows them, rendered once, found again."""
 
 from __future__ import annotations
 
@@ -6,31 +6,37 @@ from pathlib import Path
 
 import pytest
 import torch
-from methods.steernerf.method.training import distillation as distil
-from tests.methods.test_joint import TARGET, misty_field, shell
 
 from bench.cameras import pack_camera
-from bench.types import Log, NullProbe, Scene
-from methods.instant_ngp.stage1 import Pretrained
-from methods.steernerf.range_reduction import render_guided
+from bench.console import ConsoleLog
+from bench.types import Budget, NullProbe, Scene
+from methods.instant_ngp.stage1 import Setup, TrainedField
+from methods.instant_ngp.training import TrainingOptions
+from methods.rendering.frame import everywhere, render_frame
+from methods.rendering.march import March
+from methods.steernerf.training import distillation
 from methods.steernerf.training.distillation import distilled_views
 from methods.steernerf.training.sequences import TrueView
 from tests.methods.conftest import SIZE
+from tests.methods.models import SMALL_GRID, misty_field, shell
 
 COUNT = 3
+BUDGET = Budget("test", steps=1, samples=1)
 
 
 @pytest.fixture(scope="module")
-def trained() -> Pretrained:
+def trained() -> TrainedField:
     """In place of a trained field, one in which there is something to see."""
-    return Pretrained(misty_field(channels=3), shell(), train_s=0.0)
+    return TrainedField(misty_field(channels=3), shell(), train_s=0.0)
 
 
 def views_of(
-    trained: Pretrained, scene: Scene, folder: Path, log: Log, seed: int = 0
+    trained: TrainedField, scene: Scene, root: Path, seed: int = 0, count: int = COUNT
 ) -> list[TrueView]:
-    folder.mkdir(exist_ok=True)
-    return distilled_views(trained, scene, TARGET, COUNT, seed, folder, log)[0]
+    """With `root` as the folder of all results."""
+    setup = Setup.resolved(SMALL_GRID, TrainingOptions(), "bf16", "auto", "cpu", seed)
+    log = ConsoleLog(root, quiet=True)
+    return distilled_views(setup, trained, scene, BUDGET, count, log)[0]
 
 
 def same(first: list[TrueView], second: list[TrueView]) -> bool:
@@ -43,56 +49,60 @@ def same(first: list[TrueView], second: list[TrueView]) -> bool:
 
 
 def test_a_view_is_what_the_field_shows_at_full_resolution(
-    trained: Pretrained, ball_scene: Scene, tmp_path: Path, quiet_log: Log
+    trained: TrainedField, ball_scene: Scene, tmp_path: Path
 ) -> None:
-    views = views_of(trained, ball_scene, tmp_path, quiet_log)
+    views = views_of(trained, ball_scene, tmp_path)
     assert len(views) == COUNT
     for view in views:
         assert (view.camera.width, view.camera.height) == (SIZE, SIZE)
         assert view.picture.shape == (SIZE, SIZE, 3)
         assert view.picture.dtype == torch.uint8
-        frame = render_guided(
-            trained.field,
-            view.camera,
-            trained.occupancy,
-            ball_scene.background,
-            NullProbe(),
-            None,
-        )
+        field, occupancy, probe = trained.field, trained.occupancy, NullProbe()
+        render = everywhere(field, occupancy, probe, March())
+        white = ball_scene.background
+        frame = render_frame(field, view.camera, occupancy, white, probe, render)
         assert (frame.alpha > 0.1).float().mean() > 0.1
         shown = 255 * frame.values
         assert (view.picture.float() - shown).abs().max() <= 0.5 + 1e-4  # rounded, in float32
 
 
 def test_views_lie_among_the_training_cameras_and_on_none(
-    trained: Pretrained, ball_scene: Scene, tmp_path: Path, quiet_log: Log
+    trained: TrainedField, ball_scene: Scene, tmp_path: Path
 ) -> None:
     centres = torch.stack([camera.c2w[:, 3] for camera in ball_scene.splits["train"].cameras])
-    for view in views_of(trained, ball_scene, tmp_path, quiet_log):
+    for view in views_of(trained, ball_scene, tmp_path):
         away = (view.camera.c2w[:, 3] - centres).norm(dim=1)
         assert 1e-3 < away.min() < 1.6  # the distance of all cameras from the ball
 
 
 def test_views_are_found_again_without_rendering(
-    trained: Pretrained,
+    trained: TrainedField,
     ball_scene: Scene,
     tmp_path: Path,
-    quiet_log: Log,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    first = views_of(trained, ball_scene, tmp_path, quiet_log)
-    monkeypatch.delattr(distil, "render_guided")
-    assert same(views_of(trained, ball_scene, tmp_path, quiet_log), first)
-    with pytest.raises(NameError, match="render_guided"):
-        views_of(trained, ball_scene, tmp_path / "elsewhere", quiet_log)
-    assert [path.name for path in (tmp_path / "elsewhere").iterdir()] == ["lock"]
+    first = views_of(trained, ball_scene, tmp_path)
+    monkeypatch.delattr(distillation, "render_frame")
+    assert same(views_of(trained, ball_scene, tmp_path), first)
+    with pytest.raises(NameError, match="render_frame"):
+        views_of(trained, ball_scene, tmp_path / "elsewhere")
+    left = (tmp_path / "elsewhere" / "stages").glob("*/*")
+    assert [path.name for path in left] == ["lock"]
+
+
+def test_other_numbers_of_views_are_others(
+    trained: TrainedField, ball_scene: Scene, tmp_path: Path
+) -> None:
+    assert views_of(trained, ball_scene, tmp_path, count=0) == []
+    assert len(views_of(trained, ball_scene, tmp_path, count=1)) == 1
+    assert len(views_of(trained, ball_scene, tmp_path, count=2)) == 2
 
 
 def test_the_seed_alone_decides_which_views(
-    trained: Pretrained, ball_scene: Scene, tmp_path: Path, quiet_log: Log
+    trained: TrainedField, ball_scene: Scene, tmp_path: Path
 ) -> None:
     first, again, other = (
-        views_of(trained, ball_scene, tmp_path / name, quiet_log, seed)
+        views_of(trained, ball_scene, tmp_path / name, seed)
         for name, seed in (("first", 0), ("again", 0), ("other", 1))
     )
     assert same(first, again)

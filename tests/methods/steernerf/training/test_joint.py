@@ -12,15 +12,11 @@ from torch import Tensor
 
 from bench.types import Camera, Log, NullProbe, Scene, SteerbenchError
 from methods.instant_ngp.field import HashField
-from methods.kernels.encode import HashGrid
-from methods.kernels.march import Occupancy
 from methods.steernerf.beyond.cells import pixels_of
-from methods.steernerf.beyond.lean_renderer import SpaceToDepth
-from methods.steernerf.beyond.surface import Surface
-from methods.steernerf.options import PipelineOptions
+from methods.steernerf.beyond.surface import surface_points
+from methods.steernerf.options import Model, Rendering
 from methods.steernerf.pipeline import Pipeline
-from methods.steernerf.range_reduction import RangeReduction
-from methods.steernerf.renderer import Renderer2d
+from methods.steernerf.renderer import Points, Renderer2d
 from methods.steernerf.training.joint import (
     LEAST_ERROR,
     JointOptions,
@@ -28,66 +24,40 @@ from methods.steernerf.training.joint import (
     RendererTraining,
 )
 from methods.steernerf.training.patches import Batch, PatchSource, Through
-from methods.steernerf.training.sequences import MotionOptions, SequencePool, true_views
-from methods.steernerf.unet import UnetRelease
+from methods.steernerf.training.sequences import MotionOptions, SequencePool, TrainingViews
+from methods.steernerf.unet import UNet
 from methods.steernerf.view import View
 from methods.training import loop
+from tests.methods.conftest import ball
+from tests.methods.models import misty_field, shell, small_model, small_renderer
 from tests.methods.observations import shaken
 
-GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)
 MOTION = MotionOptions(pool=3, uses=4, length=2)
-OPTIONS = JointOptions(patch=4, batch=2, motion=MOTION, precision="fp32")
-PIPELINE = PipelineOptions(channels=4, frames=2, steps=8)
-TARGET = torch.full((3,), 0.5)
-
-
-def shell() -> Occupancy:
-    """Where the surface of the ball is, and a little more."""
-    axis = (torch.arange(32) + 0.5) / 32 - 0.5
-    radius = torch.cartesian_prod(axis, axis, axis).norm(dim=1).view(32, 32, 32)
-    return Occupancy((radius - 0.3).abs() < 0.06)
-
-
-def misty_field(precision: str = "bf16", backend: str = "auto", channels: int = 4) -> HashField:
-    """A field in which every sample matters: density of about 10, features all different."""
-    generator = torch.Generator().manual_seed(3)
-    field = HashField(GRID, channels, precision=precision, backend=backend, generator=generator)
-    with torch.no_grad():
-        field.table.uniform_(-1, 1, generator=generator)
-        field.layers["density_out"][0] = 0.3
-    field.repack()
-    return field
+OPTIONS = JointOptions(patch=4, batch=2, motion=MOTION, precision="fp32", refined=0.0)
+MODEL = small_model()
 
 
 def new_training(
     scene: Scene,
     options: JointOptions = OPTIONS,
-    pipeline: PipelineOptions = PIPELINE,
+    model: Model = MODEL,
     field: HashField | None = None,
     renderer: Renderer2d | None = None,
     steps: int = 12,
 ) -> RendererTraining:
     torch.manual_seed(0)
-    field = field or misty_field(channels=pipeline.channels)
-    renderer = renderer or SpaceToDepth(
-        pipeline.channels,
-        pipeline.frames,
-        pipeline.scale,
-        width=8,
-        blocks=1,
-        init="scratch",
-        history=pipeline.history,
-        surface=pipeline.surface,
-    )
-    views = true_views(scene)
+    field = field or misty_field(channels=model.channels)
+    renderer = renderer or small_renderer(model)
     generator = torch.Generator().manual_seed(1)
-    whole = Pipeline(field, shell(), scene.background, renderer, pipeline)
-    pool = SequencePool(whole, views, [], 0.0, TARGET, options.motion, generator)
+    pipeline = Pipeline(field, shell(), scene.background, renderer, model)
+    rendering = Rendering.in_training(model, options.refined)
+    pool = SequencePool(pipeline, rendering, TrainingViews.of(scene), options.motion, generator)
     learning = options.field == "joint"
-    patches = PatchSource(whole, pool, options.patch, learning, options.through, generator)
+    through = options.through if learning else "none"
+    patches = PatchSource(pool, options.patch, through, generator)
     rest = (renderer, patches, options, steps, generator)
-    training = JointTraining(whole, *rest) if learning else RendererTraining(*rest)
-    whole.renderer = training.mean
+    training = JointTraining(field, *rest) if learning else RendererTraining(*rest)
+    pipeline.renderer = training.mean
     return training
 
 
@@ -103,17 +73,15 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
     are constants.
     """
     field = misty_field("fp32", "reference").double()
-    pipeline = replace(PIPELINE, history=False, surface=surface)
-    renderer = SpaceToDepth(
-        4, 2, 4, width=6, blocks=1, init="scratch", history=False, surface=surface
-    )
+    model = small_model(history=False, surface=surface)
+    renderer = small_renderer(model, width=6)
     options = replace(OPTIONS, through=through, motion=MotionOptions(pool=16))
     with torch.no_grad():
         for layer in filter(
-            None, (renderer.network.leave, renderer.network.read, renderer.network.doubt)
+            None, (renderer.network.leave, renderer.network.read, renderer.network.error)
         ):
             layer.weight.normal_(0, 0.1)
-    training = new_training(ball_scene, options, pipeline, field.float(), renderer)
+    training = new_training(ball_scene, options, model, field.float(), renderer)
     patches = [training.patches.cut(training.patches.pool.draw()) for _ in range(16)]
     after_two = [patch for patch in patches if len(patch.shown) == 2]
     patches = [patch for patch in after_two if all(len(shown) for shown in patch.shown)][:2]
@@ -127,19 +95,17 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
         object.__setattr__(cloud, "values", values)
     depths: dict[int, Tensor] = {}
 
-    def at_first_depth(
-        field: HashField, depth: Tensor, cells: Tensor, view: View, scale: int
-    ) -> Surface:
-        return Surface(field, depths.setdefault(id(view), depth), cells, view, scale)
+    def at_first_depth(field: HashField, depth: Tensor, cells: Tensor, view: View, *rest) -> Points:
+        return surface_points(field, depths.setdefault(id(view), depth), cells, view, *rest)
 
-    monkeypatch.setattr("methods.steernerf.pipeline.Surface", at_first_depth)
+    monkeypatch.setattr("methods.steernerf.pipeline.surface_points", at_first_depth)
 
     def loss() -> Tensor:
         observations, opacity = training.patches.observe(patches)
         drawing = renderer(observations)
-        assert drawing.doubt is not None
+        assert drawing.error is not None
         truth = torch.stack([patch.truth for patch in patches])
-        more = opacity.square().mean() + drawing.doubt.square().mean()
+        more = opacity.square().mean() + drawing.error.square().mean()
         return (drawing.pictures - truth).square().mean() + 1e-2 * more
 
     parameters = [field.table, *field.layers.values(), *renderer.parameters()]
@@ -196,9 +162,8 @@ def test_joint_trains_table_networks_and_renderer(ball_scene: Scene) -> None:
 @pytest.mark.parametrize("frames", [0, 2])
 def test_the_error_falls(ball_scene: Scene, frames: int) -> None:
     """On patches that are kept: one patch is much harder than another."""
-    pipeline = replace(PIPELINE, frames=frames)
     options = replace(OPTIONS, rate=1e-2, field_rate=1e-2)
-    training = new_training(ball_scene, options, pipeline, steps=120)
+    training = new_training(ball_scene, options, small_model(frames=frames), steps=120)
     kept = [training.patches.cut(training.patches.pool.draw()) for _ in range(8)]
     truth = torch.stack([patch.truth for patch in kept])
 
@@ -222,19 +187,19 @@ def refined_loss(training: JointTraining, batch: Batch) -> Tensor:
 def test_the_field_learns_from_the_pixels_it_is_to_refine(ball_scene: Scene) -> None:
     """From all of them: the squared error of the field's own rays, over all numbers of the
     pictures. From some: the same in the mean."""
-    pipeline = replace(PIPELINE, refined=0.25, range=RangeReduction("off"))
-    training = new_training(ball_scene, replace(OPTIONS, refined_rays=10**6), pipeline)
+    training = new_training(ball_scene, replace(OPTIONS, refined=0.25, refined_rays=10**6))
     assert isinstance(training, JointTraining)
     shaken(training.renderer)
     batch = training.patches.draw(2)
-    doubt = training.renderer(batch.observations).doubt
-    assert doubt is not None
+    estimated = training.renderer(batch.observations).error
+    assert estimated is not None
+    pipeline, rendering = training.patches.pipeline, training.patches.rendering
     error, first = 0.0, 0
     for o, view, truth in zip(batch.observations, batch.views, batch.truth, strict=True):
-        own = doubt[first : first + len(o.cells)]
+        own = estimated[first : first + len(o.cells)]
         first += len(o.cells)
         worst = own.sort(descending=True).indices[: math.ceil(0.25 * len(own))]
-        shown = training.pipeline.refine(o.cells[worst], o.frame, view, NullProbe())
+        shown = pipeline.refined(o.cells[worst], o.frame, view, rendering, NullProbe())
         error += (shown - pixels_of(truth, o.cells[worst], 4)).square().sum().item()
     whole = refined_loss(training, batch)
     # The same samples, taken in rounds or at once, and a thousand squares added up.
@@ -243,32 +208,32 @@ def test_the_field_learns_from_the_pixels_it_is_to_refine(ball_scene: Scene) -> 
     assert training.field.grad_buffer is not None
     assert training.field.grad_buffer.any()
 
-    training.options = replace(OPTIONS, refined_rays=64)
+    training.options = replace(OPTIONS, refined=0.25, refined_rays=64)
     some = torch.stack([refined_loss(training, batch).detach() for _ in range(200)])
     # 5 standard deviations of the mean of 200.
     assert (some.mean() - whole.detach()).abs() < 5 * some.std() / math.sqrt(200)
 
 
-def test_doubt_learns_the_log_of_the_error(ball_scene: Scene) -> None:
+def test_the_estimated_error_learns_the_log_of_the_error(ball_scene: Scene) -> None:
     training = new_training(ball_scene)
     batch = training.patches.draw(2)
     drawing = training.renderer(batch.observations)
-    assert drawing.doubt is not None
+    assert drawing.error is not None
     made = [
         pixels_of((picture - truth).square(), o.cells, 4).flatten(1).mean(dim=1)
         for picture, truth, o in zip(drawing.pictures, batch.truth, batch.observations, strict=True)
     ]
     right = (torch.cat(made) + LEAST_ERROR).log()
-    at_best = training._doubt_loss(batch, replace(drawing, doubt=right))
+    at_best = training._error_loss(batch, replace(drawing, error=right))
     assert at_best < 1e-12  # the logarithm is rounded
-    off = training._doubt_loss(batch, replace(drawing, doubt=right + 2))
-    torch.testing.assert_close(off, torch.tensor(4 * OPTIONS.doubt), rtol=1e-5, atol=0)
+    off = training._error_loss(batch, replace(drawing, error=right + 2))
+    torch.testing.assert_close(off, torch.tensor(4 * OPTIONS.error_weight), rtol=1e-5, atol=0)
 
 
 def test_the_renderer_of_the_release_can_be_trained(ball_scene: Scene) -> None:
-    pipeline = replace(PIPELINE, frames=1, history=False)
+    model = small_model(frames=1, history=False)
     options = replace(OPTIONS, batch=1)
-    training = new_training(ball_scene, options, pipeline, renderer=UnetRelease(4, 1, 4))
+    training = new_training(ball_scene, options, model, renderer=UNet(4, 1, 4))
     before = state_of(training)
     training.advance()
     after = training.result()
@@ -293,8 +258,6 @@ def test_a_patch_shows_what_the_picture_shows_there(ball_scene: Scene) -> None:
     patch = training.patches.cut(training.patches.pool.draw())
     cut: Camera = patch.view.full
     assert patch.truth.shape == (cut.height, cut.width, 3)
-    from tests.methods.conftest import ball
-
     expected = ball(cut).float() / 255
     expected = expected[..., :3] * expected[..., 3:] + 1 - expected[..., 3:]
     assert (patch.truth - expected).abs().max() <= 1 / 255  # the colour of a ray, rounded twice

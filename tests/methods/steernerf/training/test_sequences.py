@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from tests.methods.test_pipeline import OPTIONS, new_pipeline
 
-from bench.types import Scene
-from methods.steernerf.training.sequences import MotionOptions, SequencePool, true_views
+from bench.types import Camera, Frame, Scene
+from methods.steernerf.options import Rendering
+from methods.steernerf.training.sequences import MotionOptions, SequencePool, TrainingViews
 from methods.training import checkpoint
+from tests.methods.models import new_pipeline, small_model
 
 TARGET = torch.full((3,), 0.5)
 
 
 def new_pool(scene: Scene, motion: MotionOptions, share: float = 0.0, frames: int = 2):
-    real = true_views(scene)
-    pipeline = new_pipeline(replace(OPTIONS, frames=frames))
+    """The second half of the pictures of `scene` stands for distilled views."""
+    real = TrainingViews.of(scene).real
+    views = TrainingViews(real[:12], TARGET, real[12:], share)
+    pipeline = new_pipeline(small_model(frames=frames))
+    rendering = Rendering.in_training(pipeline.model, refined=0.0)
     generator = torch.Generator().manual_seed(0)
-    return SequencePool(pipeline, real[:12], real[12:], share, TARGET, motion, generator)
+    return SequencePool(pipeline, rendering, views, motion, generator)
 
 
-def test_a_sequence_is_made_anew_after_its_uses(ball_scene: Scene) -> None:
+def test_a_sequence_is_replaced_after_its_uses(ball_scene: Scene) -> None:
     pool = new_pool(ball_scene, MotionOptions(pool=1, uses=3))
     drawn = [pool.draw() for _ in range(7)]
     assert [sequence is drawn[0] for sequence in drawn] == [True] * 3 + [False] * 4
@@ -43,7 +46,7 @@ def test_the_share_of_distilled_views_is_kept(
     ball_scene: Scene, share: float, distilled: int
 ) -> None:
     pool = new_pool(ball_scene, MotionOptions(pool=1, uses=1, length=0), share)
-    of_field = {id(view.camera) for view in true_views(ball_scene)[12:]}
+    of_field = {id(camera) for camera in ball_scene.splits["train"].cameras[12:]}
     drawn = [pool.draw() for _ in range(20)]
     assert sum(id(sequence.truth.camera) in of_field for sequence in drawn) == distilled
 
@@ -65,14 +68,26 @@ def test_the_newest_preceding_frame_is_a_step_away(ball_scene: Scene) -> None:
             assert turn.item() == pytest.approx(2.0 * age, rel=0.05)  # the bend makes it shorter
 
 
-def test_a_sequence_goes_on_there_and_back_to_its_view(ball_scene: Scene) -> None:
+def test_a_sequence_goes_on_there_and_back_to_its_view(
+    ball_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     motion = MotionOptions(degrees=(2.0, 2.0), pool=1, uses=1, length=4, longer=0.999)
     pool = new_pool(ball_scene, motion)
-    drawn = [pool.draw() for _ in range(12)]
+    drawn, rendered = [pool.draw()], []
+    render = pool.pipeline.render
+
+    def watched(camera: Camera, *rest: Any) -> Frame:
+        rendered[-1].append(camera)
+        return render(camera, *rest)
+
+    monkeypatch.setattr(pool.pipeline, "render", watched)
+    for _ in range(11):
+        rendered.append([])
+        drawn.append(pool.draw())
     assert len({id(sequence.truth) for sequence in drawn}) == 1
     centre = drawn[0].truth.camera.c2w[:, 3]
-    for before, after in pairwise(drawn):
-        frames = after.buffer.turn - before.buffer.turn
+    for done, after in zip(rendered, drawn[1:], strict=True):
+        frames = len(done)
         assert frames in (1, 2, 4)  # the view, and if the camera leaves it, out and back
         moved = (after.buffer.frames[0].camera.c2w[:, 3] - centre).norm().item()
         step = 2 * (centre - TARGET).norm().item() * math.sin(math.radians(1.0))

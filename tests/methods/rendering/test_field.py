@@ -1,0 +1,96 @@
+"""What a radiance field is: two fields that have nothing in common are rendered alike."""
+
+from __future__ import annotations
+
+import inspect
+
+import pytest
+import torch
+
+from bench.cameras import cast
+from bench.types import NullProbe
+from methods.instant_ngp.field import HashField
+from methods.kernels.march import Occupancy
+from methods.rendering.batch import render_batch
+from methods.rendering.field import BATCH_QUANTUM, Field, pad, query
+from methods.rendering.march import March
+from methods.rendering.occupancy import RESOLUTION, DensityGrid
+from methods.rendering.rays import render_rays
+from tests.methods.conftest import GRID, Work, look_at_the_middle
+from tests.methods.solids import DENSITY, Solid, ball
+
+EVERYWHERE = Occupancy(torch.ones(32, 32, 32, dtype=torch.bool))
+MEMBERS = {name for name in vars(Field) if not name.startswith("_")} | set(Field.__annotations__)
+
+
+def solid() -> Field:
+    return Solid(ball())
+
+
+def hash_field() -> Field:
+    return HashField(GRID, generator=torch.Generator().manual_seed(0))
+
+
+def test_a_field_has_more_than_its_attributes() -> None:
+    assert {"channels", "backend", "device", "density", "features", "count"} < MEMBERS
+
+
+@pytest.mark.parametrize("make", [solid, hash_field])
+@pytest.mark.parametrize("name", sorted(MEMBERS))
+def test_a_field_has_every_member_with_the_same_arguments(make, name: str) -> None:
+    member, wanted = getattr(make(), name), getattr(Field, name, None)
+    if inspect.isfunction(wanted):
+        parameters = list(inspect.signature(wanted).parameters)[1:]  # without self
+        assert len(inspect.signature(member).parameters) == len(parameters)
+
+
+@pytest.mark.parametrize("make", [solid, hash_field])
+def test_a_field_answers_in_the_shapes_that_are_promised(make) -> None:
+    field, positions = make(), torch.rand(7, 3)
+    assert field.device == torch.device("cpu")
+    encoded = field.encode_directions(torch.rand(2, 3))
+    sigma, values = query(field, positions, torch.tensor([0, 0, 0, 1, 1, 1, 1]), encoded)
+    assert sigma.shape == (7,)
+    assert values.shape == (7, field.channels)
+    field.count(NullProbe(), 7, 3)
+
+
+def test_rays_of_a_solid_end_at_its_surface() -> None:
+    field, rays = solid(), cast(look_at_the_middle(0.1, 0.4))
+    work = Work()
+    pixels = render_rays(field, rays, EVERYWHERE, work, March())
+    batch, used = render_batch(field, rays, EVERYWHERE, March())
+    middle = (32 * 32 + 32) // 2
+    for got in (pixels, batch):
+        assert got.alpha[middle] > 0.99
+        # The camera is 1.6 away, the ball has a radius of 0.3; a few steps of 1 / 600.
+        assert got.depth_sum[middle] / got.alpha[middle] == pytest.approx(1.3, abs=0.01)
+        assert got.values[middle, 3] == pytest.approx(0.25, abs=1e-3)
+    assert 0 < work.done["shaded_samples"] < work.done["samples"]
+    assert used > 0
+
+
+def test_the_density_grid_finds_a_solid() -> None:
+    slice_ = torch.zeros(RESOLUTION, RESOLUTION, RESOLUTION, dtype=torch.bool)
+    slice_[62:66] = True  # through the middle of the ball
+    grid, generator = DensityGrid(slice_), torch.Generator().manual_seed(0)
+    for _ in range(4):
+        grid.update(solid(), generator, samples=2 * int(slice_.sum()))
+    axis = (torch.arange(RESOLUTION) + 0.5) / RESOLUTION - 0.5
+    radius = (axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2).sqrt()
+    cells = grid.occupancy.cells
+    inside, outside = slice_ & (radius < 0.28), slice_ & (radius > 0.32)
+    assert cells[inside].all()
+    assert (grid.density[inside] == DENSITY).float().mean() > 0.9
+    # All but the one in e^4 that were left out were found to be empty.
+    assert cells[outside].float().mean() < 0.05
+    assert not cells[~slice_].any()
+
+
+def test_padding_hides_behind_the_samples() -> None:
+    rows = torch.rand(BATCH_QUANTUM + 1, 3)
+    padded = pad(rows)
+    assert len(padded) == 2 * BATCH_QUANTUM
+    assert torch.equal(padded[: len(rows)], rows)
+    assert not padded[len(rows) :].any()
+    assert pad(rows[:BATCH_QUANTUM]).shape == (BATCH_QUANTUM, 3)
