@@ -1,4 +1,4 @@
-"""The 2D neural renderers: from low-resolution features to the picture (SteerNeRF, Section 3.4)."""
+"""The 2D neural renderers: from low-resolution features to the picture (SteerNeRF, Section 3.3)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stage 2: the 2D renderer, and with it the field, trained on patches of pictures (Section 3.5)."""
+"""Stage 2: the 2D renderer, and with it the field, trained on patches of pictures (Section 3.4)."""
 
 from __future__ import annotations
 
