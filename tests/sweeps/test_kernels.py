@@ -6,7 +6,7 @@ import fcntl
 import json
 
 import pytest
-from sweeps.turns import lock_file
+from sweeps.device_lock import lock_file
 
 from bench.case import Case
 from bench.types import Log
