@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from torch import Tensor, nn
 
 from bench.types import NullProbe, Probe
-from methods.engines import Network
+from methods.engines.network import Network
 from methods.rendering.frame import FeatureFrame
 from methods.steernerf.beyond.cells import cells_near, largest_in_cell
 

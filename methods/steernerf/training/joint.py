@@ -49,8 +49,7 @@ class JointOptions:
         refined_rays: pixels of those that the field learns from in a step.
         clip: largest norm of the 2D renderer's gradient.
         average: decay of the running mean of the 2D renderer's weights, which is the result.
-        distilled_views: at most so many pictures of the stage 1 field, at random views, are added to
-            the real ones.
+        distilled_views: most pictures of the stage 1 field, at random views, to learn from, too.
         distilled_share: share of the patches that come from those.
         motion: what precedes a training view.
     """
