@@ -33,7 +33,7 @@ from tests.methods.models import misty_field, shell, small_model, small_renderer
 from tests.methods.observations import shaken
 
 MOTION = MotionOptions(pool=3, uses=4, length=2)
-OPTIONS = JointOptions(patch=4, batch=2, motion=MOTION, precision="fp32", refined=0.0)
+OPTIONS = JointOptions(patch=4, batch=2, motion=MOTION, refined=0.0)
 MODEL = small_model()
 
 
@@ -301,7 +301,7 @@ def test_a_killed_training_goes_on_with_the_same_state(
 def test_a_killed_training_ends_as_if_it_had_never_stopped(
     ball_scene: Scene, tmp_path: Path
 ) -> None:
-    """The sequences go on, too: there and back, or to be made anew when they are used up."""
+    """The sequences go on, too: there and back, or are replaced when they are used up."""
     options = replace(OPTIONS, motion=MotionOptions(pool=2, uses=3, longer=0.5))
     whole = new_training(ball_scene, options)
     for _ in range(4):
