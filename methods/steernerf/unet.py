@@ -11,6 +11,7 @@ from torch.nn import functional
 from bench.types import Probe
 from methods.engines.network import Network
 from methods.kernels.splat import gather
+from methods.steernerf.options import check_size
 from methods.steernerf.renderer import UNWATCHED, Drawing, Observation, Renderer2d
 
 
@@ -19,20 +20,25 @@ class UNet(Renderer2d):
 
     Its input are the features of all frames, zero where nothing is: those of the present one at
     every s-th pixel, those of the preceding ones where they land. Its output is added to the
-    bilinearly enlarged RGB of the present frame. 2,115,587 parameters at L = 2, K = 6.
+    bilinearly enlarged RGB of the present frame. 2,115,587 parameters at L = 2, K = 6
+    and a width of 64; its outputs are those of the release (tests/data/steernerf_release.npz).
 
     Args:
         channels: K.
         frames: L.
         scale: s.
+        width: channels at full resolution; 64 as the release.
         aligned: the base has its corners, and so all pixels but the middle one, in the wrong place
             (False: as the release) or in the right one.
     """
 
-    def __init__(self, channels: int, frames: int, scale: int, *, aligned: bool = False) -> None:
+    def __init__(
+        self, channels: int, frames: int, scale: int, *, width: int = 64, aligned: bool = False
+    ) -> None:
         super().__init__()
+        check_size("renderer.width", width, 1, 4096)
         self.channels, self.frames, self.scale, self.aligned = channels, frames, scale, aligned
-        self.network = _Network(channels * (frames + 1))
+        self.network = _Network(channels * (frames + 1), width)
 
     def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Drawing:
         """See `Renderer2d`."""
@@ -63,21 +69,23 @@ class UNet(Renderer2d):
 
 
 class _Network(Network):
+    """The layers of `ReconstructionNet_v4`, of `width` channels at full resolution."""
+
     varying = ((),)
 
-    def __init__(self, inputs: int) -> None:
+    def __init__(self, inputs: int, width: int) -> None:
         super().__init__()
-        self.first = _conv(inputs, 64)
-        self.enter = _conv(64, 64)
-        self.at_half = _Residual(64)
-        self.narrow = _conv(64, 128)
-        self.at_quarter = nn.Sequential(*(_Residual(128) for _ in range(3)))
-        self.widen_quarter = _conv(128, 512)
-        self.merge_half = _conv(192, 64)
-        self.half_again = _Residual(64)
-        self.widen_half = _conv(64, 256)
-        self.merge_full = _conv(128, 64)
-        self.last = nn.Sequential(_conv(64, 64), nn.ReLU(), _conv(64, 3))
+        self.first, self.enter = _conv(inputs, width), _conv(width, width)
+        self.at_half = _Residual(width)
+        self.narrow = _conv(width, 2 * width)
+        self.at_quarter = nn.ModuleList(_Residual(2 * width) for _ in range(3))
+        self.widen_quarter = _conv(2 * width, 8 * width)
+        self.merge_half, self.half_again = _conv(3 * width, width), _Residual(width)
+        self.widen_half = _conv(width, 4 * width)
+        self.merge_full, self.leave = _conv(2 * width, width), _conv(width, width)
+        self.last = _conv(width, 3)
+        for layer in (self.widen_quarter, self.widen_half):
+            _kaiming(layer, 1.0)
 
     def forward(self, inputs: Tensor) -> tuple[Tensor]:
         """[B, C, H, W] to [B, 3, H, W]."""
@@ -87,20 +95,21 @@ class _Network(Network):
         full = self.enter(self.first(padded)).relu()
         half = self.at_half(functional.max_pool2d(full, 2)).relu()
         quarter = self.narrow(functional.max_pool2d(half, 2)).relu()
-        quarter = self.widen_quarter(self.at_quarter(quarter).relu()).relu()
-        quarter = functional.pixel_shuffle(quarter, 2)
-        merged = self.merge_half(torch.cat((quarter, half), dim=1)).relu()
-        merged = self.widen_half(self.half_again(merged)).relu()
-        merged = functional.pixel_shuffle(merged, 2)
-        merged = self.merge_full(torch.cat((merged, full), dim=1)).relu()
-        return (self.last(merged)[..., :height, :width],)
+        for block in self.at_quarter:
+            quarter = block(quarter).relu()
+        wide = functional.pixel_shuffle(self.widen_quarter(quarter), 2)
+        merged = self.merge_half(torch.cat((wide, half), dim=1)).relu()
+        merged = self.half_again(merged).relu()
+        wide = functional.pixel_shuffle(self.widen_half(merged), 2)
+        merged = self.merge_full(torch.cat((wide, full), dim=1)).relu()
+        return (self.last(self.leave(merged).relu())[..., :height, :width],)
 
     def products(self, *inputs: Tensor) -> int:
         """See `Network`: every kernel once a pixel of the size at which it is used."""
         batch, _, height, width = inputs[0].shape
         full = batch * (-(-height // 4) * 4) * (-(-width // 4) * 4)
         used = {
-            full: (self.first, self.enter, self.merge_full, self.last),
+            full: (self.first, self.enter, self.merge_full, self.leave, self.last),
             full // 4: (self.at_half, self.merge_half, self.half_again, self.widen_half),
             full // 16: (self.narrow, self.at_quarter, self.widen_quarter),
         }
@@ -114,12 +123,13 @@ class _Network(Network):
 
 
 class _Residual(nn.Module):
+    """x + conv(ReLU(conv(x)))."""
+
     def __init__(self, width: int) -> None:
         super().__init__()
         self.first, self.second = _conv(width, width), _conv(width, width)
         for layer in (self.first, self.second):
-            with torch.no_grad():
-                layer.weight.mul_(0.1)
+            _kaiming(layer, 0.1)
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.second(self.first(x).relu())
@@ -127,3 +137,11 @@ class _Residual(nn.Module):
 
 def _conv(inputs: int, outputs: int) -> nn.Conv2d:
     return nn.Conv2d(inputs, outputs, 3, padding=1)
+
+
+def _kaiming(layer: nn.Conv2d, scale: float) -> None:
+    """Start from `scale` times the weights of He et al. 2015 for ReLU, and from no bias."""
+    nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+    with torch.no_grad():
+        layer.weight.mul_(scale)
+        layer.bias.zero_()

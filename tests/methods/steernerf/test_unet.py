@@ -2,15 +2,69 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.flop_counter import FlopCounterMode
 
 from methods.steernerf.unet import UNet
 from tests.methods.observations import ROUNDING, doubled, features_of, observe, shaken
+
+RELEASE = np.load(Path(__file__).parents[2] / "data" / "steernerf_release.npz")
+"""What the released code computes on the formulas below."""
+
+
+def hashed(count: int, number: int) -> Tensor:
+    """`count` numbers in [0, 1), of a formula, in float64."""
+    place = torch.arange(1, count + 1, dtype=torch.float64)
+    x = 43758.5453 * torch.sin(12.9898 * place + 78.233 * (number + 1))
+    return x - x.floor()
+
+
+@pytest.mark.parametrize("frames", [0, 2])
+def test_it_computes_what_the_released_network_computes(frames: int) -> None:
+    network = UNet(6, frames, 4).network
+    convolutions = [layer for layer in network.modules() if isinstance(layer, nn.Conv2d)]
+    with torch.no_grad():
+        for number, layer in enumerate(convolutions):
+            size, spread = layer.weight.numel(), math.sqrt(24 / (9 * layer.in_channels))
+            layer.weight.copy_((spread * (hashed(size, number) - 0.5)).view_as(layer.weight))
+            layer.bias.copy_(0.1 * (hashed(layer.out_channels, number + 100) - 0.5))
+        inputs = hashed(6 * (frames + 1) * 16 * 24, 200).view(1, -1, 16, 24).float()
+        (output,) = network(inputs)
+    wanted = torch.from_numpy(RELEASE[f"unet.{frames + 1}.out"])
+    # 19 layers, each of sums of up to 1,728 products: their errors add up like sqrt(1728) roundings
+    # of float32 a layer, of numbers as large as the largest output.
+    tolerance = 19 * math.sqrt(1728) * 2.0**-24 * float(wanted.abs().max())
+    torch.testing.assert_close(output[0], wanted, rtol=0, atol=tolerance)
+
+
+def test_its_first_weights_are_drawn_as_those_of_the_release() -> None:
+    """Residual blocks: Kaiming times 0.1; before a pixel shuffle: Kaiming; others as torch does."""
+    network = UNet(6, 2, 4).network
+    layers = {n: x for n, x in network.named_modules() if isinstance(x, nn.Conv2d)}
+    for name, layer in layers.items():
+        residual, shuffled = "." in name or "again" in name, name.startswith("widen")
+        kaiming = math.sqrt(2 / (9 * layer.in_channels))
+        wanted = kaiming * (0.1 if residual else 1 if shuffled else math.sqrt(1 / 6))
+        samples = layer.weight.numel()
+        assert layer.weight.std().item() == pytest.approx(wanted, rel=5 / math.sqrt(2 * samples))
+        assert (residual or shuffled) == (not layer.bias.any())
+
+
+@pytest.mark.parametrize("width", [16, 32])
+def test_a_width_scales_all_channels(width: int) -> None:
+    inputs = torch.zeros(1, 18, 8, 8)
+    whole, narrow = (UNet(6, 2, 4, width=w).network.products(inputs) for w in (64, width))
+    ends = 9 * 64 * (18 + 3)  # of the first and the last layer, which scale with the width alone
+    share = width / 64
+    assert narrow == share**2 * (whole - 64 * ends) + share * 64 * ends
 
 
 @pytest.mark.parametrize(("frames", "count"), [(0, 2_108_675), (1, 2_112_131), (2, 2_115_587)])
@@ -105,7 +159,7 @@ def test_the_base_puts_the_corners_on_corners_or_centres(aligned: bool) -> None:
 
 def test_without_an_output_of_the_network_the_picture_is_the_base() -> None:
     renderer = UNet(6, 2, 4, aligned=True)
-    for layer in renderer.network.last[2].parameters():
+    for layer in renderer.network.last.parameters():
         torch.nn.init.zeros_(layer)
     observation = observe()
     base = renderer.base([observation])
