@@ -173,7 +173,6 @@ class SequencePool:
         distilled = self._chance() < (views.share if views.distilled else 0.0)
         first, pictures = (len(views.real), views.distilled) if distilled else (0, views.real)
         number = first + self._random(len(pictures))
-        self._random(self.pipeline.model.scale**2)
         buffer = RenderingBuffer(self.pipeline.model.frames)
         view = views.all[number]
         cells = _cells_with_content(view.picture, self.pipeline)
