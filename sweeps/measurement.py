@@ -183,7 +183,7 @@ def _folder(config: DictConfig) -> str | None:
 
 def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any]:
     """Everything that can change the rows, except for the weights of LPIPS: a run's key."""
-    things = [measure, *_targets(OmegaConf.to_container(config, resolve=True))]
+    things = [measure, *_targets(described(config))]
     return {
         "code": digest(*things),
         "libraries": libraries(*things),

@@ -31,7 +31,7 @@ def render_batch(
     gradient.
 
     Args:
-        how: its window and its faint weight do not count here.
+        how: `window` and `faint` are ignored.
         jitter: [R] phase of the samples of each ray, in [0, 1); None: as `rays.render_rays`.
         background: [K] or [R, K]; None: not composited on any.
     """

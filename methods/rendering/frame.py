@@ -71,8 +71,8 @@ def render_frame(
 def everywhere(
     field: Field, occupancy: Occupancy, probe: Probe, how: March
 ) -> Callable[[Tensor, Rays], Pixels]:
-    """For `render_frame`: rays are marched from the camera to their end, or in the window of `how`,
-    here of all pixels, [h * w, 2]."""
+    """What marches rays for `render_frame`: whole rays, or within `how.window` [h * w, 2], which is
+    given for all pixels."""
 
     def render(seen: Tensor, rays: Rays) -> Pixels:
         window = None if how.window is None else how.window[seen]

@@ -10,8 +10,8 @@ from methods.kernels.composite import STOP
 from methods.rendering.occupancy import STEP
 
 FAINT = 0.1
-"""Share of `stop` below which the weight of a sample is faint: black instead of its colour, it
-changes a pixel by less than a tenth of what may lie behind the end of its ray."""
+"""A sample of less weight than `FAINT * stop` has an opacity but no features: the error is less
+than a tenth of what the early stop may cause."""
 
 
 @dataclass(frozen=True)

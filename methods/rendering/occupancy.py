@@ -32,7 +32,10 @@ DECAY = 0.8
 
 MIN_ALPHA = 0.01
 THRESHOLD = MIN_ALPHA / STEP
+"""Density that is opaque to `MIN_ALPHA` over one step."""
+
 INITIAL = 1.2 * THRESHOLD
+"""Density of a cell before its first visit: one that finds nothing empties the cell."""
 
 LARGEST = math.exp(LOG_DENSITY_CLAMP)
 """A cell that was denser is remembered as this and can be forgotten: infinity does not decay."""

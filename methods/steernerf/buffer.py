@@ -81,10 +81,9 @@ class Cloud:
     def overlap(self, camera: Camera) -> float:
         """About which share of what this frame shows `camera` can see, 0 to 1.
 
-        A point is seen again if it lies inside the other picture and its surface faces that camera,
-        too. Of a ball's disc, as a far camera sees it, another one at an angle of t sees
-        (1 + cos t) / 2, half the disc and a half-ellipse; all that is seen is taken for such balls.
-        What hides behind something else is not found out. 0 for a frame that shows nothing.
+        An estimate that takes all surfaces for balls: a point inside the other picture counts
+        (1 + cos t) / 2, the share of a ball's disc that a camera at an angle of t sees as well.
+        Occlusion is ignored. 0 for a frame that shows nothing.
         """
         points = self.points[self.alpha > SPLAT_ALPHA]
         if not len(points):

@@ -64,7 +64,8 @@ class Calibration:
     def record(self, count: int, log: Log) -> list[Inputs]:
         """What the network is given in `count` training views, evenly spread.
 
-        Each view ends a random smooth motion of as many frames as the buffer holds and one more.
+        L + 1 frames of a random smooth motion precede each view: with one more than the buffer
+        holds, its oldest frame was rendered after another one.
         """
         generator = torch.Generator().manual_seed(self.seed)
         cameras, target = self.scene.splits["train"].cameras, viewing_target(self.scene)

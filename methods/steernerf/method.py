@@ -98,7 +98,8 @@ class SteerNerf:
     def _build_network(self, second: TrainedPipeline, scene: Scene, log: Log) -> None:
         """Have the engine compute the network of the 2D renderer from now on.
 
-        It is calibrated as it was trained, so that one network serves every rendering.
+        It is calibrated on frames rendered as in training, so that it does not depend on
+        `rendering`.
         """
         renderer, engine, joint = second.pipeline.renderer, self.engine, self.stage2.joint
         rendering = Rendering.in_training(self.stage2.model, joint.refined)
@@ -128,6 +129,11 @@ def _check(stage2: Stage2, rendering: Rendering) -> None:
         )
     with torch.device("meta"):  # shapes alone
         renderer = stage2.make_renderer(model.channels, model.frames, model.scale)
+    for name in ("history", "surface"):
+        if getattr(model, name) and not renderer.reads_details:
+            raise ValueError(
+                f"model.{name}: {type(renderer).__name__} does not read it, expected false, got true"
+            )
     for name, share in (
         ("rendering.refined", rendering.refined),
         ("joint.refined", stage2.joint.refined),

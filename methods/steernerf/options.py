@@ -15,12 +15,12 @@ SIZES = {"channels": (3, 256), "frames": (0, 64), "scale": (1, 64)}
 
 @dataclass(frozen=True)
 class Reprojection:
-    """How a frame is brought into another view; each `paper` value is what the release does.
+    """How a frame is brought into another view; the release's values are marked (paper).
 
     Attributes:
         rule: which point a pixel shows, the "nearest", or the "last" written (paper).
-        centres: "exact", or "paper": unprojected through the corner of a pixel, a constant offset
-            of s / 2 - 1/2 pixels that the 2D renderer has to learn.
+        centres: "exact", or "paper" (paper): unprojected through the corner of a pixel, a constant
+            offset of s / 2 - 1/2 pixels that the 2D renderer has to learn.
         depth: "expected" termination, or the "sum" of w t (paper): too near where alpha < 1; empty
             pixels become points at the camera.
     """
@@ -38,8 +38,8 @@ class Model:
         channels: K, features of the field; the first three are RGB.
         frames: L, preceding frames.
         scale: s, the field is rendered at 1/s of the resolution.
-        step: length of a ray-marching step at low resolution, in those of stage 1. Stage 2 teaches
-            the field to do with longer ones.
+        step: of the rays at low resolution, as a multiple of the step of stage 1. Stage 2 trains
+            the field for a longer one.
         stop: transmittance at which a ray ends.
         reprojection: how preceding frames are brought into the present view.
         feature_background: what the features beyond RGB are composited on. 1/2 is what an
@@ -71,11 +71,10 @@ class RangeReduction:
     """Where along a ray to look for a surface, given the depth of the newest preceding frame.
 
     Attributes:
-        mode: "off": everywhere. "paper": within `epsilon` of the depth reprojected onto the pixel,
-            whatever is found there (SteerNeRF, Section 3.2). "window": within `epsilon` of the
-            depths reprojected onto its 3 x 3 neighbourhood, until the ray has the opacity they had;
-            a ray that does not reach it looks behind the window as well, and one at a depth edge
-            everywhere.
+        mode: "off": everywhere. "paper": within `epsilon` of the depth reprojected onto the pixel
+            (SteerNeRF, Section 3.2). "window": within `epsilon` of the depths reprojected onto its
+            3 x 3 neighbourhood. A ray ends at the opacity they had; if it does not reach it, it
+            continues behind the window. At a depth edge the whole ray is marched.
         epsilon: scene units along z.
     """
 
@@ -107,14 +106,15 @@ class Rendering:
     """What is chosen after the training: one training serves every choice.
 
     Attributes:
-        step: length of a ray-marching step at low resolution, in those of stage 1.
+        step: of the rays at low resolution, as a multiple of the step of stage 1.
         stop: transmittance at which a ray ends.
         range: where rays look for a surface.
         overlap: a preceding frame that shares less than this of what it shows with the present view
             is not used; see `buffer.Cloud.overlap`.
         refined: share of the cells whose pixels are rendered by the field after all: those with the
             largest estimated error (not in the paper).
-        refined_step: length of a ray-marching step there. Training takes those of stage 1.
+        refined_step: of the rays there, as a multiple of the step of stage 1, with which it is
+            trained.
         skip: what is not computed.
     """
 

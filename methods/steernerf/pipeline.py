@@ -2,10 +2,11 @@
 
 | stage                | what it does                                            | equations |
 |----------------------|---------------------------------------------------------|-----------|
-| depth_reprojection   | the newest preceding depth limits where rays look       | 6 to 8    |
+| depth_reprojection   | the newest preceding depth limits where rays look       | 7, 8      |
 | field                | features F and depth D at h x w = H/s x W/s             | 2 to 5    |
-| feature_reprojection | preceding features at H x W                             | 6, 9, 10  |
+| feature_reprojection | preceding features at H x W                             | 9, 10     |
 | renderer2d           | the 2D neural renderer draws the picture                | 11        |
+| finish               | F and D are stored as points, for the frames to come    | 6         |
 
 Beyond the paper, and off in its method: the preceding picture is reprojected (`history`), the
 field is evaluated at the surface of each pixel (`surface`), and the cells with the largest
@@ -112,8 +113,8 @@ class Pipeline:
     def features(
         self, view: View, preceding: Sequence[Remembered], rendering: Rendering, probe: Probe
     ) -> FeatureFrame:
-        """Features and depth at low resolution (Eq. 2 to 5), marched where the newest of the
-        `preceding` frames has a surface."""
+        """Features and depth at low resolution (Eq. 2 to 5); with range reduction on, rays look
+        near the depth of the newest of the `preceding` frames only."""
         newest = preceding[0].cloud if preceding else None
         render = self._marcher(newest, view, rendering, probe)
         with probe.stage("field"):
@@ -123,7 +124,7 @@ class Pipeline:
     def _marcher(
         self, newest: Cloud | None, view: View, rendering: Rendering, probe: Probe
     ) -> Callable[[Tensor, Rays], Pixels]:
-        """How rays at low resolution are marched, as of `render_frame`."""
+        """What marches the rays at low resolution: the argument `render` of `render_frame`."""
         occupancy, how, reduction = self._occupied(rendering), rendering.march, rendering.range
         if newest is None or reduction.mode == "off":
             return everywhere(self.field, occupancy, probe, how)
@@ -151,12 +152,11 @@ class Pipeline:
     ) -> Observation:
         """All that the 2D renderer is given: the present `frame`, the `preceding` features and,
         beyond the paper, the `newest` preceding picture and the field at the surface."""
-        model, size = self.model, frame.alpha.numel()
+        model = self.model
         if rendering.skip.background:
             cells = cells_at_matter(frame.alpha, preceding)
         else:
-            cells = torch.arange(size, device=frame.alpha.device)
-        probe.count("cells", len(cells), size)
+            cells = torch.arange(frame.alpha.numel(), device=frame.alpha.device)
         history = surface = None
         if model.history or model.surface:
             depth = enlarge(frame.depth.detach(), cells, model.scale, backend=self.backend)

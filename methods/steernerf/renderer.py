@@ -16,7 +16,7 @@ from methods.steernerf.beyond.cells import cells_near, largest_in_cell
 
 @dataclass(frozen=True)
 class Points:
-    """Points in the present view: `values` [P, C] of each, and of the one that a pixel shows the
+    """Features `values` [P, C] of points, and for each pixel the row of `values` that it shows:
     `index` [...], int32, -1 for none."""
 
     values: Tensor
@@ -91,12 +91,14 @@ class Renderer2d(nn.Module, ABC):
     Attributes:
         scale: s.
         estimates_error: it says which cells of its pictures may be wrong.
+        reads_details: it reads the preceding picture and the field at the surface.
         network: what is learned.
         engine: computes what the network does, in its place; see `methods.engines`.
     """
 
     scale: int
     estimates_error = False
+    reads_details = False
     network: Network
     engine: Callable[..., tuple[Tensor, ...]] | None = None
 

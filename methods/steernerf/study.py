@@ -24,9 +24,6 @@ def ranges(mode: str, epsilons: Iterable[float]) -> list[Variant]:
 
 PARTS = {
     "field": "field",
-    "rays": "field",
-    "march": "field",
-    "composite": "field",
     "depth_reprojection": "reprojection",
     "feature_reprojection": "reprojection",
     "feature_reprojection/surface": "surface",

@@ -28,8 +28,8 @@ class UNet(Renderer2d):
         frames: L.
         scale: s.
         width: channels at full resolution; 64 as the release.
-        aligned: the base has its corners, and so all pixels but the middle one, in the wrong place
-            (False: as the release) or in the right one.
+        aligned: False, as the release, enlarges the base with align_corners=True, which moves all
+            pixels but the middle one; True keeps every pixel in its place.
     """
 
     def __init__(

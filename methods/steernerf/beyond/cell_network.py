@@ -11,7 +11,8 @@ from methods.kernels.depthwise import TAPS, depthwise
 from methods.kernels.space_to_depth import Layout
 
 LEAK = 0.1
-"""Slope of the activations below 0. With a slope of 0 the sparse inputs kill a trunk for good."""
+"""Slope of the activations below 0. With plain ReLU, units die on the sparse inputs and never
+recover."""
 
 
 class CellNetwork(Network):

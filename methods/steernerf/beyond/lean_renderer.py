@@ -62,6 +62,7 @@ class LeanRenderer(Renderer2d):
     """
 
     estimates_error = True
+    reads_details = True
     network: CellNetwork
 
     def __init__(
@@ -87,6 +88,8 @@ class LeanRenderer(Renderer2d):
 
     def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Drawing:
         """See `Renderer2d`."""
+        for o in observations:
+            probe.count("cells", len(o.cells), o.frame.alpha.numel())
         base, rows = self._rows(observations)
         neighbours, backend = self._neighbours(observations, len(rows)), observations[0].backend
         self.network.backend = backend

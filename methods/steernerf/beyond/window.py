@@ -76,21 +76,21 @@ def _highest(image: Tensor) -> Tensor:
 def within(
     field: Field, occupancy: Occupancy, probe: Probe, how: March, prior: DepthPrior
 ) -> Callable[[Tensor, Rays], Pixels]:
-    """For `rendering.frame.render_frame`: rays are marched within the windows of `prior`, and
-    behind them where they do not find the opacity to expect."""
+    """For `rendering.frame.render_frame`: a ray looks in its window of `prior`, and behind it where
+    it does not reach the expected opacity."""
 
     def render(seen: Tensor, rays: Rays) -> Pixels:
         window, expected = prior.window.view(-1, 2)[seen], prior.alpha.flatten()[seen]
         narrow = window[:, 1].isfinite()
         inside = narrow.nonzero().squeeze(1)
         expected = expected[inside]
-        # Most rays end here, but those that go on must not lack what is faint in front.
+        # A stricter limit of what is faint: rays that go on would lack faint samples in front.
         loose = March(
             how.step, max(how.stop, 1 - KEPT_ALPHA), window[inside], faint=FAINT * how.stop
         )
         first = render_rays(field, rays.take(inside), occupancy, probe, loose)
         enough = first.alpha >= KEPT_ALPHA * expected
-        # What is left of the opacity looks like what was found.
+        # Scaled to the expected opacity: the rest looks like what was found.
         more = torch.where(enough & (first.alpha < expected), expected / first.alpha, 1)
         canvas = Pixels.blank(len(seen), first.values.shape[1], field.device)
         canvas.put(

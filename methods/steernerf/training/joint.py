@@ -44,7 +44,7 @@ class JointOptions:
         patch: side of a patch, low-resolution pixels.
         batch: patches of a step.
         opacity_entropy: weight of -o ln o of the rays.
-        error_weight: of the squared error of the estimated error, in log.
+        error_weight: of the squared difference between the estimated log error and the true one.
         refined: share of the cells that are refined while it is trained.
         refined_rays: pixels of those that the field learns from in a step.
         clip: largest norm of the 2D renderer's gradient.
@@ -87,7 +87,7 @@ class JointOptions:
     def distilled(self, steps: int, frames: int) -> int:
         """Distilled views that a training of so many `steps` can use.
 
-        Without preceding `frames` no sequence goes on.
+        With L = 0 `frames`, sequences are never continued.
         """
         longer = self.motion.longer if frames else 0.0
         sequences = self.motion.pool + (1 - longer) * steps * self.batch / self.motion.uses
@@ -230,11 +230,8 @@ class JointTraining(RendererTraining):
         return self.options.opacity_entropy * opacity_entropy(opacity) if len(opacity) else 0.0
 
     def _refinement_loss(self, batch: Batch, drawing: Drawing) -> Tensor | float:
-        """Mean squared error that the pixels to be refined add to the pictures, estimated from
-        `refined_rays` of them.
-
-        Without it the field forgets how to look at full resolution.
-        """
+        """Squared error of rays through the refined cells, estimated from `refined_rays` of them
+        and scaled to the batch: it keeps the field accurate at full resolution."""
         pipeline, rendering = self.patches.pipeline, self.patches.rendering
         if not rendering.refined or drawing.error is None:
             return 0.0

@@ -72,7 +72,7 @@ class Sequence:
         cells: [N, 2] row and column of the low-resolution pixels in which the picture is not just
             background, or of all if it is.
         uses: patches that may still be cut out of it.
-        lasting: after these it goes on; otherwise another sequence takes its place.
+        lasting: after these it is continued, not replaced.
     """
 
     number: int
@@ -93,8 +93,8 @@ class MotionOptions:
         length: most frames that precede a view; fewer, and none at times, teach the cold start.
         pool: sequences kept at a time.
         uses: patches cut out of a sequence before it is replaced.
-        longer: share of the sequences that then go on, there and back to their view, instead of
-            being replaced: what is drawn becomes its own history, again and again.
+        longer: probability that it is continued instead, there and back to its view, so that what
+            is drawn becomes its own history.
     """
 
     degrees: tuple[float, float] = (0.0, 2.5)
