@@ -132,7 +132,8 @@ def _check(stage2: Stage2, rendering: Rendering) -> None:
     for name in ("history", "surface"):
         if getattr(model, name) and not renderer.reads_details:
             raise ValueError(
-                f"model.{name}: {type(renderer).__name__} does not read it, expected false, got true"
+                f"model.{name}: {type(renderer).__name__} does not read it: expected false, got "
+                "true"
             )
     for name, share in (
         ("rendering.refined", rendering.refined),

@@ -142,6 +142,7 @@ def _conv(inputs: int, outputs: int) -> nn.Conv2d:
 def _kaiming(layer: nn.Conv2d, scale: float) -> None:
     """Start from `scale` times the weights of He et al. 2015 for ReLU, and from no bias."""
     nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+    assert layer.bias is not None
+    nn.init.zeros_(layer.bias)
     with torch.no_grad():
         layer.weight.mul_(scale)
-        layer.bias.zero_()
