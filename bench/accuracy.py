@@ -16,10 +16,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bench.compositing import composite
 from bench.frontier import observed_order
 from bench.metrics import psnr, psnr_of_mse
 from bench.probes import FrameRecord, StageClock, p99_to_p50
-from bench.protocol import EvaluationProtocol, composite
+from bench.protocol import EvaluationProtocol
 from bench.scoring import check_frame
 from bench.trajectories import Trajectory
 from bench.types import Log, Method, Scene, SteerbenchError

@@ -103,6 +103,21 @@ class Case:
 
 
 @dataclass(frozen=True)
+class Property:
+    """What must hold in several cases, within the same tolerances; see `Case`."""
+
+    subject: str
+    holds: str
+    derivation: str
+    tolerances: Mapping[Cell, float]
+
+    def case(self, name: str, error: Callable[[str, str, str], float], slow: bool = False) -> Case:
+        """One of the cases."""
+        given = self.subject, name, self.holds, self.derivation, self.tolerances, error
+        return Case(*given, slow=slow)
+
+
+@dataclass(frozen=True)
 class Difference:
     """The largest difference from the reference backend on the CPU."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -21,7 +20,7 @@ from bench.cameras import (
     scale_camera,
     unproject,
 )
-from bench.case import U32, Case
+from bench.case import U32, Case, Property
 from bench.types import Camera
 
 IDENTITY = torch.eye(4)[:3]
@@ -48,87 +47,55 @@ MOTION_UNITS = 64 * (32 + 42)
 
 def cases() -> list[Case]:
     """Points projected and unprojected, at all scales; rigid motions."""
-    front = "its depth is not positive, its pixel finite"
+    front = _property("projection", "its depth is not positive, its pixel finite", "comparisons: 0")
+    pixels = _property(
+        "normalisation",
+        "rays of the unit cube go through the pixels of the data set's",
+        "the camera's position rounded, projected: 16 (reach + f) u",
+        16 * (32 + 42),
+    )
+    scaled = _property("cameras", "intrinsics are unchanged", "powers of 2: 0")
+    moved = _property(
+        "cameras",
+        "pixels do not move",
+        "points of size 3 in a rotation of 3 products, twice: 64 (reach + f) u",
+        MOTION_UNITS,
+    )
     return [
-        *(_round_trip(*kind) for kind in product(CAMERAS.items(), DEPTHS) if _resolved(*kind)),
-        _case(
-            "projection",
-            "behind the camera",
-            front,
-            ("comparisons: 0", 0),
-            partial(_not_in_front, (-1e20, -1.0, -1e-20)),
-        ),
-        _case(
-            "projection",
-            "on the camera's plane",
-            front,
-            ("comparisons: 0", 0),
-            partial(_not_in_front, (0.0, -0.0)),
-        ),
+        *_round_trips(),
+        front.case("behind the camera", partial(_not_in_front, (-1e20, -1.0, -1e-20))),
+        front.case("on the camera's plane", partial(_not_in_front, (0.0, -0.0))),
         *(
-            _case(
-                "normalisation",
-                f"a scene {side:g} wide",
-                "rays of the unit cube go through the pixels of the data set's",
-                ("the camera's position rounded, projected: 16 (reach + f) u", 16 * (32 + 42)),
-                partial(_normalisation_error, side),
-            )
+            pixels.case(f"a scene {side:g} wide", partial(_normalisation_error, side))
             for side in (1e-6, 1e6)
         ),
-        _case(
-            "cameras",
-            "a quarter and back",
-            "intrinsics are unchanged",
-            ("powers of 2: 0", 0),
-            _scaling_error,
-        ),
-        _case(
-            "cameras",
-            "rigid motion of scene and camera",
-            "pixels do not move",
-            (
-                "points of size 3 in a rotation of 3 products, twice: 64 (reach + f) u",
-                MOTION_UNITS,
-            ),
-            _fixed_motion,
-        ),
+        scaled.case("a quarter and back", _scaling_error),
+        moved.case("rigid motion of scene and camera", _fixed_motion),
     ]
 
 
-def _case(
-    subject: str,
-    name: str,
-    holds: str,
-    bound: tuple[str, float],
-    error: Callable[[str, str, str], float],
-) -> Case:
-    """`bound`: the derivation of the tolerance, and the tolerance in u."""
-    derivation, units = bound
-    return Case(subject, name, holds, derivation, {("torch", "fp32"): units * U32}, error)
+def _property(subject: str, holds: str, derivation: str, units: float = 0.0) -> Property:
+    return Property(subject, holds, derivation, {("torch", "fp32"): units * U32})
 
 
-def _resolved(named: tuple[str, Camera], depth: float) -> bool:
-    """Whether a depth is larger than the roundings of the camera's position."""
-    return depth >= 1 or not _distance(named[1])
-
-
-def _round_trip(named: tuple[str, Camera], depth: float) -> Case:
-    name, camera = named
-    reach = max(abs(camera.cx), abs(camera.cy), camera.width, camera.height)
-    distance, units = _distance(camera), 8 * reach
-    if distance:
-        units += 8 * reach + 8 * max(camera.fx, camera.fy) * (1 + distance / depth)
-    return _case(
-        "projection",
-        f"{name}, depth {depth:g}",
-        "a pixel unprojected and projected is the same pixel",
-        (
+def _round_trips() -> list[Case]:
+    found = []
+    for (name, camera), depth in product(CAMERAS.items(), DEPTHS):
+        reach = max(abs(camera.cx), abs(camera.cy), camera.width, camera.height)
+        distance, units = _distance(camera), 8 * reach
+        if distance and depth < 1:
+            continue  # nearer than the roundings of where the camera is
+        if distance:
+            units += 8 * reach + 8 * max(camera.fx, camera.fy) * (1 + distance / depth)
+        same = _property(
+            "projection",
+            "a pixel unprojected and projected is the same pixel",
             "(u - c) / f and back, 4 roundings each at the size of the picture: 8 reach u; "
             "turned, as many more; away from the origin by r, 8 f (1 + r / z) u more",
             units,
-        ),
-        partial(_round_trip_error, camera, depth),
-    )
+        )
+        found.append(same.case(f"{name}, depth {depth:g}", partial(_round_trip, camera, depth)))
+    return found
 
 
 def _distance(camera: Camera) -> float:
@@ -140,9 +107,7 @@ def _apart(got: Tensor, want: Tensor) -> float:
     return (got.double() - want.double()).abs().nan_to_num(nan=math.inf).max().item()
 
 
-def _round_trip_error(
-    camera: Camera, depth: float, backend: str, device: str, precision: str
-) -> float:
+def _round_trip(camera: Camera, depth: float, backend: str, device: str, precision: str) -> float:
     camera = place_camera(camera, device)
     pixels = pixel_grid(camera.width, camera.height, device)
     points = unproject(camera, pixels, torch.full_like(pixels[:, 0], depth))

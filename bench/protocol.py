@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from bench import metrics
+from bench.compositing import composite
 from bench.lpips_weights import locate
 from bench.trajectories import Trajectory
 from bench.types import BACKGROUNDS, Log, Scene, SteerbenchError, Unavailable
@@ -146,12 +147,3 @@ def _weights_digest(net: str, weights_dir: Path | None, log: Log) -> str | None:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except Unavailable:
         return None
-
-
-def composite(picture: Tensor, background: Tensor) -> Tensor:
-    """An 8-bit `picture` [H, W, 3 or 4] as float [H, W, 3] over `background` [3]."""
-    values = picture.float() / 255.0
-    if values.shape[-1] == 3:
-        return values
-    rgb, alpha = values[..., :3], values[..., 3:]
-    return rgb * alpha + background.to(values) * (1.0 - alpha)

@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bench.compositing import composite
 from bench.metrics import Lpips, flicker, quantise
-from bench.protocol import EvaluationProtocol, composite
+from bench.protocol import EvaluationProtocol
 from bench.trajectories import Step, Trajectory, spread
 from bench.types import Camera, Frame, Scene, SteerbenchError, check_shape
 

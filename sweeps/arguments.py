@@ -90,7 +90,7 @@ ARGUMENTS = {
         *_one(
             "--output", help="the weights, safetensors", type=Path, required=True, metavar="FILE"
         ),
-        *_words("method=steernerf_lean scene=medley budget=generic"),
+        *_words("method=steernerf_lean scene=medley budget=pretrain"),
     ],
     "list": FOLDER,
     "results": [

@@ -9,6 +9,7 @@ from bench.errors import SteerbenchError
 
 RENAMED = {
     "command=generic": "steerbench pretrain",
+    "budget=generic": "budget=pretrain",
     "method=steernerf_paper": "method=steernerf",
     "method=steernerf_frozen": "method=steernerf_lean_frozen",
     "method=steernerf_k3": "method=steernerf_lean_k3",

@@ -14,7 +14,7 @@ from sweeps.overrides import composed
 SETTINGS = (
     "method=steernerf_lean",
     "scene=medley",
-    "budget=generic",
+    "budget=pretrain",
     "method.model.channels=3",  # features beyond colour mean something else in every scene
     "method.renderer.init=scratch",
 )

@@ -65,7 +65,8 @@ def test_every_package_on_disk_is_listed_and_nothing_else():
 def test_every_configuration_is_shipped():
     patterns = PYPROJECT["tool"]["setuptools"]["package-data"]["sweeps"]
     shipped = {path for pattern in patterns for path in (ROOT / "sweeps").glob(pattern)}
-    assert shipped == {path for path in CONFIGS.rglob("*") if path.is_file()}
+    configurations = {path for path in CONFIGS.rglob("*") if path.is_file()}
+    assert shipped == {ROOT / "sweeps" / "commands.toml", *configurations}
 
 
 def test_everything_that_is_installed_for_the_project_is_pinned():

@@ -17,12 +17,13 @@ from types import ModuleType
 from typing import ClassVar, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from bench.errors import Unavailable, explained
 from bench.sharing import missing
 from bench.sources import digest, libraries
 from bench.types import Log
+from methods.engines.network import Network as Network
 
 Precision = Literal["fp32", "bf16", "fp16", "int8"]
 
@@ -40,25 +41,6 @@ varying axes to expect."""
 
 SIZES = "steerbench_sizes"
 """Key, in a stored model, of the sizes of varying axes to prepare."""
-
-
-class Network(nn.Module, ABC):
-    """A network that engines can run: tensors to a tuple of tensors.
-
-    Attributes:
-        varying: of each input, the axes whose size, the same for all of them, differs from frame to
-            frame.
-        quantum: that size is a multiple of this while frames are rendered.
-        backend: of its kernels; engines read "reference", which is plain torch.
-    """
-
-    varying: tuple[tuple[int, ...], ...]
-    quantum = 1
-    backend = "auto"
-
-    @abstractmethod
-    def products(self, *inputs: Tensor) -> int:
-        """Multiplications by weights that `inputs` take."""
 
 
 @dataclass(frozen=True)

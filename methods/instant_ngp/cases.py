@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from bench.cameras import look_at
-from bench.case import U16, U32, Agreement, Case
+from bench.case import U16, U32, Agreement, Case, Property
 from bench.types import Budget, Camera, Scene, Split, SteerbenchError
 from methods.instant_ngp.field import LOG_DENSITY_CLAMP, HashField, Precision
 from methods.instant_ngp.training import MIN_RAYS, FieldTraining, TrainingOptions
@@ -31,8 +31,6 @@ RAYS = 3000
 GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)
 STEPS = 6
 BY = [("reference", "fp32"), ("cpu", "fp32"), ("cpu", "bf16")]
-HOLDS = dict.fromkeys(BY, 0.0)
-BOOLEAN = "it does, or does not: 0"
 
 QUICK = TrainingOptions(grid_samples=1 << 12, max_rays=MIN_RAYS)
 
@@ -50,45 +48,42 @@ def cases() -> list[Case]:
         "pictures of one pixel": partial(_scene, 128, size=1),
         "all cameras the same": partial(_scene, 128, apart=0.0),
     }
-    finite = f"losses and parameters stay finite for {STEPS} steps"
-    stops = "it stays finite, or stops with a SteerbenchError and a good last state"
-    reports = "the next step stops with a SteerbenchError that names the table"
-    pixels = "pixels, opacity and gradients are finite"
-    boolean: list[tuple[str, str, str, Callable[[str, str, str], float]]] = [
-        *(("training", name, finite, partial(_stays_finite, make)) for name, make in data.items()),
+
+    def property_of(subject: str, holds: str) -> Property:
+        return Property(subject, holds, "it does, or does not: 0", dict.fromkeys(BY, 0.0))
+
+    finite = property_of("training", f"losses and parameters stay finite for {STEPS} steps")
+    stops = property_of(
+        "training", "it stays finite, or stops with a SteerbenchError and a good last state"
+    )
+    reports = property_of(
+        "training", "the next step stops with a SteerbenchError that names the table"
+    )
+    forgotten = f"no cell counts as occupied after {FORGOTTEN_AFTER} visits"
+    pixels = property_of("field", "pixels, opacity and gradients are finite")
+    shrunk = Property(
+        "training",
+        "they do not vanish: 1e-20 of what they were",
+        "a factor in front of sums: float32 and bfloat16 have the exponents; 5 layers of "
+        "roundings of size 1: 16 u, in bf16 5 ulp",
+        {(b, p): 16 * U32 if p == "fp32" else 5 * U16 for b, p in BY},
+    )
+    return [
+        step.case("T=2^17", _prepare_step, 5 * U16, precision="bf16", items=SAMPLES),
+        *(finite.case(name, partial(_stays_finite, make)) for name, make in data.items()),
         *(
-            ("training", f"learning rate {rate:g}", stops, partial(_keeps_a_good_state, rate))
+            stops.case(f"learning rate {rate:g}", partial(_keeps_a_good_state, rate))
             for rate in (10.0, 1e10, 1e30)
         ),
         *(
-            ("training", f"{value} in the table", reports, partial(_reports, value))
+            reports.case(f"{value} in the table", partial(_reports, value))
             for value in (math.nan, math.inf)
         ),
-        (
-            "density grid",
-            "field explodes, then is empty",
-            f"no cell counts as occupied after {FORGOTTEN_AFTER} visits",
-            _unforgotten,
-        ),
+        shrunk.case("gradients 1e-20 as large", _shrunk_gradient_error),
+        property_of("density grid", forgotten).case("field explodes, then is empty", _unforgotten),
         *(
-            ("field", f"log density {raw:g}", pixels, partial(_extreme_density, raw))
+            pixels.case(f"log density {raw:g}", partial(_extreme_density, raw))
             for raw in (-1e4, -100.0, 100.0, 1e4)
-        ),
-    ]
-    return [
-        step.case("T=2^17", _prepare_step, 5 * U16, precision="bf16", items=SAMPLES),
-        Case(
-            "training",
-            "gradients 1e-20 as large",
-            "they do not vanish: 1e-20 of what they were",
-            "a factor in front of sums: float32 and bfloat16 have the exponents; 5 layers of "
-            "roundings of size 1: 16 u, in bf16 5 ulp",
-            {(b, p): 16 * U32 if p == "fp32" else 5 * U16 for b, p in BY},
-            _shrunk_gradient_error,
-        ),
-        *(
-            Case(subject, name, holds, BOOLEAN, HOLDS, error)
-            for subject, name, holds, error in boolean
         ),
     ]
 

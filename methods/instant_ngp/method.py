@@ -36,6 +36,7 @@ class InstantNgp:
             ]
         },
         exact=("method.stop=1e-4",),
+        parts=dict.fromkeys(("rays", "march", "composite"), "field"),
     )
 
     def __init__(

@@ -15,11 +15,4 @@ from methods.kernels.dispatch import (
     resolve,
 )
 
-__all__ = [
-    "BACKENDS",
-    "availability",
-    "compiled",
-    "description",
-    "multiplies_bf16",
-    "resolve",
-]
+__all__ = ["BACKENDS", "availability", "compiled", "description", "multiplies_bf16", "resolve"]

@@ -1,4 +1,4 @@
-"""The 2D neural renderers: from low-resolution features to the picture (SteerNeRF, Section 3.4)."""
+"""The 2D neural renderers: from low-resolution features to the picture (SteerNeRF, Section 3.3)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from torch import Tensor, nn
 
 from bench.types import NullProbe, Probe
-from methods.engines import Network
+from methods.engines.network import Network
 from methods.rendering.frame import FeatureFrame
 from methods.steernerf.beyond.cells import cells_near, largest_in_cell
 

@@ -66,8 +66,6 @@ STUDY = Study(
         "field, trained": turned("field", "method.precision", ("fp32",)),
     },
     exact=(
-        "engine=torch",
-        "precision=fp32",
         "method.rendering.overlap=0",
         "method.rendering.range.mode=off",
         "method.rendering.step=1",

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from bench.types import Probe
-from methods.engines import Network
+from methods.engines.network import Network
 from methods.kernels.splat import gather
 from methods.steernerf.renderer import UNWATCHED, Drawing, Observation, Renderer2d
 

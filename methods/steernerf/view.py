@@ -14,7 +14,8 @@ class View:
 
     Attributes:
         full: the camera, its picture enlarged to the right and below to multiples of s.
-        low: the same view at 1/s of the resolution (K_h and K_l of Eq. 7 and 9).
+        low: the same view at 1/s of the resolution; its intrinsics are K_l of Eq. 7, those of
+            `full` K_h of Eq. 9.
         scale: s.
     """
 

@@ -16,9 +16,10 @@ from bench.accuracy import (
     render_in_turns,
     steady_frames,
 )
+from bench.compositing import composite
 from bench.errors import SteerbenchError
 from bench.probes import FrameRecord
-from bench.protocol import EvaluationProtocol, composite
+from bench.protocol import EvaluationProtocol
 from bench.trajectories import Step, Trajectory, from_split
 from bench.types import Frame
 

@@ -1,4 +1,4 @@
-"""The runner of cases: what counts as a fail, that a crash is one, that what is wrong has no time."""
+"""The runner of cases: a crash is a fail, and a backend that is wrong gets no time."""
 
 from __future__ import annotations
 

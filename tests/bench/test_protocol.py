@@ -13,8 +13,9 @@ import torch
 from omegaconf import OmegaConf
 
 from bench.cameras import scale_camera
+from bench.compositing import composite
 from bench.metrics import psnr, quantise
-from bench.protocol import EvaluationProtocol, composite
+from bench.protocol import EvaluationProtocol
 from bench.trajectories import from_split
 from bench.types import SteerbenchError
 

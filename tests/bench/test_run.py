@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 
+from bench.compositing import composite
 from bench.metrics import psnr, quantise
-from bench.protocol import EvaluationProtocol, composite
+from bench.protocol import EvaluationProtocol
 from bench.results import COLUMNS, Store
 from bench.run import Task, measure
 from bench.trajectories import from_split

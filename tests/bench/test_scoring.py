@@ -8,8 +8,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from bench.compositing import composite
 from bench.metrics import flicker, quantise
-from bench.protocol import EvaluationProtocol, composite
+from bench.protocol import EvaluationProtocol
 from bench.scoring import Scoring
 from bench.trajectories import Step, Trajectory, from_split
 

@@ -13,7 +13,7 @@ import pytest
 from bench import sources
 from bench.run import measure
 from bench.sources import digest, libraries
-from methods.instant_ngp.training import train_field
+from methods.instant_ngp.stage1 import train_field
 
 FILES = {
     "bench/ruler.py": "",

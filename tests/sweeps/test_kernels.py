@@ -6,10 +6,10 @@ import fcntl
 import json
 
 import pytest
-from sweeps.turns import lock_file
 
 from bench.case import Case
 from bench.types import Log
+from sweeps.device_lock import lock_file
 
 RIGHT = {
     "kernel": "encode", "case": "view", "backend": "cpu", "dtype": "float32", "error": 1e-7,

@@ -53,7 +53,7 @@ def test_one_renderer_is_trained_on_as_many_scenes_as_asked_for(steerbench, reco
     assert outcome.status == 0
     scenes = ["medley 0", "medley 1", "medley 2"]
     assert recorder.fitted == [(scenes, "budget", Path("w.safetensors"))]
-    assert recorder.config["budget"]["name"] == "generic"
+    assert recorder.config["budget"]["name"] == "pretrain"
     method = recorder.config["method"]
     assert method["name"] == "steernerf_lean"
     assert method["seed"] == 5
@@ -82,7 +82,7 @@ def test_no_scenes_at_all_are_refused(steerbench, recorder, scenes):
         (["--scenes", "two", "--output", "w"], "--scenes: expected 1 or more, got two"),
         (["--scenes", "2"], "the following arguments are required: --output"),
         (["--output", "w", "method.joint.rat=1"], "Did you mean method.joint.rate?"),
-        (["--output", "w", "budget=genric"], "Did you mean generic?"),
+        (["--output", "w", "budget=pretran"], "Did you mean pretrain?"),
         (["--output", "w", "seed"], "cannot read 'seed'"),
         (["--output", "w", "seed=-1"], "seed: expected 0 or more"),
         (["--output", "w", "threads=0"], "threads: expected 1 or more"),

@@ -9,7 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from bench.case import U16, U32, Agreement, Case, on_backends
+from bench.case import U16, U32, Agreement, Case, Property, on_backends
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.dispatch import served
 from methods.kernels.encode import pack
@@ -29,28 +29,20 @@ def cases() -> list[Case]:
     )
     tolerance = STEPS * 4 * 36 * U32 + 2 * U16
     kinds = ((0, 0.5), (1, 1.0), (5000, 0.0), (5000, 0.3), (5000, 1.0), (LARGE, 0.3))
-    return [
-        *(
-            kernel.case(
-                f"{share:.0%} of {count:,}",
-                partial(_prepare, count, share),
-                tolerance,
-                items=count if count == LARGE else None,
-            )
-            for count, share in kinds
-        ),
-        *(
-            Case(
-                "adam",
-                f"first gradient {gradient:g}",
-                "the step is that of the closed form",
-                "moments, corrections, root, quotient and sum: 16 u of rates of 1",
-                on_backends(16),
-                partial(_first_step_error, gradient),
-            )
-            for gradient in (0.0, 1e-40, 1e-30, 1e-15, 1.0, 1e15)
-        ),
+    first = Property(
+        "adam",
+        "the step is that of the closed form",
+        "moments, corrections, root, quotient and sum: 16 u of rates of 1",
+        on_backends(16),
+    )
+    found = [
+        first.case(f"first gradient {gradient:g}", partial(_first_step_error, gradient))
+        for gradient in (0.0, 1e-40, 1e-30, 1e-15, 1.0, 1e15)
     ]
+    for count, share in kinds:
+        name, items = f"{share:.0%} of {count:,}", count if count == LARGE else None
+        found.append(kernel.case(name, partial(_prepare, count, share), tolerance, items=items))
+    return found
 
 
 def _prepare(count: int, share: float, device: str) -> Callable[[str], tuple[Tensor, ...]]:

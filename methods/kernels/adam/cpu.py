@@ -18,11 +18,7 @@ CHUNK = 4096  # entries
 
 @torch.no_grad()
 def sparse_adam_(
-    table: Tensor,
-    grad: Tensor,
-    state: AdamState,
-    rate: float,
-    packed: Tensor | None,
+    table: Tensor, grad: Tensor, state: AdamState, rate: float, packed: Tensor | None
 ) -> None:
     """See `methods.kernels.adam.sparse_adam_`."""
     if table.dtype != torch.float32:
@@ -54,18 +50,7 @@ def _corrections(beta: float) -> np.ndarray:
 
 @njit(cache=True, parallel=True)
 def _update(
-    table,
-    grad,
-    first,
-    second,
-    steps,
-    packed,
-    corrections1,
-    corrections2,
-    rate,
-    beta1,
-    beta2,
-    eps,
+    table, grad, first, second, steps, packed, corrections1, corrections2, rate, beta1, beta2, eps
 ):
     entries, features = table.shape
     for chunk in prange((entries + CHUNK - 1) // CHUNK):

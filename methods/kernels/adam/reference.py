@@ -11,11 +11,7 @@ from methods.kernels.encode import pack
 
 @torch.no_grad()
 def sparse_adam_(
-    table: Tensor,
-    grad: Tensor,
-    state: AdamState,
-    rate: float,
-    packed: Tensor | None,
+    table: Tensor, grad: Tensor, state: AdamState, rate: float, packed: Tensor | None
 ) -> None:
     """See `methods.kernels.adam.sparse_adam_`."""
     touched = (grad != 0).any(dim=-1).nonzero().squeeze(-1)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from bench.case import DTYPES, U32, Agreement, Case, largest_error, on_backends
+from bench.case import DTYPES, U32, Agreement, Case, Property, largest_error, on_backends
 from methods.kernels.composite import Intervals, Pixels, composite, visible_counts, weights
 from methods.kernels.dispatch import served
 
@@ -129,7 +129,6 @@ EXTREMES = {
 
 LENGTHS = (1, 64, 1024, 65536)
 
-PIXEL = "8 samples: a weight has 4 roundings, thickness in front and sum 9; values up to 2: 32 u"
 RAY = (
     "a weight has 4 roundings, what is in front 1, a sum of n in pairs log2 n: (8 + log2 n) u; in "
     "fp64, where nothing wider is there to sum thicknesses in, n u more"
@@ -139,46 +138,37 @@ SAME = "a sum in another order: twice (8 + log2 n) u; the compiled one has no or
 
 def cases() -> list[Case]:
     """One extreme sample among ordinary ones; light kept over long rays; what changes nothing."""
-    pixels = [
-        Case(
-            "composite",
-            name,
-            "pixels are those of the closed form",
-            PIXEL,
-            on_backends(32, "fp64", "fp16", "bf16"),
-            partial(_pixel_error, extreme),
-        )
-        for name, extreme in EXTREMES.items()
-    ]
-    gradients = [
-        Case(
-            "composite backward",
-            name,
-            "gradients are finite and those of the closed form",
-            "as of a pixel, by the length of the sample; behind it, as many again: 64 u",
-            on_backends(64, "fp64"),
-            partial(_gradient_error, extreme),
-        )
-        for name, extreme in EXTREMES.items()
-    ]
-    light = [
-        Case(
+    pixels = Property(
+        "composite",
+        "pixels are those of the closed form",
+        "8 samples: a weight has 4 roundings, thickness in front and sum 9; values up to 2: 32 u",
+        on_backends(32, "fp64", "fp16", "bf16"),
+    )
+    gradients = Property(
+        "composite backward",
+        "gradients are finite and those of the closed form",
+        "as of a pixel, by the length of the sample; behind it, as many again: 64 u",
+        on_backends(64, "fp64"),
+    )
+    found = _agreements()
+    for name, extreme in EXTREMES.items():
+        found.append(pixels.case(name, partial(_pixel_error, extreme)))
+        found.append(gradients.case(name, partial(_gradient_error, extreme)))
+    for count in LENGTHS:
+        units = 8 + math.log2(count)
+        light = Property(
             "transmittance",
-            f"{count:,} samples, {kind}",
             "weights and what is left add up to 1",
             RAY,
-            on_backends(8 + math.log2(count))
-            | {("reference", "fp64"): (8 + math.log2(count) + count) * 2**-53},
-            partial(_light_error, count, kind),
+            on_backends(units) | {("reference", "fp64"): (units + count) * 2**-53},
         )
-        for count in LENGTHS
-        for kind in ("thin", "opaque", "alternating")
-    ]
-    changes = [
-        Case("composite", name, holds, derivation, cells, partial(_change_error, changed))
-        for name, changed, holds, derivation, cells in CHANGES
-    ]
-    return [*_agreements(), *pixels, *gradients, *light, *changes]
+        for kind in ("thin", "opaque", "alternating"):
+            name = f"{count:,} samples, {kind}"
+            found.append(light.case(name, partial(_light_error, count, kind)))
+    for name, changed, holds, derivation, cells in CHANGES:
+        change = Property("composite", holds, derivation, cells)
+        found.append(change.case(name, partial(_change_error, changed)))
+    return found
 
 
 def _agreements() -> list[Case]:

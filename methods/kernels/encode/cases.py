@@ -17,8 +17,8 @@ from bench.case import (
     U32,
     Agreement,
     Case,
-    Cell,
     Prepare,
+    Property,
     largest_error,
     on_backends,
 )
@@ -168,40 +168,27 @@ def _extremes() -> list[Case]:
         "on grid lines": _grid_lines(),
         "beyond the cube": _product(-math.inf, -1e30, -0.0, 1.5, 1e30, math.inf),
     }
-    found = [
-        Case(
-            "encode",
-            name,
-            "features are those of the closed form at the nearest position in the cube",
-            FEATURES,
-            on_backends(_units(GRID), "fp64") | packed,
-            partial(_feature_error, positions),
-        )
-        for name, positions in kinds.items()
+    closed_form = Property(
+        "encode",
+        "features are those of the closed form at the nearest position in the cube",
+        FEATURES,
+        on_backends(_units(GRID), "fp64") | packed,
+    )
+    not_a_number = Property(
+        "encode",
+        "its own features are NaN; no others change, nor any gradient",
+        "the same arithmetic for all other positions: 0",
+        dict.fromkeys([*on_backends(0), *packed], 0.0),
+    )
+    huge = Property(
+        "encode", "features are those of the closed form", FEATURES, on_backends(_units(LARGEST))
+    )
+    return [
+        *(closed_form.case(name, partial(_feature_error, at)) for name, at in kinds.items()),
+        not_a_number.case("NaN", _spread_of_nan),
+        # Reserves, though it does not fill, 9 GB.
+        huge.case("2^31 numbers in the table", _largest_table_error, slow=True),
     ]
-    exact: dict[Cell, float] = dict.fromkeys([*on_backends(0), *packed], 0.0)
-    found.append(
-        Case(
-            "encode",
-            "NaN",
-            "its own features are NaN; no others change, nor any gradient",
-            "the same arithmetic for all other positions: 0",
-            exact,
-            _spread_of_nan,
-        )
-    )
-    found.append(
-        Case(
-            "encode",
-            "2^31 numbers in the table",
-            "features are those of the closed form",
-            FEATURES,
-            on_backends(_units(LARGEST)),
-            _largest_table_error,
-            slow=True,  # reserves, though it does not fill, 9 GB
-        )
-    )
-    return found
 
 
 def _product(*edges: float) -> Tensor:

@@ -69,11 +69,7 @@ class _Encode(torch.autograd.Function):
 
 
 def _launch(
-    kernel: triton.JITFunction,
-    positions: Tensor,
-    table: Tensor,
-    grid: HashGrid,
-    features: Tensor,
+    kernel: triton.JITFunction, positions: Tensor, table: Tensor, grid: HashGrid, features: Tensor
 ) -> None:
     """Run `kernel`, which reads or adds to one of `table` and `features`, for the other."""
     launch(

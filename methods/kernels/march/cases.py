@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from bench.case import DTYPES, U32, Agreement, Case
+from bench.case import DTYPES, U32, Agreement, Case, Property
 from bench.types import Rays
 from methods.kernels.dispatch import served
 from methods.kernels.march import MAX_SAMPLES, Occupancy, march
@@ -157,28 +157,22 @@ def _ways() -> list[Case]:
             # sample lies half a step behind it, a step in the cell, at both ends.
             steps = {"full grid": 0.5, "one cell": 1.0, "empty grid": 0.0}[grid]
             rounding = 0.0 if grid == "empty grid" else 4 * math.sqrt(3) * size * U32
-            cells = {(backend, "fp32"): steps * STEP + rounding for backend in ("reference", "cpu")}
-            found.append(
-                Case(
-                    "march",
-                    f"{kind}, {grid}",
-                    holds,
-                    f"{steps} steps, and t rounded 4 times at the size of the origin: 4 √3 |o| u",
-                    cells,
-                    partial(_way_error, grid, Rays(*rays), STEP),
-                )
+            way = Property(
+                "march",
+                holds,
+                f"{steps} steps, and t rounded 4 times at the size of the origin: 4 √3 |o| u",
+                {(b, "fp32"): steps * STEP + rounding for b in ("reference", "cpu")},
             )
-    found.append(
-        Case(
-            "march",
-            "1024 samples reached",
-            "going on from where a ray was left gives the rest of the way",
-            "half a step, and t rounded 4 times at the size of the origin: 4 √3 |o| u",
-            {(b, "fp32"): FINE / 2 + 12 * math.sqrt(3) * U32 for b in ("reference", "cpu")},
-            partial(_way_error, "full grid", Rays(*kinds["along diagonals"]), FINE),
-        )
+            found.append(way.case(f"{kind}, {grid}", partial(_way_error, grid, Rays(*rays), STEP)))
+    rest = Property(
+        "march",
+        "going on from where a ray was left gives the rest of the way",
+        "half a step, and t rounded 4 times at the size of the origin: 4 √3 |o| u",
+        {(b, "fp32"): FINE / 2 + 12 * math.sqrt(3) * U32 for b in ("reference", "cpu")},
     )
-    return found
+    diagonals = Rays(*kinds["along diagonals"])
+    error = partial(_way_error, "full grid", diagonals, FINE)
+    return [*found, rest.case("1024 samples reached", error)]
 
 
 def _one_or_all(kind: str, device: str) -> Occupancy:

@@ -16,13 +16,7 @@ from torch import Tensor
 
 from bench.case import U32, Agreement, Case
 from methods.kernels.dispatch import served
-from methods.kernels.space_to_depth import (
-    CellInputs,
-    Layout,
-    Pair,
-    depth_to_space,
-    space_to_depth,
-)
+from methods.kernels.space_to_depth import CellInputs, Layout, Pair, depth_to_space, space_to_depth
 
 STEPS = 16
 """Numbers are multiples of 1/16 from -1 to 1. With weights in multiples of 1/64 a product has 11

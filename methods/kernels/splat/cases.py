@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from bench.cameras import pixel_grid, project, unproject
-from bench.case import DTYPES, U32, Agreement, Case, on_backends
+from bench.case import DTYPES, U32, Agreement, Case, Property, on_backends
 from bench.cases import CAMERAS, moved_by, random_motion
 from bench.types import Camera
 from methods.kernels.dispatch import served
@@ -44,7 +44,7 @@ Points = Callable[[], tuple[Tensor, Tensor]]
 
 def cases() -> list[Case]:
     """Splatting and gathering by all backends; frames and points whose pixels are known."""
-    return [*_splats(), *_gathers(), *_frames(), *_single_points()]
+    return [*_splats(), *_gathers(), *_known_pixels()]
 
 
 def _splats() -> list[Case]:
@@ -103,43 +103,42 @@ def _gathers() -> list[Case]:
     return found
 
 
-def _frames() -> list[Case]:
-    """A frame seen by its own camera, by a turned and a rolled one, and after a rigid motion."""
+def _known_pixels() -> list[Case]:
+    """Frames seen by their own camera, a turned and a rolled one, after a rigid motion; points at
+    borders, in ties, with extreme depths and coordinates."""
     here = CAMERAS["looking at the cube"]
     turned, rolled = rotated(here, TURNED), rotated(here, ROLLED)
-    itself = "every pixel shows itself"
-    kinds: list[tuple[str, str, Callable[[str, str, str], float]]] = [
-        *(
-            (f"same pose, {name}", itself, partial(_frame_error, camera, camera, lambda own: own))
-            for name, camera in CAMERAS.items()
-        ),
-        (
-            "turned by 180 degrees",
+    derivation = "decided by comparisons, half a pixel from where they turn: 0 wrong"
+    itself, nothing, opposite, loop = (
+        Property("splat", holds, derivation, on_backends(0, "fp64"))
+        for holds in (
+            "every pixel shows itself",
             "nothing is seen",
-            partial(_frame_error, here, turned, lambda own: -torch.ones_like(own)),
-        ),
-        (
-            "rolled by 180 degrees",
             "every pixel is opposite",
-            partial(_frame_error, here, rolled, lambda own: own.flip(0, 1)),
-        ),
-        ("rigid motion of scene and cameras", itself, partial(_moved_frame_error, 0)),
-    ]
-    return [_case(*kind) for kind in kinds]
-
-
-def _single_points() -> list[Case]:
-    """Points at borders, in ties, with extreme depths and coordinates."""
-    return [
-        _case(f"{name}, {rule}", "each pixel as of a loop", partial(_points_error, points, rule))
-        for name, points in (
-            ("borders, to the last bit", _borders),
-            ("depth 0, negative, 1e-20, 1e20, inf, NaN", _depths),
-            ("places inf and NaN", _places),
-            ("ties in depth, in u, in all", _ties),
+            "each pixel as of a loop",
         )
-        for rule in ("nearest", "last")
+    )
+    away = partial(_frame_error, here, turned, lambda own: -torch.ones_like(own))
+    upside_down = partial(_frame_error, here, rolled, lambda own: own.flip(0, 1))
+    found = [
+        nothing.case("turned by 180 degrees", away),
+        opposite.case("rolled by 180 degrees", upside_down),
+        itself.case("rigid motion of scene and cameras", partial(_moved_frame_error, 0)),
     ]
+    for name, camera in CAMERAS.items():
+        error = partial(_frame_error, camera, camera, lambda own: own)
+        found.append(itself.case(f"same pose, {name}", error))
+    for name, points in (
+        ("borders, to the last bit", _borders),
+        ("depth 0, negative, 1e-20, 1e20, inf, NaN", _depths),
+        ("places inf and NaN", _places),
+        ("ties in depth, in u, in all", _ties),
+    ):
+        found += [
+            loop.case(f"{name}, {rule}", partial(_points_error, points, rule))
+            for rule in ("nearest", "last")
+        ]
+    return found
 
 
 def _points(
@@ -202,17 +201,6 @@ def _gather_backward(
         return torch.autograd.grad(gather(values, index, backend=backend), values, grad)
 
     return call
-
-
-def _case(name: str, holds: str, error: Callable[[str, str, str], float]) -> Case:
-    return Case(
-        "splat",
-        name,
-        holds,
-        "decided by comparisons, half a pixel from where they turn: 0 wrong",
-        on_backends(0, "fp64"),
-        error,
-    )
 
 
 def rotated(camera: Camera, rotation: Tensor) -> Camera:

@@ -87,15 +87,7 @@ def _pixel(pixels, depth, points, width, height, i):
 
 @triton.jit
 def _compete(
-    pixels,
-    depth,
-    points,
-    width,
-    height,
-    size,
-    least,
-    KEY: tl.constexpr,
-    BLOCK: tl.constexpr,
+    pixels, depth, points, width, height, size, least, KEY: tl.constexpr, BLOCK: tl.constexpr
 ):
     """Lower `least` [4, H, W], of depth, u, v or index, by `KEY`, for points that are the least by
     all keys before; `size` is H W.

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from bench.cameras import look_at, pixel_grid, project, scale_camera, unproject
-from bench.case import DTYPES, U32, Agreement, Case, Prepare, on_backends
+from bench.case import DTYPES, U32, Agreement, Case, Prepare, Property, on_backends
 from bench.cases import CAMERAS
 from bench.types import Camera
 from methods.kernels.dispatch import served
@@ -141,7 +141,61 @@ BACK = "x, y and w rounded 6 times at the size of the picture, looked up twice: 
 
 def cases() -> list[Case]:
     """Warping and enlarging by all backends; views whose pictures are known; a walk."""
-    return [*_agreements(), *_same_poses(), *_known_views(), *_walks()]
+    here, origin = CAMERAS["looking at the cube"], CAMERAS["at the origin"]
+    found = _agreements()
+    for name, camera in CAMERAS.items():
+        reach = max(abs(camera.cx), abs(camera.cy), camera.width, camera.height)
+        exact = () if camera.c2w[:, 3].any() else ("fp64",)  # where the pose is
+        tolerances = on_backends(24 * reach + 8, *exact)
+        same = Property("warp", "the picture is unchanged", BACK, tolerances)
+        for depth in (1e-20, 1.0, 1e20):
+            error = partial(_same_error, camera, camera, depth)
+            found.append(same.case(f"same pose, {name}, depth {depth:g}", error))
+    nothing = Property("warp", "nothing is valid", "comparisons: 0", on_backends(0, "fp64"))
+    for name, camera, depth in (
+        ("turned by 180 degrees", rotated(here, TURNED), 1.0),
+        ("depth inf", here, math.inf),
+        ("depth NaN", here, math.nan),
+        ("depth 0", here, 0.0),
+        ("depth 0, seen from behind", _ahead(here), 0.0),
+        ("depth -1, seen from behind", _ahead(here), -1.0),
+        ("depth -inf", here, -math.inf),
+    ):
+        found.append(nothing.case(name, partial(_seen, camera, depth)))
+    rolled = Property("warp", "the picture is upside down", BACK, on_backends(24 * 32 + 8))
+    known = Property("warp", "what is valid is unchanged", BACK, on_backends(24 * 32 + 8, "fp64"))
+    inside = Property(
+        "warp",
+        "what is valid is what float64 gives",
+        "24 reach u as at the same pose, twice with an offset as large as what it is added to, in "
+        "a picture that rises by 1 over its width, and looked up: 56 u",
+        on_backends(56, "fp64"),
+    )
+    apart = Property(
+        "warp",
+        "finite only where a neighbour is, and one of them",
+        "depths that far apart do not mix; a mean of one has 8 roundings: 8 u",
+        on_backends(8, "fp64"),
+    )
+    upside_down = partial(_same_error, here, rotated(here, ROLLED), 1.0)
+    found += [
+        rolled.case("rolled by 180 degrees", upside_down),
+        known.case(
+            "depth 1e38, of which products are infinite", partial(_known_error, origin, 1e38)
+        ),
+        inside.case("camera inside the object", _inside_error),
+        apart.case("enlarged depth of inf, NaN, 1e20 and 1", _enlarged_error),
+    ]
+    for frames in (300, 10_000):
+        walk = Property(
+            "warp",
+            "a constant is unchanged, and the rest stays within its range",
+            "a look-up has 4 roundings, all of which may point the same way: 4 n u",
+            on_backends(4 * frames, "fp64"),
+        )
+        name = f"{frames:,} frames there and back"
+        found.append(walk.case(name, partial(_walk_error, frames), slow=frames > 1000))
+    return found
 
 
 def _agreements() -> list[Case]:
@@ -242,99 +296,6 @@ def _sure(kind: Kind, margin: float) -> Tensor:
         given = picture, moved, fine, cells, kind.camera, scale
         valid.append(warp(*given, backend="reference")[1])
     return (torch.stack(valid) == valid[0]).all(dim=0).float()
-
-
-def _same_poses() -> list[Case]:
-    return [
-        Case(
-            "warp",
-            f"same pose, {name}, depth {depth:g}",
-            "the picture is unchanged",
-            BACK,
-            on_backends(
-                24 * max(abs(camera.cx), abs(camera.cy), camera.width, camera.height) + 8,
-                *(() if camera.c2w[:, 3].any() else ("fp64",)),  # where the pose is exact
-            ),
-            partial(_same_error, camera, camera, depth),
-        )
-        for name, camera in CAMERAS.items()
-        for depth in (1e-20, 1.0, 1e20)
-    ]
-
-
-def _known_views() -> list[Case]:
-    here, origin = CAMERAS["looking at the cube"], CAMERAS["at the origin"]
-    rolled, in_fp64 = rotated(here, ROLLED), on_backends(24 * 32 + 8, "fp64")
-    nothing = [
-        Case(
-            "warp",
-            name,
-            "nothing is valid",
-            "comparisons: 0",
-            on_backends(0, "fp64"),
-            partial(_seen, camera, depth),
-        )
-        for name, camera, depth in (
-            ("turned by 180 degrees", rotated(here, TURNED), 1.0),
-            ("depth inf", here, math.inf),
-            ("depth NaN", here, math.nan),
-            ("depth 0", here, 0.0),
-            ("depth 0, seen from behind", _ahead(here), 0.0),
-            ("depth -1, seen from behind", _ahead(here), -1.0),
-            ("depth -inf", here, -math.inf),
-        )
-    ]
-    return [
-        Case(
-            "warp",
-            "rolled by 180 degrees",
-            "the picture is upside down",
-            BACK,
-            on_backends(24 * 32 + 8),
-            partial(_same_error, here, rolled, 1.0),
-        ),
-        Case(
-            "warp",
-            "depth 1e38, of which products are infinite",
-            "what is valid is unchanged",
-            BACK,
-            in_fp64,
-            partial(_known_error, origin, 1e38),
-        ),
-        *nothing,
-        Case(
-            "warp",
-            "camera inside the object",
-            "what is valid is what float64 gives",
-            "24 reach u as at the same pose, twice with an offset as large as what it is added to, "
-            "in a picture that rises by 1 over its width, and looked up: 56 u",
-            on_backends(56, "fp64"),
-            _inside_error,
-        ),
-        Case(
-            "warp",
-            "enlarged depth of inf, NaN, 1e20 and 1",
-            "finite only where a neighbour is, and one of them",
-            "depths that far apart do not mix; a mean of one has 8 roundings: 8 u",
-            on_backends(8, "fp64"),
-            _enlarged_error,
-        ),
-    ]
-
-
-def _walks() -> list[Case]:
-    return [
-        Case(
-            "warp",
-            f"{frames:,} frames there and back",
-            "a constant is unchanged, and the rest stays within its range",
-            "a look-up has 4 roundings, all of which may point the same way: 4 n u",
-            on_backends(4 * frames, "fp64"),
-            partial(_walk_error, frames),
-            slow=frames > 1000,
-        )
-        for frames in (300, 10_000)
-    ]
 
 
 def _ahead(camera: Camera) -> Camera:

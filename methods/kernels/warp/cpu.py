@@ -19,13 +19,7 @@ def enlarge(depth: Tensor, cells: Tensor, scale: int) -> Tensor:
             f"backend 'cpu' enlarges float32, got depth {depth.dtype}: use backend='reference'"
         )
     out = torch.empty(len(cells), scale**2)
-    _enlarge(
-        depth.contiguous().numpy(),
-        cells.numpy(),
-        scale,
-        f32(TOLERANCE),
-        out.numpy(),
-    )
+    _enlarge(depth.contiguous().numpy(), cells.numpy(), scale, f32(TOLERANCE), out.numpy())
     return out
 
 
@@ -69,10 +63,7 @@ def _enlarge(depth, cells, scale, tolerance, out):
             v = f32(row * scale + sub // scale) + f32(0.5)
             u = f32(column * scale + sub % scale) + f32(0.5)
             out[n, sub] = _depth_at(
-                depth,
-                v / f32(scale) - f32(0.5),
-                u / f32(scale) - f32(0.5),
-                tolerance,
+                depth, v / f32(scale) - f32(0.5), u / f32(scale) - f32(0.5), tolerance
             )
 
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from copy import deepcopy
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from bench.case import Case, Cell
+from bench.case import Case, Cell, Property
 from bench.console import ConsoleLog
 from methods.engines import Engine, Inputs, Precision
 from methods.engines.onnxruntime_engine import OnnxRuntime
@@ -43,43 +44,27 @@ def cases() -> list[Case]:
     rounded = {cell: share for cell, share in shares.items() if cell[1] != "int8"}
     counted = {cell: 0.0 for cell in CELLS if cell[1] == "int8"}
     same = "the output is that of the network"
-    return [
-        _case("all inputs 0", same, SHARE, shares, partial(_error, 0.0)),
+    cases = [
+        Property("engine", same, SHARE, shares).case("all inputs 0", partial(_error, 0.0)),
         # In int8 it saturates, layer by layer: no random view is as bright inside.
-        _case("all inputs 1/2", same, SHARE, rounded, partial(_error, 0.5)),
-        _case(
-            "inputs up to 1e4",
-            "the output is finite",
-            "it is, or is not: 0",
-            dict.fromkeys(CELLS, 0.0),
-            _not_finite,
-        ),
-        _case(
-            "inputs 8 times as large as in the calibration",
+        Property("engine", same, SHARE, rounded).case("all inputs 1/2", partial(_error, 0.5)),
+        Property(
+            "engine", "the output is finite", "it is, or is not: 0", dict.fromkeys(CELLS, 0.0)
+        ).case("inputs up to 1e4", _not_finite),
+        Property(
+            "engine",
             "int8 saturates: twice as large, they give the same output, number by number",
             "numbers that differ are counted: 0",
             counted,
-            _not_saturated,
-        ),
-        _case(
-            "a cell of NaN",
+        ).case("inputs 8 times as large as in the calibration", _not_saturated),
+        Property(
+            "engine",
             "its output is NaN, but in int8; cells out of its reach are unchanged",
             SHARE,
             shares,
-            _spread_of_nan,
-        ),
+        ).case("a cell of NaN", _spread_of_nan),
     ]
-
-
-def _case(
-    name: str,
-    holds: str,
-    derivation: str,
-    tolerances: Mapping[Cell, float],
-    worst: Callable[[str, str, str], float],
-) -> Case:
-    # Engines take seconds to build.
-    return Case("engine", name, holds, derivation, tolerances, worst, slow=True)
+    return [replace(case, slow=True) for case in cases]  # engines take seconds to build
 
 
 @cache

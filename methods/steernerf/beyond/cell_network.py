@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from methods.engines import Network
+from methods.engines.network import Network
 from methods.kernels.depthwise import TAPS, depthwise
 from methods.kernels.space_to_depth import Layout
 

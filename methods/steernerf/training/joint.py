@@ -1,4 +1,4 @@
-"""Stage 2: the 2D renderer, and with it the field, trained on patches of pictures (Section 3.5)."""
+"""Stage 2: the 2D renderer, and with it the field, trained on patches of pictures (Section 3.4)."""
 
 from __future__ import annotations
 
@@ -37,8 +37,7 @@ class JointOptions:
 
     Attributes:
         field: "joint", or "frozen" as stage 1 left it (the ablation of the paper's Table 5).
-        through: which frames the field learns from: "all", also the preceding ones, or only the
-            "present" one.
+        through: frames that the field learns from: "all", or only the "present" one.
         rate: learning rate of the 2D renderer at the beginning.
         field_rate: of the field.
         final_rate: share of both left at the end of the cosine schedule.
@@ -49,9 +48,9 @@ class JointOptions:
         refined: share of the cells that are refined while it is trained.
         refined_rays: pixels of those that the field learns from in a step.
         clip: largest norm of the 2D renderer's gradient.
-        average: decay of the running mean of the 2D renderer's weights that is used in the end.
-        distilled_views: most pictures of the stage 1 field at random views, to learn from as well.
-        distilled_share: of the patches that are taken from those.
+        average: decay of the running mean of the 2D renderer's weights, which is the result.
+        distilled_views: most pictures of the stage 1 field, at random views, to learn from, too.
+        distilled_share: share of the patches that come from those.
         motion: what precedes a training view.
     """
 
@@ -73,33 +72,25 @@ class JointOptions:
     motion: MotionOptions = MotionOptions()
 
     def __post_init__(self) -> None:
-        fits = {
-            "rate": (self.rate > 0, "more than 0"),
-            "field_rate": (self.field_rate > 0, "more than 0"),
-            "final_rate": (0 < self.final_rate <= 1, "a share, more than 0"),
-            "patch": (self.patch >= 1, "1 or more"),
-            "batch": (self.batch >= 1, "1 or more"),
-            "opacity_entropy": (self.opacity_entropy >= 0, "0 or more"),
-            "error_weight": (self.error_weight >= 0, "0 or more"),
-            "refined": (0 <= self.refined <= 1, "a share of 0 to 1"),
-            "refined_rays": (self.refined_rays >= 1, "1 or more"),
-            "clip": (self.clip > 0, "more than 0"),
-            "average": (0 <= self.average < 1, "a share of less than 1"),
-            "distilled_views": (self.distilled_views >= 0, "0 or more"),
-            "distilled_share": (0 <= self.distilled_share <= 1, "a share of 0 to 1"),
-        }
-        for name, (fit, wanted) in fits.items():
-            if not fit:
-                raise ValueError(f"joint.{name}: expected {wanted}, got {getattr(self, name)}")
+        for wanted, fits, names in (
+            ("more than 0", lambda x: x > 0, ("rate", "field_rate", "clip")),
+            ("0 or more", lambda x: x >= 0, ("opacity_entropy", "error_weight", "distilled_views")),
+            ("1 or more", lambda x: x >= 1, ("patch", "batch", "refined_rays")),
+            ("a share, more than 0", lambda x: 0 < x <= 1, ("final_rate",)),
+            ("a share of less than 1", lambda x: 0 <= x < 1, ("average",)),
+            ("a share of 0 to 1", lambda x: 0 <= x <= 1, ("refined", "distilled_share")),
+        ):
+            for name in names:
+                if not fits(got := getattr(self, name)):
+                    raise ValueError(f"joint.{name}: expected {wanted}, got {got}")
 
     def distilled(self, steps: int, frames: int) -> int:
-        """Distilled views of a training of so many steps: no more than it has a use for.
+        """Distilled views that a training of so many `steps` can use.
 
-        Without preceding `frames` every sequence begins anew.
+        Without preceding `frames` no sequence goes on.
         """
         longer = self.motion.longer if frames else 0.0
-        anew = (1 - longer) * steps * self.batch / self.motion.uses
-        sequences = self.motion.pool + anew
+        sequences = self.motion.pool + (1 - longer) * steps * self.batch / self.motion.uses
         return min(self.distilled_views, math.ceil(self.distilled_share * sequences))
 
 
@@ -108,7 +99,7 @@ class RendererTraining:
 
     Args:
         renderer: trained in place.
-        patches: what it is shown.
+        patches: what it learns from.
         steps: optimiser steps.
         generator: of all random numbers, also those of `patches`.
 

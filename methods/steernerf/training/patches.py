@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from bench.cameras import cast, pixel_grid
-from bench.protocol import composite
+from bench.compositing import composite
 from bench.types import Camera, NullProbe, Rays
 from methods.kernels.composite import Pixels
 from methods.rendering.batch import render_batch

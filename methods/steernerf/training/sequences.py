@@ -1,8 +1,8 @@
 """Training sequences: a true picture, and the frames that came before it.
 
 Training views are scattered, so the cameras before each are made up: a random smooth motion that
-ends there. The frames before it are rendered as they will be when the method is used, by the same
-pipeline as it stands, and rendered anew, along another motion, when they have served for a while.
+ends there. The pipeline renders these frames with its present weights, as it will when it is used.
+After some patches they are rendered again, along another motion.
 """
 
 from __future__ import annotations
@@ -62,8 +62,7 @@ class TrainingViews:
 
 @dataclass
 class Sequence:
-    """A view to be drawn and what precedes it; good for `uses` more patches, after which it begins
-    anew or, if it is `lasting`, goes on.
+    """A view to be drawn and what precedes it.
 
     Attributes:
         number: of the view, among those of its pool.
@@ -72,6 +71,8 @@ class Sequence:
         buffer: the preceding frames.
         cells: [N, 2] row and column of the low-resolution pixels in which the picture is not just
             background, or of all if it is.
+        uses: patches that may still be cut out of it.
+        lasting: after these it goes on; otherwise another sequence takes its place.
     """
 
     number: int
@@ -91,9 +92,9 @@ class MotionOptions:
         degrees: range of the angular speed, degrees a frame.
         length: most frames that precede a view; fewer, and none at times, teach the cold start.
         pool: sequences kept at a time.
-        uses: patches cut out of a sequence before it is rendered anew.
+        uses: patches cut out of a sequence before it is replaced.
         longer: share of the sequences that then go on, there and back to their view, instead of
-            beginning anew: what is drawn must also do as its own history, again and again.
+            being replaced: what is drawn becomes its own history, again and again.
     """
 
     degrees: tuple[float, float] = (0.0, 2.5)
@@ -113,7 +114,7 @@ class MotionOptions:
 
 
 class SequencePool:
-    """Sequences that end in randomly chosen views, always as fresh as `MotionOptions` says.
+    """Sequences that end in randomly chosen views and are replaced as `MotionOptions` says.
 
     Args:
         pipeline: renders the frames that precede a view,

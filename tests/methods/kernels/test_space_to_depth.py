@@ -1,6 +1,6 @@
 """Rows and pixels of cells: gradients by finite differences, wrong inputs.
 
-Its values are compared with a dense network in `tests/methods/steernerf/beyond/test_lean_renderer.py`.
+Its values are compared with a dense network in `test_lean_renderer.py`.
 """
 
 from __future__ import annotations

@@ -1,0 +1,14 @@
+"""Pictures with an opacity channel over a background."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+
+def composite(picture: Tensor, background: Tensor) -> Tensor:
+    """An 8-bit `picture` [H, W, 3 or 4] as float [H, W, 3] over `background` [3]."""
+    values = picture.float() / 255.0
+    if values.shape[-1] == 3:
+        return values
+    rgb, alpha = values[..., :3], values[..., 3:]
+    return rgb * alpha + background.to(values) * (1.0 - alpha)
