@@ -32,7 +32,7 @@ CASE_COLUMNS = (
     "case",
     "what must hold",
     "cells",
-    "nearest by",
+    "backend, precision",
     "worst",
     "at most",
     "status",
