@@ -5,6 +5,7 @@ What TensorRT itself makes of the models is not tested here; see `tensorrt_doubl
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 
@@ -46,7 +47,11 @@ def test_tensors_go_in_and_out_as_the_network_takes_and_gives_them(
             assert got.shape == want.shape
             assert got.dtype == torch.float32
             error = (got - want).square().mean().sqrt()
-            assert error < TOLERANCE.get(precision, 2**-8) * want.square().mean().sqrt()
+            # The tolerance is of half a dozen layers; the U-Net has 19, whose roundings add up as
+            # their square root.
+            depth = math.sqrt(19 / 6) if network is unet else 1.0
+            tolerance = depth * TOLERANCE.get(precision, 2**-8)
+            assert error < tolerance * want.square().mean().sqrt()
 
 
 def test_plans_are_built_for_the_sizes_to_expect_and_found_again(double, tmp_path, quiet_log):

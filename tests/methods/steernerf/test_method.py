@@ -205,7 +205,7 @@ def test_training_renders_everywhere_whatever_is_chosen_afterwards() -> None:
 
 def refused(**others: Any) -> SteerNerf:
     parts: dict[str, Any] = {
-        "model": small_model(),
+        "model": small_model(history=False, surface=False),
         "rendering": small_rendering(),
         "renderer": UNet,
         "joint": JointOptions(refined=0.0),
@@ -233,7 +233,7 @@ def test_without_preceding_frames_there_is_no_range_reduction(mode: str) -> None
     ranged = small_rendering(range=RangeReduction(mode))
     refused(rendering=ranged)  # with them there is
     with pytest.raises(ValueError, match=rf"range.mode: expected off without .* got {mode}"):
-        refused(model=small_model(frames=0), rendering=ranged)
+        refused(model=small_model(frames=0, history=False, surface=False), rendering=ranged)
 
 
 def test_a_rendering_may_be_exchanged_between_frames(ball_scene: Scene, log: ConsoleLog) -> None:
@@ -245,3 +245,11 @@ def test_a_rendering_may_be_exchanged_between_frames(ball_scene: Scene, log: Con
     method.rendering = replace(method.rendering, refined=0.0)
     drawn = method.render(camera, NullProbe()).rgb
     assert not torch.equal(drawn, refined)
+
+
+@pytest.mark.parametrize("name", ["history", "surface"])
+def test_what_the_renderer_does_not_read_is_refused(name: str) -> None:
+    only = {"history": False, "surface": False} | {name: True}
+    with pytest.raises(ValueError, match=rf"^model\.{name}: UNet does not read it"):
+        refused(model=small_model(**only))
+    refused(model=small_model(**only), renderer=RENDERER)

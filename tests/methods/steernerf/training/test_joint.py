@@ -164,7 +164,7 @@ def test_the_error_falls(ball_scene: Scene, frames: int) -> None:
     """On patches that are kept: one patch is much harder than another."""
     options = replace(OPTIONS, rate=1e-2, field_rate=1e-2)
     training = new_training(ball_scene, options, small_model(frames=frames), steps=120)
-    kept = [training.patches.cut(training.patches.pool.draw()) for _ in range(8)]
+    kept = [training.patches.cut(training.patches.pool.draw()) for _ in range(32)]
     truth = torch.stack([patch.truth for patch in kept])
 
     @torch.no_grad()
