@@ -36,6 +36,7 @@ REMOVED = {
     "method=ngp_guided",
     "protocol=steerbench-1-lookahead",
     "protocol.lookahead",
+    "method.joint.precision",
     "method.pipeline.jitter",
     "method.pipeline.levels",
     "method.pipeline.refresh",
