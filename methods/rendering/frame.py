@@ -36,7 +36,7 @@ class FeatureFrame:
     @classmethod
     def of(cls, camera: Camera, pixels: Pixels, background: Tensor) -> FeatureFrame:
         """From all pixels of `camera`, not yet composited on `background` [K]."""
-        values = pixels.values + (1 - pixels.alpha)[:, None] * background
+        values = pixels.over(background).values
         seen = pixels.alpha > EMPTY_ALPHA
         depth = torch.where(seen, pixels.depth_sum / pixels.alpha, torch.inf)
         shape = (camera.height, camera.width)

@@ -188,7 +188,7 @@ class Pipeline:
         how = refined_march(cells, frame, view.scale, rendering)
         probe.count("refined_rays", len(rays.origins), view.full.width * view.full.height)
         found = render_rays(self.field, rays, self._occupied(rendering), probe, how)
-        colours = found.values[:, :3] + (1 - found.alpha)[:, None] * self.background[:3]
+        colours = found.over(self.background).values[:, :3]
         return colours.clamp_(0, 1).view(len(cells), -1, 3)
 
     def _occupied(self, rendering: Rendering) -> Occupancy:

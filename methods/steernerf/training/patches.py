@@ -158,8 +158,8 @@ class PatchSource:
         frames = patch.sequence.buffer.frames
         values = [frame.cloud.values for frame in frames]
         for age, pixels in enumerate(preceding):
-            shine = (1 - pixels.alpha)[:, None] * self.pipeline.background
-            values[age] = values[age].index_copy(0, patch.shown[age], pixels.values + shine)
+            rendered_values = pixels.over(self.pipeline.background).values
+            values[age] = values[age].index_copy(0, patch.shown[age], rendered_values)
         points = [Points(v, i) for v, i in zip(values, patch.indices, strict=True)]
         newest = frames[0] if frames else None
         return self.pipeline.observe(frame, points, newest, patch.view, self.rendering, NullProbe())
