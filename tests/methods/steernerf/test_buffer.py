@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from bench.cameras import pixel_grid, project, scale_camera, unproject
 from bench.types import EMPTY_ALPHA, Camera
+from methods.kernels.splat import gather
 from methods.rendering.frame import FeatureFrame
 from methods.steernerf.buffer import SPLAT_ALPHA, Cloud, Remembered, RenderingBuffer
 from methods.steernerf.options import Reprojection
 from tests.methods.conftest import look_at_the_middle
 
 EXACT = Reprojection()
+RELEASED = Reprojection(rule="last", centres="paper", depth="sum")
+RELEASE = np.load(Path(__file__).parents[2] / "data" / "steernerf_release.npz")
+"""Two frames of 10 x 12 pixels, brought into a third of 40 x 48 by the released code."""
 BACKENDS = ["reference", "cpu"]
 
 
@@ -128,6 +134,27 @@ def test_an_empty_frame_is_shown_nowhere(backend: str) -> None:
     index, depth = Cloud.of(frame, EXACT).splat(low, EXACT, backend)
     assert (index == -1).all()
     assert depth.shape == (0,)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("age", [1, 2])
+@pytest.mark.parametrize("which", ["zero_upsampling", "direct"])
+def test_features_land_where_the_released_code_puts_them(
+    which: str, age: int, backend: str
+) -> None:
+    """`warp_zero_upsampling`, with which it trains, and `warp_direct`, with which it renders. Six
+    pixels of one frame are empty: they must write nothing that is seen."""
+    given = {name: torch.from_numpy(RELEASE[f"warp.{name}"]) for name in ("poses", "depth")}
+    cameras = [Camera(pose[:3], 14.0, 14.0, 6.0, 5.0, 12, 10) for pose in given["poses"]]
+    features = np.concatenate((RELEASE["warp.rgb"][age], RELEASE["warp.feat"][age]))
+    depth, values = given["depth"][age], torch.from_numpy(features).permute(1, 2, 0)
+    seen = depth > 0
+    frame = FeatureFrame(cameras[age], values, depth.where(seen, math.inf), seen.float())
+    cloud = Cloud.of(frame, RELEASED)
+    index, _ = cloud.splat(scale_camera(cameras[0], 48, 40), RELEASED, backend)
+    # Features are moved, not computed: no rounding at all.
+    wanted = torch.from_numpy(RELEASE[f"warp.{which}"][age]).permute(1, 2, 0)
+    assert torch.equal(gather(cloud.values, index, backend=backend), wanted)
 
 
 @pytest.mark.parametrize("scale", [3, 4])
