@@ -69,15 +69,21 @@ class HashField(nn.Module):
         if self.packed is not None:
             self.packed.copy_(pack(self.table))
 
-    def widen(self, channels: int) -> None:
-        """Append features up to `channels`; they are 1/2 everywhere until they are trained."""
+    def widen(self, channels: int, generator: torch.Generator | None = None) -> None:
+        """Append features up to `channels`: random ones, of first weights from `generator`, or
+        without one features that are 1/2 everywhere until they are trained.
+
+        Raises:
+            ValueError: there are more features than `channels` already.
+        """
         old = self.layers["feature_out"].detach()
         if channels < len(old):
             raise ValueError(f"channels: expected at least {len(old)}, got {channels}")
+        more = torch.zeros(channels - len(old), HIDDEN_CHANNELS)
+        if generator is not None:
+            more = _xavier_uniform(channels, HIDDEN_CHANNELS, generator).detach()[len(old) :]
         self.channels = channels
-        self.layers["feature_out"] = nn.Parameter(
-            functional.pad(old, (0, 0, 0, channels - len(old)))
-        )
+        self.layers["feature_out"] = nn.Parameter(torch.cat((old, more.to(old))))
 
     @property
     def device(self) -> torch.device:

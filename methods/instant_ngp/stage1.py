@@ -15,6 +15,7 @@ from methods.kernels import multiplies_bf16, resolve
 from methods.kernels.dispatch import description, used_by
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy
+from methods.rendering.occupancy import DensityGrid
 from methods.training import checkpoint, loop
 
 
@@ -96,11 +97,16 @@ class Setup:
 
 @dataclass(frozen=True)
 class TrainedField:
-    """A trained `field`, where it may hold matter, and the seconds its training took."""
+    """A trained `field`, the `grid` of its densities, and the seconds its training took."""
 
     field: HashField
-    occupancy: Occupancy
+    grid: DensityGrid
     train_s: float
+
+    @property
+    def occupancy(self) -> Occupancy:
+        """Where the field may hold matter."""
+        return self.grid.occupancy
 
     def sizes(self) -> dict[str, int]:
         """Bytes of table, networks and occupancy bits."""
@@ -124,8 +130,8 @@ def train_field(setup: Setup, scene: Scene, budget: Budget, log: Log) -> Trained
             restore_field(field, grid, tensors)
             seconds = figures["seconds"]
         log.info(f"trained field found: {finished}")
-        return TrainedField(field, grid.occupancy, seconds)
+        return TrainedField(field, grid, seconds)
     training = FieldTraining(field, scene, budget, setup.training, setup.seed)
     loop.train(training, finished, "training", log)
     field.grad_buffer = None
-    return TrainedField(field, training.grid.occupancy, training.seconds)
+    return TrainedField(field, training.grid, training.seconds)

@@ -98,11 +98,12 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Remembered:
-    """What is kept of a frame: its `cloud`, and its `picture` [H, W, 3] as `camera` saw it."""
+    """What is kept of a frame: its `cloud`, and its `picture` [H, W, 3] as `camera` saw it, None
+    where no frame to come reads it."""
 
     cloud: Cloud
     camera: Camera
-    picture: Tensor
+    picture: Tensor | None
 
 
 class RenderingBuffer:
@@ -145,17 +146,16 @@ class RenderingBuffer:
 
 
 def _packed(frame: Remembered) -> dict[str, Tensor]:
-    """Of the picture only what differs from its first pixel: most of it is background."""
-    cloud, pixels = frame.cloud, frame.picture.flatten(0, 1)
+    parts = {name: getattr(frame.cloud, name) for name in CLOUD}
+    parts |= {"cloud_camera": pack_camera(frame.cloud.camera), "camera": pack_camera(frame.camera)}
+    return parts if frame.picture is None else parts | _packed_picture(frame.picture)
+
+
+def _packed_picture(picture: Tensor) -> dict[str, Tensor]:
+    """Only what differs from its first pixel: most of it is background."""
+    pixels = picture.flatten(0, 1)
     places = (pixels != pixels[0]).any(dim=1).nonzero().squeeze(1)
-    parts = {name: getattr(cloud, name) for name in CLOUD}
-    return parts | {
-        "cloud_camera": pack_camera(cloud.camera),
-        "camera": pack_camera(frame.camera),
-        "background": pixels[0].clone(),
-        "places": places.int(),
-        "pixels": pixels[places],
-    }
+    return {"background": pixels[0].clone(), "places": places.int(), "pixels": pixels[places]}
 
 
 def _unpacked(tensors: Mapping[str, Tensor], device: torch.device) -> Remembered:
@@ -163,6 +163,8 @@ def _unpacked(tensors: Mapping[str, Tensor], device: torch.device) -> Remembered
         place_camera(unpack_camera(tensors[name]), device) for name in ("cloud_camera", "camera")
     )
     cloud = Cloud(cloud_camera, **{name: tensors[name].to(device) for name in CLOUD})
+    if "background" not in tensors:
+        return Remembered(cloud, camera, None)
     picture = tensors["background"].repeat(camera.height * camera.width, 1)
     picture[tensors["places"].long()] = tensors["pixels"]
     return Remembered(cloud, camera, picture.view(camera.height, camera.width, 3).to(device))

@@ -83,7 +83,7 @@ class Calibration:
                     camera = cameras[place * len(cameras) // count]
                     before = self.pipeline.model.frames + 1
                     motion = preceding(camera, target, before, self.degrees, generator)
-                    self._render([*motion, camera])
+                    self._render(motion, camera)
                     frames.append(seen[-1])
                     seen.clear()
                     progress.advance()
@@ -91,7 +91,8 @@ class Calibration:
             renderer.engine = None
         return frames
 
-    def _render(self, path: Sequence[Camera]) -> None:
+    def _render(self, motion: Sequence[Camera], camera: Camera) -> None:
         buffer = RenderingBuffer(self.pipeline.model.frames)
-        for camera in path:
-            self.pipeline.render(camera, buffer, self.rendering, NullProbe())
+        for before in motion:
+            self.pipeline.remember(before, buffer, self.rendering)
+        self.pipeline.render(camera, buffer, self.rendering, NullProbe())

@@ -34,6 +34,7 @@ class SteerNerf:
         rendering: what is chosen afterwards.
         renderer: makes the 2D renderer, called with K, L and s.
         joint: stage 2, on patches, of `budget.renderer_steps` steps.
+        after: share of these after which it is rendered; see `training.stage2.Stage2`.
         engine: computes the network of the 2D renderer once it is trained.
         precision: of the field, "bf16" (packed table, bfloat16 networks) or "fp32".
         name: as it stands in result rows.
@@ -54,13 +55,14 @@ class SteerNerf:
         renderer: Callable[..., Renderer2d],
         joint: JointOptions,
         engine: Engine,
+        after: float = 1.0,
         precision: Precision = "bf16",
         name: str = "steernerf",
         backend: str = "auto",
         device: str = "auto",
         seed: int = 0,
     ) -> None:
-        self.stage2 = Stage2(model, renderer, joint)
+        self.stage2 = Stage2(model, renderer, joint, after)
         _check(self.stage2, rendering)
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         engine.check(self.setup.device)

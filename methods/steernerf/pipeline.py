@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench.cameras import place_camera
-from bench.types import Camera, Frame, Probe, Rays
+from bench.types import Camera, Frame, NullProbe, Probe, Rays
 from methods.kernels.composite import Pixels
 from methods.kernels.march import Occupancy
 from methods.kernels.warp import enlarge, warp
@@ -97,8 +97,21 @@ class Pipeline:
                 colours = self.refined(cells, frame, view, rendering, probe)
                 put_pixels(picture, cells, model.scale, colours)
         with probe.stage("finish"):
-            buffer.push(Remembered(Cloud.of(frame, model.reprojection), view.full, picture))
+            kept = picture if model.history else None
+            buffer.push(Remembered(Cloud.of(frame, model.reprojection), view.full, kept))
             return _finished(camera, picture, frame, model.scale)
+
+    @torch.no_grad()
+    def remember(self, camera: Camera, buffer: RenderingBuffer, rendering: Rendering) -> None:
+        """As `render`, for `buffer` alone: a picture that no frame to come reads is not drawn."""
+        probe = NullProbe()
+        if self.model.history:
+            self.render(camera, buffer, rendering, probe)
+            return
+        view = self.view(camera)
+        preceding = self.overlapping(buffer.frames, view, rendering, probe)
+        frame = self.features(view, preceding, rendering, probe)
+        buffer.push(Remembered(Cloud.of(frame, self.model.reprojection), view.full, None))
 
     def overlapping(
         self, frames: Sequence[Remembered], view: View, rendering: Rendering, probe: Probe
@@ -163,14 +176,16 @@ class Pipeline:
             if model.surface:
                 with probe.stage("surface"):
                     surface = surface_points(self.field, depth, cells, view, model.scale, probe)
-            if model.history and newest is not None:
-                history = self._history(newest, depth, cells, view)
+            if newest is not None and newest.picture is not None:
+                history = self._history(newest, newest.picture, depth, cells, view)
         return Observation(frame, self.background, preceding, cells, history, surface, self.backend)
 
-    def _history(self, newest: Remembered, depth: Tensor, cells: Tensor, view: View) -> Detail:
-        """The preceding picture where the present one, of `depth` [N, s^2] in `cells`, sees it."""
+    def _history(
+        self, newest: Remembered, picture: Tensor, depth: Tensor, cells: Tensor, view: View
+    ) -> Detail:
+        """The preceding `picture` where the present, of `depth` [N, s^2] in `cells`, sees it."""
         values, valid = warp(
-            newest.picture,
+            picture,
             newest.camera,
             depth,
             cells,

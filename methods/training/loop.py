@@ -52,9 +52,16 @@ class Training(Protocol):
         """Put back results and state."""
 
 
-def train(training: Training, finished: Path, label: str, log: Log) -> None:
+def train(
+    training: Training,
+    finished: Path,
+    label: str,
+    log: Log,
+    marks: Mapping[Path, int] | None = None,
+) -> None:
     """Drive `training` to its end and write its result to `finished`, or load what is there.
 
+    On the way the results after the numbers of steps in `marks` are written, too.
     Another process that does the same is waited for. A training that was killed goes on from the
     checkpoint beside it.
 
@@ -63,16 +70,27 @@ def train(training: Training, finished: Path, label: str, log: Log) -> None:
     """
     with missing(finished, log) as to_train:
         if to_train:
-            _drive(training, finished, label, log)
+            _drive(training, finished, label, log, marks or {})
         else:
-            tensors, figures = checkpoint.read(finished)
-            with checkpoint.restoring(finished):
-                training.restore_result(tensors)
-                training.seconds = figures["seconds"]
+            load(training, finished)
             log.info(f"{label}: found in {finished}")
 
 
-def _drive(training: Training, finished: Path, label: str, log: Log) -> None:
+def load(training: Training, path: Path) -> None:
+    """Put a result that `train` wrote to `path` into `training`.
+
+    Raises:
+        SteerbenchError: the file is damaged, or of another training.
+    """
+    tensors, figures = checkpoint.read(path)
+    with checkpoint.restoring(path):
+        training.restore_result(tensors)
+        training.seconds = figures["seconds"]
+
+
+def _drive(
+    training: Training, finished: Path, label: str, log: Log, marks: Mapping[Path, int]
+) -> None:
     unfinished = finished.with_name("checkpoint.safetensors")
     if unfinished.exists():
         resume(training, unfinished)
@@ -86,6 +104,9 @@ def _drive(training: Training, finished: Path, label: str, log: Log) -> None:
             means = {k: 0.99 * means.get(k, mse) + 0.01 * mse for k, mse in errors.items()}
             progress.advance(note=", ".join(f"{k} {_db(mse)}".strip() for k, mse in means.items()))
             training.seconds = time.monotonic() - began
+            for path, step in marks.items():
+                if training.step == step:
+                    save(training, path, done=True)
             if time.monotonic() - saved > CHECKPOINT_S:
                 save(training, unfinished)
                 saved = time.monotonic()

@@ -8,9 +8,11 @@ from typing import Any
 import torch
 
 from methods.instant_ngp.field import HashField
+from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.composite import STOP
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy
+from methods.rendering.occupancy import DensityGrid
 from methods.steernerf.beyond.lean_renderer import LeanRenderer
 from methods.steernerf.options import Model, Rendering, Reprojection
 from methods.steernerf.pipeline import Pipeline
@@ -44,6 +46,11 @@ def shell() -> Occupancy:
     axis = (torch.arange(32) + 0.5) / 32 - 0.5
     radius = torch.cartesian_prod(axis, axis, axis).norm(dim=1).view(32, 32, 32)
     return Occupancy((radius - 0.3).abs() < 0.06)
+
+
+def trained_field(field: HashField) -> TrainedField:
+    """In place of a trained field: `field`, around the surface of the ball."""
+    return TrainedField(field, DensityGrid(shell().cells), train_s=0.0)
 
 
 def misty_field(precision: str = "bf16", backend: str = "auto", channels: int = 4) -> HashField:

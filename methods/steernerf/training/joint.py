@@ -13,10 +13,12 @@ from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel
 
 from bench.types import Rays
-from methods.instant_ngp.field import HashField
 from methods.instant_ngp.optimiser import FieldOptimiser
+from methods.instant_ngp.stage1 import TrainedField
+from methods.instant_ngp.training import restore_field
 from methods.kernels import multiplies_bf16
 from methods.rendering.batch import opacity_entropy, render_batch
+from methods.rendering.occupancy import EVERY
 from methods.steernerf.beyond.cells import pixels_of
 from methods.steernerf.beyond.refinement import rays_of_cells, worst_cells
 from methods.steernerf.renderer import Drawing, Renderer2d
@@ -38,17 +40,24 @@ class JointOptions:
     Attributes:
         field: "joint", or "frozen" as stage 1 left it (the ablation of the paper's Table 5).
         through: frames that the field learns from: "all", or only the "present" one.
+        features: what the features beyond RGB are at first: "random", of random weights, or
+            "constant", 1/2 everywhere.
         rate: learning rate of the 2D renderer at the beginning.
         field_rate: of the field.
-        final_rate: share of both left at the end of the cosine schedule.
-        patch: side of a patch, low-resolution pixels.
+        final_rate: of both at the end of the cosine schedule.
+        half_waves: of that schedule, an odd number; see `methods.training.optimiser.cosine`.
+        patch: side of a patch, low-resolution pixels, at most.
+        patch_share: of the shorter side of the low-resolution frame that a patch has, at most.
         batch: patches of a step.
         opacity_entropy: weight of -o ln o of the rays.
         error_weight: of the squared difference between the estimated log error and the true one.
         refined: share of the cells that are refined while it is trained.
         refined_rays: pixels of those that the field learns from in a step.
-        clip: largest norm of the 2D renderer's gradient.
-        average: decay of the running mean of the 2D renderer's weights, which is the result.
+        clip: largest norm of the 2D renderer's gradient; None: as it is.
+        average: decay of the running mean of the 2D renderer's weights, which is the result; 0: the
+            weights themselves.
+        grid_samples: visits of an update of the density grid while the field learns; 0: it stays as
+            stage 1 left it.
         distilled_views: most pictures of the stage 1 field, at random views, to learn from, too.
         distilled_share: share of the patches that come from those.
         motion: what precedes a training view.
@@ -56,27 +65,34 @@ class JointOptions:
 
     field: Literal["joint", "frozen"] = "joint"
     through: Literal["all", "present"] = "present"
+    features: Literal["random", "constant"] = "constant"
     rate: float = 1e-3
     field_rate: float = 1e-3
-    final_rate: float = 0.01
+    final_rate: float = 1e-5
+    half_waves: int = 1
     patch: int = 32
+    patch_share: float = 1.0
     batch: int = 2
     opacity_entropy: float = 1e-3
     error_weight: float = 1e-4
     refined: float = 0.2
     refined_rays: int = 2048
-    clip: float = 1.0
+    clip: float | None = 1.0
     average: float = 0.999
+    grid_samples: int = 0
     distilled_views: int = 100
     distilled_share: float = 0.5
     motion: MotionOptions = MotionOptions()
 
     def __post_init__(self) -> None:
         for wanted, fits, names in (
-            ("more than 0", lambda x: x > 0, ("rate", "field_rate", "clip")),
+            ("more than 0", lambda x: x > 0, ("rate", "field_rate", "final_rate")),
+            ("more than 0, or null", lambda x: x is None or x > 0, ("clip",)),
             ("0 or more", lambda x: x >= 0, ("opacity_entropy", "error_weight", "distilled_views")),
             ("1 or more", lambda x: x >= 1, ("patch", "batch", "refined_rays")),
-            ("a share, more than 0", lambda x: 0 < x <= 1, ("final_rate",)),
+            ("an odd number", lambda x: x > 0 and x % 2 == 1, ("half_waves",)),
+            ("0, or 2 or more", lambda x: x == 0 or x >= 2, ("grid_samples",)),
+            ("a share, more than 0", lambda x: 0 < x <= 1, ("patch_share",)),
             ("a share of less than 1", lambda x: 0 <= x < 1, ("average",)),
             ("a share of 0 to 1", lambda x: 0 <= x <= 1, ("refined", "distilled_share")),
         ):
@@ -139,8 +155,9 @@ class RendererTraining:
         value = loss.item()
         if not math.isfinite(value):
             loop.check_finite(self, {"loss": loss, "picture": drawing.pictures})
-        nn.utils.clip_grad_norm_(self.renderer.parameters(), self.options.clip)
-        self._update(cosine(self.step / self.steps, self.options.final_rate))
+        if self.options.clip is not None:
+            nn.utils.clip_grad_norm_(self.renderer.parameters(), self.options.clip)
+        self._update()
         self.step += 1
         with torch.no_grad():
             base = functional.mse_loss(self.renderer.base(batch.observations), batch.truth).item()
@@ -162,10 +179,15 @@ class RendererTraining:
         """What the field learns from, beside the pictures that are drawn."""
         return 0.0
 
-    def _update(self, share: float) -> None:
-        """Change the weights, at `share` of the learning rates of the beginning."""
-        step_at(self.optimiser, share * self.options.rate)
+    def _update(self) -> None:
+        """Change the weights."""
+        step_at(self.optimiser, self.rate_now(self.options.rate))
         self._averaged.update_parameters(self.renderer)
+
+    def rate_now(self, first: float) -> float:
+        """The learning rate of the next step, of one that is `first` at the beginning."""
+        final, waves = self.options.final_rate / first, self.options.half_waves
+        return first * cosine(self.step / self.steps, final, waves)
 
     @torch.no_grad()
     def _average(self, mean: Tensors, new: Tensors, count: Tensor | int) -> None:
@@ -212,7 +234,7 @@ class JointTraining(RendererTraining):
 
     def __init__(
         self,
-        field: HashField,
+        trained: TrainedField,
         renderer: Renderer2d,
         patches: PatchSource,
         options: JointOptions,
@@ -220,8 +242,16 @@ class JointTraining(RendererTraining):
         generator: torch.Generator,
     ) -> None:
         super().__init__(renderer, patches, options, steps, generator)
-        self.field = field
+        self.field, self.grid = trained.field, trained.grid
         self.field_optimiser = FieldOptimiser(self.field, fused=True)
+        self._visits = torch.Generator(self.field.device).manual_seed(generator.initial_seed())
+
+    def advance(self) -> dict[str, float]:
+        """As `RendererTraining`; the density grid follows the field."""
+        if self.options.grid_samples and self.step % EVERY == 0:
+            self.grid.update(self.field, self._visits, self.options.grid_samples)
+            self.patches.pipeline.occupancy = self.grid.occupancy
+        return super().advance()
 
     def _field_loss(self, batch: Batch, drawing: Drawing) -> Tensor | float:
         return self._opacity_loss(batch.opacity) + self._refinement_loss(batch, drawing)
@@ -257,31 +287,33 @@ class JointTraining(RendererTraining):
         error = (pixels.values[:, :3] - wanted[some]).square().sum() / len(some)
         return error * len(wanted) / batch.truth.numel()
 
-    def _update(self, share: float) -> None:
-        super()._update(share)
-        self.field_optimiser.step(share * self.options.field_rate)
+    def _update(self) -> None:
+        super()._update()
+        self.field_optimiser.step(self.rate_now(self.options.field_rate))
 
     def watched(self) -> dict[str, Tensor]:
         """Table, networks, 2D renderer."""
         return {"table": self.field.table, **self.field.layers, **super().watched()}
 
     def result(self) -> dict[str, Tensor]:
-        """Field and running mean of the renderer."""
+        """Field, density grid and running mean of the renderer."""
         field = {f"field.{name}": x for name, x in self.field.state_dict().items()}
-        return field | super().result()
+        return field | {"grid.density": self.grid.density} | super().result()
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
         """Put back what `result` gave."""
         super().restore_result(tensors)
-        self.field.load_state_dict(checkpoint.part(tensors, "field."))
-        self.field.repack()
+        restore_field(self.field, self.grid, tensors)
+        self.patches.pipeline.occupancy = self.grid.occupancy
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """The optimisers of the field, too."""
+        """The optimisers of the field, too, and the random numbers of its grid."""
         tensors, figures = super().state()
-        return tensors | self.field_optimiser.tensors(), figures
+        visits = {"visits": self._visits.get_state()}
+        return tensors | self.field_optimiser.tensors() | visits, figures
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
         """See `loop.Training`."""
         super().restore(tensors, figures)
         self.field_optimiser.restore(tensors)
+        self._visits.set_state(tensors["visits"].cpu())

@@ -80,15 +80,22 @@ class PatchSource:
     """Batches of random patches of the sequences of a pool.
 
     Args:
-        side: of a patch, low-resolution pixels.
+        side: of a patch, low-resolution pixels, at most.
+        share: of the shorter side of a frame that a patch has, at most.
         through: frames that the field learns from: "all", only the "present" one, or "none".
     """
 
     def __init__(
-        self, pool: SequencePool, side: int, through: Through, generator: torch.Generator
+        self,
+        pool: SequencePool,
+        side: int,
+        share: float,
+        through: Through,
+        generator: torch.Generator,
     ) -> None:
         self.pipeline, self.rendering = pool.pipeline, pool.rendering
-        self.pool, self.side, self.through, self.generator = pool, side, through, generator
+        self.pool, self.side, self.share = pool, side, share
+        self.through, self.generator = through, generator
 
     def draw(self, count: int) -> Batch:
         """See `Patches`."""
@@ -110,7 +117,8 @@ class PatchSource:
         view = sequence.view
         place = sequence.cells[self._random(len(sequence.cells))].tolist()
         size = view.low.height, view.low.width
-        height, width = (min(self.side, side) for side in size)
+        largest = min(self.side, max(1, int(self.share * min(size))))
+        height, width = (min(largest, side) for side in size)
         top, left = (
             min(max(centre - self._random(extent), 0), side - extent)
             for centre, extent, side in zip(place, (height, width), size, strict=True)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from bench.motion import preceding, viewing_target
-from bench.types import Camera, NullProbe, Scene
+from bench.types import Camera, Scene
 from methods.steernerf.buffer import RenderingBuffer
 from methods.steernerf.options import Rendering
 from methods.steernerf.pipeline import Pipeline
@@ -90,7 +90,9 @@ class MotionOptions:
 
     Attributes:
         degrees: range of the angular speed, degrees a frame.
-        length: most frames that precede a view; fewer, and none at times, teach the cold start.
+        length: most frames that precede a view,
+        least: and fewest: fewer than L, and none at times, teach the cold start; the release trains
+            with L, always.
         pool: sequences kept at a time.
         uses: patches cut out of a sequence before it is replaced.
         longer: probability that it is continued instead, there and back to its view, so that what
@@ -99,16 +101,19 @@ class MotionOptions:
 
     degrees: tuple[float, float] = (0.0, 2.5)
     length: int = 4
+    least: int = 0
     pool: int = 32
     uses: int = 32
     longer: float = 0.75
 
     def __post_init__(self) -> None:
         low, high = self.degrees
-        if not (0 <= low <= high and self.length >= 0 and self.pool >= 1 and self.uses >= 1):
+        if not (0 <= low <= high and 0 <= self.least <= self.length):
             raise ValueError(
-                f"expected 0 <= degrees[0] <= degrees[1], length >= 0, pool and uses >= 1: {self}"
+                f"expected 0 <= degrees[0] <= degrees[1] and 0 <= least <= length: {self}"
             )
+        if not (self.pool >= 1 and self.uses >= 1):
+            raise ValueError(f"expected pool and uses of 1 or more: {self}")
         if not 0 <= self.longer < 1:
             raise ValueError(f"longer: expected a share from 0 to less than 1, got {self.longer}")
 
@@ -187,7 +192,7 @@ class SequencePool:
 
     def _motion(self, truth: TrueView) -> list[Camera]:
         options = self._options
-        count = self._random(options.length + 1)
+        count = options.least + self._random(options.length - options.least + 1)
         return preceding(truth.camera, self._views.target, count, options.degrees, self._generator)
 
     def _ended(
@@ -196,7 +201,7 @@ class SequencePool:
         """The sequence of a view whose `buffer` has seen the frames of a `motion` besides."""
         if self.pipeline.model.frames:
             for camera in motion:
-                self.pipeline.render(camera, buffer, self.rendering, NullProbe())
+                self.pipeline.remember(camera, buffer, self.rendering)
         # Without frames before it, a view that goes on would be the same once more.
         lasting = self._chance() < self._options.longer and self.pipeline.model.frames > 0
         return self._sequence(number, buffer, cells, self._options.uses, lasting)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -22,6 +24,10 @@ from methods.steernerf.training.patches import PatchSource
 from methods.steernerf.training.sequences import SequencePool, TrainingViews
 from methods.training import loop
 
+MARKS = (0.125, 0.25, 0.5)
+"""Shares of the steps after which the weights are kept besides, so that an ablation can be shown as
+a curve over the steps."""
+
 
 @dataclass(frozen=True)
 class Stage2:
@@ -31,11 +37,19 @@ class Stage2:
         model: what it is trained for.
         make_renderer: makes the 2D renderer, called with K, L and s.
         joint: how it is trained.
+        after: share of its steps after which it is used, 1 or one of `MARKS`: one training serves
+            all of them.
     """
 
     model: Model
     make_renderer: Callable[..., Renderer2d]
     joint: JointOptions
+    after: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.after not in (*MARKS, 1):
+            choices = ", ".join(map(str, MARKS))
+            raise ValueError(f"after: expected {choices} or 1, got {self.after}")
 
     def new_renderer(self, seed: int, device: torch.device) -> Renderer2d:
         """A 2D renderer that has learned nothing."""
@@ -45,7 +59,7 @@ class Stage2:
         return renderer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def key(self, budget: Budget) -> dict[str, object]:
-        """Everything that the result depends on, beside the field of stage 1."""
+        """Everything that the training depends on, beside the field of stage 1."""
         make: Any = self.make_renderer
         kind, settings = (make.func, make.keywords) if isinstance(make, partial) else (make, {})
         return {
@@ -60,7 +74,7 @@ class Stage2:
 
 @dataclass(frozen=True)
 class TrainedPipeline:
-    """A trained `pipeline`, the `key` of its training, and the seconds of stage 2."""
+    """A trained `pipeline`, the `key` of its weights, and the seconds of stage 2 behind them."""
 
     pipeline: Pipeline
     key: dict[str, object]
@@ -75,16 +89,26 @@ def train_stage2(
     model, joint = stage2.model, stage2.joint
     count = joint.distilled(budget.renderer_steps, model.frames)
     distilled, distilled_s = distilled_views(setup, trained, scene, budget, count, log)
-    trained.field.widen(model.channels)
+    random = torch.Generator().manual_seed(setup.seed) if joint.features == "random" else None
+    trained.field.widen(model.channels, random)
     views = TrainingViews.of(scene, distilled, joint.distilled_share)
     background = scene.background.to(setup.device)
     pipeline, training = _prepared(trained, background, stage2, views, budget, setup.seed)
     key = {**setup.key(scene, budget), **stage2.key(budget)}
-    finished = log.stage_dir("steernerf", key) / "steernerf.safetensors"
-    loop.train(training, finished, "training the 2D renderer", log)
+    folder = log.stage_dir("steernerf", key)
+    marks = {_at(folder, share): math.ceil(share * training.steps) for share in MARKS}
+    loop.train(training, folder / "steernerf.safetensors", "training the 2D renderer", log, marks)
+    if stage2.after < 1:
+        loop.load(training, _at(folder, stage2.after))
+        key["after"] = stage2.after
     trained.field.requires_grad_(False).grad_buffer = None
     pipeline.renderer.requires_grad_(False)
     return TrainedPipeline(pipeline, key, distilled_s + training.seconds)
+
+
+def _at(folder: Path, share: float) -> Path:
+    """Where the weights after a `share` of the steps are kept."""
+    return folder / f"after-{share}.safetensors"
 
 
 def _prepared(
@@ -102,8 +126,9 @@ def _prepared(
     rendering = Rendering.in_training(model, joint.refined)
     pool = SequencePool(pipeline, rendering, views, joint.motion, generator)
     learning = joint.field == "joint"
-    patches = PatchSource(pool, joint.patch, joint.through if learning else "none", generator)
+    through = joint.through if learning else "none"
+    patches = PatchSource(pool, joint.patch, joint.patch_share, through, generator)
     rest = renderer, patches, joint, budget.renderer_steps, generator
-    training = JointTraining(field, *rest) if learning else RendererTraining(*rest)
+    training = JointTraining(trained, *rest) if learning else RendererTraining(*rest)
     pipeline.renderer = training.mean
     return pipeline, training

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
@@ -98,6 +100,19 @@ def test_the_work_of_a_field_is_what_torch_counts() -> None:
         evaluate(made)
     assert 2 * work.done["products"] == counter.get_total_flops()
     assert work.done["table_reads"] == 200 * GRID.levels * 8
+
+
+def test_random_features_that_are_appended_differ_from_place_to_place() -> None:
+    made = field("fp32")
+    before = evaluate(made)
+    made.widen(6, torch.Generator().manual_seed(0))
+    sigma, features = evaluate(made)
+    assert torch.equal(sigma, before[0])
+    torch.testing.assert_close(features[:, :3], before[1], rtol=0, atol=1e-6)
+    appended = made.layers["feature_out"].detach()[3:]
+    # Xavier: uniform in +-sqrt(6 / (64 + 6)), 192 of them.
+    assert 0.9 * math.sqrt(6 / 70) < appended.abs().max() < math.sqrt(6 / 70)
+    assert (features[:, 3:].std(dim=0) > 0).all()
 
 
 def test_features_that_are_appended_are_one_half_everywhere() -> None:

@@ -37,6 +37,7 @@ def new_method(
     rate: float = 1e-3,
     engine: Engine | None = None,
     device: str = "cpu",
+    after: float = 1.0,
     **rendering: Any,
 ) -> SteerNerf:
     return SteerNerf(
@@ -52,6 +53,7 @@ def new_method(
             motion=MotionOptions(pool=2, length=2),
         ),
         engine=engine or TorchEngine(),
+        after=after,
         device=device,
     )
 
@@ -194,6 +196,26 @@ def test_no_field_of_a_rendering_is_in_the_key_of_a_training(name: str) -> None:
     other = replace(usual, **{name: TURNED[name]})
     assert other != usual
     assert key_of(small_model(), other) == key_of(small_model(), usual)
+
+
+@pytest.mark.parametrize("after", [0.125, 0.5, 1.0])
+def test_the_weights_after_a_share_of_the_steps_are_of_the_same_training(
+    ball_scene: Scene, log: ConsoleLog, tmp_path: Path, after: float
+) -> None:
+    whole, part = new_method(), new_method(after=after)
+    assert part.stage2.key(BUDGET) == whole.stage2.key(BUDGET)
+    for method in (whole, part):
+        method.fit(ball_scene, BUDGET, log)
+    assert stages(tmp_path).count("steernerf") == 1
+    one, other = (m.pipeline.renderer.state_dict() for m in (whole, part))
+    same = all(torch.equal(one[name], other[name]) for name in one)
+    assert same == (after == 1)
+    assert (part.train_s < whole.train_s) == (after < 1)
+
+
+def test_an_unknown_share_of_the_steps_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"^after: expected 0\.125, 0\.25, 0\.5 or 1, got 0\.3$"):
+        new_method(after=0.3)
 
 
 def test_training_renders_everywhere_whatever_is_chosen_afterwards() -> None:

@@ -18,7 +18,7 @@ from methods.steernerf.training import distillation
 from methods.steernerf.training.distillation import distilled_views
 from methods.steernerf.training.sequences import TrueView
 from tests.methods.conftest import SIZE
-from tests.methods.models import SMALL_GRID, misty_field, shell
+from tests.methods.models import SMALL_GRID, misty_field, trained_field
 
 COUNT = 3
 BUDGET = Budget("test", steps=1, samples=1)
@@ -27,7 +27,7 @@ BUDGET = Budget("test", steps=1, samples=1)
 @pytest.fixture(scope="module")
 def trained() -> TrainedField:
     """In place of a trained field, one in which there is something to see."""
-    return TrainedField(misty_field(channels=3), shell(), train_s=0.0)
+    return trained_field(misty_field(channels=3))
 
 
 def views_of(

@@ -29,7 +29,7 @@ from methods.steernerf.unet import UNet
 from methods.steernerf.view import View
 from methods.training import loop
 from tests.methods.conftest import ball
-from tests.methods.models import misty_field, shell, small_model, small_renderer
+from tests.methods.models import misty_field, shell, small_model, small_renderer, trained_field
 from tests.methods.observations import shaken
 
 MOTION = MotionOptions(pool=3, uses=4, length=2)
@@ -54,9 +54,10 @@ def new_training(
     pool = SequencePool(pipeline, rendering, TrainingViews.of(scene), options.motion, generator)
     learning = options.field == "joint"
     through = options.through if learning else "none"
-    patches = PatchSource(pool, options.patch, through, generator)
+    patches = PatchSource(pool, options.patch, options.patch_share, through, generator)
     rest = (renderer, patches, options, steps, generator)
-    training = JointTraining(field, *rest) if learning else RendererTraining(*rest)
+    trained = trained_field(field)
+    training = JointTraining(trained, *rest) if learning else RendererTraining(*rest)
     pipeline.renderer = training.mean
     return training
 
@@ -250,6 +251,69 @@ def test_the_learning_rate_only_falls(ball_scene: Scene) -> None:
         rates.append(training.optimiser.param_groups[0]["lr"])
     assert rates == sorted(rates, reverse=True)
     assert rates[0] == OPTIONS.rate
+
+
+def test_both_learning_rates_of_the_release_fall_twice_to_the_same(ball_scene: Scene) -> None:
+    """From 3e-3 and 1e-4 to 5e-5, back, and to 5e-5 again: each in a third of the steps."""
+    options = replace(OPTIONS, rate=1e-4, field_rate=3e-3, final_rate=5e-5, half_waves=3)
+    training = new_training(ball_scene, options, steps=30)
+    for first in (1e-4, 3e-3):
+        rates = []
+        for training.step in range(31):
+            rates.append(training.rate_now(first))
+        assert [rates[n] for n in (0, 10, 20, 30)] == pytest.approx([first, 5e-5, first, 5e-5])
+        assert rates[15] == pytest.approx((first + 5e-5) / 2)
+    with pytest.raises(ValueError, match=r"^joint\.half_waves: expected an odd number, got 2$"):
+        replace(OPTIONS, half_waves=2)
+
+
+def test_without_a_running_mean_the_result_is_the_weights(ball_scene: Scene) -> None:
+    training = new_training(ball_scene, replace(OPTIONS, average=0.0, clip=None))
+    for _ in range(2):
+        training.advance()
+    for one, other in zip(training.mean.parameters(), training.renderer.parameters(), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_the_density_grid_follows_the_field_if_it_is_to(ball_scene: Scene) -> None:
+    """The field of the test is dense everywhere, the grid knows of a shell alone: half of the
+    visits are to any cell."""
+    for visits in (0, 512):
+        training = new_training(ball_scene, replace(OPTIONS, grid_samples=visits))
+        assert isinstance(training, JointTraining)
+        before = training.grid.density.clone()
+        training.advance()
+        changed = not torch.equal(training.grid.density, before)
+        assert changed == (visits > 0)
+        kept = training.result()["grid.density"]
+        assert torch.equal(kept, training.grid.density)
+        assert training.patches.pipeline.occupancy is (
+            training.grid.occupancy if visits else training.patches.pipeline.occupancy
+        )
+
+
+@pytest.mark.parametrize(("share", "side"), [(1.0, 6), (0.75, 6), (0.5, 4), (0.01, 1)])
+def test_a_patch_has_its_side_and_at_most_its_share_of_the_frame(
+    ball_scene: Scene, share: float, side: int
+) -> None:
+    """Of a frame of 8 x 8 low-resolution pixels."""
+    training = new_training(ball_scene, replace(OPTIONS, patch=6, patch_share=share))
+    patch = training.patches.cut(training.patches.pool.draw())
+    assert (patch.view.low.width, patch.view.low.height) == (side, side)
+
+
+def test_weights_on_the_way_are_kept(ball_scene: Scene, tmp_path: Path, quiet_log: Log) -> None:
+    """And put back by `load`, with the seconds that they took."""
+    training, marks = new_training(ball_scene, steps=4), {tmp_path / "half.safetensors": 2}
+    loop.train(training, tmp_path / "whole.safetensors", "training", quiet_log, marks)
+    half = new_training(ball_scene, steps=4)
+    for _ in range(2):
+        half.advance()
+    found = new_training(ball_scene, steps=4)
+    loop.load(found, tmp_path / "half.safetensors")
+    assert 0 < found.seconds < training.seconds
+    for name, tensor in half.result().items():
+        assert torch.equal(tensor, found.result()[name]), name
 
 
 def test_a_patch_shows_what_the_picture_shows_there(ball_scene: Scene) -> None:

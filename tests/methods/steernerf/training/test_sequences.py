@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 import torch
 
-from bench.types import Camera, Frame, Scene
+from bench.types import Camera, Frame, NullProbe, Scene
+from methods.steernerf.buffer import RenderingBuffer
 from methods.steernerf.options import Rendering
 from methods.steernerf.training.sequences import MotionOptions, SequencePool, TrainingViews
 from methods.training import checkpoint
@@ -55,6 +56,33 @@ def test_cold_and_steady_starts_both_occur(ball_scene: Scene) -> None:
     pool = new_pool(ball_scene, MotionOptions(pool=1, uses=1, length=3))
     lengths = {len(pool.draw().buffer.frames) for _ in range(24)}
     assert lengths == {0, 1, 2}  # L = 2 of the 0 to 3 that were rendered
+
+
+def test_a_view_can_always_have_all_its_preceding_frames(ball_scene: Scene) -> None:
+    pool = new_pool(ball_scene, MotionOptions(pool=1, uses=1, length=2, least=2))
+    assert {len(pool.draw().buffer.frames) for _ in range(12)} == {2}
+
+
+@pytest.mark.parametrize("history", [False, True])
+def test_a_preceding_frame_is_drawn_only_if_its_picture_is_read(
+    ball_scene: Scene, history: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its features and depth are the same either way."""
+    pipeline = new_pipeline(small_model(history=history, surface=False))
+    camera, drawn = ball_scene.splits["train"].cameras[0], []
+    forward = pipeline.renderer.forward
+    monkeypatch.setattr(
+        pipeline.renderer, "forward", lambda *given: (drawn.append(given), forward(*given))[1]
+    )
+    rendering = Rendering.in_training(pipeline.model, refined=0.0)
+    remembered, rendered = RenderingBuffer(2), RenderingBuffer(2)
+    pipeline.remember(camera, remembered, rendering)
+    assert len(drawn) == int(history)
+    pipeline.render(camera, rendered, rendering, NullProbe())
+    one, other = (buffer.frames[0] for buffer in (remembered, rendered))
+    assert torch.equal(one.cloud.values, other.cloud.values)
+    assert torch.equal(one.cloud.points, other.cloud.points)
+    assert (one.picture is None) == (other.picture is None) == (not history)
 
 
 def test_the_newest_preceding_frame_is_a_step_away(ball_scene: Scene) -> None:
