@@ -66,8 +66,12 @@ class SteerNerfLean(SteerNerf):
         skips_with=("method.rendering.refined=0",),  # refinement takes a share of the cells drawn
         beside={
             **STUDY.beside,
-            # What its U-Net has learned does not change what it costs.
-            "the paper's": ("method=steernerf", "budget.renderer_steps=8"),
+            # The release's network; what it has learned does not change what it costs.
+            "the paper's": (
+                "method=steernerf",
+                "method.renderer.width=64",
+                "budget.renderer_steps=8",
+            ),
         },
     )
 
