@@ -10,7 +10,7 @@ import numpy as np
 
 from bench.errors import SteerbenchError
 from bench.results import STEADY
-from bench.run import half_interval
+from bench.intervals import half_interval
 from reports.runs import Run
 from reports.tables import QUALITY, Table
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from bench.run import half_interval
+from bench.intervals import half_interval
 from reports.comparison import metric_format
 from reports.regression import LIMITS, Figures
 from reports.runs import Repeated

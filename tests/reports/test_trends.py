@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.run import half_interval
+from bench.intervals import half_interval
 from reports.runs import Repeated, Run, load
 from reports.trends import FAILS, HOLDS, OPEN, REVERSED, SEEN, Trend, steps
 
