@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from scipy import stats
 
+from bench.intervals import path_interval
 from bench.probes import FrameRecord, MemoryMeter, StageClock
 from bench.protocol import EvaluationProtocol
 from bench.results import COLD, STEADY, WHOLE, Measurement
@@ -22,7 +22,6 @@ from bench.scoring import ERROR_RANGE, Scoring, check_frame
 from bench.trajectories import Trajectory, spread
 from bench.types import Budget, Log, Method, Scene
 
-CONFIDENCE = 0.95
 QUANTILES = (50, 95, 99)
 UNITS = {
     "psnr": "dB",
@@ -176,25 +175,12 @@ def _frame_rows(frames: pd.DataFrame, protocol: EvaluationProtocol) -> list[dict
 
 
 def _mean(metric: str, values: pd.Series) -> dict[str, Any]:
-    """Mean over the frames that have a value, with the t-interval of that mean.
-
-    The interval needs two frames and finite values; it takes the frames as independent, which
-    neighbours on a path are not quite.
-    """
+    """Mean over the frames that have a value, in the order of the path, and its interval."""
     known = values.dropna().to_numpy(dtype=float)
     value = known.mean() if len(known) else math.nan
-    half = half_interval(known)
+    half = path_interval(known)
     figures = {"value": value, "n": len(known), "lo": value - half, "hi": value + half}
     return {"metric": metric} | figures
-
-
-def half_interval(values: np.ndarray) -> float:
-    """Half of the t-interval of the mean of `values` [n]; nan for fewer than two, or where one is
-    not finite."""
-    if len(values) < 2 or not np.isfinite(values).all():
-        return math.nan
-    quantile = stats.t.ppf(0.5 + CONFIDENCE / 2, len(values) - 1)
-    return quantile * values.std(ddof=1) / math.sqrt(len(values))
 
 
 def _rate(ms: dict) -> dict[str, float]:

@@ -109,7 +109,8 @@ def section(table: PaperTable, lines: Sequence[Repeated]) -> str:
         parts.append(f"Measured: {conditions_of(runs)}, {_origin(runs)}.")
     parts.append(f"Paper: {table.published_on}.")
     parts.append(shown.markdown())
-    if found := [step for trend in table.trends for step in steps(trend, measured)]:
+    published = {line.label: line.published for line in table.lines}
+    if found := [step for trend in table.trends for step in steps(trend, measured, published)]:
         parts.append(trend_table(found).markdown())
     notes = dict.fromkeys((*table.notes, *missing_figures(runs)))
     parts.append("\n".join(f"- {note}" for note in notes))

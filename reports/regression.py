@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.errors import SteerbenchError
+from bench.intervals import path_interval
 from bench.results import STEADY
-from bench.run import half_interval
 from reports.runs import Run
 from reports.tables import QUALITY, Table
 
@@ -40,6 +40,8 @@ LIMITS: Mapping[str, Limit] = {
     "lpips_squeeze": Limit(-1, absolute=0.003),
     "flicker": Limit(-1, relative=0.05),
     "size_bytes.total": Limit(-1, relative=0.001),
+    "work.samples": Limit(-1, relative=0.05),
+    "work.products": Limit(-1, relative=0.05),
     "frame_ms": Limit(-1, relative=0.25, here=True),
     "peak_bytes": Limit(-1, relative=0.2, here=True),
 }
@@ -56,7 +58,8 @@ class Figures:
     Attributes:
         values: of its headline, by metric.
         frames: the figures that the headline averages, by metric and by number and name of the
-            frame. Qualities have steady frames with ground truth, other metrics all steady frames.
+            frame, in the order of the path. Qualities have steady frames with ground truth, other
+            metrics all steady frames.
         machine: names of its processor and graphics processors.
         views: equal for the same frames of the same scene under one protocol.
     """
@@ -97,7 +100,8 @@ class Change:
         old, new: `new` is nan if the new run lacks the metric.
         by: new less old; the mean over the frames that both runs have, where frames are known.
         interval: 95 % interval of that mean over frames; None where only two figures are known.
-        verdict: "" if as good, "worse" by more than its limit, "missing" if it or a frame is gone.
+        verdict: "worse" by more than its limit and not by chance, "missing" if it or a frame is
+            gone, else "".
     """
 
     metric: str
@@ -111,6 +115,9 @@ class Change:
 def changes(old: Figures, new: Figures, limits: Mapping[str, Limit] = LIMITS) -> Iterator[Change]:
     """The change of every metric of `old` that has a limit.
 
+    A change beyond its limit is chance where its interval contains 0, unless one frame alone moves
+    the mean beyond the limit. Then that frame is broken; but a time may be long by chance.
+
     Raises:
         SteerbenchError: the runs rendered other frames.
     """
@@ -123,15 +130,17 @@ def changes(old: Figures, new: Figures, limits: Mapping[str, Limit] = LIMITS) ->
         if metric not in old.values or (limit.here and old.machine != new.machine):
             continue
         before, after = old.values[metric], new.values.get(metric, math.nan)
-        by, interval = after - before, None
+        by, interval, certain = after - before, None, True
+        allowed = limit.absolute + limit.relative * abs(before)
         one, other = old.frames.get(metric, {}), new.frames.get(metric, {})
         both = [name for name in one if name in other]
         if len(both) > 1:
             apart = np.array([other[name] - one[name] for name in both])
-            by = float(apart.mean())
-            half = half_interval(apart)
+            by, half = float(apart.mean()), path_interval(apart)
             interval = (by - half, by + half)
-        worse = limit.better * by < -limit.absolute - limit.relative * abs(before)
+            broken = not limit.here and (-limit.better * apart).max() / len(apart) > allowed
+            certain = broken or -limit.better * by - half > 0
+        worse = certain and -limit.better * by > allowed
         gone = math.isnan(after) or len(both) < len(one)
         verdict = "missing" if gone else "worse" if worse else ""
         yield Change(metric, before, after, by, interval, verdict)

@@ -13,8 +13,8 @@ import numpy as np
 import pandas as pd
 
 from bench.errors import SteerbenchError
+from bench.intervals import half_interval
 from bench.results import WHOLE, Store, unreadable
-from bench.run import half_interval
 from reports.tables import headline, phases, suffix
 
 

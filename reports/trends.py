@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
-from bench.run import half_interval
-from reports.comparison import metric_format
+from bench.intervals import half_interval, path_interval
+from reports.comparison import Write, metric_format
 from reports.regression import LIMITS, Figures
 from reports.runs import Repeated
 from reports.tables import Table
 
 HOLDS, FAILS, OPEN = "holds", "does not hold", "cannot be told"
+SMALLER = "smaller than the paper's step"
 SEEN, REVERSED = "so, by one seed", "the reverse, by one seed"
 """Verdicts from the frames of one seed: another training may turn them around."""
 
@@ -30,50 +32,71 @@ class Trend:
 
 
 @dataclass(frozen=True)
-class Step:
-    """From one line of a trend to the next.
+class Growth:
+    """Of a metric from one line to another.
 
     Attributes:
-        by: the growth of the metric.
-        half: half of the 95 % interval of `by`; nan where it is not known.
+        by: the mean difference.
+        half: half of its 95 % interval; nan where it is not known.
         over: the samples that `by` is the mean of, in words.
         proves: whether the interval covers the differences between trainings.
     """
 
-    metric: str
-    smaller: str
-    larger: str
     by: float
     half: float
     over: str
     proves: bool
 
+
+@dataclass(frozen=True)
+class Step:
+    """From one line of a trend to the next.
+
+    Attributes:
+        paper: by how much the metric grows in the paper; nan where it does not give both figures.
+    """
+
+    metric: str
+    smaller: str
+    larger: str
+    paper: float
+    here: Growth
+
     @property
     def verdict(self) -> str:
-        """Whether the metric grows, does not, or neither can be told."""
-        if self.by - self.half > 0:
-            return HOLDS if self.proves else SEEN
-        if self.by + self.half <= 0:
-            return FAILS if self.proves else REVERSED
-        return OPEN
+        """Whether the metric grows here, does not, grows less than in the paper, or whether that
+        cannot be told."""
+        low, high = self.here.by - self.here.half, self.here.by + self.here.half
+        if low > 0:
+            return HOLDS if self.here.proves else SEEN
+        if high <= 0:
+            return FAILS if self.here.proves else REVERSED
+        return SMALLER if self.here.proves and high < self.paper else OPEN
 
 
-def steps(trend: Trend, lines: Mapping[str, Repeated]) -> Iterator[Step]:
-    """Every step of `trend` between two lines that were measured."""
+def steps(
+    trend: Trend,
+    lines: Mapping[str, Repeated],
+    published: Mapping[str, Mapping[str, float]],
+) -> Iterator[Step]:
+    """Every step of `trend` between two lines that were measured.
+
+    Args:
+        lines: measured, by label.
+        published: the paper's figures, by label and metric.
+    """
     for smaller, larger in pairwise(trend.rising):
         one, other = lines.get(smaller), lines.get(larger)
-        if one is not None and other is not None:
-            differences, over, proves = _differences(one, other, trend.metric)
-            if len(differences):
-                half = half_interval(differences)
-                if trend.metric.startswith("size_bytes"):
-                    half, over, proves = 0.0, COMPUTED, True
-                by = float(differences.mean())
-                yield Step(trend.metric, smaller, larger, by, half, over, proves)
+        here = _growth(one, other, trend.metric) if one and other else None
+        if here is not None:
+            below, above = (
+                published.get(label, {}).get(trend.metric, math.nan) for label in (smaller, larger)
+            )
+            yield Step(trend.metric, smaller, larger, above - below, here)
 
 
-def _differences(one: Repeated, other: Repeated, metric: str) -> tuple[np.ndarray, str, bool]:
-    """Differences of pairs [n], what the pairs are, and whether they cover several trainings.
+def _growth(one: Repeated, other: Repeated, metric: str) -> Growth | None:
+    """The mean difference of pairs; None if there are none.
 
     Pairs have the same seed if there are several seeds, else they are the same frame of one seed.
     """
@@ -87,29 +110,40 @@ def _differences(one: Repeated, other: Repeated, metric: str) -> tuple[np.ndarra
         and metric in twin.values
         and (anywhere or run.computer == twin.computer)
     ]
-    if len(pairs) == 1:
-        frames, others = (Figures.of(run).frames.get(metric, {}) for run in pairs[0])
-        by_frame = [others[name] - frames[name] for name in frames if name in others]
-        if len(by_frame) > 1:
-            return np.array(by_frame), f"{len(by_frame)} frames of one seed", False
+    if not pairs:
+        return None
     by_seed = np.array([twin.values[metric] - run.values[metric] for run, twin in pairs])
-    several = len(pairs) > 1
-    return by_seed, f"{len(pairs)} seeds" if several else "one figure each", several
+    by = float(by_seed.mean())
+    if metric.startswith("size_bytes"):
+        return Growth(by, 0.0, COMPUTED, proves=True)
+    if len(pairs) > 1:
+        return Growth(by, half_interval(by_seed), f"{len(pairs)} seeds", proves=True)
+    frames, others = (Figures.of(run).frames.get(metric, {}) for run in pairs[0])
+    by_frame = np.array([others[name] - frames[name] for name in frames if name in others])
+    if len(by_frame) > 1:
+        over = f"{len(by_frame)} frames of one seed"
+        return Growth(float(by_frame.mean()), path_interval(by_frame), over, proves=False)
+    return Growth(by, math.nan, "one figure each", proves=False)
 
 
 def trend_table(found: Sequence[Step]) -> Table:
     """The steps `found`, a line each."""
-    columns = ("grows in the paper", "here by", "95 % interval", "over", "")
+    columns = ("grows in the paper", "paper", "here", "over", "")
     return Table("Trends", columns, tuple(map(_line, found)))
 
 
 def _line(step: Step) -> tuple[str, ...]:
-    scale = 1e6 if step.metric.startswith("size_bytes") else 1.0
-    by, half = step.by / scale, step.half / scale
+    label, write = metric_format(step.metric)
+    here = step.here
+    half = f" ± {write(here.half)}" if here.half > 0 else ""
     return (
-        f"{metric_format(step.metric)[0].rstrip(' ↑↓')}: {step.smaller} < {step.larger}",
-        f"{by:+.3f}",
-        f"{by - half:+.3f} to {by + half:+.3f}" if half >= 0 and step.over != COMPUTED else "",
-        step.over,
+        f"{label.rstrip(' ↑↓')}: {step.smaller} < {step.larger}",
+        "" if math.isnan(step.paper) else _signed(step.paper, write),
+        _signed(here.by, write) + half,
+        here.over,
         step.verdict,
     )
+
+
+def _signed(by: float, write: Write) -> str:
+    return ("-" if by < 0 else "+") + write(abs(by))

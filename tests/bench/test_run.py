@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from bench.compositing import composite
+from bench.intervals import path_interval
 from bench.metrics import psnr, quantise
 from bench.protocol import EvaluationProtocol
 from bench.results import COLUMNS, Store
@@ -90,6 +91,13 @@ def test_the_interval_is_that_of_student(run, offset_method, tiny_scene):
     assert found["n"] == 2
     assert found["hi"] - found["value"] == pytest.approx(half, rel=1e-6)
     assert found["value"] - found["lo"] == pytest.approx(half, rel=1e-6)
+
+
+def test_the_interval_takes_the_frames_in_the_order_of_their_path(run, offset_method):
+    measured = run(offset_method)
+    found = row(measured.rows, "psnr")
+    scores = measured.frames.sort_values("frame")["psnr"].to_numpy()
+    assert found["hi"] - found["value"] == pytest.approx(path_interval(scores))
 
 
 def test_one_frame_has_a_value_and_no_interval(run, offset_method, tiny_scene):

@@ -117,10 +117,11 @@ def test_the_best_is_bold_and_the_second_of_three_italic(run: Run) -> None:
 def test_a_section_says_on_what_and_what_to_mind_and_whether_trends_hold(run: Run) -> None:
     trend = Trend("psnr", ["elsewhere", "here"])
     lines = [Repeated("here", [with_psnr(run, 31.0)]), Repeated("elsewhere", [run])]
-    text = section(replace(TABLE, trends=[trend]), lines)
+    published = [TABLE.lines[0], replace(TABLE.lines[1], published={"psnr": 30.4})]
+    text = section(replace(TABLE, lines=published, trends=[trend]), lines)
     assert text.startswith("## Table 9: What is shown")
     assert "Paper: Chair." in text
     assert f"scene {run.facts['scene']}" in text
-    assert "| PSNR, dB: elsewhere < here | " in text
+    assert "| PSNR, dB: elsewhere < here | +0.60 | " in text
     assert "- Mind this." in text
     assert "- lpips_alex: n/a. no weights were found" in text

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
-from scipy import stats
 
 from bench.errors import SteerbenchError
+from bench.intervals import path_interval
 from bench.results import Store
 from reports.regression import LIMITS, Change, Figures, Limit, changes
 from reports.runs import load
@@ -58,17 +59,51 @@ def paired(*by: float) -> Change:
 
 
 def test_frames_that_both_have_are_compared_in_pairs() -> None:
-    found = paired(-0.3, -0.2, -0.4, -0.3)
+    apart = [-0.3, -0.2, -0.4, -0.3]
+    found = paired(*apart)
     assert found.by == pytest.approx(-0.3)
-    half = stats.t.ppf(0.975, 3) * (0.02 / 3) ** 0.5 / 2  # standard deviation over sqrt(n)
+    half = path_interval(np.array(apart))
     assert found.interval == pytest.approx((-0.3 - half, -0.3 + half))
     assert found.verdict == "worse"
+
+
+def test_a_change_whose_interval_contains_no_change_is_chance() -> None:
+    found = paired(*[-1.0] * 13, *[0.8] * 11)  # -0.175 dB in the mean
+    assert found.by < -LIMITS["psnr"].absolute
+    assert found.interval is not None
+    assert found.interval[0] < 0 < found.interval[1]
+    assert found.verdict == ""
+
+
+def test_a_sure_change_within_the_limit_is_as_good() -> None:
+    found = paired(*[-0.05] * 24)
+    assert found.interval == pytest.approx((-0.05, -0.05))
+    assert found.verdict == ""
+
+
+@pytest.mark.parametrize("metric", ["work.samples", "work.products"])
+def test_more_work_is_worse_on_any_machine(metric: str) -> None:
+    old = replace(OLD, values={metric: 1e6})
+    found = [
+        next(changes(old, replace(old, values={metric: work}, machine="another"))).verdict
+        for work in (1.04e6, 1.06e6)
+    ]
+    assert found == ["", "worse"]
 
 
 def test_one_broken_frame_among_many_is_worse() -> None:
     found = paired(*[0.0] * 23, -20.0)
     assert found.by == pytest.approx(-20 / 24)
     assert found.verdict == "worse"
+
+
+def test_one_slow_frame_among_many_is_chance() -> None:
+    times = {str(i): 100.0 for i in range(24)}
+    old = replace(OLD, frames={"frame_ms": times})
+    new = replace(OLD, frames={"frame_ms": {**times, "11": 2000.0}})
+    found = next(each for each in changes(old, new) if each.metric == "frame_ms")
+    assert found.by > 25
+    assert found.verdict == ""
 
 
 def test_a_metric_or_a_frame_that_is_gone_is_missing() -> None:

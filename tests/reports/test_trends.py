@@ -1,15 +1,28 @@
-"""Trends: which step holds, over what its interval is, and what cannot be told."""
+"""Trends: the paper's step beside ours, over what its interval is, and what may be concluded."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from bench.run import half_interval
+from bench.intervals import half_interval, path_interval
 from reports.runs import Repeated, Run, load
-from reports.trends import FAILS, HOLDS, OPEN, REVERSED, SEEN, Trend, steps
+from reports.trends import (
+    FAILS,
+    HOLDS,
+    OPEN,
+    REVERSED,
+    SEEN,
+    SMALLER,
+    Growth,
+    Step,
+    Trend,
+    steps,
+    trend_table,
+)
 
 TREND = Trend("psnr", ["one", "two"])
 
@@ -29,8 +42,12 @@ def changed(run: Run, by: float | list[float], seed: int = 5) -> Run:
 
 
 def only(one: list[Run], two: list[Run]):
-    (step,) = steps(TREND, {"one": Repeated("one", one), "two": Repeated("two", two)})
+    (step,) = steps(TREND, {"one": Repeated("one", one), "two": Repeated("two", two)}, {})
     return step
+
+
+def step_of(by: float, half: float, paper: float, proves: bool = True) -> Step:
+    return Step("psnr", "one", "two", paper, Growth(by, half, "3 seeds", proves))
 
 
 @pytest.mark.parametrize(
@@ -43,51 +60,95 @@ def only(one: list[Run], two: list[Run]):
 )
 def test_one_seed_is_compared_frame_by_frame(run: Run, apart: list[float], verdict: str) -> None:
     step = only([run], [changed(run, apart)])
-    assert step.over == "6 frames of one seed"
-    assert step.by == pytest.approx(np.mean(apart))
-    assert step.half == pytest.approx(half_interval(np.array(apart)))
+    assert step.here.over == "6 frames of one seed"
+    assert step.here.by == pytest.approx(np.mean(apart))
+    assert step.here.half == pytest.approx(path_interval(np.array(apart)))
     assert step.verdict == verdict
 
 
 @pytest.mark.parametrize(("by", "verdict"), [(0.1, HOLDS), (-0.1, FAILS)])
 def test_several_seeds_are_compared_seed_by_seed(run: Run, by: float, verdict: str) -> None:
-    """Seeds differ by a decibel, the lines by a tenth with each of them."""
+    """Seeds differ by a decibel, the lines by about a tenth with each of them."""
+    apart = [by - 0.01, by, by + 0.01]
     one = [changed(run, seed, seed) for seed in (0, 1, 2)]
-    two = [changed(run, seed + by, seed) for seed in (2, 0, 1)]
+    two = [changed(run, seed + apart[seed], seed) for seed in (2, 0, 1)]
     step = only(one, two)
-    assert step.over == "3 seeds"
-    assert step.by == pytest.approx(by)
+    assert step.here.over == "3 seeds"
+    assert step.here.by == pytest.approx(by)
+    assert step.here.half == pytest.approx(half_interval(np.array(apart)))
     assert step.verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("by", "half", "verdict"),
+    [
+        (0.5, 0.4, HOLDS),
+        (0.5, 0.5, OPEN),  # up to 1.0, as in the paper
+        (0.4, 0.5, SMALLER),  # at most 0.9
+        (-0.1, 0.2, SMALLER),
+        (-0.5, 0.4, FAILS),
+        (0.0, 0.0, FAILS),
+        (0.5, math.nan, OPEN),
+    ],
+)
+def test_several_seeds_against_a_step_of_one_decibel_in_the_paper(
+    by: float, half: float, verdict: str
+) -> None:
+    assert step_of(by, half, paper=1.0).verdict == verdict
+
+
+def test_only_several_seeds_show_that_a_step_is_smaller_than_a_published_one() -> None:
+    assert step_of(-0.1, 0.2, paper=math.nan).verdict == OPEN
+    assert step_of(-0.1, 0.2, paper=1.0, proves=False).verdict == OPEN
+
+
+def test_the_papers_step_is_known_where_both_its_figures_are(run: Run) -> None:
+    lines = {name: Repeated(name, [run]) for name in ("one", "two")}
+    published = {"one": {"psnr": 31.0}, "two": {"psnr": 31.5}}
+    (step,) = steps(TREND, lines, published)
+    assert step.paper == pytest.approx(0.5)
+    (step,) = steps(TREND, lines, {**published, "two": {}})
+    assert math.isnan(step.paper)
+
+
+def test_a_line_of_the_table_has_both_steps_in_the_unit_of_the_metric() -> None:
+    size = Step("size_bytes.total", "one", "two", 21e6, Growth(2e6, 0.0, "computed", True))
+    found = [step_of(-0.481, 0.15, 0.61), step_of(0.5, math.nan, math.nan), size]
+    assert trend_table(found).lines == (
+        ("PSNR, dB: one < two", "+0.61", "-0.48 ± 0.15", "3 seeds", FAILS),
+        ("PSNR, dB: one < two", "", "+0.50", "3 seeds", OPEN),
+        ("model, MB: one < two", "+21.00", "+2.00", "computed", HOLDS),
+    )
 
 
 def test_seeds_that_only_one_line_has_are_left_out(run: Run) -> None:
     step = only([changed(run, 0, 0), changed(run, 9, 1)], [changed(run, 1, 0)])
-    assert step.over == "6 frames of one seed"
-    assert step.by == pytest.approx(1)
+    assert step.here.over == "6 frames of one seed"
+    assert step.here.by == pytest.approx(1)
 
 
 def test_a_figure_without_frames_alone_tells_nothing(run: Run) -> None:
     trend = Trend("fps", ["one", "two"])
     lines = {name: Repeated(name, [run]) for name in ("one", "two")}
-    (step,) = steps(trend, lines)
+    (step,) = steps(trend, lines, {})
     assert step.verdict == OPEN
 
 
 def test_bytes_are_computed_and_need_no_interval(run: Run) -> None:
     larger = replace(run, rows=run.rows.assign(value=run.rows["value"] + 1))
     lines = {"one": Repeated("one", [run]), "two": Repeated("two", [larger])}
-    (step,) = steps(Trend("size_bytes.total", ["one", "two"]), lines)
-    assert (step.half, step.verdict) == (0.0, HOLDS)
+    (step,) = steps(Trend("size_bytes.total", ["one", "two"]), lines, {})
+    assert (step.here.half, step.verdict) == (0.0, HOLDS)
 
 
 def test_a_line_that_was_not_measured_has_no_step(run: Run) -> None:
     lines = {"one": Repeated("one", [run]), "two": Repeated("two", [])}
-    assert list(steps(TREND, lines)) == []
+    assert list(steps(TREND, lines, {})) == []
 
 
 def test_times_of_different_machines_tell_nothing(run: Run) -> None:
     machine = {**run.record["machine"], "cpu": "another"}
     elsewhere = replace(run, record={**run.record, "machine": machine})
     lines = {"one": Repeated("one", [run]), "two": Repeated("two", [elsewhere])}
-    assert not list(steps(Trend("frame_ms", ["one", "two"]), lines))
-    assert list(steps(TREND, lines))
+    assert not list(steps(Trend("frame_ms", ["one", "two"]), lines, {}))
+    assert list(steps(TREND, lines, {}))
