@@ -6,7 +6,9 @@ Quality, time and memory of a run come from the same rendering of the same frame
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ import pandas as pd
 import torch
 
 from bench.intervals import path_interval
+from bench.metrics import Lpips
 from bench.probes import FrameRecord, MemoryMeter, StageClock
 from bench.protocol import EvaluationProtocol
 from bench.results import COLD, STEADY, WHOLE, Measurement
@@ -52,6 +55,11 @@ class Task:
     seed: int
     weights_dir: Path | None = None
 
+    @cached_property
+    def preceding(self) -> Sequence[int]:
+        """See `bench.trajectories.Trajectory`."""
+        return self.trajectory.preceding
+
 
 def measure(method: Method, task: Task, log: Log) -> Measurement:
     """Fit `method` to the scene of `task`, render its trajectory under the clock and score it.
@@ -60,13 +68,46 @@ def measure(method: Method, task: Task, log: Log) -> Measurement:
         SteerbenchError: the scene does not suit the protocol, or the method rendered values that
             are not finite.
     """
+    return measure_in_turns([method], task, log)[0]
+
+
+def measure_in_turns(methods: Sequence[Method], task: Task, log: Log) -> list[Measurement]:
+    """`measure` several methods that draw each frame one after the other, so that their times are
+    those of the same minutes. The peak memory of one process is that of all of them.
+
+    Raises as `measure` does.
+    """
+    lpips, missing = task.protocol.load_lpips(task.weights_dir, log)
+    task.protocol.check(task.scene, task.trajectory)
+    for method in methods:
+        method.fit(task.scene, task.budget, log)
+    takes = [_Take.of(method, task, lpips) for method in methods]
+    _render(takes, task, log)
+    return [_measurement(take, task, missing) for take in takes]
+
+
+@dataclass(frozen=True)
+class _Take:
+    """A method in front of its clock, and a row for each frame that it has drawn."""
+
+    method: Method
+    clock: StageClock
+    meter: MemoryMeter
+    scoring: Scoring
+    rows: list[dict[str, Any]]
+
+    @classmethod
+    def of(cls, method: Method, task: Task, lpips: Mapping[str, Lpips]) -> _Take:
+        device = method.settings()["device"]
+        scoring = Scoring(task.scene, task.trajectory, task.protocol, lpips)
+        return cls(method, StageClock(device), MemoryMeter(device), scoring, [])
+
+
+def _measurement(take: _Take, task: Task, missing: Mapping[str, str]) -> Measurement:
+    """What is kept of a method that has drawn all frames."""
     scene, trajectory, protocol, budget = task.scene, task.trajectory, task.protocol, task.budget
-    lpips, missing = protocol.load_lpips(task.weights_dir, log)
-    protocol.check(scene, trajectory)
-    method.fit(scene, budget, log)
-    meter = MemoryMeter(method.settings()["device"])
-    scoring = Scoring(scene, trajectory, protocol, lpips)
-    frames = _render(method, task, scoring, meter, log)
+    method, meter, scoring = take.method, take.meter, take.scoring
+    frames = _frame_table(take.rows, protocol)
     summary = [
         *_frame_rows(frames, protocol),
         *(_single(f"size_bytes.{part}", size) for part, size in method.sizes().items()),
@@ -97,36 +138,40 @@ def measure(method: Method, task: Task, log: Log) -> Measurement:
     return Measurement(rows, frames, scoring.images, record)
 
 
-def _render(
-    method: Method, task: Task, scoring: Scoring, meter: MemoryMeter, log: Log
-) -> pd.DataFrame:
+def _render(takes: Sequence[_Take], task: Task, log: Log) -> None:
     """Warm up, then render the sequence in its order; each frame is scored and let go."""
-    steps, protocol = task.trajectory.steps, task.protocol
-    clock = StageClock(method.settings()["device"])
-    warmup = spread(len(steps), protocol.warmup)
-    table: list[dict[str, Any]] = []
-    with torch.no_grad(), log.progress("rendering", len(warmup) + len(steps)) as progress:
+    steps = task.trajectory.steps
+    warmup = spread(len(steps), task.protocol.warmup)
+    frames = len(takes) * (len(warmup) + len(steps))
+    with torch.no_grad(), log.progress("rendering", frames) as progress:
+        for take in takes:
+            take.method.reset()
+            for index in warmup:
+                with take.clock.frame():
+                    take.method.render(steps[index].camera, take.clock)
+                progress.advance(note="warming up")
+            take.method.reset()
+        for index in range(len(steps)):
+            for take in takes:
+                _draw(take, task, index)
+                scores = [row["psnr"] for row in take.rows if "psnr" in row]
+                progress.advance(note=f"{np.mean(scores):.2f} dB" if scores else "")
+
+
+def _draw(take: _Take, task: Task, index: int) -> None:
+    """The next frame of a method, under the clock. No cut is announced to it: nobody who steers a
+    camera announces a jump."""
+    method, step, before = take.method, task.trajectory.steps[index], task.preceding[index]
+    if task.protocol.memory == "cold":
         method.reset()
-        for index in warmup:
-            with clock.frame():
-                method.render(steps[index].camera, clock)
-            progress.advance(note="warming up")
-        method.reset()
-        # Nobody announces a cut to the method, as nobody announces a jump who steers a camera.
-        for index, (step, before) in enumerate(zip(steps, task.trajectory.preceding, strict=True)):
-            if protocol.memory == "cold":
-                method.reset()
-                before = 0
-            with meter, clock.frame():
-                frame = method.render(step.camera, clock)
-            check_frame(frame, step.camera, method.name, index)
-            phase = COLD if before < method.memory else STEADY
-            figures = {"frame": index, "phase": phase, "peak_bytes": meter.last_bytes}
-            figures |= _times_and_work(clock.frames[-1])
-            table.append(figures | scoring.score(index, step, frame.rgb))
-            scores = [row["psnr"] for row in table if "psnr" in row]
-            progress.advance(note=f"{np.mean(scores):.2f} dB" if scores else "")
-    return _frame_table(table, protocol)
+        before = 0
+    with take.meter, take.clock.frame():
+        frame = method.render(step.camera, take.clock)
+    check_frame(frame, step.camera, method.name, index)
+    phase = COLD if before < method.memory else STEADY
+    figures = {"frame": index, "phase": phase, "peak_bytes": take.meter.last_bytes}
+    figures |= _times_and_work(take.clock.frames[-1])
+    take.rows.append(figures | take.scoring.score(index, step, frame.rgb))
 
 
 def _times_and_work(record: FrameRecord) -> dict[str, Any]:

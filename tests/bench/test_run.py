@@ -15,7 +15,7 @@ from bench.intervals import path_interval
 from bench.metrics import psnr, quantise
 from bench.protocol import EvaluationProtocol
 from bench.results import COLUMNS, Store
-from bench.run import Task, measure
+from bench.run import Task, measure, measure_in_turns
 from bench.trajectories import from_split
 from bench.types import Budget, SteerbenchError
 
@@ -298,3 +298,23 @@ def test_a_measurement_survives_the_store(run, offset_method, tmp_path):
     for column in ("value", "lo", "hi", "n"):
         np.testing.assert_array_equal(stored[column], measured.rows[column])
     assert store.frames(key).columns.tolist() == measured.frames.columns.tolist()
+
+
+def test_methods_in_turns_draw_each_frame_one_after_the_other_as_they_would_alone(
+    run, offset_method, tiny_scene, quiet_log
+):
+    other = type(offset_method)(offset_method.settings()["device"], 16 / 255)
+    task = Task(tiny_scene, from_split(tiny_scene), QUICK, BUDGET, seed=5)
+    drawn = []
+    for name, method in (("one", offset_method), ("other", other)):
+
+        def watched(camera, probe, name=name, method=method):
+            drawn.append(name)
+            return type(method).render(method, camera, probe)
+
+        method.render = watched
+    both = measure_in_turns([offset_method, other], task, quiet_log)
+    assert drawn == ["one"] * QUICK.warmup + ["other"] * QUICK.warmup + ["one", "other"] * 6
+    for method, measured in zip((offset_method, other), both, strict=True):
+        assert measured.frames["psnr"].tolist() == run(method).frames["psnr"].tolist()
+    assert value(both[0].rows, "psnr") > value(both[1].rows, "psnr")
