@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -114,15 +115,64 @@ def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
+@dataclass(frozen=True)
+class Curve:
+    """A model at several points of its training.
+
+    Attributes:
+        panel: the title of the panel that shows it.
+        label: its name there.
+        points: steps of the training, and what was measured after them.
+    """
+
+    panel: str
+    label: str
+    points: Mapping[float, Repeated]
+
+
+def quality_over_training(curves: Sequence[Curve], path: Path) -> None:
+    """Write a PNG: PSNR over the steps of the training, a panel for each that `curves` name.
+
+    Bars show the intervals where there are several seeds. Steps have a logarithmic scale.
+    """
+    titles = list(dict.fromkeys(curve.panel for curve in curves))
+    figure = Figure(figsize=(4.2 * len(titles), 3.6), layout="constrained")
+    for axes, title in zip(figure.subplots(1, len(titles), squeeze=False)[0], titles, strict=True):
+        _label_psnr(axes, "steps of stage 2")
+        axes.set_title(title, fontsize="medium")
+        shown = [curve for curve in curves if curve.panel == title]
+        for number, curve in enumerate(shown):
+            halves = [line.half("psnr") for line in curve.points.values()]
+            axes.errorbar(
+                list(curve.points),
+                [line.mean("psnr") for line in curve.points.values()],
+                yerr=np.nan_to_num(halves) if np.isfinite(halves).all() else None,
+                marker=MARKERS[number % len(MARKERS)],
+                color=COLOURS[number % len(COLOURS)],
+                capsize=3,
+                label=curve.label,
+            )
+        axes.set_xscale("log")
+        steps = sorted({step for curve in shown for step in curve.points})
+        axes.set_xticks(steps, [f"{step:g}" for step in steps])
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.legend(frameon=False, fontsize="small")
+    figure.savefig(path, dpi=150)
+
+
 def _psnr_axes(height: float, across: str) -> tuple[Figure, Axes]:
     """Axes with PSNR upwards and the label `across`; `height` in inches."""
     figure = Figure(figsize=(8, height), layout="constrained")
     axes = figure.subplots()
+    _label_psnr(axes, across)
+    return figure, axes
+
+
+def _label_psnr(axes: Axes, across: str) -> None:
     axes.set_xlabel(across)
     axes.set_ylabel("PSNR, dB")
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
-    return figure, axes
 
 
 def frontier_plot(rows: Sequence[Row], path: Path) -> None:
