@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+import torch
 
-from bench.motion import between, rotation_between
+from bench.motion import between, preceding, rotation_between, viewing_target
 from bench.types import Camera, Scene, SteerbenchError
 
 MIXED = "mixed"
@@ -168,6 +169,34 @@ def static(scene: Scene, split: str = "test", view: int = 0, frames: int = 60) -
         )
     _at_least_one("frames", frames)
     return Trajectory(f"{split}-static{view}", split, (Step(cameras[view], view),) * frames)
+
+
+def approached(
+    scene: Scene, split: str, lead: int, degrees: float, seed: int, limit: int
+) -> Trajectory:
+    """Scattered cameras of a split, each at the end of a random smooth motion of its own.
+
+    The `lead` frames before a camera have no ground truth; the first of them comes after a cut.
+    From frame to frame the camera turns by `degrees` about what it looks at (`motion.preceding`).
+    `seed` decides about the motions, and `limit` > 0 keeps that many cameras, evenly spread.
+
+    Raises:
+        SteerbenchError: as `from_split`; `lead` is negative, or `degrees` not from 0 to 180.
+    """
+    if lead < 0:
+        raise SteerbenchError(f"trajectory.lead: expected 0 or more, got {lead}")
+    if not 0 < degrees <= 180:
+        raise SteerbenchError(f"trajectory.degrees: expected more than 0, up to 180, got {degrees}")
+    cameras = _cameras(scene, split, limit)
+    kept = spread(len(cameras), limit or len(cameras))
+    target, generator = viewing_target(scene), torch.Generator().manual_seed(seed)
+    steps: list[Step] = []
+    for index in kept:
+        before = preceding(cameras[index], target, lead, (degrees, degrees), generator)
+        steps += [Step(camera, None, cut=n == 0) for n, camera in enumerate(before)]
+        steps.append(Step(cameras[index], index, cut=not before))
+    part = "" if len(kept) == len(cameras) else f"-{len(kept)}of{len(cameras)}"
+    return Trajectory(f"{split}-approached{lead}-{degrees:g}deg{part}", split, tuple(steps))
 
 
 def _cameras(scene: Scene, split: str, limit: int) -> Sequence[Camera]:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -20,6 +20,7 @@ from bench.errors import SteerbenchError, Unavailable
 from bench.provenance import decisive
 from bench.results import Store
 from bench.run import Task, measure
+from bench.scenes.held_out import hold_out
 from bench.sources import digest, libraries
 from bench.types import DEVICE, Method, Scene
 from reports.page import write_page
@@ -28,10 +29,14 @@ from reports.tables import run_tables
 from sweeps import failures
 from sweeps.build import build, check_settings, target_of
 from sweeps.device_lock import device_lock
+from sweeps.overrides import VALIDATION
 from sweeps.terminal import console, rich_table
 
 PLACES = ("outputs", "report", "weights_dir")
 """Settings that say where things lie: they do not change a row."""
+
+HELD_OUT = 8
+"""Of so many training pictures one is held out, where a trajectory goes to these."""
 
 USUAL_THREADS = torch.get_num_threads()
 """How many threads torch uses by default."""
@@ -42,6 +47,7 @@ class Settings:
     """The settings of a run that are no choices; run.yaml explains each of them."""
 
     seed: int
+    split: Literal["test", "validation"]
     device: str
     backend: str
     threads: int | None
@@ -95,7 +101,7 @@ def _obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
     log, store = ConsoleLog(root), Store(root)
 
     method, budget, protocol = (build(config, group) for group in ("method", "budget", "protocol"))
-    scene = _scene(OmegaConf.to_yaml(config.scene, resolve=True), root)
+    scene = scene_of(config)
     trajectory = build(config, "trajectory", scene)
     weights = Path(settings.weights_dir) if settings.weights_dir else None
     parts = _identity(config, scene, method) | {"lpips": protocol.find_lpips(weights, log)}
@@ -112,6 +118,18 @@ def _obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
     record["scene_path"] = _folder(config)
     store.save(parts, replace(measurement, record=record))
     return Obtained(store, run, measured=True)
+
+
+def scene_of(config: DictConfig) -> Scene:
+    """The scene that `config` describes. Where its trajectory is through training pictures that are
+    held out, they are: what is trained on all of them is never scored on some of them.
+
+    Raises:
+        SteerbenchError: the scene cannot be loaded, or has too few training pictures.
+    """
+    scene = _scene(OmegaConf.to_yaml(config.scene, resolve=True), Path(config.outputs))
+    held_out = OmegaConf.select(config, "trajectory.split") == VALIDATION
+    return hold_out(scene, VALIDATION, HELD_OUT) if held_out else scene
 
 
 @lru_cache(maxsize=1)
@@ -152,14 +170,15 @@ def described(config: DictConfig) -> dict[str, Any]:
     """The settings that decide a run; equal for equal jobs.
 
     Without the places of weights and scenes, except for the last name of a scene's folder, which
-    rows show; and without the engine where the method uses none.
+    rows show; without `split`, which the trajectory has; and without the engine where the method
+    uses none.
     """
     try:
         plain: Any = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException as error:  # a setting was removed that others use
         raise SteerbenchError(" ".join(str(error).split())) from error
     unused = () if "engine" in plain["method"] else ("engine", "precision")
-    kept = {key: value for key, value in plain.items() if key not in (*PLACES, *unused)}
+    kept = {key: value for key, value in plain.items() if key not in ("split", *PLACES, *unused)}
     kept["scene"] = {name: value for name, value in plain["scene"].items() if name != "root"}
     if "path" in kept["scene"]:
         kept["scene"]["path"] = Path(kept["scene"]["path"]).name
@@ -172,8 +191,7 @@ def of_scene(run: Run, config: DictConfig) -> bool:
     folder = _folder(config)
     if folder is None or run.record.get("scene_path") == folder or not Path(folder).is_dir():
         return True
-    scene = _scene(OmegaConf.to_yaml(config.scene, resolve=True), Path(config.outputs))
-    return run.record["scene"]["digest"] == scene.digest
+    return run.record["scene"]["digest"] == scene_of(config).digest
 
 
 def _folder(config: DictConfig) -> str | None:

@@ -25,6 +25,9 @@ from sweeps.names import unknown
 CONFIGS = Path(__file__).parent / "configs"
 FLAGS = ("--config-dir", "-cd")
 
+VALIDATION = "validation"
+"""The split of training pictures that are held out, and the trajectory that goes to them."""
+
 
 def composed(words: Sequence[str], **options: bool) -> DictConfig:
     """The configuration of a run; `options` as of Hydra's `compose`.
@@ -38,11 +41,23 @@ def composed(words: Sequence[str], **options: bool) -> DictConfig:
         overrides.append(f"hydra.searchpath=[{paths}]")
     try:
         with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-            return compose("run", overrides=overrides, **options)
+            return settled(compose("run", overrides=overrides, **options))
     except Exception as error:
         if not of_hydra(error):
             raise
         raise explain(error, words) from error
+
+
+def settled(config: DictConfig) -> DictConfig:
+    """`config` with the trajectory that split=validation asks for, unless its own goes there.
+
+    From here on the trajectory alone says what is scored, and with that what is held out.
+    """
+    asked, there = (OmegaConf.select(config, name) for name in ("split", "trajectory.split"))
+    if asked == VALIDATION and there != VALIDATION:
+        node = OmegaConf.load(CONFIGS / "trajectory" / f"{VALIDATION}.yaml")
+        OmegaConf.update(config, "trajectory", node, merge=False, force_add=True)
+    return config
 
 
 def choices(group: str, words: Sequence[str] = ()) -> dict[str, Path]:

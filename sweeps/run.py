@@ -11,7 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from sweeps.overrides import CONFIGS, explain, of_hydra
+from sweeps.overrides import CONFIGS, explain, of_hydra, settled
 from sweeps.sweep_callback import SweepCallback
 
 
@@ -50,10 +50,10 @@ def _launch(argv: Sequence[str]) -> Exception | None:
 
         command = ["steerbench", "run", *_config_dir(), *HydraConfig.get().overrides.task]
         if HydraConfig.get().mode == RunMode.MULTIRUN:
-            run_job(config, command)
+            run_job(settled(config), command)
             return
         try:
-            execute(config, command)
+            execute(settled(config), command)
         except Exception as error:
             failures.append(error)  # past Hydra, which would print it in its own way
 

@@ -25,7 +25,7 @@ from reports.figures import growth_panels
 from reports.tables import Table, decimal, megabytes
 from sweeps.build import build
 from sweeps.device_lock import device_lock
-from sweeps.measurement import checked_settings
+from sweeps.measurement import checked_settings, scene_of
 from sweeps.names import unknown
 from sweeps.overrides import composed
 from sweeps.studies.variants import METHOD, Row, amount, computes_with_engine, declared
@@ -75,7 +75,7 @@ def main(options: argparse.Namespace) -> int:
     config = composed(words, return_hydra_config=True)
     log = ConsoleLog(Path(checked_settings(config).outputs))
     points = _chosen(config, options.axis)
-    scene = build(config, "scene", log=log)
+    scene = scene_of(config)
     configs = [composed([*words, *point.settings]) for point in points]
     rows = []
     with log.progress("scaling", len(points)) as progress, device_lock(config.device, log):

@@ -22,7 +22,7 @@ from bench.types import Log, Method, Scene
 from reports.tables import decimal
 from sweeps.build import build, target_of
 from sweeps.device_lock import device_lock
-from sweeps.measurement import checked_settings
+from sweeps.measurement import checked_settings, scene_of
 from sweeps.overrides import choices, composed
 
 Row = dict[str, Any]
@@ -97,7 +97,7 @@ def render_variants(
     settings = checked_settings(first)
     log = OnceLog(Path(settings.outputs))
     methods = usable(configs, log)
-    scene, path, protocol = common_ground(first, frames, log)
+    scene, path, protocol = common_ground(first, frames)
     with device_lock(settings.device, log):
         fit_each(methods, configs, scene, path, log)
         rows = render_in_turns(methods, scene, path, protocol, repeats, log)
@@ -163,16 +163,14 @@ class OnceLog(ConsoleLog):
             super().info(message)
 
 
-def common_ground(
-    config: DictConfig, frames: int, log: Log
-) -> tuple[Scene, Trajectory, EvaluationProtocol]:
+def common_ground(config: DictConfig, frames: int) -> tuple[Scene, Trajectory, EvaluationProtocol]:
     """What all variants render and are scored by: the first `frames` of the trajectory, and the
     protocol without LPIPS.
 
     Raises:
         SteerbenchError: a setting is wrong, or the scene does not suit the protocol.
     """
-    scene = build(config, "scene", log=log)
+    scene = scene_of(config)
     path = build(config, "trajectory", scene)
     steps = path.steps[:frames]
     path = replace(path, name=f"{path.name}-first{len(steps)}", steps=steps)

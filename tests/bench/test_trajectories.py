@@ -15,7 +15,17 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from bench.cameras import look_at, scale_camera
-from bench.trajectories import Step, from_split, jump, loop, orbit, smooth, spread, static
+from bench.trajectories import (
+    Step,
+    approached,
+    from_split,
+    jump,
+    loop,
+    orbit,
+    smooth,
+    spread,
+    static,
+)
 from bench.types import Camera, Scene, Split, SteerbenchError
 
 CONFIGS = Path(__file__).parents[2] / "sweeps" / "configs" / "trajectory"
@@ -222,3 +232,55 @@ def test_the_configurations_are_the_defaults(choice, made):
         {"trajectory": OmegaConf.load(CONFIGS / f"{choice}.yaml"), "budget": {"frames": 12}}
     )
     assert hydra.utils.instantiate(config.trajectory, scene) == made(scene, limit=12)
+
+
+def test_each_camera_is_approached_once_after_a_cut_from_a_motion_of_its_own(tiny_scene):
+    path = approached(tiny_scene, "test", lead=2, degrees=3.3, seed=0, limit=0)
+    cameras = tiny_scene.splits["test"].cameras
+    assert [step.truth for step in path.steps] == [x for n in range(6) for x in (None, None, n)]
+    assert [step.cut for step in path.steps] == [True, False, False] * 6
+    assert [step.camera for step in path.steps if step.truth is not None] == list(cameras)
+    assert path.preceding == [0, 1, 2] * 6  # steady for a method that looks back on `lead` frames
+    starts = [turn_deg(step.camera, path.steps[0].camera) for step in path.steps[::3]]
+    assert len({round(start, 1) for start in starts}) == 6
+
+
+@pytest.mark.parametrize("degrees", [0.5, 3.3, 30])
+def test_an_approach_turns_by_the_same_angle_from_frame_to_frame(tiny_scene, degrees):
+    path = approached(tiny_scene, "test", lead=3, degrees=degrees, seed=0, limit=0)
+    turns = [turn_deg(a.camera, b.camera) for a, b in pairwise(path.steps) if not b.cut]
+    assert turns == pytest.approx([degrees] * 18, abs=0.05)
+
+
+def test_without_a_lead_each_camera_is_reached_by_a_cut(tiny_scene):
+    path = approached(tiny_scene, "test", lead=0, degrees=3.3, seed=0, limit=0)
+    assert [(step.truth, step.cut) for step in path.steps] == [(n, True) for n in range(6)]
+
+
+def test_approaches_are_the_same_each_time_and_others_with_another_seed(tiny_scene):
+    first, again, other = (approached(tiny_scene, "test", 1, 3.3, seed, 0) for seed in (0, 0, 1))
+    poses = [[step.camera.c2w.tolist() for step in path.steps] for path in (first, again, other)]
+    assert poses[0] == poses[1] != poses[2]
+
+
+def test_a_limit_keeps_evenly_spread_cameras_to_approach(tiny_scene):
+    path = approached(tiny_scene, "test", lead=1, degrees=3.3, seed=0, limit=3)
+    assert [step.truth for step in path.steps] == [None, 0, None, 2, None, 5]
+    assert path.name == "test-approached1-3.3deg-3of6"
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"lead": -1}, r"trajectory\.lead: expected 0 or more"),
+        ({"degrees": 0}, r"trajectory\.degrees: expected more than 0"),
+        ({"degrees": math.nan}, r"trajectory\.degrees: expected more than 0"),
+        ({"degrees": math.inf}, r"trajectory\.degrees: expected more than 0, up to 180"),
+        ({"split": "validation"}, "no frames in 'validation'; it has train, test"),
+        ({"limit": -1}, r"trajectory\.limit"),
+    ],
+)
+def test_what_is_no_approach_is_refused(tiny_scene, setting, message):
+    usual = {"split": "test", "lead": 3, "degrees": 3.3, "seed": 0, "limit": 0}
+    with pytest.raises(SteerbenchError, match=message):
+        approached(tiny_scene, **usual | setting)

@@ -57,13 +57,13 @@ def test_a_path_without_truth_is_refused_before_anything_is_trained(fitted, quie
     assert fitted == []
 
 
-def test_a_protocol_that_forgets_between_frames_is_refused(quiet_log):
-    config = composed([*SMALL, "protocol.memory=cold", "protocol.name=cold"])
+def test_a_protocol_that_forgets_between_frames_is_refused(tmp_path):
+    config = composed([*SMALL, f"outputs={tmp_path}", "protocol.memory=cold", "protocol.name=cold"])
     with pytest.raises(SteerbenchError, match=r"protocol\.memory: expected steady"):
-        common_ground(config, 2, quiet_log)
+        common_ground(config, 2)
 
 
-def test_pictures_too_small_for_lpips_are_not_refused_where_it_is_not_computed(quiet_log):
-    _, found, protocol = common_ground(composed([*SMALL]), 1, quiet_log)
+def test_pictures_too_small_for_lpips_are_not_refused_where_it_is_not_computed(tmp_path):
+    _, found, protocol = common_ground(composed([*SMALL, f"outputs={tmp_path}"]), 1)
     assert len(found.steps) == 1
     assert protocol.lpips == ()
