@@ -12,14 +12,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import SteerbenchError
 from bench.results import Store, content_key
-from reports.paper_tables import Line, PaperTable, paper_tables
+from reports.paper_tables import METHOD, Line, PaperTable, paper_tables
 from reports.runs import Repeated, Run, readable
 from sweeps import failures
 from sweeps.measurement import described, of_scene
 from sweeps.names import unknown
 from sweeps.overrides import composed, swept
 
-METHOD = "method"
 REPEATED = "seed"
 """The one setting that may have several values: a cell then has a mean and an interval."""
 
@@ -69,8 +68,8 @@ def plan(table: PaperTable, words: Sequence[str]) -> list[Planned]:
     """The jobs of the experiment of `table` under the settings in `words`: one for each line that
     has a job, and for each seed.
 
-    A job of the experiment that no line names is left out: Instant-NGP has no 2D renderer to
-    compute in int8.
+    What a line does not set is as the experiment has it. A job of the sweep that no line names is
+    left out: Instant-NGP has no 2D renderer to compute in int8.
 
     Raises:
         SteerbenchError: a word cannot be read, names nothing, or gives several values to another
@@ -81,18 +80,17 @@ def plan(table: PaperTable, words: Sequence[str]) -> list[Planned]:
     params = experiment.hydra.sweeper.params
     grid = swept([f"{name}={values}" for name, values in params.items()])
     jobs = []
-    for line in table.lines:
-        if not line.job:
+    for line in (line for block in table.blocks for line in block.lines):
+        if line.job is None:
             continue
-        in_grid = {name for name in grid if line.job.get(name) in grid[name]}
         added = line.job == {METHOD: line.label}
-        if not added and not line.job.keys() == grid.keys() == in_grid:
+        if not added and any(value not in grid.get(name, ()) for name, value in line.job.items()):
             choices = "; ".join(f"{name}={','.join(some)}" for name, some in grid.items())
             raise SteerbenchError(
                 f"{table.name}: no job of its experiment fills the line {line.label!r}; expected "
                 f"the settings of its job among {choices}"
             )
-        settings = [f"{name}={line.job[name]}" for name in grid if name in line.job]
+        settings = [f"{name}={value}" for name, value in line.job.items()]
         together = [f"+experiment={table.name}", *fixed, *settings]
         config = composed(together)
         for seed in seeds:

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -26,7 +27,9 @@ TABLES = {table.name: table for table in paper_tables()}
 @pytest.mark.parametrize("name", TABLES)
 def test_every_line_that_can_be_measured_has_its_job(name: str) -> None:
     jobs = plan(TABLES[name], [])
-    lines = [line.label for line in TABLES[name].lines if line.job is not None]
+    lines = [
+        line.label for block in TABLES[name].blocks for line in block.lines if line.job is not None
+    ]
     assert sorted(job.line for job in jobs) == sorted(lines)
     assert len({job.key for job in jobs}) == len(lines)
 
@@ -35,12 +38,31 @@ def test_settings_hold_for_every_job() -> None:
     for job in plan(TABLES["table3"], ["budget=tiny", "seed=3"]):
         assert job.config.budget.name == "tiny"
         assert job.config.seed == 3
-        assert job.line == f"L = {job.config.method.model.frames}"
-        assert job.config.trajectory._target_ == "bench.trajectories.smooth"
+        assert job.line.partition(" (")[0] == f"L = {job.config.method.model.frames}"
+        assert job.config.trajectory._target_ == "bench.trajectories.orbit"
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_table_is_of_the_papers_method_and_then_of_ours(name: str) -> None:
+    configs = [job.config for job in plan(TABLES[name], [])]
+    methods = [
+        config.method.name for config in configs if "name" in config.method
+    ]  # not Instant-NGP
+    half = len(methods) // 2
+    assert methods == ["steernerf"] * half + ["steernerf_lean"] * half
+
+
+def test_the_lines_of_table_3_differ_in_l_alone() -> None:
+    of_paper = plan(TABLES["table3"], [])[:4]
+    settings = [described(job.config) for job in of_paper]
+    for number, setting in enumerate(settings):
+        assert setting["method"]["rendering"]["range"]["mode"] == "off"
+        assert setting["method"]["model"].pop("frames") == number
+    assert all(setting == settings[0] for setting in settings)
 
 
 def test_every_seed_is_a_job_of_its_own_and_a_command_that_makes_it() -> None:
-    jobs = plan(TABLES["table5"], ["budget=tiny", "seed=0,2"])
+    jobs = plan(replace(TABLES["table5"], beyond=None), ["budget=tiny", "seed=0,2"])
     assert [(job.line[:4], job.config.seed) for job in jobs] == [
         ("with", 0),
         ("with", 2),
@@ -62,9 +84,10 @@ def test_tables_share_the_run_that_they_have_in_common() -> None:
     ("method", "name", "line"),
     [
         ("ngp", "table1", "Instant-NGP"),
-        ("steernerf_lean", "table4", "K = 6"),
-        ("steernerf_lean_frozen", "table5", "without joint training"),
-        ("steernerf_lean_k3", "table4", "K = 3"),
+        ("steernerf", "table4", "K = 6"),
+        ("steernerf_lean", "table4", "K = 6 (steernerf_lean)"),
+        ("steernerf_lean_frozen", "table5", "without joint training (steernerf_lean)"),
+        ("steernerf_lean_k3", "table4", "K = 3 (steernerf_lean)"),
     ],
 )
 def test_what_the_figures_show_is_what_the_tables_measure(
@@ -118,8 +141,9 @@ def put(store: Store, source: str, config: DictConfig) -> str:
 
 
 def labels(page: Path) -> list[str]:
-    """The lines of Table 3 on a page."""
-    lines = [line for line in page.read_text().splitlines() if line.startswith("| L = ")]
+    """The lines of Table 3 on a page, without those beyond the paper."""
+    paper, _, _ = page.read_text().partition("### Beyond")
+    lines = [line for line in paper.splitlines() if line.startswith("| L = ")]
     return [line.split("|")[1].strip() for line in lines]
 
 
@@ -128,7 +152,7 @@ def test_a_job_that_fails_stands_in_its_line_and_the_others_run(
 ) -> None:
     outcome = steerbench("paper", "--table", "table3", f"outputs={store.folder.parent}")
     assert outcome.status == 1
-    assert len(measured) == 4
+    assert len(measured) == 8
     assert "failed: table3: L = 3, seed 0: no room" in outcome.err
     assert "about 0:00:0" in outcome.err
     page = Path(re.search(r"report: (.*)", outcome.err)[1])

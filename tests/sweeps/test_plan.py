@@ -102,6 +102,14 @@ def test_a_failure_stands_beside_what_was_measured_before(measured: Store, tmp_p
     assert line.gaps == ["failed when it was tried again: no such folder"]
 
 
+@pytest.mark.parametrize("name", ["method", "method.joint.through"])
+def test_a_setting_outside_the_sweep_fills_no_line(name: str) -> None:
+    first, *others = TABLE.lines
+    wrong = replace(first, job={name: "all"})
+    with pytest.raises(SteerbenchError, match="no job of its experiment"):
+        plan(replace(TABLE, lines=[wrong, *others]), [])
+
+
 def test_a_line_that_no_job_fills_is_named() -> None:
     first, *others = TABLE.lines
     wrong = replace(first, job={"method.joint.field": "frosen"})
