@@ -152,7 +152,7 @@ def described(config: DictConfig) -> dict[str, Any]:
     """The settings that decide a run; equal for equal jobs.
 
     Without the places of weights and scenes, except for the last name of a scene's folder, which
-    rows show; and without the engine where the method uses none.
+    rows show; without the engine where the method uses none; and without the number of seeds.
     """
     try:
         plain: Any = OmegaConf.to_container(config, resolve=True)
@@ -160,6 +160,7 @@ def described(config: DictConfig) -> dict[str, Any]:
         raise SteerbenchError(" ".join(str(error).split())) from error
     unused = () if "engine" in plain["method"] else ("engine", "precision")
     kept = {key: value for key, value in plain.items() if key not in (*PLACES, *unused)}
+    kept["budget"] = {name: value for name, value in plain["budget"].items() if name != "seeds"}
     kept["scene"] = {name: value for name, value in plain["scene"].items() if name != "root"}
     if "path" in kept["scene"]:
         kept["scene"]["path"] = Path(kept["scene"]["path"]).name

@@ -15,6 +15,7 @@ from bench.results import Store, content_key
 from reports.paper_tables import METHOD, Line, PaperTable, paper_tables
 from reports.runs import Repeated, Run, readable
 from sweeps import failures
+from sweeps.build import build
 from sweeps.measurement import described, of_scene
 from sweeps.names import unknown
 from sweeps.overrides import composed, swept
@@ -66,7 +67,7 @@ def chosen(name: str | None, methods: Sequence[str]) -> list[PaperTable]:
 
 def plan(table: PaperTable, words: Sequence[str]) -> list[Planned]:
     """The jobs of the experiment of `table` under the settings in `words`: one for each line that
-    has a job, and for each seed.
+    has a job, and for each seed: those in `words`, or as many as the budget says.
 
     What a line does not set is as the experiment has it. A job of the sweep that no line names is
     left out: Instant-NGP has no 2D renderer to compute in int8.
@@ -77,6 +78,7 @@ def plan(table: PaperTable, words: Sequence[str]) -> list[Planned]:
     """
     fixed, seeds = _seeds(words)
     experiment = composed([f"+experiment={table.name}", *fixed], return_hydra_config=True)
+    seeds = seeds or [str(seed) for seed in range(build(experiment, "budget").seeds)]
     params = experiment.hydra.sweeper.params
     grid = swept([f"{name}={values}" for name, values in params.items()])
     jobs = []
@@ -94,23 +96,24 @@ def plan(table: PaperTable, words: Sequence[str]) -> list[Planned]:
         together = [f"+experiment={table.name}", *fixed, *settings]
         config = composed(together)
         for seed in seeds:
-            command = ["steerbench", "run", *together, *seed, "hydra.mode=RUN"]
-            merged = OmegaConf.merge(config, OmegaConf.from_dotlist(seed))
+            word = f"{REPEATED}={seed}"
+            command = ["steerbench", "run", *together, word, "hydra.mode=RUN"]
+            merged = OmegaConf.merge(config, OmegaConf.from_dotlist([word]))
             jobs.append(Planned(table.name, line.label, cast(DictConfig, merged), command))
     return jobs
 
 
-def _seeds(words: Sequence[str]) -> tuple[list[str], list[list[str]]]:
-    """The words that all jobs share, and those of each repetition."""
+def _seeds(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The words that all jobs share, and the seeds that the others name, if any does."""
     several = swept(words)
     if others := sorted(several.keys() - {REPEATED}):
         raise SteerbenchError(
             f"{others[0]}: expected one value, got {', '.join(several[others[0]])}; only "
             f"{REPEATED} may take several here"
         )
-    fixed = [text for text in words if REPEATED not in swept([text])]
-    values = dict.fromkeys(several.get(REPEATED, ()))
-    return fixed, [[f"{REPEATED}={value}"] for value in values] or [[]]
+    named = [word for word in words if word.lstrip("+").partition("=")[0] == REPEATED]
+    values = several.get(REPEATED) or [word.partition("=")[2] for word in named[-1:]]
+    return [word for word in words if word not in named], list(dict.fromkeys(values))
 
 
 def newest(store: Store) -> dict[str, list[Run]]:

@@ -23,7 +23,7 @@ from sweeps.plan import Planned, gather, newest, plan
 
 
 def job(folder: Path) -> Planned:
-    return plan(TABLE, ["scene=blender", f"scene.path={folder}"])[0]
+    return plan(TABLE, ["scene=blender", f"scene.path={folder}", "seed=0"])[0]
 
 
 def shown(store: Store, folder: Path) -> list[str]:
