@@ -8,9 +8,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from reports.comparison import conditions_of, metric_format, ranks
+from reports.comparison import conditions_of, metric_format, ranks, written
 from reports.page import missing_figures
 from reports.runs import Repeated, Run
+from reports.scenes import scene_table
 from reports.tables import Table
 from reports.trends import Trend, steps, trend_table
 
@@ -50,6 +51,7 @@ class PaperTable:
         trends: what the paper concludes from it.
         beyond: a further method with the lines of the paper's; None without one.
         beyond_notes: the notes about that.
+        scenes: the metrics that are also shown of every scene of a data set; none: no such table.
     """
 
     name: str
@@ -61,6 +63,7 @@ class PaperTable:
     trends: Sequence[Trend] = ()
     beyond: str | None = None
     beyond_notes: Sequence[str] = ()
+    scenes: Sequence[str] = ()
 
     @property
     def blocks(self) -> list[PaperTable]:
@@ -130,13 +133,15 @@ def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
 
 
 def section(table: PaperTable, lines: Sequence[Repeated]) -> str:
-    """A table as a part of a page: the paper's, then the lines of a method beyond it."""
+    """A table as a part of a page: the paper's, the lines of a method beyond it, each scene."""
     measured = {line.label: line for line in lines}
     first, *further = table.blocks
     heading = f"## {table.name.replace('table', 'Table ')}: {table.title}"
     parts = [heading, *_block(first, measured, f"Paper: {table.published_on}.")]
     for block in further:
         parts += [f"### {block.title}", *_block(block, measured)]
+    if table.scenes and len({scene for line in lines for scene in line.by_scene}) > 1:
+        parts.append(scene_table(table.scenes, lines).section(level=3))
     return "\n\n".join(parts)
 
 
@@ -170,10 +175,8 @@ def _cell(found: Repeated, published: float | None, metric: str, mark: str) -> s
     measured, (_, write) = found.mean(metric), metric_format(metric)
     if measured is None and published is None:
         return ABSENT
-    texts = [ABSENT if figure is None else write(figure) for figure in (measured, published)]
-    if found.half(metric) > 0:
-        texts[0] += f" ± {write(found.half(metric))}"
-    texts[0] = f"{mark}{texts[0]}{mark}"
+    shown = written(found, metric) or ABSENT
+    texts = [f"{mark}{shown}{mark}", ABSENT if published is None else write(published)]
     if measured is not None and published is not None and not math.isnan(measured):
         sign = "-" if measured < published else "+"
         texts.append(f"{sign}{write(abs(measured - published))}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -173,8 +173,14 @@ def of_scene(run: Run, config: DictConfig) -> bool:
     folder = _folder(config)
     if folder is None or run.record.get("scene_path") == folder or not Path(folder).is_dir():
         return True
-    scene = _scene(OmegaConf.to_yaml(config.scene, resolve=True), Path(config.outputs))
-    return run.record["scene"]["digest"] == scene.digest
+    digest = _digest(OmegaConf.to_yaml(config.scene, resolve=True), Path(config.outputs))
+    return run.record["scene"]["digest"] == digest
+
+
+@cache
+def _digest(node: str, root: Path) -> str:
+    """The digest of the scene that `node`, as YAML, describes."""
+    return _scene(node, root).digest
 
 
 def _folder(config: DictConfig) -> str | None:

@@ -39,8 +39,8 @@ OLD = {"CHANGELOG.md", "RESULTS.md", "RESULTS-mic.md", "log.md"}
 
 PRESENT = [path for path in DOCUMENTS if path.name not in OLD]
 
-ELSEWHERE = ("hydra", "--config-dir")
-"""What the words of a command begin with that need something that is not installed here."""
+ELSEWHERE = ("hydra", "--config-dir", "data=")
+"""What the words of a command begin with that need something that is not here."""
 
 
 def named(path: Path) -> str:

@@ -16,8 +16,9 @@ from bench.results import Store
 from bench.types import Scene
 from reports.paper_tables import paper_tables
 from sweeps import failures, measurement
+from sweeps.gather import gather, newest
 from sweeps.measurement import described
-from sweeps.plan import Planned, gather, newest, plan
+from sweeps.plan import Planned, plan
 
 (TABLE,) = (table for table in paper_tables() if table.name == "table5")
 
