@@ -4,7 +4,7 @@
 #   VENV=.venv             where the environment lives
 #   PIP_ARGS="..."         further arguments for pip, e.g. an index of CPU-only wheels of torch
 #   DEMO_ARGS="..."        overrides for the demo, e.g. DEMO_ARGS="seed=1 scene=wires"
-#   PAPER_ARGS="..."       overrides for the paper's tables, e.g. PAPER_ARGS="budget=demo seed=0,1,2"
+#   PAPER_ARGS="..."       overrides for the paper's tables, e.g. PAPER_ARGS="budget=full data=DIR"
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help

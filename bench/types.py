@@ -146,6 +146,7 @@ class Budget:
         samples: field samples with a gradient that a step aims at; the rays follow from it.
         frames: at most this many test frames are rendered and scored (0: all).
         renderer_steps: optimiser steps of the second stage, for methods with a 2D renderer.
+        seeds: with how many seeds, 0 to seeds - 1, `steerbench paper` repeats a measurement.
     """
 
     name: str
@@ -153,11 +154,12 @@ class Budget:
     samples: int
     frames: int = 0
     renderer_steps: int = 1
+    seeds: int = 1
 
     def __post_init__(self) -> None:
-        if min(self.steps, self.samples, self.renderer_steps) < 1 or self.frames < 0:
+        if min(self.steps, self.samples, self.renderer_steps, self.seeds) < 1 or self.frames < 0:
             raise ValueError(
-                f"expected steps, samples and renderer_steps >= 1, frames >= 0: {self}"
+                f"expected steps, samples, renderer_steps and seeds >= 1, frames >= 0: {self}"
             )
 
 

@@ -76,6 +76,15 @@ def metric_format(metric: str) -> tuple[str, Write]:
     return f"{rest or family}, {unit} ↓", partial(decimal, decimals=0 if family == "work" else 2)
 
 
+def written(found: Repeated, metric: str) -> str | None:
+    """The mean of a metric with half of its 95 % interval, if known, as text; None without it."""
+    mean, half = found.mean(metric), found.half(metric)
+    _, write = metric_format(metric)
+    if mean is None:
+        return None
+    return f"{write(mean)} ± {write(half)}" if half > 0 else write(mean)
+
+
 def ranks(runs: Sequence[Run | Repeated], metric: str) -> dict[int, int]:
     """The place, from 1, of each of `runs`, by its index, among those of the same conditions.
 

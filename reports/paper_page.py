@@ -29,7 +29,11 @@ Lines = Mapping[str, Sequence[Repeated]]
 
 
 def write_paper_page(
-    tables: Sequence[PaperTable], lines: Lines, found: Sequence[Outlier], folder: Path
+    tables: Sequence[PaperTable],
+    lines: Lines,
+    found: Sequence[Outlier],
+    folder: Path,
+    missing: Mapping[str, str] | None = None,
 ) -> Path:
     """Write `folder/report.md` with its pictures, and the same as `report.html`; return the former.
 
@@ -38,19 +42,22 @@ def write_paper_page(
         lines: the measured ones of any of them.
         found: outliers, also among runs that the page does not show.
         folder: made if missing.
+        missing: why scenes of the data set are left out, by their names.
 
     Raises:
         SteerbenchError: `folder` cannot be written to.
     """
     runs = list(
-        {run.key: run for of in lines.values() for line in of for run in line.runs}.values()
+        {run.key: run for of in lines.values() for line in of for run in line.measured}.values()
     )
+    left_out = "\n".join(f"- missing: {name}: {why}" for name, why in (missing or {}).items())
     listed = outlier_table(found, runs)
     sources = "\n".join(f"{run.key}  {run.record['command']}" for run in runs)
     with explained(folder):
         parts = [
             f"# {PAGE['title']}",
             PAGE["reading"].strip(),
+            *([f"## Scenes that are left out\n\n{left_out}"] if left_out else []),
             *([listed.section()] if listed.lines else []),
             *(section(table, lines.get(table.name, ())) for table in tables),
             *(text for plot in PAGE["plot"] for text in _plot(plot, lines, folder)),
@@ -73,7 +80,7 @@ def _plot(plot: Mapping[str, Any], lines: Lines, folder: Path) -> Iterator[str]:
         draw = partial(figures.quality_against, shown, plot["metric"], plot["unit"], plot["axis"])
         some = bool(shown)
     else:
-        runs = _chosen(plot["lines"], lines)
+        runs = _chosen(plot["lines"], lines, one_scene=plot.get("one_scene", False))
         draw = partial(getattr(figures, plot["draw"]), runs)
         some = bool(runs)
     if some:
@@ -84,7 +91,7 @@ def _plot(plot: Mapping[str, Any], lines: Lines, folder: Path) -> Iterator[str]:
 
 def _images(images: Mapping[str, Any], lines: Lines, folder: Path) -> Iterator[str]:
     """The middle one of the frames that all runs kept."""
-    runs = _chosen(images["lines"], lines)
+    runs = _chosen(images["lines"], lines, one_scene=True)
     runs = [run for run in runs if run.views == runs[0].views]
     if runs and (frames := kept_frames(runs[0])):
         title, stem = images["title"], f"frames-{images['title'].lower()}"
@@ -92,8 +99,14 @@ def _images(images: Mapping[str, Any], lines: Lines, folder: Path) -> Iterator[s
         yield from frame_section(runs, frames[len(frames) // 2], stem, folder)
 
 
-def _chosen(wanted: Mapping[str, Sequence[str]], lines: Lines) -> list[Run]:
-    """The first run of each line of `wanted`, which has table and line by label, that has one."""
+def _chosen(
+    wanted: Mapping[str, Sequence[str]], lines: Lines, one_scene: bool = False
+) -> list[Run]:
+    """The first run of each line of `wanted`, which has table and line by label, that has one.
+
+    It is the mean over all scenes, unless `one_scene` asks for that of the first.
+    """
     known = {(table, line.label): line for table in lines for line in lines[table]}
     found = ((label, known.get((table, line))) for label, (table, line) in wanted.items())
-    return [replace(line.runs[0], label=label) for label, line in found if line and line.runs]
+    runs = ((label, line.measured if one_scene else line.runs) for label, line in found if line)
+    return [replace(of_line[0], label=label) for label, of_line in runs if of_line]

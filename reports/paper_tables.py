@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from reports.comparison import conditions_of, metric_format, ranks
+from reports.comparison import conditions_of, metric_format, ranks, written
 from reports.page import missing_figures
 from reports.runs import Repeated, Run
+from reports.scenes import scene_table
 from reports.tables import Table
 from reports.trends import Trend, steps, trend_table
 
 FOLDER = Path(__file__).parent / "paper"
+METHOD = "method"
 ABSENT = "–"
 """In place of a figure that the paper does not give or that nothing here can measure."""
 
@@ -26,6 +28,7 @@ class Line:
     Attributes:
         label: its name.
         job: the settings that measure it, beside those of all lines; None if no method here does.
+            Without a method it is of the paper's.
         published: the paper's figures by metric; bytes, ms, dB as in our rows.
     """
 
@@ -46,6 +49,9 @@ class PaperTable:
         lines: in the paper's order.
         notes: what a reader should know before comparing.
         trends: what the paper concludes from it.
+        beyond: a further method with the lines of the paper's; None without one.
+        beyond_notes: the notes about that.
+        scenes: the metrics that are also shown of every scene of a data set; none: no such table.
     """
 
     name: str
@@ -55,6 +61,34 @@ class PaperTable:
     lines: Sequence[Line]
     notes: Sequence[str]
     trends: Sequence[Trend] = ()
+    beyond: str | None = None
+    beyond_notes: Sequence[str] = ()
+    scenes: Sequence[str] = ()
+
+    @property
+    def blocks(self) -> list[PaperTable]:
+        """The table, and the one of the method beyond the paper, where there is one."""
+        return [self, self._of_beyond()] if self.beyond else [self]
+
+    def _of_beyond(self) -> PaperTable:
+        """The lines of the paper's method, and the trends, for the method `beyond`."""
+        jobs = {
+            line.label: {**line.job, METHOD: str(self.beyond)}
+            for line in self.lines
+            if line.job is not None and METHOD not in line.job
+        }
+        names = {label: f"{label} ({self.beyond})" for label in jobs}
+        return replace(
+            self,
+            title=f"Beyond the paper: {self.beyond}",
+            lines=[Line(names[label], job) for label, job in jobs.items()],
+            notes=self.beyond_notes,
+            trends=[
+                replace(trend, rising=[names.get(label, label) for label in trend.rising])
+                for trend in self.trends
+            ],
+            beyond=None,
+        )
 
 
 def paper_tables() -> list[PaperTable]:
@@ -93,28 +127,36 @@ def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
             ]
         )
     names = [": ".join((line.label, *line.gaps)) for line in lines]
-    title = f"{table.name.replace('table', 'Table ')}: {table.title}"
     labels = (metric_format(metric)[0] for metric in table.metrics)
     heads = ("measured / paper / difference", *labels)
-    return Table(title, heads, tuple(zip(names, *columns, strict=True)))
+    return Table(table.title, heads, tuple(zip(names, *columns, strict=True)))
 
 
 def section(table: PaperTable, lines: Sequence[Repeated]) -> str:
-    """A table as a part of a page: conditions of both, the figures, trends, notes."""
+    """A table as a part of a page: the paper's, the lines of a method beyond it, each scene."""
     measured = {line.label: line for line in lines}
-    shown = with_published(table, measured)
-    parts = [f"## {shown.title}"]
-    runs = [run for line in lines for run in line.runs]
-    if runs:
-        parts.append(f"Measured: {conditions_of(runs)}, {_origin(runs)}.")
-    parts.append(f"Paper: {table.published_on}.")
-    parts.append(shown.markdown())
-    published = {line.label: line.published for line in table.lines}
-    if found := [step for trend in table.trends for step in steps(trend, measured, published)]:
-        parts.append(trend_table(found).markdown())
+    first, *further = table.blocks
+    heading = f"## {table.name.replace('table', 'Table ')}: {table.title}"
+    parts = [heading, *_block(first, measured, f"Paper: {table.published_on}.")]
+    for block in further:
+        parts += [f"### {block.title}", *_block(block, measured)]
+    if table.scenes and len({scene for line in lines for scene in line.by_scene}) > 1:
+        parts.append(scene_table(table.scenes, lines).section(level=3))
+    return "\n\n".join(parts)
+
+
+def _block(table: PaperTable, measured: Mapping[str, Repeated], published: str = "") -> list[str]:
+    """Conditions of the measured and of the published figures, the figures, trends, notes."""
+    labels = [line.label for line in table.lines]
+    runs = [run for label in labels if label in measured for run in measured[label].runs]
+    where = f"Measured: {conditions_of(runs)}, {_origin(runs)}." if runs else ""
+    figures = {line.label: line.published for line in table.lines}
+    found = [step for trend in table.trends for step in steps(trend, measured, figures)]
+    trends = trend_table(found).markdown() if found else ""
     notes = dict.fromkeys((*table.notes, *missing_figures(runs)))
-    parts.append("\n".join(f"- {note}" for note in notes))
-    return "\n\n".join(filter(None, parts))
+    listed = "\n".join(f"- {note}" for note in notes)
+    shown = with_published(table, measured).markdown()
+    return [part for part in (where, published, shown, trends, listed) if part]
 
 
 def _origin(runs: Sequence[Run]) -> str:
@@ -134,10 +176,8 @@ def _cell(found: Repeated, published: float | None, metric: str, mark: str) -> s
     measured, (_, write) = found.mean(metric), metric_format(metric)
     if measured is None and published is None:
         return ABSENT
-    texts = [ABSENT if figure is None else write(figure) for figure in (measured, published)]
-    if found.half(metric) > 0:
-        texts[0] += f" ± {write(found.half(metric))}"
-    texts[0] = f"{mark}{texts[0]}{mark}"
+    shown = written(found, metric) or ABSENT
+    texts = [f"{mark}{shown}{mark}", ABSENT if published is None else write(published)]
     if measured is not None and published is not None and not math.isnan(measured):
         sign = "-" if measured < published else "+"
         texts.append(f"{sign}{write(abs(measured - published))}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -91,13 +91,20 @@ class Repeated:
 
     Attributes:
         label: name of the line of a table that they fill.
-        runs: one for each seed that was measured.
+        runs: one for each seed that was measured; of a data set their means over scenes.
         gaps: why others are missing.
+        by_scene: of a data set all runs that were measured, by scene, those in the means first.
     """
 
     label: str
     runs: Sequence[Run]
     gaps: Sequence[str] = ()
+    by_scene: Mapping[str, Sequence[Run]] = field(default_factory=dict)
+
+    @property
+    def measured(self) -> list[Run]:
+        """The runs of the store behind the figures, each of one scene."""
+        return [run for runs in self.by_scene.values() for run in runs] or list(self.runs)
 
     @cached_property
     def values(self) -> dict[str, float]:

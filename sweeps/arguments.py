@@ -79,7 +79,9 @@ TABLES = [
         **{"dest": "methods", "default": [], "metavar": "METHOD"},
     ),
     *_one("--report", help="where the page goes (default OUTPUTS/paper)", type=Path, metavar="DIR"),
-    *_words("those of each table; seed=0,1,2 gives means and intervals"),
+    *_words(
+        "those of each table, as many seeds as the budget says; data=DIR: every scene of a data set"
+    ),
 ]
 SMOOTH = "method=steernerf_lean trajectory=smooth"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -127,8 +127,17 @@ def scene_of(config: DictConfig) -> Scene:
     Raises:
         SteerbenchError: the scene cannot be loaded, or has too few training pictures.
     """
-    scene = _scene(OmegaConf.to_yaml(config.scene, resolve=True), Path(config.outputs))
+    return _divided(*_contents(config))
+
+
+def _contents(config: DictConfig) -> tuple[str, Path, bool]:
+    """The scene's node as YAML, the root of all outputs, and whether views are held out."""
     held_out = OmegaConf.select(config, "trajectory.split") == VALIDATION
+    return OmegaConf.to_yaml(config.scene, resolve=True), Path(config.outputs), held_out
+
+
+def _divided(node: str, root: Path, held_out: bool) -> Scene:
+    scene = _scene(node, root)
     return hold_out(scene, VALIDATION, HELD_OUT) if held_out else scene
 
 
@@ -170,15 +179,17 @@ def described(config: DictConfig) -> dict[str, Any]:
     """The settings that decide a run; equal for equal jobs.
 
     Without the places of weights and scenes, except for the last name of a scene's folder, which
-    rows show; without `split`, which the trajectory has; and without the engine where the method
-    uses none.
+    rows show; without `split`, which the trajectory has, and `sizing`, which methods have; without
+    the engine where the method uses none; and without the number of seeds.
     """
     try:
         plain: Any = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException as error:  # a setting was removed that others use
         raise SteerbenchError(" ".join(str(error).split())) from error
     unused = () if "engine" in plain["method"] else ("engine", "precision")
-    kept = {key: value for key, value in plain.items() if key not in ("split", *PLACES, *unused)}
+    left_out = ("split", "sizing", *PLACES, *unused)
+    kept = {key: value for key, value in plain.items() if key not in left_out}
+    kept["budget"] = {name: value for name, value in plain["budget"].items() if name != "seeds"}
     kept["scene"] = {name: value for name, value in plain["scene"].items() if name != "root"}
     if "path" in kept["scene"]:
         kept["scene"]["path"] = Path(kept["scene"]["path"]).name
@@ -191,7 +202,13 @@ def of_scene(run: Run, config: DictConfig) -> bool:
     folder = _folder(config)
     if folder is None or run.record.get("scene_path") == folder or not Path(folder).is_dir():
         return True
-    return run.record["scene"]["digest"] == scene_of(config).digest
+    return run.record["scene"]["digest"] == _digest(*_contents(config))
+
+
+@cache
+def _digest(node: str, root: Path, held_out: bool) -> str:
+    """The digest of a scene: kept, because to find it the whole scene is loaded."""
+    return _divided(node, root, held_out).digest
 
 
 def _folder(config: DictConfig) -> str | None:

@@ -70,6 +70,14 @@ def choices(group: str, words: Sequence[str] = ()) -> dict[str, Path]:
     return dict(sorted(found.items()))
 
 
+def setting(name: str, text: str) -> str:
+    """The word that sets `name` to `text`, quoted where Hydra would read something else."""
+    if re.fullmatch(r"[\w/.+-]+", text):
+        return f"{name}={text}"
+    escaped = text.replace("'", r"\'")
+    return f"{name}='{escaped}'"
+
+
 def of_hydra(error: Exception) -> bool:
     """Whether Hydra raised it: for some mistakes (budget=0.0) it raises no exception of its own,
     but a ValueError or what its parser stumbled over."""

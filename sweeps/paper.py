@@ -10,34 +10,67 @@ from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
+from bench.errors import SteerbenchError
 from bench.results import Store
 from reports.outliers import outlier_table, outliers
 from reports.paper_page import write_paper_page
+from sweeps.data_sets import DataSet, find
+from sweeps.gather import gather, newest
 from sweeps.jobs import attempt, say, time_left
 from sweeps.overrides import composed
-from sweeps.plan import Planned, chosen, gather, newest, plan
+from sweeps.plan import Planned, chosen, plan
 from sweeps.terminal import console, show
+
+DATA = "data="
+"""How the word begins that names the folder of a data set."""
 
 
 def main(options: argparse.Namespace) -> int:
     """Measure what the store does not have, unless a report is enough, and write the page; return 1
     if a job failed. With `check`, name the runs that look broken, and return 1 if there are any."""
+    words, data = data_set(options.overrides)
     if options.command == "report" and options.check:
-        return _check(Store(Path(composed(options.overrides).outputs)))
+        return _check(Store(Path(composed(words).outputs)))
+    missing = data.missing if data else {}
+    for name, why in missing.items():
+        print(f"missing: {name}: {why}", file=sys.stderr)
     tables = chosen(options.table, options.methods)
-    jobs = [job for table in tables for job in plan(table, options.overrides)]
+    jobs = [job for table in tables for job in plan(table, words, data)]
     failed = _run(jobs) if options.command == "paper" else 0
     outputs = Path(jobs[0].config.outputs)
     runs = newest(Store(outputs))
     found = outliers(list(chain(*runs.values())))
     folder = options.report or outputs / "paper"
-    page = write_paper_page(tables, gather(jobs, runs, outputs), found, folder)
+    page = write_paper_page(tables, gather(jobs, runs, outputs), found, folder, missing)
     print(f"report: {page}", file=sys.stderr)
     return int(failed > 0)
 
 
+def data_set(words: Sequence[str]) -> tuple[list[str], DataSet | None]:
+    """The settings among `words`, and the data set that one of them names (data=DIR), if any does.
+
+    Raises:
+        SteerbenchError: another one names a scene; or there are no scenes.
+    """
+    settings = [word for word in words if not word.startswith(DATA)]
+    named = [word.removeprefix(DATA) for word in words if word.startswith(DATA)]
+    scenes = [
+        word for word in settings if word.lstrip("+~").partition("=")[0] in ("scene", "scene.path")
+    ]
+    if named and scenes:
+        raise SteerbenchError(
+            f"{DATA}{named[-1]} and {scenes[0]}: expected one of them; data names all scenes"
+        )
+    return settings, find(named[-1]) if named else None
+
+
 def _run(jobs: Sequence[Planned]) -> int:
-    """Run one job after the other, equal ones once; return how many failed."""
+    """Run one job after the other, equal ones once; return how many failed.
+
+    All lines of all tables come with the first seed and scene, then with the next.
+    """
+    rounds = list(dict.fromkeys((job.config.seed, job.scene) for job in jobs))
+    jobs = sorted(jobs, key=lambda job: rounds.index((job.config.seed, job.scene)))
     distinct = {job.key: job for job in reversed(jobs)}
     jobs = [job for job in jobs if distinct[job.key] is job]
     begun, measured, failed = time.monotonic(), 0, 0

@@ -1,42 +1,46 @@
-"""The jobs of the tables of the paper, and their results as far as the store has them."""
+"""The jobs of the tables of the paper."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
+from itertools import product
 from typing import cast
 
 from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import SteerbenchError
-from bench.results import Store, content_key
-from reports.paper_tables import Line, PaperTable, paper_tables
-from reports.runs import Repeated, Run, readable
-from sweeps import failures
-from sweeps.measurement import described, of_scene
+from bench.results import content_key
+from reports.paper_tables import METHOD, Line, PaperTable, paper_tables
+from sweeps.build import build
+from sweeps.data_sets import DataSet
+from sweeps.measurement import described
 from sweeps.names import unknown
-from sweeps.overrides import composed, swept
+from sweeps.overrides import composed, setting, swept
 
-METHOD = "method"
 REPEATED = "seed"
-"""The one setting that may have several values: a cell then has a mean and an interval."""
+"""The setting that may have several values: a cell then has a mean and an interval."""
 
 
 @dataclass(frozen=True)
 class Planned:
-    """A job: the line of a table that it fills, its configuration, and the command that runs it."""
+    """A job: the line of a table that it fills, its configuration, and the command that runs it.
+
+    `scene` is the name of its scene among those of a data set, empty without one.
+    """
 
     table: str
     line: str
     config: DictConfig
     command: Sequence[str]
+    scene: str = ""
 
     @property
     def name(self) -> str:
         """The name of the job at the terminal."""
-        return f"{self.table}: {self.line}, seed {self.config.seed}"
+        parts = (f"{self.table}: {self.line}", self.scene, f"seed {self.config.seed}")
+        return ", ".join(filter(None, parts))
 
     @cached_property
     def key(self) -> str:
@@ -65,91 +69,58 @@ def chosen(name: str | None, methods: Sequence[str]) -> list[PaperTable]:
     return found
 
 
-def plan(table: PaperTable, words: Sequence[str]) -> list[Planned]:
+def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -> list[Planned]:
     """The jobs of the experiment of `table` under the settings in `words`: one for each line that
-    has a job, and for each seed.
+    has a job, for each seed (those in `words`, or as many as the budget says), and for each scene
+    of `data`.
 
-    A job of the experiment that no line names is left out: Instant-NGP has no 2D renderer to
-    compute in int8.
+    What a line does not set is as the experiment has it. A job of the sweep that no line names is
+    left out: Instant-NGP has no 2D renderer to compute in int8.
 
     Raises:
         SteerbenchError: a word cannot be read, names nothing, or gives several values to another
             setting than the seed; or a line asks for a job that the experiment does not have.
     """
     fixed, seeds = _seeds(words)
+    fixed += [f"scene={data.layout}"] if data else []
+    scenes = {name: str(folder) for name, folder in data.scenes.items()} if data else {"": ""}
     experiment = composed([f"+experiment={table.name}", *fixed], return_hydra_config=True)
+    seeds = seeds or [str(seed) for seed in range(build(experiment, "budget").seeds)]
     params = experiment.hydra.sweeper.params
     grid = swept([f"{name}={values}" for name, values in params.items()])
     jobs = []
-    for line in table.lines:
-        if not line.job:
+    for line in (line for block in table.blocks for line in block.lines):
+        if line.job is None:
             continue
-        in_grid = {name for name in grid if line.job.get(name) in grid[name]}
         added = line.job == {METHOD: line.label}
-        if not added and not line.job.keys() == grid.keys() == in_grid:
+        if not added and any(value not in grid.get(name, ()) for name, value in line.job.items()):
             choices = "; ".join(f"{name}={','.join(some)}" for name, some in grid.items())
             raise SteerbenchError(
                 f"{table.name}: no job of its experiment fills the line {line.label!r}; expected "
                 f"the settings of its job among {choices}"
             )
-        settings = [f"{name}={line.job[name]}" for name in grid if name in line.job]
+        settings = [f"{name}={value}" for name, value in line.job.items()]
         together = [f"+experiment={table.name}", *fixed, *settings]
         config = composed(together)
-        for seed in seeds:
-            command = ["steerbench", "run", *together, *seed, "hydra.mode=RUN"]
-            merged = OmegaConf.merge(config, OmegaConf.from_dotlist(seed))
-            jobs.append(Planned(table.name, line.label, cast(DictConfig, merged), command))
+        for seed, (scene, folder) in product(seeds, scenes.items()):
+            word = f"{REPEATED}={seed}"
+            job = cast(DictConfig, OmegaConf.merge(config, OmegaConf.from_dotlist([word])))
+            if data:
+                job.scene.path = folder
+            place = [setting("scene.path", folder)] if data else []
+            command = ["steerbench", "run", *together, *place, word, "hydra.mode=RUN"]
+            jobs.append(Planned(table.name, line.label, job, command, scene))
     return jobs
 
 
-def _seeds(words: Sequence[str]) -> tuple[list[str], list[list[str]]]:
-    """The words that all jobs share, and those of each repetition."""
+def _seeds(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The words that all jobs share, and the seeds that the others name, if any does."""
     several = swept(words)
     if others := sorted(several.keys() - {REPEATED}):
         raise SteerbenchError(
             f"{others[0]}: expected one value, got {', '.join(several[others[0]])}; only "
             f"{REPEATED} may take several here"
         )
-    fixed = [text for text in words if REPEATED not in swept([text])]
-    values = dict.fromkeys(several.get(REPEATED, ()))
-    return fixed, [[f"{REPEATED}={value}"] for value in values] or [[]]
-
-
-def newest(store: Store) -> dict[str, list[Run]]:
-    """The runs of the store by the key of their job, the newest first: of each scene that has the
-    settings of the job, the run that was stored last."""
-    found: dict[str, dict[str, Run]] = {}
-    for run in reversed(readable(store)):
-        parts = run.record["made_of"]
-        if "config" in parts:
-            of_job = found.setdefault(content_key(parts["config"]), {})
-            of_job.setdefault(run.record["scene"]["digest"], run)
-    return {job: list(of_scenes.values()) for job, of_scenes in found.items()}
-
-
-def gather(
-    jobs: Sequence[Planned], runs: Mapping[str, Sequence[Run]], outputs: Path
-) -> dict[str, list[Repeated]]:
-    """The lines of every table: the runs of each, and why others are missing.
-
-    Args:
-        runs: as `newest` has them.
-    """
-    lines: dict[tuple[str, str], list[Planned]] = {}
-    for job in jobs:
-        lines.setdefault((job.table, job.line), []).append(job)
-    tables: dict[str, list[Repeated]] = {}
-    for (table, label), same in lines.items():
-        found, gaps = [], []
-        for job in same:
-            failure = failures.found(outputs, described(job.config))
-            shown = (run for run in runs.get(job.key, ()) if of_scene(run, job.config))
-            if run := next(shown, None):
-                found.append(replace(run, label=label))
-                why = failure and f"failed when it was tried again: {failure}"
-            else:
-                why = f"failed: {failure}" if failure else "not measured yet"
-            if why:
-                gaps.append(f"seed {job.config.seed} {why}" if len(same) > 1 else why)
-        tables.setdefault(table, []).append(Repeated(label, found, gaps))
-    return tables
+    named = [word for word in words if word.lstrip("+").partition("=")[0] == REPEATED]
+    values = several.get(REPEATED) or [word.partition("=")[2] for word in named[-1:]]
+    return [word for word in words if word not in named], list(dict.fromkeys(values))

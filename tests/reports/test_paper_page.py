@@ -27,7 +27,12 @@ def of(run: Run, label: str) -> Repeated:
 
 
 def test_every_line_that_is_shown_in_a_figure_is_one_of_the_tables() -> None:
-    lines = {(table.name, line.label) for table in paper_tables() for line in table.lines}
+    lines = {
+        (table.name, line.label)
+        for table in paper_tables()
+        for block in table.blocks
+        for line in block.lines
+    }
     shown = [entry["lines"] for entry in (*PAGE["plot"], *PAGE["images"]) if "lines" in entry]
     assert shown
     assert {tuple(line) for entry in shown for line in entry.values()} <= lines
@@ -36,7 +41,7 @@ def test_every_line_that_is_shown_in_a_figure_is_one_of_the_tables() -> None:
 
 def test_the_page_has_every_table_and_every_figure(run: Run, tmp_path: Path) -> None:
     lines = {
-        table.name: [of(run, line.label) for line in table.lines if line.job]
+        table.name: [of(run, line.label) for block in table.blocks for line in block.lines]
         for table in paper_tables()
     }
     page = write_paper_page(paper_tables(), lines, [], tmp_path)

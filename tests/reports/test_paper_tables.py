@@ -20,7 +20,7 @@ from reports.runs import Repeated, Run, load
 from reports.tables import QUALITY
 from reports.trends import Trend
 
-METRICS = {*QUALITY, "fps", "frame_ms", "size_bytes.total"}
+METRICS = {*QUALITY, "fps", "frame_ms", "size_bytes.total", "work.samples"}
 TABLE = PaperTable(
     "table9",
     "What is shown",
@@ -65,6 +65,42 @@ def test_the_first_files_are_the_six_tables_of_the_paper() -> None:
             assert set(trend.rising) <= set(labels), trend.rising
         for metric in table.metrics:
             assert metric in METRICS or metric.startswith("stage_ms."), metric
+
+
+@pytest.mark.parametrize("table", paper_tables(), ids=lambda table: table.name)
+def test_the_block_beyond_the_paper_has_its_lines_and_trends_but_no_published_figure(
+    table: PaperTable,
+) -> None:
+    first, second = table.blocks
+    own = [line for line in first.lines if line.job is not None and "method" not in line.job]
+    assert [line.job for line in second.lines] == [
+        {**line.job, "method": "steernerf_lean"} for line in own
+    ]
+    assert not any(line.published for line in second.lines)
+    labels = {line.label for block in table.blocks for line in block.lines}
+    assert len(labels) == len(first.lines) + len(second.lines)
+    assert len(second.trends) == len(first.trends)
+    for one, other in zip(first.trends, second.trends, strict=True):
+        assert set(other.rising) <= labels
+        assert one.rising != other.rising
+
+
+def test_weights_from_other_scenes_are_a_matter_of_the_block_beyond_the_paper() -> None:
+    for table in paper_tables()[1:]:
+        assert "other scenes" not in " ".join(table.notes)
+
+
+def test_a_section_shows_both_blocks_each_with_its_trends(run: Run) -> None:
+    (table,) = (table for table in paper_tables() if table.name == "table5")
+    labels = [line.label for block in table.blocks for line in block.lines]
+    lines = [Repeated(label, [run]) for label in labels]
+    paper, beyond = section(table, lines).split("### Beyond the paper: steernerf_lean")
+    assert "PSNR, dB: without joint training < with joint training |" in paper
+    assert "(steernerf_lean)" not in paper
+    shown = "without joint training (steernerf_lean) < with joint training (steernerf_lean)"
+    assert f"PSNR, dB: {shown} |" in beyond
+    assert "/ 33.05" in paper
+    assert "33.05" not in beyond.partition("- ")[0]
 
 
 def test_a_cell_is_measured_published_and_their_difference(run: Run) -> None:

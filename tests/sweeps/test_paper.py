@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -25,8 +26,10 @@ TABLES = {table.name: table for table in paper_tables()}
 
 @pytest.mark.parametrize("name", TABLES)
 def test_every_line_that_can_be_measured_has_its_job(name: str) -> None:
-    jobs = plan(TABLES[name], [])
-    lines = [line.label for line in TABLES[name].lines if line.job is not None]
+    jobs = plan(TABLES[name], ["seed=0"])
+    lines = [
+        line.label for block in TABLES[name].blocks for line in block.lines if line.job is not None
+    ]
     assert sorted(job.line for job in jobs) == sorted(lines)
     assert len({job.key for job in jobs}) == len(lines)
 
@@ -35,12 +38,31 @@ def test_settings_hold_for_every_job() -> None:
     for job in plan(TABLES["table3"], ["budget=tiny", "seed=3"]):
         assert job.config.budget.name == "tiny"
         assert job.config.seed == 3
-        assert job.line == f"L = {job.config.method.model.frames}"
-        assert job.config.trajectory._target_ == "bench.trajectories.smooth"
+        assert job.line.partition(" (")[0] == f"L = {job.config.method.model.frames}"
+        assert job.config.trajectory._target_ == "bench.trajectories.orbit"
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_table_is_of_the_papers_method_and_then_of_ours(name: str) -> None:
+    configs = [job.config for job in plan(TABLES[name], ["seed=0"])]
+    methods = [
+        config.method.name for config in configs if "name" in config.method
+    ]  # not Instant-NGP
+    half = len(methods) // 2
+    assert methods == ["steernerf"] * half + ["steernerf_lean"] * half
+
+
+def test_the_lines_of_table_3_differ_in_l_alone() -> None:
+    of_paper = plan(TABLES["table3"], ["seed=0"])[:4]
+    settings = [described(job.config) for job in of_paper]
+    for number, setting in enumerate(settings):
+        assert setting["method"]["rendering"]["range"]["mode"] == "off"
+        assert setting["method"]["model"].pop("frames") == number
+    assert all(setting == settings[0] for setting in settings)
 
 
 def test_every_seed_is_a_job_of_its_own_and_a_command_that_makes_it() -> None:
-    jobs = plan(TABLES["table5"], ["budget=tiny", "seed=0,2"])
+    jobs = plan(replace(TABLES["table5"], beyond=None), ["budget=tiny", "seed=0,2"])
     assert [(job.line[:4], job.config.seed) for job in jobs] == [
         ("with", 0),
         ("with", 2),
@@ -54,7 +76,7 @@ def test_every_seed_is_a_job_of_its_own_and_a_command_that_makes_it() -> None:
 
 def test_tables_share_the_run_that_they_have_in_common() -> None:
     lines = [("table2", 0), ("table3", 2), ("table4", 1), ("table5", 0)]
-    jobs = [plan(TABLES[name], [])[place] for name, place in lines]
+    jobs = [plan(TABLES[name], ["seed=0"])[place] for name, place in lines]
     assert len({job.key for job in jobs}) == 1
 
 
@@ -62,17 +84,39 @@ def test_tables_share_the_run_that_they_have_in_common() -> None:
     ("method", "name", "line"),
     [
         ("ngp", "table1", "Instant-NGP"),
-        ("steernerf_lean", "table4", "K = 6"),
-        ("steernerf_lean_frozen", "table5", "without joint training"),
-        ("steernerf_lean_k3", "table4", "K = 3"),
+        ("steernerf", "table4", "K = 6"),
+        ("steernerf_lean", "table4", "K = 6 (steernerf_lean)"),
+        ("steernerf_lean_frozen", "table5", "without joint training (steernerf_lean)"),
+        ("steernerf_lean_k3", "table4", "K = 3 (steernerf_lean)"),
     ],
 )
 def test_what_the_figures_show_is_what_the_tables_measure(
     method: str, name: str, line: str
 ) -> None:
     shown = composed(["+experiment=figures", f"method={method}"])
-    (job,) = (job for job in plan(TABLES[name], []) if job.line == line)
+    (job,) = (job for job in plan(TABLES[name], ["seed=0"]) if job.line == line)
     assert described(shown) == described(job.config)
+
+
+@pytest.mark.parametrize(("budget", "seeds"), [("tiny", 1), ("demo", 3), ("small", 3), ("full", 1)])
+def test_without_seeds_the_budget_says_how_many(budget: str, seeds: int) -> None:
+    jobs = plan(replace(TABLES["table5"], beyond=None), [f"budget={budget}"])
+    assert [job.config.seed for job in jobs] == 2 * list(range(seeds))
+
+
+def test_a_seed_that_is_given_is_the_only_one() -> None:
+    jobs = plan(TABLES["table5"], ["budget=demo", "seed=7"])
+    assert {job.config.seed for job in jobs} == {7}
+
+
+def test_no_seeds_are_refused() -> None:
+    with pytest.raises(SteerbenchError, match="seeds >= 1"):
+        plan(TABLES["table5"], ["budget.seeds=0"])
+
+
+def test_how_many_seeds_a_budget_has_changes_no_key() -> None:
+    few, many = (composed(["budget=demo", f"budget.seeds={seeds}"]) for seeds in (1, 3))
+    assert described(few) == described(many)
 
 
 @pytest.mark.parametrize(
@@ -118,17 +162,18 @@ def put(store: Store, source: str, config: DictConfig) -> str:
 
 
 def labels(page: Path) -> list[str]:
-    """The lines of Table 3 on a page."""
-    lines = [line for line in page.read_text().splitlines() if line.startswith("| L = ")]
+    """The lines of Table 3 on a page, without those beyond the paper."""
+    paper, _, _ = page.read_text().partition("### Beyond")
+    lines = [line for line in paper.splitlines() if line.startswith("| L = ")]
     return [line.split("|")[1].strip() for line in lines]
 
 
 def test_a_job_that_fails_stands_in_its_line_and_the_others_run(
     steerbench, measured: list[DictConfig], store: Store
 ) -> None:
-    outcome = steerbench("paper", "--table", "table3", f"outputs={store.folder.parent}")
+    outcome = steerbench("paper", "--table", "table3", "seed=0", f"outputs={store.folder.parent}")
     assert outcome.status == 1
-    assert len(measured) == 4
+    assert len(measured) == 8
     assert "failed: table3: L = 3, seed 0: no room" in outcome.err
     assert "about 0:00:0" in outcome.err
     page = Path(re.search(r"report: (.*)", outcome.err)[1])
@@ -139,10 +184,10 @@ def test_a_job_that_fails_stands_in_its_line_and_the_others_run(
 def test_a_report_has_what_is_there_and_measures_nothing(
     steerbench, measured: list[DictConfig], store: Store, stored_run: str
 ) -> None:
-    jobs = plan(TABLES["table3"], [f"outputs={store.folder.parent}"])
+    jobs = plan(TABLES["table3"], [f"outputs={store.folder.parent}", "seed=0"])
     put(store, stored_run, jobs[1].config)
     failures.keep(store.folder.parent, described(jobs[2].config), "killed")
-    outcome = steerbench("report", "--table", "table3", f"outputs={store.folder.parent}")
+    outcome = steerbench("report", "--table", "table3", "seed=0", f"outputs={store.folder.parent}")
     assert (outcome.status, measured) == (0, [])
     page = Path(re.search(r"report: (.*)", outcome.err)[1])
     missing = "not measured yet"
@@ -170,7 +215,7 @@ def test_a_check_names_the_broken_rows_of_the_store(
     steerbench, measured: list[DictConfig], store: Store, stored_run: str
 ) -> None:
     outputs = f"outputs={store.folder.parent}"
-    key = put(store, stored_run, plan(TABLES["table3"], [outputs])[0].config)
+    key = put(store, stored_run, plan(TABLES["table3"], [outputs, "seed=0"])[0].config)
     rows = store.folder / key / "rows.csv"
     table = pd.read_csv(rows)
     named = table["metric"].str.startswith("stage_ms.") & (table["metric"] != "stage_ms.other")
@@ -188,7 +233,7 @@ def test_the_frames_of_runs_that_are_not_on_a_page_are_not_read(
     steerbench, store: Store, stored_run: str
 ) -> None:
     outputs = f"outputs={store.folder.parent}"
-    key = put(store, stored_run, plan(TABLES["table3"], [outputs])[0].config)
+    key = put(store, stored_run, plan(TABLES["table3"], [outputs, "seed=0"])[0].config)
     for run in (stored_run, key):
         (store.folder / run / "frames.csv").unlink()
     checked = steerbench("report", "--check", outputs)

@@ -16,14 +16,15 @@ from bench.results import Store
 from bench.types import Scene
 from reports.paper_tables import paper_tables
 from sweeps import failures, measurement
+from sweeps.gather import gather, newest
 from sweeps.measurement import described
-from sweeps.plan import Planned, gather, newest, plan
+from sweeps.plan import Planned, plan
 
 (TABLE,) = (table for table in paper_tables() if table.name == "table5")
 
 
 def job(folder: Path) -> Planned:
-    return plan(TABLE, ["scene=blender", f"scene.path={folder}"])[0]
+    return plan(TABLE, ["scene=blender", f"scene.path={folder}", "seed=0"])[0]
 
 
 def shown(store: Store, folder: Path) -> list[str]:
@@ -100,6 +101,14 @@ def test_a_failure_stands_beside_what_was_measured_before(measured: Store, tmp_p
     ((line,),) = gather([asked], newest(measured), outputs).values()
     assert len(line.runs) == 1
     assert line.gaps == ["failed when it was tried again: no such folder"]
+
+
+@pytest.mark.parametrize("name", ["method", "method.joint.through"])
+def test_a_setting_outside_the_sweep_fills_no_line(name: str) -> None:
+    first, *others = TABLE.lines
+    wrong = replace(first, job={name: "all"})
+    with pytest.raises(SteerbenchError, match="no job of its experiment"):
+        plan(replace(TABLE, lines=[wrong, *others]), [])
 
 
 def test_a_line_that_no_job_fills_is_named() -> None:

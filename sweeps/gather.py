@@ -1,0 +1,103 @@
+"""What the store has of the jobs of the paper's tables, and why the rest is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from bench.results import Store, content_key
+from reports.runs import Repeated, Run, readable
+from reports.scenes import over_scenes
+from sweeps import failures
+from sweeps.measurement import described, of_scene
+from sweeps.plan import Planned
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A job with its run, if it has one, and with what is wrong, if anything is."""
+
+    job: Planned
+    run: Run | None
+    gap: str | None
+
+
+def newest(store: Store) -> dict[str, list[Run]]:
+    """The runs of the store by the key of their job, the newest first: of each scene that has the
+    settings of the job, the run that was stored last."""
+    found: dict[str, dict[str, Run]] = {}
+    for run in reversed(readable(store)):
+        parts = run.record["made_of"]
+        if "config" in parts:
+            of_job = found.setdefault(content_key(parts["config"]), {})
+            of_job.setdefault(run.record["scene"]["digest"], run)
+    return {job: list(of_scenes.values()) for job, of_scenes in found.items()}
+
+
+def gather(
+    jobs: Sequence[Planned], runs: Mapping[str, Sequence[Run]], outputs: Path
+) -> dict[str, list[Repeated]]:
+    """The lines of every table: the runs of each, and why others are missing.
+
+    Of several scenes a run is the mean with one seed over the scenes that all lines of the table
+    have. A line of which nothing was measured does not count.
+
+    Args:
+        runs: as `newest` has them.
+    """
+    tables: dict[str, dict[str, list[Outcome]]] = {}
+    for job in jobs:
+        line = tables.setdefault(job.table, {}).setdefault(job.line, [])
+        line.append(_outcome(job, runs, outputs))
+    return {table: _lines(of_table) for table, of_table in tables.items()}
+
+
+def _outcome(job: Planned, runs: Mapping[str, Sequence[Run]], outputs: Path) -> Outcome:
+    failure = failures.found(outputs, described(job.config))
+    shown = (run for run in runs.get(job.key, ()) if of_scene(run, job.config))
+    if run := next(shown, None):
+        why = failure and f"failed when it was tried again: {failure}"
+        return Outcome(job, replace(run, label=job.line), why)
+    return Outcome(job, None, f"failed: {failure}" if failure else "not measured yet")
+
+
+def _lines(of_table: Mapping[str, Sequence[Outcome]]) -> list[Repeated]:
+    """The lines of a table, each from the outcomes of its jobs."""
+    measured = [{each.job.scene for each in line if each.run} for line in of_table.values()]
+    common = set.intersection(*filter(None, measured)) if any(measured) else set()
+    return [_line(label, outcomes, common) for label, outcomes in of_table.items()]
+
+
+def _line(label: str, outcomes: Sequence[Outcome], common: set[str]) -> Repeated:
+    """A line whose runs are means over the scenes `common`, of the seeds that have all of them."""
+    by_seed: dict[int, list[Run]] = {}
+    by_scene: dict[str, list[Run]] = {}
+    for each in sorted(outcomes, key=lambda each: each.job.scene not in common):
+        if each.run:
+            by_scene.setdefault(each.job.scene, []).append(each.run)
+            if each.job.scene in common:
+                by_seed.setdefault(each.job.config.seed, []).append(each.run)
+    runs = [over_scenes(of_seed) for of_seed in by_seed.values() if len(of_seed) == len(common)]
+    gaps = list(_gaps(outcomes))
+    if by_scene and not common:
+        gaps.append("no scene that all lines have")
+    several = {each.job.scene for each in outcomes} != {""}
+    return Repeated(label, runs, gaps, by_scene if several else {})
+
+
+def _gaps(outcomes: Sequence[Outcome]) -> Iterator[str]:
+    """What is wrong, each reason once, with the seeds and scenes where it is not all of them."""
+    seeds = {each.job.config.seed for each in outcomes}
+    scenes = {each.job.scene for each in outcomes}
+    for why in dict.fromkeys(each.gap for each in outcomes if each.gap):
+        where: dict[int, list[str]] = {}
+        for each in outcomes:
+            if each.gap == why:
+                where.setdefault(each.job.config.seed, []).append(each.job.scene)
+        groups = list(where.items())
+        same = where.keys() == seeds and all(of == groups[0][1] for _, of in groups)
+        for seed, of_seed in groups[:1] if same else groups:
+            words = [] if same else [f"seed {seed}"]
+            words += [] if len(of_seed) == len(scenes) else [", ".join(of_seed)]
+            yield " ".join((*words, why))
