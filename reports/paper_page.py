@@ -16,7 +16,7 @@ from bench.errors import explained
 from reports import figures
 from reports.images import frame_section, kept_frames
 from reports.outliers import Outlier, outlier_table
-from reports.paper_tables import PaperTable, section
+from reports.paper_tables import PaperTable, paper_tables, section
 from reports.publish import add_picture, publish
 from reports.runs import Repeated, Run
 
@@ -79,6 +79,10 @@ def _plot(plot: Mapping[str, Any], lines: Lines, folder: Path) -> Iterator[str]:
         ]
         draw = partial(figures.quality_against, shown, plot["metric"], plot["unit"], plot["axis"])
         some = bool(shown)
+    elif "curves" in plot:
+        curves = [curve for name in plot["curves"] for curve in _curves(name, lines)]
+        draw = partial(figures.quality_over_training, curves)
+        some = bool(curves)
     else:
         runs = _chosen(plot["lines"], lines, one_scene=plot.get("one_scene", False))
         draw = partial(getattr(figures, plot["draw"]), runs)
@@ -87,6 +91,27 @@ def _plot(plot: Mapping[str, Any], lines: Lines, folder: Path) -> Iterator[str]:
         file = add_picture(folder, plot["file"], draw)
         title, caption = plot["title"], plot["caption"].strip()
         yield f"## {title}\n\n![{title}]({file})\n\n{caption}"
+
+
+def _curves(name: str, lines: Lines) -> Iterator[figures.Curve]:
+    """The measured lines of the table called `name` over their trainings."""
+    (table,) = (table for table in paper_tables() if table.name == name)
+    measured = {line.label: line for line in lines.get(name, ()) if line.runs}
+    for line in table.lines:
+        marks = {
+            share: mark.label for (label, share), mark in table.marks.items() if label == line.label
+        }
+        known = {
+            share: measured[label]
+            for share, label in {**marks, 1: line.label}.items()
+            if label in measured
+        }
+        if len(known) > 1:
+            steps = {
+                of.runs[0].record["budget"]["renderer_steps"] * share: of
+                for share, of in known.items()
+            }
+            yield figures.Curve(f"{name.replace('table', 'Table ')}", line.label, steps)
 
 
 def _images(images: Mapping[str, Any], lines: Lines, folder: Path) -> Iterator[str]:

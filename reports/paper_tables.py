@@ -17,6 +17,9 @@ from reports.trends import Trend, steps, trend_table
 
 FOLDER = Path(__file__).parent / "paper"
 METHOD = "method"
+AFTER, SHARES = "method.after", (0.125, 0.25, 0.5)
+"""The setting of the share of a training after which a method is rendered, and shares before its
+end."""
 ABSENT = "–"
 """In place of a figure that the paper does not give or that nothing here can measure."""
 
@@ -52,6 +55,8 @@ class PaperTable:
         beyond: a further method with the lines of the paper's; None without one.
         beyond_notes: the notes about that.
         scenes: the metrics that are also shown of every scene of a data set; none: no such table.
+        in_turns: the lines of a block are measured frame by frame in turns: it compares times.
+        curve: the lines of the paper's method are also shown as curves over the training.
     """
 
     name: str
@@ -64,6 +69,21 @@ class PaperTable:
     beyond: str | None = None
     beyond_notes: Sequence[str] = ()
     scenes: Sequence[str] = ()
+    in_turns: bool = False
+    curve: bool = False
+
+    @property
+    def marks(self) -> dict[tuple[str, float], Line]:
+        """What is measured besides for the curves: by the label of a line and the share of the
+        training after which it is rendered."""
+        return {
+            (line.label, share): Line(
+                f"{line.label}, after {share}", {**line.job, AFTER: str(share)}
+            )
+            for line in self.lines
+            for share in SHARES
+            if self.curve and line.job is not None
+        }
 
     @property
     def blocks(self) -> list[PaperTable]:
@@ -88,6 +108,7 @@ class PaperTable:
                 for trend in self.trends
             ],
             beyond=None,
+            curve=False,
         )
 
 

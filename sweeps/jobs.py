@@ -16,7 +16,7 @@ from bench.sharing import whole
 from reports.runs import load
 from reports.tables import decimal
 from sweeps import failures
-from sweeps.measurement import Obtained, described, obtain
+from sweeps.measurement import Obtained, described, obtain_in_turns
 
 SUFFIX = ".job.json"
 
@@ -93,12 +93,18 @@ def attempt(config: DictConfig, command: Sequence[str], name: str) -> Obtained:
 
     Raises as `obtain` does.
     """
+    return attempt_in_turns([(config, command, name)])[0]
+
+
+def attempt_in_turns(jobs: Sequence[tuple[DictConfig, Sequence[str], str]]) -> list[Obtained]:
+    """`attempt` several jobs in turns; if one fails, all of them do."""
     try:
-        return obtain(config, command)
+        return obtain_in_turns([(config, command) for config, command, _ in jobs])
     except Exception as error:
-        print(f"steerbench: failed: {name}: {error}", file=sys.stderr)
-        with failures.printed():
-            failures.keep(Path(config.outputs), described(config), failures.reason(error))
+        for config, _, name in jobs:
+            print(f"steerbench: failed: {name}: {error}", file=sys.stderr)
+            with failures.printed():
+                failures.keep(Path(config.outputs), described(config), failures.reason(error))
         raise
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,11 +18,11 @@ from rich.columns import Columns
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
 from bench.provenance import decisive
-from bench.results import Store
-from bench.run import Task, measure
+from bench.results import Measurement, Store
+from bench.run import Task, measure_in_turns
 from bench.scenes.held_out import hold_out
 from bench.sources import digest, libraries
-from bench.types import DEVICE, Method, Scene
+from bench.types import DEVICE, Log, Method, Scene
 from reports.page import write_page
 from reports.runs import Run, load
 from reports.tables import run_tables
@@ -89,35 +89,75 @@ def obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
     Raises:
         SteerbenchError: a setting is wrong, or something in the measurement went wrong.
     """
-    obtained = _obtain(config, command)
-    failures.forget(Path(config.outputs), described(config))
-    return obtained
+    return obtain_in_turns([(config, command)])[0]
 
 
-def _obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
-    settings = checked_settings(config)
-    torch.manual_seed(settings.seed)
-    root = Path(settings.outputs)
-    log, store = ConsoleLog(root), Store(root)
+def obtain_in_turns(jobs: Sequence[tuple[DictConfig, Sequence[str]]]) -> list[Obtained]:
+    """`obtain` several jobs, which share scene, trajectory, protocol and seed: those that the store
+    does not have draw each frame one after the other, see `bench.run.measure_in_turns`.
 
-    method, budget, protocol = (build(config, group) for group in ("method", "budget", "protocol"))
-    scene = scene_of(config)
-    trajectory = build(config, "trajectory", scene)
-    weights = Path(settings.weights_dir) if settings.weights_dir else None
-    parts = _identity(config, scene, method) | {"lpips": protocol.find_lpips(weights, log)}
-    run = store.key(parts)
-    if store.find(run) is not None:
-        log.info(f"already measured; to measure again, remove {store.folder / run}")
-        return Obtained(store, run, measured=False)
-    with device_lock(method.settings()["device"], log):
-        if store.find(run) is not None:  # measured by the process that had the lock before
-            return Obtained(store, run, measured=False)
+    Raises as `obtain` does.
+    """
+    log = ConsoleLog(Path(jobs[0][0].outputs))
+    ready = [_Ready.of(config, command, log) for config, command in jobs]
+    for one in ready:
+        if one.stored:
+            log.info(f"already measured; to measure again, remove {one.store.folder / one.run}")
+    missing = [one for one in ready if not one.stored]
+    if missing:
+        with device_lock(missing[0].method.settings()["device"], log):
+            missing = [one for one in missing if not one.stored]  # by who had the lock before
+            if missing:
+                methods = [one.method for one in missing]
+                for one, of_one in zip(
+                    missing, measure_in_turns(methods, missing[0].task, log), strict=True
+                ):
+                    one.keep(of_one)
+    for config, _ in jobs:
+        failures.forget(Path(config.outputs), described(config))
+    measured = {one.run for one in missing}
+    return [Obtained(one.store, one.run, one.run in measured) for one in ready]
+
+
+@dataclass(frozen=True)
+class _Ready:
+    """A measurement that can begin, and everything that can change its rows: its `parts`."""
+
+    config: DictConfig
+    command: Sequence[str]
+    method: Method
+    task: Task
+    parts: Mapping[str, Any]
+    store: Store
+
+    @classmethod
+    def of(cls, config: DictConfig, command: Sequence[str], log: Log) -> _Ready:
+        settings = checked_settings(config)
+        torch.manual_seed(settings.seed)
+        method, budget, protocol = (
+            build(config, name) for name in ("method", "budget", "protocol")
+        )
+        scene = scene_of(config)
+        trajectory = build(config, "trajectory", scene)
+        weights = Path(settings.weights_dir) if settings.weights_dir else None
+        parts = _identity(config, scene, method) | {"lpips": protocol.find_lpips(weights, log)}
         task = Task(scene, trajectory, protocol, budget, settings.seed, weights)
-        measurement = measure(method, task, log)
-    record = {**measurement.record, "command": shlex.join(command)}
-    record["scene_path"] = _folder(config)
-    store.save(parts, replace(measurement, record=record))
-    return Obtained(store, run, measured=True)
+        return cls(config, command, method, task, parts, Store(Path(settings.outputs)))
+
+    @cached_property
+    def run(self) -> str:
+        """Its key in the store."""
+        return self.store.key(self.parts)
+
+    @property
+    def stored(self) -> bool:
+        return self.store.find(self.run) is not None
+
+    def keep(self, measurement: Measurement) -> None:
+        """Put it into the store, with where it comes from."""
+        more = {"command": shlex.join(self.command), "scene_path": _folder(self.config)}
+        record = {**measurement.record, **more}
+        self.store.save(self.parts, replace(measurement, record=record))
 
 
 def scene_of(config: DictConfig) -> Scene:
@@ -218,7 +258,7 @@ def _folder(config: DictConfig) -> str | None:
 
 def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any]:
     """Everything that can change the rows, except for the weights of LPIPS: a run's key."""
-    things = [measure, *_targets(described(config))]
+    things = [measure_in_turns, *_targets(described(config))]
     return {
         "code": digest(*things),
         "libraries": libraries(*things),

@@ -16,7 +16,7 @@ from reports.outliers import outlier_table, outliers
 from reports.paper_page import write_paper_page
 from sweeps.data_sets import DataSet, find
 from sweeps.gather import gather, newest
-from sweeps.jobs import attempt, say, time_left
+from sweeps.jobs import attempt_in_turns, say, time_left
 from sweeps.overrides import composed
 from sweeps.plan import Planned, chosen, plan
 from sweeps.terminal import console, show
@@ -73,17 +73,29 @@ def _run(jobs: Sequence[Planned]) -> int:
     jobs = sorted(jobs, key=lambda job: rounds.index((job.config.seed, job.scene)))
     distinct = {job.key: job for job in reversed(jobs)}
     jobs = [job for job in jobs if distinct[job.key] is job]
-    begun, measured, failed = time.monotonic(), 0, 0
-    for number, job in enumerate(jobs, 1):
-        print(f"{number} of {len(jobs)}, {job.name}", file=sys.stderr)
+    begun, measured, failed, ended = time.monotonic(), 0, 0, 0
+    for group in _groups(jobs):
+        for number, job in enumerate(group, ended + 1):
+            print(f"{number} of {len(jobs)}, {job.name}", file=sys.stderr)
+        ended += len(group)
         try:
-            obtained = attempt(job.config, job.command, job.name)
-        except Exception:  # which `attempt` has printed: the other jobs still run
-            failed += 1
+            obtained = attempt_in_turns([(job.config, job.command, job.name) for job in group])
+        except Exception:  # which `attempt_in_turns` has printed: the other jobs still run
+            failed += len(group)
             continue
-        measured += obtained.measured
-        say(obtained, job.name, time_left(time.monotonic() - begun, measured, len(jobs) - number))
+        measured += sum(of_job.measured for of_job in obtained)
+        left = time_left(time.monotonic() - begun, measured, len(jobs) - ended)
+        for job, of_job in zip(group, obtained, strict=True):
+            say(of_job, job.name, left)
     return failed
+
+
+def _groups(jobs: Sequence[Planned]) -> list[list[Planned]]:
+    """The jobs that are measured in turns, together; each of the others alone."""
+    groups: dict[object, list[Planned]] = {}
+    for job in jobs:
+        groups.setdefault(job.turns or job.key, []).append(job)
+    return list(groups.values())
 
 
 def _check(store: Store) -> int:

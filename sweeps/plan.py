@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import SteerbenchError
 from bench.results import content_key
-from reports.paper_tables import METHOD, Line, PaperTable, paper_tables
+from reports.paper_tables import AFTER, METHOD, Line, PaperTable, paper_tables
 from sweeps.build import build
 from sweeps.data_sets import DataSet
 from sweeps.measurement import described
@@ -27,7 +27,8 @@ REPEATED = "seed"
 class Planned:
     """A job: the line of a table that it fills, its configuration, and the command that runs it.
 
-    `scene` is the name of its scene among those of a data set, empty without one.
+    `scene` is the name of its scene among those of a data set, empty without one. Jobs with the
+    same `turns` are measured in turns; without one a job is measured alone.
     """
 
     table: str
@@ -35,6 +36,7 @@ class Planned:
     config: DictConfig
     command: Sequence[str]
     scene: str = ""
+    turns: str = ""
 
     @property
     def name(self) -> str:
@@ -71,8 +73,8 @@ def chosen(name: str | None, methods: Sequence[str]) -> list[PaperTable]:
 
 def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -> list[Planned]:
     """The jobs of the experiment of `table` under the settings in `words`: one for each line that
-    has a job, for each seed (those in `words`, or as many as the budget says), and for each scene
-    of `data`.
+    has a job, for each seed (those in `words`; or as many as the budget says, and for a method
+    beyond the paper the first of these), and for each scene of `data`.
 
     What a line does not set is as the experiment has it. A job of the sweep that no line names is
     left out: Instant-NGP has no 2D renderer to compute in int8.
@@ -85,15 +87,16 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     fixed += [f"scene={data.layout}"] if data else []
     scenes = {name: str(folder) for name, folder in data.scenes.items()} if data else {"": ""}
     experiment = composed([f"+experiment={table.name}", *fixed], return_hydra_config=True)
-    seeds = seeds or [str(seed) for seed in range(build(experiment, "budget").seeds)]
+    usual = [str(seed) for seed in range(build(experiment, "budget").seeds)]
     params = experiment.hydra.sweeper.params
     grid = swept([f"{name}={values}" for name, values in params.items()])
     jobs = []
-    for line in (line for block in table.blocks for line in block.lines):
+    for block, line in _lines(table):
         if line.job is None:
             continue
         added = line.job == {METHOD: line.label}
-        if not added and any(value not in grid.get(name, ()) for name, value in line.job.items()):
+        swept_here = {name: value for name, value in line.job.items() if name != AFTER}
+        if not added and any(value not in grid.get(name, ()) for name, value in swept_here.items()):
             choices = "; ".join(f"{name}={','.join(some)}" for name, some in grid.items())
             raise SteerbenchError(
                 f"{table.name}: no job of its experiment fills the line {line.label!r}; expected "
@@ -102,15 +105,24 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
         settings = [f"{name}={value}" for name, value in line.job.items()]
         together = [f"+experiment={table.name}", *fixed, *settings]
         config = composed(together)
-        for seed, (scene, folder) in product(seeds, scenes.items()):
+        of_line = seeds or (usual if block is table else usual[:1])
+        for seed, (scene, folder) in product(of_line, scenes.items()):
             word = f"{REPEATED}={seed}"
             job = cast(DictConfig, OmegaConf.merge(config, OmegaConf.from_dotlist([word])))
             if data:
                 job.scene.path = folder
             place = [setting("scene.path", folder)] if data else []
             command = ["steerbench", "run", *together, *place, word, "hydra.mode=RUN"]
-            jobs.append(Planned(table.name, line.label, job, command, scene))
+            turns = f"{table.name}, {block.title}, {seed}, {scene}" if table.in_turns else ""
+            jobs.append(Planned(table.name, line.label, job, command, scene, turns))
     return jobs
+
+
+def _lines(table: PaperTable) -> Iterator[tuple[PaperTable, Line]]:
+    """The lines of all blocks of a table and those of its curves, each with its block."""
+    for block in table.blocks:
+        yield from ((block, line) for line in block.lines)
+        yield from ((block, line) for line in block.marks.values())
 
 
 def _seeds(words: Sequence[str]) -> tuple[list[str], list[str]]:
