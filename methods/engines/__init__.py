@@ -27,6 +27,9 @@ from methods.engines.network import Network as Network
 
 Precision = Literal["fp32", "bf16", "fp16", "int8"]
 
+Calibration = Literal["frames", "none"]
+"""What gives the ranges of 8-bit activations: real frames, or nothing (`fixed_ranges`)."""
+
 Inputs = tuple[Tensor, ...]
 
 Samples = Callable[[], Sequence[Inputs]]
@@ -59,7 +62,12 @@ class Built:
 class Engine(ABC):
     """Builds networks at one `precision`.
 
+    Args:
+        precision: one of `precisions`.
+        calibration: of int8; no other precision depends on it.
+
     Attributes:
+        uncalibrated: whether it is int8 without calibration.
         name: as it stands in rows.
         precisions: those it has.
         libraries: distributions that it loads when it is made.
@@ -75,13 +83,14 @@ class Engine(ABC):
     libraries: ClassVar[tuple[str, ...]] = ()
     prepares_sizes: ClassVar[bool] = True
 
-    def __init__(self, precision: Precision = "fp32") -> None:
+    def __init__(self, precision: Precision = "fp32", calibration: Calibration = "frames") -> None:
         if precision not in self.precisions:
             raise Unavailable(
                 f"precision={precision}: expected one of {', '.join(self.precisions)}, which "
                 f"engine={self.name} has"
             )
         self.precision = precision
+        self.uncalibrated = precision == "int8" and calibration == "none"
 
     def check(self, device: torch.device) -> None:
         """Raise `Unavailable` unless the engine computes at this precision on `device`."""
@@ -96,11 +105,14 @@ class Engine(ABC):
 
         With int8 a second part, after `+`, is the precision of everything that is not quantised.
         """
-        return f"{self.precision}+fp32" if self.precision == "int8" else self.precision
+        if self.precision != "int8":
+            return self.precision
+        return "int8 uncalibrated+fp32" if self.uncalibrated else "int8+fp32"
 
     def samples(self, network: Network) -> int:
-        """Number of frames whose inputs `build` needs."""
-        several = self.precision == "int8" or (self.prepares_sizes and any(network.varying))
+        """Number of frames whose inputs `build` needs. Of one frame it reads the shapes alone."""
+        calibrated = self.precision == "int8" and not self.uncalibrated
+        several = calibrated or (self.prepares_sizes and any(network.varying))
         return CALIBRATION if several else 1
 
     def key(self) -> dict[str, object]:
@@ -109,6 +121,7 @@ class Engine(ABC):
         return {
             "engine": self.name,
             "precision": self.precision,
+            "uncalibrated": self.uncalibrated,
             "code": digest(kind),
             "libraries": libraries(kind),
         }

@@ -7,22 +7,25 @@ import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from bench.types import Log
 from methods.engines import (
     SIZES,
+    Engine,
     Folder,
     Inputs,
     Network,
-    Precision,
     Samples,
     keep,
     readable,
     sizes_to_expect,
 )
+from methods.engines.fixed_ranges import largest
 
 OPSET = 17
 
@@ -34,18 +37,18 @@ def kept(
     network: Network,
     samples: Samples,
     folder: Folder,
-    precision: Precision,
+    engine: Engine,
     log: Log,
-    options: Mapping[str, bool] | None = None,
+    options: Mapping[str, Any] | None = None,
 ) -> Path:
     """The path of `network` in `folder` as a model, which is made if it is missing.
 
     Args:
         network: to be exported.
         samples: of one frame, or of those to calibrate on.
-        folder: of this network and precision alone.
-        precision: fp32; fp16, with inputs and outputs in float32; or int8, with what is not
-            quantised in float32.
+        folder: of this network and engine alone.
+        engine: its precision is that of the model: fp32; fp16, with inputs and outputs in float32;
+            or int8, with what is not quantised in float32, on `fixed_ranges` if it is uncalibrated.
         log: of what is found or made.
         options: further ones of ONNX Runtime's quantiser.
 
@@ -56,12 +59,15 @@ def kept(
     def write(path: Path) -> None:
         seen = [tuple(x.cpu() for x in inputs) for inputs in samples()]
         plain = readable(network).cpu()
-        if precision == "int8":
-            exported = path.with_name("exported.onnx")
+        if engine.precision == "int8":
+            exported, prepared = path.with_name("exported.onnx"), path.with_name("prepared.onnx")
             _export(plain, network, seen[0], exported)
-            _quantise(exported, seen, input_names(network), path, options or {})
+            _prepare(exported, prepared)
+            further = _uncalibrated(prepared) if engine.uncalibrated else {}
+            _quantise(prepared, seen, input_names(network), path, {**(options or {}), **further})
         else:
-            _export(_Halved(plain) if precision == "fp16" else plain, network, seen[0], path)
+            half = engine.precision == "fp16"
+            _export(_Halved(plain) if half else plain, network, seen[0], path)
         _note_sizes(path, sizes_to_expect(seen, network))
 
     path = folder() / "network.onnx"
@@ -133,21 +139,48 @@ def _export(module: nn.Module, network: Network, sample: Inputs, path: Path) -> 
         )
 
 
+def _prepare(exported: Path, prepared: Path) -> None:
+    from onnxruntime.quantization import shape_inference
+
+    shape_inference.quant_pre_process(exported, prepared, skip_symbolic_shape=True)
+
+
+def _uncalibrated(prepared: Path) -> dict[str, Any]:
+    """Options of the quantiser for `fixed_ranges`, whatever numbers the samples have.
+
+    What is padded with zeros keeps its range.
+    """
+    import onnx
+
+    graph = onnx.load(prepared).graph
+    bounds = {entry.name: largest(None) for entry in graph.input}
+    for node in graph.node:
+        padded = bounds.get(node.input[0]) if node.op_type == "Pad" else None
+        for name in node.output:
+            bounds[name] = padded or largest(node.op_type)
+    read = {name for node in graph.node if node.op_type in PRODUCTS for name in node.input}
+    zero = np.array(0, np.int8)
+    return {
+        "OpTypesToExcludeOutputQuantization": list(PRODUCTS),
+        "TensorQuantOverrides": {
+            name: [{"scale": np.array(bounds[name] / 127, np.float32), "zero_point": zero}]
+            for name in sorted(read & bounds.keys())
+        },
+    }
+
+
 def _quantise(
-    exported: Path,
+    prepared: Path,
     samples: Sequence[Inputs],
     names: Sequence[str],
     path: Path,
-    options: Mapping[str, bool],
+    options: Mapping[str, Any],
 ) -> None:
-    """Write the model `exported` to `path` with 8-bit products, calibrated on `samples`."""
+    """Write the model `prepared` to `path` with 8-bit products, calibrated on `samples`."""
     from onnxruntime import quantization
-    from onnxruntime.quantization import shape_inference
 
     arrays = [[x.numpy() for x in inputs] for inputs in samples]
     frames = iter([dict(zip(names, frame, strict=True)) for frame in arrays])
-    prepared = path.with_name("prepared.onnx")
-    shape_inference.quant_pre_process(exported, prepared, skip_symbolic_shape=True)
     quantization.quantize_static(
         prepared,
         path,

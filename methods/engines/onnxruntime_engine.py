@@ -5,9 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from bench.errors import Unavailable
 from bench.types import Log
 from methods.engines import (
     Built,
+    Calibration,
     Engine,
     Folder,
     Inputs,
@@ -31,14 +33,24 @@ class OnnxRuntime(Engine):
     libraries = ("onnx", "onnxruntime")
     prepares_sizes = False
 
-    def __init__(self, precision: Precision = "fp32") -> None:
-        super().__init__(precision)
+    def __init__(self, precision: Precision = "fp32", calibration: Calibration = "frames") -> None:
+        super().__init__(precision, calibration)
         _, self._runtime = (required(self.name, library, "onnx") for library in self.libraries)
         self._runtime.disable_telemetry_events()
 
+    def check(self, device: torch.device) -> None:
+        """See `Engine.check`."""
+        super().check(device)
+        if self.uncalibrated:
+            raise Unavailable(
+                "calibration=none: engine=onnxruntime would multiply in float32, because it "
+                "multiplies 8-bit integers only where their sums are rounded, too: use "
+                "engine=openvino"
+            )
+
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
         """See `Engine.build`."""
-        path = onnx_model.kept(network, samples, folder, self.precision, log)
+        path = onnx_model.kept(network, samples, folder, self, log)
         options = self._runtime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
         session = self._runtime.InferenceSession(path, options, ["CPUExecutionProvider"])

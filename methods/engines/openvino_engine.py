@@ -20,6 +20,7 @@ from bench.types import Log
 from methods.engines import (
     SIZES,
     Built,
+    Calibration,
     Engine,
     Folder,
     Inputs,
@@ -31,11 +32,15 @@ from methods.engines import (
     required,
     sizes_to_expect,
 )
+from methods.engines.fixed_ranges import largest
 
 # Keeps OpenVINO and NNCF from reporting their use to anybody: both work without this package.
 sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
 
 Varying = tuple[tuple[int, ...], ...]
+
+NO_PRODUCTS = ("Add", "Multiply", "MaxPool")
+"""Operators whose inputs NNCF would round, too, which `fixed_ranges` do not."""
 
 
 class OpenVino(Engine):
@@ -52,8 +57,8 @@ class OpenVino(Engine):
     precisions = ("fp32", "bf16", "int8")
     libraries = ("openvino", "nncf")
 
-    def __init__(self, precision: Precision = "fp32") -> None:
-        super().__init__(precision)
+    def __init__(self, precision: Precision = "fp32", calibration: Calibration = "frames") -> None:
+        super().__init__(precision, calibration)
         self._openvino = required(self.name, "openvino", "openvino")
         self._nncf = required(self.name, "nncf", "openvino") if precision == "int8" else None
         self._half = precision != "fp32" and "BF16" in _capabilities(self._openvino)
@@ -64,7 +69,8 @@ class OpenVino(Engine):
 
     def computed(self, device: torch.device) -> str:
         """See `Engine.computed`."""
-        return "int8+bf16" if self.precision == "int8" and self._half else super().computed(device)
+        computed = super().computed(device)
+        return computed.replace("+fp32", "+bf16") if self._half else computed
 
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
         """See `Engine.build`."""
@@ -102,12 +108,39 @@ class OpenVino(Engine):
         logging.getLogger("nncf").setLevel(logging.ERROR)
         frames = self._nncf.Dataset(samples, lambda inputs: [x.numpy() for x in inputs])
         with contextlib.redirect_stdout(sys.stderr):  # its progress bars
-            return self._nncf.quantize(
+            options = _uncalibrated(self._nncf) if self.uncalibrated else {}
+            quantised = self._nncf.quantize(
                 model,
                 frames,
                 preset=self._nncf.QuantizationPreset.MIXED,  # activations are not symmetric
                 subset_size=len(samples),
+                **options,
             )
+        if self.uncalibrated:
+            _fix_ranges(quantised)
+        return quantised
+
+
+def _uncalibrated(nncf: Any) -> dict[str, Any]:
+    """Options with which NNCF rounds the inputs of products alone, and corrects no bias."""
+    return {
+        "ignored_scope": nncf.IgnoredScope(types=list(NO_PRODUCTS), validate=False),
+        "advanced_parameters": nncf.AdvancedQuantizationParameters(disable_bias_correction=True),
+    }
+
+
+def _fix_ranges(model: Any) -> None:
+    """Put `fixed_ranges` in the place of those on which `model` rounds activations."""
+    from openvino import opset13
+
+    for op in model.get_ops():
+        if op.get_type_name() != "FakeQuantize":
+            continue
+        maker = op.input_value(0).get_node().get_type_name()
+        most = largest(None if maker == "Parameter" else maker)
+        bounds = (np.float32(-most * 128 / 127), np.float32(most))
+        for place, bound in enumerate(2 * bounds, start=1):  # of what goes in, of what comes out
+            op.input(place).replace_source_output(opset13.constant(bound).output(0))
 
 
 def _capabilities(openvino: Any) -> list[str]:

@@ -19,6 +19,7 @@ from bench.errors import SteerbenchError, Unavailable
 from bench.types import Log
 from methods.engines import (
     Built,
+    Calibration,
     Engine,
     Folder,
     Inputs,
@@ -48,8 +49,8 @@ class TensorRt(Engine):
     precisions = ("fp32", "fp16", "int8")
     libraries = ("onnx", "onnxruntime", "tensorrt")
 
-    def __init__(self, precision: Precision = "fp32") -> None:
-        super().__init__(precision)
+    def __init__(self, precision: Precision = "fp32", calibration: Calibration = "frames") -> None:
+        super().__init__(precision, calibration)
         if not torch.cuda.is_available():
             raise Unavailable(
                 "engine=tensorrt computes on a CUDA GPU, and torch sees none here: use "
@@ -72,7 +73,7 @@ class TensorRt(Engine):
 
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
         """See `Engine.build`."""
-        path = onnx_model.kept(network, samples, folder, self.precision, log, QUANTISED)
+        path = onnx_model.kept(network, samples, folder, self, log, QUANTISED)
         plans = _Plans(self._tensorrt, path, network, exact=self.precision != "fp16", log=log)
         plans.prepare(onnx_model.sizes(path))
         return Built(plans, onnx_model.weight_bytes(path))

@@ -100,6 +100,11 @@ def test_stages_that_leave_a_frame_unexplained_are_outliers(make: Make) -> None:
     assert keys(stages_do_not_add_up([make("c", **{"stage_ms.field": 250.0})])) == ["c"]
 
 
+def test_int8_without_calibration_may_lose_anything(make: Make) -> None:
+    runs = [make("fp32", psnr=30.0), make("int8", precision="int8 uncalibrated+fp32", psnr=20.0)]
+    assert keys(int8_far_from_fp32(runs)) == []
+
+
 @pytest.mark.parametrize(("psnr", "found"), [(29.9, []), (28.0, ["int8"])])
 def test_int8_is_compared_with_the_same_in_fp32(make: Make, psnr: float, found: list[str]) -> None:
     runs = [make("fp32", psnr=30.0), make("int8", precision="int8", psnr=psnr)]

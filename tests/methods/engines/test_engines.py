@@ -71,11 +71,6 @@ def unet() -> tuple[Network, list[Inputs]]:
     return renderer.network, [(torch.rand(1, 12, 36, 44, generator=generator),) for _ in range(3)]
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Callable[[], Path]:
-    return lambda: tmp_path
-
-
 @pytest.mark.parametrize(("kind", "precision"), ENGINES)
 @pytest.mark.parametrize("network", [lean, unet])
 def test_an_engine_computes_what_the_network_does(

@@ -21,20 +21,6 @@ from tests.methods.engines import tensorrt_double
 from tests.methods.engines.test_engines import TOLERANCE, cells, lean, unet
 
 
-@pytest.fixture
-def double(monkeypatch: pytest.MonkeyPatch) -> None:
-    """TensorRT and a GPU, both played."""
-    monkeypatch.setitem(sys.modules, "tensorrt", tensorrt_double)
-    monkeypatch.setattr(tensorrt_double.Builder, "built", 0)
-    for name, value in (
-        ("is_available", lambda: True),
-        ("get_device_name", lambda: "a GPU"),
-        ("Stream", tensorrt_double.Stream),
-        ("current_stream", tensorrt_double.Stream),
-    ):
-        monkeypatch.setattr(torch.cuda, name, value)
-
-
 @pytest.mark.parametrize("precision", TensorRt.precisions)
 @pytest.mark.parametrize("network", [lean, unet])
 def test_tensors_go_in_and_out_as_the_network_takes_and_gives_them(

@@ -1,0 +1,243 @@
+"""int8 without calibration: activations on fixed ranges, weights as ever, no frame for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from bench.console import ConsoleLog
+from bench.errors import Unavailable
+from methods.engines import CALIBRATION, Engine, Inputs, Network, required
+from methods.engines.onnxruntime_engine import OnnxRuntime
+from methods.engines.openvino_engine import OpenVino
+from methods.engines.tensorrt_engine import TensorRt
+from tests.methods.engines.test_engines import lean, unet
+
+Kind = Callable[[str, str], Engine]
+
+pytestmark = pytest.mark.usefixtures("double", "no_bfloat16")
+
+KINDS = [OpenVino, TensorRt]
+CPU = torch.device("cpu")
+
+
+class Layers(Network):
+    """Two convolutions, and one of what is pooled between them."""
+
+    varying = ((),)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first, self.second = nn.Conv2d(4, 8, 3, padding=1), nn.Conv2d(8, 3, 3, padding=1)
+        self.pooled = nn.Conv2d(8, 3, 1)
+
+    def forward(self, x: Tensor) -> Inputs:
+        between = self.first(x).relu()
+        return self.second(between), self.pooled(functional.max_pool2d(between, 2))
+
+    def products(self, *inputs: Tensor) -> int:
+        return 0
+
+
+@pytest.fixture
+def no_bfloat16(monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenVINO computes in float32 what it does not quantise, on any CPU."""
+    monkeypatch.setattr("methods.engines.openvino_engine._capabilities", lambda openvino: [])
+
+
+def layers() -> Layers:
+    """With weights so large that what they make leaves its range, too."""
+    torch.manual_seed(0)
+    module = Layers().requires_grad_(False)
+    module.first.weight.mul_(2)
+    return module
+
+
+def noise(seed: int) -> Inputs:
+    generator = torch.Generator().manual_seed(seed)
+    return (torch.randn(1, 4, 8, 8, generator=generator),)
+
+
+def rounded(x: Tensor, largest: float) -> Tensor:
+    """As 8-bit integers hold it, in steps of `largest` / 127."""
+    return (x * 127 / largest).round().clamp(-128, 127) * largest / 127
+
+
+def built(
+    kind: Kind,
+    network: Network,
+    samples: list[Inputs],
+    folder: Path,
+    calibration: str = "none",
+) -> Callable[..., Inputs]:
+    folder.mkdir(exist_ok=True)
+    log = ConsoleLog(folder, quiet=True)
+    engine = kind("int8", calibration)
+    return engine.build(network, lambda: samples, lambda: folder, log).run
+
+
+def weights(kind: Kind, folder: Path) -> list[np.ndarray]:
+    """All 8-bit constants, and the scales of those that are convolved with."""
+    if kind is OpenVino:
+        model = (
+            required("openvino", "openvino", "openvino").Core().read_model(folder / "network.xml")
+        )
+        kernels = [
+            op.input_value(1).get_node()
+            for op in model.get_ordered_ops()
+            if op.get_type_name() == "Convolution"
+        ]
+        return [
+            x
+            for kernel in kernels
+            for x in (
+                kernel.input_value(0).get_node().input_value(0).get_node().data,
+                kernel.input_value(1).get_node().data,
+            )
+        ]
+    graph = onnx.load(folder / "network.onnx").graph
+    values = {x.name: onnx.numpy_helper.to_array(x) for x in graph.initializer}
+    makers = {name: node for node in graph.node for name in node.output}
+    kernels = [makers[node.input[1]] for node in graph.node if node.op_type == "Conv"]
+    return [values[name] for kernel in kernels for name in kernel.input[:2]]
+
+
+def per_channel(scale: np.ndarray) -> np.ndarray:
+    return scale.reshape(-1, 1, 1, 1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_activations_are_rounded_on_the_ranges_of_trtexec(kind: Kind, tmp_path: Path) -> None:
+    module, inputs = layers(), (3 * noise(1)[0],)  # beyond all three ranges
+    got = built(kind, module, [noise(0)], tmp_path)(*inputs)
+    found = weights(kind, tmp_path)
+    kernels = [
+        torch.from_numpy(q * per_channel(scale))
+        for q, scale in zip(found[::2], found[1::2], strict=True)
+    ]
+    by_shape = {tuple(kernel.shape): kernel for kernel in kernels}
+    first, second, pooled = (
+        by_shape[tuple(layer.weight.shape)]
+        for layer in (module.first, module.second, module.pooled)
+    )
+    x = rounded(inputs[0], 2)
+    between = functional.conv2d(x, first, module.first.bias, padding=1).relu()
+    assert between.max() > 4
+    want = functional.conv2d(rounded(between, 4), second, module.second.bias, padding=1)
+    # Sums in another order turn a few numbers that lie between two integers.
+    assert (got[0] - want).abs().median() < 1e-5
+    assert (got[0] - want).abs().max() < 4 / 127
+    inside = functional.max_pool2d(between, 2)
+    assert inside.max() > 4
+    want = functional.conv2d(rounded(inside, 2), pooled, module.pooled.bias)
+    # What is pooled may have been rounded on [-4, 4] before: half a step there, half a step here.
+    step = pooled.abs().sum((1, 2, 3)).max() * (4 + 2) / 127 / 2
+    assert (got[1] - want).abs().max() < step + 1e-5
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_inputs_beyond_the_range_saturate(kind: Kind, tmp_path: Path) -> None:
+    run = built(kind, layers(), [noise(0)], tmp_path)
+    signs = noise(1)[0].sign()
+    at_the_end = [x.clone() for x in run(signs * 2 * 128 / 127)]
+    for factor in (3.0, 1e4):
+        for some, end in zip(run(factor * signs), at_the_end, strict=True):
+            assert torch.equal(some, end)
+    inside = run(1.9 * signs)
+    assert not any(torch.equal(a, b) for a, b in zip(inside, at_the_end, strict=True))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_weights_are_those_of_int8_on_frames(kind: Kind, tmp_path: Path) -> None:
+    found = {}
+    for calibration in ("frames", "none"):
+        built(kind, layers(), [noise(0)], tmp_path / calibration, calibration)
+        found[calibration] = weights(kind, tmp_path / calibration)
+    assert len(found["none"]) == 6
+    for some, others in zip(found["none"], found["frames"], strict=True):
+        assert np.array_equal(some, others)
+
+
+def test_every_channel_of_weights_is_scaled_by_its_largest(tmp_path: Path) -> None:
+    module = layers()
+    built(TensorRt, module, [noise(0)], tmp_path)
+    largest = {
+        tuple(layer.weight.shape): layer.weight.abs().amax((1, 2, 3)).numpy()
+        for layer in (module.first, module.second, module.pooled)
+    }
+    found = weights(TensorRt, tmp_path)
+    for q, scale in zip(found[::2], found[1::2], strict=True):
+        assert np.allclose(127 * scale, largest[q.shape], rtol=1e-6)
+        assert (np.abs(q.astype(int)).reshape(len(q), -1).max(1) == 127).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_number_of_a_frame_is_read(kind: Kind, tmp_path: Path) -> None:
+    samples = (noise(0), (9 * noise(1)[0],))
+    once, again = (
+        built(kind, layers(), [some], tmp_path / str(place))(*noise(2))
+        for place, some in enumerate(samples)
+    )
+    for a, b in zip(once, again, strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("network", [lean, unet])
+def test_networks_are_computed_within_half_a_step(
+    network: Callable[[], tuple[Network, list[Inputs]]], kind: Kind, tmp_path: Path
+) -> None:
+    module, inputs = network()
+    run = built(kind, module, inputs[:1], tmp_path)
+    for got, want in zip(run(*inputs[0]), module(*inputs[0]), strict=True):
+        assert (got - want).square().mean().sqrt() < 4 / 127 / 2
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("network", [lean, unet])
+def test_no_more_frames_are_needed_than_without_int8(
+    network: Callable[[], tuple[Network, list[Inputs]]], kind: Kind
+) -> None:
+    module, _ = network()
+    assert kind("int8", "none").samples(module) == kind("fp32", "frames").samples(module)
+    assert kind("int8", "frames").samples(module) == CALIBRATION
+
+
+@pytest.mark.parametrize("kind", [*KINDS, OnnxRuntime])
+def test_only_int8_depends_on_the_calibration(kind: Kind) -> None:
+    assert kind("int8", "none").key() != kind("int8", "frames").key()
+    assert kind("fp32", "none").key() == kind("fp32", "frames").key()
+    assert kind("fp32", "none").computed(CPU) == "fp32"
+
+
+def test_without_int8_the_result_is_the_same(tmp_path: Path, quiet_log: ConsoleLog) -> None:
+    module, found = layers(), []
+    for calibration in ("frames", "none"):
+        place = tmp_path / calibration
+        place.mkdir()
+        engine = OpenVino("fp32", calibration)
+        found.append(engine.build(module, lambda: [noise(0)], lambda at=place: at, quiet_log).run)
+    for a, b in zip(*(run(*noise(1)) for run in found), strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize(("half", "rest"), [(["BF16"], "bf16"), ([], "fp32")])
+def test_rows_say_that_int8_was_not_calibrated(
+    half: list[str], rest: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("methods.engines.openvino_engine._capabilities", lambda openvino: half)
+    assert OpenVino("int8", "none").computed(CPU) == f"int8 uncalibrated+{rest}"
+    assert TensorRt("int8", "none").computed(CPU) == "int8 uncalibrated+fp32"
+
+
+def test_onnx_runtime_refuses_before_anything_is_trained() -> None:
+    with pytest.raises(Unavailable, match=r"calibration=none: .* use engine=openvino"):
+        OnnxRuntime("int8", "none").check(CPU)
+    OnnxRuntime("fp32", "none").check(CPU)
