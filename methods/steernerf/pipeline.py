@@ -166,7 +166,7 @@ class Pipeline:
         """All that the 2D renderer is given: the present `frame`, the `preceding` features and,
         beyond the paper, the `newest` preceding picture and the field at the surface."""
         model = self.model
-        if rendering.skip.background:
+        if rendering.skip.background and self.renderer.draws_cells:
             cells = cells_at_matter(frame.alpha, preceding)
         else:
             cells = torch.arange(frame.alpha.numel(), device=frame.alpha.device)

@@ -90,6 +90,7 @@ class Renderer2d(nn.Module, ABC):
 
     Attributes:
         scale: s.
+        draws_cells: it draws the cells of an observation alone; otherwise the whole picture.
         estimates_error: it says which cells of its pictures may be wrong.
         reads_details: it reads the preceding picture and the field at the surface.
         network: what is learned.
@@ -97,6 +98,7 @@ class Renderer2d(nn.Module, ABC):
     """
 
     scale: int
+    draws_cells = False
     estimates_error = False
     reads_details = False
     network: Network

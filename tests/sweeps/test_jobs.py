@@ -47,7 +47,7 @@ def test_a_failure_that_cannot_be_kept_is_printed_all_the_same(
     def obtain(*_: object) -> None:
         raise SteerbenchError("the cause")
 
-    monkeypatch.setattr(jobs, "obtain", obtain)
+    monkeypatch.setattr(jobs, "obtain_in_turns", obtain)
     (tmp_path / "outputs").touch()  # no folder can be made there
     with pytest.raises(SteerbenchError, match="the cause"):
         jobs.attempt(composed([f"outputs={tmp_path / 'outputs'}"]), [], "a job")

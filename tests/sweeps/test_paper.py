@@ -21,7 +21,9 @@ from sweeps.measurement import Obtained, described
 from sweeps.overrides import composed
 from sweeps.plan import plan
 
-TABLES = {table.name: table for table in paper_tables()}
+CURVED = {table.name: table for table in paper_tables()}
+TABLES = {name: replace(table, curve=False) for name, table in CURVED.items()}
+"""Their lines alone."""
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -32,6 +34,41 @@ def test_every_line_that_can_be_measured_has_its_job(name: str) -> None:
     ]
     assert sorted(job.line for job in jobs) == sorted(lines)
     assert len({job.key for job in jobs}) == len(lines)
+
+
+def test_a_curve_has_the_lines_of_the_papers_method_at_several_shares_of_one_training() -> None:
+    table = CURVED["table5"]
+    lines, jobs = (plan(one, ["budget=demo"]) for one in (TABLES["table5"], table))
+    marks = [job for job in jobs if "after" in job.line]
+    assert [job.key for job in jobs if job not in marks] == [job.key for job in lines]
+    assert len(marks) == 2 * 3 * 3  # lines, shares, seeds
+    for job in marks:
+        label, _, share = job.line.partition(", after ")
+        (whole,) = (
+            one for one in lines if one.line == label and one.config.seed == job.config.seed
+        )
+        one, other = described(job.config), described(whole.config)
+        assert (one["method"].pop("after"), other["method"].pop("after")) == (float(share), 1)
+        assert one == other
+
+
+def test_ours_is_repeated_only_with_seeds_that_are_asked_for() -> None:
+    for words, seeds in ((["budget=demo"], [0]), (["budget=demo", "seed=1,2"], [1, 2])):
+        jobs = plan(TABLES["table5"], words)
+        ours = [job.config.seed for job in jobs if job.config.method.name == "steernerf_lean"]
+        assert ours == 2 * seeds
+
+
+def test_only_the_table_of_times_is_measured_in_turns() -> None:
+    """The lines of a method with one seed together."""
+    for name, table in TABLES.items():
+        jobs = plan(table, ["budget=demo"])
+        turns = {job.turns for job in jobs}
+        assert (turns == {""}) == (name != "table2")
+        for turn in turns - {""}:
+            together = [job for job in jobs if job.turns == turn]
+            assert len(together) == 3
+            assert len({(job.config.method.name, job.config.seed) for job in together}) == 1
 
 
 def test_settings_hold_for_every_job() -> None:
@@ -142,7 +179,10 @@ def measured(
             raise SteerbenchError("no room\nfor L = 3")
         return Obtained(store, put(store, stored_run, config), measured=True)
 
-    monkeypatch.setattr(jobs, "obtain", obtain)
+    def in_turns(asked: Sequence[tuple[DictConfig, Sequence[str]]]) -> list[Obtained]:
+        return [obtain(*job) for job in asked]
+
+    monkeypatch.setattr(jobs, "obtain_in_turns", in_turns)
     monkeypatch.chdir(tmp_path)
     return asked
 

@@ -143,17 +143,17 @@ def test_other_studies_take_it(call, command):
 def only_mine(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Measure nothing but the plug-in; the methods of all jobs."""
     from sweeps import jobs
-    from sweeps.measurement import obtain
+    from sweeps.measurement import obtain_in_turns
 
     names = []
 
-    def some(config, command):
-        names.append(config.method._target_)
+    def some(asked):
+        names.extend(config.method._target_ for config, _ in asked)
         if names[-1] != "mine.renderer.Mine":
             raise RuntimeError("not measured here")
-        return obtain(config, command)
+        return obtain_in_turns(asked)
 
-    monkeypatch.setattr(jobs, "obtain", some)
+    monkeypatch.setattr(jobs, "obtain_in_turns", some)
     return names
 
 

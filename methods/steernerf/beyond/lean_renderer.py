@@ -61,6 +61,7 @@ class LeanRenderer(Renderer2d):
         surface: use the features at the surface, pixel by pixel.
     """
 
+    draws_cells = True
     estimates_error = True
     reads_details = True
     network: CellNetwork
