@@ -235,6 +235,10 @@ def _error_against_time(axes: Axes, rows: Sequence[Row], column: str) -> None:
         )
     axes.loglog()
     axes.margins(0.15, 0.12)
+    errors = [float(_rms(row[column])) for row in rows if math.isfinite(row[column])]
+    if errors and max(errors) < 1.01 * min(errors):  # a margin of nothing is nothing
+        axes.set_autoscaley_on(False)
+        axes.set_ylim(min(errors) / 2, max(errors) * 2)
     axes.set_xlabel("ms of a frame: median of the rounds, bars from the fastest to the slowest")
     axes.set_ylabel("error of a pixel (root mean square; 1 is black against white)")
     decibels = axes.secondary_yaxis("right", functions=(_psnr, _rms))

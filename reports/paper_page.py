@@ -16,7 +16,7 @@ from bench.errors import explained
 from reports import figures
 from reports.images import frame_section, kept_frames
 from reports.outliers import Outlier, outlier_table
-from reports.paper_tables import PaperTable, paper_tables, section
+from reports.paper_tables import SHARES, PaperTable, section
 from reports.publish import add_picture, publish
 from reports.runs import Repeated, Run
 
@@ -60,14 +60,16 @@ def write_paper_page(
             *([f"## Scenes that are left out\n\n{left_out}"] if left_out else []),
             *([listed.section()] if listed.lines else []),
             *(section(table, lines.get(table.name, ())) for table in tables),
-            *(text for plot in PAGE["plot"] for text in _plot(plot, lines, folder)),
+            *(text for plot in PAGE["plot"] for text in _plot(plot, tables, lines, folder)),
             *(text for images in PAGE["images"] for text in _images(images, lines, folder)),
             f"## Runs\n\nTheir keys in the store, and the commands:\n\n```\n{sources}\n```",
         ]
     return publish("\n\n".join(parts), folder)
 
 
-def _plot(plot: Mapping[str, Any], lines: Lines, folder: Path) -> Iterator[str]:
+def _plot(
+    plot: Mapping[str, Any], tables: Sequence[PaperTable], lines: Lines, folder: Path
+) -> Iterator[str]:
     """A plot with its heading and caption, if anything that it shows was measured."""
     draw: Callable[[Path], None]
     if "metric" in plot:
@@ -80,7 +82,7 @@ def _plot(plot: Mapping[str, Any], lines: Lines, folder: Path) -> Iterator[str]:
         draw = partial(figures.quality_against, shown, plot["metric"], plot["unit"], plot["axis"])
         some = bool(shown)
     elif "curves" in plot:
-        curves = [curve for name in plot["curves"] for curve in _curves(name, lines)]
+        curves = [curve for table in tables for curve in _curves(table, lines)]
         draw = partial(figures.quality_over_training, curves)
         some = bool(curves)
     else:
@@ -93,25 +95,18 @@ def _plot(plot: Mapping[str, Any], lines: Lines, folder: Path) -> Iterator[str]:
         yield f"## {title}\n\n![{title}]({file})\n\n{caption}"
 
 
-def _curves(name: str, lines: Lines) -> Iterator[figures.Curve]:
-    """The measured lines of the table called `name` over their trainings."""
-    (table,) = (table for table in paper_tables() if table.name == name)
-    measured = {line.label: line for line in lines.get(name, ()) if line.runs}
-    for line in table.lines:
-        marks = {
-            share: mark.label for (label, share), mark in table.marks.items() if label == line.label
+def _curves(table: PaperTable, lines: Lines) -> Iterator[figures.Curve]:
+    """The measured lines of `table` over their trainings, if it has curves."""
+    measured = {line.label: line for line in lines.get(table.name, ()) if line.runs}
+    for line in table.lines if table.curve else ():
+        labels = {share: table.marks[line.label, share].label for share in SHARES if line.job}
+        points = {
+            of.runs[0].record["budget"]["renderer_steps"] * share: of
+            for share, label in {**labels, 1.0: line.label}.items()
+            if (of := measured.get(label))
         }
-        known = {
-            share: measured[label]
-            for share, label in {**marks, 1: line.label}.items()
-            if label in measured
-        }
-        if len(known) > 1:
-            steps = {
-                of.runs[0].record["budget"]["renderer_steps"] * share: of
-                for share, of in known.items()
-            }
-            yield figures.Curve(f"{name.replace('table', 'Table ')}", line.label, steps)
+        if len(points) > 1:
+            yield figures.Curve(f"{table.name.replace('table', 'Table ')}", line.label, points)
 
 
 def _images(images: Mapping[str, Any], lines: Lines, folder: Path) -> Iterator[str]:

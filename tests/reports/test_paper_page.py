@@ -10,7 +10,7 @@ import pytest
 
 from reports import figures
 from reports.outliers import Outlier
-from reports.paper_page import PAGE, write_paper_page
+from reports.paper_page import PAGE, _curves, write_paper_page
 from reports.paper_tables import paper_tables
 from reports.runs import Repeated, Run, load
 
@@ -94,3 +94,27 @@ def test_a_mark_stands_where_its_line_is_in_quality_and_cost(
     figures.quality_against(lines, "size_bytes.total", 1e6, "MB", tmp_path / "marks.png")
     (mark,) = drawn[0].axes[0].lines
     assert mark.get_xydata().tolist() == [[104e-6, run.values["psnr"]]]
+
+
+def test_a_curve_has_a_point_for_every_share_of_the_training_that_was_measured(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[figures.Figure] = []
+    monkeypatch.setattr(figures.Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    (table,) = (table for table in paper_tables() if table.name == "table5")
+    trained = replace(run, record={**run.record, "budget": {"renderer_steps": 80}})
+    first, second = table.lines
+    halves = [table.marks[line.label, 0.5].label for line in table.lines]
+    quarter = table.marks[first.label, 0.25].label
+    measured = [of(trained, label) for label in (first.label, second.label, *halves, quarter)]
+    curves = list(_curves(table, {"table5": measured}))
+    assert [(curve.label, list(curve.points)) for curve in curves] == [
+        (first.label, [20, 40, 80]),
+        (second.label, [40, 80]),
+    ]
+    figures.quality_over_training(curves, tmp_path / "curves.png")
+    (axes,) = drawn[0].axes
+    assert axes.get_title() == "Table 5"
+    for line, curve in zip(axes.lines, curves, strict=True):
+        assert list(line.get_xdata()) == list(curve.points)
+        assert set(line.get_ydata()) == {run.values["psnr"]}

@@ -73,9 +73,9 @@ def test_one_seed_is_compared_over_the_frames_of_all_scenes(run: Run) -> None:
     one = over_scenes([of_scene(run, "a"), of_scene(run, "b")])
     other = over_scenes([of_scene(run, "a", 1.0), of_scene(run, "b", 2.0)])
     lines = {"one": Repeated("one", [one]), "two": Repeated("two", [other])}
-    (step,) = steps(Trend("psnr", ["one", "two"]), lines)
-    assert (step.over, step.verdict) == ("12 frames of one seed", SEEN)
-    assert step.by == pytest.approx(1.5)
+    (step,) = steps(Trend("psnr", ["one", "two"]), lines, {})
+    assert (step.here.over, step.verdict) == ("12 frames of one seed", SEEN)
+    assert step.here.by == pytest.approx(1.5)
 
 
 @pytest.mark.parametrize("scenes", ["ab", "a"])

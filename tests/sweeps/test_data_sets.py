@@ -24,7 +24,9 @@ from sweeps.overrides import composed, setting
 from sweeps.paper import data_set
 from sweeps.plan import Planned, plan
 
-(TABLE,) = (table for table in paper_tables.paper_tables() if table.name == "table5")
+(TABLE,) = (
+    replace(table, curve=False) for table in paper_tables.paper_tables() if table.name == "table5"
+)
 HERE = Path(__file__).parent
 POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
 

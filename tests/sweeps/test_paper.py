@@ -94,7 +94,13 @@ def test_the_lines_of_table_3_differ_in_l_alone() -> None:
     settings = [described(job.config) for job in of_paper]
     for number, setting in enumerate(settings):
         assert setting["method"]["rendering"]["range"]["mode"] == "off"
-        assert setting["method"]["model"].pop("frames") == number
+        of_training = setting["method"]["joint"]["motion"]  # has exactly L frames
+        nodes = (
+            (setting["method"]["model"], "frames"),
+            (of_training, "length"),
+            (of_training, "least"),
+        )
+        assert [node.pop(name) for node, name in nodes] == [number] * 3
     assert all(setting == settings[0] for setting in settings)
 
 
@@ -213,7 +219,7 @@ def test_a_job_that_fails_stands_in_its_line_and_the_others_run(
 ) -> None:
     outcome = steerbench("paper", "--table", "table3", "seed=0", f"outputs={store.folder.parent}")
     assert outcome.status == 1
-    assert len(measured) == 8
+    assert len(measured) == 4 * (1 + 3 + 1)  # lines; thrice each for their curves; ours
     assert "failed: table3: L = 3, seed 0: no room" in outcome.err
     assert "about 0:00:0" in outcome.err
     page = Path(re.search(r"report: (.*)", outcome.err)[1])
