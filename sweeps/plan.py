@@ -73,8 +73,8 @@ def chosen(name: str | None, methods: Sequence[str]) -> list[PaperTable]:
 
 def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -> list[Planned]:
     """The jobs of the experiment of `table` under the settings in `words`: one for each line that
-    has a job, for each seed (those in `words`; or as many as the budget says, and for a method
-    beyond the paper the first of these), and for each scene of `data`.
+    has a job, for each seed (those in `words`; or as many as the budget says, and for curves and a
+    method beyond the paper the first of these), and for each scene of `data`.
 
     What a line does not set is as the experiment has it. A job of the sweep that no line names is
     left out: Instant-NGP has no 2D renderer to compute in int8.
@@ -91,7 +91,7 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     params = experiment.hydra.sweeper.params
     grid = swept([f"{name}={values}" for name, values in params.items()])
     jobs = []
-    for block, line in _lines(table):
+    for line, block, repeated in _lines(table):
         if line.job is None:
             continue
         added = line.job == {METHOD: line.label}
@@ -105,7 +105,7 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
         settings = [f"{name}={value}" for name, value in line.job.items()]
         together = [f"+experiment={table.name}", *fixed, *settings]
         config = composed(together)
-        of_line = seeds or (usual if block is table else usual[:1])
+        of_line = seeds or (usual if repeated else usual[:1])
         for seed, (scene, folder) in product(of_line, scenes.items()):
             word = f"{REPEATED}={seed}"
             job = cast(DictConfig, OmegaConf.merge(config, OmegaConf.from_dotlist([word])))
@@ -113,16 +113,17 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
                 job.scene.path = folder
             place = [setting("scene.path", folder)] if data else []
             command = ["steerbench", "run", *together, *place, word, "hydra.mode=RUN"]
-            turns = f"{table.name}, {block.title}, {seed}, {scene}" if table.in_turns else ""
+            turns = f"{table.name}, {block}, {seed}, {scene}" if table.in_turns else ""
             jobs.append(Planned(table.name, line.label, job, command, scene, turns))
     return jobs
 
 
-def _lines(table: PaperTable) -> Iterator[tuple[PaperTable, Line]]:
-    """The lines of all blocks of a table and those of its curves, each with its block."""
+def _lines(table: PaperTable) -> Iterator[tuple[Line, str, bool]]:
+    """The lines of all blocks of a table and those of its curves, each with the title of its block,
+    and whether several seeds repeat it."""
     for block in table.blocks:
-        yield from ((block, line) for line in block.lines)
-        yield from ((block, line) for line in block.marks.values())
+        yield from ((line, block.title, block is table) for line in block.lines)
+    yield from ((line, table.title, False) for line in table.marks.values())
 
 
 def _seeds(words: Sequence[str]) -> tuple[list[str], list[str]]:

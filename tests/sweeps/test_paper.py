@@ -41,7 +41,7 @@ def test_a_curve_has_the_lines_of_the_papers_method_at_several_shares_of_one_tra
     lines, jobs = (plan(one, ["budget=demo"]) for one in (TABLES["table5"], table))
     marks = [job for job in jobs if "after" in job.line]
     assert [job.key for job in jobs if job not in marks] == [job.key for job in lines]
-    assert len(marks) == 2 * 3 * 3  # lines, shares, seeds
+    assert len(marks) == 2 * 3  # lines, shares; of the first seed
     for job in marks:
         label, _, share = job.line.partition(", after ")
         (whole,) = (
