@@ -100,10 +100,13 @@ def _curves(table: PaperTable, lines: Lines) -> Iterator[figures.Curve]:
     measured = {line.label: line for line in lines.get(table.name, ()) if line.runs}
     for line in table.lines if table.curve else ():
         labels = {share: table.marks[line.label, share].label for share in SHARES if line.job}
+        marks = {share: measured[label] for share, label in labels.items() if label in measured}
+        seeds = {run.facts["seed"] for mark in marks.values() for run in mark.runs}
+        if whole := measured.get(line.label):  # of the same trainings
+            runs = [run for run in whole.runs if run.facts["seed"] in seeds]
+            marks |= {1.0: replace(whole, runs=runs)} if runs else {}
         points = {
-            of.runs[0].record["budget"]["renderer_steps"] * share: of
-            for share, label in {**labels, 1.0: line.label}.items()
-            if (of := measured.get(label))
+            of.runs[0].record["budget"]["renderer_steps"] * share: of for share, of in marks.items()
         }
         if len(points) > 1:
             yield figures.Curve(f"{table.name.replace('table', 'Table ')}", line.label, points)

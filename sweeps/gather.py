@@ -6,11 +6,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from bench.results import Store, content_key
+from bench.results import Store
 from reports.runs import Repeated, Run, readable
 from reports.scenes import over_scenes
 from sweeps import failures
-from sweeps.measurement import described, of_scene
+from sweeps.measurement import described, job_key, of_scene
 from sweeps.plan import Planned
 
 
@@ -30,7 +30,7 @@ def newest(store: Store) -> dict[str, list[Run]]:
     for run in reversed(readable(store)):
         parts = run.record["made_of"]
         if "config" in parts:
-            of_job = found.setdefault(content_key(parts["config"]), {})
+            of_job = found.setdefault(job_key(parts["config"], parts.get("turns", "")), {})
             of_job.setdefault(run.record["scene"]["digest"], run)
     return {job: list(of_scenes.values()) for job, of_scenes in found.items()}
 
@@ -40,17 +40,20 @@ def gather(
 ) -> dict[str, list[Repeated]]:
     """The lines of every table: the runs of each, and why others are missing.
 
-    Of several scenes a run is the mean with one seed over the scenes that all lines of the table
+    Of several scenes a run is the mean with one seed over the scenes that all lines of its block
     have. A line of which nothing was measured does not count.
 
     Args:
         runs: as `newest` has them.
     """
-    tables: dict[str, dict[str, list[Outcome]]] = {}
+    blocks: dict[tuple[str, str], dict[str, list[Outcome]]] = {}
     for job in jobs:
-        line = tables.setdefault(job.table, {}).setdefault(job.line, [])
+        line = blocks.setdefault((job.table, job.block), {}).setdefault(job.line, [])
         line.append(_outcome(job, runs, outputs))
-    return {table: _lines(of_table) for table, of_table in tables.items()}
+    tables: dict[str, list[Repeated]] = {}
+    for (table, _), of_block in blocks.items():
+        tables.setdefault(table, []).extend(_lines(of_block))
+    return tables
 
 
 def _outcome(job: Planned, runs: Mapping[str, Sequence[Run]], outputs: Path) -> Outcome:
@@ -62,11 +65,11 @@ def _outcome(job: Planned, runs: Mapping[str, Sequence[Run]], outputs: Path) -> 
     return Outcome(job, None, f"failed: {failure}" if failure else "not measured yet")
 
 
-def _lines(of_table: Mapping[str, Sequence[Outcome]]) -> list[Repeated]:
-    """The lines of a table, each from the outcomes of its jobs."""
-    measured = [{each.job.scene for each in line if each.run} for line in of_table.values()]
+def _lines(of_block: Mapping[str, Sequence[Outcome]]) -> list[Repeated]:
+    """The lines of a block, each from the outcomes of its jobs."""
+    measured = [{each.job.scene for each in line if each.run} for line in of_block.values()]
     common = set.intersection(*filter(None, measured)) if any(measured) else set()
-    return [_line(label, outcomes, common) for label, outcomes in of_table.items()]
+    return [_line(label, outcomes, common) for label, outcomes in of_block.items()]
 
 
 def _line(label: str, outcomes: Sequence[Outcome], common: set[str]) -> Repeated:

@@ -96,10 +96,12 @@ def attempt(config: DictConfig, command: Sequence[str], name: str) -> Obtained:
     return attempt_in_turns([(config, command, name)])[0]
 
 
-def attempt_in_turns(jobs: Sequence[tuple[DictConfig, Sequence[str], str]]) -> list[Obtained]:
-    """`attempt` several jobs in turns; if one fails, all of them do."""
+def attempt_in_turns(
+    jobs: Sequence[tuple[DictConfig, Sequence[str], str]], turns: str = ""
+) -> list[Obtained]:
+    """`attempt` several jobs, see `obtain_in_turns`; if one fails, all of them do."""
     try:
-        return obtain_in_turns([(config, command) for config, command, _ in jobs])
+        return obtain_in_turns([(config, command) for config, command, _ in jobs], turns)
     except Exception as error:
         for config, _, name in jobs:
             print(f"steerbench: failed: {name}: {error}", file=sys.stderr)

@@ -18,7 +18,7 @@ from rich.columns import Columns
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
 from bench.provenance import decisive
-from bench.results import Measurement, Store
+from bench.results import Measurement, Store, content_key
 from bench.run import Task, measure_in_turns
 from bench.scenes.held_out import hold_out
 from bench.sources import digest, libraries
@@ -92,14 +92,17 @@ def obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
     return obtain_in_turns([(config, command)])[0]
 
 
-def obtain_in_turns(jobs: Sequence[tuple[DictConfig, Sequence[str]]]) -> list[Obtained]:
-    """`obtain` several jobs, which share scene, trajectory, protocol and seed: those that the store
-    does not have draw each frame one after the other, see `bench.run.measure_in_turns`.
+def obtain_in_turns(
+    jobs: Sequence[tuple[DictConfig, Sequence[str]]], turns: str = ""
+) -> list[Obtained]:
+    """`obtain` several jobs, which share scene, trajectory, protocol and seed, under the name
+    `turns`: unless the store has all of them, they draw each frame one after the other, see
+    `bench.run.measure_in_turns`. A job alone has no such name.
 
     Raises as `obtain` does.
     """
     log = ConsoleLog(Path(jobs[0][0].outputs))
-    ready = [_Ready.of(config, command, log) for config, command in jobs]
+    ready = [_Ready.of(config, command, turns, log) for config, command in jobs]
     for one in ready:
         if one.stored:
             log.info(f"already measured; to measure again, remove {one.store.folder / one.run}")
@@ -108,18 +111,18 @@ def obtain_in_turns(jobs: Sequence[tuple[DictConfig, Sequence[str]]]) -> list[Ob
         with device_lock(missing[0].method.settings()["device"], log):
             missing = [one for one in missing if not one.stored]  # by who had the lock before
             if missing:
-                methods = [one.method for one in missing]
-                for one, of_one in zip(
-                    missing, measure_in_turns(methods, missing[0].task, log), strict=True
-                ):
-                    one.keep(of_one)
+                methods = [one.method for one in ready]
+                found = measure_in_turns(methods, missing[0].task, log)
+                for one, measurement in zip(ready, found, strict=True):
+                    if one in missing:
+                        one.keep(measurement)
     for config, _ in jobs:
         failures.forget(Path(config.outputs), described(config))
     measured = {one.run for one in missing}
     return [Obtained(one.store, one.run, one.run in measured) for one in ready]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Ready:
     """A measurement that can begin, and everything that can change its rows: its `parts`."""
 
@@ -131,7 +134,7 @@ class _Ready:
     store: Store
 
     @classmethod
-    def of(cls, config: DictConfig, command: Sequence[str], log: Log) -> _Ready:
+    def of(cls, config: DictConfig, command: Sequence[str], turns: str, log: Log) -> _Ready:
         settings = checked_settings(config)
         torch.manual_seed(settings.seed)
         method, budget, protocol = (
@@ -141,6 +144,7 @@ class _Ready:
         trajectory = build(config, "trajectory", scene)
         weights = Path(settings.weights_dir) if settings.weights_dir else None
         parts = _identity(config, scene, method) | {"lpips": protocol.find_lpips(weights, log)}
+        parts |= {"turns": turns} if turns else {}
         task = Task(scene, trajectory, protocol, budget, settings.seed, weights)
         return cls(config, command, method, task, parts, Store(Path(settings.outputs)))
 
@@ -234,6 +238,11 @@ def described(config: DictConfig) -> dict[str, Any]:
     if "path" in kept["scene"]:
         kept["scene"]["path"] = Path(kept["scene"]["path"]).name
     return kept
+
+
+def job_key(settings: Mapping[str, Any], turns: str) -> str:
+    """Equal for jobs with the same `settings`, as of `described`, measured in the same `turns`."""
+    return content_key({"settings": settings, "turns": turns} if turns else settings)
 
 
 def of_scene(run: Run, config: DictConfig) -> bool:

@@ -79,7 +79,8 @@ def _run(jobs: Sequence[Planned]) -> int:
             print(f"{number} of {len(jobs)}, {job.name}", file=sys.stderr)
         ended += len(group)
         try:
-            obtained = attempt_in_turns([(job.config, job.command, job.name) for job in group])
+            wanted = [(job.config, job.command, job.name) for job in group]
+            obtained = attempt_in_turns(wanted, group[0].turns)
         except Exception:  # which `attempt_in_turns` has printed: the other jobs still run
             failed += len(group)
             continue

@@ -11,11 +11,10 @@ from typing import cast
 from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import SteerbenchError
-from bench.results import content_key
 from reports.paper_tables import AFTER, METHOD, Line, PaperTable, paper_tables
 from sweeps.build import build
 from sweeps.data_sets import DataSet
-from sweeps.measurement import described
+from sweeps.measurement import described, job_key
 from sweeps.names import unknown
 from sweeps.overrides import composed, setting, swept
 
@@ -27,11 +26,13 @@ REPEATED = "seed"
 class Planned:
     """A job: the line of a table that it fills, its configuration, and the command that runs it.
 
-    `scene` is the name of its scene among those of a data set, empty without one. Jobs with the
-    same `turns` are measured in turns; without one a job is measured alone.
+    `block` is the title of the lines that it is compared with. `scene` is the name of its scene
+    among those of a data set, empty without one. Jobs with the same `turns` are measured in turns;
+    without one a job is measured alone.
     """
 
     table: str
+    block: str
     line: str
     config: DictConfig
     command: Sequence[str]
@@ -47,7 +48,7 @@ class Planned:
     @cached_property
     def key(self) -> str:
         """Equal for equal jobs."""
-        return content_key(described(self.config))
+        return job_key(described(self.config), self.turns)
 
 
 def chosen(name: str | None, methods: Sequence[str]) -> list[PaperTable]:
@@ -91,7 +92,7 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     params = experiment.hydra.sweeper.params
     grid = swept([f"{name}={values}" for name, values in params.items()])
     jobs = []
-    for line, block, repeated in _lines(table):
+    for block, line, repeated in _lines(table):
         if line.job is None:
             continue
         added = line.job == {METHOD: line.label}
@@ -114,16 +115,16 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
             place = [setting("scene.path", folder)] if data else []
             command = ["steerbench", "run", *together, *place, word, "hydra.mode=RUN"]
             turns = f"{table.name}, {block}, {seed}, {scene}" if table.in_turns else ""
-            jobs.append(Planned(table.name, line.label, job, command, scene, turns))
+            jobs.append(Planned(table.name, block, line.label, job, command, scene, turns))
     return jobs
 
 
-def _lines(table: PaperTable) -> Iterator[tuple[Line, str, bool]]:
-    """The lines of all blocks of a table and those of its curves, each with the title of its block,
+def _lines(table: PaperTable) -> Iterator[tuple[str, Line, bool]]:
+    """The lines of all blocks of a table and those of its curves, each with the title of its block
     and whether several seeds repeat it."""
     for block in table.blocks:
-        yield from ((line, block.title, block is table) for line in block.lines)
-    yield from ((line, table.title, False) for line in table.marks.values())
+        yield from ((block.title, line, block is table) for line in block.lines)
+    yield from (("curves", line, False) for line in table.marks.values())
 
 
 def _seeds(words: Sequence[str]) -> tuple[list[str], list[str]]:

@@ -19,7 +19,7 @@ from methods.steernerf.calibration import Calibration
 from methods.steernerf.options import Model, Rendering
 from methods.steernerf.renderer import Renderer2d
 from methods.steernerf.study import STUDY
-from methods.steernerf.training.joint import JointOptions
+from methods.steernerf.training.options import JointOptions
 from methods.steernerf.training.stage2 import Stage2, TrainedPipeline, train_stage2
 
 

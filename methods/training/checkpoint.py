@@ -86,7 +86,12 @@ def restore_optimiser(
 ) -> None:
     """Put back what `optimiser_tensors` gave."""
     state = optimiser.state_dict()
+    parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
     for name, value in part(tensors, prefix).items():
-        parameter, slot = name.split(".")
-        state["state"].setdefault(int(parameter), {})[slot] = value
+        number, slot = name.split(".")
+        parameter = parameters[int(number)]
+        if value.shape == parameter.shape:
+            # In its memory order, which files do not keep: a fused step takes both as they lie.
+            value = torch.empty_like(parameter).copy_(value)
+        state["state"].setdefault(int(number), {})[slot] = value
     optimiser.load_state_dict(state)

@@ -118,9 +118,12 @@ def test_every_seed_is_a_job_of_its_own_and_a_command_that_makes_it() -> None:
 
 
 def test_tables_share_the_run_that_they_have_in_common() -> None:
-    lines = [("table2", 0), ("table3", 2), ("table4", 1), ("table5", 0)]
-    jobs = [plan(TABLES[name], ["seed=0"])[place] for name, place in lines]
+    """But for the table of times: a time in turns is another figure than one alone."""
+    lines = [("table3", 2), ("table4", 1), ("table5", 0), ("table2", 0)]
+    *jobs, timed = (plan(TABLES[name], ["seed=0"])[place] for name, place in lines)
     assert len({job.key for job in jobs}) == 1
+    assert described(timed.config) == described(jobs[0].config)
+    assert timed.key != jobs[0].key
 
 
 @pytest.mark.parametrize(
@@ -185,8 +188,8 @@ def measured(
             raise SteerbenchError("no room\nfor L = 3")
         return Obtained(store, put(store, stored_run, config), measured=True)
 
-    def in_turns(asked: Sequence[tuple[DictConfig, Sequence[str]]]) -> list[Obtained]:
-        return [obtain(*job) for job in asked]
+    def in_turns(jobs: Sequence[tuple[DictConfig, Sequence[str]]], _: str) -> list[Obtained]:
+        return [obtain(*job) for job in jobs]
 
     monkeypatch.setattr(jobs, "obtain_in_turns", in_turns)
     monkeypatch.chdir(tmp_path)

@@ -147,11 +147,11 @@ def only_mine(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     names = []
 
-    def some(asked):
+    def some(asked, turns):
         names.extend(config.method._target_ for config, _ in asked)
         if names[-1] != "mine.renderer.Mine":
             raise RuntimeError("not measured here")
-        return obtain_in_turns(asked)
+        return obtain_in_turns(asked, turns)
 
     monkeypatch.setattr(jobs, "obtain_in_turns", some)
     return names

@@ -74,7 +74,7 @@ def pretrain_renderer(
         pipeline = Pipeline(trained.field, trained.occupancy, background, renderer, model)
         rendering, views = Rendering.in_training(model, joint.refined), TrainingViews.of(scene)
         pool = SequencePool(pipeline, rendering, views, joint.motion, generator)
-        sources.append(PatchSource(pool, joint.patch, joint.patch_share, "none", generator))
+        sources.append(PatchSource(pool, joint, "none", generator))
         pipelines.append(pipeline)
     patches = AnyOf(sources, generator)
     training = RendererTraining(renderer, patches, joint, budget.renderer_steps, generator)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -22,8 +20,8 @@ from methods.rendering.occupancy import EVERY
 from methods.steernerf.beyond.cells import pixels_of
 from methods.steernerf.beyond.refinement import rays_of_cells, worst_cells
 from methods.steernerf.renderer import Drawing, Renderer2d
+from methods.steernerf.training.options import JointOptions
 from methods.steernerf.training.patches import Batch, Patches, PatchSource
-from methods.steernerf.training.sequences import MotionOptions
 from methods.training import checkpoint, loop
 from methods.training.optimiser import cosine, step_at
 
@@ -31,83 +29,6 @@ LEAST_ERROR = 1e-6
 """Mean squared error of a cell below which one is as good as another."""
 
 Tensors = tuple[Tensor, ...] | list[Tensor]
-
-
-@dataclass(frozen=True)
-class JointOptions:
-    """How stage 2 is trained.
-
-    Attributes:
-        field: "joint", or "frozen" as stage 1 left it (the ablation of the paper's Table 5).
-        through: frames that the field learns from: "all", or only the "present" one.
-        features: what the features beyond RGB are at first: "random", of random weights, or
-            "constant", 1/2 everywhere.
-        rate: learning rate of the 2D renderer at the beginning.
-        field_rate: of the field.
-        final_rate: of both at the end of the cosine schedule.
-        half_waves: of that schedule, an odd number; see `methods.training.optimiser.cosine`.
-        patch: side of a patch, low-resolution pixels, at most.
-        patch_share: of the shorter side of the low-resolution frame that a patch has, at most.
-        batch: patches of a step.
-        opacity_entropy: weight of -o ln o of the rays.
-        error_weight: of the squared difference between the estimated log error and the true one.
-        refined: share of the cells that are refined while it is trained.
-        refined_rays: pixels of those that the field learns from in a step.
-        clip: largest norm of the 2D renderer's gradient; None: as it is.
-        average: decay of the running mean of the 2D renderer's weights, which is the result; 0: the
-            weights themselves.
-        grid_samples: visits of an update of the density grid while the field learns; 0: it stays as
-            stage 1 left it.
-        distilled_views: most pictures of the stage 1 field, at random views, to learn from, too.
-        distilled_share: share of the patches that come from those.
-        motion: what precedes a training view.
-    """
-
-    field: Literal["joint", "frozen"] = "joint"
-    through: Literal["all", "present"] = "present"
-    features: Literal["random", "constant"] = "constant"
-    rate: float = 1e-3
-    field_rate: float = 1e-3
-    final_rate: float = 1e-5
-    half_waves: int = 1
-    patch: int = 32
-    patch_share: float = 1.0
-    batch: int = 2
-    opacity_entropy: float = 1e-3
-    error_weight: float = 1e-4
-    refined: float = 0.2
-    refined_rays: int = 2048
-    clip: float | None = 1.0
-    average: float = 0.999
-    grid_samples: int = 0
-    distilled_views: int = 100
-    distilled_share: float = 0.5
-    motion: MotionOptions = MotionOptions()
-
-    def __post_init__(self) -> None:
-        for wanted, fits, names in (
-            ("more than 0", lambda x: x > 0, ("rate", "field_rate", "final_rate")),
-            ("more than 0, or null", lambda x: x is None or x > 0, ("clip",)),
-            ("0 or more", lambda x: x >= 0, ("opacity_entropy", "error_weight", "distilled_views")),
-            ("1 or more", lambda x: x >= 1, ("patch", "batch", "refined_rays")),
-            ("an odd number", lambda x: x > 0 and x % 2 == 1, ("half_waves",)),
-            ("0, or 2 or more", lambda x: x == 0 or x >= 2, ("grid_samples",)),
-            ("a share, more than 0", lambda x: 0 < x <= 1, ("patch_share",)),
-            ("a share of less than 1", lambda x: 0 <= x < 1, ("average",)),
-            ("a share of 0 to 1", lambda x: 0 <= x <= 1, ("refined", "distilled_share")),
-        ):
-            for name in names:
-                if not fits(got := getattr(self, name)):
-                    raise ValueError(f"joint.{name}: expected {wanted}, got {got}")
-
-    def distilled(self, steps: int, frames: int) -> int:
-        """Distilled views that a training of so many `steps` can use.
-
-        With L = 0 `frames`, sequences are never continued.
-        """
-        longer = self.motion.longer if frames else 0.0
-        sequences = self.motion.pool + (1 - longer) * steps * self.batch / self.motion.uses
-        return min(self.distilled_views, math.ceil(self.distilled_share * sequences))
 
 
 class RendererTraining:

@@ -17,6 +17,7 @@ from methods.rendering.batch import render_batch
 from methods.rendering.frame import FeatureFrame, rays_at_matter
 from methods.steernerf.buffer import Cloud
 from methods.steernerf.renderer import Observation, Points
+from methods.steernerf.training.options import JointOptions
 from methods.steernerf.training.sequences import Sequence, SequencePool
 from methods.steernerf.view import View
 
@@ -80,21 +81,19 @@ class PatchSource:
     """Batches of random patches of the sequences of a pool.
 
     Args:
-        side: of a patch, low-resolution pixels, at most.
-        share: of the shorter side of a frame that a patch has, at most.
+        options: how large a patch is, where it lies, and whether its rays are jittered.
         through: frames that the field learns from: "all", only the "present" one, or "none".
     """
 
     def __init__(
         self,
         pool: SequencePool,
-        side: int,
-        share: float,
+        options: JointOptions,
         through: Through,
         generator: torch.Generator,
     ) -> None:
         self.pipeline, self.rendering = pool.pipeline, pool.rendering
-        self.pool, self.side, self.share = pool, side, share
+        self.pool, self.options = pool, options
         self.through, self.generator = through, generator
 
     def draw(self, count: int) -> Batch:
@@ -113,16 +112,15 @@ class PatchSource:
         self.pool.restore(tensors)
 
     def cut(self, sequence: Sequence) -> Patch:
-        """A random patch of `sequence` in which there is more than background."""
-        view = sequence.view
-        place = sequence.cells[self._random(len(sequence.cells))].tolist()
+        """A random patch of `sequence`."""
+        view, options = sequence.view, self.options
         size = view.low.height, view.low.width
-        largest = min(self.side, max(1, int(self.share * min(size))))
+        largest = min(options.patch, max(1, int(options.patch_share * min(size))))
         height, width = (min(largest, side) for side in size)
-        top, left = (
-            min(max(centre - self._random(extent), 0), side - extent)
-            for centre, extent, side in zip(place, (height, width), size, strict=True)
-        )
+        if options.place == "content":
+            top, left = self._around_content(sequence, (height, width), size)
+        else:
+            top, left = self._random(size[0] - height + 1), self._random(size[1] - width + 1)
         cut = view.crop(left, top, width, height)
         seen, rays = rays_at_matter(cut.low, self.pipeline.occupancy)
         truth = self._truth(sequence, top, left, cut.full)
@@ -135,6 +133,16 @@ class PatchSource:
             if self.through == "all":
                 patch.rays.append(_rays_of(frame.cloud, shown))
         return patch
+
+    def _around_content(
+        self, sequence: Sequence, extents: tuple[int, int], size: tuple[int, int]
+    ) -> list[int]:
+        """The first row and column of a patch in which there is more than background."""
+        place = sequence.cells[self._random(len(sequence.cells))].tolist()
+        return [
+            min(max(centre - self._random(extent), 0), side - extent)
+            for centre, extent, side in zip(place, extents, size, strict=True)
+        ]
 
     def _truth(self, sequence: Sequence, top: int, left: int, full: Camera) -> Tensor:
         """The true picture [H, W, 3] of the patch; the background where it ends."""
@@ -151,10 +159,18 @@ class PatchSource:
         """What the renderer is given of `patches`, with the gradient it is to have; opacities."""
         rays = [rays for patch in patches for rays in patch.rays]
         together = Rays.joined(rays)
-        pipeline = self.pipeline
+        pipeline, count = self.pipeline, len(together.origins)
+        device = together.origins.device
+        jitter = None
+        if self.options.jitter:
+            jitter = torch.rand(count, generator=self.generator).to(device)
         with torch.set_grad_enabled(self.through != "none"):
             pixels, _ = render_batch(
-                pipeline.field, together, pipeline.occupancy, self.rendering.march
+                pipeline.field,
+                together,
+                pipeline.occupancy,
+                self.rendering.march,
+                jitter=jitter,
             )
             parts = iter(_split(pixels, [len(r.origins) for r in rays]))
             observations = [self._observation(p, [next(parts) for _ in p.rays]) for p in patches]

@@ -13,13 +13,14 @@ import torch
 from torch import Tensor
 
 from bench.sources import digest, libraries
-from bench.types import Budget, Log, Scene
+from bench.types import Budget, Log, Scene, SteerbenchError
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.steernerf.options import Model, Rendering
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.renderer import Renderer2d
 from methods.steernerf.training.distillation import distilled_views
-from methods.steernerf.training.joint import JointOptions, JointTraining, RendererTraining
+from methods.steernerf.training.joint import JointTraining, RendererTraining
+from methods.steernerf.training.options import JointOptions
 from methods.steernerf.training.patches import PatchSource
 from methods.steernerf.training.sequences import SequencePool, TrainingViews
 from methods.training import loop
@@ -99,7 +100,10 @@ def train_stage2(
     marks = {_at(folder, share): math.ceil(share * training.steps) for share in MARKS}
     loop.train(training, folder / "steernerf.safetensors", "training the 2D renderer", log, marks)
     if stage2.after < 1:
-        loop.load(training, _at(folder, stage2.after))
+        mark = _at(folder, stage2.after)
+        if not mark.exists():
+            raise SteerbenchError(f"{mark} is missing: remove {folder} to train again")
+        loop.load(training, mark)
         key["after"] = stage2.after
     trained.field.requires_grad_(False).grad_buffer = None
     pipeline.renderer.requires_grad_(False)
@@ -127,7 +131,7 @@ def _prepared(
     pool = SequencePool(pipeline, rendering, views, joint.motion, generator)
     learning = joint.field == "joint"
     through = joint.through if learning else "none"
-    patches = PatchSource(pool, joint.patch, joint.patch_share, through, generator)
+    patches = PatchSource(pool, joint, through, generator)
     rest = renderer, patches, joint, budget.renderer_steps, generator
     training = JointTraining(trained, *rest) if learning else RendererTraining(*rest)
     pipeline.renderer = training.mean

@@ -21,7 +21,7 @@ from methods.kernels.encode import HashGrid
 from methods.steernerf.beyond.lean_renderer import LeanRenderer
 from methods.steernerf.method import SteerNerf
 from methods.steernerf.options import Model, RangeReduction, Rendering, Reprojection, Skips
-from methods.steernerf.training.joint import JointOptions
+from methods.steernerf.training.options import JointOptions
 from methods.steernerf.training.sequences import MotionOptions
 from methods.steernerf.unet import UNet
 from tests.methods.models import small_model, small_rendering

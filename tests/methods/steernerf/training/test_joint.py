@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import pytest
 import torch
@@ -17,12 +18,8 @@ from methods.steernerf.beyond.surface import surface_points
 from methods.steernerf.options import Model, Rendering
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.renderer import Points, Renderer2d
-from methods.steernerf.training.joint import (
-    LEAST_ERROR,
-    JointOptions,
-    JointTraining,
-    RendererTraining,
-)
+from methods.steernerf.training.joint import LEAST_ERROR, JointTraining, RendererTraining
+from methods.steernerf.training.options import JointOptions
 from methods.steernerf.training.patches import Batch, PatchSource, Through
 from methods.steernerf.training.sequences import MotionOptions, SequencePool, TrainingViews
 from methods.steernerf.unet import UNet
@@ -35,6 +32,7 @@ from tests.methods.observations import shaken
 MOTION = MotionOptions(pool=3, uses=4, length=2)
 OPTIONS = JointOptions(patch=4, batch=2, motion=MOTION, refined=0.0)
 MODEL = small_model()
+Place = Literal["anywhere", "content"]
 
 
 def new_training(
@@ -54,7 +52,7 @@ def new_training(
     pool = SequencePool(pipeline, rendering, TrainingViews.of(scene), options.motion, generator)
     learning = options.field == "joint"
     through = options.through if learning else "none"
-    patches = PatchSource(pool, options.patch, options.patch_share, through, generator)
+    patches = PatchSource(pool, options, through, generator)
     rest = (renderer, patches, options, steps, generator)
     trained = trained_field(field)
     training = JointTraining(trained, *rest) if learning else RendererTraining(*rest)
@@ -300,6 +298,53 @@ def test_a_patch_has_its_side_and_at_most_its_share_of_the_frame(
     training = new_training(ball_scene, replace(OPTIONS, patch=6, patch_share=share))
     patch = training.patches.cut(training.patches.pool.draw())
     assert (patch.view.low.width, patch.view.low.height) == (side, side)
+
+
+@pytest.mark.parametrize("place", ["anywhere", "content"])
+def test_a_patch_lies_anywhere_or_around_content(ball_scene: Scene, place: Place) -> None:
+    """Of a side of 2: the corner of a picture has no content, a patch around content has some."""
+    options = replace(OPTIONS, patch=2, place=place)
+    source = new_training(ball_scene, options).patches
+    patches = [source.cut(source.pool.draw()) for _ in range(200)]
+    corners = {(round(patch.view.low.cx, 3), round(patch.view.low.cy, 3)) for patch in patches}
+    background = [bool((patch.truth == 1).all()) for patch in patches]
+    if place == "anywhere":
+        assert len(corners) > 40  # of 7 x 7, one of which 200 draws miss in the mean
+        assert any(background)
+    else:
+        assert not any(background)
+
+
+def test_rays_of_patches_are_jittered_if_they_are_to(ball_scene: Scene) -> None:
+    """The same patch twice: other samples, and so other opacities, only with jitter."""
+    for jitter in (False, True):
+        source = new_training(ball_scene, replace(OPTIONS, jitter=jitter)).patches
+        patch = source.cut(source.pool.draw())
+        (_, one), (_, other) = (source.observe([patch]) for _ in range(2))
+        assert torch.equal(one, other) == (not jitter)
+
+
+def test_a_killed_training_of_the_u_net_goes_on_in_its_memory_order(
+    ball_scene: Scene, tmp_path: Path
+) -> None:
+    """Its kernels are channels last, and files keep no order; a fused optimiser reads both as they
+    lie."""
+    model = small_model(frames=1, history=False, surface=False)
+
+    def new() -> RendererTraining:
+        torch.manual_seed(0)
+        renderer = UNet(4, 1, 4, width=8).to(memory_format=torch.channels_last)
+        return new_training(ball_scene, replace(OPTIONS, batch=1), model, renderer=renderer)
+
+    whole, again = new(), new()
+    for _ in range(2):
+        whole.advance()
+    loop.save(whole, tmp_path / "checkpoint.safetensors")
+    loop.resume(again, tmp_path / "checkpoint.safetensors")
+    for training in (whole, again):
+        training.advance()
+    for name, tensor in whole.result().items():
+        assert torch.equal(tensor, again.result()[name]), name
 
 
 def test_weights_on_the_way_are_kept(ball_scene: Scene, tmp_path: Path, quiet_log: Log) -> None:
