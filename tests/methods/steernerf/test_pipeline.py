@@ -92,7 +92,9 @@ def test_the_preceding_picture_of_a_still_camera_is_where_it_was() -> None:
     view = View.of(CAMERA, 4)
     low_depth = frame.depth[::4, ::4]
     fine = enlarge(low_depth, ALL_CELLS, 4)
-    history = pipeline._history(buffer.frames[0], fine, ALL_CELLS, view)
+    newest = buffer.frames[0]
+    assert newest.picture is not None
+    history = pipeline._history(newest, newest.picture, fine, ALL_CELLS, view)
     blocks = frame.rgb.view(8, 4, 8, 4, 3).transpose(1, 2).reshape(64, 16, 3)
     known = history.valid > 0
     assert known.float().mean() > 0.2
