@@ -144,12 +144,14 @@ def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
         columns.append(
             [
                 _cell(found, line.published.get(metric), metric, marks.get(places.get(row, 0), ""))
+                if _published(table)
+                else _measured(found, metric, marks.get(places.get(row, 0), ""))
                 for row, (found, line) in enumerate(zip(lines, table.lines, strict=True))
             ]
         )
     names = [": ".join((line.label, *line.gaps)) for line in lines]
     labels = (metric_format(metric)[0] for metric in table.metrics)
-    heads = ("measured / paper / difference", *labels)
+    heads = ("measured / paper / difference" if _published(table) else "measured", *labels)
     return Table(table.title, heads, tuple(zip(names, *columns, strict=True)))
 
 
@@ -192,13 +194,22 @@ def _origin(runs: Sequence[Run]) -> str:
     return ", ".join(f"{name} {' / '.join(dict.fromkeys(of))}" for name, of in origin.items())
 
 
+def _published(table: PaperTable) -> bool:
+    return any(line.published for line in table.lines)
+
+
+def _measured(found: Repeated, metric: str, mark: str) -> str:
+    """A figure alone; `mark` goes around it."""
+    shown = written(found, metric)
+    return f"{mark}{shown}{mark}" if shown else ABSENT
+
+
 def _cell(found: Repeated, published: float | None, metric: str, mark: str) -> str:
     """Measured, published and their difference; `mark` goes around the first."""
     measured, (_, write) = found.mean(metric), metric_format(metric)
     if measured is None and published is None:
         return ABSENT
-    shown = written(found, metric) or ABSENT
-    texts = [f"{mark}{shown}{mark}", ABSENT if published is None else write(published)]
+    texts = [_measured(found, metric, mark), ABSENT if published is None else write(published)]
     if measured is not None and published is not None and not math.isnan(measured):
         sign = "-" if measured < published else "+"
         texts.append(f"{sign}{write(abs(measured - published))}")
