@@ -137,21 +137,23 @@ def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
         measured: by the label of a line; lines may be missing.
     """
     lines = [measured.get(line.label, Repeated(line.label, ())) for line in table.lines]
+    beside = any(line.published for line in table.lines)
     columns = []
     for metric in table.metrics:
         places = {} if metric.startswith("stage_ms.") else ranks(lines, metric)
         marks = {1: "**", 2: "*" if len(places) > 2 else ""}
-        columns.append(
-            [
-                _cell(found, line.published.get(metric), metric, marks.get(places.get(row, 0), ""))
-                if _published(table)
-                else _measured(found, metric, marks.get(places.get(row, 0), ""))
-                for row, (found, line) in enumerate(zip(lines, table.lines, strict=True))
+        texts = [
+            _marked(found, metric, marks.get(places.get(n, 0), "")) for n, found in enumerate(lines)
+        ]
+        if beside:
+            texts = [
+                _beside(text, found.mean(metric), line.published.get(metric), metric)
+                for text, found, line in zip(texts, lines, table.lines, strict=True)
             ]
-        )
+        columns.append(texts)
     names = [": ".join((line.label, *line.gaps)) for line in lines]
     labels = (metric_format(metric)[0] for metric in table.metrics)
-    heads = ("measured / paper / difference" if _published(table) else "measured", *labels)
+    heads = ("measured / paper / difference" if beside else "measured", *labels)
     return Table(table.title, heads, tuple(zip(names, *columns, strict=True)))
 
 
@@ -194,22 +196,18 @@ def _origin(runs: Sequence[Run]) -> str:
     return ", ".join(f"{name} {' / '.join(dict.fromkeys(of))}" for name, of in origin.items())
 
 
-def _published(table: PaperTable) -> bool:
-    return any(line.published for line in table.lines)
-
-
-def _measured(found: Repeated, metric: str, mark: str) -> str:
-    """A figure alone; `mark` goes around it."""
+def _marked(found: Repeated, metric: str, mark: str) -> str:
+    """A measured figure; `mark` goes around it."""
     shown = written(found, metric)
     return f"{mark}{shown}{mark}" if shown else ABSENT
 
 
-def _cell(found: Repeated, published: float | None, metric: str, mark: str) -> str:
-    """Measured, published and their difference; `mark` goes around the first."""
-    measured, (_, write) = found.mean(metric), metric_format(metric)
+def _beside(text: str, measured: float | None, published: float | None, metric: str) -> str:
+    """The measured figure, as `text`, the published one and their difference."""
     if measured is None and published is None:
         return ABSENT
-    texts = [_measured(found, metric, mark), ABSENT if published is None else write(published)]
+    _, write = metric_format(metric)
+    texts = [text, ABSENT if published is None else write(published)]
     if measured is not None and published is not None and not math.isnan(measured):
         sign = "-" if measured < published else "+"
         texts.append(f"{sign}{write(abs(measured - published))}")
