@@ -145,9 +145,19 @@ def test_the_best_is_bold_and_the_second_of_three_italic(run: Run) -> None:
     psnr = {"a": 1.0, "b": 3.0, "c": 2.0}
     of = {name: Repeated(name, [with_psnr(run, value)]) for name, value in psnr.items()}
     cells = [line[1] for line in with_published(table, of).lines]
-    assert cells == ["1.00 / –", "**3.00** / –", "*2.00* / –"]
+    assert cells == ["1.00", "**3.00**", "*2.00*"]
     two = with_published(table, {name: of[name] for name in "ab"})
-    assert [line[1] for line in two.lines] == ["1.00 / –", "**3.00** / –", ABSENT]
+    assert [line[1] for line in two.lines] == ["1.00", "**3.00**", ABSENT]
+
+
+@pytest.mark.parametrize("published", [{}, {"psnr": 31.0}])
+def test_lines_of_which_nothing_is_published_show_what_was_measured_alone(
+    run: Run, published: dict[str, float]
+) -> None:
+    table = replace(TABLE, lines=[Line("a", {"method": "a"}, published)])
+    shown = with_published(table, {"a": Repeated("a", [with_psnr(run, 30.0)])})
+    assert shown.columns[0] == ("measured / paper / difference" if published else "measured")
+    assert shown.lines[0][1] == ("30.00 / 31.00 / -1.00" if published else "30.00")
 
 
 def test_a_section_says_on_what_and_what_to_mind_and_whether_trends_hold(run: Run) -> None:
