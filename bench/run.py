@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -54,11 +53,6 @@ class Task:
     budget: Budget
     seed: int
     weights_dir: Path | None = None
-
-    @cached_property
-    def preceding(self) -> Sequence[int]:
-        """See `bench.trajectories.Trajectory`."""
-        return self.trajectory.preceding
 
 
 def measure(method: Method, task: Task, log: Log) -> Measurement:
@@ -151,17 +145,17 @@ def _render(takes: Sequence[_Take], task: Task, log: Log) -> None:
                     take.method.render(steps[index].camera, take.clock)
                 progress.advance(note="warming up")
             take.method.reset()
-        for index in range(len(steps)):
+        for index, before in enumerate(task.trajectory.preceding):
             for take in takes:
-                _draw(take, task, index)
+                _draw(take, task, index, before)
                 scores = [row["psnr"] for row in take.rows if "psnr" in row]
                 progress.advance(note=f"{np.mean(scores):.2f} dB" if scores else "")
 
 
-def _draw(take: _Take, task: Task, index: int) -> None:
-    """The next frame of a method, under the clock. No cut is announced to it: nobody who steers a
-    camera announces a jump."""
-    method, step, before = take.method, task.trajectory.steps[index], task.preceding[index]
+def _draw(take: _Take, task: Task, index: int, before: int) -> None:
+    """The next frame of a method, with `before` frames since the last cut, under the clock. No cut
+    is announced to it: nobody who steers a camera announces a jump."""
+    method, step = take.method, task.trajectory.steps[index]
     if task.protocol.memory == "cold":
         method.reset()
         before = 0

@@ -109,7 +109,7 @@ def _curves(table: PaperTable, lines: Lines) -> Iterator[figures.Curve]:
             of.runs[0].record["budget"]["renderer_steps"] * share: of for share, of in marks.items()
         }
         if len(points) > 1:
-            yield figures.Curve(f"{table.name.replace('table', 'Table ')}", line.label, points)
+            yield figures.Curve(table.number, line.label, points)
 
 
 def _images(images: Mapping[str, Any], lines: Lines, folder: Path) -> Iterator[str]:

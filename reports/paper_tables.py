@@ -73,6 +73,11 @@ class PaperTable:
     curve: bool = False
 
     @property
+    def number(self) -> str:
+        """As the paper counts it: "Table 3"."""
+        return self.name.replace("table", "Table ")
+
+    @property
     def marks(self) -> dict[tuple[str, float], Line]:
         """What is measured besides for the curves: by the label of a line and the share of the
         training after which it is rendered."""
@@ -161,7 +166,7 @@ def section(table: PaperTable, lines: Sequence[Repeated]) -> str:
     """A table as a part of a page: the paper's, the lines of a method beyond it, each scene."""
     measured = {line.label: line for line in lines}
     first, *further = table.blocks
-    heading = f"## {table.name.replace('table', 'Table ')}: {table.title}"
+    heading = f"## {table.number}: {table.title}"
     parts = [heading, *_block(first, measured, f"Paper: {table.published_on}.")]
     for block in further:
         parts += [f"### {block.title}", *_block(block, measured)]
