@@ -9,14 +9,15 @@ import torch
 
 
 @contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """Compute each of torch's operations on `count` threads, and afterwards on as many as before.
+def torch_threads(count: int | None) -> Iterator[None]:
+    """Compute each of torch's operations on `count` threads, and afterwards on as many as before;
+    with None, on as many as before all along.
 
     One, for many small operations: pools inside a pool fight for the cores, and on a busy machine
     even a single pool spends most of its time waiting for its slowest thread.
     """
     before = torch.get_num_threads()
-    torch.set_num_threads(count)
+    torch.set_num_threads(count or before)
     try:
         yield
     finally:

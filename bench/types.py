@@ -147,6 +147,9 @@ class Budget:
         frames: at most this many test frames are rendered and scored (0: all).
         renderer_steps: optimiser steps of the second stage, for methods with a 2D renderer.
         seeds: with how many seeds, 0 to seeds - 1, `steerbench paper` repeats a measurement.
+        beyond: whether it also varies what a method beyond the paper is trained for.
+        threads: CPU threads of a training; None: as many as torch uses. On a CPU `steerbench paper`
+            trains side by side what the cores have room for.
     """
 
     name: str
@@ -155,12 +158,16 @@ class Budget:
     frames: int = 0
     renderer_steps: int = 1
     seeds: int = 1
+    beyond: bool = True
+    threads: int | None = None
 
     def __post_init__(self) -> None:
         if min(self.steps, self.samples, self.renderer_steps, self.seeds) < 1 or self.frames < 0:
             raise ValueError(
                 f"expected steps, samples, renderer_steps and seeds >= 1, frames >= 0: {self}"
             )
+        if self.threads is not None and self.threads < 1:
+            raise ValueError(f"threads: expected 1 or more, or none, got {self.threads}")
 
 
 class Log(Protocol):

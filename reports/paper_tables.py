@@ -169,6 +169,8 @@ def section(table: PaperTable, lines: Sequence[Repeated]) -> str:
     heading = f"## {table.number}: {table.title}"
     parts = [heading, *_block(first, measured, f"Paper: {table.published_on}.")]
     for block in further:
+        if not any(line.label in measured for line in block.lines):
+            continue  # the budget leaves them out
         parts += [f"### {block.title}", *_block(block, measured)]
     if table.scenes and len({scene for line in lines for scene in line.by_scene}) > 1:
         parts.append(scene_table(table.scenes, lines).section(level=3))

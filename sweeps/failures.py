@@ -13,7 +13,7 @@ from bench.results import content_key
 from bench.sharing import whole
 
 
-def reason(error: Exception) -> str:
+def reason(error: BaseException) -> str:
     """The message of `error` in one line."""
     return " ".join(str(error).split()) or type(error).__name__
 

@@ -122,6 +122,25 @@ def obtain_in_turns(
     return [Obtained(one.store, one.run, one.run in measured) for one in ready]
 
 
+def stored(config: DictConfig, command: Sequence[str], turns: str = "") -> bool:
+    """Whether `obtain_in_turns` would find this job in the store.
+
+    Raises as `obtain` does.
+    """
+    return _Ready.of(config, command, turns, ConsoleLog(Path(config.outputs))).stored
+
+
+def trained(config: DictConfig, log: Log) -> Method:
+    """The method that `config` describes, trained on its scene.
+
+    Raises as `obtain` does.
+    """
+    torch.manual_seed(checked_settings(config).seed)
+    method, budget = (build(config, name) for name in ("method", "budget"))
+    method.fit(scene_of(config), budget, log)
+    return method
+
+
 @dataclass(frozen=True, eq=False)
 class _Ready:
     """A measurement that can begin, and everything that can change its rows: its `parts`."""
@@ -224,7 +243,7 @@ def described(config: DictConfig) -> dict[str, Any]:
 
     Without the places of weights and scenes, except for the last name of a scene's folder, which
     rows show; without `split`, which the trajectory has, and `sizing`, which methods have; without
-    the engine where the method uses none; and without the number of seeds.
+    the engine where the method uses none; and without what the budget says about other jobs.
     """
     try:
         plain: Any = OmegaConf.to_container(config, resolve=True)
@@ -233,7 +252,8 @@ def described(config: DictConfig) -> dict[str, Any]:
     unused = () if "engine" in plain["method"] else ("engine", "precision")
     left_out = ("split", "sizing", *PLACES, *unused)
     kept = {key: value for key, value in plain.items() if key not in left_out}
-    kept["budget"] = {name: value for name, value in plain["budget"].items() if name != "seeds"}
+    of_sweep = ("seeds", "beyond")
+    kept["budget"] = {key: value for key, value in plain["budget"].items() if key not in of_sweep}
     kept["scene"] = {name: value for name, value in plain["scene"].items() if name != "root"}
     if "path" in kept["scene"]:
         kept["scene"]["path"] = Path(kept["scene"]["path"]).name

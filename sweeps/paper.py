@@ -20,6 +20,7 @@ from sweeps.jobs import attempt_in_turns, say, time_left
 from sweeps.overrides import composed
 from sweeps.plan import Planned, chosen, plan
 from sweeps.terminal import console, show
+from sweeps.train_ahead import train_ahead
 
 DATA = "data="
 """How the word begins that names the folder of a data set."""
@@ -65,29 +66,34 @@ def data_set(words: Sequence[str]) -> tuple[list[str], DataSet | None]:
 
 
 def _run(jobs: Sequence[Planned]) -> int:
-    """Run one job after the other, equal ones once; return how many failed.
+    """Run the jobs, equal ones once; return how many failed.
 
-    All lines of all tables come with the first seed and scene, then with the next.
+    Of one scene after the other, all models are trained that can be trained side by side; then all
+    lines of all tables are measured with the first seed, then with the next.
     """
-    rounds = list(dict.fromkeys((job.config.seed, job.scene) for job in jobs))
-    jobs = sorted(jobs, key=lambda job: rounds.index((job.config.seed, job.scene)))
     distinct = {job.key: job for job in reversed(jobs)}
     jobs = [job for job in jobs if distinct[job.key] is job]
+    of_scenes: dict[str, list[Planned]] = {}
+    for job in jobs:
+        of_scenes.setdefault(job.scene, []).append(job)
     begun, measured, failed, ended = time.monotonic(), 0, 0, 0
-    for group in _groups(jobs):
-        for number, job in enumerate(group, ended + 1):
-            print(f"{number} of {len(jobs)}, {job.name}", file=sys.stderr)
-        ended += len(group)
-        try:
-            wanted = [(job.config, job.command, job.name) for job in group]
-            obtained = attempt_in_turns(wanted, group[0].turns)
-        except Exception:  # which `attempt_in_turns` has printed: the other jobs still run
-            failed += len(group)
-            continue
-        measured += sum(of_job.measured for of_job in obtained)
-        left = time_left(time.monotonic() - begun, measured, len(jobs) - ended)
-        for job, of_job in zip(group, obtained, strict=True):
-            say(of_job, job.name, left)
+    for together in of_scenes.values():
+        train_ahead(together)
+        seeds = list(dict.fromkeys(job.config.seed for job in together))
+        for group in _groups(sorted(together, key=lambda job: seeds.index(job.config.seed))):
+            for number, job in enumerate(group, ended + 1):
+                print(f"{number} of {len(jobs)}, {job.name}", file=sys.stderr)
+            ended += len(group)
+            try:
+                wanted = [(job.config, job.command, job.name) for job in group]
+                obtained = attempt_in_turns(wanted, group[0].turns)
+            except Exception:  # which `attempt_in_turns` has printed: the other jobs still run
+                failed += len(group)
+                continue
+            measured += sum(of_job.measured for of_job in obtained)
+            left = time_left(time.monotonic() - begun, measured, len(jobs) - ended)
+            for job, of_job in zip(group, obtained, strict=True):
+                say(of_job, job.name, left)
     return failed
 
 

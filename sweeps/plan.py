@@ -88,11 +88,12 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     fixed += [f"scene={data.layout}"] if data else []
     scenes = {name: str(folder) for name, folder in data.scenes.items()} if data else {"": ""}
     experiment = composed([f"+experiment={table.name}", *fixed], return_hydra_config=True)
-    usual = [str(seed) for seed in range(build(experiment, "budget").seeds)]
+    budget = build(experiment, "budget")
+    usual = [str(seed) for seed in range(budget.seeds)]
     params = experiment.hydra.sweeper.params
     grid = swept([f"{name}={values}" for name, values in params.items()])
     jobs = []
-    for block, line, repeated in _lines(table):
+    for block, line, repeated in _lines(table, budget.beyond):
         if line.job is None:
             continue
         added = line.job == {METHOD: line.label}
@@ -119,10 +120,11 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     return jobs
 
 
-def _lines(table: PaperTable) -> Iterator[tuple[str, Line, bool]]:
+def _lines(table: PaperTable, beyond: bool) -> Iterator[tuple[str, Line, bool]]:
     """The lines of all blocks of a table and those of its curves, each with the title of its block
-    and whether several seeds repeat it."""
-    for block in table.blocks:
+    and whether several seeds repeat it; a table that varies the training is one of the paper's
+    method alone, unless those `beyond` it are to be trained as often."""
+    for block in table.blocks if beyond or not table.curve else [table]:
         yield from ((block.title, line, block is table) for line in block.lines)
     yield from (("curves", line, False) for line in table.marks.values())
 

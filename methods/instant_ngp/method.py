@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from bench.cameras import place_camera
 from bench.study import Study, Variant
+from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.instant_ngp.field import Precision
 from methods.instant_ngp.stage1 import Setup, train_field
@@ -13,7 +16,6 @@ from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.composite import STOP, check_stop
 from methods.kernels.encode import HashGrid
 from methods.rendering.frame import everywhere, render_frame
-from methods.rendering.march import March
 
 
 class InstantNgp:
@@ -58,7 +60,8 @@ class InstantNgp:
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Train the field, or load the one that the same training left behind."""
-        self.trained = train_field(self.setup, scene, budget, log)
+        with torch_threads(budget.threads):
+            self.trained = train_field(self.setup, scene, budget, log)
         self.train_s = self.trained.train_s
         self.background = scene.background.to(self.setup.device)
 
@@ -70,7 +73,8 @@ class InstantNgp:
         """One frame at the camera's full resolution."""
         camera = place_camera(camera, self.setup.device)
         field, occupancy = self.trained.field, self.trained.occupancy
-        render = everywhere(field, occupancy, probe, March(stop=self.stop))
+        march = self.setup.training.march
+        render = everywhere(field, occupancy, probe, replace(march, stop=self.stop))
         frame = render_frame(field, camera, occupancy, self.background, probe, render)
         return Frame(frame.values, frame.depth, frame.alpha)
 

@@ -14,8 +14,8 @@ from bench.types import Budget, Rays, Scene, Split, SteerbenchError
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.optimiser import FieldOptimiser
 from methods.rendering.batch import opacity_entropy, render_batch
-from methods.rendering.march import March
-from methods.rendering.occupancy import EVERY, MIN_VIEWS, DensityGrid, learnable_cells
+from methods.rendering.march import March, check_step
+from methods.rendering.occupancy import EVERY, MIN_VIEWS, STEP, DensityGrid, learnable_cells
 from methods.training import checkpoint, loop
 from methods.training.optimiser import cosine
 
@@ -38,6 +38,8 @@ class TrainingOptions:
             background, so that no density can pass for background.
         grid_samples: visits of an update of the density grid.
         max_rays: most rays of a step.
+        march_step: length of a ray-marching step, in diagonals of the cube / 1024, as the release
+            has it.
     """
 
     rate: float = 1e-2
@@ -46,6 +48,7 @@ class TrainingOptions:
     random_background: bool = True
     grid_samples: int = 1 << 17
     max_rays: int = 1 << 15
+    march_step: float = 1.0
 
     def __post_init__(self) -> None:
         if not (self.rate > 0 and 0 < self.final_rate <= 1 and self.opacity_entropy >= 0):
@@ -54,6 +57,12 @@ class TrainingOptions:
             )
         if not (self.grid_samples >= 2 and self.max_rays >= MIN_RAYS):
             raise ValueError(f"expected grid_samples >= 2, max_rays >= {MIN_RAYS}: {self}")
+        check_step("march_step", self.march_step)
+
+    @property
+    def march(self) -> March:
+        """Of the rays of stage 1, and of what is shown as it was trained."""
+        return March(step=self.march_step * STEP)
 
 
 class PixelBatches:
@@ -140,7 +149,12 @@ class FieldTraining:
         target, background = self._target(colours)
         jitter = torch.rand(len(target), generator=self.generator, device=target.device)
         pixels, samples = render_batch(
-            self.field, rays, self.grid.occupancy, March(), jitter=jitter, background=background
+            self.field,
+            rays,
+            self.grid.occupancy,
+            self.options.march,
+            jitter=jitter,
+            background=background,
         )
         loss = functional.mse_loss(pixels.values, target)
         entropy = opacity_entropy(pixels.alpha)

@@ -14,6 +14,12 @@ FAINT = 0.1
 than a tenth of what the early stop may cause."""
 
 
+def check_step(name: str, length: float) -> None:
+    """Refuse, with a ValueError, a step that leads nowhere."""
+    if not length > 0:
+        raise ValueError(f"{name}: expected a length of more than 0, got {length}")
+
+
 @dataclass(frozen=True)
 class March:
     """How rays are marched.

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from bench.sources import digest
+from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.engines import Engine, Inputs
 from methods.instant_ngp.field import Precision
@@ -72,8 +73,9 @@ class SteerNerf:
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Train both stages, or load what the same trainings left behind."""
-        self.trained = train_field(self.setup, scene, budget, log)
-        second = train_stage2(self.trained, self.setup, self.stage2, scene, budget, log)
+        with torch_threads(budget.threads):
+            self.trained = train_field(self.setup, scene, budget, log)
+            second = train_stage2(self.trained, self.setup, self.stage2, scene, budget, log)
         self.pipeline = second.pipeline
         self.train_s = self.trained.train_s + second.train_s
         self._build_network(second, scene, log)

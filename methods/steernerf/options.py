@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from methods.kernels.composite import check_stop
-from methods.rendering.march import March
+from methods.rendering.march import March, check_step
 from methods.rendering.occupancy import STEP
 
 SIZES = {"channels": (3, 256), "frames": (0, 64), "scale": (1, 64)}
@@ -106,15 +106,14 @@ class Rendering:
     """What is chosen after the training: one training serves every choice.
 
     Attributes:
-        step: of the rays at low resolution, as a multiple of the step of stage 1.
+        step: of the rays at low resolution, in diagonals of the cube / 1024.
         stop: transmittance at which a ray ends.
         range: where rays look for a surface.
         overlap: a preceding frame that shares less than this of what it shows with the present view
             is not used; see `buffer.Cloud.overlap`.
         refined: share of the cells whose pixels are rendered by the field after all: those with the
             largest estimated error (not in the paper).
-        refined_step: of the rays there, as a multiple of the step of stage 1, with which it is
-            trained.
+        refined_step: of the rays there; 1 when it is trained.
         skip: what is not computed.
     """
 
@@ -166,9 +165,3 @@ def check_size(name: str, got: int, least: int, most: int) -> None:
     """Refuse, with a ValueError, a size that is not of `least` to `most`."""
     if not least <= got <= most:
         raise ValueError(f"{name}: expected {least} to {most}, got {got}")
-
-
-def check_step(name: str, length: float) -> None:
-    """Refuse, with a ValueError, a step that leads nowhere."""
-    if not length > 0:
-        raise ValueError(f"{name}: expected a length of more than 0, got {length}")

@@ -1,0 +1,115 @@
+"""Trainings of many jobs, several at a time: small ones gain little from a second core."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+
+from bench.console import ConsoleLog
+from bench.errors import SteerbenchError
+from bench.results import content_key
+from sweeps.build import build
+from sweeps.device_lock import device_lock
+from sweeps.failures import reason
+from sweeps.jobs import time_left
+from sweeps.measurement import described, stored, trained
+from sweeps.plan import Planned
+
+CHOSEN_AFTERWARDS = {"engine", "precision", "protocol", "rendering", "after"}
+"""Settings of a run and of its method that no training depends on."""
+
+
+def train_ahead(jobs: Sequence[Planned]) -> None:
+    """Do the trainings of `jobs`, which share their budget, if there is room for several at a time.
+
+    They are found again when the jobs are measured. What fails here fails there once more, and is
+    reported then.
+    """
+    workers = _room(jobs[0].config)
+    if workers < 2:
+        return
+    todo = list({_training(job.config): job for job in jobs if _missing(job)}.values())
+    if len(todo) < 2:
+        return
+    log = ConsoleLog(Path(jobs[0].config.outputs))
+    log.info(f"training {len(todo)} models, {workers} at a time")
+    begun = time.monotonic()
+    with device_lock("cpu", log), _pool(workers) as pool:
+        names = {pool.submit(_train, job.config): job.name for job in todo}
+        for number, ended in enumerate(as_completed(names), 1):
+            left = time_left(time.monotonic() - begun, number, len(todo) - number)
+            print(f"{_said(ended)}: {names[ended]}{left}", file=sys.stderr)
+
+
+def _room(config: DictConfig) -> int:
+    """How many trainings the cores have room for; 1 on a GPU, or where the budget does not say how
+    many threads one has."""
+    threads = build(config, "budget").threads
+    on_gpu = config.device.startswith("cuda") or (
+        config.device == "auto" and torch.cuda.is_available()
+    )
+    return 1 if on_gpu or threads is None else len(os.sched_getaffinity(0)) // threads
+
+
+def _missing(job: Planned) -> bool:
+    """Whether the store lacks the run of `job`; of one that cannot even begin it need not be known,
+    because that will be reported when it is measured."""
+    try:
+        return not stored(job.config, job.command, job.turns)
+    except SteerbenchError:
+        return False
+
+
+def _training(config: DictConfig) -> str:
+    """Equal for jobs that share a training: a key of all settings that it may depend on."""
+    settings = described(config)
+    settings["method"] = _kept(settings["method"])
+    return content_key(_kept(settings))
+
+
+def _kept(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in settings.items() if name not in CHOSEN_AFTERWARDS}
+
+
+def _train(config: DictConfig) -> float:
+    """In a process of its own: the seconds of a training that may have been done before."""
+    return trained(config, ConsoleLog(Path(config.outputs), quiet=True)).train_s
+
+
+def _said(ended: Future[float]) -> str:
+    """How a training ended."""
+    error = ended.exception()
+    return f"trained in {ended.result():.0f} s" if error is None else f"failed: {reason(error)}"
+
+
+@contextmanager
+def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """Processes that end with this one, however it ends."""
+    fresh = multiprocessing.get_context("spawn")  # threads do not survive a fork
+    pool = ProcessPoolExecutor(workers, mp_context=fresh, initializer=_end_with_parent)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
