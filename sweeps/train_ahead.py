@@ -39,14 +39,16 @@ def train_ahead(jobs: Sequence[Planned]) -> None:
     workers = _room(jobs[0].config)
     if workers < 2:
         return
-    todo = list({_training(job.config): job for job in jobs if _missing(job)}.values())
+    todo: dict[str, Planned] = {}
+    for job in filter(_missing, jobs):
+        todo.setdefault(_training(job.config), job)
     if len(todo) < 2:
         return
     log = ConsoleLog(Path(jobs[0].config.outputs))
     log.info(f"training {len(todo)} models, {workers} at a time")
     begun = time.monotonic()
     with device_lock("cpu", log), _pool(workers) as pool:
-        names = {pool.submit(_train, job.config): job.name for job in todo}
+        names = {pool.submit(_train, job.config): job.name for job in todo.values()}
         for number, ended in enumerate(as_completed(names), 1):
             left = time_left(time.monotonic() - begun, number, len(todo) - number)
             print(f"{_said(ended)}: {names[ended]}{left}", file=sys.stderr)

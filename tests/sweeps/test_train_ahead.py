@@ -1,0 +1,86 @@
+"""Trainings side by side: how many, which of them, and that measurements find them again."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import Future
+from dataclasses import replace
+
+import pytest
+
+from bench.errors import SteerbenchError
+from reports.paper_tables import paper_tables
+from sweeps import train_ahead
+from sweeps.overrides import composed
+from sweeps.plan import plan
+
+TABLES = {table.name: replace(table, curve=False) for table in paper_tables()}
+
+
+def trainings(*names: str) -> int:
+    """How many different ones the jobs of the tables `names` have with one seed."""
+    jobs = [job for name in names for job in plan(TABLES[name], ["budget=paper", "seed=0"])]
+    return len({train_ahead._training(job.config) for job in jobs})
+
+
+def test_what_is_chosen_afterwards_is_no_training_of_its_own() -> None:
+    """The engines, precisions and range reductions of Tables 1 and 2."""
+    assert trainings("table1") == 3  # Instant-NGP, the paper's method, ours
+    assert trainings("table2") == 2
+    assert trainings("table1", "table2") == 3
+
+
+@pytest.mark.parametrize(("name", "lines"), [("table3", 4), ("table4", 3), ("table5", 2)])
+def test_each_line_of_an_ablation_is_a_training_of_its_own(name: str, lines: int) -> None:
+    whole = replace(TABLES[name], beyond=None)
+    jobs = plan(whole, ["budget=paper", "seed=0,1"])
+    assert len({train_ahead._training(job.config) for job in jobs}) == 2 * lines
+
+
+@pytest.mark.parametrize(
+    ("threads", "device", "together"),
+    [("1", "cpu", 6), ("4", "cpu", 1), ("3", "cpu", 2), ("null", "cpu", 1), ("1", "cuda", 1)],
+)
+def test_there_are_as_many_at_a_time_as_cores_have_room_for(
+    threads: str, device: str, together: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(6)))
+    config = composed([f"budget.threads={threads}", f"device={device}"])
+    assert train_ahead._room(config) == together
+
+
+def test_a_failed_training_says_why() -> None:
+    ended: Future[float] = Future()
+    ended.set_exception(SteerbenchError("no room\nfor it"))
+    assert train_ahead._said(ended) == "failed: no room for it"
+
+
+@pytest.mark.parametrize("threads", [0, -1])
+def test_no_threads_are_refused(threads: int) -> None:
+    with pytest.raises(SteerbenchError, match="threads: expected 1 or more"):
+        plan(TABLES["table5"], [f"budget.threads={threads}"])
+
+
+SMALL = [
+    *("scene=totem", "scene.width=24", "scene.train=3", "scene.test=1", "trajectory=test"),
+    *("budget=tiny", "budget.steps=4", "budget.samples=512", "budget.renderer_steps=8"),
+    *("budget.threads=1", "budget.beyond=false", "method.joint.distilled_views=1"),
+    *("protocol.name=quick", "protocol.lpips=[]", "protocol.warmup=0"),
+]
+
+
+def test_what_was_trained_ahead_is_found_when_it_is_measured(
+    steerbench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    outcome = steerbench("paper", "--table", "table5", *SMALL)
+    assert outcome.status == 0, outcome.err
+    assert "training 2 models, 2 at a time" in outcome.err
+    assert outcome.err.count("trained in") == 2
+    _, measured = outcome.err.split("1 of 8")
+    assert "training the 2D renderer: done" not in measured
+    assert measured.count("training the 2D renderer: found in") == 8
+
+    again = steerbench("paper", "--table", "table5", *SMALL)
+    assert "models" not in again.err
+    assert again.err.count("already measured") == 8
