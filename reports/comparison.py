@@ -85,12 +85,16 @@ def written(found: Repeated, metric: str) -> str | None:
     return f"{write(mean)} ± {write(half)}" if half > 0 else write(mean)
 
 
-def ranks(runs: Sequence[Run | Repeated], metric: str) -> dict[int, int]:
+def ranks(
+    runs: Sequence[Run | Repeated], metric: str, write: Write | None = None
+) -> dict[int, int]:
     """The place, from 1, of each of `runs`, by its index, among those of the same conditions.
 
-    Figures that are written alike share a place. A run that is alone under its conditions has none.
+    Figures that are written alike, by `write` or as everywhere else, share a place. A run that is
+    alone under its conditions has none.
     """
-    label, write = metric_format(metric)
+    label, usual = metric_format(metric)
+    write = write or usual
     known: dict[tuple[object, ...], dict[int, float]] = {}
     for row, run in enumerate(runs):
         if math.isfinite(run.values.get(metric, math.nan)):

@@ -7,6 +7,9 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+FORMATS = ("latex", "csv")
+"""Of the tables of the paper; see `reports.export`."""
+
 Arguments = list[tuple[tuple[str, ...], dict[str, Any]]]
 """Names and options of each argument, as of `ArgumentParser.add_argument`."""
 
@@ -79,6 +82,7 @@ TABLES = [
         **{"dest": "methods", "default": [], "metavar": "METHOD"},
     ),
     *_one("--report", help="where the page goes (default OUTPUTS/paper)", type=Path, metavar="DIR"),
+    *_one("--format", help="also print the tables, for a paper or a program", choices=[*FORMATS]),
     *_words(
         "those of each table, as many seeds as the budget says; data=DIR: every scene of a data set"
     ),

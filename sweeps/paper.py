@@ -12,6 +12,7 @@ from pathlib import Path
 
 from bench.errors import SteerbenchError
 from bench.results import Store
+from reports import export
 from reports.outliers import outlier_table, outliers
 from reports.paper_page import write_paper_page
 from sweeps.data_sets import DataSet, find
@@ -42,7 +43,10 @@ def main(options: argparse.Namespace) -> int:
     runs = newest(Store(outputs))
     found = outliers(list(chain(*runs.values())))
     folder = options.report or outputs / "paper"
-    page = write_paper_page(tables, gather(jobs, runs, outputs), found, folder, missing)
+    lines = gather(jobs, runs, outputs)
+    page = write_paper_page(tables, lines, found, folder, missing)
+    if options.format:
+        print(getattr(export, options.format)(tables, lines), end="")
     print(f"report: {page}", file=sys.stderr)
     return int(failed > 0)
 

@@ -290,13 +290,15 @@ def test_the_frames_of_runs_that_are_not_on_a_page_are_not_read(
     assert steerbench("report", "--table", "table3", "seed=1", outputs).status == 0
 
 
-def test_the_page_goes_where_it_is_asked_for(
+def test_the_page_goes_where_it_is_asked_for_and_the_tables_to_standard_output(
     steerbench, measured: list[DictConfig], store: Store, tmp_path: Path
 ) -> None:
     folder = tmp_path / "there"
     outputs = f"outputs={store.folder.parent}"
-    outcome = steerbench("paper", "--table", "table5", "--report", str(folder), outputs)
+    words = ("--table", "table5", "--report", str(folder), "--format", "latex")
+    outcome = steerbench("paper", *words, outputs)
     assert outcome.status == 0
+    assert r"\label{tab:table5}" in outcome.out
     assert "## Table 5: Joint training" in (folder / "report.md").read_text()
 
 

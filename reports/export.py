@@ -1,0 +1,146 @@
+"""The tables of the paper for other programs: LaTeX for an article, CSV for a spreadsheet."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+import pandas as pd
+
+from reports.comparison import conditions_of, metric_format, ranks
+from reports.paper_tables import PaperTable
+from reports.runs import Repeated
+from reports.tables import decimal
+
+Lines = Mapping[str, Sequence[Repeated]]
+"""The measured lines of each table, by the name of the table."""
+
+DECIMALS = {"psnr": 2, "ssim": 3, "lpips": 3, "fps": 2, "frame": 2, "stage": 2, "size": 1}
+"""With how many the paper prints a metric, by the first part of its name."""
+
+ESCAPES = str.maketrans(
+    {
+        **{sign: f"\\{sign}" for sign in "&%$#_{}"},
+        "\\": r"\textbackslash{}",
+        "^": r"\textasciicircum{}",
+        "~": r"\textasciitilde{}",
+        "<": "$<$",
+        ">": "$>$",
+        "±": r"$\pm$",
+        "↑": r"$\uparrow$",
+        "↓": r"$\downarrow$",
+        "–": "--",
+    }
+)
+
+SETTING = re.compile(r"(?P<name>[A-Z]) = (?P<base>\d+)(\^(?P<power>\d+))?")
+"""A label such as "T = 2^19", set as mathematics."""
+
+MARKS = {1: r"\textbf{%s}", 2: r"\underline{%s}"}
+"""How the best figure of a column and the second look."""
+
+PUBLISHED = r"$^\dagger$"
+
+
+def latex(tables: Sequence[PaperTable], measured: Lines) -> str:
+    """All tables as LaTeX, for the package booktabs, with as many decimals as the paper prints.
+
+    The best figures of a column are bold, the second of at least three underlined, among those
+    measured under the same conditions; what is written alike shares a place. Figures of methods
+    that nothing here measures are the paper's and have a dagger.
+    """
+    return "\n".join(_latex(table, measured.get(table.name, ())) for table in tables)
+
+
+def _latex(table: PaperTable, lines: Sequence[Repeated]) -> str:
+    known = {line.label: line for line in lines}
+    blocks = [block for block in table.blocks if block is table or _measured(block, known)]
+    heads = ["", *(_escaped(metric_format(metric)[0]) for metric in table.metrics)]
+    rows = [row for block in blocks for row in _rows(block, known)]
+    runs = [run for line in lines for run in line.runs]
+    caption = f"{_escaped(table.title)}. " + (f"{_escaped(conditions_of(runs))}. " if runs else "")
+    if any(PUBLISHED in cell for row in rows for cell in row):
+        caption += f"{PUBLISHED}Published figures, of other conditions."
+    text = pd.DataFrame(rows, columns=heads).to_latex(
+        index=False,
+        column_format="l" + "r" * len(table.metrics),
+        caption=caption.strip(),
+        label=f"tab:{table.name}",
+    )
+    if len(blocks) > 1:  # a rule before the lines beyond the paper
+        first = " & ".join(rows[len(_rows(table, known))])
+        text = text.replace(first, f"\\midrule\n{first}", 1)
+    return text
+
+
+def _rows(block: PaperTable, known: Mapping[str, Repeated]) -> list[list[str]]:
+    """The label of each line and its figures."""
+    lines = [known.get(line.label, Repeated(line.label, ())) for line in block.lines]
+    columns = []
+    for metric in block.metrics:
+        write = partial(_written, metric)
+        places = {} if metric.startswith("stage_ms.") else ranks(lines, metric, write)
+        cells = []
+        for number, (found, line) in enumerate(zip(lines, block.lines, strict=True)):
+            mean, half = found.mean(metric), found.half(metric)
+            published = line.published.get(metric)
+            if mean is not None:
+                text = write(mean) + (rf" $\pm$ {write(half)}" if half > 0 else "")
+                place = places.get(number, 0)
+                several = place == 1 or len(places) > 2
+                cells.append(MARKS[place] % text if place in MARKS and several else text)
+            elif published is not None and line.job is None:
+                cells.append(write(published) + PUBLISHED)
+            else:
+                cells.append("--")
+        columns.append(cells)
+    labels = (_label(line.label) for line in block.lines)
+    return [list(row) for row in zip(labels, *columns, strict=True)]
+
+
+def csv(tables: Sequence[PaperTable], measured: Lines) -> str:
+    """All tables as CSV, one figure a row, in the units of `steerbench results`: what was measured,
+    as the mean of so many runs with half of its 95 % interval, and what the paper has."""
+    rows = []
+    for table in tables:
+        known = {line.label: line for line in measured.get(table.name, ())}
+        for block in table.blocks:
+            for line in block.lines if block is table or _measured(block, known) else ():
+                found = known.get(line.label, Repeated(line.label, ()))
+                rows += [
+                    {
+                        "table": table.name,
+                        "line": line.label,
+                        "metric": metric,
+                        "measured": found.mean(metric),
+                        "half_interval": found.half(metric),
+                        "runs": len(found.runs),
+                        "published": line.published.get(metric),
+                    }
+                    for metric in table.metrics
+                ]
+    return pd.DataFrame(rows).to_csv(index=False)
+
+
+def _measured(block: PaperTable, known: Mapping[str, Repeated]) -> bool:
+    return any(line.label in known for line in block.lines)
+
+
+def _written(metric: str, value: float | None) -> str:
+    """A figure with the paper's decimals, bytes in MB."""
+    family = re.split(r"[._]", metric)[0]
+    if family == "size" and value is not None:
+        value /= 1e6
+    return decimal(value, DECIMALS.get(family, 0))
+
+
+def _label(label: str) -> str:
+    if found := SETTING.fullmatch(label):
+        power = f"^{{{found['power']}}}" if found["power"] else ""
+        return f"${found['name']} = {found['base']}{power}$"
+    return _escaped(label)
+
+
+def _escaped(text: str) -> str:
+    return text.translate(ESCAPES)

@@ -1,0 +1,114 @@
+"""The tables of the paper as LaTeX and as CSV."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+
+import pandas as pd
+import pytest
+
+from bench.results import Store
+from reports import export
+from reports.paper_tables import Line, PaperTable, paper_tables
+from reports.runs import Repeated, Run, load
+
+TABLE = PaperTable(
+    name="table9",
+    title="Quality & size",
+    published_on="Chair",
+    metrics=["psnr", "ssim", "size_bytes.total"],
+    lines=[
+        Line("T = 2^19", {"method": "a"}, {"psnr": 33.0}),
+        Line("K = 3", {"method": "b"}),
+        Line("mine_1", {"method": "c"}),
+        Line("elsewhere", None, {"size_bytes.total": 5e6}),
+        Line("not yet", {"method": "d"}, {"psnr": 30.0}),
+    ],
+    notes=[],
+)
+
+
+@pytest.fixture
+def lines(store: Store, stored_run: str) -> dict[str, list[Repeated]]:
+    """Three measured lines; two of them differ by less than the decimals show."""
+    (run,) = load(store, {stored_run: "run"})
+    figures = {
+        "T = 2^19": (30.456, 0.9512, 25.24e6),
+        "K = 3": (30.461, 0.9514, 25.0e6),
+        "mine_1": (29.0, 0.9, 3e6),
+    }
+    return {
+        "table9": [Repeated(label, [of(run, *values)]) for label, values in figures.items()],
+    }
+
+
+def of(run: Run, psnr: float, ssim: float, size: float) -> Run:
+    values = {"psnr": psnr, "ssim": ssim, "size_bytes.total": size}
+    rows = run.rows[run.rows["metric"].isin(values)].copy()
+    rows["value"] = rows["metric"].map(values)
+    return replace(run, rows=rows)
+
+
+def cells(text: str) -> dict[str, list[str]]:
+    """The figures of each line of a LaTeX table by its label."""
+    rows = [line.removesuffix(r" \\") for line in text.splitlines() if " & " in line]
+    return {
+        label.strip(): list(map(str.strip, row)) for label, *row in (r.split("&") for r in rows)
+    }
+
+
+def test_latex_has_the_decimals_of_the_paper_and_marks_the_best(
+    lines: dict[str, list[Repeated]],
+) -> None:
+    found = cells(export.latex([TABLE], lines))
+    # 0.9512 and 0.9514 are both .951: they share the first place.
+    assert found["$T = 2^{19}$"] == [r"\textbf{30.46}", r"\textbf{0.951}", "25.2"]
+    assert found["$K = 3$"] == [r"\textbf{30.46}", r"\textbf{0.951}", r"\underline{25.0}"]
+    assert found[r"mine\_1"] == [r"\underline{29.00}", r"\underline{0.900}", r"\textbf{3.0}"]
+
+
+def test_latex_has_published_figures_only_of_what_nothing_here_measures(
+    lines: dict[str, list[Repeated]],
+) -> None:
+    text = export.latex([TABLE], lines)
+    found = cells(text)
+    assert found["elsewhere"] == ["--", "--", r"5.0$^\dagger$"]
+    assert found["not yet"] == ["--", "--", "--"]
+    assert r"$^\dagger$Published figures" in text
+
+
+def test_latex_of_several_seeds_has_their_interval(lines: dict[str, list[Repeated]]) -> None:
+    (line, *_) = lines["table9"]
+    runs = [of(line.runs[0], psnr, 0.95, 1e6) for psnr in (29.0, 31.0)]
+    found = cells(export.latex([TABLE], {"table9": [replace(line, runs=runs)]}))
+    assert found["$T = 2^{19}$"][0] == r"30.00 $\pm$ 12.71"  # t(0.975, 1) = 12.71
+
+
+def test_latex_is_escaped_and_of_booktabs(lines: dict[str, list[Repeated]]) -> None:
+    text = export.latex([TABLE], lines)
+    assert r"\caption{Quality \& size." in text
+    for rule in ("toprule", "midrule", "bottomrule"):
+        assert text.count(f"\\{rule}") == 1
+    assert r"PSNR, dB $\uparrow$" in text
+    assert text.isascii()
+
+
+def test_a_rule_stands_before_what_is_beyond_the_paper(lines: dict[str, list[Repeated]]) -> None:
+    (table,) = (table for table in paper_tables() if table.name == "table5")
+    run = lines["table9"][0].runs[0]
+    labels = [line.label for block in table.blocks for line in block.lines]
+    both = export.latex([table], {"table5": [Repeated(label, [run]) for label in labels]})
+    first, second = both.split("\\midrule\n")[1:]
+    assert "lean" not in first
+    assert second.count("lean") == 2
+    alone = export.latex([table], {"table5": [Repeated(label, [run]) for label in labels[:2]]})
+    assert "lean" not in alone
+
+
+def test_csv_has_a_figure_a_row_as_it_was_measured(lines: dict[str, list[Repeated]]) -> None:
+    found = pd.read_csv(io.StringIO(export.csv([TABLE], lines)))
+    assert len(found) == len(TABLE.lines) * len(TABLE.metrics)
+    row = found.set_index(["line", "metric"]).loc[("T = 2^19", "psnr")]
+    assert (row["measured"], row["published"], row["runs"]) == (30.456, 33.0, 1)
+    assert pd.isna(row["half_interval"])
