@@ -31,8 +31,9 @@ demo: install ## build a scene, train on it, render it, write outputs/demo/repor
 paper: install ## measure every table of the SteerNeRF paper, write outputs/paper/report.md
 	@$(BIN)/steerbench paper $(PAPER_ARGS)
 
+# A process for each core, a file of tests in one of them, in the order of tests/conftest.py.
 test: lint ## lint, then all tests
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 fuzz: install ## loaders and settings on whatever comes, for some minutes
 	$(BIN)/python -m pytest --hypothesis-profile=fuzz tests/bench/scenes/test_fuzz.py tests/sweeps/test_fuzz.py

@@ -13,6 +13,10 @@ from pathlib import Path
 
 import hypothesis
 import pytest
+
+# Before torch starts its threads: tests are small, and other tests have the other cores.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import torch
 from torch import Tensor
 
@@ -35,6 +39,15 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # Set before anything imports Triton, which reads it once.
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"
+
+FIRST = "test_end_to_end.py"
+"""The file that takes longest: begun last, it would run alone in the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest file first."""
+    items.sort(key=lambda item: item.path.name != FIRST)
+
 
 DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
 
