@@ -201,20 +201,21 @@ def _frame_rows(frames: pd.DataFrame, protocol: EvaluationProtocol) -> list[dict
         blink = ["flicker"] if of_phase["flicker"].notna().any() else []
         parts = [name for name in map(str, frames) if name.startswith(("stage_ms.", "work."))]
         times = of_phase["frame_ms"]
-        ms = _mean("frame_ms", times)
+        ms = mean_row("frame_ms", times)
         found = [
-            *(_mean(name, of_phase[name]) for name in (*protocol.metric_names, *blink)),
+            *(mean_row(name, of_phase[name]) for name in (*protocol.metric_names, *blink)),
             ms,
             *(_single(f"frame_ms.p{part}", np.percentile(times, part)) for part in QUANTILES),
             {"metric": "fps", "n": ms["n"]} | _rate(ms),
-            *(_mean(name, of_phase[name]) for name in parts),
+            *(mean_row(name, of_phase[name]) for name in parts),
         ]
         rows += [row | {"phase": phase} for row in found]
     return rows
 
 
-def _mean(metric: str, values: pd.Series) -> dict[str, Any]:
-    """Mean over the frames that have a value, in the order of the path, and its interval."""
+def mean_row(metric: str, values: pd.Series) -> dict[str, Any]:
+    """A row of a metric: its mean over the frames that have a value, in the order of the path, and
+    the interval of that."""
     known = values.dropna().to_numpy(dtype=float)
     value = known.mean() if len(known) else math.nan
     half = path_interval(known)

@@ -69,7 +69,7 @@ class Scoring:
             figures["name"] = self._split.names[step.truth]
             figures |= self._protocol.score(rgb, truth, background, self._lpips)
             if index in self._shown:
-                self.images |= _pictures(index, rgb, composite(truth, background))
+                self.images |= kept_pictures(index, rgb, composite(truth, background))
         return figures | self._flicker(step, rgb)
 
     def _flicker(self, step: Step, rgb: Tensor) -> dict[str, float]:
@@ -91,7 +91,7 @@ class Scoring:
         return self._protocol.rounded(rgb), composite(truth.to(rgb.device), background)
 
 
-def _pictures(index: int, rgb: Tensor, truth: Tensor) -> dict[str, np.ndarray]:
+def kept_pictures(index: int, rgb: Tensor, truth: Tensor) -> dict[str, np.ndarray]:
     """Ground truth, rendering and error map of a frame, as 8-bit pictures by file name."""
     rendering, truth = quantise(rgb).cpu(), truth.cpu()
     error = (rendering - truth).abs().mean(dim=-1) / ERROR_RANGE

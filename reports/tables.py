@@ -100,14 +100,14 @@ def suffix(phase: str) -> str:
 
 
 def run_tables(rows: pd.DataFrame) -> list[Table]:
-    """The tables of one run: quality, time by stage and work (if any was counted) of each phase;
-    memory."""
+    """The tables of one run: quality, time by stage and work of each phase; memory. Of
+    pictures that nobody rendered here there is the quality alone."""
     tables = [
         table(of_phase, suffix(phase))
         for phase, of_phase in phases(rows)
         for table in (_quality, _time, _work)
     ]
-    return [*(table for table in tables if table.lines), _memory(rows)]
+    return [table for table in (*tables, _memory(rows)) if table.lines]
 
 
 def _values(rows: pd.DataFrame, prefix: str = "", column: str = "value") -> dict[str, float]:
@@ -133,6 +133,8 @@ def _quality(rows: pd.DataFrame, suffix: str) -> Table:
 
 def _time(rows: pd.DataFrame, suffix: str) -> Table:
     value, stages = _values(rows), _values(rows, "stage_ms.")
+    if "frame_ms" not in value:
+        return Table("Time", (), ())
     total = value["frame_ms"]
     lines = [(name, decimal(ms, 2), share(ms, total)) for name, ms in stages.items()]
     lines.append(("frame", decimal(total, 2), share(sum(stages.values()), total)))
@@ -159,6 +161,8 @@ def _work(rows: pd.DataFrame, suffix: str) -> Table:
 
 def _memory(rows: pd.DataFrame) -> Table:
     sizes = _values(rows, "size_bytes.")
+    if not sizes:
+        return Table("Memory", (), ())
     sizes["model"] = sizes.pop("total")
     sizes["peak, rendering"] = _values(rows)["peak_bytes"]
     lines = tuple((name, megabytes(size)) for name, size in sizes.items())

@@ -91,6 +91,19 @@ SMOOTH = "method=steernerf_lean trajectory=smooth"
 
 ARGUMENTS = {
     "paper": TABLES,
+    "score": [
+        *_one("pictures", help="the folder of the pictures", type=Path, metavar="PICTURES"),
+        *_one("--truth", help="the folder of the true ones", type=Path, metavar="DIR"),
+        *_one("--name", help="of the method in the rows (default that of the folder)"),
+        *_one(
+            "--match",
+            help="how a picture finds its truth (default name)",
+            choices=["name", "order"],
+            default="name",
+        ),
+        *_flag("--sequence", "the pictures follow one another: score the flicker, too"),
+        *_words("protocol=steerbench-1 scene=totem split=test"),
+    ],
     "pretrain": [
         *_count("--scenes", 8, "random scenes"),
         *_one(

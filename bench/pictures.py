@@ -1,0 +1,202 @@
+"""Pictures that exist already, from whatever program, scored as rendered frames are."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from bench.compositing import composite
+from bench.metrics import Lpips, check_size, flicker
+from bench.protocol import EvaluationProtocol
+from bench.results import STEADY, Measurement
+from bench.run import UNITS, mean_row
+from bench.scenes.files import unexpected
+from bench.scenes.images import decode_bytes
+from bench.scoring import PICTURES, kept_pictures
+from bench.trajectories import MIXED, spread
+from bench.types import BACKGROUNDS, Log, Split, SteerbenchError
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+"""Of the files that count as pictures; others in a folder are ignored."""
+
+NAMED = 5
+"""As many files are named in an error; of the rest their number."""
+
+Match = Literal["name", "order"]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """The file of a picture to be scored, and the name of its truth, which is a file, too, or uint8
+    [H, W, 3 or 4]."""
+
+    picture: Path
+    name: str
+    truth: Path | Tensor
+
+
+def pairs_with_folder(pictures: Path, truth: Path, match: Match = "name") -> list[Pair]:
+    """Each picture of the folder `truth` with its counterpart in the folder `pictures`.
+
+    Raises:
+        SteerbenchError: they do not match, see `matched`.
+    """
+    files = {path.stem: path for path in listed(truth)}
+    found = matched(pictures, list(files), match)
+    pairs = zip(found, files.values(), strict=True)
+    return [Pair(picture, path.name, path) for picture, path in pairs]
+
+
+def pairs_with_split(pictures: Path, split: Split, match: Match = "name") -> list[Pair]:
+    """Each picture of a `split` of a scene with its counterpart in the folder `pictures`.
+
+    Raises:
+        SteerbenchError: they do not match, see `matched`.
+    """
+    found = matched(pictures, [Path(name).stem for name in split.names], match)
+    known = zip(found, split.names, split.images, strict=True)
+    return [Pair(picture, name, image) for picture, name, image in known]
+
+
+def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
+    """The file of `folder` for each of `names`: of the same name without the ending, or in the same
+    order, where numbers in names count as numbers.
+
+    Raises:
+        SteerbenchError: a picture is missing, or there is one that belongs to none of `names`.
+    """
+    files = listed(folder)
+    if match == "order":
+        if len(files) != len(names):
+            raise unexpected(folder, f"{len(names)} pictures, as many as true ones", len(files))
+        return files
+    known = {path.stem: path for path in files}
+    missing = [name for name in names if name not in known]
+    further = sorted(known.keys() - set(names), key=_natural)
+    if missing or further:
+        advice = "; --match order takes both in their order" if len(files) == len(names) else ""
+        got = [f"none for {_some(missing)}"] if missing else []
+        got += [f"also {_some(further)}"] if further else []
+        raise unexpected(folder, "a picture for each true one", f"{', '.join(got)}{advice}")
+    return [known[name] for name in names]
+
+
+def listed(folder: Path) -> list[Path]:
+    """The pictures in a folder by their names, 10 after 9.
+
+    Raises:
+        SteerbenchError: there are none, or two that differ in the ending of their names alone.
+    """
+    if not folder.is_dir():
+        raise unexpected(folder, "a folder", "a file" if folder.exists() else "nothing there")
+    files = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+    files.sort(key=lambda path: _natural(path.name))
+    if not files:
+        raise unexpected(folder, f"pictures ({', '.join(SUFFIXES)})", "none")
+    stems = [path.stem for path in files]
+    if twice := sorted({stem for stem in stems if stems.count(stem) > 1}):
+        raise unexpected(folder, "one picture of a name", f"several of {_some(twice)}")
+    return files
+
+
+def read(path: Path) -> Tensor:
+    """The picture in a file, uint8 [H, W, 3 or 4].
+
+    Raises:
+        SteerbenchError: it is none, or damaged, or has more than 8 bits a channel.
+    """
+    try:
+        return decode_bytes(path.read_bytes(), path)
+    except OSError as error:
+        raise unexpected(path, "a readable picture", error) from error
+
+
+def score(
+    pairs: Sequence[Pair],
+    protocol: EvaluationProtocol,
+    lpips: Mapping[str, Lpips],
+    facts: Mapping[str, Any],
+    log: Log,
+    *,
+    sequence: bool = False,
+) -> Measurement:
+    """Score pictures under a protocol. Alpha is composited on the background of the protocol.
+
+    Args:
+        facts: method, scene and so on, for the rows.
+        sequence: they were taken one after the other: their flicker is scored, too.
+
+    Raises:
+        SteerbenchError: a picture cannot be read, or is not of the size of its truth.
+    """
+    background = torch.full((3,), BACKGROUNDS[protocol.background])
+    shown = spread(len(pairs), PICTURES)
+    frames: list[dict[str, Any]] = []
+    images: dict[str, np.ndarray] = {}
+    sizes, alphas = set(), 0
+    seen, last = hashlib.sha256(), None
+    with log.progress("scoring", len(pairs)) as progress:
+        for index, pair in enumerate(pairs):
+            picture = read(pair.picture)
+            truth = read(pair.truth) if isinstance(pair.truth, Path) else pair.truth
+            _check(pair, picture, truth, protocol)
+            for tensor in (picture, truth):
+                seen.update(tensor.numpy().tobytes())
+            alphas += picture.shape[2] == 4
+            rgb = composite(picture, background)
+            figures = protocol.score(rgb, truth, background, lpips)
+            now = protocol.rounded(rgb), composite(truth, background)
+            if sequence and last is not None and last[0].shape == now[0].shape:
+                figures["flicker"] = flicker(*now, *last)
+            last = now
+            frames.append({"frame": index, "name": pair.name, "phase": STEADY, **figures})
+            sizes.add(f"{rgb.shape[1]}x{rgb.shape[0]}")
+            if index in shown:
+                images |= kept_pictures(index, rgb, now[1])
+            progress.advance()
+    if alphas:
+        log.info(f"{alphas} pictures with an alpha channel were put on {protocol.background}")
+    table = pd.DataFrame(frames)
+    metrics = [*protocol.metric_names, *(["flicker"] if "flicker" in table else [])]
+    rows = pd.DataFrame([mean_row(metric, table[metric]) for metric in metrics]).assign(
+        unit=lambda of: [UNITS.get(name, "1") for name in of["metric"]],
+        phase=STEADY,
+        resolution=sizes.pop() if len(sizes) == 1 else MIXED,
+        protocol=protocol.name,
+        **facts,
+    )
+    record = {"protocol": asdict(protocol), "content": seen.hexdigest(), "with_alpha": alphas}
+    return Measurement(rows, table, images, record)
+
+
+def _check(pair: Pair, picture: Tensor, truth: Tensor, protocol: EvaluationProtocol) -> None:
+    if picture.shape[:2] != truth.shape[:2]:
+        wanted, got = (f"{image.shape[1]} x {image.shape[0]}" for image in (truth, picture))
+        raise unexpected(pair.picture, f"{wanted} pixels, as {pair.name} has", got)
+    for metric in protocol.metric_names:
+        if metric != "psnr":
+            try:
+                check_size(metric, picture.shape[1], picture.shape[0])
+            except SteerbenchError as error:
+                raise SteerbenchError(f"{pair.picture}: {error}") from error
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """A key that sorts numbers in names as numbers."""
+    return [
+        (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)
+    ]
+
+
+def _some(names: Sequence[str]) -> str:
+    further = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + further

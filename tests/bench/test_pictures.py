@@ -1,0 +1,164 @@
+"""Pictures of other programs: matched with their truth, read, and scored as frames are."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from bench import pictures
+from bench.protocol import EvaluationProtocol
+from bench.results import Store
+from bench.types import Log, Scene, Split, SteerbenchError
+
+QUICK = EvaluationProtocol(name="quick", lpips=())
+FACTS = {"method": "theirs", "scene": "a"}
+
+
+def write(folder: Path, images: dict[str, Tensor]) -> Path:
+    folder.mkdir()
+    for name, image in images.items():
+        Image.fromarray(image.numpy()).save(folder / name)
+    return folder
+
+
+def noise(channels: int = 3, size: tuple[int, int] = (16, 20), seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randint(256, (*size, channels), dtype=torch.uint8, generator=generator)
+
+
+def brighter(levels: int) -> tuple[Tensor, Tensor]:
+    """A grey picture, and one that is so many levels brighter."""
+    grey = torch.full((16, 20, 3), 100, dtype=torch.uint8)
+    return grey, grey + levels
+
+
+def test_the_psnr_is_that_of_the_difference_and_equal_pictures_have_none(
+    tmp_path: Path, quiet_log: Log
+) -> None:
+    truth, picture = brighter(10)
+    ours = write(tmp_path / "ours", {"a.png": picture, "b.png": truth})
+    true = write(tmp_path / "true", {"a.png": truth, "b.png": truth})
+    pairs = pictures.pairs_with_folder(ours, true)
+    found = pictures.score(pairs, QUICK, {}, FACTS, quiet_log)
+    assert found.frames["psnr"][0] == pytest.approx(20 * math.log10(255 / 10), abs=1e-5)
+    assert found.frames["psnr"][1] == math.inf
+    assert set(found.rows["metric"]) == {"psnr", "ssim"}
+    assert set(found.rows["resolution"]) == {"20x16"}
+
+
+def test_a_sequence_has_a_flicker_where_the_error_changes(tmp_path: Path, quiet_log: Log) -> None:
+    truth, picture = brighter(51)  # 0.2
+    ours = write(tmp_path / "ours", {"1.png": picture, "2.png": picture, "10.png": truth})
+    true = write(tmp_path / "true", {f"{number}.png": truth for number in (1, 2, 10)})
+    pairs = pictures.pairs_with_folder(ours, true)
+    found = pictures.score(pairs, QUICK, {}, FACTS, quiet_log, sequence=True)
+    assert math.isnan(found.frames["flicker"][0])
+    assert found.frames["flicker"][1:].tolist() == pytest.approx([0.0, 0.2], abs=1e-6)
+
+
+@pytest.mark.parametrize(("background", "level"), [("white", 255), ("black", 0)])
+def test_alpha_is_put_on_the_background_of_the_protocol(
+    tmp_path: Path, quiet_log: Log, background: str, level: int
+) -> None:
+    clear = torch.zeros(16, 20, 4, dtype=torch.uint8)
+    plain = torch.full((16, 20, 3), level, dtype=torch.uint8)
+    ours, true = write(tmp_path / "ours", {"a.png": clear}), write(tmp_path / "b", {"a.png": plain})
+    protocol = EvaluationProtocol(name="mine", lpips=(), background=background)
+    for pair in (ours, true), (true, ours):
+        found = pictures.score(pictures.pairs_with_folder(*pair), protocol, {}, FACTS, quiet_log)
+        assert found.frames["psnr"][0] == math.inf
+
+
+def test_names_match_without_their_endings_and_folders(tmp_path: Path, quiet_log: Log) -> None:
+    images = [noise(seed=number) for number in (9, 10)]
+    ours = write(tmp_path / "ours", {"r_9.bmp": images[0], "r_10.bmp": images[1]})
+    split = Split([], images, ["test/r_9.png", "test/r_10.png"])
+    found = pictures.score(pictures.pairs_with_split(ours, split), QUICK, {}, FACTS, quiet_log)
+    assert found.frames["psnr"].tolist() == [math.inf] * 2
+    assert found.frames["name"].tolist() == split.names
+
+
+def test_by_order_the_tenth_comes_after_the_ninth(tmp_path: Path) -> None:
+    ours = write(tmp_path / "ours", {f"{number}.png": noise() for number in range(11)})
+    true = write(tmp_path / "true", {f"r_{number}.png": noise() for number in range(11)})
+    pairs = pictures.pairs_with_folder(ours, true, "order")
+    assert [(pair.picture.stem, pair.name) for pair in pairs] == [
+        (str(number), f"r_{number}.png") for number in range(11)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (["a.png"], "none for b"),
+        (["a.png", "b.png", "c.png"], "also c"),
+        (["c.png", "d.png"], "none for a, b, also c, d; --match order"),
+        (["a.png", "a.jpg", "b.png"], "several of a"),
+        ([], "none"),
+    ],
+)
+def test_pictures_that_do_not_match_are_named(tmp_path: Path, names: list[str], said: str) -> None:
+    ours = write(tmp_path / "ours", dict.fromkeys(names, noise()))
+    true = write(tmp_path / "true", dict.fromkeys(["a.png", "b.png"], noise()))
+    with pytest.raises(SteerbenchError, match=said):
+        pictures.pairs_with_folder(ours, true)
+
+
+def test_another_number_has_no_order(tmp_path: Path) -> None:
+    ours = write(tmp_path / "ours", {"a.png": noise()})
+    true = write(tmp_path / "true", {"a.png": noise(), "b.png": noise()})
+    with pytest.raises(SteerbenchError, match="2 pictures, as many as true ones, got 1"):
+        pictures.pairs_with_folder(ours, true, "order")
+
+
+def test_another_size_is_refused_with_both_names(tmp_path: Path, quiet_log: Log) -> None:
+    ours = write(tmp_path / "ours", {"a.png": noise(size=(8, 10))})
+    true = write(tmp_path / "true", {"a.jpg": noise()})
+    pairs = pictures.pairs_with_folder(ours, true)
+    with pytest.raises(SteerbenchError, match=r"ours/a.png: expected 20 x 16 .* a.jpg .* 10 x 8"):
+        pictures.score(pairs, QUICK, {}, FACTS, quiet_log)
+
+
+def test_a_picture_too_small_for_a_metric_is_named(tmp_path: Path, quiet_log: Log) -> None:
+    tiny = {"a.png": noise(size=(8, 10))}
+    pairs = pictures.pairs_with_folder(write(tmp_path / "x", tiny), write(tmp_path / "y", tiny))
+    with pytest.raises(SteerbenchError, match=r"x/a.png: ssim needs"):
+        pictures.score(pairs, QUICK, {}, FACTS, quiet_log)
+
+
+def test_a_picture_that_is_cut_is_named(tmp_path: Path, quiet_log: Log) -> None:
+    ours = write(tmp_path / "ours", {"a.png": noise()})
+    true = write(tmp_path / "true", {"a.png": noise()})
+    whole = (ours / "a.png").read_bytes()
+    (ours / "a.png").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(SteerbenchError, match=r"ours/a.png: expected a whole picture"):
+        pictures.score(pictures.pairs_with_folder(ours, true), QUICK, {}, FACTS, quiet_log)
+
+
+def test_what_a_run_rendered_has_its_figures_to_the_last_digit(
+    store: Store, stored_run: str, tiny_scene: Scene, tmp_path: Path, quiet_log: Log
+) -> None:
+    kept = sorted((store.folder / stored_run / "pictures").glob("*-rendered.png"))
+    measured = store.frames(stored_run).set_index("frame")
+    measured = measured.loc[[int(path.stem.partition("-")[0]) for path in kept]]
+    images = {f"{name}.png": noise() for name in measured["name"]}
+    folder = write(tmp_path / "theirs", images)
+    for path, name in zip(kept, images, strict=True):
+        (folder / name).write_bytes(path.read_bytes())
+    split = tiny_scene.splits["test"]
+    truths = dict(zip(split.names, split.images, strict=True))
+    names = list(measured["name"])
+    pairs = pictures.pairs_with_split(folder, Split([], [truths[name] for name in names], names))
+    found = pictures.score(pairs, QUICK, {}, FACTS, quiet_log).frames
+    for metric in ("psnr", "ssim"):
+        assert found[metric].tolist() == measured[metric].tolist()
+
+
+def test_no_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SteerbenchError, match="expected a folder, got nothing there"):
+        pictures.listed(tmp_path / "nowhere")
