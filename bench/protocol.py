@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cache
 from pathlib import Path
 
 import torch
@@ -143,7 +144,14 @@ class EvaluationProtocol:
 
 def _weights_digest(net: str, weights_dir: Path | None, log: Log) -> str | None:
     try:
-        with locate(net, weights_dir, log).open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        path = locate(net, weights_dir, log)
     except Unavailable:
         return None
+    return _digest(path, path.stat().st_mtime_ns)
+
+
+@cache
+def _digest(path: Path, changed: int) -> str:
+    """SHA-256 of a file as it is since it was `changed`."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

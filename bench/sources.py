@@ -56,6 +56,24 @@ def sources(*things: Any) -> dict[str, Path]:
     Returns:
         Their paths by name, which begins with the top-level package, wherever that lies.
     """
+    known = _known.get((ROOT, things))
+    if known is None or _times(known[0]) != known[1]:
+        found = _found(*things)
+        known = _known[ROOT, things] = found, _times(found)
+    return known[0]
+
+
+_known: dict[tuple[Path, tuple[Any, ...]], tuple[dict[str, Path], list[int]]] = {}
+"""What `sources` found, and when these files and their folders were changed last: a sweep asks for
+the same things again and again."""
+
+
+def _times(files: dict[str, Path]) -> list[int]:
+    places = {*files.values(), *(path.parent for path in files.values())}
+    return [path.stat().st_mtime_ns if path.exists() else 0 for path in sorted(places)]
+
+
+def _found(*things: Any) -> dict[str, Path]:
     found: dict[str, Path] = {}
     pending = {
         name: path for thing in things for name, path in _files(thing.__module__, home=True).items()

@@ -105,7 +105,7 @@ def obtain_in_turns(
     ready = [_Ready.of(config, command, turns, log) for config, command in jobs]
     for one in ready:
         if one.stored:
-            log.info(f"already measured; to measure again, remove {one.store.folder / one.run}")
+            one.say_stored(log)
     missing = [one for one in ready if not one.stored]
     if missing:
         with device_lock(missing[0].method.settings()["device"], log):
@@ -122,12 +122,18 @@ def obtain_in_turns(
     return [Obtained(one.store, one.run, one.run in measured) for one in ready]
 
 
-def stored(config: DictConfig, command: Sequence[str], turns: str = "") -> bool:
-    """Whether `obtain_in_turns` would find this job in the store.
+def stored(config: DictConfig, command: Sequence[str], turns: str = "") -> Obtained | None:
+    """What `obtain_in_turns` would find of this job in the store, if anything.
 
     Raises as `obtain` does.
     """
-    return _Ready.of(config, command, turns, ConsoleLog(Path(config.outputs))).stored
+    log = ConsoleLog(Path(config.outputs))
+    ready = _Ready.of(config, command, turns, log)
+    if not ready.stored:
+        return None
+    ready.say_stored(log)
+    failures.forget(Path(config.outputs), described(config))
+    return Obtained(ready.store, ready.run, measured=False)
 
 
 def trained(config: DictConfig, log: Log) -> Method:
@@ -175,6 +181,9 @@ class _Ready:
     @property
     def stored(self) -> bool:
         return self.store.find(self.run) is not None
+
+    def say_stored(self, log: Log) -> None:
+        log.info(f"already measured; to measure again, remove {self.store.folder / self.run}")
 
     def keep(self, measurement: Measurement) -> None:
         """Put it into the store, with where it comes from."""
@@ -287,11 +296,12 @@ def _folder(config: DictConfig) -> str | None:
 
 def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any]:
     """Everything that can change the rows, except for the weights of LPIPS: a run's key."""
-    things = [measure_in_turns, *_targets(described(config))]
+    settings = described(config)
+    things = [measure_in_turns, *_targets(settings)]
     return {
         "code": digest(*things),
         "libraries": libraries(*things),
-        "config": described(config),
+        "config": settings,
         "scene": scene.digest,
         "resolved": method.settings(),
         "threads": torch.get_num_threads(),

@@ -18,10 +18,11 @@ from reports.paper_page import write_paper_page
 from sweeps.data_sets import DataSet, find
 from sweeps.gather import gather, newest
 from sweeps.jobs import attempt_in_turns, say, time_left
+from sweeps.measurement import Obtained, stored
 from sweeps.overrides import composed
 from sweeps.plan import Planned, chosen, plan
 from sweeps.terminal import console, show
-from sweeps.train_ahead import train_ahead
+from sweeps.train_ahead import room, train_ahead
 
 DATA = "data="
 """How the word begins that names the folder of a data set."""
@@ -80,25 +81,40 @@ def _run(jobs: Sequence[Planned]) -> int:
     of_scenes: dict[str, list[Planned]] = {}
     for job in jobs:
         of_scenes.setdefault(job.scene, []).append(job)
-    begun, measured, failed, ended = time.monotonic(), 0, 0, 0
+    seconds, measured, failed, ended = 0.0, 0, 0, 0
     for together in of_scenes.values():
-        train_ahead(together)
+        there: dict[str, Obtained] = {}
+        if room(together[0].config) > 1:  # or else each job is looked up when its turn comes
+            there = {job.key: found for job in together if (found := _stored(job))}
+            train_ahead([job for job in together if job.key not in there])
         seeds = list(dict.fromkeys(job.config.seed for job in together))
         for group in _groups(sorted(together, key=lambda job: seeds.index(job.config.seed))):
             for number, job in enumerate(group, ended + 1):
                 print(f"{number} of {len(jobs)}, {job.name}", file=sys.stderr)
             ended += len(group)
+            begun = time.monotonic()
             try:
-                wanted = [(job.config, job.command, job.name) for job in group]
-                obtained = attempt_in_turns(wanted, group[0].turns)
+                obtained = [there[job.key] for job in group if job.key in there]
+                if len(obtained) < len(group):
+                    wanted = [(job.config, job.command, job.name) for job in group]
+                    obtained = attempt_in_turns(wanted, group[0].turns)
             except Exception:  # which `attempt_in_turns` has printed: the other jobs still run
                 failed += len(group)
                 continue
             measured += sum(of_job.measured for of_job in obtained)
-            left = time_left(time.monotonic() - begun, measured, len(jobs) - ended)
+            seconds += time.monotonic() - begun
+            left = time_left(seconds, measured, len(jobs) - ended)
             for job, of_job in zip(group, obtained, strict=True):
                 say(of_job, job.name, left)
     return failed
+
+
+def _stored(job: Planned) -> Obtained | None:
+    """What the store has of `job`; nothing of one that cannot even begin: measuring it says why."""
+    try:
+        return stored(job.config, job.command, job.turns)
+    except SteerbenchError:
+        return None
 
 
 def _groups(jobs: Sequence[Planned]) -> list[list[Planned]]:

@@ -17,13 +17,12 @@ import torch
 from omegaconf import DictConfig
 
 from bench.console import ConsoleLog
-from bench.errors import SteerbenchError
 from bench.results import content_key
 from sweeps.build import build
 from sweeps.device_lock import device_lock
 from sweeps.failures import reason
 from sweeps.jobs import time_left
-from sweeps.measurement import described, stored, trained
+from sweeps.measurement import described, trained
 from sweeps.plan import Planned
 
 CHOSEN_AFTERWARDS = {"engine", "precision", "protocol", "rendering", "after"}
@@ -31,19 +30,17 @@ CHOSEN_AFTERWARDS = {"engine", "precision", "protocol", "rendering", "after"}
 
 
 def train_ahead(jobs: Sequence[Planned]) -> None:
-    """Do the trainings of `jobs`, which share their budget, if there is room for several at a time.
+    """Do the trainings of `jobs`, which share their budget, as many at a time as there is room for.
 
     They are found again when the jobs are measured. What fails here fails there once more, and is
     reported then.
     """
-    workers = _room(jobs[0].config)
-    if workers < 2:
-        return
     todo: dict[str, Planned] = {}
-    for job in filter(_missing, jobs):
+    for job in jobs:
         todo.setdefault(_training(job.config), job)
     if len(todo) < 2:
         return
+    workers = room(jobs[0].config)
     log = ConsoleLog(Path(jobs[0].config.outputs))
     log.info(f"training {len(todo)} models, {workers} at a time")
     begun = time.monotonic()
@@ -54,7 +51,7 @@ def train_ahead(jobs: Sequence[Planned]) -> None:
             print(f"{_said(ended)}: {names[ended]}{left}", file=sys.stderr)
 
 
-def _room(config: DictConfig) -> int:
+def room(config: DictConfig) -> int:
     """How many trainings the cores have room for; 1 on a GPU, or where the budget does not say how
     many threads one has."""
     threads = build(config, "budget").threads
@@ -62,15 +59,6 @@ def _room(config: DictConfig) -> int:
         config.device == "auto" and torch.cuda.is_available()
     )
     return 1 if on_gpu or threads is None else len(os.sched_getaffinity(0)) // threads
-
-
-def _missing(job: Planned) -> bool:
-    """Whether the store lacks the run of `job`; of one that cannot even begin it need not be known,
-    because that will be reported when it is measured."""
-    try:
-        return not stored(job.config, job.command, job.turns)
-    except SteerbenchError:
-        return False
 
 
 def _training(config: DictConfig) -> str:

@@ -46,7 +46,7 @@ def test_there_are_as_many_at_a_time_as_cores_have_room_for(
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(6)))
     config = composed([f"budget.threads={threads}", f"device={device}"])
-    assert train_ahead._room(config) == together
+    assert train_ahead.room(config) == together
 
 
 def test_a_failed_training_says_why() -> None:
