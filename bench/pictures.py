@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 
 from bench.compositing import composite
-from bench.metrics import Lpips, check_size, flicker
+from bench.metrics import Lpips, check_size
 from bench.protocol import EvaluationProtocol
 from bench.results import STEADY, Measurement
 from bench.run import UNITS, mean_row
 from bench.scenes.files import unexpected
-from bench.scenes.images import decode_bytes
-from bench.scoring import PICTURES, kept_pictures
+from bench.scenes.images import contents, decode_bytes
+from bench.scoring import PICTURES, Flicker, kept_pictures
 from bench.trajectories import MIXED, spread
 from bench.types import BACKGROUNDS, Log, Split, SteerbenchError
 
@@ -114,10 +114,7 @@ def read(path: Path) -> Tensor:
     Raises:
         SteerbenchError: it is none, or damaged, or has more than 8 bits a channel.
     """
-    try:
-        return decode_bytes(path.read_bytes(), path)
-    except OSError as error:
-        raise unexpected(path, "a readable picture", error) from error
+    return decode_bytes(contents(path), path)
 
 
 def score(
@@ -143,7 +140,7 @@ def score(
     frames: list[dict[str, Any]] = []
     images: dict[str, np.ndarray] = {}
     sizes, alphas = set(), 0
-    seen, last = hashlib.sha256(), None
+    seen, blinking = hashlib.sha256(), Flicker()
     with log.progress("scoring", len(pairs)) as progress:
         for index, pair in enumerate(pairs):
             picture = read(pair.picture)
@@ -155,9 +152,8 @@ def score(
             rgb = composite(picture, background)
             figures = protocol.score(rgb, truth, background, lpips)
             now = protocol.rounded(rgb), composite(truth, background)
-            if sequence and last is not None and last[0].shape == now[0].shape:
-                figures["flicker"] = flicker(*now, *last)
-            last = now
+            if sequence:
+                figures |= blinking.since_last(now)
             frames.append({"frame": index, "name": pair.name, "phase": STEADY, **figures})
             sizes.add(f"{rgb.shape[1]}x{rgb.shape[0]}")
             if index in shown:

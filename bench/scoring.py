@@ -39,6 +39,23 @@ def check_frame(frame: Frame, camera: Camera, method: str, index: int) -> None:
         )
 
 
+class Flicker:
+    """Scores frames against the one before, which it keeps."""
+
+    def __init__(self) -> None:
+        self._last: tuple[Tensor, Tensor] | None = None
+
+    def since_last(
+        self, frame: tuple[Tensor, Tensor] | None, cut: bool = False
+    ) -> dict[str, float]:
+        """The flicker of a frame and its truth, both [H, W, 3], since the frame before, where both
+        have a true picture of the same size; none after a `cut`."""
+        last, self._last = self._last, frame
+        if cut or last is None or frame is None or last[0].shape != frame[0].shape:
+            return {}
+        return {"flicker": flicker(*frame, *last)}
+
+
 class Scoring:
     """Scores the frames of a trajectory in their order; keeps the last one for the flicker.
 
@@ -59,7 +76,7 @@ class Scoring:
         self._split = scene.splits[trajectory.split]
         scored = [index for index, step in enumerate(trajectory.steps) if step.truth is not None]
         self._shown = {scored[i] for i in spread(len(scored), PICTURES)}
-        self._last: tuple[Tensor, Tensor] | None = None
+        self._flicker = Flicker()
 
     def score(self, index: int, step: Step, rgb: Tensor) -> dict[str, Any]:
         """Name and metrics of frame `index`, rendered as `rgb` [H, W, 3]; none without a truth."""
@@ -70,14 +87,7 @@ class Scoring:
             figures |= self._protocol.score(rgb, truth, background, self._lpips)
             if index in self._shown:
                 self.images |= kept_pictures(index, rgb, composite(truth, background))
-        return figures | self._flicker(step, rgb)
-
-    def _flicker(self, step: Step, rgb: Tensor) -> dict[str, float]:
-        """The flicker since the frame before, where both have a true picture of the same size."""
-        last, self._last = self._last, self._with_truth(step, rgb)
-        if step.cut or last is None or self._last is None or last[0].shape != rgb.shape:
-            return {}
-        return {"flicker": flicker(*self._last, *last)}
+        return figures | self._flicker.since_last(self._with_truth(step, rgb), step.cut)
 
     def _with_truth(self, step: Step, rgb: Tensor) -> tuple[Tensor, Tensor] | None:
         """The frame as it is scored and its true picture, both [H, W, 3]."""

@@ -9,12 +9,9 @@ from functools import partial
 import pandas as pd
 
 from reports.comparison import conditions_of, metric_format, ranks
-from reports.paper_tables import PaperTable
+from reports.paper_tables import Lines, PaperTable
 from reports.runs import Repeated
 from reports.tables import decimal
-
-Lines = Mapping[str, Sequence[Repeated]]
-"""The measured lines of each table, by the name of the table."""
 
 DECIMALS = {"psnr": 2, "ssim": 3, "lpips": 3, "fps": 2, "frame": 2, "stage": 2, "size": 1}
 """With how many the paper prints a metric, by the first part of its name."""
@@ -55,7 +52,7 @@ def latex(tables: Sequence[PaperTable], measured: Lines) -> str:
 
 def _latex(table: PaperTable, lines: Sequence[Repeated]) -> str:
     known = {line.label: line for line in lines}
-    blocks = [block for block in table.blocks if block is table or _measured(block, known)]
+    blocks = table.shown(known)
     heads = ["", *(_escaped(metric_format(metric)[0]) for metric in table.metrics)]
     rows = [row for block in blocks for row in _rows(block, known)]
     runs = [run for line in lines for run in line.runs]
@@ -105,8 +102,8 @@ def csv(tables: Sequence[PaperTable], measured: Lines) -> str:
     rows = []
     for table in tables:
         known = {line.label: line for line in measured.get(table.name, ())}
-        for block in table.blocks:
-            for line in block.lines if block is table or _measured(block, known) else ():
+        for block in table.shown(known):
+            for line in block.lines:
                 found = known.get(line.label, Repeated(line.label, ()))
                 rows += [
                     {
@@ -121,10 +118,6 @@ def csv(tables: Sequence[PaperTable], measured: Lines) -> str:
                     for metric in table.metrics
                 ]
     return pd.DataFrame(rows).to_csv(index=False)
-
-
-def _measured(block: PaperTable, known: Mapping[str, Repeated]) -> bool:
-    return any(line.label in known for line in block.lines)
 
 
 def _written(metric: str, value: float | None) -> str:

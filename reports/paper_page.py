@@ -16,16 +16,13 @@ from bench.errors import explained
 from reports import figures
 from reports.images import frame_section, kept_frames
 from reports.outliers import Outlier, outlier_table
-from reports.paper_tables import SHARES, PaperTable, section
+from reports.paper_tables import SHARES, Lines, PaperTable, section
 from reports.publish import add_picture, publish
-from reports.runs import Repeated, Run
+from reports.runs import Run
 
 PAGE: Mapping[str, Any] = tomllib.loads(
     (Path(__file__).parent / "paper" / "page.toml").read_text(encoding="utf-8")
 )
-
-Lines = Mapping[str, Sequence[Repeated]]
-"""The measured lines of each table, by the name of the table."""
 
 
 def write_paper_page(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -22,6 +22,10 @@ AFTER, SHARES = "method.after", (0.125, 0.25, 0.5)
 end."""
 ABSENT = "–"
 """In place of a figure that the paper does not give or that nothing here can measure."""
+
+
+Lines = Mapping[str, Sequence[Repeated]]
+"""The measured lines of each table, by the name of the table."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,15 @@ class PaperTable:
         """The table, and the one of the method beyond the paper, where there is one."""
         return [self, self._of_beyond()] if self.beyond else [self]
 
+    def shown(self, measured: Container[str]) -> list[PaperTable]:
+        """The blocks to show where the lines with the labels `measured` are there: a budget may
+        leave out the method beyond the paper."""
+        return [
+            block
+            for block in self.blocks
+            if block is self or any(line.label in measured for line in block.lines)
+        ]
+
     def _of_beyond(self) -> PaperTable:
         """The lines of the paper's method, and the trends, for the method `beyond`."""
         jobs = {
@@ -165,12 +178,10 @@ def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
 def section(table: PaperTable, lines: Sequence[Repeated]) -> str:
     """A table as a part of a page: the paper's, the lines of a method beyond it, each scene."""
     measured = {line.label: line for line in lines}
-    first, *further = table.blocks
+    first, *further = table.shown(measured)
     heading = f"## {table.number}: {table.title}"
     parts = [heading, *_block(first, measured, f"Paper: {table.published_on}.")]
     for block in further:
-        if not any(line.label in measured for line in block.lines):
-            continue  # the budget leaves them out
         parts += [f"### {block.title}", *_block(block, measured)]
     if table.scenes and len({scene for line in lines for scene in line.by_scene}) > 1:
         parts.append(scene_table(table.scenes, lines).section(level=3))

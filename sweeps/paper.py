@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -93,13 +93,9 @@ def _run(jobs: Sequence[Planned]) -> int:
                 print(f"{number} of {len(jobs)}, {job.name}", file=sys.stderr)
             ended += len(group)
             begun = time.monotonic()
-            try:
-                obtained = [there[job.key] for job in group if job.key in there]
-                if len(obtained) < len(group):
-                    wanted = [(job.config, job.command, job.name) for job in group]
-                    obtained = attempt_in_turns(wanted, group[0].turns)
-            except Exception:  # which `attempt_in_turns` has printed: the other jobs still run
-                failed += len(group)
+            obtained = _obtained(group, there)
+            failed += len(group) - len(obtained)
+            if not obtained:
                 continue
             measured += sum(of_job.measured for of_job in obtained)
             seconds += time.monotonic() - begun
@@ -107,6 +103,18 @@ def _run(jobs: Sequence[Planned]) -> int:
             for job, of_job in zip(group, obtained, strict=True):
                 say(of_job, job.name, left)
     return failed
+
+
+def _obtained(group: Sequence[Planned], there: Mapping[str, Obtained]) -> list[Obtained]:
+    """What is `there` of all jobs of a group, by their keys, or else is measured now; nothing if
+    that fails."""
+    if all(job.key in there for job in group):
+        return [there[job.key] for job in group]
+    try:
+        wanted = [(job.config, job.command, job.name) for job in group]
+        return attempt_in_turns(wanted, group[0].turns)
+    except Exception:  # which `attempt_in_turns` has printed: the other jobs still run
+        return []
 
 
 def _stored(job: Planned) -> Obtained | None:

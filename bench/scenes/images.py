@@ -78,10 +78,7 @@ def decode_all(views: Sequence[View], downscale: int, log: Log) -> list[Picture]
 
 def decode(view: View, downscale: int) -> Picture:
     """One view as a pinhole picture at 1 / downscale of its resolution."""
-    try:
-        content = view.path.read_bytes()
-    except OSError as error:
-        raise unexpected(view.path, "a readable picture", error) from error
+    content = contents(view.path)
     image = decode_bytes(content, view.path)
     camera = view.camera
     if image.shape[:2] != (camera.height, camera.width):
@@ -91,6 +88,14 @@ def decode(view: View, downscale: int) -> Picture:
         image, camera = undistort(image, camera, view.distortion, view.path)
     image, camera = shrink(image, camera, downscale, view.path)
     return Picture(image, camera, hashlib.sha256(content).hexdigest())
+
+
+def contents(path: Path) -> bytes:
+    """The bytes of a picture's file."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise unexpected(path, "a readable picture", error) from error
 
 
 def decode_bytes(content: bytes, path: Path) -> Tensor:
