@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -298,12 +299,14 @@ def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any
     """Everything that can change the rows, except for the weights of LPIPS: a run's key."""
     settings = described(config)
     things = [measure_in_turns, *_targets(settings)]
+    read = [file for file in getattr(method, "reads", ()) if file.is_file()]
     return {
         "code": digest(*things),
         "libraries": libraries(*things),
         "config": settings,
         "scene": scene.digest,
         "resolved": method.settings(),
+        "files": [hashlib.sha256(file.read_bytes()).hexdigest() for file in read],
         "threads": torch.get_num_threads(),
         "machine": decisive(),
     }

@@ -25,7 +25,7 @@ from sweeps.jobs import time_left
 from sweeps.measurement import described, trained
 from sweeps.plan import Planned
 
-CHOSEN_AFTERWARDS = {"engine", "precision", "protocol", "rendering", "after"}
+CHOSEN_AFTERWARDS = {"engine", "precision", "protocol", "rendering", "after", "stored"}
 """Settings of a run and of its method that no training depends on."""
 
 

@@ -31,6 +31,7 @@ STANDS_ON = {
     "rendering": {"kernels"},
     "training": {"kernels"},
     "instant_ngp": {"kernels", "rendering", "training"},
+    "gaussians": {"kernels", "rendering", "training", "instant_ngp"},
     "steernerf": {"kernels", "engines", "rendering", "training", "instant_ngp"},
 }
 """The folders of `methods` from which each may import, beside itself; `methods/checks.py` stands

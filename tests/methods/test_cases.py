@@ -80,13 +80,22 @@ def test_every_kernel_has_cases_for_all_its_backends(kernel: str) -> None:
     }
 
 
+NAMES = {
+    "adam": "sparse_adam_",
+    "gaussian_blending": "blend",
+    "gaussian_projection": "project_gaussians",
+    "spherical": "spherical_harmonics",
+}
+"""What a kernel is called where it is not called as its folder."""
+
+
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_backends_have_the_same_signature(kernel: str) -> None:
     folder = Path(methods.kernels.__file__).parent / kernel
     usable = [name for name in BACKENDS if not availability()[name]]
     names = [path.stem for path in folder.glob("*.py") if path.stem in usable]
     assert {"reference", "cpu"} <= set(names)
-    public = {"adam": "sparse_adam_", "spherical": "spherical_harmonics"}.get(kernel, kernel)
+    public = NAMES.get(kernel, kernel)
     signatures = {
         inspect.signature(
             getattr(importlib.import_module(f"methods.kernels.{kernel}.{name}"), public)

@@ -1,4 +1,4 @@
-"""Real spherical harmonics of view directions, degrees 0 to 3: 16 values."""
+"""Real spherical harmonics of view directions, degrees 0 to 3, and colours made of them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from bench.types import check_shape
 from methods.kernels.dispatch import implementation
 
 CHANNELS = 16
+SIZES = (1, 4, 9, 16)
+"""Numbers of harmonics up to a degree."""
 
 
 def spherical_harmonics(directions: Tensor, *, backend: str = "auto") -> Tensor:
@@ -18,3 +20,25 @@ def spherical_harmonics(directions: Tensor, *, backend: str = "auto") -> Tensor:
     """
     check_shape("directions", directions, None, 3)
     return implementation("spherical", backend, directions.device).spherical_harmonics(directions)
+
+
+def shade(coefficients: Tensor, directions: Tensor, *, backend: str = "auto") -> Tensor:
+    """Sums of harmonics [N, 3]: of each direction, weighted with its own coefficients.
+
+    Differentiable in the coefficients; in the directions with backend="reference" only.
+
+    Args:
+        coefficients: [N, C, 3], of the first C harmonics in the order of `spherical_harmonics`;
+            C is 1, 4, 9 or 16, for degrees up to 0, 1, 2 or 3.
+        directions: [N, 3], unit vectors.
+
+    Raises:
+        ValueError: a shape other than these; backend "cpu": not float32.
+    """
+    check_shape("coefficients", coefficients, len(directions), None, 3)
+    check_shape("directions", directions, None, 3)
+    if coefficients.shape[1] not in SIZES:
+        raise ValueError(
+            f"coefficients: expected one of {SIZES} a colour, got {list(coefficients.shape)}"
+        )
+    return implementation("spherical", backend, directions.device).shade(coefficients, directions)

@@ -31,3 +31,9 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
         sqrt(35 / (32 * pi)) * x * (xx - 3 * yy),
     )
     return torch.stack(values, dim=-1)
+
+
+def shade(coefficients: Tensor, directions: Tensor) -> Tensor:
+    """See `methods.kernels.spherical.shade`."""
+    basis = spherical_harmonics(directions)[:, : coefficients.shape[1]]
+    return (basis[:, :, None] * coefficients).sum(dim=1)

@@ -1,0 +1,168 @@
+"""3D Gaussian Splatting, as a `bench.types.Method`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from bench.cameras import place_camera
+from bench.provenance import decisive
+from bench.sources import digest, libraries
+from bench.study import Study, Variant
+from bench.threads import torch_threads
+from bench.types import Budget, Camera, Frame, Log, Probe, Scene
+from methods.gaussians import ply
+from methods.gaussians.model import Gaussians
+from methods.gaussians.start import anywhere, on_surfaces, spacing
+from methods.gaussians.storage import rounded, stored_bytes
+from methods.gaussians.training import Fitting, GaussianTraining
+from methods.instant_ngp.field import Precision
+from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
+from methods.instant_ngp.training import TrainingOptions
+from methods.kernels.composite import STOP, check_stop
+from methods.kernels.encode import HashGrid
+from methods.rendering.frame import FeatureFrame
+from methods.training import loop
+
+
+class GaussianSplatting:
+    """3D Gaussians, whose number is a setting. A training leaves them as a PLY file, too.
+
+    Args:
+        grid, training, precision: of the field that they start from; shared with every method that
+            trains it in the same way.
+        count: number of Gaussians.
+        degree: of the spherical harmonics of a colour, 0 to 3.
+        start: "field": on the surfaces of a trained Instant-NGP field; "scratch": anywhere.
+        fitting: how they learn, in `budget.renderer_steps` steps.
+        checkpoint: a PLY file to show instead of training, in the coordinates of the data set.
+        stored: "fp32", or "int8": rounded after the training, means to 16 bits and all else to 8.
+        stop: transmittance at which a pixel ends, less than 1.
+        name: as it stands in result rows.
+    """
+
+    memory = 0
+    study = Study(
+        knobs={
+            "stop": [
+                Variant(f"stop {stop}", (f"method.stop={stop}",))
+                for stop in ("1e-1", "1e-2", "1e-3")
+            ],
+            "stored": [Variant("stored int8", ("method.stored=int8",))],
+        },
+        exact=("method.stop=1e-4", "method.stored=fp32"),
+    )
+
+    def __init__(
+        self,
+        *,
+        grid: HashGrid,
+        training: TrainingOptions,
+        fitting: Fitting,
+        count: int,
+        degree: int = 3,
+        start: Literal["field", "scratch"] = "field",
+        checkpoint: str | None = None,
+        stored: Literal["fp32", "int8"] = "fp32",
+        stop: float = STOP,
+        precision: Precision = "bf16",
+        name: str = "gaussians",
+        backend: str = "auto",
+        device: str = "auto",
+        seed: int = 0,
+    ) -> None:
+        if count < 1 or degree not in range(4):
+            raise ValueError(f"expected count >= 1 and degree 0 to 3, got {count} and {degree}")
+        check_stop(stop)
+        self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
+        self.fitting, self.count, self.degree, self.start = fitting, count, degree, start
+        self.stored, self.stop, self.name = stored, stop, name
+        self.reads = [] if checkpoint is None else [Path(checkpoint)]
+        self.train_s = 0.0
+
+    def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
+        """Train field and Gaussians, or load what the same trainings, or others, left behind."""
+        if self.reads:
+            gaussians = ply.read(self.reads[0], scene).to(self.setup.device)
+        else:
+            with torch_threads(budget.threads):
+                gaussians = self._trained(scene, budget, log)
+        self.gaussians = gaussians if self.stored == "fp32" else rounded(gaussians)
+        self.background = scene.background.to(self.setup.device)
+
+    def _trained(self, scene: Scene, budget: Budget, log: Log) -> Gaussians:
+        setup, key, field = self.setup, self._key(scene, budget), None
+        if self.start == "field":
+            field = train_field(setup, scene, budget, log)
+            key["field"] = setup.key(scene, budget)
+        finished = log.stage_dir("gaussians", key) / "gaussians.safetensors"
+        gaussians = self._untrained(field, scene, finished.exists())
+        work = GaussianTraining(
+            gaussians, scene, budget.renderer_steps, self.fitting, setup.backend, setup.seed
+        )
+        loop.train(work, finished, "gaussians", log)
+        self.train_s = work.seconds + (0.0 if field is None else field.train_s)
+        exported = finished.with_suffix(".ply")
+        if not exported.exists():
+            ply.write(gaussians, scene, exported)
+            log.info(f"Gaussians for other programs: {exported}")
+        return gaussians
+
+    def _untrained(self, field: TrainedField | None, scene: Scene, blank: bool) -> Gaussians:
+        """What the training begins with; with `blank`, only of the same shape."""
+        setup = self.setup
+        generator = torch.Generator(setup.device).manual_seed(setup.seed)
+        if blank:
+            points = colours = torch.zeros(self.count, 3, device=setup.device)
+            scales = torch.ones(self.count, device=setup.device)
+        else:
+            points, colours = (
+                anywhere(scene, self.count, generator)
+                if field is None
+                else on_surfaces(field, setup.training.march, scene, self.count, generator)
+            )
+            scales = self.fitting.size * spacing(points)
+        return Gaussians.at(points, colours, scales, self.fitting.opacity, self.degree)
+
+    def _key(self, scene: Scene, budget: Budget) -> dict[str, object]:
+        """Everything the Gaussians depend on, beside the field that they start from."""
+        return {
+            "scene": scene.digest,
+            "steps": budget.renderer_steps,
+            "fitting": asdict(self.fitting),
+            "count": self.count,
+            "degree": self.degree,
+            "start": self.start,
+            "backend": self.setup.backend,
+            "device": self.setup.device.type,
+            "machine": decisive(),
+            "libraries": libraries(GaussianTraining),
+            "threads": torch.get_num_threads(),
+            "seed": self.setup.seed,
+            "code": digest(GaussianTraining),
+        }
+
+    def reset(self) -> None:
+        """Do nothing: every frame stands alone."""
+
+    @torch.no_grad()
+    def render(self, camera: Camera, probe: Probe) -> Frame:
+        """One frame at the camera's full resolution."""
+        camera = place_camera(camera, self.setup.device)
+        pixels = self.gaussians.render(camera, self.stop, probe, self.setup.backend)
+        with probe.stage("finish"):
+            frame = FeatureFrame.of(camera, pixels, self.background)
+        return Frame(frame.values, frame.depth, frame.alpha)
+
+    def sizes(self) -> dict[str, int]:
+        """Bytes of the Gaussians' parameters, as they are stored."""
+        if self.stored == "int8":
+            return {"gaussians": stored_bytes(self.gaussians)}
+        return {"gaussians": sum(4 * x.numel() for x in self.gaussians.parameters())}
+
+    def settings(self) -> dict[str, str]:
+        """See `bench.types.Method.settings`."""
+        return self.setup.settings(type(self)) | {"precision": self.stored, "engine": "none"}

@@ -1,0 +1,63 @@
+"""Where Gaussians begin: on the surfaces of a trained field, or anywhere."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from bench.types import NullProbe, Scene
+from methods.instant_ngp.stage1 import TrainedField
+from methods.instant_ngp.training import PixelBatches
+from methods.rendering.march import March
+from methods.rendering.rays import render_rays
+
+SOLID = 0.5
+"""Opacity of a ray from which on it ends at a surface."""
+
+NEIGHBOURS = 3
+
+
+def on_surfaces(
+    trained: TrainedField, march: March, scene: Scene, count: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """`count` points where rays of random training pixels end, and their colours: [count, 3] twice.
+
+    If the pictures show too little matter, points are taken more than once.
+    """
+    field = trained.field
+    batches = PixelBatches(scene.splits["train"], field.device)
+    points: list[Tensor] = []
+    colours: list[Tensor] = []
+    for _ in range(64):  # pictures with less than a 64th of matter give fewer points
+        rays, _ = batches.draw(count, generator)
+        pixels = render_rays(field, rays, trained.occupancy, NullProbe(), march)
+        hit = pixels.alpha > SOLID
+        depth = pixels.depth_sum[hit] / pixels.alpha[hit]
+        points.append(rays.origins[hit] + depth[:, None] * rays.directions[hit])
+        colours.append(pixels.values[hit, :3] / pixels.alpha[hit, None])
+        if sum(map(len, points)) >= count:
+            break
+    found, shades = torch.cat(points), torch.cat(colours)
+    if not len(found):
+        return anywhere(scene, count, generator)
+    index = torch.arange(count, device=found.device) % len(found)
+    return found[index], shades[index].clamp(0, 1)
+
+
+def anywhere(scene: Scene, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """`count` points spread evenly over the bounds of `scene`, of random colours."""
+    low, high = scene.bounds.to(generator.device)
+    unit = torch.rand(2, count, 3, generator=generator, device=generator.device)
+    return low + unit[0] * (high - low), unit[1]
+
+
+def spacing(points: Tensor) -> Tensor:
+    """Root mean square distance [N] of each point from its nearest neighbours, more than 0."""
+    if len(points) <= NEIGHBOURS:
+        return torch.full_like(points[:, 0], 0.01)
+    places = points.cpu().numpy()
+    distances, _ = KDTree(places).query(places, NEIGHBOURS + 1, workers=torch.get_num_threads())
+    mean = np.sqrt(np.square(distances[:, 1:]).mean(axis=1))
+    return torch.from_numpy(mean).to(points).clamp(min=1e-5)

@@ -1,0 +1,44 @@
+"""Blending in plain torch: all Gaussians that reach a band of rows, at all of its pixels."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from bench.cameras import pixel_grid
+from methods.kernels.composite import Pixels
+from methods.kernels.gaussian_blending import LARGEST_ALPHA
+from methods.kernels.gaussian_projection import LEAST_ALPHA, Ellipses
+
+BAND = 16
+"""Rows that are blended together: bounds the memory of a picture."""
+
+
+def blend(
+    ellipses: Ellipses,
+    opacities: Tensor,
+    colours: Tensor,
+    width: int,
+    height: int,
+    stop: float,
+) -> Pixels:
+    """See `methods.kernels.gaussian_blending.blend`."""
+    order = ellipses.depth.argsort(stable=True)
+    bands = []
+    for top in range(0, height, BAND):
+        rows = min(BAND, height - top)
+        y, half = ellipses.centres[:, 1].detach(), ellipses.extents[:, 1]
+        reaching = (half > 0) & (y + half >= top) & (y - half <= top + rows)
+        some = order[reaching[order]]
+        x = pixel_grid(width, rows, opacities.device).to(opacities) + opacities.new_tensor((0, top))
+        offset = x[:, None] - ellipses.centres[some]  # [P, M, 2]
+        a, b, c = ellipses.conics[some].unbind(dim=1)
+        u, v = offset.unbind(dim=2)
+        alpha = opacities[some] * (-(a * u * u + 2 * b * u * v + c * v * v) / 2).exp()
+        alpha = torch.where(alpha >= LEAST_ALPHA, alpha.clamp(max=LARGEST_ALPHA), 0)
+        transmittance = (1 - alpha).cumprod(dim=1).roll(1, dims=1)  # in front of each
+        transmittance = torch.cat((torch.ones_like(alpha[:, :1]), transmittance[:, 1:]), dim=1)
+        weight = torch.where(transmittance > stop, transmittance * alpha, 0)[:, : len(some)]
+        bands.append((weight @ colours[some], weight @ ellipses.depth[some], weight.sum(dim=1)))
+    values, depth, alpha = (torch.cat(parts) for parts in zip(*bands, strict=True))
+    return Pixels(values, depth.detach(), alpha)

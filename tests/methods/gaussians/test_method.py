@@ -1,0 +1,153 @@
+"""3D Gaussians as a method: what they learn, what a training leaves, what is measured of others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from bench.metrics import psnr
+from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene, SteerbenchError
+from methods.gaussians.method import GaussianSplatting
+from methods.gaussians.start import anywhere, on_surfaces, spacing
+from methods.gaussians.training import Fitting, GaussianTraining
+from methods.instant_ngp.stage1 import Setup, train_field
+from methods.instant_ngp.training import TrainingOptions
+from methods.kernels.encode import HashGrid
+from methods.training import loop
+
+GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
+BUDGET = Budget("test", steps=100, samples=8192, renderer_steps=60)
+
+
+def fitted(scene: Scene, log: Log, budget: Budget = BUDGET, **options) -> GaussianSplatting:
+    settings = {"count": 400, "fitting": Fitting()} | options
+    method = GaussianSplatting(grid=GRID, training=TrainingOptions(), device="cpu", **settings)
+    method.fit(scene, budget, log)
+    return method
+
+
+def quality(method: GaussianSplatting, scene: Scene) -> float:
+    test = scene.splits["test"]
+    truth = test.images[1].float() / 255
+    on_white = truth[..., :3] * truth[..., 3:] + 1 - truth[..., 3:]
+    return psnr(method.render(test.cameras[1], NullProbe()).rgb, on_white)
+
+
+def test_they_learn_a_ball(ball_scene: Scene, quiet_log: Log) -> None:
+    budget = Budget("test", steps=100, samples=8192, renderer_steps=300)
+    method = fitted(ball_scene, quiet_log, budget)
+    assert quality(method, ball_scene) > 24
+    frame = method.render(ball_scene.splits["test"].cameras[1], NullProbe())
+    # Depth is that of the front of the ball, 1.6 - 0.3 from the camera, to four pixels' widths:
+    # it is that of the centres of Gaussians, which reach out of the ball.
+    assert abs(frame.depth[16, 16].item() - 1.3) < 4 * 1.6 / 40
+    assert torch.equal(frame.depth.isinf(), frame.alpha <= EMPTY_ALPHA)
+    assert (frame.rgb[frame.alpha == 0] == 1).all()
+
+
+def test_they_learn_from_scratch(ball_scene: Scene, quiet_log: Log) -> None:
+    fast = Fitting(means=1e-3, size=1.0)
+    before = fitted(
+        ball_scene,
+        quiet_log,
+        Budget("test", 1, 64, renderer_steps=1),
+        start="scratch",
+        fitting=fast,
+    )
+    after = fitted(
+        ball_scene,
+        quiet_log,
+        Budget("test", 1, 64, renderer_steps=200),
+        start="scratch",
+        fitting=fast,
+    )
+    assert quality(after, ball_scene) > quality(before, ball_scene) + 3
+
+
+def test_they_begin_on_surfaces_with_their_colours(ball_scene: Scene, quiet_log: Log) -> None:
+    setup = Setup.resolved(GRID, TrainingOptions(), "bf16", "auto", "cpu", seed=0)
+    budget = Budget("test", steps=400, samples=8192)
+    field = train_field(setup, ball_scene, budget, quiet_log)
+    generator = torch.Generator().manual_seed(0)
+    points, colours = on_surfaces(field, setup.training.march, ball_scene, 500, generator)
+    radius = (points - 0.5).norm(dim=1)
+    assert len(points) == 500
+    assert abs(radius.median().item() - 0.3) < 2 * 1.6 / 40
+    error = colours - (0.5 + (points - 0.5) / 0.6).clamp(0, 1)  # the ball is coloured by its normal
+    assert error.abs().median() < 0.05
+
+
+def test_spacing_is_the_distance_of_neighbours(ball_scene: Scene) -> None:
+    axis = 0.1 * torch.arange(4.0)
+    lattice = torch.cartesian_prod(axis, axis, axis)
+    torch.testing.assert_close(spacing(lattice), torch.full((64,), 0.1))
+    assert (spacing(torch.zeros(10, 3)) > 0).all()  # all in one place
+    points, _ = anywhere(ball_scene, 100, torch.Generator().manual_seed(0))
+    assert ((points >= 0.1) & (points <= 0.9)).all()
+
+
+def test_a_killed_training_goes_on_as_if_it_had_not_been(
+    ball_scene: Scene, quiet_log: Log, tmp_path: Path
+) -> None:
+    def training() -> GaussianTraining:
+        method = GaussianSplatting(
+            grid=GRID,
+            training=TrainingOptions(),
+            fitting=Fitting(every=10),
+            count=200,
+            start="scratch",
+        )
+        gaussians = method._untrained(None, ball_scene, blank=False)
+        return GaussianTraining(gaussians, ball_scene, 40, Fitting(every=10), "auto", seed=0)
+
+    whole, half = training(), training()
+    for _ in range(40):
+        whole.advance()
+    for _ in range(23):
+        half.advance()
+    loop.save(half, tmp_path / "half")
+    resumed = training()
+    loop.resume(resumed, tmp_path / "half")
+    while resumed.step < 40:
+        resumed.advance()
+    for name, value in whole.result().items():
+        assert torch.equal(resumed.result()[name], value), name
+
+
+def test_a_training_is_found_again_and_left_for_others(
+    ball_scene: Scene, quiet_log: Log, tmp_path: Path
+) -> None:
+    first = fitted(ball_scene, quiet_log)
+    again = fitted(ball_scene, quiet_log)
+    assert again.train_s == first.train_s > 0
+    (exported,) = (tmp_path / "outputs").rglob("gaussians.ply")
+    shown = fitted(ball_scene, quiet_log, checkpoint=str(exported))
+    camera = ball_scene.splits["test"].cameras[0]
+    pictures = [m.render(camera, NullProbe()).rgb for m in (first, again, shown)]
+    assert torch.equal(pictures[0], pictures[1])
+    torch.testing.assert_close(pictures[2], pictures[0], rtol=0, atol=1e-4)
+    assert shown.train_s == 0
+
+
+def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, quiet_log: Log) -> None:
+    plain = fitted(ball_scene, quiet_log)
+    small = fitted(ball_scene, quiet_log, stored="int8")
+    assert plain.sizes() == {"gaussians": 400 * 59 * 4}
+    assert small.sizes()["gaussians"] < plain.sizes()["gaussians"] / 3.5
+    assert small.settings()["precision"] == "int8"
+    assert abs(quality(small, ball_scene) - quality(plain, ball_scene)) < 0.5
+
+
+def test_a_missing_checkpoint_is_one_line(ball_scene: Scene, quiet_log: Log) -> None:
+    with pytest.raises(SteerbenchError, match="there is none"):
+        fitted(ball_scene, quiet_log, checkpoint="nowhere.ply")
+
+
+@pytest.mark.parametrize("wrong", [{"count": 0}, {"degree": 4}, {"stop": 1.0}])
+def test_wrong_settings_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        GaussianSplatting(
+            grid=GRID, training=TrainingOptions(), fitting=Fitting(), **{"count": 10} | wrong
+        )
