@@ -11,7 +11,7 @@ import torch
 from bench.cameras import place_camera
 from bench.provenance import decisive
 from bench.sources import digest, libraries
-from bench.study import Study, Variant
+from bench.study import Axis, Study, Variant
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.gaussians import ply
@@ -53,7 +53,11 @@ class GaussianSplatting:
             ],
             "stored": [Variant("stored int8", ("method.stored=int8",))],
         },
+        trained={
+            "number, trained": [Variant(f"{n:,}", (f"method.count={n}",)) for n in (15_000, 30_000)]
+        },
         exact=("method.stop=1e-4", "method.stored=fp32"),
+        axes={"N": Axis("{:,} Gaussians", "method.count", (15_000, 30_000, 60_000, 120_000))},
     )
 
     def __init__(

@@ -14,8 +14,8 @@ from bench.compositing import composite
 from bench.types import Camera, NullProbe, Scene
 from methods.gaussians.mcmc import disturb, relocate
 from methods.gaussians.model import Gaussians
-from methods.gaussians.similarity import dissimilarity
 from methods.kernels.composite import STOP
+from methods.kernels.ssim import ssim
 from methods.training import checkpoint
 
 
@@ -26,7 +26,8 @@ class Fitting:
     Attributes:
         means, scales, rotations, opacities, colours: rates; of the harmonics beyond the first, a
             twentieth of `colours`. Means are in scene units.
-        final_means: share of the rate of the means that is left at the end; it falls exponentially.
+        final_means, final: shares of the rate of the means, and of the others, that are left at the
+            end; they fall exponentially.
         similarity: weight of 1 - SSIM; the rest is of the mean absolute error.
         opacity_cost, scale_cost: weights of the mean opacity and of the mean scale: what is not
             needed fades.
@@ -40,6 +41,7 @@ class Fitting:
 
     means: float = 1e-4
     final_means: float = 0.01
+    final: float = 0.1
     scales: float = 5e-3
     rotations: float = 1e-3
     opacities: float = 5e-2
@@ -88,11 +90,10 @@ class GaussianTraining:
             "base": options.colours,
             "view": options.colours / 20,
         }
-        groups = [
-            {"params": [getattr(gaussians, name)], "lr": rate, "name": name}
-            for name, rate in rates.items()
-        ]
+        groups = [{"params": [getattr(gaussians, name)]} for name in rates]
         self.optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        finals = {"means": options.final_means}
+        self.rates = [(rate, finals.get(name, options.final)) for name, rate in rates.items()]
 
     def advance(self) -> dict[str, float]:
         """One step; its mean squared error."""
@@ -103,20 +104,21 @@ class GaussianTraining:
         picture = pixels.over(self.background).values.view_as(target)
         loss = (1 - options.similarity) * functional.l1_loss(picture, target)
         if options.similarity:
-            loss = loss + options.similarity * dissimilarity(picture, target)
+            loss = loss + options.similarity * (1 - ssim(picture, target, backend=self.backend))
         costs = (
             options.opacity_cost * gaussians.opacities.mean()
             + options.scale_cost * gaussians.log_scales.exp().mean()
         )
         (loss + costs).backward()
-        rate = options.means * options.final_means**share
-        self.optimiser.param_groups[0]["lr"] = rate
+        for group, (rate, final) in zip(self.optimiser.param_groups, self.rates, strict=True):
+            group["lr"] = rate * final**share
         self.optimiser.step()
         self.optimiser.zero_grad(set_to_none=True)
         self.step += 1
         if options.relocate_from <= share < options.relocate_to and self.step % options.every == 0:
             relocate(gaussians, self.optimiser, self.generator)
         if options.noise:
+            rate = self.optimiser.param_groups[0]["lr"]
             disturb(gaussians, options.noise * rate, self.generator)
         return {"": functional.mse_loss(picture.detach(), target).item()}
 

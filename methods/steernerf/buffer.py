@@ -65,6 +65,13 @@ class Cloud:
         points = unproject(camera, centres, depth)  # Eq. 6
         return cls(camera, source, points, values, alpha[source])
 
+    def expected(self) -> Cloud:
+        """Of a cloud of sums w t: its points at the depths sum w t / sum w, without the faint."""
+        clear = (self.alpha > SPLAT_ALPHA).nonzero().squeeze(1)
+        alpha, centre = self.alpha[clear], self.camera.c2w[:, 3]
+        points = centre + (self.points[clear] - centre) / alpha[:, None]
+        return Cloud(self.camera, self.source[clear], points, self.values[clear], alpha)
+
     def splat(self, camera: Camera, how: Reprojection, backend: str) -> tuple[Tensor, Tensor]:
         """Which point each pixel of `camera` shows.
 

@@ -76,10 +76,13 @@ class RangeReduction:
             3 x 3 neighbourhood. A ray ends at the opacity they had; if it does not reach it, it
             continues behind the window. At a depth edge the whole ray is marched.
         epsilon: scene units along z.
+        depth: of "paper", which D it is that is reprojected: "sum", sum w t as the release renders
+            it, or "expected", divided by the opacity. The two differ at silhouettes.
     """
 
     mode: Literal["off", "paper", "window"] = "off"
     epsilon: float = 0.03
+    depth: Literal["sum", "expected"] = "sum"
 
     def __post_init__(self) -> None:
         if not self.epsilon > 0:

@@ -141,8 +141,11 @@ class Pipeline:
         occupancy, how, reduction = self._occupied(rendering), rendering.march, rendering.range
         if newest is None or reduction.mode == "off":
             return everywhere(self.field, occupancy, probe, how)
-        by = newest, view.low, reduction.epsilon, self.model.reprojection, self.backend
+        reprojection = self.model.reprojection
         with probe.stage("depth_reprojection"):
+            if reprojection.depth == "sum" and reduction.depth == "expected":
+                newest = newest.expected()
+            by = newest, view.low, reduction.epsilon, reprojection, self.backend
             if reduction.mode == "window":
                 prior = window.depth_prior(*by)
                 return window.within(self.field, occupancy, probe, how, prior)

@@ -191,6 +191,9 @@ def test_summed_depths_are_too_near_and_empty_pixels_lie_at_the_camera() -> None
     torch.testing.assert_close(z[24:40], true[24:], rtol=0, atol=error)
     centre = low.c2w[:, 3].expand(8, 3)
     torch.testing.assert_close(summed.points[40:], centre, rtol=0, atol=1e-11)
+    again = summed.expected()
+    assert torch.equal(again.source, expected.source)
+    torch.testing.assert_close(again.points, expected.points, rtol=0, atol=2 * error)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
