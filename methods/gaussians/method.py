@@ -54,10 +54,10 @@ class GaussianSplatting:
             "stored": [Variant("stored int8", ("method.stored=int8",))],
         },
         trained={
-            "number, trained": [Variant(f"{n:,}", (f"method.count={n}",)) for n in (15_000, 30_000)]
+            "number, trained": [Variant(f"{n:,}", (f"method.count={n}",)) for n in (20_000, 40_000)]
         },
         exact=("method.stop=1e-4", "method.stored=fp32"),
-        axes={"N": Axis("{:,} Gaussians", "method.count", (15_000, 30_000, 60_000, 120_000))},
+        axes={"N": Axis("{:,} Gaussians", "method.count", (20_000, 40_000, 80_000, 160_000))},
     )
 
     def __init__(

@@ -26,8 +26,7 @@ class Fitting:
     Attributes:
         means, scales, rotations, opacities, colours: rates; of the harmonics beyond the first, a
             twentieth of `colours`. Means are in scene units.
-        final_means, final: shares of the rate of the means, and of the others, that are left at the
-            end; they fall exponentially.
+        final_means: share of the rate of the means that is left at the end; it falls exponentially.
         similarity: weight of 1 - SSIM; the rest is of the mean absolute error.
         opacity_cost, scale_cost: weights of the mean opacity and of the mean scale: what is not
             needed fades.
@@ -39,15 +38,14 @@ class Fitting:
         size: scales at the beginning, times the distance between neighbours.
     """
 
-    means: float = 1e-4
+    means: float = 3e-4
     final_means: float = 0.01
-    final: float = 0.1
-    scales: float = 5e-3
+    scales: float = 1e-2
     rotations: float = 1e-3
     opacities: float = 5e-2
-    colours: float = 2.5e-3
+    colours: float = 2e-2
     similarity: float = 0.2
-    opacity_cost: float = 0.01
+    opacity_cost: float = 2e-3
     scale_cost: float = 0.01
     noise: float = 5e5
     every: int = 100
@@ -90,10 +88,10 @@ class GaussianTraining:
             "base": options.colours,
             "view": options.colours / 20,
         }
-        groups = [{"params": [getattr(gaussians, name)]} for name in rates]
+        groups = [
+            {"params": [getattr(gaussians, name)], "lr": rate} for name, rate in rates.items()
+        ]
         self.optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
-        finals = {"means": options.final_means}
-        self.rates = [(rate, finals.get(name, options.final)) for name, rate in rates.items()]
 
     def advance(self) -> dict[str, float]:
         """One step; its mean squared error."""
@@ -110,15 +108,14 @@ class GaussianTraining:
             + options.scale_cost * gaussians.log_scales.exp().mean()
         )
         (loss + costs).backward()
-        for group, (rate, final) in zip(self.optimiser.param_groups, self.rates, strict=True):
-            group["lr"] = rate * final**share
+        rate = options.means * options.final_means**share
+        self.optimiser.param_groups[0]["lr"] = rate
         self.optimiser.step()
         self.optimiser.zero_grad(set_to_none=True)
         self.step += 1
         if options.relocate_from <= share < options.relocate_to and self.step % options.every == 0:
             relocate(gaussians, self.optimiser, self.generator)
         if options.noise:
-            rate = self.optimiser.param_groups[0]["lr"]
             disturb(gaussians, options.noise * rate, self.generator)
         return {"": functional.mse_loss(picture.detach(), target).item()}
 
