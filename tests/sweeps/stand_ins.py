@@ -24,6 +24,7 @@ class Grey:
     name = "grey"
     train_s = 0.0
     memory = 0
+    reads = (Path("shade"),)  # as a checkpoint from elsewhere, if it is there
 
     def __init__(self, seed: int, device: str, backend: str, level: float = 0.5) -> None:
         self.level = level

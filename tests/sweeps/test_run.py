@@ -42,6 +42,13 @@ def test_what_changes_rows_makes_another_run(run, tmp_path, change):
     assert len(stored(tmp_path)) == 2
 
 
+def test_another_content_of_a_file_that_the_method_reads_makes_another_run(run, tmp_path):
+    for number, content in enumerate(("old", "new", "new"), 1):
+        (tmp_path / "shade").write_text(content)
+        run()
+        assert len(stored(tmp_path)) == min(number, 2)
+
+
 def test_moving_data_or_report_makes_no_other_run(run, tmp_path):
     run("scene.path=here/scene")
     run("scene.path=moved/scene", "report=elsewhere")
