@@ -143,10 +143,10 @@ class GaussianSplatting:
             "backend": self.setup.backend,
             "device": self.setup.device.type,
             "machine": decisive(),
-            "libraries": libraries(GaussianTraining),
+            "libraries": libraries(GaussianTraining, on_surfaces),
             "threads": torch.get_num_threads(),
             "seed": self.setup.seed,
-            "code": digest(GaussianTraining),
+            "code": digest(GaussianTraining, on_surfaces),
         }
 
     def reset(self) -> None:
