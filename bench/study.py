@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +13,11 @@ class Variant:
 
     name: str
     settings: tuple[str, ...] = ()
+
+
+def turned(label: str, setting: str, values: Iterable[object], *more: str) -> list[Variant]:
+    """A variant for each of the `values` of a setting; all have `more` settings."""
+    return [Variant(f"{label} {value}", (f"{setting}={value}", *more)) for value in values]
 
 
 @dataclass(frozen=True)

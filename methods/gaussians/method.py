@@ -11,7 +11,7 @@ import torch
 from bench.cameras import place_camera
 from bench.provenance import decisive
 from bench.sources import digest, libraries
-from bench.study import Axis, Study, Variant
+from bench.study import Axis, Study, Variant, turned
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.gaussians import ply
@@ -47,10 +47,7 @@ class GaussianSplatting:
     memory = 0
     study = Study(
         knobs={
-            "stop": [
-                Variant(f"stop {stop}", (f"method.stop={stop}",))
-                for stop in ("1e-1", "1e-2", "1e-3")
-            ],
+            "stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3")),
             "stored": [Variant("stored int8", ("method.stored=int8",))],
         },
         trained={

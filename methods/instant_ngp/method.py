@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 
 from bench.cameras import place_camera
-from bench.study import Study, Variant
+from bench.study import Study, turned
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.instant_ngp.field import Precision
@@ -31,12 +31,7 @@ class InstantNgp:
 
     memory = 0
     study = Study(
-        knobs={
-            "stop": [
-                Variant(f"stop {stop}", (f"method.stop={stop}",))
-                for stop in ("1e-1", "1e-2", "1e-3")
-            ]
-        },
+        knobs={"stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3"))},
         exact=("method.stop=1e-4",),
         parts=dict.fromkeys(("rays", "march", "composite"), "field"),
     )

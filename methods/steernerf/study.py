@@ -4,12 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from bench.study import Axis, Study, Variant
-
-
-def turned(label: str, setting: str, values: Iterable[object], *more: str) -> list[Variant]:
-    """A variant for each of the `values` of a setting; all have `more` settings."""
-    return [Variant(f"{label} {value}", (f"{setting}={value}", *more)) for value in values]
+from bench.study import Axis, Study, Variant, turned
 
 
 def ranges(mode: str, epsilons: Iterable[float]) -> list[Variant]:

@@ -36,9 +36,9 @@ def blend(
         u, v = offset.unbind(dim=2)
         alpha = opacities[some] * (-(a * u * u + 2 * b * u * v + c * v * v) / 2).exp()
         alpha = torch.where(alpha >= LEAST_ALPHA, alpha.clamp(max=LARGEST_ALPHA), 0)
-        transmittance = (1 - alpha).cumprod(dim=1).roll(1, dims=1)  # in front of each
-        transmittance = torch.cat((torch.ones_like(alpha[:, :1]), transmittance[:, 1:]), dim=1)
-        weight = torch.where(transmittance > stop, transmittance * alpha, 0)[:, : len(some)]
+        through = torch.cat((alpha.new_ones(len(alpha), 1), (1 - alpha).cumprod(dim=1)), dim=1)
+        transmittance = through[:, :-1]  # in front of each
+        weight = torch.where(transmittance > stop, transmittance * alpha, 0)
         bands.append((weight @ colours[some], weight @ ellipses.depth[some], weight.sum(dim=1)))
     values, depth, alpha = (torch.cat(parts) for parts in zip(*bands, strict=True))
     return Pixels(values, depth.detach(), alpha)

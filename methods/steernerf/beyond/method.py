@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from bench.study import Variant
+from bench.study import Variant, turned
 from bench.types import Budget, Log, Scene
 from methods.steernerf.beyond.pretraining import pretrain_renderer
 from methods.steernerf.method import SteerNerf
-from methods.steernerf.study import STUDY, not_skipped, ranges, turned
+from methods.steernerf.study import STUDY, not_skipped, ranges
 
 SHARES = (0, 0.06, 0.25, 0.5, 1)
 SKIPS = {**STUDY.skips, "background cells": "method.rendering.skip.background"}
