@@ -32,6 +32,12 @@ STANDS_ON = {
     "training": {"kernels"},
     "instant_ngp": {"kernels", "rendering", "training"},
     "gaussians": {"kernels", "rendering", "training", "instant_ngp"},
+    "students": {"kernels", "rendering", "training", "instant_ngp"},
+    "nerf": {"kernels", "rendering", "training", "instant_ngp", "students"},
+    "nsvf": {"kernels", "rendering", "training", "instant_ngp", "students"},
+    "kilonerf": {"kernels", "rendering", "training", "instant_ngp", "students"},
+    "plenoctree": {"kernels", "rendering", "training", "instant_ngp", "students"},
+    "diver": {"kernels", "rendering", "training", "instant_ngp", "students"},
     "steernerf": {"kernels", "engines", "rendering", "training", "instant_ngp"},
 }
 """The folders of `methods` from which each may import, beside itself; `methods/checks.py` stands

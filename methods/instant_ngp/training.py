@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from torch.nn import functional
 from bench.types import Budget, Rays, Scene, Split, SteerbenchError
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.optimiser import FieldOptimiser
+from methods.kernels.composite import Pixels
 from methods.rendering.batch import opacity_entropy, render_batch
 from methods.rendering.march import March, check_step
 from methods.rendering.occupancy import EVERY, MIN_VIEWS, STEP, DensityGrid, learnable_cells
@@ -112,24 +114,54 @@ def new_grid(scene: Scene, device: torch.device) -> DensityGrid:
     return DensityGrid(cells)
 
 
-class FieldTraining:
-    """Stage 1 as a `loop.Training`."""
+class PixelTraining(ABC):
+    """A training whose steps render random pixels of the training pictures, as a `loop.Training`.
+
+    What is trained, and how its rays are rendered and its parameters updated, is a subclass's.
+
+    Args:
+        samples: samples with a gradient that a step aims at; the number of rays follows from it.
+    """
 
     advice = "Try a smaller learning rate (method.training.rate)."
 
     def __init__(
-        self, field: HashField, scene: Scene, budget: Budget, options: TrainingOptions, seed: int
+        self,
+        scene: Scene,
+        device: torch.device,
+        steps: int,
+        samples: int,
+        options: TrainingOptions,
+        seed: int,
     ) -> None:
-        device = field.device
-        self.field, self.budget, self.options = field, budget, options
-        self.grid = new_grid(scene, device)
+        self.options, self.samples = options, samples
         self.batches = PixelBatches(scene.splits["train"], device)
         self.background = scene.background.to(device)
-        self.step, self.steps = 0, budget.steps
+        self.step, self.steps = 0, steps
         self.rays = min(1024, options.max_rays)
         self.seconds = 0.0
         self.generator = torch.Generator(device).manual_seed(seed)
-        self.optimiser = FieldOptimiser(field)
+
+    @abstractmethod
+    def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
+        """The pixels of `rays`, R of them, on `background` [3] or [R, 3], differentiably, and the
+        number of samples that took part; `jitter` [R] in [0, 1) is the phase of samples."""
+
+    @abstractmethod
+    def _update(self) -> None:
+        """A step of the optimiser; the gradients are used up."""
+
+    @abstractmethod
+    def watched(self) -> Mapping[str, Tensor]:
+        """See `loop.Training`."""
+
+    @abstractmethod
+    def result(self) -> dict[str, Tensor]:
+        """See `loop.Training`."""
+
+    @abstractmethod
+    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+        """See `loop.Training`."""
 
     def learning_rate(self) -> float:
         """Of the next step."""
@@ -141,21 +173,10 @@ class FieldTraining:
         Raises:
             SteerbenchError: the loss is not finite.
         """
-        if self.step % EVERY == 0:
-            young = self.step < GRID_YOUTH_STEPS
-            samples = self.options.grid_samples * (4 if young else 1)
-            self.grid.update(self.field, self.generator, samples)
         rays, colours = self.batches.draw(self.rays, self.generator)
         target, background = self._target(colours)
         jitter = torch.rand(len(target), generator=self.generator, device=target.device)
-        pixels, samples = render_batch(
-            self.field,
-            rays,
-            self.grid.occupancy,
-            self.options.march,
-            jitter=jitter,
-            background=background,
-        )
+        pixels, samples = self._render(rays, jitter, background)
         loss = functional.mse_loss(pixels.values, target)
         entropy = opacity_entropy(pixels.alpha)
         (loss + self.options.opacity_entropy * entropy).backward()
@@ -179,13 +200,52 @@ class FieldTraining:
         rgb, alpha = colours[:, :3], colours[:, 3:]
         return rgb * alpha + background * (1 - alpha), background
 
+    def _fit_batch(self, samples: int) -> None:
+        """Choose the next number of rays so that it brings about `self.samples` samples."""
+        change = min(max(self.samples / max(samples, 1), 0.5), 1.25)
+        self.rays = min(max(int(self.rays * change), MIN_RAYS), self.options.max_rays)
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+        """Random numbers, size of the batch."""
+        return {"generator": self.generator.get_state()}, {"rays": self.rays}
+
+    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
+        """See `loop.Training`."""
+        self.restore_result(tensors)
+        self.rays = int(figures["rays"])
+        self.generator.set_state(tensors["generator"].cpu())
+
+
+class FieldTraining(PixelTraining):
+    """Stage 1."""
+
+    def __init__(
+        self, field: HashField, scene: Scene, budget: Budget, options: TrainingOptions, seed: int
+    ) -> None:
+        super().__init__(scene, field.device, budget.steps, budget.samples, options, seed)
+        self.field, self.grid = field, new_grid(scene, field.device)
+        self.optimiser = FieldOptimiser(field)
+
+    def advance(self) -> dict[str, float]:
+        """One step; its mean squared error."""
+        if self.step % EVERY == 0:
+            young = self.step < GRID_YOUTH_STEPS
+            samples = self.options.grid_samples * (4 if young else 1)
+            self.grid.update(self.field, self.generator, samples)
+        return super().advance()
+
+    def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
+        return render_batch(
+            self.field,
+            rays,
+            self.grid.occupancy,
+            self.options.march,
+            jitter=jitter,
+            background=background,
+        )
+
     def _update(self) -> None:
         self.optimiser.step(self.learning_rate())
-
-    def _fit_batch(self, samples: int) -> None:
-        """Choose the next number of rays so that it brings about `budget.samples` samples."""
-        change = min(max(self.budget.samples / max(samples, 1), 0.5), 1.25)
-        self.rays = min(max(int(self.rays * change), MIN_RAYS), self.options.max_rays)
 
     def watched(self) -> dict[str, Tensor]:
         """Table and its moments, networks."""
@@ -203,15 +263,13 @@ class FieldTraining:
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         """Optimisers, random numbers, size of the batch."""
-        generator = {"generator": self.generator.get_state()}
-        return self.optimiser.tensors() | generator, {"rays": self.rays}
+        tensors, figures = super().state()
+        return self.optimiser.tensors() | tensors, figures
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
         """See `loop.Training`."""
-        self.restore_result(tensors)
-        self.rays = int(figures["rays"])
+        super().restore(tensors, figures)
         self.optimiser.restore(tensors)
-        self.generator.set_state(tensors["generator"].cpu())
 
 
 def restore_field(field: HashField, grid: DensityGrid, tensors: Mapping[str, Tensor]) -> None:

@@ -14,7 +14,13 @@ from bench.sharing import locked
 from bench.types import Budget, Log, Scene, Split, SteerbenchError
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.stage1 import Setup, train_field
-from methods.instant_ngp.training import MIN_RAYS, FieldTraining, PixelBatches, TrainingOptions
+from methods.instant_ngp.training import (
+    MIN_RAYS,
+    FieldTraining,
+    PixelBatches,
+    PixelTraining,
+    TrainingOptions,
+)
 from methods.kernels.encode import HashGrid
 from methods.training import checkpoint, loop
 
@@ -112,7 +118,7 @@ def test_a_finished_training_is_loaded(
 ) -> None:
     first = trained(ball_scene, tmp_path)
     written = (stage(ball_scene, tmp_path) / "field.safetensors").stat().st_mtime_ns
-    monkeypatch.delattr(FieldTraining, "advance")
+    monkeypatch.delattr(PixelTraining, "advance")
     second = trained(ball_scene, tmp_path)
     assert torch.equal(first.table, second.table)
     assert torch.equal(first.packed, second.packed)
@@ -123,7 +129,7 @@ def test_who_finds_the_same_training_under_way_waits_and_loads_its_result(
     ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = trained(ball_scene, tmp_path / "first")
-    monkeypatch.delattr(FieldTraining, "advance")
+    monkeypatch.delattr(PixelTraining, "advance")
     made = stage(ball_scene, tmp_path / "first") / "field.safetensors"
     folder = stage(ball_scene, tmp_path / "shared")
 

@@ -1,0 +1,220 @@
+"""Students that are fields: they learn the teacher's densities and colours, then the photos."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from bench.cameras import place_camera
+from bench.types import Budget, Camera, Frame, Probe, Rays, Scene
+from methods.instant_ngp.stage1 import TrainedField
+from methods.instant_ngp.training import PixelTraining, TrainingOptions
+from methods.kernels.composite import Pixels
+from methods.kernels.march import Occupancy
+from methods.rendering.batch import render_batch
+from methods.rendering.field import Field
+from methods.rendering.frame import everywhere, render_frame
+from methods.rendering.occupancy import STEP
+from methods.students.method import Student
+from methods.training import checkpoint, loop
+from methods.training.optimiser import step_at
+
+REACH = 5 * STEP
+"""Length over which densities are compared as opacities: about KiloNeRF's 0.0211 of its scenes."""
+
+
+@dataclass(frozen=True)
+class FieldLessons(TrainingOptions):
+    """How a student that is a field learns: from rays as Instant-NGP does, after some points.
+
+    Attributes:
+        points: share of the steps, at the beginning, that compare densities and colours at random
+            points of occupied cells with the teacher's.
+    """
+
+    points: float = 0.5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.points <= 1:
+            raise ValueError(f"points: expected a share of the steps, 0 to 1, got {self.points}")
+
+
+class StudentField(nn.Module, ABC):
+    """A `methods.rendering.field.Field` of colours that is trained and knows its size.
+
+    Args:
+        backend: of the kernels that render it.
+    """
+
+    channels = 3
+
+    def __init__(self, backend: str) -> None:
+        super().__init__()
+        self.backend = backend
+
+    @property
+    def device(self) -> torch.device:
+        """Where its parameters lie."""
+        return next(self.parameters()).device
+
+    @abstractmethod
+    def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """See `Field`."""
+
+    @abstractmethod
+    def encode_directions(self, directions: Tensor) -> Tensor:
+        """See `Field`."""
+
+    @abstractmethod
+    def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
+        """See `Field`."""
+
+    @abstractmethod
+    def count(self, probe: Probe, samples: int, shaded: int) -> None:
+        """See `Field`."""
+
+    @abstractmethod
+    def sizes(self) -> dict[str, int]:
+        """Bytes by component."""
+
+
+class FieldTraining(PixelTraining):
+    """Points of the teacher, then rays of the photos, among what the teacher's grid has.
+
+    The occupied cells stay those of the teacher.
+    """
+
+    def __init__(
+        self,
+        field: StudentField,
+        teacher: TrainedField,
+        scene: Scene,
+        budget: Budget,
+        options: FieldLessons,
+        seed: int,
+    ) -> None:
+        device = teacher.field.device
+        super().__init__(scene, device, budget.renderer_steps, budget.samples, options, seed)
+        self.field, self.teacher, self.occupancy = field, teacher.field, teacher.occupancy
+        self.cells = self.occupancy.cells.nonzero()
+        self.points_until = options.points * self.steps if len(self.cells) else 0
+        self.optimiser = torch.optim.Adam(field.parameters(), betas=(0.9, 0.99), eps=1e-15)
+
+    def advance(self) -> dict[str, float]:
+        """One step; its mean squared error, of opacities and colours or of pixels."""
+        if self.step >= self.points_until:
+            return super().advance()
+        positions, directions = self._places()
+        loss = self._difference(positions, directions)
+        loss.backward()
+        value = loss.item()
+        if not math.isfinite(value):
+            loop.check_finite(self, {"loss": loss})
+        self._update()
+        self.step += 1
+        return {"": value}
+
+    def _places(self) -> tuple[Tensor, Tensor]:
+        """Random points [S, 3] of occupied cells, and directions [S, 3] to see them in."""
+        count, device, generator = self.samples, self.cells.device, self.generator
+        chosen = torch.randint(len(self.cells), (count,), generator=generator, device=device)
+        jitter = torch.rand(count, 3, generator=generator, device=device)
+        directions = torch.randn(count, 3, generator=generator, device=device)
+        positions = (self.cells[chosen] + jitter) / self.occupancy.resolution
+        return positions, functional.normalize(directions, dim=1)
+
+    def _difference(self, positions: Tensor, directions: Tensor) -> Tensor:
+        """Mean square of the differences in opacity over `REACH`, and in colour where there is
+        any."""
+        with torch.no_grad():
+            wanted, shown = _seen(self.teacher, positions, directions)
+        opacity, colour = _seen(self.field, positions, directions)
+        return (
+            functional.mse_loss(opacity, wanted)
+            + (wanted[:, None] * (colour - shown).square()).mean()
+        )
+
+    def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
+        return render_batch(
+            self.field,
+            rays,
+            self.occupancy,
+            self.options.march,
+            jitter=jitter,
+            background=background,
+        )
+
+    def _update(self) -> None:
+        step_at(self.optimiser, self.learning_rate())
+
+    def watched(self) -> dict[str, Tensor]:
+        """All parameters."""
+        return dict(self.field.named_parameters())
+
+    def result(self) -> dict[str, Tensor]:
+        """The field, and the occupied cells."""
+        tensors = {f"field.{name}": value for name, value in self.field.state_dict().items()}
+        return tensors | {"cells": self.occupancy.cells}
+
+    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+        """Put back what `result` gave."""
+        self.field.load_state_dict(checkpoint.part(tensors, "field."))
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+        """The optimiser, random numbers, size of the batch."""
+        tensors, figures = super().state()
+        return tensors | checkpoint.optimiser_tensors(self.optimiser, "adam."), figures
+
+    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
+        """See `loop.Training`."""
+        super().restore(tensors, figures)
+        checkpoint.restore_optimiser(self.optimiser, tensors, "adam.")
+
+
+def _seen(field: Field, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Opacity [S] over `REACH` and colour [S, 3] of points."""
+    sigma, geometry = field.density(positions)
+    colour = field.features(geometry, field.encode_directions(directions))[:, :3]
+    return 1 - torch.exp(-sigma * REACH), colour
+
+
+class FieldStudent(Student):
+    """Base of the methods that are another field, rendered as Instant-NGP is."""
+
+    training: FieldLessons
+
+    @abstractmethod
+    def new_field(self) -> StudentField:
+        """The untrained field on the teacher's device, with weights by the seed."""
+
+    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> loop.Training:
+        """See `Student`."""
+        return FieldTraining(
+            self.new_field(), teacher, scene, budget, self.training, self.teacher.seed
+        )
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """See `Student`."""
+        self.field = self.new_field()
+        self.field.load_state_dict(checkpoint.part(tensors, "field."))
+        self.occupancy = Occupancy(tensors["cells"].to(self.teacher.device))
+
+    @torch.no_grad()
+    def render(self, camera: Camera, probe: Probe) -> Frame:
+        """One frame at the camera's full resolution."""
+        camera = place_camera(camera, self.teacher.device)
+        march = replace(self.training.march, stop=self.stop)
+        render = everywhere(self.field, self.occupancy, probe, march)
+        frame = render_frame(self.field, camera, self.occupancy, self.background, probe, render)
+        return Frame(frame.values, frame.depth, frame.alpha)
+
+    def sizes(self) -> dict[str, int]:
+        """Bytes of the field and of the occupancy bits."""
+        return self.field.sizes() | {"occupancy": self.occupancy.cells.numel() // 8}

@@ -1,0 +1,104 @@
+"""A method whose model starts from a trained field, its teacher, then learns from the photos."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from bench.provenance import decisive
+from bench.sources import digest, libraries
+from bench.study import Study, turned
+from bench.threads import torch_threads
+from bench.types import Budget, Log, Scene
+from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
+from methods.instant_ngp.training import TrainingOptions
+from methods.kernels.composite import check_stop
+from methods.training import checkpoint, loop
+
+
+class Student(ABC):
+    """Base of the methods that start from the Instant-NGP field that all methods share.
+
+    The model learns in `budget.renderer_steps` steps. `train_s` counts the training of the field,
+    the start of the model and its own training.
+
+    Args:
+        teacher: the field that it starts from, and where it runs.
+        training: how the model learns.
+        stop: transmittance at which a ray ends when rendering, less than 1.
+        name: as it stands in result rows.
+    """
+
+    memory = 0
+    kind: ClassVar[str]
+    """Of its trained stage: "nerf"."""
+
+    study = Study(
+        knobs={"stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3"))},
+        exact=("method.stop=1e-4",),
+        parts=dict.fromkeys(("rays", "march", "composite"), "field"),
+    )
+
+    def __init__(self, teacher: Setup, training: TrainingOptions, stop: float, name: str) -> None:
+        check_stop(stop)
+        self.teacher, self.training, self.stop, self.name = teacher, training, stop, name
+        self.train_s = 0.0
+
+    @abstractmethod
+    def model_settings(self) -> Mapping[str, object]:
+        """The settings of the model that its training depends on."""
+
+    @abstractmethod
+    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> loop.Training:
+        """The training of the model before its first step."""
+
+    @abstractmethod
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Take over what a training had as its `result`, to be rendered."""
+
+    def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
+        """Train the field and the model, or load what the same trainings left behind."""
+        with torch_threads(budget.threads):
+            teacher = train_field(self.teacher, scene, budget, log)
+            folder = log.stage_dir(self.kind, self._key(scene, budget))
+            finished = folder / f"{self.kind}.safetensors"
+            if finished.exists():
+                tensors, figures = checkpoint.read(finished)
+                seconds = figures["seconds"]
+                log.info(f"trained {self.kind} found: {finished}")
+            else:
+                begun = time.monotonic()
+                training = self.begin(teacher, scene, budget)
+                training.seconds = time.monotonic() - begun
+                loop.train(training, finished, self.kind, log)
+                tensors, seconds = training.result(), training.seconds
+            with checkpoint.restoring(finished):
+                self.restore(tensors)
+        self.train_s = teacher.train_s + seconds
+        self.background = scene.background.to(self.teacher.device)
+
+    def _key(self, scene: Scene, budget: Budget) -> dict[str, object]:
+        """Everything the trained model depends on."""
+        return {
+            "field": self.teacher.key(scene, budget),
+            "steps": budget.renderer_steps,
+            "model": self.model_settings(),
+            "training": asdict(self.training),
+            "libraries": libraries(type(self)),
+            "machine": decisive(),
+            "threads": torch.get_num_threads(),
+            "code": digest(type(self)),
+        }
+
+    def reset(self) -> None:  # noqa: B027 (no student has anything to forget)
+        """Do nothing: every frame stands alone."""
+
+    def settings(self) -> dict[str, str]:
+        """See `bench.types.Method.settings`."""
+        return self.teacher.settings(type(self)) | {"engine": "none"}
