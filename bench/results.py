@@ -93,6 +93,20 @@ class Store:
         folder = self.folder / key
         return folder if (folder / RECORD).is_file() else None
 
+    def whole_key(self, beginning: str) -> str:
+        """The key of the one run whose key begins so.
+
+        Raises:
+            SteerbenchError: there is none, or several.
+        """
+        keys = [path.name for path in self.folder.glob(f"{beginning}*") if self.find(path.name)]
+        if len(keys) != 1:
+            raise SteerbenchError(
+                f"run {beginning!r}: expected the beginning of one key, {len(keys)} runs below "
+                f"{self.folder} have it; see `steerbench results`"
+            )
+        return keys[0]
+
     def save(self, parts: Mapping[str, object], measurement: Measurement) -> str:
         """Write the run that is made of `parts`, and return its key; raises as `write` does."""
         key = self.key(parts)

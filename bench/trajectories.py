@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -44,11 +45,13 @@ class Trajectory:
         name: as it stands in result rows.
         split: the split of the scene that `Step.truth` counts in.
         steps: at least one.
+        reads: the files that it was read from.
     """
 
     name: str
     split: str
     steps: tuple[Step, ...]
+    reads: tuple[Path, ...] = ()
 
     @property
     def resolution(self) -> str:

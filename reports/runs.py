@@ -15,7 +15,7 @@ import pandas as pd
 from bench.errors import SteerbenchError
 from bench.intervals import half_interval
 from bench.results import WHOLE, Store, unreadable
-from reports.tables import headline, phases, suffix
+from reports.tables import headline, phases, run_tables, suffix
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,11 @@ class Run:
             replace(self, label=self.label + suffix(phase), rows=pd.concat([of_phase, whole]))
             for phase, of_phase in phases(self.rows)
         ]
+
+    def _repr_markdown_(self) -> str:
+        """Its tables, as a notebook shows them."""
+        tables = "\n\n".join(table.section(level=4) for table in run_tables(self.rows))
+        return f"### {self.label}\n\n{tables}"
 
     @cached_property
     def facts(self) -> pd.Series:

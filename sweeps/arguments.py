@@ -104,6 +104,29 @@ ARGUMENTS = {
         *_flag("--sequence", "the pictures follow one another: score the flicker, too"),
         *_words("protocol=steerbench-1 scene=totem split=test"),
     ],
+    "render": [
+        *_one("--run", help="take the settings of this run of the store", metavar="KEY"),
+        *_one(
+            "--path",
+            help="cameras of a file: a path of nerfstudio's viewer, or a transforms.json",
+            type=Path,
+            metavar="FILE.json",
+        ),
+        *_several(
+            "--beside",
+            "also draw this method, to the right of the first",
+            **{"default": [], "metavar": "METHOD"},
+        ),
+        *_one(
+            "--output",
+            help="where the pictures go (default OUTPUTS/render/TRAJECTORY)",
+            type=Path,
+            metavar="DIR",
+        ),
+        *_one("--video", help="also write a video", type=Path, metavar="FILE.mp4"),
+        *_one("--fps", help="frames a second of it (default 30)", type=float, default=30.0),
+        *_words("method=ngp scene=totem trajectory=test budget=small"),
+    ],
     "pretrain": [
         *_count("--scenes", 8, "random scenes"),
         *_one(

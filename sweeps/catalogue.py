@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from contextlib import suppress
 from importlib import metadata
 from typing import Any
@@ -21,9 +22,9 @@ def main(options: argparse.Namespace) -> int:
     from methods.kernels import availability
 
     files = [
-        (f"{'+' if group == 'experiment' else ''}{group}={name}", _comment(path.read_text()))
+        (f"{'+' if group == 'experiment' else ''}{group}={name}", about)
         for group in GROUPS
-        for name, path in choices(group, options.config_dir).items()
+        for name, about in described(group, options.config_dir).items()
     ]
     backends = [(name, why or "usable") for name, why in availability().items()]
     engines = [
@@ -36,6 +37,11 @@ def main(options: argparse.Namespace) -> int:
     ):
         show(Table(title, columns, tuple(lines), figures=False))
     return 0
+
+
+def described(group: str, words: Sequence[str] = ()) -> dict[str, str]:
+    """Every choice of `group`, also of the folders that `words` name, and what it is."""
+    return {name: _comment(path.read_text()) for name, path in choices(group, words).items()}
 
 
 def _state(name: str, kind: Any) -> str:

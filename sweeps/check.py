@@ -53,22 +53,11 @@ def main(options: argparse.Namespace) -> int:
 def _compare(options: argparse.Namespace) -> int:
     """Print what the second of two runs of the store is, less the first; 1 if it is worse."""
     store = Store(options.outputs)
-    keys = [_whole(store, key) for key in (options.old, options.new)]
+    keys = [store.whole_key(key) for key in (options.old, options.new)]
     old, new = (Figures.of(load(store, {key: key})[0]) for key in keys)
     rows = list(changes(old, new))
     show(change_table(" to ".join(keys), rows))
     return int(any(row.verdict for row in rows))
-
-
-def _whole(store: Store, key: str) -> str:
-    """The key of the one run whose key begins so."""
-    keys = [path.name for path in store.folder.glob(f"{key}*") if store.find(path.name)]
-    if len(keys) != 1:
-        raise SteerbenchError(
-            f"run {key!r}: expected the beginning of one key, {len(keys)} runs below "
-            f"{store.folder} have it; see `steerbench results`"
-        )
-    return keys[0]
 
 
 def _by_command(store: Store) -> dict[str, Run]:

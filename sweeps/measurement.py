@@ -23,6 +23,7 @@ from bench.results import Measurement, Store, content_key
 from bench.run import Task, measure_in_turns
 from bench.scenes.held_out import hold_out
 from bench.sources import digest, libraries
+from bench.trajectories import Trajectory
 from bench.types import DEVICE, Log, Method, Scene
 from reports.page import write_page
 from reports.runs import Run, load
@@ -169,7 +170,9 @@ class _Ready:
         scene = scene_of(config)
         trajectory = build(config, "trajectory", scene)
         weights = Path(settings.weights_dir) if settings.weights_dir else None
-        parts = _identity(config, scene, method) | {"lpips": protocol.find_lpips(weights, log)}
+        parts = _identity(config, scene, method, trajectory) | {
+            "lpips": protocol.find_lpips(weights, log)
+        }
         parts |= {"turns": turns} if turns else {}
         task = Task(scene, trajectory, protocol, budget, settings.seed, weights)
         return cls(config, command, method, task, parts, Store(Path(settings.outputs)))
@@ -295,11 +298,14 @@ def _folder(config: DictConfig) -> str | None:
     return str(Path(config.scene.path).resolve()) if "path" in config.scene else None
 
 
-def _identity(config: DictConfig, scene: Scene, method: Method) -> dict[str, Any]:
+def _identity(
+    config: DictConfig, scene: Scene, method: Method, trajectory: Trajectory
+) -> dict[str, Any]:
     """Everything that can change the rows, except for the weights of LPIPS: a run's key."""
     settings = described(config)
     things = [measure_in_turns, *_targets(settings)]
-    read = [file for file in getattr(method, "reads", ()) if file.is_file()]
+    files = (*getattr(method, "reads", ()), *trajectory.reads)
+    read = [file for file in files if file.is_file()]
     return {
         "code": digest(*things),
         "libraries": libraries(*things),

@@ -14,12 +14,12 @@ from rich.columns import Columns
 
 from bench import pictures
 from bench.console import ConsoleLog
-from bench.pictures import Pair
+from bench.pictures import Match, Pair
 from bench.protocol import EvaluationProtocol
 from bench.results import Store
 from bench.sources import digest, libraries
-from bench.types import Log, SteerbenchError
-from reports.runs import load
+from bench.types import SteerbenchError
+from reports.runs import Run, load
 from reports.tables import run_tables
 from sweeps.build import build
 from sweeps.measurement import checked_settings, scene_of
@@ -33,15 +33,57 @@ NOTHING = "-"
 
 def main(options: argparse.Namespace) -> int:
     """Score the pictures, keep the rows in the store, print them."""
-    config = composed(options.overrides)
+    run = scored(
+        options.pictures,
+        options.truth,
+        options.overrides,
+        name=options.name,
+        match=options.match,
+        sequence=options.sequence,
+    )
+    facts, out = run.facts, console()
+    out.print(f"{run.label} on {facts['scene']}, protocol {facts['protocol']}: run {run.key}")
+    out.print(Columns([rich_table(table) for table in run_tables(run.rows)]))
+    return 0
+
+
+def scored(
+    folder: Path,
+    truth: Path | None,
+    words: Sequence[str],
+    *,
+    name: str | None = None,
+    match: Match = "name",
+    sequence: bool = False,
+) -> Run:
+    """The pictures in `folder` scored against those in `truth`, or against the split of a scene, as
+    a run of the store.
+
+    Args:
+        words: settings as of `steerbench run`: protocol, scene, split, outputs.
+        name: of the method in the rows; None: that of the folder.
+        match: how a picture finds its truth.
+        sequence: whether the pictures follow one another: the flicker is scored, too.
+
+    Raises:
+        SteerbenchError: a setting is wrong; pictures are missing, damaged or of another size.
+    """
+    config = composed(words)
     settings = checked_settings(config)
     log, store = ConsoleLog(Path(settings.outputs)), Store(Path(settings.outputs))
     protocol: EvaluationProtocol = build(config, "protocol")
     weights = Path(settings.weights_dir) if settings.weights_dir else None
-    pairs, facts = _pairs(options, config, protocol, log)
-    log.info(f"{len(pairs)} pictures, matched by {options.match}: {_example(pairs)}")
+    if truth is None:
+        pairs, place = _against_scene(folder, config, protocol, match)
+    else:
+        if named := [word for word in words if word.startswith("scene")]:
+            raise SteerbenchError(f"--truth and {named[0]}: expected one of them")
+        pairs = pictures.pairs_with_folder(folder, truth, match)
+        place = {"scene": truth.resolve().name, "split": NOTHING}
+    facts = {"method": name or folder.resolve().name, **place, "trajectory": "pictures", "seed": 0}
+    facts |= dict.fromkeys(("budget", "device", "backend", "engine", "precision"), NOTHING)
+    log.info(f"{len(pairs)} pictures, matched by {match}: {_example(pairs)}")
     lpips, missing = protocol.load_lpips(weights, log)
-    sequence = options.sequence
     measurement = pictures.score(pairs, protocol, lpips, facts, log, sequence=sequence)
     record = measurement.record
     parts = {
@@ -54,7 +96,7 @@ def main(options: argparse.Namespace) -> int:
         "sequence": sequence,
     }
     more: dict[str, Any] = {
-        "command": shlex.join(_typed(options)),
+        "command": shlex.join(_command(folder, truth, words, name, match, sequence)),
         "missing": missing,
         "scene": {"name": facts["scene"], "digest": record["content"]},
         "budget": {"name": NOTHING},
@@ -62,41 +104,35 @@ def main(options: argparse.Namespace) -> int:
     key = store.key(parts)
     if store.find(key) is None:
         store.save(parts, replace(measurement, record={**record, **more}))
-    (run,) = load(store, {key: facts["method"]})
-    out = console()
-    out.print(f"{facts['method']} on {facts['scene']}, protocol {protocol.name}: run {key}")
-    out.print(Columns([rich_table(table) for table in run_tables(run.rows)]))
-    return 0
+    (run,) = load(store, {key: str(facts["method"])})
+    return run
 
 
-def _pairs(
-    options: argparse.Namespace, config: DictConfig, protocol: EvaluationProtocol, log: Log
+def _against_scene(
+    folder: Path, config: DictConfig, protocol: EvaluationProtocol, match: Match
 ) -> tuple[list[Pair], dict[str, Any]]:
-    """The pictures with their truth, and the facts of their rows."""
-    if options.truth:
-        if named := [word for word in options.overrides if word.startswith("scene")]:
-            raise SteerbenchError(f"--truth and {named[0]}: expected one of them")
-        pairs = pictures.pairs_with_folder(options.pictures, options.truth, options.match)
-        scene, split = options.truth.resolve().name, NOTHING
-    else:
-        OmegaConf.update(config, "scene.background", protocol.background)
-        loaded, split = scene_of(config), config.split
-        if split not in loaded.splits:
-            raise unknown("split", split, loaded.splits)
-        pairs = pictures.pairs_with_split(options.pictures, loaded.splits[split], options.match)
-        scene = loaded.name
-    name = options.name or options.pictures.resolve().name
-    unknown_facts = ("budget", "device", "backend", "engine", "precision")
-    facts = {"method": name, "scene": scene, "split": split, "trajectory": "pictures", "seed": 0}
-    return pairs, facts | dict.fromkeys(unknown_facts, NOTHING)
+    """The pictures with those of the scene's split, and the facts of their rows."""
+    OmegaConf.update(config, "scene.background", protocol.background)
+    scene, split = scene_of(config), config.split
+    if split not in scene.splits:
+        raise unknown("split", split, scene.splits)
+    pairs = pictures.pairs_with_split(folder, scene.splits[split], match)
+    return pairs, {"scene": scene.name, "split": split}
 
 
-def _typed(options: argparse.Namespace) -> list[str]:
-    """The command that was typed."""
-    named = (("--truth", options.truth), ("--name", options.name), ("--match", options.match))
-    words = ["steerbench", "score", str(options.pictures)]
-    words += [str(word) for pair in named if pair[1] is not None for word in pair]
-    return [*words, *(["--sequence"] if options.sequence else []), *options.overrides]
+def _command(
+    folder: Path,
+    truth: Path | None,
+    words: Sequence[str],
+    name: str | None,
+    match: Match,
+    sequence: bool,
+) -> list[str]:
+    """The command that does the same."""
+    named = (("--truth", truth), ("--name", name), ("--match", match))
+    given = [str(word) for pair in named if pair[1] is not None for word in pair]
+    flag = ["--sequence"] if sequence else []
+    return ["steerbench", "score", str(folder), *given, *flag, *words]
 
 
 def _example(pairs: Sequence[Pair]) -> str:

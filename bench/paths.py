@@ -1,0 +1,131 @@
+"""Camera paths in files: those of nerfstudio's viewer, and the cameras of a `transforms.json`.
+
+Poses are camera-to-world in the coordinates of the data set, OpenGL axes (y up, z backward).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import ChainMap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bench.cameras import move_camera
+from bench.scenes.files import (
+    describe,
+    number,
+    opengl_pose,
+    opengl_to_opencv,
+    read_json,
+    rigid_pose,
+    unexpected,
+    whole_number,
+)
+from bench.scenes.transforms import focal
+from bench.trajectories import Step, Trajectory
+from bench.types import Camera, Scene
+
+KEYFRAMES = "camera_path"
+"""What a file of nerfstudio's viewer has its cameras under."""
+
+
+def follow(scene: Scene, path: str, limit: int = 0) -> Trajectory:
+    """The cameras of a file, in their order and without ground truth.
+
+    nerfstudio's file has `camera_path`, with a `camera_to_world` of 16 numbers row by row and a
+    vertical `fov` in degrees for each, and `render_width`, `render_height` for all. A
+    `transforms.json` has `frames`; what intrinsics it lacks are those of the first test camera.
+
+    Args:
+        path: the file.
+        limit: > 0 keeps the first that many.
+
+    Raises:
+        SteerbenchError: the file is damaged or has no cameras; a pose is not rigid.
+    """
+    file = Path(path).expanduser().resolve()
+    record = read_json(file.parent, file.name)
+    cameras = _of_viewer(record, file) if KEYFRAMES in record else _of_frames(record, file, scene)
+    whole_number(limit, "trajectory.limit", 0)
+    scale, offset = 1 / scene.unit_length, -scene.origin.double() / scene.unit_length
+    moved = [move_camera(camera, scale, offset) for camera in cameras[: limit or None]]
+    steps = tuple(Step(camera, truth=None) for camera in moved)
+    return Trajectory(file.stem, "test", steps, reads=(file,))
+
+
+def write(path: Path, cameras: Sequence[Camera], scene: Scene, fps: float = 30.0) -> None:
+    """Write `cameras`, of one size and in scene units, as a path that nerfstudio's viewer reads."""
+    first = cameras[0]
+    record = {
+        "camera_type": "perspective",
+        "render_width": first.width,
+        "render_height": first.height,
+        "fps": fps,
+        "seconds": len(cameras) / fps,
+        KEYFRAMES: [_keyframe(camera, scene) for camera in cameras],
+    }
+    path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+def _keyframe(camera: Camera, scene: Scene) -> dict[str, Any]:
+    moved = move_camera(camera, scene.unit_length, scene.origin)
+    pose = opengl_to_opencv(moved.c2w.double())  # the same change of signs, there and back
+    rows = torch.cat((pose, pose.new_tensor([[0, 0, 0, 1]])))
+    return {
+        "camera_to_world": rows.flatten().tolist(),
+        "fov": math.degrees(2 * math.atan(camera.height / 2 / camera.fy)),
+        "aspect": camera.width / camera.height,
+    }
+
+
+def _of_viewer(record: dict, file: Path) -> list[Camera]:
+    """The cameras of nerfstudio's file: square pixels, the principal point in the middle."""
+    width, height = (whole_number(record.get(k), f"{file}: {k}", 1) for k in _SIZE)
+    found = []
+    for where, entry in _entries(record, KEYFRAMES, file):
+        flat = entry.get("camera_to_world")
+        if not isinstance(flat, list) or len(flat) != 16:
+            raise unexpected(f"{where}.camera_to_world", "16 numbers", describe(flat))
+        rows = [flat[row : row + 4] for row in range(0, 16, 4)]
+        pose = opengl_to_opencv(rigid_pose(rows, f"{where}.camera_to_world"))
+        angle = number(entry.get("fov", record.get("default_fov")), f"{where}.fov", 0, 180)
+        length = height / 2 / math.tan(math.radians(angle) / 2)
+        found.append(_camera(pose, length, length, width, height))
+    return found
+
+
+_SIZE = ("render_width", "render_height")
+
+
+def _of_frames(record: dict, file: Path, scene: Scene) -> list[Camera]:
+    """The cameras of a `transforms.json`, with or without pictures."""
+    usual = scene.splits["test"].cameras[0]
+    found = []
+    for where, frame in _entries(record, "frames", file):
+        settings = ChainMap(frame, record)
+        width = whole_number(settings.get("w", usual.width), f"{where}.w", 1)
+        height = whole_number(settings.get("h", usual.height), f"{where}.h", 1)
+        fx = focal(settings, "x", width, where) or usual.fx * width / usual.width
+        fy = focal(settings, "y", height, where) or fx
+        found.append(_camera(opengl_pose(frame, where), fx, fy, width, height))
+    return found
+
+
+def _entries(record: dict, name: str, file: Path) -> list[tuple[str, dict]]:
+    """The objects of a list in the file, each after its place."""
+    entries = record.get(name)
+    if not isinstance(entries, list) or not entries:
+        raise unexpected(f"{file}: {name}", "a list with at least one camera", describe(entries))
+    for index, entry in enumerate(entries):
+        if not isinstance(entry, dict):
+            raise unexpected(f"{file}: {name}[{index}]", "an object", describe(entry))
+    return [(f"{file}: {name}[{index}]", entry) for index, entry in enumerate(entries)]
+
+
+def _camera(pose: Tensor, fx: float, fy: float, width: int, height: int) -> Camera:
+    return Camera(pose, fx, fy, width / 2, height / 2, width, height)

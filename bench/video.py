@@ -1,0 +1,55 @@
+"""Videos of 8-bit pictures, by PyAV."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+
+from bench.errors import SteerbenchError, Unavailable
+
+QUALITY = "18"
+"""H.264's constant rate factor: hardly to be told from the original."""
+
+
+@contextmanager
+def recorded(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
+    """What takes the pictures of a video, uint8 [H, W, 3], of one size, one after the other.
+
+    H.264 needs even sizes: an odd last row or column is repeated.
+
+    Raises:
+        Unavailable: PyAV is not installed.
+        SteerbenchError: the file cannot be written, or its name ends in nothing that is a video.
+    """
+    try:
+        import av
+    except ImportError as error:
+        raise Unavailable(
+            f"{path}: videos need PyAV: pip install 'steerbench[video]'; without --video the "
+            "pictures alone are written"
+        ) from error
+    try:
+        with av.open(path, "w") as container:
+            stream = container.add_stream("h264", rate=Fraction(fps).limit_denominator(1000))
+            stream.pix_fmt, stream.options = "yuv420p", {"crf": QUALITY}
+
+            sized = False
+
+            def take(picture: np.ndarray) -> None:
+                nonlocal sized
+                height, width = picture.shape[:2]
+                even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+                if not sized:
+                    stream.height, stream.width = even.shape[:2]
+                    sized = True
+                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
+                container.mux(stream.encode(frame))
+
+            yield take
+            container.mux(stream.encode())
+    except (av.error.FFmpegError, ValueError) as error:
+        raise SteerbenchError(f"{path}: cannot write the video: {error}") from error

@@ -1,0 +1,80 @@
+"""`steerbench render`: every frame of a trajectory as a picture, and as a video."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from bench import paths
+from bench.console import ConsoleLog
+from bench.errors import SteerbenchError, explained
+from bench.metrics import quantise
+from bench.results import Store
+from bench.scoring import check_frame
+from bench.trajectories import MIXED
+from bench.types import Camera, Method, NullProbe
+from bench.video import recorded
+from sweeps.build import build
+from sweeps.measurement import scene_of, trained
+from sweeps.overrides import composed, setting
+
+
+def main(options: argparse.Namespace) -> int:
+    """Render, write `0000.png` and so on, the path and the video; say where they are."""
+    words = [*_of_run(options.run, options.overrides), *options.overrides]
+    if options.path:
+        place = setting("trajectory.path", str(options.path.resolve()))
+        words = [*words, "trajectory=path", place]
+    config = composed(words)
+    log, scene = ConsoleLog(Path(config.outputs)), scene_of(config)
+    trajectory = build(config, "trajectory", scene)
+    if options.video and trajectory.resolution == MIXED:
+        raise SteerbenchError("--video: expected frames of one size, the trajectory has several")
+    beside = [composed([*words, f"method={name}"]) for name in options.beside]
+    methods = [trained(each, log) for each in (config, *beside)]
+    cameras = [step.camera for step in trajectory.steps]
+    folder = options.output or Path(config.outputs) / "render" / trajectory.name
+    with explained(folder), ExitStack() as stack:
+        folder.mkdir(parents=True, exist_ok=True)
+        if trajectory.resolution != MIXED:
+            paths.write(folder / "path.json", cameras, scene, options.fps)
+        film = stack.enter_context(recorded(options.video, options.fps)) if options.video else None
+        progress = stack.enter_context(log.progress("rendering", len(cameras)))
+        for method in methods:
+            method.reset()
+        for index, camera in enumerate(cameras):
+            picture = np.concatenate([_drawn(one, camera, index) for one in methods], axis=1)
+            Image.fromarray(picture).save(folder / f"{index:04}.png")
+            if film:
+                film(picture)
+            progress.advance()
+    log.info(f"{len(cameras)} pictures: {folder}")
+    if options.video:
+        log.info(f"video: {options.video}")
+    return 0
+
+
+@torch.no_grad()
+def _drawn(method: Method, camera: Camera, index: int) -> np.ndarray:
+    """The next frame of `method`, uint8 [H, W, 3]."""
+    frame = method.render(camera, NullProbe())
+    check_frame(frame, camera, method.name, index)
+    return (255 * quantise(frame.rgb.cpu())).round().byte().numpy()
+
+
+def _of_run(key: str | None, words: Sequence[str]) -> list[str]:
+    """The words of the command that measured a run of the store."""
+    if key is None:
+        return []
+    store = Store(Path(composed(words).outputs))
+    _, command, *rest = shlex.split(str(store.record(store.whole_key(key))["command"]))
+    if command != "run":
+        raise SteerbenchError(f"run {key}: expected one of a method, got pictures that were scored")
+    return [word for word in rest if not word.startswith("hydra.")]

@@ -1,0 +1,105 @@
+"""Camera paths in files: there and back, what they mean, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from bench.paths import follow, write
+from bench.types import Camera, Scene, Split, SteerbenchError
+
+POSE = torch.tensor([[1.0, 0, 0, 0.5], [0, -1, 0, 0.25], [0, 0, -1, 2.0]])
+
+
+@pytest.fixture
+def scene() -> Scene:
+    """Four data set units to a scene unit, the corner of the cube at (-1, -2, 0)."""
+    camera = Camera(POSE, 40.0, 40.0, 16.0, 12.0, 32, 24)
+    image = torch.zeros(24, 32, 3, dtype=torch.uint8)
+    split = Split([camera], [image], ["0"])
+    bounds = torch.tensor([[0.0, 0, 0], [1, 1, 1]])
+    origin = torch.tensor([-1.0, -2.0, 0.0])
+    splits = {"train": split, "test": split}
+    return Scene("cube", splits, torch.ones(3), bounds, 4.0, "cube", origin)
+
+
+def keyframe(**others: Any) -> dict[str, Any]:
+    flat = [1.0, 0, 0, 3.0, 0, 1, 0, 0, 0, 0, 1, 8, 0, 0, 0, 1]
+    return {"camera_to_world": flat, "fov": 90.0} | others
+
+
+def stored(folder: Path, record: Any, name: str = "path.json") -> str:
+    (folder / name).write_text(json.dumps(record))
+    return str(folder / name)
+
+
+def viewer(*keyframes: dict[str, Any]) -> dict[str, Any]:
+    return {"render_width": 40, "render_height": 30, "camera_path": list(keyframes)}
+
+
+def test_a_path_comes_back_as_it_was_written(scene: Scene, tmp_path: Path) -> None:
+    first = scene.splits["test"].cameras[0]
+    second = replace(first, c2w=first.c2w + torch.tensor([0.0, 0, 0, 0.125]))
+    write(tmp_path / "there.json", [first, second], scene)
+    trajectory = follow(scene, str(tmp_path / "there.json"))
+    assert trajectory.name == "there"
+    assert trajectory.reads == (tmp_path / "there.json",)
+    assert trajectory.preceding == [0, 1]
+    for step, camera in zip(trajectory.steps, (first, second), strict=True):
+        assert step.truth is None
+        torch.testing.assert_close(step.camera.c2w, camera.c2w)
+        assert (step.camera.width, step.camera.height) == (32, 24)
+        assert step.camera.fy == pytest.approx(camera.fy)
+
+
+def test_a_key_frame_of_the_viewer_is_read_as_nerfstudio_means_it(
+    scene: Scene, tmp_path: Path
+) -> None:
+    (step,) = follow(scene, stored(tmp_path, viewer(keyframe()))).steps
+    camera = step.camera
+    # 90 degrees from top to bottom: the focal length is half the height. y and z change signs.
+    assert (camera.fx, camera.fy) == pytest.approx((15, 15))
+    expected = torch.tensor([[1.0, 0, 0, 1.0], [0, -1, 0, 0.5], [0, 0, -1, 2.0]])
+    torch.testing.assert_close(camera.c2w, expected)  # (3, 0, 8) of the data set
+
+
+def test_a_transforms_file_needs_no_pictures(scene: Scene, tmp_path: Path) -> None:
+    pose = [[1.0, 0, 0, 3], [0, 1, 0, 0], [0, 0, 1, 8], [0, 0, 0, 1]]
+    record = {"camera_angle_x": math.pi / 2, "w": 20, "frames": [{"transform_matrix": pose}] * 3}
+    trajectory = follow(scene, stored(tmp_path, record), limit=2)
+    assert len(trajectory.steps) == 2
+    camera = trajectory.steps[0].camera
+    assert (camera.width, camera.height) == (20, 24)  # the height is that of the test camera
+    assert camera.fx == pytest.approx(10)
+
+
+@pytest.mark.parametrize(
+    ("record", "message"),
+    [
+        (viewer(), r"camera_path: expected a list with at least one camera, got list of 0"),
+        ({"camera_path": [{}]}, r"render_width: expected a whole number"),
+        (viewer(keyframe(fov=200)), r"camera_path\[0\]\.fov: expected a finite number above 0"),
+        (viewer(keyframe(camera_to_world=[1, 2])), r"camera_to_world: expected 16 numbers"),
+        (
+            viewer(keyframe(camera_to_world=[2.0, *keyframe()["camera_to_world"][1:]])),
+            "expected an orthonormal rotation",
+        ),
+        ({"nothing": 1}, "frames: expected a list with at least one camera, got nothing"),
+    ],
+)
+def test_a_damaged_path_is_named_with_what_was_expected(
+    scene: Scene, tmp_path: Path, record: dict, message: str
+) -> None:
+    with pytest.raises(SteerbenchError, match=message):
+        follow(scene, stored(tmp_path, record))
+
+
+def test_a_path_that_is_not_there_is_named(scene: Scene, tmp_path: Path) -> None:
+    with pytest.raises(SteerbenchError, match=r"gone\.json: expected a file, got nothing there"):
+        follow(scene, str(tmp_path / "gone.json"))

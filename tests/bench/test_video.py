@@ -1,0 +1,42 @@
+"""Videos: as many pictures as were given, of their size and colours."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.errors import SteerbenchError, Unavailable
+from bench.video import recorded
+
+
+def test_a_video_shows_its_pictures_one_after_the_other(tmp_path: Path) -> None:
+    av = pytest.importorskip("av")
+    levels = (40, 120, 200)
+    with recorded(tmp_path / "a.mp4", fps=10) as take:
+        for level in levels:
+            take(np.full((17, 30, 3), level, np.uint8))
+    with av.open(tmp_path / "a.mp4") as video:
+        assert float(video.streams.video[0].average_rate) == 10
+        frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    assert [frame.shape for frame in frames] == [(18, 30, 3)] * 3  # H.264 has even sizes
+    for frame, level in zip(frames, levels, strict=True):
+        assert np.abs(frame.astype(int) - level).max() <= 3  # limited range of YUV, and its loss
+
+
+def test_a_file_that_is_no_video_is_one_line(tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    refused = pytest.raises(SteerbenchError, match=r"a\.nothing: cannot write the video")
+    with refused, recorded(tmp_path / "a.nothing", fps=10) as take:
+        take(np.zeros((8, 8, 3), np.uint8))
+
+
+def test_without_pyav_it_says_how_to_get_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    refused = pytest.raises(Unavailable, match=r"pip install 'steerbench\[video\]'")
+    with refused, recorded(tmp_path / "a.mp4", fps=10):
+        pass

@@ -1,0 +1,64 @@
+"""`steerbench render`: the pictures of a path, again from its own file, next to another method."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from bench.results import Store
+
+SCENE = ("scene=totem", "scene.width=24", "scene.train=3", "scene.test=3")
+QUICK = ("budget=tiny", "budget.steps=4", "budget.samples=512", "budget.frames=2")
+PROTOCOL = ("protocol.name=quick", "protocol.lpips=[]", "protocol.warmup=0")
+
+
+def pictures(folder: str) -> list[np.ndarray]:
+    return [np.asarray(Image.open(path)).astype(int) for path in sorted(Path(folder).glob("*.png"))]
+
+
+def test_every_frame_of_a_run_is_written_and_its_path_can_be_followed(steerbench) -> None:
+    assert steerbench("run", "method=ngp", *SCENE, *QUICK, *PROTOCOL).status == 0
+    (run,) = Store(Path("outputs")).rows()["run"].unique()
+
+    outcome = steerbench("render", "--run", run[:6], "--output", "there")
+    assert outcome.status == 0, outcome.err
+    assert "trained field found" in outcome.err
+    there = pictures("there")
+    assert [picture.shape for picture in there] == [(24, 24, 3)] * 2
+    kept = Path("outputs/runs") / run / "pictures" / "0000-rendered.png"
+    assert np.array_equal(np.asarray(Image.open(kept)), there[0])
+
+    path = json.loads(Path("there/path.json").read_text())
+    assert len(path["camera_path"]) == 2
+    words = ["--run", run, "--path", "there/path.json", "--beside", "ngp", "--output", "again"]
+    outcome = steerbench("render", *words)
+    assert outcome.status == 0, outcome.err
+    for before, after in zip(there, pictures("again"), strict=True):
+        left, right = after[:, :24], after[:, 24:]
+        assert np.array_equal(left, right)  # the same method twice
+        # Poses in float32, there and back: a ray that touches a cell's edge may miss a sample.
+        assert np.abs(left - before).mean() < 0.5
+
+
+def test_a_path_file_may_be_timed(steerbench) -> None:
+    assert steerbench("render", "method=ngp", *SCENE, *QUICK, "--output", "there").status == 0
+    words = ("trajectory=path", "trajectory.path=there/path.json")
+    outcome = steerbench("run", "method=ngp", *words, *SCENE, *QUICK, *PROTOCOL)
+    assert outcome.status == 0, outcome.err
+    rows = Store(Path("outputs")).rows().set_index("metric")
+    assert rows["n"]["frame_ms"] == 2
+    assert rows["n"]["psnr"] == 0  # without ground truth
+
+
+def test_scored_pictures_are_no_run_to_render(steerbench) -> None:
+    for name in ("a", "b"):
+        Path(name).mkdir()
+        Image.fromarray(np.zeros((16, 16, 3), np.uint8)).save(f"{name}/0.png")
+    assert steerbench("score", "a", "--truth", "b", *PROTOCOL[:2]).status == 0
+    (run,) = Store(Path("outputs")).rows()["run"].unique()
+    outcome = steerbench("render", "--run", run)
+    assert outcome.status == 2
+    assert "got pictures that were scored" in outcome.err

@@ -1,0 +1,101 @@
+"""`import steerbench`: the names that are documented, and the tour that shows them."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import steerbench
+
+DOCS = Path(__file__).parent.parent / "docs"
+QUICK = (
+    *("method=ngp", "scene=totem", "scene.width=24", "scene.train=3", "scene.test=2"),
+    *("budget=tiny", "budget.steps=4", "budget.samples=512"),
+    *("protocol.name=quick", "protocol.lpips=[]", "protocol.warmup=0"),
+)
+
+
+def test_every_name_is_documented_and_every_documented_name_is_there() -> None:
+    assert steerbench.__doc__ is not None
+    table = [line for line in steerbench.__doc__.splitlines() if line.startswith("| `")]
+    named = [name for line in table for name in re.findall(r"`(\w+)`", line.split("|")[1])]
+    assert sorted(named) == sorted(steerbench.__all__)
+    for name in named:
+        assert getattr(steerbench, name).__doc__
+
+
+def test_a_run_is_measured_once_and_a_method_renders_what_it_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run = steerbench.run(*QUICK)
+    again = steerbench.run(*QUICK)
+    assert again.key == run.key
+    assert len(steerbench.results()["run"].unique()) == 1
+    assert run.label == "ngp"
+    assert "| PSNR, dB" in run._repr_markdown_()
+
+    camera = steerbench.load_scene(*QUICK).splits["test"].cameras[0]
+    frame = steerbench.fit(*QUICK).render(camera, steerbench.NullProbe())
+    kept = np.asarray(Image.open(run.pictures / "0000-rendered.png"))
+    shown = (255 * frame.rgb.clamp(0, 1)).round().byte().numpy()
+    assert np.array_equal(shown, kept)
+
+
+def test_pictures_are_scored_as_on_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, level in (("theirs", 151), ("true", 100)):
+        Path(name).mkdir()
+        Image.fromarray(np.full((16, 20, 3), level, np.uint8)).save(f"{name}/0.png")
+    run = steerbench.score("theirs", "true", "protocol.name=quick", "protocol.lpips=[]", name="x")
+    assert run.label == "x"
+    assert run.values["psnr"] == pytest.approx(20 * np.log10(255 / 51))
+
+
+def test_choices_come_with_what_they_are() -> None:
+    assert steerbench.methods()["ngp"].startswith("Instant-NGP")
+    assert "totem" in steerbench.scenes()
+
+
+def test_a_wrong_setting_is_an_error_with_the_nearest_name() -> None:
+    with pytest.raises(steerbench.SteerbenchError, match="did you mean 'ngp'"):
+        steerbench.run("method=npg")
+
+
+def cells() -> list[str]:
+    notebook = json.loads((DOCS / "tour.ipynb").read_text(encoding="utf-8"))
+    return ["".join(c["source"]) for c in notebook["cells"] if c["cell_type"] == "code"]
+
+
+def test_the_tour_runs(tmp_path: Path) -> None:
+    """Its cells one after the other; what the last line of a cell is, a notebook would show."""
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join(cells())],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_tour_uses_what_the_door_has() -> None:
+    used = {
+        node.attr
+        for node in ast.walk(ast.parse("\n".join(cells())))
+        if isinstance(node, ast.Attribute)
+        and isinstance(node.value, ast.Name)
+        and node.value.id == "steerbench"
+    }
+    assert used <= set(steerbench.__all__)
+    assert len(used) >= 6
