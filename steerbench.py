@@ -30,6 +30,7 @@ from pathlib import Path
 
 import pandas as pd
 
+import sweeps  # noqa: F401 (first: it sets what torch reads when it is loaded)
 from bench.console import ConsoleLog
 from bench.pictures import Match
 from bench.results import Store
