@@ -29,36 +29,50 @@ GRID_YOUTH_STEPS = 256
 
 
 @dataclass(frozen=True)
-class TrainingOptions:
-    """How a field is trained; the defaults follow ngp_pl where facts are known.
+class PixelOptions:
+    """How anything learns from random pixels; the defaults follow ngp_pl where facts are known.
 
     Attributes:
-        rate: learning rate at the beginning, of table and networks.
+        rate: learning rate at the beginning.
         final_rate: share of `rate` left at the end of the cosine schedule.
         opacity_entropy: weight of -o ln o, which drives the opacity of a ray to 0 or 1.
         random_background: train RGBA pictures on a random colour a ray instead of the scene's
             background, so that no density can pass for background.
-        grid_samples: visits of an update of the density grid.
         max_rays: most rays of a step.
-        march_step: length of a ray-marching step, in diagonals of the cube / 1024, as the release
-            has it.
     """
 
     rate: float = 1e-2
     final_rate: float = 1 / 30
     opacity_entropy: float = 1e-3
     random_background: bool = True
-    grid_samples: int = 1 << 17
     max_rays: int = 1 << 15
-    march_step: float = 1.0
 
     def __post_init__(self) -> None:
         if not (self.rate > 0 and 0 < self.final_rate <= 1 and self.opacity_entropy >= 0):
             raise ValueError(
                 f"expected rate > 0, final_rate in (0, 1], opacity_entropy >= 0: {self}"
             )
-        if not (self.grid_samples >= 2 and self.max_rays >= MIN_RAYS):
-            raise ValueError(f"expected grid_samples >= 2, max_rays >= {MIN_RAYS}: {self}")
+        if self.max_rays < MIN_RAYS:
+            raise ValueError(f"expected max_rays >= {MIN_RAYS}: {self}")
+
+
+@dataclass(frozen=True)
+class TrainingOptions(PixelOptions):
+    """How a field of stage 1 is trained; `rate` is that of table and networks.
+
+    Attributes:
+        grid_samples: visits of an update of the density grid.
+        march_step: length of a ray-marching step, in diagonals of the cube / 1024, as the release
+            has it.
+    """
+
+    grid_samples: int = 1 << 17
+    march_step: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.grid_samples < 2:
+            raise ValueError(f"expected grid_samples >= 2: {self}")
         check_step("march_step", self.march_step)
 
     @property
@@ -131,7 +145,7 @@ class PixelTraining(ABC):
         device: torch.device,
         steps: int,
         samples: int,
-        options: TrainingOptions,
+        options: PixelOptions,
         seed: int,
     ) -> None:
         self.options, self.samples = options, samples
@@ -224,13 +238,14 @@ class FieldTraining(PixelTraining):
     ) -> None:
         super().__init__(scene, field.device, budget.steps, budget.samples, options, seed)
         self.field, self.grid = field, new_grid(scene, field.device)
+        self.grid_samples, self.march = options.grid_samples, options.march
         self.optimiser = FieldOptimiser(field)
 
     def advance(self) -> dict[str, float]:
         """One step; its mean squared error."""
         if self.step % EVERY == 0:
             young = self.step < GRID_YOUTH_STEPS
-            samples = self.options.grid_samples * (4 if young else 1)
+            samples = self.grid_samples * (4 if young else 1)
             self.grid.update(self.field, self.generator, samples)
         return super().advance()
 
@@ -239,7 +254,7 @@ class FieldTraining(PixelTraining):
             self.field,
             rays,
             self.grid.occupancy,
-            self.options.march,
+            self.march,
             jitter=jitter,
             background=background,
         )

@@ -103,7 +103,7 @@ class FieldTraining(PixelTraining):
         device = teacher.field.device
         super().__init__(scene, device, budget.renderer_steps, budget.samples, options, seed)
         self.field, self.teacher, self.occupancy = field, teacher.field, teacher.occupancy
-        self.cells = self.occupancy.cells.nonzero()
+        self.march, self.cells = options.march, self.occupancy.cells.nonzero()
         self.points_until = options.points * self.steps if len(self.cells) else 0
         self.optimiser = torch.optim.Adam(field.parameters(), betas=(0.9, 0.99), eps=1e-15)
 
@@ -146,7 +146,7 @@ class FieldTraining(PixelTraining):
             self.field,
             rays,
             self.occupancy,
-            self.options.march,
+            self.march,
             jitter=jitter,
             background=background,
         )

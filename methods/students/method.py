@@ -17,7 +17,7 @@ from bench.study import Study, turned
 from bench.threads import torch_threads
 from bench.types import Budget, Log, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
-from methods.instant_ngp.training import TrainingOptions
+from methods.instant_ngp.training import PixelOptions
 from methods.kernels.composite import check_stop
 from methods.training import checkpoint, loop
 
@@ -45,7 +45,7 @@ class Student(ABC):
         parts=dict.fromkeys(("rays", "march", "composite"), "field"),
     )
 
-    def __init__(self, teacher: Setup, training: TrainingOptions, stop: float, name: str) -> None:
+    def __init__(self, teacher: Setup, training: PixelOptions, stop: float, name: str) -> None:
         check_stop(stop)
         self.teacher, self.training, self.stop, self.name = teacher, training, stop, name
         self.train_s = 0.0
