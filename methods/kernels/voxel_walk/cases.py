@@ -166,9 +166,10 @@ def _lengths() -> list[Case]:
         "one number, computed once: 0",
         {(b, "fp32"): 0.0 for b in ("reference", "cpu")},
     )
-    for kind in ("from all around", "along diagonals", "from inside"):
-        found.append(touching.case(f"{kind}, all touch", partial(_gaps, Rays(*kinds[kind]))))
-    return found
+    return found + [
+        touching.case(f"{kind}, all touch", partial(_gaps, Rays(*kinds[kind])))
+        for kind in ("from all around", "along diagonals", "from inside")
+    ]
 
 
 def _length_error(
