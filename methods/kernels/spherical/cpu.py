@@ -65,7 +65,7 @@ class _Shade(torch.autograd.Function):
 @njit(cache=True, parallel=True)
 def _evaluate(directions, out):
     for i in prange(len(directions)):
-        harmonics(directions[i], out[i])
+        _harmonics(directions[i], out[i])
 
 
 @njit(cache=True, parallel=True)
@@ -74,7 +74,7 @@ def _shade(coefficients, directions, colours):
     for chunk in prange((count + CHUNK - 1) // CHUNK):
         basis = np.empty(16, np.float32)
         for i in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-            harmonics(directions[i], basis)
+            _harmonics(directions[i], basis)
             red, green, blue = f32(0), f32(0), f32(0)
             for k in range(size):
                 red += basis[k] * coefficients[i, k, 0]
@@ -89,15 +89,14 @@ def _unshade(grad, directions, grads):
     for chunk in prange((count + CHUNK - 1) // CHUNK):
         basis = np.empty(16, np.float32)
         for i in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-            harmonics(directions[i], basis)
+            _harmonics(directions[i], basis)
             for k in range(size):
                 for channel in range(3):
                     grads[i, k, channel] = basis[k] * grad[i, channel]
 
 
 @njit(cache=True)
-def harmonics(direction, out):
-    """All 16 of a unit direction."""
+def _harmonics(direction, out):
     x, y, z = direction[0], direction[1], direction[2]
     xx, yy, zz = x * x, y * y, z * z
     out[0] = C00

@@ -17,7 +17,7 @@ from torch import Tensor
 from bench.types import Rays
 from methods.kernels.composite import Pixels
 from methods.kernels.cpu import f32
-from methods.kernels.spherical.cpu import harmonics as spherical_harmonics
+from methods.kernels.spherical.cpu import _harmonics as spherical_harmonics
 from methods.kernels.voxel_shading import Light
 from methods.kernels.voxel_walk import Voxels
 from methods.kernels.voxel_walk.cpu import length_of, walk_ray
