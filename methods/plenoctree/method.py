@@ -15,7 +15,7 @@ from bench.types import Budget, Camera, Frame, Probe, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.instant_ngp.training import PixelBatches
 from methods.kernels.composite import STOP, Pixels
-from methods.kernels.voxel_shading import render_voxels
+from methods.kernels.voxel_walk import render_voxels
 from methods.plenoctree.octree import Octree
 from methods.plenoctree.start import Extraction, extract
 from methods.plenoctree.training import OctreeLessons, OctreeTraining

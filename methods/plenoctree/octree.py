@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from methods.kernels.march import Occupancy
-from methods.kernels.voxel_shading import Light
-from methods.kernels.voxel_walk import BRICK, Voxels
+from methods.kernels.voxel_walk import BRICK, Light, Voxels
 
 CELL = 4
 """Leaves along the side of a cell of the occupancy with which a frame finds its rays."""

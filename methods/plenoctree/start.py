@@ -15,8 +15,7 @@ from methods.instant_ngp.training import PixelBatches
 from methods.kernels.composite import STOP, visible_counts, weights
 from methods.kernels.march import Occupancy
 from methods.kernels.spherical import spherical_harmonics
-from methods.kernels.voxel_shading import Light
-from methods.kernels.voxel_walk import BRICK, Voxels, walk
+from methods.kernels.voxel_walk import BRICK, Light, Voxels, walk
 from methods.plenoctree.octree import Octree
 from methods.rendering.field import Field, pad
 

@@ -1,4 +1,5 @@
-"""Which voxels of a sparse grid a ray crosses, front to back, and where it enters and leaves them.
+"""Which voxels of a sparse grid a ray crosses, front to back, where it enters and leaves them, and
+what it sees of them.
 
 The unit cube is divided into G^3 cells, some of which are voxels that hold something. A ray o + t d
 crosses the plane k of an axis at t = (k / G - o) / d, computed from the integer k alone: two
@@ -17,9 +18,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench.types import Rays, check_shape
-from methods.kernels.composite import Intervals
+from methods.kernels.composite import STOP, Intervals, Pixels, check_stop
 from methods.kernels.dispatch import implementation
 from methods.kernels.march import PARALLEL as PARALLEL
+from methods.kernels.spherical import SIZES
 
 BRICK = 8
 """Cells along the side of a brick."""
@@ -140,6 +142,19 @@ class Crossings(Intervals):
         )
 
 
+@dataclass(frozen=True)
+class Light:
+    """What V voxels hold.
+
+    Attributes:
+        density: [V] 1 / scene unit, not negative.
+        harmonics: [V, C, 3] coefficients of the first C spherical harmonics, C of 1, 4, 9 or 16.
+    """
+
+    density: Tensor
+    harmonics: Tensor
+
+
 def walk(
     rays: Rays,
     voxels: Voxels,
@@ -174,4 +189,41 @@ def walk(
         raise ValueError(f"limit: expected 1 or more, got {limit}")
     kernel = implementation("voxel_walk", backend, origins.device)
     found: Crossings = kernel.walk(rays, voxels, start, min(limit, most))
+    return found
+
+
+def render_voxels(
+    rays: Rays,
+    voxels: Voxels,
+    light: Light,
+    *,
+    stop: float = STOP,
+    faint: float = 0.0,
+    backend: str = "auto",
+) -> tuple[Pixels, Tensor, Tensor]:
+    """The pixels of R `rays`, not composited on a background. Not differentiable.
+
+    A voxel has the opacity 1 - exp(-sigma delta) over a length delta, and shows
+    sigmoid(sum_k c_k Y_k(d)) in direction d (Yu et al. 2021, Eq. 1 to 3).
+
+    Also, for each ray, how many voxels it crossed and how many of them it shaded: [R] int32.
+
+    Args:
+        stop: transmittance at which a ray ends, less than 1.
+        faint: weight up to which a voxel has an opacity but no colour.
+
+    Raises:
+        ValueError: wrong shapes, a stop outside [0, 1); backend "cpu": not float32.
+    """
+    check_stop(stop)
+    check_shape("origins", rays.origins, None, 3)
+    check_shape("directions", rays.directions, len(rays.origins), 3)
+    check_shape("density", light.density, len(voxels))
+    check_shape("harmonics", light.harmonics, len(voxels), None, 3)
+    if light.harmonics.shape[1] not in SIZES:
+        raise ValueError(
+            f"harmonics: expected one of {SIZES} a colour, got {list(light.harmonics.shape)}"
+        )
+    kernel = implementation("voxel_walk", backend, rays.origins.device)
+    found: tuple[Pixels, Tensor, Tensor] = kernel.render_voxels(rays, voxels, light, stop, faint)
     return found

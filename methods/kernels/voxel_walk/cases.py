@@ -1,5 +1,6 @@
 """Cases of the voxel walk: the same crossings by all backends, to the last bit; against the slab
-test of each voxel alone; rays that meet faces, edges and corners, or come from very far."""
+test of each voxel alone; rays that meet faces, edges and corners, or come from very far; pixels,
+and those of a cube in closed form."""
 
 from __future__ import annotations
 
@@ -16,15 +17,22 @@ from bench.case import DTYPES, U32, Agreement, Case, Property
 from bench.types import Rays
 from methods.kernels.dispatch import served
 from methods.kernels.march.cases import ALL, AXES
-from methods.kernels.voxel_walk import Voxels, walk
+from methods.kernels.voxel_walk import Light, Voxels, render_voxels, walk
 
 SIZE = 24
 """Of the grids of most cases: no power of two, so that planes are rounded."""
 
+LONGEST = 3 * SIZE
+"""Most voxels of a ray in them."""
+
+COLOUR = (16 * 50 * 6 + 16 * 16 * 6) / 4 + 8
+"""Roundings of a colour: of a sum of 16 products of harmonics below 2, off by 48 u, with numbers
+below 6, of which the sigmoid passes on a quarter, and its own."""
+
 
 def cases() -> list[Case]:
     """Every kind of grid, ray, start and limit."""
-    return [*_agreements(), *_lengths()]
+    return [*_agreements(), *_lengths(), *_pixels(), *_cubes()]
 
 
 def _agreements() -> list[Case]:
@@ -224,3 +232,110 @@ def _gaps(rays: Rays, backend: str, device: str, precision: str) -> float:
         return math.inf
     same = found.ray[1:] == found.ray[:-1]
     return (found.near[1:] - found.far[:-1])[same].abs().amax().item()
+
+
+def _scene(size: int, kind: str, device: str) -> tuple[Voxels, Light]:
+    """Voxels in a thick shell, every second one, of random density and light."""
+    generator = torch.Generator().manual_seed(size)
+    axis = (torch.arange(size) + 0.5) / size - 0.5
+    cells = torch.cartesian_prod(*[torch.arange(size)] * 3)
+    radius = torch.cartesian_prod(axis, axis, axis).norm(dim=1)
+    kept = (radius > 0.27) & (radius < 0.4) & (torch.rand(len(cells), generator=generator) < 0.5)
+    if kind == "nothing":
+        kept[:] = False
+    coordinates = cells[kept]
+    scale = {"clear": 0.0, "mist": 2.0, "stone": 1e4}.get(kind, 20.0)
+    density = scale * torch.rand(len(coordinates), generator=generator)
+    harmonics = torch.randn(len(coordinates), 9, 3, generator=generator).clamp(-6, 6)
+    return Voxels(coordinates.to(device), size), Light(density.to(device), harmonics.to(device))
+
+
+def _views(count: int, device: str) -> Rays:
+    generator = torch.Generator().manual_seed(count)
+    origins = normalize(torch.randn(count, 3, generator=generator), dim=1) * 1.5 + 0.5
+    targets = torch.rand(count, 3, generator=generator)
+    return Rays(origins.to(device), (targets - origins).to(device))
+
+
+def _pixels() -> list[Case]:
+    kernel = Agreement(
+        "render_voxels",
+        served("voxel_walk"),
+        "colours as `COLOUR` says; light rounded once or twice a voxel by u, at most 72 voxels, and "
+        "depths up to 3; where a weight next to `stop` or `faint` counts on one side only: 3 (stop "
+        "+ 72 faint)",
+    )
+    rounding = (COLOUR + 3 * 4 * LONGEST) * U32
+    found = []
+    for name, rays, kind, stop, faint in (
+        ("no ray", 0, "cloud", 0.0, 0.0),
+        ("one ray", 1, "cloud", 0.0, 0.0),
+        ("cloud", 129, "cloud", 0.0, 0.0),
+        ("mist", 129, "mist", 0.0, 0.0),
+        ("stone", 129, "stone", 0.0, 0.0),
+        ("voxels without density", 129, "clear", 0.0, 0.0),
+        ("no voxel", 129, "nothing", 0.0, 0.0),
+        ("stop and faint", 129, "cloud", 1e-4, 1e-5),
+    ):
+        found.append(
+            kernel.case(
+                name,
+                partial(_rendered, 24, rays, kind, stop, faint),
+                rounding + 3 * (stop + LONGEST * faint),
+            )
+        )
+    # Of 128^3: 384 voxels at most.
+    large = (COLOUR + 3 * 4 * 384) * U32 + 3 * (1e-4 + 384 * 1e-5)
+    timed = partial(_rendered, 128, 1 << 13, "cloud", 1e-4, 1e-5)
+    return [*found, kernel.case("a frame of 128^3", timed, large, items=1 << 13)]
+
+
+def _rendered(
+    size: int, count: int, kind: str, stop: float, faint: float, device: str
+) -> Callable[[str], tuple[Tensor, ...]]:
+    voxels, light = _scene(size, kind, device)
+    rays = _views(count, device)
+
+    def call(backend: str) -> tuple[Tensor, ...]:
+        pixels, _, _ = render_voxels(rays, voxels, light, stop=stop, faint=faint, backend=backend)
+        return pixels.values, pixels.depth_sum, pixels.alpha
+
+    return call
+
+
+def _cubes() -> list[Case]:
+    """A cube of voxels all alike, whose pixels are known."""
+    known = Property(
+        "render_voxels",
+        "opacity is 1 - exp(-sigma chord), and colour is that opacity times that of the direction",
+        "a chord of at most 36 pieces, each off by 16 √3 (|o| + 1) u, at |o| of 2 and a density of "
+        "10, and what compositing rounds",
+        {
+            (b, "fp32"): (10 * 36 * 16 * 3 * math.sqrt(3) + COLOUR) * U32
+            for b in ("reference", "cpu")
+        },
+    )
+    return [known.case("a cube of 12^3 voxels", _cube_error)]
+
+
+def _cube_error(backend: str, device: str, precision: str) -> float:
+    dtype = DTYPES[precision]
+    rays = _views(200, device)
+    rays = Rays(rays.origins.to(dtype), rays.directions.to(dtype))
+    cells = torch.cartesian_prod(*[torch.arange(6, 18, device=device)] * 3)
+    # C of Y_1,-1 = sqrt(3 / 4 pi) y: the logit of red is the direction's y, of green 1.
+    harmonics = torch.zeros(len(cells), 4, 3, dtype=dtype, device=device)
+    harmonics[:, 1, 0] = math.sqrt(4 * math.pi / 3)
+    harmonics[:, 0, 1] = math.sqrt(4 * math.pi)
+    density = torch.full((len(cells),), 10.0, dtype=dtype, device=device)
+    light = Light(density, harmonics)
+    pixels, _, _ = render_voxels(rays, Voxels(cells, 24), light, stop=0.0, backend=backend)
+    o, d = rays.origins.double(), rays.directions.double()
+    ends = torch.stack(((0.25 - o) / d, (0.75 - o) / d))
+    chord = (ends.amax(0).amin(1) - ends.amin(0).amax(1).clamp(min=0)).clamp(min=0)
+    opacity = -torch.expm1(-10 * chord * d.norm(dim=1))
+    red = (d[:, 1] / d.norm(dim=1)).sigmoid()
+    green, blue = torch.full_like(red, 1.0).sigmoid(), torch.full_like(red, 0.5)
+    want = opacity[:, None] * torch.stack((red, green, blue), dim=1)
+    colours = (pixels.values.double() - want).abs().max()
+    return max(colours.item(), (pixels.alpha.double() - opacity).abs().max().item())

@@ -2,7 +2,8 @@
 bricks that are known to be empty in one step.
 
 As in the ray march, a chunk of rays writes what it finds into its own part of a scratch array; when
-all counts are known, it is moved to its place.
+all counts are known, it is moved to its place. A frame does not keep what it finds: each ray walks,
+shades and composites a few voxels at a time, which never leave the first-level cache.
 """
 
 from __future__ import annotations
@@ -13,12 +14,18 @@ import numpy as np
 import torch
 from numba import njit, prange
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from bench.types import Rays
+from methods.kernels.composite import Pixels
 from methods.kernels.cpu import f32, i32
-from methods.kernels.voxel_walk import PARALLEL, Crossings, Voxels
+from methods.kernels.spherical import spherical_harmonics
+from methods.kernels.voxel_walk import PARALLEL, Crossings, Light, Voxels
 
 CHUNK = 64  # rays
+ROUND = 16
+"""Voxels that a ray of a frame finds at a time: few are walked in vain behind its end."""
+
 f64 = np.float64
 INF = f32(np.inf)
 
@@ -63,14 +70,40 @@ def walk(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> Crossings:
     return Crossings(t, delta, offsets.cumsum(dim=0), near, far, ray, voxel, resume)
 
 
+def render_voxels(
+    rays: Rays, voxels: Voxels, light: Light, stop: float, faint: float
+) -> tuple[Pixels, Tensor, Tensor]:
+    """See `methods.kernels.voxel_walk.render_voxels`."""
+    dtypes = {x.dtype for x in (rays.origins, rays.directions, light.density, light.harmonics)}
+    if dtypes != {torch.float32}:
+        raise ValueError(f"backend 'cpu' renders float32, got {dtypes}: use backend='reference'")
+    count = len(rays.origins)
+    pixels = Pixels.blank(count, 3)
+    crossed, shaded = (torch.zeros(count, dtype=torch.int32) for _ in range(2))
+    basis = spherical_harmonics(normalize(rays.directions, dim=1), backend="cpu")
+    given = (rays.origins, rays.directions, basis, light.density, light.harmonics)
+    _render(
+        *(x.detach().contiguous().numpy() for x in given),
+        *(x.numpy() for x in (voxels.bricks, voxels.leaves, voxels.clearance)),
+        f64(f32(stop)),
+        f64(f32(faint)),
+        pixels.values.numpy(),
+        pixels.depth_sum.numpy(),
+        pixels.alpha.numpy(),
+        crossed.numpy(),
+        shaded.numpy(),
+    )
+    return pixels, crossed, shaded
+
+
 @njit(cache=True)
-def slope_of(direction):
+def _slope(direction):
     """t by length along an axis; 0 for a ray that does not move along it."""
     return f32(1) / direction if abs(direction) >= PARALLEL else f32(0)
 
 
 @njit(cache=True)
-def length_of(dx, dy, dz):
+def _length(dx, dy, dz):
     """Of a direction."""
     return f32(math.sqrt(f64(dx) ** 2 + f64(dy) ** 2 + f64(dz) ** 2))
 
@@ -123,19 +156,19 @@ def _empty_cells(cell, free, size):
 
 
 @njit(cache=True, error_model="numpy")
-def walk_ray(origin, direction, bricks, leaves, clearance, start, limit, nears, fars, found):
+def _walk_ray(origin, direction, bricks, leaves, clearance, start, limit, nears, fars, found):
     """Write entry, exit and voxel of at most `limit` crossings; return how many there are and the t
     to go on from."""
     size = bricks.shape[0] << 3
     width = f32(1) / f32(size)
     ox, oy, oz = origin[0], origin[1], origin[2]
     dx, dy, dz = direction[0], direction[1], direction[2]
-    sx, sy, sz = slope_of(dx), slope_of(dy), slope_of(dz)
+    sx, sy, sz = _slope(dx), _slope(dy), _slope(dz)
     ax, bx = _slab(ox, sx, size, width)
     ay, by = _slab(oy, sy, size, width)
     az, bz = _slab(oz, sz, size, width)
     t, far = max(max(ax, f32(0)), max(ay, az)), min(bx, min(by, bz))
-    length = length_of(dx, dy, dz)
+    length = _length(dx, dy, dz)
     finite = abs(ox) + abs(oy) + abs(oz) < INF and f32(0) < length < INF
     if not (finite and t < far < INF and start < far):
         return 0, INF
@@ -209,7 +242,7 @@ def _find(
     for chunk in prange((rays + CHUNK - 1) // CHUNK):
         used = chunk * CHUNK * limit
         for ray in range(chunk * CHUNK, min(rays, (chunk + 1) * CHUNK)):
-            counts[ray], resume[ray] = walk_ray(
+            counts[ray], resume[ray] = _walk_ray(
                 origins[ray],
                 directions[ray],
                 bricks,
@@ -246,10 +279,79 @@ def _place(
         begin = chunk * CHUNK
         shift = begin * limit - (ends[begin] - counts[begin])
         for ray in range(begin, min(rays, begin + CHUNK)):
-            length = length_of(directions[ray, 0], directions[ray, 1], directions[ray, 2])
+            length = _length(directions[ray, 0], directions[ray, 1], directions[ray, 2])
             for i in range(ends[ray] - counts[ray], ends[ray]):
                 enter, leave = nears[i + shift], fars[i + shift]
                 near[i], far[i], voxel[i] = enter, leave, voxels[i + shift]
                 t[i] = (enter + leave) * f32(0.5)
                 delta[i] = (leave - enter) * length
                 ray_of[i] = first + ray
+
+
+@njit(cache=True)
+def _sigmoid(x):
+    return f32(1) / (f32(1) + f32(math.exp(-x)))
+
+
+@njit(cache=True)
+def _colour(coefficients, basis):
+    size = coefficients.shape[0]
+    red, green, blue = f32(0), f32(0), f32(0)
+    for k in range(size):
+        red += basis[k] * coefficients[k, 0]
+        green += basis[k] * coefficients[k, 1]
+        blue += basis[k] * coefficients[k, 2]
+    return _sigmoid(red), _sigmoid(green), _sigmoid(blue)
+
+
+@njit(cache=True, parallel=True)
+def _render(
+    origins,
+    directions,
+    basis,
+    density,
+    harmonics,
+    bricks,
+    leaves,
+    clearance,
+    stop,
+    faint,
+    values,
+    depth_sum,
+    alpha,
+    crossed,
+    shaded,
+):
+    rays = len(origins)
+    for chunk in prange((rays + CHUNK - 1) // CHUNK):
+        near, far = np.empty(ROUND, np.float32), np.empty(ROUND, np.float32)
+        voxel = np.empty(ROUND, np.int32)
+        for ray in range(chunk * CHUNK, min(rays, (chunk + 1) * CHUNK)):
+            origin, direction = origins[ray], directions[ray]
+            length = _length(direction[0], direction[1], direction[2])
+            red, green, blue, depth, transmittance = 0.0, 0.0, 0.0, 0.0, 1.0
+            start, steps, colours = f32(0), 0, 0
+            while start < np.inf and transmittance > stop:
+                count, start = _walk_ray(
+                    origin, direction, bricks, leaves, clearance, start, ROUND, near, far, voxel
+                )
+                for i in range(count):
+                    if transmittance <= stop:
+                        break
+                    steps += 1
+                    sigma = density[voxel[i]]
+                    if sigma <= 0:
+                        continue
+                    delta = (far[i] - near[i]) * length
+                    weight = transmittance * -math.expm1(-f64(sigma * delta))
+                    transmittance -= weight
+                    depth += weight * f64((near[i] + far[i]) * f32(0.5))
+                    if weight > faint:
+                        colours += 1
+                        r, g, b = _colour(harmonics[voxel[i]], basis[ray])
+                        red += weight * f64(r)
+                        green += weight * f64(g)
+                        blue += weight * f64(b)
+            values[ray, 0], values[ray, 1], values[ray, 2] = red, green, blue
+            depth_sum[ray], alpha[ray] = depth, 1 - transmittance
+            crossed[ray], shaded[ray] = steps, colours

@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from bench.types import Rays
-from methods.kernels.voxel_walk import BRICK, PARALLEL, Crossings, Voxels
+from methods.kernels.composite import Pixels, composite, visible_counts, weights
+from methods.kernels.spherical import shade
+from methods.kernels.voxel_walk import BRICK, PARALLEL, Crossings, Light, Voxels
 
 BLOCK = 1 << 11
 """Rays whose planes are sorted at once."""
@@ -28,6 +31,26 @@ def walk(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> Crossings:
     delta = (far - near) * _length(rays.directions)[ray]
     middle = (near + far) * 0.5
     return Crossings(middle, delta, offsets, near, far, ray.int(), voxel, resume)
+
+
+@torch.no_grad()
+def render_voxels(
+    rays: Rays, voxels: Voxels, light: Light, stop: float, faint: float
+) -> tuple[Pixels, Tensor, Tensor]:
+    """See `methods.kernels.voxel_walk.render_voxels`."""
+    crossings = walk(rays, voxels, torch.zeros_like(rays.origins[:, 0]), 3 * voxels.resolution)
+    sigma = light.density[crossings.voxel.long()]
+    crossed = visible_counts(sigma, crossings, stop=stop, backend="reference")
+    weight = weights(sigma, crossings, stop=stop, backend="reference")
+    seen = weight > faint
+    values = sigma.new_zeros(len(sigma), 3)
+    towards = normalize(rays.directions, dim=1)[crossings.ray[seen].long()]
+    coefficients = light.harmonics[crossings.voxel[seen].long()]
+    values[seen] = shade(coefficients, towards, backend="reference").sigmoid()
+    pixels = composite(sigma, values, crossings, stop=stop, backend="reference")
+    shaded = torch.zeros(len(rays.origins), dtype=torch.int32, device=sigma.device)
+    shaded.index_add_(0, crossings.ray.long(), seen.int())
+    return pixels, crossed.int(), shaded
 
 
 def _walk_block(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> tuple[Tensor, ...]:
