@@ -261,9 +261,9 @@ def _pixels() -> list[Case]:
     kernel = Agreement(
         "render_voxels",
         served("voxel_walk"),
-        "colours as `COLOUR` says; light rounded once or twice a voxel by u, at most 72 voxels, and "
-        "depths up to 3; where a weight next to `stop` or `faint` counts on one side only: 3 (stop "
-        "+ 72 faint)",
+        "colours as `COLOUR` says; light rounded once or twice a voxel by u, at most 72 voxels, "
+        "and depths up to 3; where a weight next to `stop` or `faint` counts on one side only: 3 "
+        "(stop + 72 faint)",
     )
     rounding = (COLOUR + 3 * 4 * LONGEST) * U32
     found = []
