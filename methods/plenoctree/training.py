@@ -39,7 +39,11 @@ class OctreeLessons(TrainingOptions):
 
 
 class OctreeTraining(PixelTraining):
-    """The leaves stay as they are; their densities and harmonics change where rays see them."""
+    """The leaves stay as they are; their densities and harmonics change where rays see them.
+
+    Attributes:
+        visited: [S] int32 leaves that the rays of the last step saw.
+    """
 
     advice = "Try a smaller learning rate (method.training.rate)."
 
@@ -74,7 +78,7 @@ class OctreeTraining(PixelTraining):
             counts = visible_counts(sigma, crossings, stop=STOP, backend=backend)
         crossings = crossings.front(counts)
         self._sigma = light.density[crossings.voxel].requires_grad_()
-        self._voxel = crossings.voxel
+        self.visited = crossings.voxel
         harmonics = light.harmonics.detach().requires_grad_()
         colours = shade_voxels(
             harmonics,
@@ -89,7 +93,7 @@ class OctreeTraining(PixelTraining):
 
     def _update(self) -> None:
         if self._sigma.grad is not None:
-            self.gradients["density"].view(-1).index_add_(0, self._voxel, self._sigma.grad)
+            self.gradients["density"].view(-1).index_add_(0, self.visited, self._sigma.grad)
         rate = self.learning_rate()
         # A leaf's optical thickness is its density times its width.
         width = 1 / self.octree.voxels.resolution
