@@ -14,7 +14,7 @@ from bench.study import Axis, Study, Variant, turned
 from bench.types import Budget, Camera, Frame, Probe, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.instant_ngp.training import PixelBatches
-from methods.kernels.composite import STOP, Pixels
+from methods.kernels.composite import Pixels
 from methods.kernels.voxel_walk import render_voxels
 from methods.plenoctree.octree import Octree
 from methods.plenoctree.start import Extraction, extract
@@ -42,7 +42,7 @@ class PlenOctree(Student):
     kind = "plenoctree"
     study = Study(
         knobs={
-            "stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3")),
+            "stop": turned("stop", "method.stop", ("1e-1", "1e-3", "1e-4")),
             "stored": [Variant("stored fp32", ("method.stored=fp32",))],
         },
         trained={
@@ -62,7 +62,7 @@ class PlenOctree(Student):
         extraction: Extraction,
         training: OctreeLessons,
         stored: Stored = "fp16",
-        stop: float = STOP,
+        stop: float = 1e-2,
         name: str = "plenoctree",
     ) -> None:
         if stored not in ("fp16", "fp32"):

@@ -97,9 +97,13 @@ class Voxels:
                 near = functional.max_pool3d(near, kernel, stride=1, padding=padding)
         return clearance[0, 0].to(torch.uint8)
 
-    def map_bytes(self) -> int:
-        """Bytes of the brick map and of the cells of the bricks in use."""
-        return 4 * (self.bricks.numel() + self.leaves.numel())
+    @cached_property
+    def masks(self) -> Tensor:
+        """Which cells of a brick are voxels: [B, 8] int64, one word for each x, bit y * 8 + z. A
+        brick's are in one line of the cache, where its `leaves` are in 32."""
+        bits = torch.arange(BRICK**2, device=self.leaves.device)
+        used = (self.leaves.view(-1, BRICK, BRICK**2) >= 0).long()
+        return used.bitwise_left_shift(bits).sum(dim=2)
 
 
 @dataclass(frozen=True)

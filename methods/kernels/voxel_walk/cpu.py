@@ -40,7 +40,7 @@ def walk(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> Crossings:
             f"backend 'cpu' walks float32, got origins {rays.origins.dtype}, directions "
             f"{rays.directions.dtype}, start {start.dtype}: use backend='reference'"
         )
-    count, maps = len(start), (voxels.bricks, voxels.leaves, voxels.clearance)
+    count, maps = len(start), (voxels.bricks, voxels.masks, voxels.leaves, voxels.clearance)
     given = [x.detach().contiguous().numpy() for x in (rays.origins, rays.directions, start)]
     slots = -(-min(count, BLOCK) // CHUNK) * CHUNK * limit
     scratch = np.empty(slots, np.float32), np.empty(slots, np.float32), np.empty(slots, np.int32)
@@ -84,7 +84,7 @@ def render_voxels(
     given = (rays.origins, rays.directions, basis, light.density, light.harmonics)
     _render(
         *(x.detach().contiguous().numpy() for x in given),
-        *(x.numpy() for x in (voxels.bricks, voxels.leaves, voxels.clearance)),
+        *(x.numpy() for x in (voxels.bricks, voxels.masks, voxels.leaves, voxels.clearance)),
         f64(f32(stop)),
         f64(f32(faint)),
         pixels.values.numpy(),
@@ -156,7 +156,9 @@ def _empty_cells(cell, free, size):
 
 
 @njit(cache=True, error_model="numpy")
-def _walk_ray(origin, direction, bricks, leaves, clearance, start, limit, nears, fars, found):
+def _walk_ray(
+    origin, direction, bricks, masks, leaves, clearance, start, limit, nears, fars, found
+):
     """Write entry, exit and voxel of at most `limit` crossings; return how many there are and the t
     to go on from."""
     size = bricks.shape[0] << 3
@@ -202,9 +204,10 @@ def _walk_ray(origin, direction, bricks, leaves, clearance, start, limit, nears,
         tz = _plane(z + step_z, width, oz, sz) if sz != 0 else INF
         while x >> 3 == brick_x and y >> 3 == brick_y and z >> 3 == brick_z:
             following = min(tx, min(ty, tz))
-            voxel = leaves[row, ((x & 7) << 6) + ((y & 7) << 3) + (z & 7)]
-            if voxel >= 0 and following > t:
-                nears[count], fars[count], found[count] = t, following, voxel
+            cell = ((y & 7) << 3) + (z & 7)
+            if (masks[row, x & 7] >> cell) & 1 and following > t:
+                nears[count], fars[count] = t, following
+                found[count] = leaves[row, ((x & 7) << 6) + cell]
                 count += 1
                 if count == limit:
                     return count, following if following < far else INF
@@ -228,6 +231,7 @@ def _find(
     origins,
     directions,
     bricks,
+    masks,
     leaves,
     clearance,
     start,
@@ -246,6 +250,7 @@ def _find(
                 origins[ray],
                 directions[ray],
                 bricks,
+                masks,
                 leaves,
                 clearance,
                 start[ray],
@@ -312,6 +317,7 @@ def _render(
     density,
     harmonics,
     bricks,
+    masks,
     leaves,
     clearance,
     stop,
@@ -333,7 +339,17 @@ def _render(
             start, steps, colours = f32(0), 0, 0
             while start < np.inf and transmittance > stop:
                 count, start = _walk_ray(
-                    origin, direction, bricks, leaves, clearance, start, ROUND, near, far, voxel
+                    origin,
+                    direction,
+                    bricks,
+                    masks,
+                    leaves,
+                    clearance,
+                    start,
+                    ROUND,
+                    near,
+                    far,
+                    voxel,
                 )
                 for i in range(count):
                     if transmittance <= stop:
