@@ -25,10 +25,13 @@ class OctreeLessons(TrainingOptions):
     Attributes:
         density_rate: learning rate of the density, as optical thickness of a leaf, at the
             beginning.
+        samples: leaves that a step aims to learn from; more than those of a field, of which every
+            sample changes the whole network.
     """
 
-    rate: float = 2e-2
-    density_rate: float = 0.05
+    rate: float = 1e-2
+    density_rate: float = 0.03
+    samples: int = 1 << 17
     final_rate: float = 0.1
     opacity_entropy: float = 0.0
 
@@ -36,6 +39,8 @@ class OctreeLessons(TrainingOptions):
         super().__post_init__()
         if not self.density_rate >= 0:
             raise ValueError(f"density_rate: expected 0 or more, got {self.density_rate}")
+        if self.samples < 1:
+            raise ValueError(f"samples: expected 1 or more, got {self.samples}")
 
 
 class OctreeTraining(PixelTraining):
@@ -57,7 +62,7 @@ class OctreeTraining(PixelTraining):
         backend: str = "auto",
     ) -> None:
         device = octree.light.density.device
-        super().__init__(scene, device, budget.renderer_steps, budget.samples, options, seed)
+        super().__init__(scene, device, budget.renderer_steps, options.samples, options, seed)
         self.lessons, self.backend = options, backend
         self._take(octree)
 

@@ -40,6 +40,7 @@ def _agreements() -> list[Case]:
         ("no ray", 0, {}),
         ("one ray", 1, {}),
         ("inside and outside", 129, {}),
+        ("more rays than are walked together", 5000, {"grid": "one"}),
         ("no voxel", 65, {"grid": "empty"}),
         ("all voxels", 65, {"grid": "full"}),
         ("one voxel", 65, {"grid": "one"}),

@@ -29,8 +29,8 @@ ROUND = 16
 f64 = np.float64
 INF = f32(np.inf)
 
-BLOCK = 1 << 16
-"""Rays walked together: bounds the scratch memory."""
+BLOCK = 1 << 12
+"""Rays walked together: the next ones write to memory that these have made warm."""
 
 
 def walk(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> Crossings:
@@ -43,7 +43,9 @@ def walk(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> Crossings:
     count, maps = len(start), (voxels.bricks, voxels.masks, voxels.leaves, voxels.clearance)
     given = [x.detach().contiguous().numpy() for x in (rays.origins, rays.directions, start)]
     slots = -(-min(count, BLOCK) // CHUNK) * CHUNK * limit
-    scratch = np.empty(slots, np.float32), np.empty(slots, np.float32), np.empty(slots, np.int32)
+    scratch = tuple(
+        torch.empty(slots, dtype=kind).numpy() for kind in (torch.float, torch.float, torch.int32)
+    )
     offsets, resume = torch.zeros(count + 1, dtype=torch.int64), torch.empty(count)
     parts = []
     for first in range(0, max(count, 1), BLOCK):

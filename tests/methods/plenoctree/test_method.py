@@ -35,7 +35,9 @@ def setup() -> Setup:
 
 def fitted(scene: Scene, log: Log, steps: int = 20, **others) -> PlenOctree:
     extraction = Extraction(**SMALL | {k: others.pop(k) for k in SMALL if k in others})
-    method = PlenOctree(teacher=setup(), extraction=extraction, training=OctreeLessons(), **others)
+    method = PlenOctree(
+        teacher=setup(), extraction=extraction, training=OctreeLessons(samples=8192), **others
+    )
     method.fit(scene, replace(BUDGET, renderer_steps=steps), log)
     return method
 
@@ -155,7 +157,7 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(
 
     def training() -> OctreeTraining:
         octree = extracted(teacher, ball_scene)
-        return OctreeTraining(octree, ball_scene, budget, OctreeLessons(), seed=0)
+        return OctreeTraining(octree, ball_scene, budget, OctreeLessons(samples=4096), seed=0)
 
     whole, half = training(), training()
     for _ in range(20):
@@ -231,3 +233,5 @@ def test_a_wrong_precision_or_rate_is_refused() -> None:
         PlenOctree(**given, stop=1.0)
     with pytest.raises(ValueError, match="density_rate: expected"):
         OctreeLessons(density_rate=-1.0)
+    with pytest.raises(ValueError, match="samples: expected"):
+        OctreeLessons(samples=0)
