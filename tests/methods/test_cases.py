@@ -85,6 +85,8 @@ NAMES = {
     "gaussian_blending": "blend",
     "gaussian_projection": "project_gaussians",
     "spherical": "spherical_harmonics",
+    "voxel_shading": "shade_voxels",
+    "voxel_walk": "walk",
 }
 """What a kernel is called where it is not called as its folder."""
 

@@ -1,0 +1,52 @@
+"""Colours of voxels of one set of spherical harmonics each, to learn from.
+
+A voxel shows sigmoid(sum_k c_k Y_k(d)) in direction d (Yu et al. 2021, Eq. 3).
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from bench.types import check_shape
+from methods.kernels.dispatch import implementation
+from methods.kernels.spherical import SIZES
+
+
+def shade_voxels(
+    harmonics: Tensor,
+    voxel: Tensor,
+    ray: Tensor,
+    directions: Tensor,
+    *,
+    grad_buffer: Tensor | None = None,
+    backend: str = "auto",
+) -> Tensor:
+    """Colours [S, 3] of S voxels in the directions of their rays.
+
+    Differentiable in `harmonics`.
+
+    Args:
+        harmonics: [V, C, 3] coefficients of the first C harmonics in the order of `spherical`;
+            C is 1, 4, 9 or 16.
+        voxel: [S] int32 rows of `harmonics`; any number of times the same.
+        ray: [S] int32 rows of `directions`.
+        directions: [R, 3] unit vectors.
+        grad_buffer: [V, C, 3]; when given, the gradient of `harmonics` is added to it in place, and
+            autograd sees none.
+
+    Raises:
+        ValueError: wrong shapes; backend "cpu": not float32.
+    """
+    check_shape("harmonics", harmonics, None, None, 3)
+    if harmonics.shape[1] not in SIZES:
+        raise ValueError(
+            f"harmonics: expected one of {SIZES} coefficients a colour, got {list(harmonics.shape)}"
+        )
+    check_shape("voxel", voxel, None)
+    check_shape("ray", ray, len(voxel))
+    check_shape("directions", directions, None, 3)
+    if grad_buffer is not None:
+        check_shape("grad_buffer", grad_buffer, *harmonics.shape)
+    kernel = implementation("voxel_shading", backend, harmonics.device)
+    colours: Tensor = kernel.shade_voxels(harmonics, voxel, ray, directions, grad_buffer)
+    return colours

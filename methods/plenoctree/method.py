@@ -1,0 +1,122 @@
+"""PlenOctree, as a `bench.types.Method`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from bench.cameras import place_camera
+from bench.study import Axis, Study, Variant, turned
+from bench.types import Budget, Camera, Frame, Probe, Scene
+from methods.instant_ngp.stage1 import Setup, TrainedField
+from methods.instant_ngp.training import PixelBatches
+from methods.kernels.composite import Pixels
+from methods.kernels.voxel_walk import render_voxels
+from methods.plenoctree.octree import Octree
+from methods.plenoctree.start import Extraction, extract
+from methods.plenoctree.training import OctreeLessons, OctreeTraining
+from methods.rendering.frame import FeatureFrame, rays_at_matter
+from methods.rendering.march import March
+from methods.students.method import Student
+
+Stored = Literal["fp16", "fp32"]
+
+
+class PlenOctree(Student):
+    """A sparse grid of densities and spherical harmonics, taken from a trained field and refined on
+    the photos.
+
+    Args:
+        teacher: the field that it is taken from.
+        extraction: which leaves there are, and what they begin with.
+        training: how they learn, in `budget.renderer_steps` steps.
+        stored: precision of the values in a file, which they are rendered at.
+        stop: transmittance at which a ray ends, less than 1.
+        name: as it stands in result rows.
+    """
+
+    kind = "plenoctree"
+    study = Study(
+        knobs={
+            "stop": turned("stop", "method.stop", ("1e-1", "1e-3", "1e-4")),
+            "stored": [Variant("stored fp32", ("method.stored=fp32",))],
+        },
+        trained={
+            "resolution, trained": [
+                Variant(f"{n}³", (f"method.extraction.resolution={n}",)) for n in (128, 256)
+            ]
+        },
+        exact=("method.stop=1e-4", "method.stored=fp32"),
+        parts=dict.fromkeys(("rays", "render"), "field"),
+        axes={"G": Axis("{}³ leaves", "method.extraction.resolution", (128, 256, 512))},
+    )
+
+    def __init__(
+        self,
+        *,
+        teacher: Setup,
+        extraction: Extraction,
+        training: OctreeLessons,
+        stored: Stored = "fp16",
+        stop: float = 1e-2,
+        name: str = "plenoctree",
+    ) -> None:
+        if stored not in ("fp16", "fp32"):
+            raise ValueError(f"stored: expected fp16 or fp32, got {stored!r}")
+        super().__init__(teacher, training, stop, name)
+        self.extraction, self.lessons, self.stored = extraction, training, stored
+
+    def model_settings(self) -> Mapping[str, object]:
+        """What is extracted."""
+        return asdict(self.extraction)
+
+    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> OctreeTraining:
+        """See `Student`."""
+        setup = self.teacher
+        generator = torch.Generator(setup.device).manual_seed(setup.seed)
+        batches = PixelBatches(scene.splits["train"], setup.device)
+        octree = extract(teacher, batches, self.extraction, generator)
+        return OctreeTraining(octree, scene, budget, self.lessons, setup.seed, setup.backend)
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """See `Student`."""
+        octree = Octree.of(tensors, self.teacher.device)
+        self.octree = octree.rounded() if self.stored == "fp16" else octree.visible()
+
+    @torch.no_grad()
+    def render(self, camera: Camera, probe: Probe) -> Frame:
+        """One frame at the camera's full resolution."""
+        camera = place_camera(camera, self.teacher.device)
+        octree, size = self.octree, camera.height * camera.width
+        with probe.stage("rays"):
+            seen, rays = rays_at_matter(camera, octree.occupancy)
+            canvas = Pixels.blank(size, 3, self.teacher.device)
+        probe.count("rays", len(seen), size)
+        with probe.stage("render"):
+            pixels, crossed, shaded = render_voxels(
+                rays,
+                octree.voxels,
+                octree.light,
+                stop=self.stop,
+                faint=March(stop=self.stop).least_weight,
+                backend=self.teacher.backend,
+            )
+        with probe.stage("finish"):
+            samples = int(crossed.sum())
+            probe.count("samples", samples)
+            probe.count("shaded_samples", int(shaded.sum()), samples)
+            canvas.put(seen, pixels)
+            frame = FeatureFrame.of(camera, canvas, self.background)
+        return Frame(frame.values, frame.depth, frame.alpha)
+
+    def sizes(self) -> dict[str, int]:
+        """Bytes of the leaves' values and of the index, as they are stored."""
+        return self.octree.sizes(2 if self.stored == "fp16" else 4)
+
+    def settings(self) -> dict[str, str]:
+        """See `bench.types.Method.settings`."""
+        return super().settings() | {"precision": self.stored}

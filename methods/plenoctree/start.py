@@ -1,0 +1,178 @@
+"""An octree from a trained field (Yu et al. 2021, Sections 3.2 and 4): which leaves are needed, how
+dense they are, and spherical harmonics for their colours."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bench.types import SteerbenchError
+from methods.instant_ngp.stage1 import TrainedField
+from methods.instant_ngp.training import PixelBatches
+from methods.kernels.composite import STOP, visible_counts, weights
+from methods.kernels.march import Occupancy
+from methods.kernels.spherical import spherical_harmonics
+from methods.kernels.voxel_walk import BRICK, Light, Voxels, walk
+from methods.plenoctree.octree import Octree
+from methods.rendering.field import Field, pad
+
+RAYS = 1 << 15
+"""Training rays whose weights are looked at together."""
+
+QUERIES = 1 << 18
+"""Places of the field that are looked at together."""
+
+CLAMP = 1e-3
+"""Colours are kept so far from 0 and 1, where their logits are infinite."""
+
+
+@dataclass(frozen=True)
+class Extraction:
+    """How leaves are found and filled.
+
+    Attributes:
+        resolution: leaves along the side of the cube, a multiple of 64, 128 to 2048.
+        degree: of the spherical harmonics, 0 to 3.
+        least_weight: leaves stay whose weight on any of the training rays is at least this.
+        rays: random training rays that are looked at.
+        points: random places of a leaf over which its density is averaged.
+        directions: from which its colour is looked at.
+        most_leaves: candidates of more are refused before there is memory for them.
+    """
+
+    resolution: int = 512
+    degree: int = 2
+    least_weight: float = 1e-3
+    rays: int = 1 << 22
+    points: int = 8
+    directions: int = 64
+    most_leaves: int = 12_000_000
+
+    def __post_init__(self) -> None:
+        if self.resolution % (BRICK * BRICK) or not 128 <= self.resolution <= 2048:
+            raise ValueError(
+                f"resolution: expected a multiple of {BRICK * BRICK} from 128 to 2048, "
+                f"got {self.resolution}"
+            )
+        if self.degree not in range(4):
+            raise ValueError(f"degree: expected 0 to 3, got {self.degree}")
+        if self.directions < (self.degree + 1) ** 2:
+            raise ValueError(
+                f"directions: expected at least {(self.degree + 1) ** 2}, as many as degree "
+                f"{self.degree} has harmonics, got {self.directions}"
+            )
+        if min(self.rays, self.points, self.most_leaves) < 1 or not self.least_weight >= 0:
+            raise ValueError(
+                f"expected rays, points and most_leaves >= 1, least_weight >= 0, got {self}"
+            )
+
+
+@torch.no_grad()
+def extract(
+    teacher: TrainedField,
+    batches: PixelBatches,
+    options: Extraction,
+    generator: torch.Generator,
+) -> Octree:
+    """The octree of what `teacher` shows to the training rays of `batches`.
+
+    Raises:
+        SteerbenchError: there are more candidates than allowed, or nothing to be seen.
+    """
+    candidates = _candidates(teacher.occupancy, options)
+    density = _densities(teacher.field, candidates, options.resolution, options.points, generator)
+    voxels = Voxels(candidates, options.resolution)
+    seen = _largest_weights(voxels, density, batches, options.rays, generator)
+    kept = (seen >= options.least_weight) & (density > 0)
+    if not kept.any():
+        raise SteerbenchError(
+            f"octree: no leaf has a weight of {options.least_weight} on a training ray: expected "
+            "a trained field; give it more steps (budget.steps)"
+        )
+    voxels = Voxels(candidates[kept], options.resolution)
+    harmonics = _harmonics(teacher.field, voxels, options.degree, options.directions)
+    return Octree(voxels, Light(density[kept], harmonics))
+
+
+def _candidates(occupancy: Occupancy, options: Extraction) -> Tensor:
+    """The leaves [V, 3] int32 inside occupied cells."""
+    size, cells = options.resolution, occupancy.cells.nonzero().int()
+    wide = size / occupancy.resolution
+    count = round(len(cells) * wide**3)
+    if count > options.most_leaves:
+        raise SteerbenchError(
+            f"octree: {count:,} leaves of {size}^3 lie in occupied cells, expected at most "
+            f"{options.most_leaves:,}: choose a smaller method.extraction.resolution, or a larger "
+            "most_leaves where there is the memory for them (about 500 bytes each)"
+        )
+    if not wide.is_integer():
+        raise ValueError(
+            f"resolution: expected a multiple of {occupancy.resolution}, that of the field's "
+            f"occupancy, got {size}"
+        )
+    side = torch.arange(int(wide), dtype=torch.int32, device=cells.device)
+    inner = torch.cartesian_prod(side, side, side).view(-1, 3)
+    return (cells[:, None] * int(wide) + inner).reshape(-1, 3)
+
+
+def _densities(
+    field: Field, leaves: Tensor, resolution: int, points: int, generator: torch.Generator
+) -> Tensor:
+    """Mean density [V] over random `points` of each leaf (Section 3.2: anti-aliasing)."""
+    found = []
+    for part in leaves.split(QUERIES):
+        total = torch.zeros(len(part), device=part.device)
+        for _ in range(points):
+            jitter = torch.rand(part.shape, generator=generator, device=part.device)
+            total += field.density(pad((part + jitter) / resolution))[0][: len(part)]
+        found.append(total / points)
+    return torch.cat(found)
+
+
+def _largest_weights(
+    voxels: Voxels, density: Tensor, batches: PixelBatches, rays: int, generator: torch.Generator
+) -> Tensor:
+    """The largest weight [V] of each voxel on any of so many random training rays (Section 4)."""
+    largest = torch.zeros_like(density)
+    for first in range(0, rays, RAYS):
+        some, _ = batches.draw(min(RAYS, rays - first), generator)
+        crossings = walk(some, voxels)
+        sigma = density[crossings.voxel]
+        crossings = crossings.front(visible_counts(sigma, crossings, stop=STOP))
+        weight = weights(density[crossings.voxel], crossings, stop=STOP)
+        largest.scatter_reduce_(0, crossings.voxel.long(), weight, "amax")
+    return largest
+
+
+def _harmonics(field: Field, voxels: Voxels, degree: int, directions: int) -> Tensor:
+    """Coefficients [V, C, 3] whose sums are nearest, in `directions` evenly spread directions, to
+    the logits of the colours at the centres of the voxels."""
+    device, terms = voxels.coordinates.device, (degree + 1) ** 2
+    towards = fibonacci_sphere(directions).to(device)
+    basis = spherical_harmonics(towards)[:, :terms].double()
+    solve = torch.linalg.pinv(basis).float()  # [C, D], the same for all voxels
+    encoded = field.encode_directions(towards)
+    found = torch.zeros(len(voxels), terms, 3, device=device)
+    batch = max(QUERIES // directions, 1)
+    for first in range(0, len(voxels), batch):
+        centres = (voxels.coordinates[first : first + batch] + 0.5) / voxels.resolution
+        count = len(centres)
+        _, geometry = field.density(pad(centres))
+        pairs = geometry[:count].repeat_interleave(directions, dim=0)
+        shown = field.features(pad(pairs), pad(encoded.repeat(count, 1)))[: len(pairs), :3]
+        logits = shown.clamp(CLAMP, 1 - CLAMP).logit().view(count, directions, 3)
+        found[first : first + batch] = torch.einsum("cd,vdk->vck", solve, logits)
+    return found
+
+
+def fibonacci_sphere(count: int) -> Tensor:
+    """Unit vectors [count, 3], evenly spread: a turn of the golden angle for each equal step in
+    height."""
+    i = torch.arange(count, dtype=torch.float64)
+    z = 1 - (2 * i + 1) / count
+    angle = i * math.pi * (3 - math.sqrt(5))
+    radius = (1 - z * z).sqrt()
+    return torch.stack((radius * angle.cos(), radius * angle.sin(), z), dim=1).float()

@@ -1,0 +1,141 @@
+"""Leaves learn from the photos (Yu et al. 2021, Section 4.2), from random rays, with Adam."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from bench.types import Budget, Rays, Scene
+from methods.instant_ngp.training import PixelTraining, TrainingOptions
+from methods.kernels.adam import AdamState, sparse_adam_
+from methods.kernels.composite import STOP, Pixels, composite, visible_counts
+from methods.kernels.voxel_shading import shade_voxels
+from methods.kernels.voxel_walk import walk
+from methods.plenoctree.octree import Octree
+
+
+@dataclass(frozen=True)
+class OctreeLessons(TrainingOptions):
+    """How leaves learn; `rate` is that of the harmonics. There is no grid, and no step.
+
+    Attributes:
+        density_rate: learning rate of the density, as optical thickness of a leaf, at the
+            beginning.
+        samples: leaves that a step aims to learn from; more than those of a field, of which every
+            sample changes the whole network.
+    """
+
+    rate: float = 1e-2
+    density_rate: float = 0.03
+    samples: int = 1 << 17
+    final_rate: float = 0.1
+    opacity_entropy: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.density_rate >= 0:
+            raise ValueError(f"density_rate: expected 0 or more, got {self.density_rate}")
+        if self.samples < 1:
+            raise ValueError(f"samples: expected 1 or more, got {self.samples}")
+
+
+class OctreeTraining(PixelTraining):
+    """The leaves stay as they are; their densities and harmonics change where rays see them.
+
+    Attributes:
+        visited: [S] int32 leaves that the rays of the last step saw.
+    """
+
+    advice = "Try a smaller learning rate (method.training.rate)."
+
+    def __init__(
+        self,
+        octree: Octree,
+        scene: Scene,
+        budget: Budget,
+        options: OctreeLessons,
+        seed: int,
+        backend: str = "auto",
+    ) -> None:
+        device = octree.light.density.device
+        super().__init__(scene, device, budget.renderer_steps, options.samples, options, seed)
+        self.lessons, self.backend = options, backend
+        self._take(octree)
+
+    def _take(self, octree: Octree) -> None:
+        self.octree = octree
+        light = octree.light
+        # As tables of one and of 3 C columns, for Adam.
+        self.tables = {"density": light.density[:, None], "harmonics": light.harmonics.flatten(1)}
+        self.gradients = {name: torch.zeros_like(table) for name, table in self.tables.items()}
+        self.moments = {name: AdamState.like(table) for name, table in self.tables.items()}
+
+    def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
+        # `jitter` is of samples; a voxel is crossed where it is crossed.
+        light, backend = self.octree.light, self.backend
+        crossings = walk(rays, self.octree.voxels, backend=backend)
+        with torch.no_grad():
+            sigma = light.density[crossings.voxel].relu()
+            counts = visible_counts(sigma, crossings, stop=STOP, backend=backend)
+        crossings = crossings.front(counts)
+        self._sigma = light.density[crossings.voxel].requires_grad_()
+        self.visited = crossings.voxel
+        harmonics = light.harmonics.detach().requires_grad_()
+        colours = shade_voxels(
+            harmonics,
+            crossings.voxel,
+            crossings.ray,
+            functional.normalize(rays.directions, dim=1),
+            grad_buffer=self.gradients["harmonics"].view_as(harmonics),
+            backend=backend,
+        )
+        pixels = composite(self._sigma.relu(), colours, crossings, stop=STOP, backend=backend)
+        return pixels.over(background), len(crossings)
+
+    def _update(self) -> None:
+        if self._sigma.grad is not None:
+            self.gradients["density"].view(-1).index_add_(0, self.visited, self._sigma.grad)
+        rate = self.learning_rate()
+        # A leaf's optical thickness is its density times its width.
+        width = 1 / self.octree.voxels.resolution
+        rates = {"harmonics": rate, "density": rate / self.options.rate}
+        rates["density"] *= self.lessons.density_rate / width
+        for name, table in self.tables.items():
+            sparse_adam_(
+                table, self.gradients[name], self.moments[name], rates[name], backend=self.backend
+            )
+
+    def watched(self) -> dict[str, Tensor]:
+        """Densities and harmonics."""
+        return self.tables
+
+    def result(self) -> dict[str, Tensor]:
+        """The octree."""
+        return self.octree.tensors()
+
+    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+        """Put back what `result` gave."""
+        self._take(Octree.of(tensors, self.octree.light.density.device))
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+        """Moments, random numbers, size of the batch."""
+        tensors, figures = super().state()
+        for name, adam in self.moments.items():
+            tensors |= {f"{name}.first": adam.first, f"{name}.second": adam.second}
+            tensors[f"{name}.steps"] = adam.steps
+        return tensors, figures
+
+    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
+        """See `loop.Training`."""
+        super().restore(tensors, figures)
+        device = self.octree.light.density.device
+        self.moments = {
+            name: AdamState(
+                *(tensors[f"{name}.{slot}"].to(device) for slot in ("first", "second", "steps"))
+            )
+            for name in self.tables
+        }

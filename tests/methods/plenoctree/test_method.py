@@ -1,0 +1,237 @@
+"""PlenOctree as a method: what is extracted, what it learns, what a training leaves."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from bench.console import ConsoleLog
+from bench.metrics import psnr
+from bench.threads import torch_threads
+from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene, SteerbenchError
+from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
+from methods.instant_ngp.training import PixelBatches, TrainingOptions
+from methods.kernels.encode import HashGrid
+from methods.plenoctree.method import PlenOctree
+from methods.plenoctree.octree import Octree
+from methods.plenoctree.start import Extraction, extract, fibonacci_sphere
+from methods.plenoctree.training import OctreeLessons, OctreeTraining
+from methods.training import loop
+from tests.methods.conftest import Work
+
+GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
+SMALL = {"resolution": 128, "degree": 1, "rays": 20_000, "points": 2, "directions": 8}
+BUDGET = Budget("test", steps=250, samples=8192)
+Y00 = (4 * math.pi) ** -0.5
+
+
+def setup() -> Setup:
+    return Setup.resolved(GRID, TrainingOptions(), "bf16", "auto", "cpu", seed=0)
+
+
+def fitted(scene: Scene, log: Log, steps: int = 20, **others) -> PlenOctree:
+    extraction = Extraction(**SMALL | {k: others.pop(k) for k in SMALL if k in others})
+    method = PlenOctree(
+        teacher=setup(), extraction=extraction, training=OctreeLessons(samples=8192), **others
+    )
+    method.fit(scene, replace(BUDGET, renderer_steps=steps), log)
+    return method
+
+
+def quality(method: PlenOctree, scene: Scene, split: str) -> float:
+    some = scene.splits[split]
+    found = []
+    for camera, picture in list(zip(some.cameras, some.images, strict=True))[:3]:
+        truth = picture.float() / 255
+        on_white = truth[..., :3] * truth[..., 3:] + 1 - truth[..., 3:]
+        found.append(psnr(method.render(camera, NullProbe()).rgb, on_white))
+    return sum(found) / len(found)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
+    """One for all: what one test trained, the next finds."""
+    return ConsoleLog(tmp_path_factory.mktemp("outputs"), quiet=True)
+
+
+@pytest.fixture(scope="module")
+def teacher(ball_scene: Scene, log: Log) -> TrainedField:
+    with torch_threads(None):
+        return train_field(setup(), ball_scene, BUDGET, log)
+
+
+def extracted(teacher: TrainedField, scene: Scene, **others) -> Octree:
+    batches = PixelBatches(scene.splits["train"], torch.device("cpu"))
+    generator = torch.Generator().manual_seed(0)
+    return extract(teacher, batches, Extraction(**SMALL | others), generator)
+
+
+def test_leaves_stand_where_the_ball_is(ball_scene: Scene, teacher: TrainedField) -> None:
+    octree = extracted(teacher, ball_scene)
+    centres = (octree.voxels.coordinates + 0.5) / 128
+    assert teacher.occupancy.cells[tuple((centres * 128).long().unbind(dim=1))].all()
+    # Pixels are 1.6 / 40 wide: half of the leaves are not farther than two from the surface.
+    away = ((centres - 0.5).norm(dim=1) - 0.3).abs()
+    assert away.median() < 2 * 1.6 / 40
+    # Without the test of weights, all that the teacher takes for occupied would be there.
+    assert len(octree.voxels) < 0.9 * int(teacher.occupancy.cells.sum())
+
+
+def test_densities_are_means_of_the_teacher(ball_scene: Scene, teacher: TrainedField) -> None:
+    octree = extracted(teacher, ball_scene, points=64)
+    centres = (octree.voxels.coordinates + 0.5) / 128
+    axis = (torch.arange(4) + 0.5) / 4 - 0.5
+    inner = torch.cartesian_prod(axis, axis, axis) / 128
+    some = torch.arange(0, len(centres), len(centres) // 50)
+    with torch.no_grad():
+        dense = torch.stack([teacher.field.density(x + inner)[0] for x in centres[some]])
+    # Two means of 64 points each are, but for chance, within 6 of their standard deviations.
+    spread = dense.std(dim=1) / 8 * 2**0.5
+    difference = (octree.light.density[some] - dense.mean(dim=1)).abs()
+    assert (difference < 6 * spread + 1e-3).all()
+
+
+def test_harmonics_of_degree_0_are_the_mean_logit(ball_scene: Scene, teacher: TrainedField) -> None:
+    octree = extracted(teacher, ball_scene, degree=0)
+    centres = ((octree.voxels.coordinates + 0.5) / 128)[:100]
+    towards = fibonacci_sphere(SMALL["directions"])
+    with torch.no_grad():
+        _, geometry = teacher.field.density(centres)
+        shown = torch.stack(
+            [
+                teacher.field.features(
+                    geometry, teacher.field.encode_directions(d.expand(len(centres), 3))
+                )[:, :3]
+                for d in towards
+            ]
+        )
+    logits = shown.clamp(1e-3, 1 - 1e-3).logit().mean(dim=0)
+    got = octree.light.harmonics[:100, 0] * Y00
+    # Products of bfloat16 are rounded in another order: 2 ulps of 16 of its layers' sums.
+    assert (got - logits).abs().median() < 0.02
+
+
+def test_directions_are_spread_evenly() -> None:
+    directions = fibonacci_sphere(64)
+    torch.testing.assert_close(directions.norm(dim=1), torch.ones(64))
+    nearest = torch.cdist(directions, directions).fill_diagonal_(9).amin(dim=1)
+    # 64 caps that cover the sphere without overlap would be (4 pi / 64)^(1/2) = 0.44 apart.
+    assert 0.6 * 0.44 < nearest.min() <= nearest.max() < 1.4 * 0.44
+
+
+def test_it_learns_a_ball(ball_scene: Scene, log: Log) -> None:
+    before, after = fitted(ball_scene, log, 1), fitted(ball_scene, log, 60)
+    assert quality(after, ball_scene, "train") > quality(before, ball_scene, "train") + 1
+    assert quality(after, ball_scene, "test") > 21
+    frame = after.render(ball_scene.splits["test"].cameras[1], NullProbe())
+    # From the front of the ball, 1.6 - 0.3 from the camera, to its middle: after so few steps the
+    # teacher's ball is a mist.
+    assert 1.3 - 1.6 / 40 < frame.depth[16, 16].item() < 1.6
+    assert torch.equal(frame.depth.isinf(), frame.alpha <= EMPTY_ALPHA)
+    assert (frame.rgb[frame.alpha == 0] == 1).all()
+
+
+def test_only_what_rays_meet_is_changed(ball_scene: Scene, teacher: TrainedField) -> None:
+    octree = extracted(teacher, ball_scene)
+    before = octree.tensors()["density"].clone(), octree.tensors()["harmonics"].clone()
+    options = OctreeLessons(max_rays=64)
+    training = OctreeTraining(octree, ball_scene, BUDGET, options, seed=0)
+    training.advance()
+    met = torch.zeros(len(octree.voxels), dtype=torch.bool)
+    met[training.visited.long()] = True
+    assert 0 < met.sum() < len(met) / 2
+    changed = (octree.light.harmonics != before[1]).flatten(1).any(dim=1)
+    assert changed.any()
+    assert not (changed & ~met).any()
+    assert not ((octree.light.density != before[0]) & ~met).any()
+
+
+def test_a_killed_training_goes_on_as_if_it_had_not_been(
+    ball_scene: Scene, teacher: TrainedField, tmp_path: Path
+) -> None:
+    budget = Budget("test", steps=1, samples=4096, renderer_steps=20)
+
+    def training() -> OctreeTraining:
+        octree = extracted(teacher, ball_scene)
+        return OctreeTraining(octree, ball_scene, budget, OctreeLessons(samples=4096), seed=0)
+
+    whole, half = training(), training()
+    for _ in range(20):
+        whole.advance()
+    for _ in range(9):
+        half.advance()
+    loop.save(half, tmp_path / "half")
+    resumed = training()
+    loop.resume(resumed, tmp_path / "half")
+    while resumed.step < 20:
+        resumed.advance()
+    for name, value in whole.result().items():
+        assert torch.equal(resumed.result()[name], value), name
+
+
+def test_a_training_is_found_again(ball_scene: Scene, log: Log) -> None:
+    first, again = fitted(ball_scene, log), fitted(ball_scene, log)
+    assert again.train_s == first.train_s > 0
+    camera = ball_scene.splits["test"].cameras[0]
+    assert torch.equal(first.render(camera, NullProbe()).rgb, again.render(camera, NullProbe()).rgb)
+
+
+def test_what_is_stored_is_chosen_afterwards(ball_scene: Scene, log: Log) -> None:
+    half, full = fitted(ball_scene, log), fitted(ball_scene, log, stored="fp32")
+    assert full.train_s == half.train_s  # the same training
+    assert full.sizes()["leaves"] == 2 * half.sizes()["leaves"]
+    assert half.settings()["precision"] == "fp16"
+    assert abs(quality(half, ball_scene, "test") - quality(full, ball_scene, "test")) < 0.05
+
+
+def test_a_frame_says_its_work(ball_scene: Scene, log: Log) -> None:
+    probe, method = Work(), fitted(ball_scene, log)
+    method.render(ball_scene.splits["test"].cameras[0], probe)
+    assert 0 < probe.done["rays"] <= 32 * 32
+    assert 0 < probe.done["shaded_samples"] <= probe.done["samples"]
+
+
+def test_too_many_leaves_are_refused_before_there_are_any(
+    ball_scene: Scene, teacher: TrainedField
+) -> None:
+    with pytest.raises(SteerbenchError, match="expected at most 1,000: choose a smaller"):
+        extracted(teacher, ball_scene, resolution=2048, most_leaves=1000)
+
+
+def test_a_field_in_which_nothing_is_seen_is_refused(
+    ball_scene: Scene, teacher: TrainedField
+) -> None:
+    with pytest.raises(SteerbenchError, match="no leaf has a weight of 2"):
+        extracted(teacher, ball_scene, least_weight=2.0)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"resolution": 100},
+        {"resolution": 4096},
+        {"degree": 4},
+        {"directions": 3},
+        {"rays": 0},
+        {"least_weight": float("nan")},
+    ],
+)
+def test_wrong_settings_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        Extraction(**SMALL | wrong)
+
+
+def test_a_wrong_precision_or_rate_is_refused() -> None:
+    given = {"teacher": setup(), "extraction": Extraction(), "training": OctreeLessons()}
+    with pytest.raises(ValueError, match="stored: expected fp16 or fp32, got 'fp8'"):
+        PlenOctree(**given, stored="fp8")
+    with pytest.raises(ValueError, match="stop: expected"):
+        PlenOctree(**given, stop=1.0)
+    with pytest.raises(ValueError, match="density_rate: expected"):
+        OctreeLessons(density_rate=-1.0)
+    with pytest.raises(ValueError, match="samples: expected"):
+        OctreeLessons(samples=0)

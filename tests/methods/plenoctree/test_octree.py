@@ -1,0 +1,130 @@
+"""Leaves: what they show against a loop over them all, what a file of them takes."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from bench.cameras import cast
+from bench.types import Rays
+from methods.kernels.spherical import spherical_harmonics
+from methods.kernels.voxel_walk import Light, Voxels, render_voxels
+from methods.plenoctree.octree import Octree
+from tests.methods.conftest import look_at_the_middle
+
+
+def some_octree(leaves: int = 60, size: int = 16) -> Octree:
+    generator = torch.Generator().manual_seed(1)
+    cells = torch.cartesian_prod(*[torch.arange(4, 12)] * 3)
+    chosen = cells[torch.randperm(len(cells), generator=generator)[:leaves]]
+    density = 40 * torch.rand(leaves, generator=generator) - 5
+    harmonics = torch.randn(leaves, 4, 3, generator=generator)
+    return Octree(Voxels(chosen, size), Light(density, harmonics))
+
+
+def slab(octree: Octree, leaf: int, origin: torch.Tensor, direction: torch.Tensor) -> list[float]:
+    """Where a ray enters and leaves a leaf, in float64."""
+    lower = octree.voxels.coordinates[leaf].double() / octree.voxels.resolution
+    ends = torch.stack(
+        ((lower - origin) / direction, (lower + 1 / octree.voxels.resolution - origin) / direction)
+    )
+    return [ends.amin(0).amax().item(), ends.amax(0).amin().item()]
+
+
+def test_a_picture_is_that_of_a_plain_loop_over_all_leaves() -> None:
+    octree = some_octree().visible()
+    camera = look_at_the_middle(0.13, 0.4)
+    every = cast(camera)
+    rays = Rays(every.origins[::9], every.directions[::9])
+    pixels, _, _ = render_voxels(rays, octree.voxels, octree.light, stop=0.0)
+    for ray in range(len(rays.origins)):
+        origin, direction = rays.origins[ray].double(), rays.directions[ray].double()
+        pieces = [(*slab(octree, leaf, origin, direction), leaf) for leaf in range(60)]
+        towards = (direction / direction.norm()).float()[None]
+        basis = spherical_harmonics(towards, backend="reference")[0, :4].double()
+        light, colour = 1.0, torch.zeros(3, dtype=torch.float64)
+        for near, far, leaf in sorted(piece for piece in pieces if piece[1] > piece[0]):
+            sigma = octree.light.density[leaf].item()
+            weight = light * -math.expm1(-sigma * (far - near) * direction.norm().item())
+            colour += weight * (basis @ octree.light.harmonics[leaf].double()).sigmoid()
+            light -= weight
+        # 24 leaves at most, densities below 35, entry and exit rounded as in the kernel's cases.
+        assert (pixels.values[ray].double() - colour).abs().max() < 1e-4
+        assert abs(pixels.alpha[ray].item() - (1 - light)) < 1e-4
+
+
+def test_colours_change_with_the_direction_as_the_harmonics_do() -> None:
+    harmonics = torch.zeros(1, 4, 3)
+    harmonics[0, 3, 0] = 2.0  # Y_1,1 = sqrt(3 / 4 pi) x
+    octree = Octree(Voxels(torch.tensor([[4, 4, 4]]), 8), Light(torch.tensor([1e6]), harmonics))
+    directions = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    centre = torch.full((3,), 4.5 / 8)
+    pixels, _, _ = render_voxels(
+        Rays(centre - 3 * directions, 2 * directions), octree.voxels, octree.light
+    )
+    size = 2 * math.sqrt(3 / (4 * math.pi))
+    want = torch.tensor([size, -size, 0.0]).sigmoid()
+    torch.testing.assert_close(pixels.values[:, 0], want)
+    torch.testing.assert_close(pixels.values[:, 1], torch.full((3,), 0.5))
+
+
+def test_a_ball_of_leaves_lets_through_what_its_chords_do() -> None:
+    size, sigma = 64, 8.0
+    axis = (torch.arange(size) + 0.5) / size - 0.5
+    inside = torch.cartesian_prod(axis, axis, axis).norm(dim=1) < 0.3
+    leaves = torch.cartesian_prod(*[torch.arange(size)] * 3)[inside]
+    light = Light(torch.full((len(leaves),), sigma), torch.zeros(len(leaves), 1, 3))
+    rays = cast(look_at_the_middle(0.3, 0.2))
+    pixels, _, _ = render_voxels(rays, Voxels(leaves, size), light, stop=0.0)
+    towards = torch.nn.functional.normalize(rays.directions, dim=1)
+    offset = 0.5 - rays.origins
+    apart = (offset - (offset * towards).sum(1, keepdim=True) * towards).norm(dim=1)
+
+    def opacity(radius: float) -> torch.Tensor:
+        return 1 - torch.exp(-2 * sigma * (radius**2 - apart**2).clamp(min=0).sqrt())
+
+    # Leaves are those whose centre is inside: the ball is known to half a leaf's diagonal.
+    half = math.sqrt(3) / 2 / size
+    assert (pixels.alpha >= opacity(0.3 - half) - 1e-5).all()
+    assert (pixels.alpha <= opacity(0.3 + half) + 1e-5).all()
+
+
+def test_the_occupancy_has_every_leaf() -> None:
+    octree = some_octree(size=64)
+    cells = octree.occupancy.cells
+    assert cells.shape == (16, 16, 16)
+    x, y, z = (octree.voxels.coordinates // 4).unbind(dim=1)
+    assert cells[x, y, z].all()
+    assert cells.sum() == len((octree.voxels.coordinates // 4).unique(dim=0))
+
+
+def test_what_a_file_holds_comes_back() -> None:
+    octree = some_octree()
+    again = Octree.of(octree.tensors(), torch.device("cpu"))
+    assert torch.equal(again.voxels.leaves, octree.voxels.leaves)
+    assert torch.equal(again.light.harmonics, octree.light.harmonics)
+
+
+def test_rounded_leaves_are_16_bit_numbers_and_not_negative() -> None:
+    octree = some_octree()
+    octree.light.density[0] = 1e6
+    rounded = octree.rounded().light
+    for values in (rounded.density, rounded.harmonics):
+        assert torch.equal(values, values.half().float())
+        assert values.isfinite().all()
+    assert (rounded.density >= 0).all()
+    torch.testing.assert_close(
+        rounded.density[1:], octree.light.density[1:].relu(), rtol=2**-11, atol=2**-24
+    )
+
+
+@pytest.mark.parametrize("width", [2, 4])
+def test_sizes_are_values_and_what_finds_them(width: int) -> None:
+    octree = some_octree()
+    bricks = len((octree.voxels.coordinates // 8).unique(dim=0))
+    assert octree.sizes(width) == {
+        "leaves": 60 * (1 + 4 * 3) * width,
+        "index": 4 * 2**3 + bricks * (64 + 4),
+    }
