@@ -86,6 +86,7 @@ NAMES = {
     "gaussian_blending": "blend",
     "gaussian_projection": "project_gaussians",
     "spherical": "spherical_harmonics",
+    "voxel_walk": "walk",
 }
 """What a kernel is called where it is not called as its folder."""
 
