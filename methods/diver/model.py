@@ -11,7 +11,7 @@ from bench.types import Rays
 from methods.diver.decoder import CHANNELS, Decoder
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.composite import Intervals
-from methods.kernels.corner_gather import gather, integral
+from methods.kernels.corner_gather import gather, integral_along
 from methods.kernels.encode import encode
 from methods.kernels.voxel_walk import Crossings, Voxels
 from methods.students.voxels import corners_of, occupied_voxels
@@ -77,15 +77,7 @@ class CornerModel(nn.Module):
 
     def weights(self, rays: Rays, crossings: Crossings) -> Tensor:
         """Weights [S, 8] of the corners in the integrals over `crossings` of `rays`."""
-        ray = crossings.ray
-        origins = rays.origins.index_select(0, ray) * self.resolution
-        directions = rays.directions.index_select(0, ray) * self.resolution
-        origins -= self.voxels.coordinates.index_select(0, crossings.voxel)
-        ends = (
-            torch.addcmul(origins, directions, t[:, None]).clamp_(0, 1)  # rounding leads outside
-            for t in (crossings.near, crossings.far)
-        )
-        return integral(*ends, backend=self.backend)
+        return integral_along(rays, crossings, self.voxels, backend=self.backend)
 
     def features(self, voxel: Tensor, weights: Tensor, grad_buffer: Tensor | None = None) -> Tensor:
         """Integrals [S, 32] of features over segments in voxels [S]."""

@@ -10,8 +10,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from bench.types import check_shape
+from bench.types import Rays, check_shape
 from methods.kernels.dispatch import implementation
+from methods.kernels.voxel_walk import Crossings, Voxels
 
 CORNERS = 8
 
@@ -87,3 +88,25 @@ def integral(entry: Tensor, leave: Tensor, *, backend: str = "auto") -> Tensor:
     check_shape("entry", entry, None, 3)
     check_shape("leave", leave, len(entry), 3)
     return implementation("corner_gather", backend, entry.device).integral(entry, leave)
+
+
+def integral_along(
+    rays: Rays, crossings: Crossings, voxels: Voxels, *, backend: str = "auto"
+) -> Tensor:
+    """Weights [S, 8] of `integral` over the `crossings` of R `rays` through `voxels`.
+
+    Not differentiable.
+
+    Raises:
+        ValueError: rays or voxels that are not those of the crossings; backend "cpu": not float32.
+    """
+    count = len(rays.origins)
+    check_shape("origins", rays.origins, count, 3)
+    check_shape("directions", rays.directions, count, 3)
+    if len(crossings.offsets) != count + 1:
+        raise ValueError(
+            f"crossings: expected those of the {count} rays, got of {len(crossings.offsets) - 1}"
+        )
+    return implementation("corner_gather", backend, rays.origins.device).integral_along(
+        rays, crossings, voxels
+    )

@@ -20,14 +20,19 @@ from bench.case import (
     largest_error,
     on_backends,
 )
-from methods.kernels.corner_gather import CORNERS, gather, integral, trilinear
+from bench.types import Rays
+from methods.kernels.corner_gather import CORNERS, gather, integral, integral_along, trilinear
 from methods.kernels.dispatch import served
+from methods.kernels.voxel_walk import Voxels, walk
 
 VIEW = 1 << 17
 """Samples of one view, for which the throughput is stated."""
 
 SIDE = 48
 """Voxels along the grid of the cases."""
+
+FINE = 16
+"""Voxels along the grid that rays are cast through."""
 
 WEIGHTS = (
     "ends of a segment, its middle and its nodes are off by 3 u along each of 3 axes, along which "
@@ -178,6 +183,13 @@ def _integrals() -> list[Case]:
         "the same arithmetic for all others: 0",
         on_backends(0),
     )
+    along = Property(
+        "integral_along",
+        "the mean place of the weights is the middle of the crossing",
+        "an end is off by its product, its sum, their product with G and the difference: 4 u of at "
+        "most 3 G, in both ends; the sum of 8 weights 16 u each: 24 G + 128 u",
+        on_backends(24 * FINE + 128),
+    )
     ends = torch.tensor(list(itertools.product((0.0, 0.5, 1.0), repeat=3)))
     first, second = (
         x.reshape(-1, 3) for x in (ends[:, None].expand(27, 27, 3), ends.repeat(27, 1))
@@ -191,6 +203,7 @@ def _integrals() -> list[Case]:
         *(exact.case(name, partial(_moment_error, *ends)) for name, ends in kinds.items()),
         *(parts.case(name, partial(_cut_error, *ends)) for name, ends in kinds.items()),
         points.case("all corners", _corner_error),
+        along.case("rays through a full grid", _way_error),
         spoiled.case("NaN", _spread_of_nan),
     ]
 
@@ -236,6 +249,24 @@ def _cut_error(entry: Tensor, leave: Tensor, backend: str, device: str, precisio
     )
     whole = integral(entry, leave, backend=backend)
     return largest_error((whole,), (share * first + (1 - share) * second,))
+
+
+def _way_error(backend: str, device: str, precision: str) -> float:
+    """How far off the mean place that the weights give is from the middle of each crossing."""
+    generator = torch.Generator().manual_seed(5)
+    ends = torch.rand(2, 100, 3, generator=generator).to(device)
+    origins = ends[0] - 1 * (ends[1] - ends[0])
+    rays = Rays(origins, ends[1] - origins)
+    full = torch.cartesian_prod(*[torch.arange(FINE, device=device)] * 3)
+    voxels = Voxels(full, FINE)
+    crossings = walk(rays, voxels, backend="reference")
+    weights = integral_along(rays, crossings, voxels, backend=backend).double()
+    bits = torch.arange(CORNERS, device=device)[:, None] >> torch.arange(3, device=device) & 1
+    local = (weights[..., None] * bits).sum(dim=1)
+    middle = (crossings.near.double() + crossings.far.double()) / 2
+    ray, voxel = crossings.ray.long(), crossings.voxel.long()
+    place = rays.origins[ray].double() + middle[:, None] * rays.directions[ray].double()
+    return largest_error((local,), (place * FINE - full[voxel],))
 
 
 def _corner_error(backend: str, device: str, precision: str) -> float:

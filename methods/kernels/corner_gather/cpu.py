@@ -14,7 +14,9 @@ import torch
 from numba import get_num_threads, njit, prange
 from torch import Tensor
 
+from bench.types import Rays
 from methods.kernels.cpu import f32, u32
+from methods.kernels.voxel_walk import Crossings, Voxels
 
 CHUNK = 256  # samples
 GAUSS = f32(0.5 / sqrt(3))
@@ -91,6 +93,25 @@ def trilinear(local: Tensor) -> Tensor:
 def integral(entry: Tensor, leave: Tensor) -> Tensor:
     """See `methods.kernels.corner_gather.integral`."""
     return _weights(_integral, entry, leave)
+
+
+def integral_along(rays: Rays, crossings: Crossings, voxels: Voxels) -> Tensor:
+    """See `methods.kernels.corner_gather.integral_along`."""
+    if not rays.origins.dtype == rays.directions.dtype == crossings.near.dtype == torch.float32:
+        raise ValueError(
+            f"backend 'cpu' takes float32 rays and crossings, got {rays.origins.dtype}, "
+            f"{rays.directions.dtype}, {crossings.near.dtype}: use backend='reference'"
+        )
+    weights = torch.empty(len(crossings), 8)
+    given = rays.origins, rays.directions, crossings.ray, crossings.near, crossings.far
+    _integral_along(
+        *(x.detach().contiguous().numpy() for x in given),
+        voxels.coordinates.contiguous().numpy(),
+        crossings.voxel.numpy(),
+        f32(voxels.resolution),
+        weights.numpy(),
+    )
+    return weights
 
 
 def _weights(fill, *places: Tensor) -> Tensor:
@@ -203,30 +224,58 @@ def _trilinear(local, weights):
             _put(weights, i, _corner_weights(local[i, 0], local[i, 1], local[i, 2]))
 
 
+@njit(cache=True, fastmath=FAST)
+def _mean_weights(ax, ay, az, bx, by, bz):
+    """A weight is a cubic along the segment, for which two Gauss-Legendre nodes are exact."""
+    half = f32(0.5)
+    mx, my, mz = (ax + bx) * half, (ay + by) * half, (az + bz) * half
+    hx, hy, hz = (bx - ax) * GAUSS, (by - ay) * GAUSS, (bz - az) * GAUSS
+    a = _corner_weights(mx - hx, my - hy, mz - hz)
+    b = _corner_weights(mx + hx, my + hy, mz + hz)
+    return (
+        half * (a[0] + b[0]),
+        half * (a[1] + b[1]),
+        half * (a[2] + b[2]),
+        half * (a[3] + b[3]),
+        half * (a[4] + b[4]),
+        half * (a[5] + b[5]),
+        half * (a[6] + b[6]),
+        half * (a[7] + b[7]),
+    )
+
+
 @njit(cache=True, fastmath=FAST, parallel=True)
 def _integral(entry, leave, weights):
-    """A weight is a cubic along the segment, for which two Gauss-Legendre nodes are exact."""
     total = len(entry)
     for chunk in prange((total + CHUNK - 1) // CHUNK):
         for i in range(chunk * CHUNK, min(total, (chunk + 1) * CHUNK)):
             ax, ay, az = entry[i, 0], entry[i, 1], entry[i, 2]
             bx, by, bz = leave[i, 0], leave[i, 1], leave[i, 2]
-            mx, my, mz = (ax + bx) * f32(0.5), (ay + by) * f32(0.5), (az + bz) * f32(0.5)
-            hx, hy, hz = (bx - ax) * GAUSS, (by - ay) * GAUSS, (bz - az) * GAUSS
-            a = _corner_weights(mx - hx, my - hy, mz - hz)
-            b = _corner_weights(mx + hx, my + hy, mz + hz)
-            half = f32(0.5)
-            _put(
-                weights,
-                i,
-                (
-                    half * (a[0] + b[0]),
-                    half * (a[1] + b[1]),
-                    half * (a[2] + b[2]),
-                    half * (a[3] + b[3]),
-                    half * (a[4] + b[4]),
-                    half * (a[5] + b[5]),
-                    half * (a[6] + b[6]),
-                    half * (a[7] + b[7]),
-                ),
+            _put(weights, i, _mean_weights(ax, ay, az, bx, by, bz))
+
+
+@njit(cache=True)
+def _local(origin, direction, t, resolution, corner):
+    """Local coordinate, along an axis, in the voxel that begins at `corner`."""
+    place = (origin + t * direction) * resolution - f32(corner)
+    return min(max(place, f32(0)), f32(1))
+
+
+@njit(cache=True, fastmath=FAST, parallel=True)
+def _integral_along(origins, directions, ray, near, far, coordinates, voxel, resolution, weights):
+    total = len(near)
+    for chunk in prange((total + CHUNK - 1) // CHUNK):
+        for i in range(chunk * CHUNK, min(total, (chunk + 1) * CHUNK)):
+            r, v = ray[i], voxel[i]
+            ox, oy, oz = origins[r, 0], origins[r, 1], origins[r, 2]
+            dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
+            x, y, z = coordinates[v, 0], coordinates[v, 1], coordinates[v, 2]
+            found = _mean_weights(
+                _local(ox, dx, near[i], resolution, x),
+                _local(oy, dy, near[i], resolution, y),
+                _local(oz, dz, near[i], resolution, z),
+                _local(ox, dx, far[i], resolution, x),
+                _local(oy, dy, far[i], resolution, y),
+                _local(oz, dz, far[i], resolution, z),
             )
+            _put(weights, i, found)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from bench.types import Rays
+from methods.kernels.voxel_walk import Crossings, Voxels
+
 
 def gather(
     table: Tensor,
@@ -37,3 +40,17 @@ def integral(entry: Tensor, leave: Tensor) -> Tensor:
     """
     middle = trilinear((entry + leave) / 2)
     return (trilinear(entry) + 4 * middle + trilinear(leave)) / 6
+
+
+@torch.no_grad()
+def integral_along(rays: Rays, crossings: Crossings, voxels: Voxels) -> Tensor:
+    """See `methods.kernels.corner_gather.integral_along`."""
+    ray = crossings.ray.long()
+    origins, directions = rays.origins[ray], rays.directions[ray]
+    corner = voxels.coordinates[crossings.voxel.long()]
+    ends = (
+        # Rounding leads out of the voxel.
+        ((origins + t[:, None] * directions) * voxels.resolution - corner).clamp(0, 1)
+        for t in (crossings.near, crossings.far)
+    )
+    return integral(*ends)
