@@ -19,7 +19,10 @@ from methods.kernels.composite import Pixels
 from methods.rendering.frame import FeatureFrame, rays_at_matter
 from methods.students.method import Student
 
-RESOLUTIONS = (128, 192, 256)
+MULTIPLE = 16
+"""The resolution is a multiple of this: its cells are looked up in bricks of bricks."""
+
+FINEST = 512
 
 
 class Diver(Student):
@@ -28,7 +31,7 @@ class Diver(Student):
     Args:
         teacher: the field that it starts from, and where it runs.
         training: how corners and decoder learn.
-        resolution: voxels along the unit cube: 128, 192 or 256.
+        resolution: voxels along the unit cube, a multiple of 16, at most 512.
         stored: "bf16" or "fp32", the features of the corners when rendering.
         faint: weight below which a segment has an opacity but no colour.
         stop: transmittance at which a ray ends when rendering, less than 1.
@@ -44,14 +47,8 @@ class Diver(Student):
             "stored": [Variant("stored fp32", ("method.stored=fp32",))],
         },
         exact=("method.stop=1e-4", "method.faint=0", "method.stored=fp32"),
-        parts={
-            "rays": "field",
-            "walk": "field",
-            "gather": "field",
-            "decode": "field",
-            "composite": "field",
-        },
-        axes={"G": Axis("{} voxels a side", "method.resolution", RESOLUTIONS)},
+        parts=dict.fromkeys(("rays", "walk", "gather", "decode", "composite"), "field"),
+        axes={"G": Axis("{} voxels a side", "method.resolution", (128, 192, 256))},
     )
 
     def __init__(
@@ -66,8 +63,10 @@ class Diver(Student):
         name: str = "diver",
     ) -> None:
         super().__init__(teacher, training, stop, name)
-        if resolution not in RESOLUTIONS:
-            raise ValueError(f"resolution: expected one of {RESOLUTIONS}, got {resolution}")
+        if resolution % MULTIPLE or not MULTIPLE <= resolution <= FINEST:
+            raise ValueError(
+                f"resolution: expected a multiple of {MULTIPLE} up to {FINEST}, got {resolution}"
+            )
         if stored not in ("bf16", "fp32"):
             raise ValueError(f"stored: expected bf16 or fp32, got {stored!r}")
         if not 0 <= faint < 1:

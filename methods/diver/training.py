@@ -35,13 +35,13 @@ class Lessons(TrainingOptions):
         prune_rays: random training rays that are looked along.
     """
 
-    rate: float = 2e-3
+    rate: float = 5e-3
     opacity_entropy: float = 0.0
-    corner_rate: float = 1e-2
+    corner_rate: float = 2e-2
     sparsity: float = 1e-5
-    prune_at: float = 0.25
+    prune_at: float = 0.1
     prune_below: float = 1e-2
-    prune_rays: int = 1 << 21
+    prune_rays: int = 1 << 20
 
     def __post_init__(self) -> None:
         super().__post_init__()
