@@ -12,7 +12,10 @@ from omegaconf import OmegaConf
 
 from sweeps.overrides import composed
 
-BASES = ("ngp", "gaussians", "plenoctree", "steernerf_lean")
+BASES = (
+    *("ngp", "gaussians", "plenoctree", "diver", "kilonerf", "nsvf", "nerf"),
+    "steernerf_lean",
+)
 """What the other methods' configurations stand on."""
 
 
