@@ -85,6 +85,7 @@ NAMES = {
     "corner_gather": "gather",
     "gaussian_blending": "blend",
     "gaussian_projection": "project_gaussians",
+    "grouped_mlp": "grouped_linear",
     "spherical": "spherical_harmonics",
     "voxel_shading": "shade_voxels",
     "voxel_walk": "walk",
