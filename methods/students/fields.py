@@ -36,14 +36,19 @@ class FieldLessons(TrainingOptions):
     Attributes:
         points: share of the steps, at the beginning, that compare densities and colours at random
             points of occupied cells with the teacher's.
+        batch: samples of a step, as a share of those of the budget: a large network learns more
+            from many small steps.
     """
 
     points: float = 0.5
+    batch: float = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0 <= self.points <= 1:
             raise ValueError(f"points: expected a share of the steps, 0 to 1, got {self.points}")
+        if not 0 < self.batch <= 1:
+            raise ValueError(f"batch: expected a share of more than 0, up to 1, got {self.batch}")
 
 
 class StudentField(nn.Module, ABC):
@@ -88,21 +93,27 @@ class StudentField(nn.Module, ABC):
 class FieldTraining(PixelTraining):
     """Points of the teacher, then rays of the photos, among what the teacher's grid has.
 
-    The occupied cells stay those of the teacher.
+    Rays learn at the samples that the teacher does not hide: its density costs less than that of a
+    large network.
+
+    Args:
+        occupancy: where the field is trained and rendered; elsewhere is nothing.
     """
 
     def __init__(
         self,
         field: StudentField,
         teacher: TrainedField,
+        occupancy: Occupancy,
         scene: Scene,
         budget: Budget,
         options: FieldLessons,
         seed: int,
     ) -> None:
         device = teacher.field.device
-        super().__init__(scene, device, budget.renderer_steps, budget.samples, options, seed)
-        self.field, self.teacher, self.occupancy = field, teacher.field, teacher.occupancy
+        samples = math.ceil(options.batch * budget.samples)
+        super().__init__(scene, device, budget.renderer_steps, samples, options, seed)
+        self.field, self.teacher, self.occupancy = field, teacher.field, occupancy
         self.cells = self.occupancy.cells.nonzero()
         self.points_until = options.points * self.steps if len(self.cells) else 0
         self.optimiser = torch.optim.Adam(field.parameters(), betas=(0.9, 0.99), eps=1e-15)
@@ -149,6 +160,7 @@ class FieldTraining(PixelTraining):
             self.options.march,
             jitter=jitter,
             background=background,
+            guide=self.teacher,
         )
 
     def _update(self) -> None:
@@ -191,20 +203,27 @@ class FieldStudent(Student):
     training: FieldLessons
 
     @abstractmethod
-    def new_field(self) -> StudentField:
-        """The untrained field on the teacher's device, with weights by the seed."""
+    def new_field(self, occupancy: Occupancy) -> StudentField:
+        """The untrained field for what is in the cells of `occupancy`, on the teacher's device,
+        with weights by the seed."""
+
+    def occupied(self, teacher: TrainedField) -> Occupancy:
+        """The cells in which the field may be other than empty: those of the teacher."""
+        return teacher.occupancy
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> loop.Training:
         """See `Student`."""
+        occupancy = self.occupied(teacher)
+        field = self.new_field(occupancy)
         return FieldTraining(
-            self.new_field(), teacher, scene, budget, self.training, self.teacher.seed
+            field, teacher, occupancy, scene, budget, self.training, self.teacher.seed
         )
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """See `Student`."""
-        self.field = self.new_field()
-        self.field.load_state_dict(checkpoint.part(tensors, "field."))
         self.occupancy = Occupancy(tensors["cells"].to(self.teacher.device))
+        self.field = self.new_field(self.occupancy)
+        self.field.load_state_dict(checkpoint.part(tensors, "field."))
 
     @torch.no_grad()
     def render(self, camera: Camera, probe: Probe) -> Frame:
