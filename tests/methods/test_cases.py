@@ -82,9 +82,11 @@ def test_every_kernel_has_cases_for_all_its_backends(kernel: str) -> None:
 
 NAMES = {
     "adam": "sparse_adam_",
+    "corner_gather": "gather",
     "gaussian_blending": "blend",
     "gaussian_projection": "project_gaussians",
     "spherical": "spherical_harmonics",
+    "voxel_walk": "walk",
 }
 """What a kernel is called where it is not called as its folder."""
 

@@ -1,0 +1,115 @@
+"""DIVeR (Wu et al. 2022), as a `bench.types.Method`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from bench.cameras import place_camera
+from bench.study import Axis, Study, Variant, turned
+from bench.types import Budget, Camera, Frame, Probe, Scene
+from methods.diver.decoder import Decoder
+from methods.diver.model import CornerModel
+from methods.diver.rendering import Baked, Stored
+from methods.diver.training import DiverTraining, Lessons
+from methods.instant_ngp.stage1 import Setup, TrainedField
+from methods.kernels.composite import Pixels
+from methods.rendering.frame import FeatureFrame, rays_at_matter
+from methods.students.method import Student
+
+MULTIPLE = 16
+"""The resolution is a multiple of this: its cells are looked up in bricks of bricks."""
+
+FINEST = 512
+
+
+class Diver(Student):
+    """Corner features of sparse voxels whose integrals along ray segments a small network decodes.
+
+    Args:
+        teacher: the field that it starts from, and where it runs.
+        training: how corners and decoder learn.
+        resolution: voxels along the unit cube, a multiple of 16, at most 512.
+        stored: "bf16" or "fp32", the features of the corners when rendering.
+        faint: weight below which a segment has an opacity but no colour.
+        stop: transmittance at which a ray ends when rendering, less than 1.
+        name: as it stands in result rows.
+    """
+
+    kind = "diver"
+    training: Lessons
+    study = Study(
+        knobs={
+            "stop": turned("stop", "method.stop", ("1e-1", "1e-3", "1e-4")),
+            "faint": turned("faint", "method.faint", ("0", "1e-3", "1e-1")),
+            "stored": [Variant("stored fp32", ("method.stored=fp32",))],
+        },
+        exact=("method.stop=1e-4", "method.faint=0", "method.stored=fp32"),
+        parts=dict.fromkeys(("rays", "walk", "gather", "decode", "composite"), "field"),
+        axes={"G": Axis("{} voxels a side", "method.resolution", (128, 192, 256))},
+    )
+
+    def __init__(
+        self,
+        *,
+        teacher: Setup,
+        training: Lessons,
+        resolution: int = 256,
+        stored: Stored = "bf16",
+        faint: float = 1e-2,
+        stop: float = 1e-2,
+        name: str = "diver",
+    ) -> None:
+        super().__init__(teacher, training, stop, name)
+        if resolution % MULTIPLE or not MULTIPLE <= resolution <= FINEST:
+            raise ValueError(
+                f"resolution: expected a multiple of {MULTIPLE} up to {FINEST}, got {resolution}"
+            )
+        if stored not in ("bf16", "fp32"):
+            raise ValueError(f"stored: expected bf16 or fp32, got {stored!r}")
+        if not 0 <= faint < 1:
+            raise ValueError(f"faint: expected a weight of 0 or more and less than 1, got {faint}")
+        self.resolution, self.stored, self.faint = resolution, stored, faint
+
+    def model_settings(self) -> Mapping[str, object]:
+        """See `Student`."""
+        return {"resolution": self.resolution}
+
+    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> DiverTraining:
+        """See `Student`."""
+        generator = torch.Generator().manual_seed(self.teacher.seed)
+        model = CornerModel.taught(teacher, self.resolution, generator)
+        return DiverTraining(model, scene, budget, self.training, self.teacher.seed)
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """See `Student`."""
+        device = self.teacher.device
+        blank = torch.zeros(0, 3, dtype=torch.int32, device=device)
+        model = CornerModel(blank, self.resolution, Decoder().to(device), self.teacher.backend)
+        model.load(tensors)
+        self.baked = Baked(model, self.stored)
+
+    @torch.no_grad()
+    def render(self, camera: Camera, probe: Probe) -> Frame:
+        """One frame at the camera's full resolution."""
+        camera = place_camera(camera, self.teacher.device)
+        size = camera.height * camera.width
+        with probe.stage("rays"):
+            seen, rays = rays_at_matter(camera, self.baked.occupancy)
+            canvas = Pixels.blank(size, 3, self.teacher.device)
+        probe.count("rays", len(seen), size)
+        rendered = self.baked.render_rays(rays, probe, self.stop, self.faint)
+        with probe.stage("finish"):
+            canvas.put(seen, rendered)
+            frame = FeatureFrame.of(camera, canvas, self.background)
+        return Frame(frame.values, frame.depth, frame.alpha)
+
+    def sizes(self) -> dict[str, int]:
+        """Bytes of what `Baked` renders."""
+        return self.baked.sizes()
+
+    def settings(self) -> dict[str, str]:
+        """See `bench.types.Method.settings`."""
+        return super().settings() | {"precision": self.stored}

@@ -1,0 +1,170 @@
+"""Corners and decoder learn from random pixels of the training pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bench.types import Budget, Rays, Scene
+from methods.diver.decoder import encode_directions
+from methods.diver.model import CornerModel, as_intervals
+from methods.instant_ngp.training import PixelTraining, TrainingOptions
+from methods.kernels.adam import AdamState, sparse_adam_
+from methods.kernels.composite import STOP, Pixels, composite, visible_counts, weights
+from methods.kernels.voxel_walk import Crossings, walk
+from methods.rendering.field import pad
+from methods.training import checkpoint
+from methods.training.optimiser import step_at
+
+CHUNK_RAYS = 1 << 15
+"""Rays that are looked along together when voxels are pruned: bounds the memory."""
+
+
+@dataclass(frozen=True)
+class Lessons(TrainingOptions):
+    """How the model learns; `rate` is that of the decoder.
+
+    Attributes:
+        corner_rate: learning rate at the beginning, of the features of the corners.
+        sparsity: weight of the mean of log(1 + 2 sigma^2) over all segments.
+        prune_at: share of the steps after which voxels go that hardly show.
+        prune_below: largest weight, in all rays that were looked along, of a voxel that goes.
+        prune_rays: random training rays that are looked along.
+    """
+
+    rate: float = 5e-3
+    opacity_entropy: float = 0.0
+    corner_rate: float = 2e-2
+    sparsity: float = 1e-5
+    prune_at: float = 0.1
+    prune_below: float = 1e-2
+    prune_rays: int = 1 << 20
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not (self.corner_rate > 0 and self.sparsity >= 0 and self.prune_rays >= 0):
+            raise ValueError(f"expected corner_rate > 0, sparsity, prune_rays >= 0: {self}")
+        if not (0 <= self.prune_at <= 1 and 0 <= self.prune_below < 1):
+            raise ValueError(f"expected prune_at in [0, 1], prune_below in [0, 1): {self}")
+
+
+class DiverTraining(PixelTraining):
+    """The training as a `methods.training.loop.Training`: some thousand rays a step."""
+
+    options: Lessons
+
+    def __init__(
+        self, model: CornerModel, scene: Scene, budget: Budget, options: Lessons, seed: int
+    ) -> None:
+        device = model.table.device
+        super().__init__(scene, device, budget.renderer_steps, budget.samples, options, seed)
+        self.model = model
+        self.networks = torch.optim.Adam(model.decoder.parameters(), betas=(0.9, 0.99), eps=1e-15)
+        self.moments = AdamState.like(model.table.detach())
+        self.grad = torch.zeros_like(model.table)
+
+    def advance(self) -> dict[str, float]:
+        """One step; its mean squared error."""
+        if self.step == int(self.options.prune_at * self.steps):
+            self._prune()
+        return super().advance()
+
+    def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
+        # A segment is integrated exactly: there is nothing to jitter.
+        model, backend = self.model, self.model.backend
+        crossings = walk(rays, model.voxels, backend=backend)
+        sigma = self._densities(rays, crossings)
+        # What lies behind an opaque surface has neither weight nor gradient.
+        counts = visible_counts(sigma, as_intervals(crossings), stop=STOP, backend=backend)
+        crossings = crossings.front(counts)
+        count = len(crossings)
+        weight = model.weights(rays, crossings)
+        features = model.features(pad(crossings.voxel), pad(weight), self.grad)
+        sigma, geometry = model.decoder.density(features)
+        self._push_to_sparsity(sigma, count)
+        encoded = encode_directions(rays.directions)
+        colours = model.decoder.colours(geometry, encoded, pad(crossings.ray))
+        pixels = composite(
+            sigma[:count], colours[:count], as_intervals(crossings), stop=STOP, backend=backend
+        )
+        return pixels.over(background), count
+
+    def _push_to_sparsity(self, sigma: Tensor, count: int) -> None:
+        """Add, to the gradient of the first `count` of `sigma`, that of the mean of
+        log(1 + 2 sigma^2)."""
+        if self.options.sparsity and sigma.requires_grad:
+            slope = 4 * sigma.detach() / (1 + 2 * sigma.detach().square())
+            slope[count:] = 0
+            push = self.options.sparsity / max(count, 1) * slope
+            sigma.register_hook(lambda grad: grad + push)
+
+    @torch.no_grad()
+    def _densities(self, rays: Rays, crossings: Crossings) -> Tensor:
+        """Integrated densities [S]."""
+        model = self.model
+        weight = model.weights(rays, crossings)
+        features = model.features(pad(crossings.voxel), pad(weight))
+        return model.decoder.density(features)[0][: len(crossings)]
+
+    @torch.no_grad()
+    def _prune(self) -> None:
+        """Forget the voxels that no ray of many shows with more than a certain weight (their
+        Section 4.1)."""
+        model, options = self.model, self.options
+        largest = torch.zeros(len(model.voxels), device=self.grad.device)
+        for first in range(0, options.prune_rays, CHUNK_RAYS):
+            count = min(CHUNK_RAYS, options.prune_rays - first)
+            rays, _ = self.batches.draw(count, self.generator)
+            crossings = walk(rays, model.voxels, backend=model.backend)
+            sigma = self._densities(rays, crossings)
+            weight = weights(sigma, as_intervals(crossings), stop=STOP, backend=model.backend)
+            largest.scatter_reduce_(0, crossings.voxel.long(), weight, "amax")
+        rows = model.keep(largest >= options.prune_below).long()
+        moments = self.moments
+        self.moments = AdamState(moments.first[rows], moments.second[rows], moments.steps[rows])
+        self.grad = torch.zeros_like(model.table)
+
+    def _update(self) -> None:
+        rate = self.learning_rate()
+        step_at(self.networks, rate)
+        corner_rate = rate * self.options.corner_rate / self.options.rate
+        table = self.model.table.detach()
+        sparse_adam_(table, self.grad, self.moments, corner_rate, backend=self.model.backend)
+
+    def watched(self) -> dict[str, Tensor]:
+        """Features, their moments, the decoder."""
+        moments = self.moments.first + self.moments.second
+        decoder = dict(self.model.decoder.named_parameters())
+        return {"corner features": self.model.table, "their moments": moments, **decoder}
+
+    def result(self) -> dict[str, Tensor]:
+        """The model."""
+        return self.model.tensors()
+
+    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
+        """Put back what `result` gave."""
+        self.model.load(tensors)
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
+        """Optimisers, random numbers, size of the batch."""
+        tensors, figures = super().state()
+        moments = self.moments
+        tensors |= {
+            "moments.first": moments.first,
+            "moments.second": moments.second,
+            "moments.steps": moments.steps,
+        }
+        return tensors | checkpoint.optimiser_tensors(self.networks, "adam."), figures
+
+    def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
+        """See `loop.Training`."""
+        super().restore(tensors, figures)
+        device = self.model.table.device
+        self.moments = AdamState(
+            *(tensors[f"moments.{name}"].to(device) for name in ("first", "second", "steps"))
+        )
+        self.grad = torch.zeros_like(self.model.table)
+        checkpoint.restore_optimiser(self.networks, tensors, "adam.")

@@ -1,0 +1,177 @@
+"""Which voxels of a sparse grid a ray crosses, front to back, and where it enters and leaves them.
+
+The unit cube is divided into G^3 cells, some of which are voxels that hold something. A ray o + t d
+crosses the plane k of an axis at t = (k / G - o) / d, computed from the integer k alone: two
+neighbouring voxels have the very same t where one is left and the other entered. A ray is in the
+cell that follows from the planes that it has crossed, so that every backend finds the same
+segments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from bench.types import Rays, check_shape
+from methods.kernels.composite import Intervals
+from methods.kernels.dispatch import implementation
+from methods.kernels.march import PARALLEL as PARALLEL
+
+BRICK = 8
+"""Cells along the side of a brick."""
+
+MAX_RESOLUTION = 2048
+"""Most cells along a side: a map of its bricks has 64 MiB."""
+
+MAX_CLEARANCE = 32
+"""Bricks beyond which a clearance is not told apart: a ray then takes another step."""
+
+
+class Voxels:
+    """Cells of a grid of G^3 over the unit cube that hold something, and where each stands in a
+    list.
+
+    Two levels of an octree of branching 8^3: a map of bricks of 8^3 cells, and the cells of those
+    bricks that have any voxel. Both give int32 numbers, -1 where nothing is.
+
+    Args:
+        coordinates: [V, 3] integers from 0 to G - 1, (x, y, z) of each voxel, none twice. The order
+            stays: row v is voxel v.
+        resolution: G, a multiple of 8, at most `MAX_RESOLUTION`.
+
+    Raises:
+        ValueError: a resolution or coordinates other than these.
+    """
+
+    def __init__(self, coordinates: Tensor, resolution: int) -> None:
+        check_shape("coordinates", coordinates, None, 3)
+        if resolution % BRICK or not 0 < resolution <= MAX_RESOLUTION:
+            raise ValueError(
+                f"resolution: expected a multiple of {BRICK} from {BRICK} to {MAX_RESOLUTION}, "
+                f"got {resolution}"
+            )
+        if coordinates.is_floating_point():
+            raise ValueError(f"coordinates: expected integers, got {coordinates.dtype}")
+        if len(coordinates) and not 0 <= coordinates.min() <= coordinates.max() < resolution:
+            raise ValueError(
+                f"coordinates: expected 0 to {resolution - 1}, got {int(coordinates.min())} to "
+                f"{int(coordinates.max())}"
+            )
+        self.coordinates, self.resolution = coordinates, resolution
+        side, device = resolution // BRICK, coordinates.device
+        x, y, z = coordinates.long().unbind(dim=1)
+        brick = ((x // BRICK) * side + y // BRICK) * side + z // BRICK
+        used, row = brick.unique(return_inverse=True)
+        bricks = torch.full((side**3,), -1, dtype=torch.int32, device=device)
+        bricks[used] = torch.arange(len(used), dtype=torch.int32, device=device)
+        self.bricks = bricks.view(side, side, side)
+        """Row of `leaves` of each brick: [G/8, G/8, G/8]."""
+        cell = (x % BRICK * BRICK + y % BRICK) * BRICK + z % BRICK
+        leaves = torch.full((len(used) * BRICK**3,), -1, dtype=torch.int32, device=device)
+        leaves[row * BRICK**3 + cell] = torch.arange(len(x), dtype=torch.int32, device=device)
+        self.leaves = leaves.view(-1, BRICK**3)
+        """Voxel of each cell (x, y, z) of a brick, at (x * 8 + y) * 8 + z: [B, 512]."""
+        if int((leaves >= 0).sum()) != len(x):
+            raise ValueError("coordinates: expected every cell once, got some of them twice")
+
+    def __len__(self) -> int:
+        return len(self.coordinates)
+
+    @cached_property
+    def clearance(self) -> Tensor:
+        """How far off the nearest brick with a voxel is, in bricks along the farthest axis, 0 in
+        such a brick, at most `MAX_CLEARANCE`: [G/8, G/8, G/8] uint8."""
+        near = (self.bricks >= 0)[None, None].float()
+        clearance = torch.zeros_like(near)
+        for _ in range(min(self.resolution // BRICK, MAX_CLEARANCE)):
+            clearance += near == 0
+            for axis in range(3):  # the maximum over a cube, an axis at a time
+                kernel, padding = [1, 1, 1], [0, 0, 0]
+                kernel[axis], padding[axis] = 3, 1
+                near = functional.max_pool3d(near, kernel, stride=1, padding=padding)
+        return clearance[0, 0].to(torch.uint8)
+
+    def map_bytes(self) -> int:
+        """Bytes of the brick map and of the cells of the bricks in use."""
+        return 4 * (self.bricks.numel() + self.leaves.numel())
+
+
+@dataclass(frozen=True)
+class Crossings(Intervals):
+    """Parts of R rays inside voxels, ray by ray, front to back.
+
+    `t` is the middle of each, `delta` its world length; see `Intervals`.
+
+    Attributes:
+        near: [S] t where the ray enters the voxel.
+        far: [S] t where it leaves; of touching voxels it is the `near` of the next.
+        ray: [S] int32.
+        voxel: [S] int32 row of `Voxels.coordinates`.
+        resume: [R] t to go on from; +inf where the ray has no more.
+    """
+
+    near: Tensor
+    far: Tensor
+    ray: Tensor
+    voxel: Tensor
+    resume: Tensor
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def front(self, counts: Tensor) -> Crossings:
+        """Only the first `counts` [R] of each ray, which then has no more."""
+        offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
+        shift = (self.offsets - offsets)[:-1].repeat_interleave(counts)
+        kept = torch.arange(len(shift), device=shift.device) + shift
+        return Crossings(
+            self.t[kept],
+            self.delta[kept],
+            offsets,
+            self.near[kept],
+            self.far[kept],
+            self.ray[kept],
+            self.voxel[kept],
+            torch.full_like(self.resume, torch.inf),
+        )
+
+
+def walk(
+    rays: Rays,
+    voxels: Voxels,
+    *,
+    start: Tensor | None = None,
+    limit: int | None = None,
+    backend: str = "auto",
+) -> Crossings:
+    """Every voxel that each of R `rays` crosses with a positive length, once. Not differentiable.
+
+    A ray that lies in a plane between cells is in those above it. A ray has no crossings if it
+    misses the cube, is not finite, has no direction or one so short that t overflows.
+
+    Args:
+        start: [R] t to begin with, `Crossings.resume` of an earlier call with the same rays; in a
+            voxel, its rest counts. +inf or NaN: none. None: 0.
+        limit: at most so many crossings a ray; None: all.
+
+    Raises:
+        ValueError: wrong shapes, a limit below 1; backend "cpu": not float32.
+    """
+    origins, count = rays.origins, len(rays.origins)
+    check_shape("origins", origins, None, 3)
+    check_shape("directions", rays.directions, count, 3)
+    if start is None:
+        start = origins.new_zeros(1).expand(count)
+    check_shape("start", start, count)
+    most = 3 * voxels.resolution  # planes of the cube, and one cell before the first
+    if limit is None:
+        limit = most
+    if limit < 1:
+        raise ValueError(f"limit: expected 1 or more, got {limit}")
+    kernel = implementation("voxel_walk", backend, origins.device)
+    found: Crossings = kernel.walk(rays, voxels, start, min(limit, most))
+    return found

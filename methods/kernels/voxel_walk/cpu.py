@@ -1,0 +1,255 @@
+"""Crossed voxels with numba: from cell to cell in integers (Amanatides & Woo 1987), and over all
+bricks that are known to be empty in one step.
+
+As in the ray march, a chunk of rays writes what it finds into its own part of a scratch array; when
+all counts are known, it is moved to its place.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numba import njit, prange
+from torch import Tensor
+
+from bench.types import Rays
+from methods.kernels.cpu import f32, i32
+from methods.kernels.voxel_walk import PARALLEL, Crossings, Voxels
+
+CHUNK = 64  # rays
+f64 = np.float64
+INF = f32(np.inf)
+
+BLOCK = 1 << 16
+"""Rays walked together: bounds the scratch memory."""
+
+
+def walk(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> Crossings:
+    """See `methods.kernels.voxel_walk.walk`."""
+    if not rays.origins.dtype == rays.directions.dtype == start.dtype == torch.float32:
+        raise ValueError(
+            f"backend 'cpu' walks float32, got origins {rays.origins.dtype}, directions "
+            f"{rays.directions.dtype}, start {start.dtype}: use backend='reference'"
+        )
+    count, maps = len(start), (voxels.bricks, voxels.leaves, voxels.clearance)
+    given = [x.detach().contiguous().numpy() for x in (rays.origins, rays.directions, start)]
+    slots = -(-min(count, BLOCK) // CHUNK) * CHUNK * limit
+    scratch = np.empty(slots, np.float32), np.empty(slots, np.float32), np.empty(slots, np.int32)
+    offsets, resume = torch.zeros(count + 1, dtype=torch.int64), torch.empty(count)
+    parts = []
+    for first in range(0, max(count, 1), BLOCK):
+        origins, directions, begin = (x[first : first + BLOCK] for x in given)
+        counts, again = offsets[1:][first : first + BLOCK], resume[first : first + BLOCK]
+        _find(
+            origins,
+            directions,
+            *(x.numpy() for x in maps),
+            begin,
+            limit,
+            *scratch,
+            counts.numpy(),
+            again.numpy(),
+        )
+        ends = counts.cumsum(dim=0)
+        total = int(ends[-1]) if len(ends) else 0
+        floats = [torch.empty(total) for _ in range(4)]
+        numbers = [torch.empty(total, dtype=torch.int32) for _ in range(2)]
+        out = (x.numpy() for x in (*floats, *numbers))
+        _place(first, directions, *scratch, limit, counts.numpy(), ends.numpy(), *out)
+        parts.append((*floats, *numbers))
+    t, delta, near, far, ray, voxel = (torch.cat(column) for column in zip(*parts, strict=True))
+    return Crossings(t, delta, offsets.cumsum(dim=0), near, far, ray, voxel, resume)
+
+
+@njit(cache=True)
+def slope_of(direction):
+    """t by length along an axis; 0 for a ray that does not move along it."""
+    return f32(1) / direction if abs(direction) >= PARALLEL else f32(0)
+
+
+@njit(cache=True)
+def length_of(dx, dy, dz):
+    """Of a direction."""
+    return f32(math.sqrt(f64(dx) ** 2 + f64(dy) ** 2 + f64(dz) ** 2))
+
+
+@njit(cache=True)
+def _plane(k, width, origin, slope):
+    """t at which a ray crosses plane `k` of an axis."""
+    return (f32(k) * width - origin) * slope
+
+
+@njit(cache=True)
+def _slab(origin, slope, size, width):
+    """Between which t a ray is inside the cube, along one axis."""
+    if slope == 0:
+        return (-INF, INF) if f32(0) <= origin <= f32(1) else (INF, -INF)
+    a, b = _plane(0, width, origin, slope), _plane(size, width, origin, slope)
+    return min(a, b), max(a, b)
+
+
+@njit(cache=True)
+def _cell(t, origin, direction, slope, size, width):
+    """The cell of an axis in which a ray is at `t`: that behind the last plane it has crossed."""
+    cell = min(max(int((origin + t * direction) * f32(size)), 0), size - 1)
+    if slope > 0:
+        while cell + 1 < size and _plane(cell + 1, width, origin, slope) <= t:
+            cell += 1
+        while cell > 0 and _plane(cell, width, origin, slope) > t:
+            cell -= 1
+    elif slope < 0:
+        while cell > 0 and _plane(cell, width, origin, slope) <= t:
+            cell -= 1
+        while cell + 1 < size and _plane(cell + 1, width, origin, slope) > t:
+            cell += 1
+    return cell
+
+
+@njit(cache=True)
+def _leave(first, end, width, origin, slope):
+    """t at which a ray leaves, along one axis, the cells `first` to `end`, excluded."""
+    if slope == 0:
+        return INF
+    return _plane(end if slope > 0 else first, width, origin, slope)
+
+
+@njit(cache=True)
+def _empty_cells(cell, free, size):
+    """Along one axis, the cells that are empty with `cell`, if `free` bricks are."""
+    brick = cell >> 3
+    return max(brick - free + 1, 0) << 3, min((brick + free) << 3, size)
+
+
+@njit(cache=True, error_model="numpy")
+def walk_ray(origin, direction, bricks, leaves, clearance, start, limit, nears, fars, found):
+    """Write entry, exit and voxel of at most `limit` crossings; return how many there are and the t
+    to go on from."""
+    size = bricks.shape[0] << 3
+    width = f32(1) / f32(size)
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    dx, dy, dz = direction[0], direction[1], direction[2]
+    sx, sy, sz = slope_of(dx), slope_of(dy), slope_of(dz)
+    ax, bx = _slab(ox, sx, size, width)
+    ay, by = _slab(oy, sy, size, width)
+    az, bz = _slab(oz, sz, size, width)
+    t, far = max(max(ax, f32(0)), max(ay, az)), min(bx, min(by, bz))
+    length = length_of(dx, dy, dz)
+    finite = abs(ox) + abs(oy) + abs(oz) < INF and f32(0) < length < INF
+    if not (finite and t < far < INF and start < far):
+        return 0, INF
+    t = max(t, start)
+    # A step to the next cell, and the plane that it crosses.
+    step_x, step_y, step_z = i32(sx > 0), i32(sy > 0), i32(sz > 0)
+    count = 0
+    x = _cell(t, ox, dx, sx, size, width)
+    y = _cell(t, oy, dy, sy, size, width)
+    z = _cell(t, oz, dz, sz, size, width)
+    while True:
+        free = np.int64(clearance[x >> 3, y >> 3, z >> 3])
+        if free > 0:
+            x0, x1 = _empty_cells(x, free, size)
+            y0, y1 = _empty_cells(y, free, size)
+            z0, z1 = _empty_cells(z, free, size)
+            t = min(
+                _leave(x0, x1, width, ox, sx),
+                min(_leave(y0, y1, width, oy, sy), _leave(z0, z1, width, oz, sz)),
+            )
+            if t >= far:
+                return count, INF
+            x = _cell(t, ox, dx, sx, size, width)
+            y = _cell(t, oy, dy, sy, size, width)
+            z = _cell(t, oz, dz, sz, size, width)
+            continue
+        row = bricks[x >> 3, y >> 3, z >> 3]
+        brick_x, brick_y, brick_z = x >> 3, y >> 3, z >> 3
+        tx = _plane(x + step_x, width, ox, sx) if sx != 0 else INF
+        ty = _plane(y + step_y, width, oy, sy) if sy != 0 else INF
+        tz = _plane(z + step_z, width, oz, sz) if sz != 0 else INF
+        while x >> 3 == brick_x and y >> 3 == brick_y and z >> 3 == brick_z:
+            following = min(tx, min(ty, tz))
+            voxel = leaves[row, ((x & 7) << 6) + ((y & 7) << 3) + (z & 7)]
+            if voxel >= 0 and following > t:
+                nears[count], fars[count], found[count] = t, following, voxel
+                count += 1
+                if count == limit:
+                    return count, following if following < far else INF
+            t = following
+            if t >= far:
+                return count, INF
+            # All planes at this t are crossed, more than one at an edge or a corner.
+            if tx <= t:
+                x += 2 * step_x - 1
+                tx = _plane(x + step_x, width, ox, sx)
+            if ty <= t:
+                y += 2 * step_y - 1
+                ty = _plane(y + step_y, width, oy, sy)
+            if tz <= t:
+                z += 2 * step_z - 1
+                tz = _plane(z + step_z, width, oz, sz)
+
+
+@njit(cache=True, parallel=True)
+def _find(
+    origins,
+    directions,
+    bricks,
+    leaves,
+    clearance,
+    start,
+    limit,
+    nears,
+    fars,
+    voxels,
+    counts,
+    resume,
+):
+    rays = len(start)
+    for chunk in prange((rays + CHUNK - 1) // CHUNK):
+        used = chunk * CHUNK * limit
+        for ray in range(chunk * CHUNK, min(rays, (chunk + 1) * CHUNK)):
+            counts[ray], resume[ray] = walk_ray(
+                origins[ray],
+                directions[ray],
+                bricks,
+                leaves,
+                clearance,
+                start[ray],
+                limit,
+                nears[used:],
+                fars[used:],
+                voxels[used:],
+            )
+            used += counts[ray]
+
+
+@njit(cache=True, parallel=True)
+def _place(
+    first,
+    directions,
+    nears,
+    fars,
+    voxels,
+    limit,
+    counts,
+    ends,
+    t,
+    delta,
+    near,
+    far,
+    ray_of,
+    voxel,
+):
+    rays = len(counts)
+    for chunk in prange((rays + CHUNK - 1) // CHUNK):
+        begin = chunk * CHUNK
+        shift = begin * limit - (ends[begin] - counts[begin])
+        for ray in range(begin, min(rays, begin + CHUNK)):
+            length = length_of(directions[ray, 0], directions[ray, 1], directions[ray, 2])
+            for i in range(ends[ray] - counts[ray], ends[ray]):
+                enter, leave = nears[i + shift], fars[i + shift]
+                near[i], far[i], voxel[i] = enter, leave, voxels[i + shift]
+                t[i] = (enter + leave) * f32(0.5)
+                delta[i] = (leave - enter) * length
+                ray_of[i] = first + ray

@@ -1,0 +1,89 @@
+"""Crossed voxels in plain torch: all planes that a ray crosses, sorted, and the cell behind each.
+
+For small grids: a ray takes memory for 3 G planes.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from bench.types import Rays
+from methods.kernels.voxel_walk import BRICK, PARALLEL, Crossings, Voxels
+
+BLOCK = 1 << 11
+"""Rays whose planes are sorted at once."""
+
+
+def walk(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> Crossings:
+    """See `methods.kernels.voxel_walk.walk`."""
+    count = len(start)
+    parts = [
+        _walk_block(Rays(rays.origins[block], rays.directions[block]), voxels, start[block], limit)
+        for block in (slice(at, at + BLOCK) for at in range(0, max(count, 1), BLOCK))
+    ]
+    near, far, voxel, counts, resume = (torch.cat(column) for column in zip(*parts, strict=True))
+    ray = torch.arange(count, device=start.device).repeat_interleave(counts)
+    offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
+    delta = (far - near) * _length(rays.directions)[ray]
+    middle = (near + far) * 0.5
+    return Crossings(middle, delta, offsets, near, far, ray.int(), voxel, resume)
+
+
+def _walk_block(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> tuple[Tensor, ...]:
+    """Near, far and voxel [S] of crossings, how many a ray has [R], where to resume [R]."""
+    origins, directions = rays.origins, rays.directions
+    size, rows = voxels.resolution, len(origins)
+    parallel = directions.abs() < PARALLEL
+    slope = torch.where(parallel, 0, 1 / torch.where(parallel, 1, directions))
+    width = 1 / torch.tensor(size, dtype=origins.dtype, device=origins.device)
+    edges = torch.arange(size + 1, device=origins.device).to(origins) * width
+    planes = (edges - origins[..., None]) * slope[..., None]  # [R, 3, G + 1]
+    planes = planes.sort(dim=2).values  # in the order in which the ray meets them
+    inside = (origins >= 0) & (origins <= 1)
+    first = torch.where(parallel, torch.where(inside, -torch.inf, torch.inf), planes[..., 0])
+    last = torch.where(parallel, torch.where(inside, torch.inf, -torch.inf), planes[..., -1])
+    near, far = first.amax(dim=1).clamp(min=0), last.amin(dim=1)
+    length = _length(directions)
+    finite = origins.isfinite().all(dim=1) & (length > 0) & length.isfinite()
+    alive = finite & (near < far) & far.isfinite() & (start < far)
+
+    near = torch.maximum(near, start)
+    # A ray that is not alive has an interval without length.
+    near, far = (torch.where(alive, x, 0)[:, None] for x in (near, far))
+    crossed = torch.where(parallel[..., None] | ~alive[:, None, None], torch.inf, planes)
+    t = torch.cat((near, crossed.flatten(1)), dim=1)
+    t = torch.minimum(torch.maximum(t, near), far).sort(dim=1).values
+    enter, leave = t[:, :-1].contiguous(), t[:, 1:]  # [R, 3 (G + 1)]
+
+    cells = []
+    for axis in range(3):
+        passed = torch.searchsorted(crossed[:, axis].contiguous(), enter, right=True)
+        cell = torch.where(slope[:, axis, None] > 0, passed - 1, size - passed)
+        still = (torch.nan_to_num(origins[:, axis]).clamp(0, 1) * size).long()
+        cells.append(torch.where(parallel[:, axis, None], still[:, None], cell))
+    voxel = _look_up(torch.stack(cells, dim=-1).clamp(0, size - 1), voxels)
+
+    rank = ((voxel >= 0) & (leave > enter)).cumsum(dim=1)
+    kept = (voxel >= 0) & (leave > enter) & (rank <= limit)
+    counts = kept.sum(dim=1)
+    ended = torch.where(kept, leave, -torch.inf).amax(dim=1) if rows else near[:, 0]
+    more = (counts == limit) & (ended < far[:, 0])
+    resume = torch.where(more, ended, torch.inf)
+    return enter[kept], leave[kept], voxel[kept], counts, resume
+
+
+def _look_up(cells: Tensor, voxels: Voxels) -> Tensor:
+    """The voxels at `cells` [..., 3], -1 where there is none."""
+    brick = voxels.bricks[tuple((cells // BRICK).unbind(dim=-1))]
+    x, y, z = (cells % BRICK).unbind(dim=-1)
+    if not len(voxels):
+        return brick
+    return torch.where(
+        brick >= 0, voxels.leaves[brick.clamp(min=0), (x * BRICK + y) * BRICK + z], -1
+    )
+
+
+def _length(directions: Tensor) -> Tensor:
+    # In float64, where every backend rounds to the same float32.
+    return directions.double().norm(dim=-1).to(directions.dtype)

@@ -1,0 +1,58 @@
+"""Sparse voxels of the unit cube: which there are, and the corners that they share."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from bench.types import check_shape
+from methods.kernels.march import Occupancy
+
+OFFSETS = tuple((c & 1, c >> 1 & 1, c >> 2 & 1) for c in range(8))
+"""Of a voxel's corners and of its eighths: bit 0 is +x, bit 1 +y, bit 2 +z."""
+
+
+def corners_of(coordinates: Tensor) -> tuple[Tensor, Tensor]:
+    """The corners of V voxels, each of them once.
+
+    Args:
+        coordinates: [V, 3] int, from 0 to 2^20.
+
+    Returns:
+        corners: [V, 8] int32, which vertices are the corners of each voxel.
+        vertices: [C, 3] int32, integer coordinates of all corners, ordered by x, then y, then z.
+    """
+    check_shape("coordinates", coordinates, None, 3)
+    offsets = torch.tensor(OFFSETS, device=coordinates.device)
+    x, y, z = (coordinates.long()[:, None] + offsets).unbind(dim=-1)  # [V, 8]
+    keys, corners = torch.unique((x << 42) + (y << 21) + z, return_inverse=True)
+    mask = (1 << 21) - 1
+    vertices = torch.stack((keys >> 42, keys >> 21 & mask, keys & mask), dim=1)
+    return corners.int(), vertices.int()
+
+
+def subdivided(coordinates: Tensor) -> Tensor:
+    """The eighths [8 V, 3] of voxels [V, 3], in a grid of twice the resolution."""
+    check_shape("coordinates", coordinates, None, 3)
+    offsets = torch.tensor(OFFSETS, dtype=coordinates.dtype, device=coordinates.device)
+    return (2 * coordinates[:, None] + offsets).reshape(-1, 3)
+
+
+def occupied_voxels(occupancy: Occupancy, resolution: int) -> Tensor:
+    """The voxels [V, 3] int32 of a grid of another resolution that reach into occupied cells.
+
+    They are ordered by x, then y, then z.
+
+    Raises:
+        ValueError: the resolution is less than 1.
+    """
+    if resolution < 1:
+        raise ValueError(f"resolution: expected 1 or more, got {resolution}")
+    size, device = occupancy.resolution, occupancy.cells.device
+    voxel = torch.arange(resolution, device=device)
+    first, last = voxel * size // resolution, -(-(voxel + 1) * size // resolution)
+    counts = occupancy.cells.int()
+    for axis in range(3):  # how many occupied cells a voxel reaches into, an axis after the other
+        sums = torch.cat((torch.zeros_like(counts.narrow(axis, 0, 1)), counts.cumsum(axis)), axis)
+        counts = (sums.index_select(axis, last) - sums.index_select(axis, first)).int()
+    return counts.nonzero().int()

@@ -1,0 +1,89 @@
+"""DIVeR's decoder: as many parameters as published, and the same after layers were merged."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch.nn import functional
+
+from bench.types import NullProbe, Rays
+from methods.diver.decoder import Decoder, encode_directions
+from methods.diver.model import CornerModel, as_intervals
+from methods.diver.rendering import Baked
+from methods.kernels.composite import composite
+from methods.kernels.voxel_walk import walk
+
+SIZE = 16
+
+
+def some_rays(count: int) -> Rays:
+    generator = torch.Generator().manual_seed(1)
+    origins = functional.normalize(torch.randn(count, 3, generator=generator), dim=1) * 2 + 0.5
+    return Rays(origins, torch.rand(count, 3, generator=generator) - origins)
+
+
+def random_model() -> CornerModel:
+    """All voxels of a small grid, with random features."""
+    generator = torch.Generator().manual_seed(0)
+    voxels = torch.cartesian_prod(*[torch.arange(SIZE)] * 3).int()
+    model = CornerModel(voxels, SIZE, Decoder(generator), "auto")
+    with torch.no_grad():
+        model.table.normal_(generator=generator)
+        model.decoder.first.bias.normal_(generator=generator)
+        model.decoder.third.bias.normal_(generator=generator)[0] = 1.0
+    return model
+
+
+def test_it_has_the_parameters_of_the_published_one() -> None:
+    assert sum(parameter.numel() for parameter in Decoder().parameters()) == 5220
+
+
+def test_directions_are_encoded_by_sines_and_cosines() -> None:
+    encoded = encode_directions(torch.tensor([[0.0, 3.0, 4.0]]))
+    want = [0.0, 0.6, 0.8]
+    for function in (math.sin, math.cos):
+        want += [function(2**k * x) for k in range(4) for x in (0.0, 0.6, 0.8)]
+    torch.testing.assert_close(encoded, torch.tensor([want]), rtol=0, atol=1e-6)
+    assert encoded.shape == (1, 27)
+
+
+def test_rendered_rays_are_those_of_the_trained_model() -> None:
+    """The baked model, in rounds, with merged layers, against the layers as they were trained."""
+    model, rays = random_model(), some_rays(200)
+    crossings = walk(rays, model.voxels)
+    features = model.features(crossings.voxel, model.weights(rays, crossings))
+    sigma, geometry = model.decoder.density(features)
+    encoded = encode_directions(rays.directions)
+    colours = model.decoder.colours(geometry, encoded, crossings.ray)
+    want = composite(sigma, colours, as_intervals(crossings), stop=0.0)
+    got = Baked(model, "fp32").render_rays(rays, NullProbe(), stop=0.0, faint=0.0)
+    # Five layers of 32 numbers below 8 with sums of 32 roundings: 5 x 32 x 8 u = 8e-5.
+    torch.testing.assert_close(got.values, want.values.detach(), rtol=0, atol=1e-4)
+    torch.testing.assert_close(got.alpha, want.alpha.detach(), rtol=0, atol=1e-4)
+    assert got.alpha.max() > 0.5
+
+
+def test_an_even_medium_has_the_opacity_of_its_number_of_voxels() -> None:
+    """All corners alike: a crossing has the same integrated density, however long it is."""
+    model, rays = random_model(), some_rays(100)
+    with torch.no_grad():
+        model.table.copy_(model.table[:1].clone())
+        model.decoder.third.bias[0] = 0.05 - (
+            model.decoder.third.weight[0]
+            @ model.decoder.second(model.decoder.first(model.table[0]).relu()).relu()
+        )
+    pixels = Baked(model, "fp32").render_rays(rays, NullProbe(), stop=0.0, faint=0.0)
+    crossed = walk(rays, model.voxels).offsets.diff()
+    want = 1 - torch.exp(-0.05 * crossed)
+    torch.testing.assert_close(pixels.alpha, want, rtol=0, atol=1e-3)
+
+
+def test_an_early_stop_leaves_out_no_more_than_it_says() -> None:
+    model, rays = random_model(), some_rays(200)
+    baked = Baked(model, "fp32")
+    whole = baked.render_rays(rays, NullProbe(), stop=0.0, faint=0.0)
+    early = baked.render_rays(rays, NullProbe(), stop=1e-2, faint=0.0)
+    assert (whole.alpha - early.alpha).abs().max() <= 1e-2 + 1e-5
+    assert (whole.values - early.values).abs().max() <= 1e-2 + 1e-5
+    assert not torch.equal(whole.values, early.values)

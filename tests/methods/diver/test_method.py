@@ -1,0 +1,158 @@
+"""DIVeR as a method: what it learns, what a training leaves, what it refuses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from bench.console import ConsoleLog
+from bench.metrics import psnr
+from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene
+from methods.diver.method import Diver
+from methods.diver.training import DiverTraining, Lessons
+from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
+from methods.instant_ngp.training import TrainingOptions
+from methods.kernels.encode import HashGrid
+from methods.training import loop
+
+GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
+SETUP = Setup.resolved(GRID, TrainingOptions(), "bf16", "auto", "cpu", seed=0)
+LESSONS = Lessons(prune_rays=1 << 13)
+BUDGET = Budget("test", steps=100, samples=4096, renderer_steps=40)
+
+
+def method_of(**options) -> Diver:
+    return Diver(**{"teacher": SETUP, "resolution": 32, "training": LESSONS} | options)
+
+
+def fitted(scene: Scene, log: Log, budget: Budget = BUDGET, **options) -> Diver:
+    method = method_of(**options)
+    method.fit(scene, budget, log)
+    return method
+
+
+def quality(method: Diver, scene: Scene) -> float:
+    test = scene.splits["test"]
+    truth = test.images[1].float() / 255
+    on_white = truth[..., :3] * truth[..., 3:] + 1 - truth[..., 3:]
+    return psnr(method.render(test.cameras[1], NullProbe()).rgb, on_white)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
+    """One folder for all tests: what one of them trained, the next one finds."""
+    return ConsoleLog(tmp_path_factory.mktemp("outputs"), quiet=True)
+
+
+@pytest.fixture(scope="module")
+def teacher(ball_scene: Scene, log: Log) -> TrainedField:
+    return train_field(SETUP, ball_scene, BUDGET, log)
+
+
+def test_it_learns_a_ball(ball_scene: Scene, log: Log) -> None:
+    method = fitted(ball_scene, log, replace(BUDGET, renderer_steps=200))
+    assert quality(method, ball_scene) > 24
+    frame = method.render(ball_scene.splits["test"].cameras[1], NullProbe())
+    # The depth is that of the front of the ball, 1.6 - 0.3 from the camera, to two voxels.
+    assert abs(frame.depth[16, 16].item() - 1.3) < 2 / 32
+    assert torch.equal(frame.depth.isinf(), frame.alpha <= EMPTY_ALPHA)
+    assert (frame.rgb[frame.alpha == 0] == 1).all()
+
+
+def test_it_begins_with_the_encoding_of_the_teacher(
+    ball_scene: Scene, teacher: TrainedField
+) -> None:
+    model = method_of().begin(teacher, ball_scene, BUDGET).model
+    cells = model.voxels.coordinates.long() * 4  # the teacher's grid is four times as fine
+    near = teacher.occupancy.cells.unfold(0, 4, 4).unfold(1, 4, 4).unfold(2, 4, 4)
+    assert near.flatten(3).any(dim=3).sum() == len(cells) > 0
+    assert model.table[:, : GRID.channels].std().item() == pytest.approx(1, rel=1e-4)
+    assert (model.table[:, GRID.channels :] == 0).all()
+
+
+def test_pruning_leaves_what_shows(ball_scene: Scene, teacher: TrainedField, log: Log) -> None:
+    late = replace(LESSONS, prune_at=1.0)
+    method = method_of(stored="fp32", stop=1e-4, faint=0.0, training=late)
+    method.background = ball_scene.background
+    training = method.begin(teacher, ball_scene, replace(BUDGET, renderer_steps=200))
+    while training.step < 100:
+        training.advance()
+    method.restore(training.result())
+    before, voxels = quality(method, ball_scene), len(training.model.voxels)
+    training._prune()
+    method.restore(training.result())
+    assert len(training.model.voxels) < 0.9 * voxels
+    # A ray that loses k voxels of weights below 0.01 changes by k / 100 at most; few lose any.
+    assert abs(quality(method, ball_scene) - before) < 0.5
+    training.advance()  # moments and gradients have the rows that are left
+
+
+@pytest.mark.parametrize("stop_at", [3, 25])
+def test_a_killed_training_goes_on_as_if_it_had_not_been(
+    ball_scene: Scene, teacher: TrainedField, tmp_path: Path, stop_at: int
+) -> None:
+    def training() -> DiverTraining:
+        return method_of().begin(teacher, ball_scene, BUDGET)
+
+    whole, half = training(), training()
+    while whole.step < 40:
+        whole.advance()
+    while half.step < stop_at:  # before and after the pruning
+        half.advance()
+    loop.save(half, tmp_path / "half")
+    resumed = training()
+    loop.resume(resumed, tmp_path / "half")
+    while resumed.step < 40:
+        resumed.advance()
+    for name, value in whole.result().items():
+        assert torch.equal(resumed.result()[name], value), name
+
+
+def test_a_training_is_found_again(ball_scene: Scene, log: Log) -> None:
+    first = fitted(ball_scene, log)
+    again = fitted(ball_scene, log)
+    assert again.train_s == first.train_s > 0
+    camera = ball_scene.splits["test"].cameras[0]
+    pictures = [method.render(camera, NullProbe()).rgb for method in (first, again)]
+    assert torch.equal(*pictures)
+
+
+def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, log: Log) -> None:
+    half, single = (fitted(ball_scene, log, stored=kind) for kind in ("bf16", "fp32"))
+    corners = len(half.baked.model.vertices)
+    merged = 32 * 32 + 32 + 32 + 1 + 32 * 32 + 32 * 27 + 32 + 3 * 32 + 3
+    assert half.sizes() == {"corners": corners * 64, "voxels": 32**3 // 8, "decoder": 4 * merged}
+    assert single.sizes()["corners"] == 2 * half.sizes()["corners"]
+    assert (half.settings()["precision"], single.settings()["precision"]) == ("bf16", "fp32")
+    # Features are rounded to 1/256 of themselves: far less than a picture's error of 1/16.
+    assert abs(quality(half, ball_scene) - quality(single, ball_scene)) < 0.1
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"resolution": 100},
+        {"resolution": 1024},
+        {"stored": "int8"},
+        {"faint": 1.0},
+        {"stop": 1.0},
+    ],
+)
+def test_wrong_settings_are_refused(wrong: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        method_of(**wrong)
+
+
+@pytest.mark.parametrize("wrong", [{"corner_rate": 0.0}, {"prune_at": 2.0}, {"prune_below": 1.0}])
+def test_wrong_lessons_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        Lessons(**wrong)
+
+
+def test_a_teacher_with_more_features_than_a_corner_is_refused(ball_scene: Scene, log: Log) -> None:
+    setup = replace(SETUP, grid=replace(GRID, levels=17))
+    with pytest.raises(ValueError, match="expected a hash grid of at most"):
+        fitted(ball_scene, log, replace(BUDGET, steps=1), teacher=setup)

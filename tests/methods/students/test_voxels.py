@@ -1,0 +1,62 @@
+"""Sparse voxels: shared corners, eighths that fill a voxel, grids of another resolution."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from methods.kernels.march import Occupancy
+from methods.students.voxels import OFFSETS, corners_of, occupied_voxels, subdivided
+
+
+def scattered(share: float, size: int = 16) -> Occupancy:
+    generator = torch.Generator().manual_seed(0)
+    return Occupancy(torch.rand(size, size, size, generator=generator) < share)
+
+
+def test_corners_are_where_they_belong_and_none_is_there_twice() -> None:
+    voxels = scattered(0.1).cells.nonzero()
+    corners, vertices = corners_of(voxels)
+    want = voxels[:, None] + torch.tensor(OFFSETS)
+    assert torch.equal(vertices[corners.long()].long(), want)
+    assert len(torch.unique(vertices, dim=0)) == len(vertices) == len(corners.unique())
+
+
+def test_the_corners_of_a_full_grid_are_its_vertices() -> None:
+    voxels = torch.cartesian_prod(*[torch.arange(4)] * 3)
+    corners, vertices = corners_of(voxels)
+    assert corners.dtype == torch.int32
+    assert torch.equal(vertices.long(), torch.cartesian_prod(*[torch.arange(5)] * 3))
+
+
+def test_no_voxel_has_no_corner() -> None:
+    corners, vertices = corners_of(torch.zeros(0, 3, dtype=torch.int32))
+    assert corners.shape == (0, 8)
+    assert vertices.shape == (0, 3)
+    assert subdivided(torch.zeros(0, 3, dtype=torch.int32)).shape == (0, 3)
+
+
+def test_eighths_fill_their_voxel() -> None:
+    voxels = scattered(0.1).cells.nonzero()
+    eighths = subdivided(voxels)
+    assert torch.equal(eighths // 2, voxels.repeat_interleave(8, dim=0))
+    assert len(torch.unique(eighths, dim=0)) == 8 * len(voxels)
+
+
+@pytest.mark.parametrize("resolution", [1, 5, 8, 16, 24, 32, 37])
+def test_voxels_are_those_that_reach_into_occupied_cells(resolution: int) -> None:
+    occupancy = scattered(0.02)
+    voxels = occupied_voxels(occupancy, resolution)
+    size = occupancy.resolution
+    # In whole numbers: voxel k covers [k size, (k + 1) size), cell c [c resolution, ...).
+    low = voxels.new_tensor(range(resolution)) * size
+    cells = occupancy.cells.nonzero().int() * resolution  # [N, 3]
+    meets = (low[:, None, None] < cells + resolution) & (cells < low[:, None, None] + size)
+    x, y, z = meets.unbind(dim=2)  # [G, N]
+    want = (x[:, None, None] & y[None, :, None] & z[None, None]).any(dim=-1).nonzero()
+    assert torch.equal(voxels.long(), want)
+
+
+def test_a_grid_without_voxels_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected 1 or more"):
+        occupied_voxels(scattered(0.1), 0)
