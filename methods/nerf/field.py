@@ -11,6 +11,7 @@ from methods.instant_ngp.field import Precision
 from methods.students.fields import REACH, StudentField
 from methods.students.networks import (
     Dense,
+    density_of,
     parameter_bytes,
     positional,
     positional_channels,
@@ -34,9 +35,6 @@ DIRECTION_FREQUENCIES = 4
 
 DENSITY = 1 / REACH
 """Density for an output of 1 of the network, whose weights then are of the usual size."""
-
-FIRST_DENSITY = 0.1
-"""Bias of the density before the first step: what ReLU makes 0 everywhere learns nothing."""
 
 CHUNK = 1 << 14
 """Samples that go through the network together: 16 MiB of activations."""
@@ -66,7 +64,6 @@ class NerfField(StudentField):
         self.bottleneck = Dense(WIDTH, WIDTH, precision, generator)
         self.view = Dense(WIDTH + direction, VIEW_WIDTH, precision, generator)
         self.colour = Dense(VIEW_WIDTH, 3, precision, generator)
-        nn.init.constant_(self.opacity.bias, FIRST_DENSITY)
 
     def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """See `Field`; the geometry is what the trunk makes of a position."""
@@ -81,7 +78,8 @@ class NerfField(StudentField):
             if number == SKIP:
                 hidden = torch.cat((encoded.to(hidden.dtype), hidden), dim=1)
             hidden = layer(hidden).relu_()
-        return DENSITY * self.opacity(hidden)[:, 0].to(positions.dtype).relu(), hidden
+        raw = self.opacity(hidden)[:, 0].to(positions.dtype)
+        return DENSITY * density_of(raw), hidden
 
     def encode_directions(self, directions: Tensor) -> Tensor:
         """See `Field`."""

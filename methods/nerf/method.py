@@ -10,13 +10,11 @@ import torch
 from bench.cameras import place_camera
 from bench.study import Study, turned
 from bench.types import Camera, Frame, Probe
-from methods.instant_ngp.stage1 import Setup, TrainedField
+from methods.instant_ngp.stage1 import Setup
 from methods.kernels.composite import STOP
-from methods.kernels.march import Occupancy
 from methods.nerf.dense import every_sample, whole_cube
 from methods.nerf.field import NerfField
-from methods.rendering.frame import everywhere, render_frame
-from methods.students.cells import finer
+from methods.rendering.frame import render_frame
 from methods.students.fields import FieldLessons, FieldStudent
 
 
@@ -25,7 +23,6 @@ class Nerf(FieldStudent):
 
     Args:
         skip: leave out the samples outside the occupied cells; the picture is the same.
-        cells: occupied cells are found on a grid of so many a side, a multiple of the teacher's.
         others: see `Student`.
     """
 
@@ -43,27 +40,22 @@ class Nerf(FieldStudent):
         teacher: Setup,
         training: FieldLessons,
         skip: bool = True,
-        cells: int = 256,
         stop: float = STOP,
         name: str = "nerf",
     ) -> None:
         super().__init__(teacher, training, stop, name)
         self.training = training
-        self.skip, self.cells = skip, cells
+        self.skip = skip
 
     def model_settings(self) -> Mapping[str, object]:
-        """See `Student`."""
-        return {"cells": self.cells}
+        """See `Student`: none, the network is the published one."""
+        return {}
 
-    def new_field(self, occupancy: Occupancy) -> NerfField:
+    def new_field(self) -> NerfField:
         """See `FieldStudent`."""
         teacher = self.teacher
         generator = torch.Generator().manual_seed(teacher.seed)
         return NerfField(teacher.precision, teacher.backend, generator).to(teacher.device)
-
-    def occupied(self, teacher: TrainedField) -> Occupancy:
-        """See `FieldStudent`."""
-        return finer(teacher, self.cells)
 
     @torch.no_grad()
     def render(self, camera: Camera, probe: Probe) -> Frame:

@@ -97,23 +97,25 @@ class FieldTraining(PixelTraining):
     large network.
 
     Args:
-        occupancy: where the field is trained and rendered; elsewhere is nothing.
+        occupancy: where the field is trained and rendered, elsewhere is nothing; None: the
+            teacher's.
     """
 
     def __init__(
         self,
         field: StudentField,
         teacher: TrainedField,
-        occupancy: Occupancy,
         scene: Scene,
         budget: Budget,
         options: FieldLessons,
         seed: int,
+        occupancy: Occupancy | None = None,
     ) -> None:
         device = teacher.field.device
         samples = math.ceil(options.batch * budget.samples)
         super().__init__(scene, device, budget.renderer_steps, samples, options, seed)
-        self.field, self.teacher, self.occupancy = field, teacher.field, occupancy
+        self.field, self.teacher = field, teacher.field
+        self.occupancy = occupancy or teacher.occupancy
         self.cells = self.occupancy.cells.nonzero()
         self.points_until = options.points * self.steps if len(self.cells) else 0
         self.optimiser = torch.optim.Adam(field.parameters(), betas=(0.9, 0.99), eps=1e-15)
@@ -203,26 +205,31 @@ class FieldStudent(Student):
     training: FieldLessons
 
     @abstractmethod
-    def new_field(self, occupancy: Occupancy) -> StudentField:
-        """The untrained field for what is in the cells of `occupancy`, on the teacher's device,
-        with weights by the seed."""
+    def new_field(self) -> StudentField:
+        """The untrained field on the teacher's device, with weights by the seed; `occupancy` is
+        known already."""
 
     def occupied(self, teacher: TrainedField) -> Occupancy:
         """The cells in which the field may be other than empty: those of the teacher."""
         return teacher.occupancy
 
-    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> loop.Training:
+    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> FieldTraining:
         """See `Student`."""
-        occupancy = self.occupied(teacher)
-        field = self.new_field(occupancy)
+        self.occupancy = self.occupied(teacher)
         return FieldTraining(
-            field, teacher, occupancy, scene, budget, self.training, self.teacher.seed
+            self.new_field(),
+            teacher,
+            scene,
+            budget,
+            self.training,
+            self.teacher.seed,
+            self.occupancy,
         )
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """See `Student`."""
         self.occupancy = Occupancy(tensors["cells"].to(self.teacher.device))
-        self.field = self.new_field(self.occupancy)
+        self.field = self.new_field()
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
 
     @torch.no_grad()

@@ -17,8 +17,8 @@ def positional(
 ) -> Tensor:
     """Sines and cosines of `values` [S, C], of frequencies 2^0 to 2^(F - 1) times `scale`.
 
-    Mildenhall et al. (2020), Eq. 4; the release has no pi (`scale` 1) and puts the values themselves
-    in front (`identity`).
+    Mildenhall et al. (2020), Eq. 4; the release has no pi (`scale` 1) and puts the values
+    themselves in front (`identity`).
 
     Returns:
         [S, C (2 F + identity)]: the values, then sines and cosines of the lowest frequency, and so
@@ -29,8 +29,9 @@ def positional(
     parts = [values] if identity else []
     for _ in range(frequencies):
         parts += [sine, cosine]
-        # Those of twice the angle cost less than functions of it, and lose one bit a frequency.
-        sine, cosine = 2 * sine * cosine, 1 - 2 * sine.square()
+        # Those of twice the angle cost less than functions of it. Errors double as the angle does;
+        # with 1 - 2 sin^2 for the cosine they would grow faster.
+        sine, cosine = 2 * sine * cosine, (cosine - sine) * (cosine + sine)
     return torch.cat(parts, dim=-1)
 
 
@@ -63,6 +64,27 @@ class Dense(nn.Linear):
         dtype = torch.bfloat16 if half else self.weight.dtype
         weight, bias = self.weight.to(dtype), self.bias.to(dtype)
         return functional.linear(inputs.to(dtype), weight, bias)
+
+
+def density_of(raw: Tensor) -> Tensor:
+    """ReLU of the last output of a density network; where it gives 0, a loss can still raise it.
+
+    Without that gradient a network that once gives 0 everywhere, as after its first steps among
+    mostly empty samples, shows nothing for ever.
+    """
+    return _RisingRelu.apply(raw)
+
+
+class _RisingRelu(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, raw):
+        ctx.save_for_backward(raw)
+        return raw.relu()
+
+    @staticmethod
+    def backward(ctx, grad):
+        (raw,) = ctx.saved_tensors
+        return torch.where(raw > 0, grad, grad.clamp(max=0))
 
 
 def products(*layers: nn.Module) -> int:

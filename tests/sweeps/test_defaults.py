@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from sweeps.overrides import composed
 
-BASES = ("ngp", "diver", "gaussians", "steernerf_lean")
+BASES = ("ngp", "diver", "gaussians", "nerf", "nsvf", "steernerf_lean")
 """What the other methods' configurations stand on."""
 
 

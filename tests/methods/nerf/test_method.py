@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import nn
 
+from bench.console import ConsoleLog
 from bench.metrics import psnr
 from bench.types import Budget, Log, NullProbe, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
@@ -18,27 +19,31 @@ from methods.kernels.encode import HashGrid
 from methods.nerf.field import NerfField
 from methods.nerf.method import Nerf
 from methods.rendering.march import March
-from methods.rendering.occupancy import THRESHOLD
-from methods.students.cells import finer
 from methods.students.fields import FieldLessons
 from methods.training import loop
 from tests.methods.conftest import Work
 
 GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
-BUDGET = Budget("test", steps=150, samples=4096, renderer_steps=4)
+BUDGET = Budget("test", steps=80, samples=4096, renderer_steps=4)
 LONG = 8.0
 """March step, in the usual ones: few samples for a large network."""
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
+    """Of the whole module: its field is trained once."""
+    return ConsoleLog(tmp_path_factory.mktemp("outputs"), quiet=True)
 
 
 def new_method(**options: Any) -> Nerf:
     setup = Setup.resolved(GRID, TrainingOptions(), "fp32", "auto", "cpu", seed=0)
     training = FieldLessons(rate=1e-3, batch=0.25, march_step=LONG)
-    return Nerf(**{"teacher": setup, "training": training, "cells": 128} | options)
+    return Nerf(**{"teacher": setup, "training": training} | options)
 
 
 def fitted(scene: Scene, log: Log, steps: int, **options: Any) -> Nerf:
     method = new_method(**options)
-    method.fit(scene, Budget("test", 150, 4096, renderer_steps=steps), log)
+    method.fit(scene, Budget("test", 80, 4096, renderer_steps=steps), log)
     return method
 
 
@@ -46,18 +51,16 @@ def trained_teacher(scene: Scene, log: Log) -> TrainedField:
     return train_field(new_method().teacher, scene, BUDGET, log)
 
 
-def test_it_learns_a_ball(ball_scene: Scene, quiet_log: Log) -> None:
-    method = fitted(ball_scene, quiet_log, steps=60)
+def test_it_learns_a_ball(ball_scene: Scene, log: Log) -> None:
+    method = fitted(ball_scene, log, steps=60)
     test = ball_scene.splits["test"]
     truth = test.images[1].float() / 255
     on_white = truth[..., :3] * truth[..., 3:] + 1 - truth[..., 3:]
     assert psnr(method.render(test.cameras[1], NullProbe()).rgb, on_white) > 20
 
 
-def test_skipping_changes_no_picture_and_saves_products(
-    ball_scene: Scene, quiet_log: Log
-) -> None:
-    method = fitted(ball_scene, quiet_log, steps=20)
+def test_skipping_changes_no_picture_and_saves_products(ball_scene: Scene, log: Log) -> None:
+    method = fitted(ball_scene, log, steps=20)
     camera = ball_scene.splits["test"].cameras[0]
     skipping, dense = Work(), Work()
     fast = method.render(camera, skipping)
@@ -79,9 +82,9 @@ def products_of_a_sample() -> int:
 
 
 def test_a_killed_training_goes_on_as_if_it_had_not_been(
-    ball_scene: Scene, quiet_log: Log, tmp_path: Path
+    ball_scene: Scene, log: Log, tmp_path: Path
 ) -> None:
-    teacher = trained_teacher(ball_scene, quiet_log)
+    teacher = trained_teacher(ball_scene, log)
 
     def training() -> loop.Training:
         return new_method().begin(teacher, ball_scene, BUDGET)
@@ -99,42 +102,18 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(
         assert torch.equal(resumed.result()[name], value), name
 
 
-def test_a_training_is_found_again(ball_scene: Scene, quiet_log: Log) -> None:
-    first = fitted(ball_scene, quiet_log, steps=2)
-    again = fitted(ball_scene, quiet_log, steps=2, skip=True)
+def test_a_training_is_found_again(ball_scene: Scene, log: Log) -> None:
+    first = fitted(ball_scene, log, steps=2)
+    again = fitted(ball_scene, log, steps=2, skip=True)
     assert again.train_s == first.train_s > 0
     camera = ball_scene.splits["test"].cameras[0]
     pictures = [method.render(camera, NullProbe()).rgb for method in (first, again)]
     assert torch.equal(*pictures)
 
 
-def test_size_is_that_of_the_published_network(ball_scene: Scene, quiet_log: Log) -> None:
-    method = fitted(ball_scene, quiet_log, steps=2)
+def test_size_is_that_of_the_published_network(ball_scene: Scene, log: Log) -> None:
+    method = fitted(ball_scene, log, steps=2)
     assert method.sizes() == {"network": 4 * 595_844, "occupancy": 128**3 // 8}
-
-
-def test_finer_cells_lie_in_the_teachers_and_hold_its_matter(
-    ball_scene: Scene, quiet_log: Log
-) -> None:
-    teacher = trained_teacher(ball_scene, quiet_log)
-    cells = finer(teacher, 256).cells
-    coarse = teacher.occupancy.cells
-    for axis in range(3):
-        coarse = coarse.repeat_interleave(2, dim=axis)
-    assert not (cells & ~coarse).any()
-    assert 0 < cells.sum() < coarse.sum()
-    empty = (coarse & ~cells).nonzero()
-    quarter = (empty + 0.25) / 256  # one of the points that were looked at
-    assert (teacher.field.density(quarter)[0] <= THRESHOLD).all()
-    assert finer(teacher, 128) is teacher.occupancy
-
-
-@pytest.mark.parametrize("wrong", [{"cells": 200}, {"cells": 64}])
-def test_cells_that_do_not_fit_the_teachers_are_refused(
-    ball_scene: Scene, quiet_log: Log, wrong: dict[str, int]
-) -> None:
-    with pytest.raises(ValueError, match="multiple of the 128"):
-        fitted(ball_scene, quiet_log, steps=2, **wrong)
 
 
 def test_a_stop_at_which_rays_never_begin_is_refused() -> None:
