@@ -23,6 +23,7 @@ def render_batch(
     *,
     jitter: Tensor | None = None,
     background: Tensor | None = None,
+    guide: Field | None = None,
 ) -> tuple[Pixels, int]:
     """Render `rays`, R of them, differentiably; also the number of samples that took part.
 
@@ -34,11 +35,14 @@ def render_batch(
         how: `window` and `faint` are ignored.
         jitter: [R] phase of the samples of each ray, in [0, 1); None: as `rays.render_rays`.
         background: [K] or [R, K]; None: not composited on any.
+        guide: a cheaper field whose densities tell in the first pass which samples are hidden, and
+            so have neither weight nor gradient; None: `field` itself.
     """
     samples = march(rays, occupancy, how.step, jitter=jitter, backend=field.backend)
     with torch.no_grad():
+        teller = field if guide is None else guide
         parts = pad(samples.positions).split(CHUNK_SAMPLES)
-        sigma = torch.cat([field.density(part)[0] for part in parts])[: len(samples)]
+        sigma = torch.cat([teller.density(part)[0] for part in parts])[: len(samples)]
         counts = visible_counts(sigma, samples, stop=how.stop, backend=field.backend)
     samples = samples.front(counts)
     encoded = field.encode_directions(rays.directions)

@@ -36,14 +36,19 @@ class FieldLessons(TrainingOptions):
     Attributes:
         points: share of the steps, at the beginning, that compare densities and colours at random
             points of occupied cells with the teacher's.
+        batch: samples of a step, as a share of those of the budget: a large network learns more
+            from many small steps.
     """
 
     points: float = 0.5
+    batch: float = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0 <= self.points <= 1:
             raise ValueError(f"points: expected a share of the steps, 0 to 1, got {self.points}")
+        if not 0 < self.batch <= 1:
+            raise ValueError(f"batch: expected a share of more than 0, up to 1, got {self.batch}")
 
 
 class StudentField(nn.Module, ABC):
@@ -88,7 +93,12 @@ class StudentField(nn.Module, ABC):
 class FieldTraining(PixelTraining):
     """Points of the teacher, then rays of the photos, among what the teacher's grid has.
 
-    The occupied cells stay those of the teacher.
+    Rays learn at the samples that the teacher does not hide: its density costs less than that of a
+    large network.
+
+    Args:
+        occupancy: where the field is trained and rendered, elsewhere is nothing; None: the
+            teacher's.
     """
 
     def __init__(
@@ -99,10 +109,13 @@ class FieldTraining(PixelTraining):
         budget: Budget,
         options: FieldLessons,
         seed: int,
+        occupancy: Occupancy | None = None,
     ) -> None:
         device = teacher.field.device
-        super().__init__(scene, device, budget.renderer_steps, budget.samples, options, seed)
-        self.field, self.teacher, self.occupancy = field, teacher.field, teacher.occupancy
+        samples = math.ceil(options.batch * budget.samples)
+        super().__init__(scene, device, budget.renderer_steps, samples, options, seed)
+        self.field, self.teacher = field, teacher.field
+        self.occupancy = occupancy or teacher.occupancy
         self.march, self.cells = options.march, self.occupancy.cells.nonzero()
         self.points_until = options.points * self.steps if len(self.cells) else 0
         self.optimiser = torch.optim.Adam(field.parameters(), betas=(0.9, 0.99), eps=1e-15)
@@ -149,6 +162,7 @@ class FieldTraining(PixelTraining):
             self.march,
             jitter=jitter,
             background=background,
+            guide=self.teacher,
         )
 
     def _update(self) -> None:
@@ -192,19 +206,31 @@ class FieldStudent(Student):
 
     @abstractmethod
     def new_field(self) -> StudentField:
-        """The untrained field on the teacher's device, with weights by the seed."""
+        """The untrained field on the teacher's device, with weights by the seed; `occupancy` is
+        known already."""
 
-    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> loop.Training:
+    def occupied(self, teacher: TrainedField) -> Occupancy:
+        """The cells in which the field may be other than empty: those of the teacher."""
+        return teacher.occupancy
+
+    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> FieldTraining:
         """See `Student`."""
+        self.occupancy = self.occupied(teacher)
         return FieldTraining(
-            self.new_field(), teacher, scene, budget, self.training, self.teacher.seed
+            self.new_field(),
+            teacher,
+            scene,
+            budget,
+            self.training,
+            self.teacher.seed,
+            self.occupancy,
         )
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """See `Student`."""
+        self.occupancy = Occupancy(tensors["cells"].to(self.teacher.device))
         self.field = self.new_field()
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
-        self.occupancy = Occupancy(tensors["cells"].to(self.teacher.device))
 
     @torch.no_grad()
     def render(self, camera: Camera, probe: Probe) -> Frame:

@@ -44,3 +44,30 @@ def test_leaving_out_hidden_samples_changes_no_gradient(
         assert want is not None
         # Sums over up to 10^5 samples, in another grouping.
         torch.testing.assert_close(got, want, rtol=1e-3, atol=1e-4 * want.abs().max().item())
+
+
+def test_a_guide_tells_which_samples_are_hidden(
+    cloud: tuple[HashField, Occupancy], device: str
+) -> None:
+    field, occupancy = cloud
+    camera = look_at_the_middle(0.1, 0.4)
+    rays = cast(replace(camera, c2w=camera.c2w.to(device)))
+
+    class Guide:
+        """As dense everywhere as is given, without colours."""
+
+        def __init__(self, sigma: float) -> None:
+            self.sigma = sigma
+
+        def density(self, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            return torch.full_like(positions[:, 0], self.sigma), positions
+
+    own, most = render_batch(field, rays, occupancy, March(stop=0))
+    clear, all_ = render_batch(field, rays, occupancy, March(stop=0), guide=Guide(0.0))  # type: ignore[arg-type]
+    assert all_ == most
+    assert torch.equal(own.values, clear.values)
+    # Opaque at once: only the first sample of every ray is seen.
+    wall, few = render_batch(field, rays, occupancy, March(), guide=Guide(1e6))  # type: ignore[arg-type]
+    offsets = march(rays, occupancy, STEP).offsets
+    assert few == int((offsets.diff() > 0).sum())
+    assert (wall.alpha <= own.alpha + 1e-6).all()

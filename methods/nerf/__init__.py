@@ -1,0 +1,1 @@
+"""NeRF (Mildenhall et al. 2020): a dense network of positions and directions."""

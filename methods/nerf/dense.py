@@ -1,0 +1,60 @@
+"""Rendering as NeRF was published: every sample of every ray, whether anything is there or not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from bench.types import Probe, Rays
+from methods.kernels.composite import Pixels, composite
+from methods.kernels.march import Occupancy, march
+from methods.rendering.field import Field, query
+from methods.rendering.march import March
+
+CHUNK_RAYS = 1 << 9
+"""Rays whose samples are evaluated together: 200 MiB of what a trunk of 256 channels gives."""
+
+
+def whole_cube(occupancy: Occupancy) -> Occupancy:
+    """With all cells of as fine a grid occupied."""
+    return Occupancy(torch.ones_like(occupancy.cells))
+
+
+def every_sample(
+    field: Field, occupancy: Occupancy, probe: Probe, how: March
+) -> Callable[[Tensor, Rays], Pixels]:
+    """What renders rays for `render_frame`: density and colour of all their samples in the cube.
+
+    Samples outside the cells of `occupancy` then count as empty, so that the picture is that of
+    `rendering.frame.everywhere`, but for the colours of samples too faint to be seen.
+    """
+    cube = whole_cube(occupancy)
+
+    def render(_: Tensor, rays: Rays) -> Pixels:
+        canvas = Pixels.blank(len(rays.origins), field.channels, field.device)
+        for part in torch.arange(len(rays.origins), device=field.device).split(CHUNK_RAYS):
+            some = rays.take(part)
+            with probe.stage("march"):
+                samples = march(some, cube, how.step, backend=field.backend)
+            probe.count("samples", len(samples))
+            probe.count("shaded_samples", len(samples), len(samples))
+            field.count(probe, len(samples), len(samples))
+            with probe.stage("field"):
+                encoded = field.encode_directions(some.directions)
+                sigma, values = query(field, samples.positions, samples.ray, encoded)
+                sigma = torch.where(occupied(samples.positions, occupancy), sigma, 0)
+            with probe.stage("composite"):
+                pixels = composite(sigma, values, samples, stop=how.stop, backend=field.backend)
+                canvas.put(part, pixels)
+        return canvas
+
+    return render
+
+
+def occupied(positions: Tensor, occupancy: Occupancy) -> Tensor:
+    """Whether the cells of `positions` [S, 3] in the unit cube are occupied, [S] bool."""
+    size = occupancy.resolution
+    x, y, z = (positions * size).long().clamp(0, size - 1).unbind(dim=-1)
+    return occupancy.cells[x, y, z]

@@ -1,0 +1,106 @@
+"""The network of NeRF, as a field."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from bench.types import Probe
+from methods.instant_ngp.field import Precision
+from methods.students.fields import REACH, StudentField
+from methods.students.networks import (
+    Dense,
+    density_of,
+    parameter_bytes,
+    positional,
+    positional_channels,
+    products,
+)
+
+WIDTH = 256
+"""Outputs of every layer of the trunk."""
+
+LAYERS = 8
+"""Of the trunk."""
+
+SKIP = 5
+"""Layers of the trunk after which the encoded position is put in again."""
+
+VIEW_WIDTH = 128
+"""Outputs of the layer that sees the direction."""
+
+POSITION_FREQUENCIES = 10
+DIRECTION_FREQUENCIES = 4
+
+DENSITY = 1 / REACH
+"""Density for an output of 1 of the network, whose weights then are of the usual size."""
+
+CHUNK = 1 << 14
+"""Samples that go through the network together: 16 MiB of activations."""
+
+
+class NerfField(StudentField):
+    """One network of 595,844 parameters (Mildenhall et al. 2020, Figure 7).
+
+    Positions of the unit cube are taken to [-1, 1], as Section 5.1 has it.
+
+    Args:
+        precision: of the products, "bf16" or "fp32".
+        backend: of the kernels that render it.
+        generator: of the first weights.
+    """
+
+    def __init__(
+        self, precision: Precision, backend: str, generator: torch.Generator | None = None
+    ) -> None:
+        super().__init__(backend)
+        position = positional_channels(3, POSITION_FREQUENCIES)
+        direction = positional_channels(3, DIRECTION_FREQUENCIES)
+        inputs = [position if layer == 0 else WIDTH for layer in range(LAYERS)]
+        inputs[SKIP] += position
+        self.trunk = nn.ModuleList(Dense(size, WIDTH, precision, generator) for size in inputs)
+        self.opacity = Dense(WIDTH, 1, precision, generator)
+        self.bottleneck = Dense(WIDTH, WIDTH, precision, generator)
+        self.view = Dense(WIDTH + direction, VIEW_WIDTH, precision, generator)
+        self.colour = Dense(VIEW_WIDTH, 3, precision, generator)
+
+    def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """See `Field`; the geometry is what the trunk makes of a position."""
+        parts = [self._density(part) for part in positions.split(CHUNK)]
+        sigma, geometry = (torch.cat(column) for column in zip(*parts, strict=True))
+        return sigma, geometry
+
+    def _density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        encoded = positional(2 * positions - 1, POSITION_FREQUENCIES)
+        hidden = encoded
+        for number, layer in enumerate(self.trunk):
+            if number == SKIP:
+                hidden = torch.cat((encoded.to(hidden.dtype), hidden), dim=1)
+            hidden = layer(hidden).relu_()
+        raw = self.opacity(hidden)[:, 0].to(positions.dtype)
+        return DENSITY * density_of(raw), hidden
+
+    def encode_directions(self, directions: Tensor) -> Tensor:
+        """See `Field`."""
+        return positional(functional.normalize(directions, dim=-1), DIRECTION_FREQUENCIES)
+
+    def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
+        """See `Field`."""
+        pairs = zip(geometry.split(CHUNK), encoded.split(CHUNK), strict=True)
+        return torch.cat([self._colours(*pair) for pair in pairs])
+
+    def _colours(self, geometry: Tensor, encoded: Tensor) -> Tensor:
+        bottleneck = self.bottleneck(geometry)
+        hidden = self.view(torch.cat((bottleneck, encoded.to(bottleneck.dtype)), dim=1)).relu_()
+        return self.colour(hidden).to(encoded.dtype).sigmoid()
+
+    def count(self, probe: Probe, samples: int, shaded: int) -> None:
+        """See `Field`."""
+        density = products(self.trunk, self.opacity)
+        colour = products(self.bottleneck, self.view, self.colour)
+        probe.count("products", density * samples + colour * shaded)
+
+    def sizes(self) -> dict[str, int]:
+        """See `StudentField`."""
+        return {"network": parameter_bytes(self)}

@@ -1,0 +1,156 @@
+"""Embeddings at the corners of sparse voxels and the network that reads them, as a field."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from bench.types import Probe
+from methods.instant_ngp.field import Precision
+from methods.kernels.corner_gather import CORNERS, gather, trilinear
+from methods.kernels.march import Occupancy
+from methods.students.fields import StudentField
+from methods.students.networks import (
+    Dense,
+    density_of,
+    parameter_bytes,
+    positional,
+    positional_channels,
+    products,
+)
+from methods.students.voxels import corners_of
+
+EMBEDDING = 32
+"""Channels at a corner."""
+
+WIDTH = 256
+DENSITY_WIDTH = 128
+EMBEDDING_FREQUENCIES = 6
+DIRECTION_FREQUENCIES = 4
+
+FREE_ENERGY = 7.0
+"""What the release multiplies lengths with before the opacity."""
+
+ACROSS = 3.0
+"""The cube in units of the published scenes, in which lengths are measured there: about."""
+
+CHUNK = 1 << 14
+"""Samples that go through the network together: 16 MiB of activations."""
+
+
+class Layer(nn.Sequential):
+    """A dense layer, LayerNorm over its outputs, ReLU."""
+
+    def __init__(
+        self, inputs: int, outputs: int, precision: Precision, generator: torch.Generator | None
+    ) -> None:
+        super().__init__(
+            Dense(inputs, outputs, precision, generator), Norm(outputs), nn.ReLU(inplace=True)
+        )
+
+
+class Norm(nn.LayerNorm):
+    """LayerNorm in the type of its inputs; means and variances are float32 all the same."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Of [S, C]: [S, C]."""
+        weight, bias = self.weight.to(input.dtype), self.bias.to(input.dtype)
+        return functional.layer_norm(input, self.normalized_shape, weight, bias, self.eps)
+
+
+class NsvfField(StudentField):
+    """Sparse voxels with embeddings, and a network of 545,284 parameters (Liu et al. 2020,
+    Section 3.1, Appendix B, with the LayerNorm of the release).
+
+    Args:
+        occupancy: its cells are the voxels.
+        precision: of the products, "bf16" or "fp32".
+        backend: of the kernels that render it.
+        generator: of the first weights and embeddings.
+    """
+
+    index: Tensor
+    corners: Tensor
+    vertices: Tensor
+
+    def __init__(
+        self,
+        occupancy: Occupancy,
+        precision: Precision,
+        backend: str,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__(backend)
+        cells = occupancy.cells.cpu()
+        coordinates = cells.nonzero()
+        corners, vertices = corners_of(coordinates)
+        index = torch.full(cells.shape, -1, dtype=torch.int32)
+        index[cells] = torch.arange(len(coordinates), dtype=torch.int32)
+        for name, value in (("index", index), ("corners", corners), ("vertices", vertices)):
+            self.register_buffer(name, value, persistent=False)  # follow from the occupied cells
+        first = torch.randn(len(vertices), EMBEDDING, generator=generator)
+        self.embeddings = nn.Parameter(first * EMBEDDING**-0.5)
+
+        def layers(*widths: int) -> list[Layer]:
+            return [Layer(*pair, precision, generator) for pair in pairwise(widths)]
+
+        encoded = positional_channels(EMBEDDING, EMBEDDING_FREQUENCIES)
+        direction = positional_channels(3, DIRECTION_FREQUENCIES, identity=False)
+        self.trunk = nn.Sequential(*layers(encoded, WIDTH, WIDTH, WIDTH))
+        self.opacity = nn.Sequential(
+            *layers(WIDTH, DENSITY_WIDTH), Dense(DENSITY_WIDTH, 1, precision, generator)
+        )
+        self.colour = nn.Sequential(
+            *layers(WIDTH + direction, WIDTH, WIDTH, WIDTH, WIDTH),
+            Dense(WIDTH, 3, precision, generator),
+        )
+
+    def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """See `Field`; outside all voxels it is 0. The geometry is what the trunk gives."""
+        parts = [self._density(part) for part in positions.split(CHUNK)]
+        sigma, geometry = (torch.cat(column) for column in zip(*parts, strict=True))
+        return sigma, geometry
+
+    def _density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        embedding, inside = self.embedding(positions)
+        hidden = self.trunk(positional(embedding, EMBEDDING_FREQUENCIES, scale=1.0))
+        raw = self.opacity(hidden)[:, 0].to(embedding.dtype)
+        return FREE_ENERGY * ACROSS * torch.where(inside, density_of(raw), 0), hidden
+
+    def embedding(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """Trilinear interpolants [S, 32] of the embeddings, and whether there is a voxel [S]."""
+        size = len(self.index)
+        scaled = positions * size
+        cell = scaled.long().clamp(0, size - 1)
+        voxel = self.index[cell[:, 0], cell[:, 1], cell[:, 2]]
+        weights = trilinear(scaled - cell, backend=self.backend)
+        # Samples outside all voxels read one that is there: what it holds is not seen.
+        read = voxel.clamp(min=0)
+        return gather(
+            self.embeddings, self.corners, read, weights, backend=self.backend
+        ), voxel >= 0
+
+    def encode_directions(self, directions: Tensor) -> Tensor:
+        """See `Field`. Of directions, where the release takes their arc cosines."""
+        unit = functional.normalize(directions, dim=-1)
+        return positional(unit, DIRECTION_FREQUENCIES, identity=False, scale=1.0)
+
+    def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
+        """See `Field`; colours are linear in [-1, 1] for black to white, as in the release."""
+        pairs = zip(geometry.split(CHUNK), encoded.split(CHUNK), strict=True)
+        shown = [self.colour(torch.cat((hidden, d.to(hidden)), dim=1)) for hidden, d in pairs]
+        return (torch.cat(shown).to(encoded.dtype) + 1) / 2
+
+    def count(self, probe: Probe, samples: int, shaded: int) -> None:
+        """See `Field`."""
+        density, colour = products(self.trunk, self.opacity), products(self.colour)
+        probe.count("table_reads", CORNERS * samples)
+        probe.count("products", density * samples + colour * shaded)
+
+    def sizes(self) -> dict[str, int]:
+        """See `StudentField`."""
+        embeddings = self.embeddings.numel() * self.embeddings.element_size()
+        return {"embeddings": embeddings, "network": parameter_bytes(self) - embeddings}

@@ -1,0 +1,98 @@
+"""Dense layers of students that are networks, and the encoding of what goes into them."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from methods.instant_ngp.field import Precision
+from methods.kernels import multiplies_bf16
+
+
+def positional(
+    values: Tensor, frequencies: int, *, identity: bool = True, scale: float = math.pi
+) -> Tensor:
+    """Sines and cosines of `values` [S, C], of frequencies 2^0 to 2^(F - 1) times `scale`.
+
+    Mildenhall et al. (2020), Eq. 4; the release has no pi (`scale` 1) and puts the values
+    themselves in front (`identity`).
+
+    Returns:
+        [S, C (2 F + identity)]: the values, then sines and cosines of the lowest frequency, and so
+        on.
+    """
+    angles = scale * values
+    sine, cosine = angles.sin(), angles.cos()
+    parts = [values] if identity else []
+    for _ in range(frequencies):
+        parts += [sine, cosine]
+        # Those of twice the angle cost less than functions of it. Errors double as the angle does;
+        # with 1 - 2 sin^2 for the cosine they would grow faster.
+        sine, cosine = 2 * sine * cosine, (cosine - sine) * (cosine + sine)
+    return torch.cat(parts, dim=-1)
+
+
+def positional_channels(channels: int, frequencies: int, *, identity: bool = True) -> int:
+    """Channels of `positional` of as many values."""
+    return channels * (2 * frequencies + identity)
+
+
+class Dense(nn.Linear):
+    """A layer of a network: `inputs` [S, I] times weights, plus biases, [S, O].
+
+    With precision "bf16" the products are those of bfloat16 with float32 accumulation, and results
+    are bfloat16, where the device has such products; elsewhere all is float32. Parameters stay
+    float32.
+    """
+
+    def __init__(
+        self, inputs: int, outputs: int, precision: Precision, generator: torch.Generator | None
+    ) -> None:
+        super().__init__(inputs, outputs)
+        self.precision = precision
+        bound = math.sqrt(6 / (inputs + outputs))  # Glorot and Bengio (2010), Eq. 16
+        with torch.no_grad():
+            self.weight.uniform_(-bound, bound, generator=generator)
+            self.bias.zero_()
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Of [S, I]: [S, O]."""
+        half = self.precision == "bf16" and multiplies_bf16(self.weight.device.type)
+        dtype = torch.bfloat16 if half else self.weight.dtype
+        weight, bias = self.weight.to(dtype), self.bias.to(dtype)
+        return functional.linear(inputs.to(dtype), weight, bias)
+
+
+def density_of(raw: Tensor) -> Tensor:
+    """ReLU of the last output of a density network; where it gives 0, a loss can still raise it.
+
+    Without that gradient a network that once gives 0 everywhere, as after its first steps among
+    mostly empty samples, shows nothing for ever.
+    """
+    return _RisingRelu.apply(raw)
+
+
+class _RisingRelu(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, raw):
+        ctx.save_for_backward(raw)
+        return raw.relu()
+
+    @staticmethod
+    def backward(ctx, grad):
+        (raw,) = ctx.saved_tensors
+        return torch.where(raw > 0, grad, grad.clamp(max=0))
+
+
+def products(*layers: nn.Module) -> int:
+    """Multiplications that one sample costs in the dense layers in `layers`."""
+    dense = (part for layer in layers for part in layer.modules() if isinstance(part, Dense))
+    return sum(part.weight.numel() for part in dense)
+
+
+def parameter_bytes(network: nn.Module) -> int:
+    """Bytes of all parameters as they are stored."""
+    return sum(value.numel() * value.element_size() for value in network.parameters())

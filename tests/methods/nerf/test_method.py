@@ -1,0 +1,171 @@
+"""NeRF as a method: what it learns, that a kill does no harm, that skipping changes no picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from bench.console import ConsoleLog
+from bench.metrics import psnr
+from bench.types import Budget, Log, NullProbe, Scene
+from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
+from methods.instant_ngp.training import TrainingOptions
+from methods.kernels.composite import STOP
+from methods.kernels.encode import HashGrid
+from methods.nerf.field import NerfField
+from methods.nerf.method import Nerf
+from methods.rendering.march import March
+from methods.students.fields import FieldLessons
+from methods.training import loop
+from tests.methods.conftest import Work
+
+GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
+BUDGET = Budget("test", steps=80, samples=4096, renderer_steps=4)
+LONG = 8.0
+"""March step, in the usual ones: few samples for a large network."""
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
+    """Of the whole module: its field is trained once."""
+    return ConsoleLog(tmp_path_factory.mktemp("outputs"), quiet=True)
+
+
+def new_method(**options: Any) -> Nerf:
+    setup = Setup.resolved(GRID, TrainingOptions(), "fp32", "auto", "cpu", seed=0)
+    training = FieldLessons(rate=1e-3, batch=0.25, march_step=LONG)
+    return Nerf(**{"teacher": setup, "training": training} | options)
+
+
+def fitted(scene: Scene, log: Log, steps: int, **options: Any) -> Nerf:
+    method = new_method(**options)
+    method.fit(scene, Budget("test", 80, 4096, renderer_steps=steps), log)
+    return method
+
+
+def trained_teacher(scene: Scene, log: Log) -> TrainedField:
+    return train_field(new_method().teacher, scene, BUDGET, log)
+
+
+def test_it_learns_a_ball(ball_scene: Scene, log: Log) -> None:
+    method = fitted(ball_scene, log, steps=60)
+    test = ball_scene.splits["test"]
+    truth = test.images[1].float() / 255
+    on_white = truth[..., :3] * truth[..., 3:] + 1 - truth[..., 3:]
+    assert psnr(method.render(test.cameras[1], NullProbe()).rgb, on_white) > 20
+
+
+def test_skipping_changes_no_picture_and_saves_products(ball_scene: Scene, log: Log) -> None:
+    method = fitted(ball_scene, log, steps=20)
+    camera = ball_scene.splits["test"].cameras[0]
+    skipping, dense = Work(), Work()
+    fast = method.render(camera, skipping)
+    method.skip = False
+    slow = method.render(camera, dense)
+    # A ray has at most 1024 / LONG samples; the faint ones, which only the dense picture has
+    # colours of, weigh at most that of `March.least_weight` each. Sums differ by their rounding.
+    faint = 1024 / LONG * March(stop=STOP).least_weight
+    torch.testing.assert_close(fast.rgb, slow.rgb, rtol=0, atol=faint + 1e-5)
+    torch.testing.assert_close(fast.alpha, slow.alpha, rtol=0, atol=1e-5)
+    assert dense.done["products"] == dense.done["samples"] * products_of_a_sample()
+    assert skipping.done["products"] < dense.done["products"] / 3
+
+
+def products_of_a_sample() -> int:
+    """Weights of the network that the paper draws, without biases."""
+    trunk = 63 * 256 + 4 * 256**2 + (63 + 256) * 256 + 2 * 256**2
+    return trunk + 256 + 256**2 + (256 + 27) * 128 + 128 * 3
+
+
+def test_a_killed_training_goes_on_as_if_it_had_not_been(
+    ball_scene: Scene, log: Log, tmp_path: Path
+) -> None:
+    teacher = trained_teacher(ball_scene, log)
+
+    def training() -> loop.Training:
+        return new_method().begin(teacher, ball_scene, BUDGET)
+
+    whole, half = training(), training()
+    for _ in range(4):
+        whole.advance()
+    for _ in range(3):  # points, then rays
+        half.advance()
+    loop.save(half, tmp_path / "half")
+    resumed = training()
+    loop.resume(resumed, tmp_path / "half")
+    resumed.advance()
+    for name, value in whole.result().items():
+        assert torch.equal(resumed.result()[name], value), name
+
+
+def test_a_training_is_found_again(ball_scene: Scene, log: Log) -> None:
+    first = fitted(ball_scene, log, steps=2)
+    again = fitted(ball_scene, log, steps=2, skip=True)
+    assert again.train_s == first.train_s > 0
+    camera = ball_scene.splits["test"].cameras[0]
+    pictures = [method.render(camera, NullProbe()).rgb for method in (first, again)]
+    assert torch.equal(*pictures)
+
+
+def test_size_is_that_of_the_published_network(ball_scene: Scene, log: Log) -> None:
+    method = fitted(ball_scene, log, steps=2)
+    assert method.sizes() == {"network": 4 * 595_844, "occupancy": 128**3 // 8}
+
+
+def test_a_stop_at_which_rays_never_begin_is_refused() -> None:
+    with pytest.raises(ValueError, match="stop: expected"):
+        new_method(stop=1.0)
+
+
+class PaperNerf(nn.Module):
+    """Figure 7 of Mildenhall et al. (2020), written as the figure is read."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first = nn.Sequential(
+            nn.Linear(63, 256), *(m for _ in range(4) for m in (nn.ReLU(), nn.Linear(256, 256)))
+        )
+        self.second = nn.Sequential(
+            nn.Linear(319, 256), *(m for _ in range(2) for m in (nn.ReLU(), nn.Linear(256, 256)))
+        )
+        self.sigma, self.feature = nn.Linear(256, 1), nn.Linear(256, 256)
+        self.view, self.rgb = nn.Linear(283, 128), nn.Linear(128, 3)
+
+    def forward(self, x: torch.Tensor, d: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        x, d = gamma(x, 10), gamma(d, 4)
+        hidden = torch.relu(self.first(x))
+        hidden = torch.relu(self.second(torch.cat((x, hidden), dim=1)))
+        view = torch.relu(self.view(torch.cat((self.feature(hidden), d), dim=1)))
+        return torch.relu(self.sigma(hidden)), torch.sigmoid(self.rgb(view))
+
+
+def gamma(p: torch.Tensor, frequencies: int) -> torch.Tensor:
+    """Eq. 4, behind the values themselves."""
+    waves = [f(2**k * torch.pi * p) for k in range(frequencies) for f in (torch.sin, torch.cos)]
+    return torch.cat((p, *waves), dim=1)
+
+
+def test_the_network_is_that_of_the_paper() -> None:
+    generator = torch.Generator().manual_seed(0)
+    field = NerfField("fp32", "auto", generator).double()
+    paper = PaperNerf().double()
+    own = [layer for layer in field.modules() if isinstance(layer, nn.Linear)]
+    theirs = [layer for layer in paper.modules() if isinstance(layer, nn.Linear)]
+    for mine, other in zip(own, theirs, strict=True):
+        other.load_state_dict(mine.state_dict())
+    positions = torch.rand(200, 3, generator=generator, dtype=torch.float64)
+    directions = torch.randn(200, 3, generator=generator, dtype=torch.float64)
+    unit = directions / directions.norm(dim=1, keepdim=True)
+
+    sigma, geometry = field.density(positions)
+    colour = field.features(geometry, field.encode_directions(directions))
+    opacity, rgb = paper(2 * positions - 1, unit)
+
+    # Doubling an angle 10 times loses 10 bits of 53.
+    torch.testing.assert_close(sigma * 5 * 3**0.5 / 1024, opacity[:, 0], rtol=0, atol=1e-9)
+    torch.testing.assert_close(colour, rgb, rtol=0, atol=1e-9)
+    assert sum(p.numel() for p in field.parameters()) == 595_844

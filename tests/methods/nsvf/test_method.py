@@ -1,0 +1,196 @@
+"""NSVF as a method: its voxels and network, what it learns, that a kill does no harm."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+from torch.nn import functional
+
+from bench.console import ConsoleLog
+from bench.metrics import psnr
+from bench.types import Budget, Log, NullProbe, Scene
+from methods.instant_ngp.stage1 import Setup, train_field
+from methods.instant_ngp.training import TrainingOptions
+from methods.kernels.encode import HashGrid, encode
+from methods.kernels.march import Occupancy
+from methods.nsvf.field import NsvfField
+from methods.nsvf.method import Nsvf
+from methods.rendering.occupancy import STEP
+from methods.students.fields import FieldLessons
+from methods.training import loop
+
+GRID = HashGrid(levels=16, log2_table=10, n_min=4, n_max=64)
+BUDGET = Budget("test", steps=80, samples=4096, renderer_steps=4)
+U = 2.0**-24
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
+    """Of the whole module: its field is trained once."""
+    return ConsoleLog(tmp_path_factory.mktemp("outputs"), quiet=True)
+
+
+def new_method(**options: Any) -> Nsvf:
+    setup = Setup.resolved(GRID, TrainingOptions(), "fp32", "auto", "cpu", seed=0)
+    training = FieldLessons(rate=2e-3, batch=0.25)
+    return Nsvf(
+        **{"teacher": setup, "training": training, "resolution": 32, "start": "random"} | options
+    )
+
+
+def fitted(scene: Scene, log: Log, steps: int, **options: Any) -> Nsvf:
+    method = new_method(**options)
+    method.fit(scene, Budget("test", 80, 4096, renderer_steps=steps), log)
+    return method
+
+
+def two_thirds(backend: str = "reference") -> NsvfField:
+    """Random voxels of a grid of 16^3, with random embeddings, in float64."""
+    generator = torch.Generator().manual_seed(2)
+    occupancy = Occupancy(torch.rand(16, 16, 16, generator=generator) < 2 / 3)
+    return NsvfField(occupancy, "fp32", backend, generator).double()
+
+
+def test_embeddings_are_those_of_grid_sample() -> None:
+    field = two_thirds()
+    dense = torch.full((17, 17, 17, 32), torch.nan, dtype=torch.float64)
+    x, y, z = field.vertices.long().unbind(dim=1)
+    dense[x, y, z] = field.embeddings.detach()
+    positions = torch.rand(500, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    found, inside = field.embedding(positions)
+    # grid_sample has its volume as [C, z, y, x] and its coordinates in [-1, 1].
+    volume = dense.permute(3, 2, 1, 0)[None]
+    grid = (2 * positions - 1)[None, None, None]
+    wanted = functional.grid_sample(volume, grid, align_corners=True)[0, :, 0, 0].T
+    assert 100 < inside.sum() < 450
+    # Positions become coordinates in another order of operations; NaN where a corner is missing.
+    torch.testing.assert_close(found[inside], wanted[inside], rtol=0, atol=1e-12)
+
+
+def test_features_are_continuous_across_faces_of_voxels() -> None:
+    field = two_thirds()
+    both = (field.index[:-1] >= 0) & (field.index[1:] >= 0)
+    x, y, z = both.nonzero().unbind(dim=1)
+    face = torch.stack((x + 1, y + 0.3, z + 0.8), dim=1).double() / 16
+    nudge = torch.tensor([1e-9, 0, 0], dtype=torch.float64)
+    (below, _), (above, _) = field.embedding(face - nudge), field.embedding(face + nudge)
+    # Embeddings below 1 change by at most 2 a voxel: 2e-9 * 16 * 2.
+    assert len(face) > 100
+    torch.testing.assert_close(below, above, rtol=0, atol=1e-7)
+
+
+def test_density_is_zero_outside_voxels() -> None:
+    field = two_thirds()
+    nn.init.constant_(field.opacity[-1].bias, 10.0)
+    axis = (torch.arange(16, dtype=torch.float64) + 0.5) / 16
+    sigma, _ = field.density(torch.cartesian_prod(axis, axis, axis))
+    assert torch.equal(sigma.view(16, 16, 16) > 0, field.index >= 0)
+
+
+def test_the_network_is_that_of_the_publication() -> None:
+    field = two_thirds().float()
+    network = sum(p.numel() for name, p in field.named_parameters() if name != "embeddings")
+    assert network == 545_284
+    assert field.sizes() == {"embeddings": 128 * len(field.vertices), "network": 4 * 545_284}
+
+    def hidden(inputs: int, outputs: int) -> list[nn.Module]:
+        return [nn.Linear(inputs, outputs), nn.LayerNorm(outputs), nn.ReLU()]
+
+    trunk = nn.Sequential(*hidden(416, 256), *hidden(256, 256), *hidden(256, 256))
+    opacity = nn.Sequential(*hidden(256, 128), nn.Linear(128, 1), nn.ReLU())
+    colour = nn.Sequential(
+        *hidden(280, 256), *(m for _ in range(3) for m in hidden(256, 256)), nn.Linear(256, 3)
+    )
+    for mine, other in ((field.trunk, trunk), (field.opacity, opacity), (field.colour, colour)):
+        for value, own in zip(other.parameters(), mine.parameters(), strict=True):
+            value.data = own.data
+    places = torch.rand(300, 3, generator=torch.Generator().manual_seed(4))
+    d = functional.normalize(torch.randn(300, 3, generator=torch.Generator().manual_seed(5)), dim=1)
+    e, inside = field.embedding(places)
+    encoded = torch.cat((e, *(f(2**k * e) for k in range(6) for f in (torch.sin, torch.cos))), 1)
+    seen = torch.cat([f(2**k * d) for k in range(4) for f in (torch.sin, torch.cos)], dim=1)
+    feature = trunk(encoded)
+    sigma, geometry = field.density(places)
+    shown = field.features(geometry, field.encode_directions(d))
+    # Angles doubled five times lose five bits; LayerNorm and four layers keep errors in proportion.
+    close = {"rtol": 1e-4, "atol": 1e4 * U}
+    torch.testing.assert_close(sigma[inside], 21 * opacity(feature)[inside, 0], **close)
+    torch.testing.assert_close(2 * shown - 1, colour(torch.cat((feature, seen), dim=1)), **close)
+
+
+def test_it_learns_a_ball(ball_scene: Scene, log: Log) -> None:
+    method = fitted(ball_scene, log, steps=40, start="teacher")
+    test = ball_scene.splits["test"]
+    truth = test.images[1].float() / 255
+    on_white = truth[..., :3] * truth[..., 3:] + 1 - truth[..., 3:]
+    assert psnr(method.render(test.cameras[1], NullProbe()).rgb, on_white) > 20
+
+
+def test_a_killed_training_goes_on_as_if_it_had_not_been(
+    ball_scene: Scene, log: Log, tmp_path: Path
+) -> None:
+    teacher = train_field(new_method().teacher, ball_scene, BUDGET, log)
+
+    def training() -> loop.Training:
+        return new_method().begin(teacher, ball_scene, BUDGET)
+
+    whole, half = training(), training()
+    for _ in range(4):
+        whole.advance()
+    for _ in range(3):  # points, then rays
+        half.advance()
+    loop.save(half, tmp_path / "half")
+    resumed = training()
+    loop.resume(resumed, tmp_path / "half")
+    resumed.advance()
+    for name, value in whole.result().items():
+        assert torch.equal(resumed.result()[name], value), name
+
+
+def test_a_training_is_found_again_and_depends_on_its_step(ball_scene: Scene, log: Log) -> None:
+    first, again = (fitted(ball_scene, log, steps=2) for _ in range(2))
+    assert again.train_s == first.train_s > 0
+    camera = ball_scene.splits["test"].cameras[0]
+    pictures = [method.render(camera, NullProbe()).rgb for method in (first, again)]
+    assert torch.equal(*pictures)
+    assert first.training.march.step == pytest.approx(0.5 / 32)
+    assert new_method(step=0.25).training.march_step * STEP == pytest.approx(0.25 / 32)
+
+
+def test_embeddings_begin_as_the_teachers_features(ball_scene: Scene, log: Log) -> None:
+    method = new_method(start="teacher")
+    teacher = train_field(method.teacher, ball_scene, BUDGET, log)
+    field = method.begin(teacher, ball_scene, BUDGET).field
+    assert isinstance(field, NsvfField)
+    embeddings = field.embeddings.detach()
+    assert embeddings.std().item() == pytest.approx(32**-0.5, rel=1e-5)
+    places = field.vertices / 32
+    learned = encode(places, teacher.field.table.detach(), GRID, backend="reference")
+    # The same table, read by another backend, and a factor: some roundings.
+    scale = 32**-0.5 / learned.std()
+    torch.testing.assert_close(embeddings, scale * learned, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"resolution": 40}, "resolution: expected a multiple of 16"),
+        ({"step": 0.0}, "step: expected a length"),
+        ({"start": "zero"}, "start: expected random or teacher"),
+        ({"stop": 1.0}, "stop: expected"),
+    ],
+)
+def test_wrong_settings_are_refused(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        new_method(**wrong)
+
+
+def test_a_teacher_of_other_channels_is_no_start() -> None:
+    small = HashGrid(levels=8, log2_table=10, n_min=4, n_max=64)
+    setup = Setup.resolved(small, TrainingOptions(), "fp32", "auto", "cpu", seed=0)
+    with pytest.raises(ValueError, match=r"32 channels .* got 16"):
+        new_method(teacher=setup, start="teacher")
