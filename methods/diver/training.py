@@ -11,7 +11,7 @@ from torch import Tensor
 from bench.types import Budget, Rays, Scene
 from methods.diver.decoder import encode_directions
 from methods.diver.model import CornerModel, as_intervals
-from methods.instant_ngp.training import PixelTraining, TrainingOptions
+from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import STOP, Pixels, composite, visible_counts, weights
 from methods.kernels.voxel_walk import Crossings, walk
@@ -24,7 +24,7 @@ CHUNK_RAYS = 1 << 15
 
 
 @dataclass(frozen=True)
-class Lessons(TrainingOptions):
+class Lessons(PixelOptions):
     """How the model learns; `rate` is that of the decoder.
 
     Attributes:

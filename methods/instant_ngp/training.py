@@ -57,28 +57,40 @@ class PixelOptions:
 
 
 @dataclass(frozen=True)
-class TrainingOptions(PixelOptions):
-    """How a field of stage 1 is trained; `rate` is that of table and networks.
+class MarchOptions(PixelOptions):
+    """How a field learns that is sampled along rays.
 
     Attributes:
-        grid_samples: visits of an update of the density grid.
         march_step: length of a ray-marching step, in diagonals of the cube / 1024, as the release
             has it.
     """
 
-    grid_samples: int = 1 << 17
     march_step: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_step("march_step", self.march_step)
+
+    @property
+    def march(self) -> March:
+        """Of the rays of the training, and of what is shown as it was trained."""
+        return March(step=self.march_step * STEP)
+
+
+@dataclass(frozen=True)
+class TrainingOptions(MarchOptions):
+    """How a field of stage 1 is trained; `rate` is that of table and networks.
+
+    Attributes:
+        grid_samples: visits of an update of the density grid.
+    """
+
+    grid_samples: int = 1 << 17
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.grid_samples < 2:
             raise ValueError(f"expected grid_samples >= 2: {self}")
-        check_step("march_step", self.march_step)
-
-    @property
-    def march(self) -> March:
-        """Of the rays of stage 1, and of what is shown as it was trained."""
-        return March(step=self.march_step * STEP)
 
 
 class PixelBatches:

@@ -14,7 +14,7 @@ from methods.kilonerf.field import KiloField
 from methods.kilonerf.grid import Grid, place_networks
 from methods.kilonerf.training import KiloTraining, Lessons
 from methods.students.fields import FieldStudent
-from methods.training import checkpoint, loop
+from methods.training import checkpoint
 
 MOST = 32
 """Networks along an axis: their numbers are int16."""
@@ -57,7 +57,7 @@ class KiloNerf(FieldStudent):
         generator = torch.Generator().manual_seed(self.teacher.seed)
         return KiloField(self.grid, self.teacher.backend, generator).to(self.teacher.device)
 
-    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> loop.Training:
+    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> KiloTraining:
         """See `Student`."""
         bounds = scene.bounds.to(self.teacher.device)
         self.grid, pieces = place_networks(teacher.occupancy, bounds, self.networks)

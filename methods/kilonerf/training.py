@@ -23,17 +23,17 @@ class Lessons(FieldLessons):
     """How the networks learn.
 
     Attributes:
-        batch: points of each network in a step of the distillation.
+        points_each: points of each network in a step of the distillation.
         view_cost: weight of the norms of the weights that see directions, while learning from rays.
     """
 
-    batch: int = 128
+    points_each: int = 128
     view_cost: float = 1e-6
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (self.batch >= 1 and self.view_cost >= 0):
-            raise ValueError(f"expected batch >= 1, view_cost >= 0: {self}")
+        if not (self.points_each >= 1 and self.view_cost >= 0):
+            raise ValueError(f"expected points_each >= 1, view_cost >= 0: {self}")
 
 
 class KiloTraining(FieldTraining):
@@ -56,7 +56,7 @@ class KiloTraining(FieldTraining):
         )
 
     def _places(self) -> tuple[Tensor, Tensor]:
-        positions = self.pieces.draw(self.lessons.batch, self.generator)
+        positions = self.pieces.draw(self.lessons.points_each, self.generator)
         directions = torch.randn(
             len(positions), 3, generator=self.generator, device=positions.device
         )

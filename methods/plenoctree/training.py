@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench.types import Budget, Rays, Scene
-from methods.instant_ngp.training import PixelTraining, TrainingOptions
+from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import STOP, Pixels, composite, visible_counts
 from methods.kernels.voxel_shading import shade_voxels
@@ -19,7 +19,7 @@ from methods.plenoctree.octree import Octree
 
 
 @dataclass(frozen=True)
-class OctreeLessons(TrainingOptions):
+class OctreeLessons(PixelOptions):
     """How leaves learn; `rate` is that of the harmonics. There is no grid, and no step.
 
     Attributes:

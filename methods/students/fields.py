@@ -14,7 +14,7 @@ from torch.nn import functional
 from bench.cameras import place_camera
 from bench.types import Budget, Camera, Frame, Probe, Rays, Scene
 from methods.instant_ngp.stage1 import TrainedField
-from methods.instant_ngp.training import PixelTraining, TrainingOptions
+from methods.instant_ngp.training import MarchOptions, PixelTraining
 from methods.kernels.composite import Pixels
 from methods.kernels.march import Occupancy
 from methods.rendering.batch import render_batch
@@ -30,7 +30,7 @@ REACH = 5 * STEP
 
 
 @dataclass(frozen=True)
-class FieldLessons(TrainingOptions):
+class FieldLessons(MarchOptions):
     """How a student that is a field learns: from rays as Instant-NGP does, after some points.
 
     Attributes:

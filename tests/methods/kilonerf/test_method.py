@@ -19,7 +19,7 @@ from methods.training import loop
 
 GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
 BUDGET = Budget("test", steps=100, samples=8192, renderer_steps=60)
-LESSONS = Lessons(batch=64, rate=1e-2)
+LESSONS = Lessons(points_each=64, rate=1e-2)
 TEACHER = Setup.resolved(GRID, TrainingOptions(), "bf16", "auto", "cpu", seed=0)
 
 
