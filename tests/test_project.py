@@ -84,7 +84,9 @@ def test_every_pin_suits_the_range_in_pyproject():
 
 
 def test_extras_are_those_that_are_promised():
-    assert set(EXTRAS) == {"openvino", "onnx", "tensorrt", "joblib", "ray", "slurm", "dev"}
+    assert set(EXTRAS) == {
+        *("openvino", "onnx", "tensorrt", "video", "joblib", "ray", "slurm", "dev")
+    }
 
 
 def test_continuous_integration_runs_make_test():
