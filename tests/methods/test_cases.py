@@ -84,6 +84,7 @@ NAMES = {
     "adam": "sparse_adam_",
     "gaussian_blending": "blend",
     "gaussian_projection": "project_gaussians",
+    "grouped_mlp": "grouped_linear",
     "spherical": "spherical_harmonics",
 }
 """What a kernel is called where it is not called as its folder."""

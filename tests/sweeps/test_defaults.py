@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from sweeps.overrides import composed
 
-BASES = ("ngp", "gaussians", "steernerf_lean")
+BASES = ("ngp", "gaussians", "kilonerf", "steernerf_lean")
 """What the other methods' configurations stand on."""
 
 

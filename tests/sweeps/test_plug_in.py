@@ -111,7 +111,7 @@ def test_a_name_near_it_is_answered_with_it(call, command):
     refused = call(command, "method=mien")
     assert refused.status == 2
     assert "unknown method 'mien'. Did you mean mine?" in refused.err
-    assert "There are: gaussians, mine, ngp" in refused.err
+    assert "There are: gaussians, kilonerf, mine, ngp" in refused.err
 
 
 def test_a_package_that_python_does_not_find_is_named(call, monkeypatch, folder):

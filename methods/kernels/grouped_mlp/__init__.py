@@ -1,0 +1,217 @@
+"""Many small networks, each for the samples of its own cell (Reiser et al. 2021, Section 3).
+
+Samples are put in the order of their networks, so that the weights of one network stay in the cache
+while its samples are computed. All networks have the same layers, those of KiloNeRF (Figure 2):
+
+hidden = relu(mid(relu(in(encoding of the position)))), density = density(hidden),
+colour = sigmoid(colour(relu(direction(feature(hidden), encoding of the direction))))
+
+`feature` is followed by no ReLU. The density has no activation yet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bench.types import check_shape
+from methods.kernels.dispatch import implementation
+
+HIDDEN = 32
+"""Outputs of a layer, but of the density and the colour."""
+
+LAYERS = ("in", "mid", "density", "feature", "direction", "colour")
+
+
+@dataclass(frozen=True)
+class Groups:
+    """Samples in the order of their networks.
+
+    Attributes:
+        permutation: [M] int64, the samples that have a network, network by network, each network's
+            in the order in which they were given.
+        offsets: [N + 1] int64, network n owns offsets[n] to offsets[n + 1] of the permutation.
+    """
+
+    permutation: Tensor
+    offsets: Tensor
+
+
+@dataclass(frozen=True)
+class Networks:
+    """N networks, by `LAYERS`.
+
+    Attributes:
+        weights: [N, I, O] of each layer, from I inputs to O outputs.
+        biases: [N, O] of each layer.
+    """
+
+    weights: Mapping[str, Tensor]
+    biases: Mapping[str, Tensor]
+
+    def layer(self, name: str) -> tuple[Tensor, Tensor]:
+        """Weights and biases of a layer."""
+        return self.weights[name], self.biases[name]
+
+    @property
+    def frequencies(self) -> int:
+        """Of the encoding of a position: the first layer has 3 + 6 of them as inputs."""
+        return (self.weights["in"].shape[1] - 3) // 6
+
+    @property
+    def learning(self) -> bool:
+        """Whether a gradient is wanted."""
+        tensors = (*self.weights.values(), *self.biases.values())
+        return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+
+
+def order(networks: Tensor, count: int, *, backend: str = "auto") -> Groups:
+    """Sort samples by their networks.
+
+    Args:
+        networks: [S] int16, int32 or int64, the number of each sample's network; negative: none.
+        count: N, how many networks there are.
+
+    Raises:
+        ValueError: a shape or a type other than these, a network of N or more.
+    """
+    check_shape("networks", networks, None)
+    if networks.is_floating_point():
+        raise ValueError(f"networks: expected whole numbers, got {networks.dtype}")
+    if len(networks) and int(networks.max()) >= count:
+        raise ValueError(
+            f"networks: expected numbers below {count}, got {int(networks.max())}: "
+            "a negative number stands for no network"
+        )
+    return implementation("grouped_mlp", backend, networks.device).order(networks, count)
+
+
+def encode_frequencies(inputs: Tensor, frequencies: int, *, backend: str = "auto") -> Tensor:
+    """Positional encoding [S, 3 + 6 F] of `inputs` [S, 3]: x, sin x, cos x, sin 2x, cos 2x, ...
+
+    Angles are 2^k x for k = 0 to F - 1, without the factor pi of Mildenhall et al. 2020, Eq. 4: so
+    had their release and that of KiloNeRF. With backend="cpu" there is no gradient, and an input
+    beyond +-16 loses digits.
+
+    Raises:
+        ValueError: a shape other than this, F < 1; backend "cpu": not float32.
+    """
+    check_shape("inputs", inputs, None, 3)
+    if frequencies < 1:
+        raise ValueError(f"frequencies: expected 1 or more, got {frequencies}")
+    return implementation("grouped_mlp", backend, inputs.device).encode_frequencies(
+        inputs, frequencies
+    )
+
+
+def grouped_linear(
+    inputs: Tensor,
+    weights: Tensor,
+    biases: Tensor,
+    offsets: Tensor,
+    *,
+    relu: bool = False,
+    backend: str = "auto",
+) -> Tensor:
+    """A linear layer [S, O] of samples that are sorted by network; differentiable in all of them.
+
+    Args:
+        inputs: [S, I], network n has rows offsets[n] to offsets[n + 1].
+        weights: [N, I, O].
+        biases: [N, O].
+        offsets: [N + 1] int64 of `Groups`, from 0 to S.
+        relu: whether outputs below 0 become 0.
+
+    Raises:
+        ValueError: a shape other than these, offsets that do not end at S; backend "cpu": not
+            float32.
+    """
+    check_shape("weights", weights, None, None, None)
+    networks, channels, outputs = weights.shape
+    check_shape("inputs", inputs, None, channels)
+    check_shape("biases", biases, networks, outputs)
+    check_shape("offsets", offsets, networks + 1)
+    if int(offsets[-1]) != len(inputs):
+        raise ValueError(
+            f"offsets: expected to end at the {len(inputs)} inputs, got {int(offsets[-1])}"
+        )
+    return implementation("grouped_mlp", backend, inputs.device).grouped_linear(
+        inputs, weights, biases, offsets, relu
+    )
+
+
+def densities(
+    positions: Tensor, networks: Networks, groups: Groups, *, backend: str = "auto"
+) -> tuple[Tensor, Tensor]:
+    """Densities [S] before their activation, and hidden channels [S, 32], of samples.
+
+    Both are 0 where a sample has no network. Differentiable in the networks.
+
+    Args:
+        positions: [S, 3] in the sample's own cell, -1 to 1 along each axis.
+
+    Raises:
+        ValueError: a shape other than this; backend "cpu": not float32.
+    """
+    check_shape("positions", positions, None, 3)
+    if networks.learning:
+        return _composed_densities(positions, networks, groups, backend)
+    return implementation("grouped_mlp", backend, positions.device).densities(
+        positions, networks, groups
+    )
+
+
+def colours(
+    hidden: Tensor, encoded: Tensor, networks: Networks, groups: Groups, *, backend: str = "auto"
+) -> Tensor:
+    """Colours [S, 3] in (0, 1) of samples; 0 where a sample has no network.
+
+    Differentiable in the hidden channels and the networks.
+
+    Args:
+        hidden: [S, 32] of `densities`.
+        encoded: [S, D] encoded directions.
+
+    Raises:
+        ValueError: a shape other than these; backend "cpu": not float32.
+    """
+    check_shape("hidden", hidden, None, HIDDEN)
+    check_shape("encoded", encoded, len(hidden), networks.weights["direction"].shape[1] - HIDDEN)
+    if networks.learning:
+        return _composed_colours(hidden, encoded, networks, groups, backend)
+    return implementation("grouped_mlp", backend, hidden.device).colours(
+        hidden, encoded, networks, groups
+    )
+
+
+def _composed_densities(
+    positions: Tensor, networks: Networks, groups: Groups, backend: str
+) -> tuple[Tensor, Tensor]:
+    """`densities`, layer by layer."""
+    place, offsets = groups.permutation, groups.offsets
+    x = encode_frequencies(positions[place], networks.frequencies, backend=backend)
+    for name in ("in", "mid"):
+        x = grouped_linear(x, *networks.layer(name), offsets, relu=True, backend=backend)
+    raw = grouped_linear(x, *networks.layer("density"), offsets, backend=backend)
+    count = len(positions)
+    return _back(raw, place, count).squeeze(1), _back(x, place, count)
+
+
+def _composed_colours(
+    hidden: Tensor, encoded: Tensor, networks: Networks, groups: Groups, backend: str
+) -> Tensor:
+    """`colours`, layer by layer."""
+    place, offsets = groups.permutation, groups.offsets
+    feature = grouped_linear(hidden[place], *networks.layer("feature"), offsets, backend=backend)
+    x = torch.cat((feature, encoded[place]), dim=1)
+    x = grouped_linear(x, *networks.layer("direction"), offsets, relu=True, backend=backend)
+    x = grouped_linear(x, *networks.layer("colour"), offsets, backend=backend)
+    return _back(x.sigmoid(), place, len(hidden))
+
+
+def _back(values: Tensor, place: Tensor, count: int) -> Tensor:
+    """Rows put back where they came from, among `count`; zeros elsewhere."""
+    return values.new_zeros(count, values.shape[1]).index_copy(0, place, values)

@@ -1,0 +1,510 @@
+"""Small networks with numba: six samples and 16 outputs at a time, kept in registers.
+
+`_product` is what all is made of. LLVM does not keep the sums of a loop nest in registers by itself
+(13 instead of 40 GFLOP/s a core), so its loop is written in LLVM's own terms. Work is divided among
+threads by samples, at the borders of networks.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from llvmlite import ir
+from numba import njit, prange, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numba.np.arrayobj import make_array
+from torch import Tensor
+from torch.nn import functional
+
+from methods.kernels.cpu import f32
+from methods.kernels.grouped_mlp import HIDDEN, Groups, Networks
+
+ROWS = 6
+"""Samples that are computed together: 6 x 16 sums fill 12 of the 16 vector registers of AVX2."""
+
+SLOT = 8  # numbers a row of `_encode`: ROWS and two idle ones, a whole vector
+LANES = 16  # outputs that are computed together
+CHUNKS = 64
+"""Parts into which samples are divided, always the same ones."""
+
+RESTART = 5
+"""Doublings of an angle, each of which doubles its error, before it is computed anew."""
+
+ZERO, ONE, TWO = f32(0), f32(1), f32(2)
+PER_TURN = f32(2 / math.pi)
+# pi / 2 in three parts, the first two short enough that multiples up to 2^11 are exact.
+QUARTER0 = f32(1.5703125)
+QUARTER1 = f32(0.000483989715576171875)
+QUARTER2 = f32(math.pi / 2 - 1.5703125 - 0.000483989715576171875)
+# sin r = r + r z (S0 + z (S1 + z S2)), cos r = 1 - z / 2 + z^2 (C0 + z (C1 + z C2)), z = r^2,
+# |r| <= pi/4: least squares, below 3e-9 before rounding.
+S0, S1, S2 = f32(-0.16666655242443085), f32(0.008332165889441967), f32(-0.00019515953317750245)
+C0, C1, C2 = f32(0.04166664555668831), f32(-0.0013887342065572739), f32(2.4435852537862957e-05)
+
+
+def order(networks: Tensor, count: int) -> Groups:
+    """See `methods.kernels.grouped_mlp.order`."""
+    offsets = torch.zeros(count + 1, dtype=torch.int64)
+    places = torch.empty(len(networks), dtype=torch.int64)
+    numbers = networks.contiguous().numpy()
+    _sort(numbers, offsets.numpy(), places.numpy())
+    return Groups(places[: int(offsets[-1])], offsets)
+
+
+def encode_frequencies(inputs: Tensor, frequencies: int) -> Tensor:
+    """See `methods.kernels.grouped_mlp.encode_frequencies`."""
+    _check("encodes", inputs)
+    out = torch.empty(len(inputs), 3 + 6 * frequencies)
+    _encode_all(inputs.detach().contiguous().numpy(), frequencies, out.numpy())
+    return out
+
+
+def grouped_linear(
+    inputs: Tensor, weights: Tensor, biases: Tensor, offsets: Tensor, relu: bool
+) -> Tensor:
+    """See `methods.kernels.grouped_mlp.grouped_linear`."""
+    _check("multiplies", inputs, weights, biases)
+    return _Linear.apply(inputs, weights, biases, offsets, relu)
+
+
+def densities(positions: Tensor, networks: Networks, groups: Groups) -> tuple[Tensor, Tensor]:
+    """See `methods.kernels.grouped_mlp.densities`."""
+    layers = [part for name in ("in", "mid", "density") for part in networks.layer(name)]
+    _check("computes", positions, *layers)
+    raw = torch.zeros(len(positions))
+    hidden = torch.zeros(len(positions), HIDDEN)
+    _densities(
+        *_arrays(positions, *layers, groups.permutation, groups.offsets),
+        networks.frequencies,
+        raw.numpy(),
+        hidden.numpy(),
+    )
+    return raw, hidden
+
+
+def colours(hidden: Tensor, encoded: Tensor, networks: Networks, groups: Groups) -> Tensor:
+    """See `methods.kernels.grouped_mlp.colours`."""
+    layers = [part for name in ("feature", "direction", "colour") for part in networks.layer(name)]
+    _check("computes", hidden, encoded, *layers)
+    raw = torch.full((len(hidden), 3), -torch.inf)  # whose sigmoid is 0
+    _colours(
+        *_arrays(hidden, encoded, *layers, groups.permutation, groups.offsets),
+        raw.numpy(),
+    )
+    return raw.sigmoid_()
+
+
+def _check(verb: str, *tensors: Tensor) -> None:
+    for tensor in tensors:
+        if tensor.dtype != torch.float32:
+            raise ValueError(
+                f"backend 'cpu' {verb} float32, got {tensor.dtype}: use backend='reference'"
+            )
+
+
+def _arrays(*tensors: Tensor) -> list[np.ndarray]:
+    return [tensor.detach().contiguous().numpy() for tensor in tensors]
+
+
+class _Linear(torch.autograd.Function):
+    """Outputs are computed, and gradients of inputs, in whole vectors; what is too much is cut."""
+
+    @staticmethod
+    def forward(ctx, inputs, weights, biases, offsets, relu):
+        outputs = weights.shape[2]
+        idle = -outputs % LANES
+        weights, biases = functional.pad(weights, (0, idle)), functional.pad(biases, (0, idle))
+        out = torch.empty(len(inputs), outputs + idle)
+        _linear(*_arrays(inputs, weights, biases, offsets), relu, out.numpy())
+        ctx.save_for_backward(inputs, weights, offsets, out)
+        ctx.relu = relu
+        return out[:, :outputs]
+
+    @staticmethod
+    def backward(ctx, grad):
+        inputs, weights, offsets, out = ctx.saved_tensors
+        outputs, wanted = grad.shape[1], ctx.needs_input_grad[0]
+        grad = functional.pad(grad, (0, out.shape[1] - outputs))
+        grads = torch.empty_like(weights), torch.empty(len(weights), out.shape[1])
+        channels = inputs.shape[1]
+        grad_inputs = torch.empty(len(inputs) if wanted else 0, channels + -channels % LANES)
+        _backward(
+            *_arrays(inputs, weights, offsets, out, grad),
+            ctx.relu,
+            *(part.numpy() for part in (grad_inputs, *grads)),
+        )
+        cut = tuple(part[..., :outputs] for part in grads)
+        return grad_inputs[:, :channels] if wanted else None, *cut, None, None
+
+
+def _product(rows: int, relu: bool):
+    """out[r, o] = bias[o] + sum_k a[r, k] w[k, o] for `rows` r and `LANES` o, of flat arrays.
+
+    Its arguments: a, the place of a[0, 0], steps to the next r and the next k; w, the place of
+    w[0, 0], the step to the next k; bias, its place; out, its place, the step to the next r; how
+    many k there are, 1 or more.
+    """
+
+    @intrinsic
+    def product(
+        typing, a, a_at, a_row, a_step, w, w_at, w_step, bias, bias_at, out, out_at, out_row, count
+    ):
+        def generate(context, builder, signature, values):
+            index = ir.IntType(64)
+            vector = ir.VectorType(ir.FloatType(), LANES)
+            zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+            fma = cgutils.get_or_insert_function(
+                builder.module,
+                ir.FunctionType(vector, [vector] * 3),
+                f"llvm.fma.v{LANES}f32",
+            )
+
+            def pointer(array: int) -> ir.Value:
+                data = make_array(signature.args[array])(context, builder, values[array]).data
+                return builder.gep(data, [values[array + 1]])
+
+            def lanes(base: ir.Value, at: ir.Value) -> ir.Value:
+                return builder.bitcast(builder.gep(base, [at]), vector.as_pointer())
+
+            def splat(number: ir.Value) -> ir.Value:
+                nothing = ir.Constant(vector, ir.Undefined)
+                one = builder.insert_element(nothing, number, ir.Constant(ir.IntType(32), 0))
+                return builder.shuffle_vector(one, nothing, zeros)
+
+            def row(step: ir.Value, r: int) -> ir.Value:
+                return builder.mul(step, ir.Constant(index, r))
+
+            a_data, w_data, bias_data, out_data = (pointer(n) for n in (0, 4, 7, 9))
+            first = builder.load(lanes(bias_data, ir.Constant(index, 0)), align=4)
+            before, loop = builder.block, builder.append_basic_block("k")
+            after = builder.append_basic_block("summed")
+            builder.branch(loop)
+
+            builder.position_at_end(loop)
+            k = builder.phi(index)
+            sums = [builder.phi(vector) for _ in range(rows)]
+            weight = builder.load(lanes(w_data, builder.mul(k, values[6])), align=4)
+            along = builder.gep(a_data, [builder.mul(k, values[3])])
+            next_k = builder.add(k, ir.Constant(index, 1))
+            k.add_incoming(ir.Constant(index, 0), before)
+            k.add_incoming(next_k, loop)
+            results = []
+            for r, total in enumerate(sums):
+                number = splat(builder.load(builder.gep(along, [row(values[2], r)])))
+                results.append(builder.call(fma, [number, weight, total]))
+                total.add_incoming(first, before)
+                total.add_incoming(results[-1], loop)
+            builder.cbranch(builder.icmp_signed("<", next_k, values[12]), loop, after)
+
+            builder.position_at_end(after)
+            nothing = ir.Constant(vector, [0.0] * LANES)
+            for r, result in enumerate(results):
+                if relu:  # NaN is not below 0 and stays
+                    below = builder.fcmp_ordered("<", result, nothing)
+                    result = builder.select(below, nothing, result)
+                builder.store(result, lanes(out_data, row(values[11], r)), align=4)
+            return context.get_dummy_value()
+
+        n = types.int64
+        return types.void(a, n, n, n, w, n, n, bias, n, out, n, n, n), generate
+
+    return product
+
+
+_six, _six_relu = _product(ROWS, relu=False), _product(ROWS, relu=True)
+_one, _one_relu = _product(1, relu=False), _product(1, relu=True)
+
+
+@njit(cache=True)
+def _multiply(rows, a, a_at, a_row, a_step, w, width, bias, out, out_at, count, relu):
+    """`rows` rows of a matrix, any number, times w [count, width], plus bias [width], which are
+    flat: out [rows, width]."""
+    for left in range(0, width, LANES):
+        r = 0
+        while r < rows:
+            if rows >= ROWS:
+                r = min(r, rows - ROWS)  # the last ones overlap: some are computed twice
+            at, to = a_at + r * a_row, out_at + r * width + left
+            if rows < ROWS:
+                if relu:
+                    _one_relu(
+                        a, at, a_row, a_step, w, left, width, bias, left, out, to, width, count
+                    )
+                else:
+                    _one(a, at, a_row, a_step, w, left, width, bias, left, out, to, width, count)
+                r += 1
+            else:
+                if relu:
+                    _six_relu(
+                        a, at, a_row, a_step, w, left, width, bias, left, out, to, width, count
+                    )
+                else:
+                    _six(a, at, a_row, a_step, w, left, width, bias, left, out, to, width, count)
+                r += ROWS
+
+
+@njit(cache=True)
+def _sort(networks, offsets, places):
+    """A counting sort: each network's samples keep their order."""
+    for s in range(len(networks)):
+        if networks[s] >= 0:
+            offsets[networks[s] + 1] += 1
+    for n in range(1, len(offsets)):
+        offsets[n] += offsets[n - 1]
+    filled = offsets.copy()
+    for s in range(len(networks)):
+        n = networks[s]
+        if n >= 0:
+            places[filled[n]] = s
+            filled[n] += 1
+
+
+@njit(cache=True)
+def _borders(offsets):
+    """The networks of each of `CHUNKS` parts with about equally many samples; [CHUNKS + 1]."""
+    ends = np.empty(CHUNKS + 1, np.int64)
+    for chunk in range(CHUNKS):
+        ends[chunk] = np.searchsorted(offsets, chunk * offsets[-1] // CHUNKS)
+    ends[0], ends[CHUNKS] = 0, len(offsets) - 1
+    return ends
+
+
+@njit(cache=True)
+def _largest(offsets):
+    """Samples of the largest group."""
+    largest = 0
+    for n in range(len(offsets) - 1):
+        largest = max(largest, offsets[n + 1] - offsets[n])
+    return largest
+
+
+@njit(cache=True, parallel=True)
+def _linear(inputs, weights, biases, offsets, relu, out):
+    channels, outputs = weights.shape[1:]
+    borders = _borders(offsets)
+    flat, flat_out = inputs.reshape(-1), out.reshape(-1)
+    for chunk in prange(CHUNKS):
+        for n in range(borders[chunk], borders[chunk + 1]):
+            _multiply(
+                offsets[n + 1] - offsets[n],
+                flat,
+                offsets[n] * channels,
+                channels,
+                1,
+                weights[n].reshape(-1),
+                outputs,
+                biases[n],
+                flat_out,
+                offsets[n] * outputs,
+                channels,
+                relu,
+            )
+
+
+@njit(cache=True, parallel=True)
+def _backward(inputs, weights, offsets, out, grad, relu, grad_inputs, grad_weights, grad_biases):
+    channels, outputs = weights.shape[1:]
+    width = grad_inputs.shape[1]
+    borders, largest = _borders(offsets), _largest(offsets)
+    flat, flat_inputs = inputs.reshape(-1), grad_inputs.reshape(-1)
+    for chunk in prange(CHUNKS):
+        through = np.empty(largest * outputs, np.float32)  # what the ReLU lets through of `grad`
+        turned = np.zeros(outputs * width, np.float32)  # the weights, transposed
+        nothing = np.zeros(max(width, outputs), np.float32)
+        for n in range(borders[chunk], borders[chunk + 1]):
+            first, count = offsets[n], offsets[n + 1] - offsets[n]
+            if count == 0:
+                grad_weights[n] = ZERO
+                grad_biases[n] = ZERO
+                continue
+            grad_biases[n] = ZERO
+            for s in range(count):
+                kept = through[s * outputs : (s + 1) * outputs]
+                for o in range(outputs):
+                    shut = relu and out[first + s, o] <= ZERO
+                    kept[o] = ZERO if shut else grad[first + s, o]
+                    grad_biases[n, o] += kept[o]
+            # Of the weights: inputs^T through.
+            at, to = first * channels, grad_weights[n].reshape(-1)
+            _multiply(
+                channels, flat, at, 1, channels, through, outputs, nothing, to, 0, count, False
+            )
+            if len(grad_inputs):  # through weights^T
+                for i in range(channels):
+                    for o in range(outputs):
+                        turned[o * width + i] = weights[n, i, o]
+                to, at = flat_inputs, first * width
+                _multiply(
+                    count, through, 0, outputs, 1, turned, width, nothing, to, at, outputs, False
+                )
+
+
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def _sine_and_cosine(angle):
+    """Of an angle of up to some thousand quarter turns."""
+    whole = np.floor(angle * PER_TURN + f32(0.5))
+    r = ((angle - whole * QUARTER0) - whole * QUARTER1) - whole * QUARTER2
+    z = r * r
+    sine = r + r * z * (S0 + z * (S1 + z * S2))
+    cosine = ONE - f32(0.5) * z + z * z * (C0 + z * (C1 + z * C2))
+    half = whole - TWO * np.floor(whole * f32(0.5))  # 1 where the two change places
+    turns = whole * f32(0.25)
+    quarter = whole - f32(4) * np.floor(turns)  # 0, 1, 2, 3
+    swapped = half > f32(0.5)
+    shown_sine = cosine if swapped else sine
+    shown_cosine = sine if swapped else cosine
+    down = quarter > f32(1.5)
+    left = (quarter > f32(0.5)) & (quarter < f32(2.5))
+    return (-shown_sine if down else shown_sine), (-shown_cosine if left else shown_cosine)
+
+
+@njit(cache=True, fastmath={"contract"}, error_model="numpy")
+def _encode(encoded, frequencies):
+    """Fill in sines and cosines: number c of sample r is encoded[c * SLOT + r], 0 to 2 given."""
+    block = 3 * SLOT
+    for k in range(frequencies):
+        sines, cosines = (1 + 2 * k) * block, (2 + 2 * k) * block
+        target_sine = encoded[sines : sines + block]
+        target_cosine = encoded[cosines : cosines + block]
+        if k % RESTART == 0:
+            scale = f32(1 << k)
+            for j in range(block):
+                target_sine[j], target_cosine[j] = _sine_and_cosine(encoded[j] * scale)
+        else:
+            before_sine = encoded[sines - 2 * block : sines - block]
+            before_cosine = encoded[cosines - 2 * block : cosines - block]
+            for j in range(block):
+                sine, cosine = before_sine[j], before_cosine[j]
+                target_sine[j] = TWO * sine * cosine
+                target_cosine[j] = ONE - TWO * sine * sine
+
+
+@njit(cache=True, parallel=True)
+def _encode_all(inputs, frequencies, out):
+    count, channels = out.shape
+    blocks = (count + ROWS - 1) // ROWS
+    for chunk in prange(CHUNKS):
+        encoded = np.zeros(channels * SLOT, np.float32)
+        for block in range(chunk * blocks // CHUNKS, (chunk + 1) * blocks // CHUNKS):
+            rows = min(ROWS, count - block * ROWS)
+            for r in range(rows):
+                for d in range(3):
+                    encoded[d * SLOT + r] = inputs[block * ROWS + r, d]
+            _encode(encoded, frequencies)
+            for r in range(rows):
+                for c in range(channels):
+                    out[block * ROWS + r, c] = encoded[c * SLOT + r]
+
+
+@njit(cache=True)
+def _copy(values, to):
+    for i in range(len(values)):
+        to[i] = values[i]
+
+
+@njit(cache=True, fastmath={"contract", "reassoc"})
+def _dot(one, other):
+    total = ZERO
+    for i in range(HIDDEN):
+        total += one[i] * other[i]
+    return total
+
+
+@njit(cache=True)
+def _block(a, a_row, a_step, w, bias, out, out_row, count, relu):
+    """`ROWS` rows times w [count, 32], plus bias [32]: out [ROWS, 32 of `out_row`]."""
+    for left in range(0, HIDDEN, LANES):
+        if relu:
+            _six_relu(
+                a, 0, a_row, a_step, w, left, HIDDEN, bias, left, out, left, out_row, count
+            )
+        else:
+            _six(a, 0, a_row, a_step, w, left, HIDDEN, bias, left, out, left, out_row, count)
+
+
+@njit(cache=True, parallel=True)
+def _densities(
+    positions,
+    in_weights,
+    in_biases,
+    mid_weights,
+    mid_biases,
+    density_weights,
+    density_biases,
+    permutation,
+    offsets,
+    frequencies,
+    raw,
+    hidden,
+):
+    channels = in_weights.shape[1]
+    borders = _borders(offsets)
+    for chunk in prange(CHUNKS):
+        encoded = np.zeros(channels * SLOT, np.float32)
+        one, two = np.empty(ROWS * HIDDEN, np.float32), np.empty(ROWS * HIDDEN, np.float32)
+        for n in range(borders[chunk], borders[chunk + 1]):
+            into, mid = in_weights[n].reshape(-1), mid_weights[n].reshape(-1)
+            weights = density_weights[n].reshape(-1)
+            for first in range(offsets[n], offsets[n + 1], ROWS):
+                rows = min(ROWS, offsets[n + 1] - first)  # idle ones repeat what was there
+                for r in range(rows):
+                    for d in range(3):
+                        encoded[d * SLOT + r] = positions[permutation[first + r], d]
+                _encode(encoded, frequencies)
+                _block(encoded, 1, SLOT, into, in_biases[n], one, HIDDEN, channels, True)
+                _block(one, HIDDEN, 1, mid, mid_biases[n], two, HIDDEN, HIDDEN, True)
+                for r in range(rows):
+                    s = permutation[first + r]
+                    _copy(two[r * HIDDEN : (r + 1) * HIDDEN], hidden[s])
+                    raw[s] = _dot(hidden[s], weights) + density_biases[n, 0]
+
+
+@njit(cache=True, parallel=True)
+def _colours(
+    hidden,
+    directions,
+    feature_weights,
+    feature_biases,
+    direction_weights,
+    direction_biases,
+    colour_weights,
+    colour_biases,
+    permutation,
+    offsets,
+    raw,
+):
+    """Colours before the sigmoid."""
+    seen = directions.shape[1]
+    channels = HIDDEN + seen
+    borders = _borders(offsets)
+    for chunk in prange(CHUNKS):
+        given = np.zeros(ROWS * HIDDEN, np.float32)
+        joined = np.zeros(ROWS * channels, np.float32)
+        inner = np.empty(ROWS * HIDDEN, np.float32)
+        last, bias = np.zeros(HIDDEN * LANES, np.float32), np.zeros(LANES, np.float32)
+        result = np.empty(ROWS * LANES, np.float32)
+        for n in range(borders[chunk], borders[chunk + 1]):
+            if offsets[n] == offsets[n + 1]:
+                continue
+            feature, direction = feature_weights[n].reshape(-1), direction_weights[n].reshape(-1)
+            for c in range(3):
+                bias[c] = colour_biases[n, c]
+                for i in range(HIDDEN):
+                    last[i * LANES + c] = colour_weights[n, i, c]
+            for first in range(offsets[n], offsets[n + 1], ROWS):
+                rows = min(ROWS, offsets[n + 1] - first)  # idle ones repeat what was there
+                for r in range(rows):
+                    s = permutation[first + r]
+                    _copy(hidden[s], given[r * HIDDEN : (r + 1) * HIDDEN])
+                    _copy(directions[s], joined[r * channels + HIDDEN : (r + 1) * channels])
+                of = feature_biases[n]
+                _block(given, HIDDEN, 1, feature, of, joined, channels, HIDDEN, False)
+                of = direction_biases[n]
+                _block(joined, channels, 1, direction, of, inner, HIDDEN, channels, True)
+                _six(inner, 0, HIDDEN, 1, last, 0, LANES, bias, 0, result, 0, LANES, HIDDEN)
+                for r in range(rows):
+                    for c in range(3):
+                        raw[permutation[first + r], c] = result[r * LANES + c]

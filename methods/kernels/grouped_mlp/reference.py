@@ -1,0 +1,43 @@
+"""Small networks in plain torch, one after the other, any dtype and device."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from methods.kernels.grouped_mlp import Groups, Networks, _composed_colours, _composed_densities
+
+
+def order(networks: Tensor, count: int) -> Groups:
+    """See `methods.kernels.grouped_mlp.order`."""
+    sorted_, permutation = networks.long().sort(stable=True)
+    numbers = torch.arange(count + 1, device=networks.device)
+    offsets = torch.searchsorted(sorted_, numbers)
+    return Groups(permutation[int(offsets[0]) :], offsets - offsets[0])
+
+
+def encode_frequencies(inputs: Tensor, frequencies: int) -> Tensor:
+    """See `methods.kernels.grouped_mlp.encode_frequencies`."""
+    angles = [inputs * 2**k for k in range(frequencies)]
+    return torch.cat((inputs, *(f(angle) for angle in angles for f in (torch.sin, torch.cos))), 1)
+
+
+def grouped_linear(
+    inputs: Tensor, weights: Tensor, biases: Tensor, offsets: Tensor, relu: bool
+) -> Tensor:
+    """See `methods.kernels.grouped_mlp.grouped_linear`."""
+    parts = inputs.split(offsets.diff().tolist())
+    layers = zip(parts, weights, biases, strict=True)
+    out = [torch.addmm(bias, part, weight) for part, weight, bias in layers]
+    joined = torch.cat(out) if out else inputs.new_zeros(0, weights.shape[2])
+    return joined.relu() if relu else joined
+
+
+def densities(positions: Tensor, networks: Networks, groups: Groups) -> tuple[Tensor, Tensor]:
+    """See `methods.kernels.grouped_mlp.densities`."""
+    return _composed_densities(positions, networks, groups, "reference")
+
+
+def colours(hidden: Tensor, encoded: Tensor, networks: Networks, groups: Groups) -> Tensor:
+    """See `methods.kernels.grouped_mlp.colours`."""
+    return _composed_colours(hidden, encoded, networks, groups, "reference")

@@ -1,0 +1,1 @@
+"""KiloNeRF: a small network for each cell of a grid (Reiser et al. 2021)."""

@@ -1,0 +1,115 @@
+"""The field: small networks, one for each cell of a grid that may hold matter."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from bench.types import Probe
+from methods.kernels.grouped_mlp import (
+    HIDDEN,
+    Networks,
+    colours,
+    densities,
+    encode_frequencies,
+    order,
+)
+from methods.kilonerf.grid import Grid
+from methods.students.fields import REACH, StudentField
+
+POSITION_FREQUENCIES = 10
+DIRECTION_FREQUENCIES = 4
+
+SHAPES = {
+    "in": (3 + 6 * POSITION_FREQUENCIES, HIDDEN),
+    "mid": (HIDDEN, HIDDEN),
+    "density": (HIDDEN, 1),
+    "feature": (HIDDEN, HIDDEN),
+    "direction": (HIDDEN + 3 + 6 * DIRECTION_FREQUENCIES, HIDDEN),
+    "colour": (HIDDEN, 3),
+}
+"""Inputs and outputs of a layer (Reiser et al. 2021, Figure 2): 6,212 parameters a network."""
+
+DENSITY_LAYERS = ("in", "mid", "density")
+
+
+class KiloField(StudentField):
+    """Small networks on a grid; density and colour are 0 where there is none.
+
+    Args:
+        grid: where the networks are.
+        backend: of the kernels.
+        generator: of the weights, which are the same in all networks at the beginning.
+    """
+
+    networks: Tensor
+    corner: Tensor
+    side: Tensor
+
+    def __init__(self, grid: Grid, backend: str, generator: torch.Generator | None = None) -> None:
+        super().__init__(backend)
+        self.register_buffer("networks", grid.networks)
+        self.register_buffer("corner", grid.corner)
+        self.register_buffer("side", grid.side)
+        self.count_networks = grid.count
+        self.weights, self.biases = nn.ParameterDict(), nn.ParameterDict()
+        for name, (inputs, outputs) in SHAPES.items():
+            # As torch's linear layers: uniform, by the number of inputs.
+            bound = 1 / math.sqrt(inputs)
+            for kind, shape in ((self.weights, (inputs, outputs)), (self.biases, (outputs,))):
+                values = torch.empty(*shape).uniform_(-bound, bound, generator=generator)
+                kind[name] = nn.Parameter(values.repeat(self.count_networks, *[1] * len(shape)))
+
+    def locate(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """The network of each of `positions` [S, 3], [S] int16, -1 for none; and where in its cell
+        the position is, [S, 3], from -1 to 1."""
+        scaled = (positions - self.corner) / self.side
+        cell = scaled.floor()
+        local = 2 * (scaled - cell) - 1
+        size = torch.tensor(self.networks.shape, device=cell.device)
+        inside = ((cell >= 0) & (cell < size)).all(dim=1)
+        x, y, z = torch.where(inside[:, None], cell, 0).long().unbind(dim=1)
+        return torch.where(inside, self.networks[x, y, z], -1), local
+
+    def raw_density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """Density [S] over `REACH` before its activation, and what `features` needs [S, 33]."""
+        numbers, local = self.locate(positions)
+        groups = order(numbers, self.count_networks, backend=self.backend)
+        raw, hidden = densities(local, self._layers, groups, backend=self.backend)
+        # The number of the network goes with the hidden channels: as float32, it is exact.
+        return raw, torch.cat((hidden, numbers[:, None].to(hidden.dtype)), dim=1)
+
+    def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """See `Field`."""
+        raw, geometry = self.raw_density(positions)
+        return raw.relu() / REACH, geometry
+
+    def encode_directions(self, directions: Tensor) -> Tensor:
+        """Encoding [R, 27] of the unit directions."""
+        unit = functional.normalize(directions, dim=1)
+        return encode_frequencies(unit, DIRECTION_FREQUENCIES, backend=self.backend)
+
+    def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
+        """See `Field`."""
+        numbers = geometry[:, HIDDEN].detach().to(torch.int16)
+        groups = order(numbers, self.count_networks, backend=self.backend)
+        hidden = geometry[:, :HIDDEN]
+        return colours(hidden, encoded, self._layers, groups, backend=self.backend)
+
+    def count(self, probe: Probe, samples: int, shaded: int) -> None:
+        """See `Field`."""
+        products = {name: inputs * outputs for name, (inputs, outputs) in SHAPES.items()}
+        density = sum(products[name] for name in DENSITY_LAYERS)
+        probe.count("products", density * samples + (sum(products.values()) - density) * shaded)
+
+    def sizes(self) -> dict[str, int]:
+        """Bytes of the networks, and of the grid that names them."""
+        parameters = sum(parameter.numel() for parameter in self.parameters())
+        return {"networks": 4 * parameters, "network_grid": 2 * self.networks.numel()}
+
+    @property
+    def _layers(self) -> Networks:
+        return Networks(dict(self.weights), dict(self.biases))

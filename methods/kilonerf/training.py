@@ -1,0 +1,92 @@
+"""Distillation of the teacher into the small networks, then the photos (Section 3.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from bench.types import Budget, Scene
+from methods.instant_ngp.stage1 import TrainedField
+from methods.kilonerf.field import KiloField
+from methods.kilonerf.grid import Pieces
+from methods.students.fields import REACH, FieldLessons, FieldTraining
+
+LEAK = 0.01
+"""Slope of the density below 0 in distillation: where nothing is, its gradient does not vanish."""
+
+
+@dataclass(frozen=True)
+class Lessons(FieldLessons):
+    """How the networks learn.
+
+    Attributes:
+        batch: points of each network in a step of the distillation.
+        view_cost: weight of the norms of the weights that see directions, while learning from rays.
+    """
+
+    batch: int = 128
+    view_cost: float = 1e-6
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not (self.batch >= 1 and self.view_cost >= 0):
+            raise ValueError(f"expected batch >= 1, view_cost >= 0: {self}")
+
+
+class KiloTraining(FieldTraining):
+    """As `FieldTraining`, with as many points for each network."""
+
+    def __init__(
+        self,
+        field: KiloField,
+        pieces: Pieces,
+        teacher: TrainedField,
+        scene: Scene,
+        budget: Budget,
+        options: Lessons,
+        seed: int,
+    ) -> None:
+        super().__init__(field, teacher, scene, budget, options, seed)
+        self.networks, self.pieces, self.lessons = field, pieces, options
+        self.optimiser = torch.optim.Adam(
+            field.parameters(), betas=(0.9, 0.99), eps=1e-15, fused=True
+        )
+
+    def _places(self) -> tuple[Tensor, Tensor]:
+        positions = self.pieces.draw(self.lessons.batch, self.generator)
+        directions = torch.randn(
+            len(positions), 3, generator=self.generator, device=positions.device
+        )
+        return positions, functional.normalize(directions, dim=1)
+
+    def _difference(self, positions: Tensor, directions: Tensor) -> Tensor:
+        """As the base has it, with a density that may fall below 0."""
+        with torch.no_grad():
+            sigma, geometry = self.teacher.density(positions)
+            opacity = 1 - torch.exp(-sigma * REACH)
+            encoded = self.teacher.encode_directions(directions)
+            colour = self.teacher.features(geometry, encoded)[:, :3]
+        raw, geometry = self.networks.raw_density(positions)
+        learned = 1 - torch.exp(-functional.leaky_relu(raw, LEAK))
+        encoded = self.networks.encode_directions(directions)
+        shown = self.networks.features(geometry, encoded)
+        weighted = opacity[:, None] * (shown - colour).square()
+        return functional.mse_loss(learned, opacity) + weighted.mean()
+
+    def _update(self) -> None:
+        if self.step >= self.points_until:
+            self._smooth_views()
+        super()._update()
+
+    @torch.no_grad()
+    def _smooth_views(self) -> None:
+        """Add the gradient of `view_cost` times the norms, not squared, of the layers behind the
+        directions (Section 3.2)."""
+        for name in ("direction", "colour"):
+            for parameter in (self.networks.weights[name], self.networks.biases[name]):
+                if parameter.grad is not None:
+                    scale = self.lessons.view_cost / parameter.norm().clamp(min=1e-12)
+                    parameter.grad.add_(parameter * scale)

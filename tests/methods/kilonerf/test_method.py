@@ -1,0 +1,97 @@
+"""KiloNeRF as a method: what it learns, what a training leaves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from bench.metrics import psnr
+from bench.types import Budget, Log, NullProbe, Scene
+from methods.instant_ngp.stage1 import Setup, train_field
+from methods.instant_ngp.training import TrainingOptions
+from methods.kernels.encode import HashGrid
+from methods.kilonerf.field import SHAPES
+from methods.kilonerf.method import KiloNerf
+from methods.kilonerf.training import Lessons
+from methods.training import loop
+
+GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
+BUDGET = Budget("test", steps=100, samples=8192, renderer_steps=60)
+LESSONS = Lessons(batch=64, rate=1e-2)
+TEACHER = Setup.resolved(GRID, TrainingOptions(), "bf16", "auto", "cpu", seed=0)
+
+
+def method(**options) -> KiloNerf:
+    return KiloNerf(**{"teacher": TEACHER, "training": LESSONS, "networks": 4} | options)
+
+
+def fitted(scene: Scene, log: Log, **options) -> KiloNerf:
+    student = method(**options)
+    student.fit(scene, BUDGET, log)
+    return student
+
+
+def test_it_learns_a_ball(ball_scene: Scene, quiet_log: Log) -> None:
+    student = fitted(ball_scene, quiet_log)
+    test = ball_scene.splits["test"]
+    truth = test.images[1].float() / 255
+    on_white = truth[..., :3] * truth[..., 3:] + 1 - truth[..., 3:]
+    frame = student.render(test.cameras[1], NullProbe())
+    assert psnr(frame.rgb, on_white) > 20
+    assert abs(frame.depth[16, 16].item() - 1.3) < 4 * 1.6 / 40  # the front, to four pixels
+
+
+def test_a_killed_training_goes_on_as_if_it_had_not_been(
+    ball_scene: Scene, quiet_log: Log, tmp_path: Path
+) -> None:
+    teacher = train_field(TEACHER, ball_scene, BUDGET, quiet_log)
+    budget = Budget("test", steps=100, samples=2048, renderer_steps=12)
+
+    whole, half = (method().begin(teacher, ball_scene, budget) for _ in range(2))
+    for _ in range(12):
+        whole.advance()
+    for _ in range(8):  # of which six from points
+        half.advance()
+    loop.save(half, tmp_path / "half")
+    resumed = method().begin(teacher, ball_scene, budget)
+    loop.resume(resumed, tmp_path / "half")
+    while resumed.step < 12:
+        resumed.advance()
+    for name, value in whole.result().items():
+        assert torch.equal(resumed.result()[name], value), name
+
+
+def test_a_finished_training_is_found_again(ball_scene: Scene, quiet_log: Log) -> None:
+    first, again = (fitted(ball_scene, quiet_log) for _ in range(2))
+    assert again.train_s == first.train_s > 0
+    camera = ball_scene.splits["test"].cameras[0]
+    pictures = [student.render(camera, NullProbe()).rgb for student in (first, again)]
+    assert torch.equal(*pictures)
+
+
+def test_sizes_are_those_of_the_networks(ball_scene: Scene, quiet_log: Log) -> None:
+    student = fitted(ball_scene, quiet_log)
+    parameters = sum(i * o + o for i, o in SHAPES.values())
+    assert parameters == 6212  # of the publication
+    cubes = student.grid.networks
+    assert student.sizes() == {
+        "networks": student.grid.count * parameters * 4,
+        "network_grid": cubes.numel() * 2,
+        "occupancy": 128**3 // 8,
+    }
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"networks": 0}, {"networks": 33}, {"stop": 1.0}], ids=lambda wrong: str(wrong)
+)
+def test_wrong_settings_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        method(**wrong)
+
+
+@pytest.mark.parametrize("wrong", [{"batch": 0}, {"view_cost": -1.0}, {"points": 2.0}])
+def test_wrong_lessons_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        Lessons(**wrong)
