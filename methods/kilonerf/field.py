@@ -15,6 +15,7 @@ from methods.kernels.grouped_mlp import (
     colours,
     densities,
     encode_frequencies,
+    locate,
     order,
 )
 from methods.kilonerf.grid import Grid
@@ -63,20 +64,10 @@ class KiloField(StudentField):
                 values = torch.empty(*shape).uniform_(-bound, bound, generator=generator)
                 kind[name] = nn.Parameter(values.repeat(self.count_networks, *[1] * len(shape)))
 
-    def locate(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """The network of each of `positions` [S, 3], [S] int16, -1 for none; and where in its cell
-        the position is, [S, 3], from -1 to 1."""
-        scaled = (positions - self.corner) / self.side
-        cell = scaled.floor()
-        local = 2 * (scaled - cell) - 1
-        size = torch.tensor(self.networks.shape, device=cell.device)
-        inside = ((cell >= 0) & (cell < size)).all(dim=1)
-        x, y, z = torch.where(inside[:, None], cell, 0).long().unbind(dim=1)
-        return torch.where(inside, self.networks[x, y, z], -1), local
-
     def raw_density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Density [S] over `REACH` before its activation, and what `features` needs [S, 33]."""
-        numbers, local = self.locate(positions)
+        grid = self.networks, self.corner, self.side
+        numbers, local = locate(positions, *grid, backend=self.backend)
         groups = order(numbers, self.count_networks, backend=self.backend)
         raw, hidden = densities(local, self._layers, groups, backend=self.backend)
         # The number of the network goes with the hidden channels: as float32, it is exact.

@@ -68,6 +68,29 @@ class Networks:
         return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
 
 
+def locate(
+    positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor, *, backend: str = "auto"
+) -> tuple[Tensor, Tensor]:
+    """The network of each position, [S] int16, -1 for none; and where in its cube the position is,
+    [S, 3], -1 to 1 along each axis. No gradient.
+
+    Args:
+        positions: [S, 3].
+        cubes: [X, Y, Z] int16, the network of each cube of a grid, -1 for none.
+        corner: [3] where the first cube begins.
+        side: [] length of a cube.
+
+    Raises:
+        ValueError: a shape other than these; backend "cpu": not float32.
+    """
+    check_shape("positions", positions, None, 3)
+    check_shape("cubes", cubes, None, None, None)
+    check_shape("corner", corner, 3)
+    return implementation("grouped_mlp", backend, positions.device).locate(
+        positions, cubes, corner, side
+    )
+
+
 def order(networks: Tensor, count: int, *, backend: str = "auto") -> Groups:
     """Sort samples by their networks.
 

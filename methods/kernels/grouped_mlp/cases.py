@@ -18,6 +18,7 @@ from methods.kernels.grouped_mlp import (
     densities,
     encode_frequencies,
     grouped_linear,
+    locate,
     order,
 )
 
@@ -43,7 +44,7 @@ MANY = 1_200_000, 2000
 
 def cases() -> list[Case]:
     """Sorting, encoding, single layers forward and backward, and whole networks."""
-    return [*_sorting(), *_encoding(), *_layers(), *_networks()]
+    return [*_places(), *_sorting(), *_encoding(), *_layers(), *_networks()]
 
 
 def _numbers(count: int, networks: int) -> Tensor:
@@ -55,6 +56,33 @@ def _numbers(count: int, networks: int) -> Tensor:
 def _uniform(seed: int, *shape: int) -> Tensor:
     """Numbers from -1 to 1."""
     return 2 * torch.rand(*shape, generator=torch.Generator().manual_seed(seed)) - 1
+
+
+def _places() -> list[Case]:
+    kernel = Agreement(
+        "locate",
+        served("grouped_mlp"),
+        "a quotient below 5 is rounded alike: the same network, and 8 u where it is rounded once "
+        "more",
+    )
+
+    def prepare(count: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
+        positions = 0.5 + 0.6 * _uniform(count, count, 3).to(device)  # some beyond the grid
+        positions[: count // 9] = torch.nan
+        cubes = torch.arange(60, dtype=torch.int16, device=device).view(3, 4, 5) - 20
+        corner = torch.tensor((0.1, 0.2, 0.0), device=device)
+        side = torch.tensor(0.2, device=device)
+
+        def call(backend: str) -> tuple[Tensor, ...]:
+            networks, local = locate(positions, cubes.clamp(min=-1), corner, side, backend=backend)
+            return networks, local
+
+        return call
+
+    return [
+        kernel.case(f"{count:,} positions", partial(prepare, count), 8 * U32, items=items)
+        for count, items in ((0, None), (1, None), (1000, None), (1 << 18, 1 << 18))
+    ]
 
 
 def _sorting() -> list[Case]:
@@ -116,9 +144,7 @@ def _layers() -> list[Case]:
     large = MANY[0] // 8, MANY[1] // 8
     for text, shape in (("150 thousand", (63, 32)),):
         found += [
-            forward.case(
-                text, partial(_forward, *large, *shape, True), 1040 * U32, items=large[0]
-            ),
+            forward.case(text, partial(_forward, *large, *shape, True), 1040 * U32, items=large[0]),
             backward.case(
                 text, partial(_backward, *large, *shape, True), 2e6 * U32, items=large[0]
             ),

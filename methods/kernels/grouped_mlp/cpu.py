@@ -45,6 +45,16 @@ S0, S1, S2 = f32(-0.16666655242443085), f32(0.008332165889441967), f32(-0.000195
 C0, C1, C2 = f32(0.04166664555668831), f32(-0.0013887342065572739), f32(2.4435852537862957e-05)
 
 
+def locate(positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
+    """See `methods.kernels.grouped_mlp.locate`."""
+    _check("locates", positions, corner, side)
+    networks = torch.empty(len(positions), dtype=torch.int16)
+    local = torch.empty(len(positions), 3)
+    given = _arrays(positions, cubes, corner)
+    _locate(*given, f32(side.item()), networks.numpy(), local.numpy())
+    return networks, local
+
+
 def order(networks: Tensor, count: int) -> Groups:
     """See `methods.kernels.grouped_mlp.order`."""
     offsets = torch.zeros(count + 1, dtype=torch.int64)
@@ -246,6 +256,23 @@ def _multiply(rows, a, a_at, a_row, a_step, w, width, bias, out, out_at, count, 
                 r += ROWS
 
 
+@njit(cache=True, parallel=True, error_model="numpy")
+def _locate(positions, cubes, corner, side, networks, local):
+    for s in prange(len(positions)):
+        inside = True
+        for d in range(3):
+            scaled = (positions[s, d] - corner[d]) / side
+            cell = np.floor(scaled)
+            local[s, d] = TWO * (scaled - cell) - ONE
+            inside &= (cell >= ZERO) & (cell < f32(cubes.shape[d]))
+        networks[s] = -1
+        if inside:
+            x = int((positions[s, 0] - corner[0]) / side)
+            y = int((positions[s, 1] - corner[1]) / side)
+            z = int((positions[s, 2] - corner[2]) / side)
+            networks[s] = cubes[x, y, z]
+
+
 @njit(cache=True)
 def _sort(networks, offsets, places):
     """A counting sort: each network's samples keep their order."""
@@ -418,9 +445,7 @@ def _block(a, a_row, a_step, w, bias, out, out_row, count, relu):
     """`ROWS` rows times w [count, 32], plus bias [32]: out [ROWS, 32 of `out_row`]."""
     for left in range(0, HIDDEN, LANES):
         if relu:
-            _six_relu(
-                a, 0, a_row, a_step, w, left, HIDDEN, bias, left, out, left, out_row, count
-            )
+            _six_relu(a, 0, a_row, a_step, w, left, HIDDEN, bias, left, out, left, out_row, count)
         else:
             _six(a, 0, a_row, a_step, w, left, HIDDEN, bias, left, out, left, out_row, count)
 

@@ -8,6 +8,16 @@ from torch import Tensor
 from methods.kernels.grouped_mlp import Groups, Networks, _composed_colours, _composed_densities
 
 
+def locate(positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
+    """See `methods.kernels.grouped_mlp.locate`."""
+    scaled = (positions.detach() - corner) / side
+    cell = scaled.floor()
+    size = torch.tensor(cubes.shape, device=cell.device)
+    inside = ((cell >= 0) & (cell < size)).all(dim=1)
+    x, y, z = torch.where(inside[:, None], cell, 0).long().unbind(dim=1)
+    return torch.where(inside, cubes[x, y, z], -1), 2 * (scaled - cell) - 1
+
+
 def order(networks: Tensor, count: int) -> Groups:
     """See `methods.kernels.grouped_mlp.order`."""
     sorted_, permutation = networks.long().sort(stable=True)

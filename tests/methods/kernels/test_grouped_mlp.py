@@ -45,7 +45,9 @@ def test_they_are_those_of_torch_one_by_one(backend: str) -> None:
     shown = colours(hidden, directions, few, groups, backend=backend)
     for s, n in enumerate(numbers.tolist()):
         if n < 0:
-            assert not raw[s] and not hidden[s].any() and not shown[s].any()
+            assert not raw[s]
+            assert not hidden[s].any()
+            assert not shown[s].any()
             continue
         layers, x = modules[n], positions[s]
         parts = [x, *(f(2**k * x) for k in range(10) for f in (torch.sin, torch.cos))]
@@ -75,9 +77,7 @@ def gradients(backend: str, offsets: list[int], inputs: Tensor) -> tuple[Tensor,
     generator = torch.Generator().manual_seed(0)
     weights = torch.randn(3, 8, 16, generator=generator, requires_grad=True)
     biases = torch.randn(3, 16, generator=generator, requires_grad=True)
-    out = grouped_linear(
-        inputs, weights, biases, torch.tensor(offsets), relu=True, backend=backend
-    )
+    out = grouped_linear(inputs, weights, biases, torch.tensor(offsets), relu=True, backend=backend)
     return torch.autograd.grad(out.square().sum(), (weights, biases))
 
 
@@ -98,7 +98,8 @@ def test_a_network_without_samples_has_no_gradient(backend: str) -> None:
     inputs = torch.randn(20, 8, generator=torch.Generator().manual_seed(1))
     for grad in gradients(backend, [0, 10, 10, 20], inputs):
         assert not grad[1].any()
-        assert grad[0].any() and grad[2].any()
+        assert grad[0].any()
+        assert grad[2].any()
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
