@@ -16,7 +16,6 @@ from methods.kernels.grouped_mlp import (
     densities,
     encode_frequencies,
     locate,
-    order,
 )
 from methods.kilonerf.grid import Grid
 from methods.students.fields import REACH, StudentField
@@ -68,10 +67,7 @@ class KiloField(StudentField):
         """Density [S] over `REACH` before its activation, and what `features` needs [S, 33]."""
         grid = self.networks, self.corner, self.side
         numbers, local = locate(positions, *grid, backend=self.backend)
-        groups = order(numbers, self.count_networks, backend=self.backend)
-        raw, hidden = densities(local, self._layers, groups, backend=self.backend)
-        # The number of the network goes with the hidden channels: as float32, it is exact.
-        return raw, torch.cat((hidden, numbers[:, None].to(hidden.dtype)), dim=1)
+        return densities(local, numbers, self._layers, backend=self.backend)
 
     def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """See `Field`."""
@@ -85,10 +81,7 @@ class KiloField(StudentField):
 
     def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
         """See `Field`."""
-        numbers = geometry[:, HIDDEN].detach().to(torch.int16)
-        groups = order(numbers, self.count_networks, backend=self.backend)
-        hidden = geometry[:, :HIDDEN]
-        return colours(hidden, encoded, self._layers, groups, backend=self.backend)
+        return colours(geometry, encoded, self._layers, backend=self.backend)
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
         """See `Field`."""

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from bench.types import Budget, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField
-from methods.kernels.composite import STOP
 from methods.kilonerf.field import KiloField
 from methods.kilonerf.grid import Grid, place_networks
 from methods.kilonerf.training import KiloTraining, Lessons
@@ -40,7 +39,7 @@ class KiloNerf(FieldStudent):
         teacher: Setup,
         training: Lessons,
         networks: int = 16,
-        stop: float = STOP,
+        stop: float = 1e-2,
         name: str = "kilonerf",
     ) -> None:
         super().__init__(teacher, training, stop, name)

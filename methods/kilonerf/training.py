@@ -20,13 +20,14 @@ LEAK = 0.01
 
 @dataclass(frozen=True)
 class Lessons(FieldLessons):
-    """How the networks learn.
+    """How the networks learn; `rate` is below that of a hash grid.
 
     Attributes:
         points_each: points of each network in a step of the distillation.
         view_cost: weight of the norms of the weights that see directions, while learning from rays.
     """
 
+    rate: float = 3e-3
     points_each: int = 128
     view_cost: float = 1e-6
 

@@ -57,6 +57,11 @@ class Networks:
         return self.weights[name], self.biases[name]
 
     @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self.biases["in"])
+
+    @property
     def frequencies(self) -> int:
         """Of the encoding of a position: the first layer has 3 + 6 of them as inputs."""
         return (self.weights["in"].shape[1] - 3) // 6
@@ -167,72 +172,78 @@ def grouped_linear(
 
 
 def densities(
-    positions: Tensor, networks: Networks, groups: Groups, *, backend: str = "auto"
+    positions: Tensor, numbers: Tensor, networks: Networks, *, backend: str = "auto"
 ) -> tuple[Tensor, Tensor]:
-    """Densities [S] before their activation, and hidden channels [S, 32], of samples.
+    """Densities [S] before their activation, and what `colours` needs of samples, [S, 33]: hidden
+    channels, then the number of the network, which float32 has exactly.
 
-    Both are 0 where a sample has no network. Differentiable in the networks.
+    Densities and hidden channels are 0 where a sample has no network. Differentiable in the
+    networks.
 
     Args:
-        positions: [S, 3] in the sample's own cell, -1 to 1 along each axis.
+        positions: [S, 3] in the sample's own cube, -1 to 1 along each axis.
+        numbers: [S] the network of each, as `order` takes them.
 
     Raises:
-        ValueError: a shape other than this; backend "cpu": not float32.
+        ValueError: a shape other than these; backend "cpu": not float32.
     """
     check_shape("positions", positions, None, 3)
+    check_shape("numbers", numbers, len(positions))
     if networks.learning:
-        return _composed_densities(positions, networks, groups, backend)
+        return composed_densities(positions, numbers, networks, backend)
     return implementation("grouped_mlp", backend, positions.device).densities(
-        positions, networks, groups
+        positions, numbers, networks
     )
 
 
 def colours(
-    hidden: Tensor, encoded: Tensor, networks: Networks, groups: Groups, *, backend: str = "auto"
+    geometry: Tensor, encoded: Tensor, networks: Networks, *, backend: str = "auto"
 ) -> Tensor:
     """Colours [S, 3] in (0, 1) of samples; 0 where a sample has no network.
 
     Differentiable in the hidden channels and the networks.
 
     Args:
-        hidden: [S, 32] of `densities`.
+        geometry: [S, 33] of `densities`.
         encoded: [S, D] encoded directions.
 
     Raises:
         ValueError: a shape other than these; backend "cpu": not float32.
     """
-    check_shape("hidden", hidden, None, HIDDEN)
-    check_shape("encoded", encoded, len(hidden), networks.weights["direction"].shape[1] - HIDDEN)
+    check_shape("geometry", geometry, None, HIDDEN + 1)
+    check_shape("encoded", encoded, len(geometry), networks.weights["direction"].shape[1] - HIDDEN)
     if networks.learning:
-        return _composed_colours(hidden, encoded, networks, groups, backend)
-    return implementation("grouped_mlp", backend, hidden.device).colours(
-        hidden, encoded, networks, groups
+        return composed_colours(geometry, encoded, networks, backend)
+    return implementation("grouped_mlp", backend, geometry.device).colours(
+        geometry, encoded, networks
     )
 
 
-def _composed_densities(
-    positions: Tensor, networks: Networks, groups: Groups, backend: str
+def composed_densities(
+    positions: Tensor, numbers: Tensor, networks: Networks, backend: str
 ) -> tuple[Tensor, Tensor]:
     """`densities`, layer by layer."""
+    groups = order(numbers, networks.count, backend=backend)
     place, offsets = groups.permutation, groups.offsets
     x = encode_frequencies(positions[place], networks.frequencies, backend=backend)
     for name in ("in", "mid"):
         x = grouped_linear(x, *networks.layer(name), offsets, relu=True, backend=backend)
     raw = grouped_linear(x, *networks.layer("density"), offsets, backend=backend)
-    count = len(positions)
-    return _back(raw, place, count).squeeze(1), _back(x, place, count)
+    hidden = _back(x, place, len(positions))
+    geometry = torch.cat((hidden, numbers[:, None].to(hidden.dtype)), dim=1)
+    return _back(raw, place, len(positions)).squeeze(1), geometry
 
 
-def _composed_colours(
-    hidden: Tensor, encoded: Tensor, networks: Networks, groups: Groups, backend: str
-) -> Tensor:
+def composed_colours(geometry: Tensor, encoded: Tensor, networks: Networks, backend: str) -> Tensor:
     """`colours`, layer by layer."""
+    groups = order(geometry[:, HIDDEN].detach().int(), networks.count, backend=backend)
     place, offsets = groups.permutation, groups.offsets
-    feature = grouped_linear(hidden[place], *networks.layer("feature"), offsets, backend=backend)
+    hidden = geometry[place, :HIDDEN]
+    feature = grouped_linear(hidden, *networks.layer("feature"), offsets, backend=backend)
     x = torch.cat((feature, encoded[place]), dim=1)
     x = grouped_linear(x, *networks.layer("direction"), offsets, relu=True, backend=backend)
     x = grouped_linear(x, *networks.layer("colour"), offsets, backend=backend)
-    return _back(x.sigmoid(), place, len(hidden))
+    return _back(x.sigmoid(), place, len(geometry))
 
 
 def _back(values: Tensor, place: Tensor, count: int) -> Tensor:

@@ -12,7 +12,6 @@ from bench.case import U32, Agreement, Case
 from methods.kernels.dispatch import served
 from methods.kernels.grouped_mlp import (
     HIDDEN,
-    Groups,
     Networks,
     colours,
     densities,
@@ -209,25 +208,22 @@ def _networks() -> list[Case]:
     return found
 
 
-def _few(count: int, networks: int, device: str) -> tuple[Networks, Groups]:
+def _few(networks: int, device: str) -> Networks:
     weights, biases = {}, {}
     for n, (name, (inputs, outputs)) in enumerate(SIZES.items()):
         weights[name] = BOUND * _uniform(10 + n, networks, inputs, outputs).to(device)
         biases[name] = BOUND * _uniform(20 + n, networks, outputs).to(device)
-    groups = order(_numbers(count, networks), networks, backend="reference")
-    return Networks(weights, biases), Groups(
-        groups.permutation.to(device), groups.offsets.to(device)
-    )
+    return Networks(weights, biases)
 
 
 def _densities(count: int, networks: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
-    few = _few(count, networks, device)
+    few, numbers = _few(networks, device), _numbers(count, networks).to(device)
     positions = _uniform(5, count, 3).to(device)
-    return lambda backend: densities(positions, *few, backend=backend)
+    return lambda backend: densities(positions, numbers, few, backend=backend)
 
 
 def _colours(count: int, networks: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
-    few = _few(count, networks, device)
-    hidden = _uniform(6, count, HIDDEN).to(device)
+    few, numbers = _few(networks, device), _numbers(count, networks)
+    geometry = torch.cat((_uniform(6, count, HIDDEN), numbers[:, None].float()), dim=1).to(device)
     encoded = _uniform(7, count, SIZES["direction"][0] - HIDDEN).to(device)
-    return lambda backend: (colours(hidden, encoded, *few, backend=backend),)
+    return lambda backend: (colours(geometry, encoded, few, backend=backend),)

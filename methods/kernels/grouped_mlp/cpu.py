@@ -80,28 +80,34 @@ def grouped_linear(
     return _Linear.apply(inputs, weights, biases, offsets, relu)
 
 
-def densities(positions: Tensor, networks: Networks, groups: Groups) -> tuple[Tensor, Tensor]:
+def densities(positions: Tensor, numbers: Tensor, networks: Networks) -> tuple[Tensor, Tensor]:
     """See `methods.kernels.grouped_mlp.densities`."""
     layers = [part for name in ("in", "mid", "density") for part in networks.layer(name)]
     _check("computes", positions, *layers)
-    raw = torch.zeros(len(positions))
-    hidden = torch.zeros(len(positions), HIDDEN)
+    groups = order(numbers, networks.count)
+    raw = torch.empty(len(positions))
+    geometry = torch.empty(len(positions), HIDDEN + 1)
+    if len(groups.permutation) < len(positions):
+        raw.zero_()
+        geometry.zero_()
     _densities(
         *_arrays(positions, *layers, groups.permutation, groups.offsets),
         networks.frequencies,
         raw.numpy(),
-        hidden.numpy(),
+        geometry.numpy(),
     )
-    return raw, hidden
+    geometry[:, HIDDEN] = numbers
+    return raw, geometry
 
 
-def colours(hidden: Tensor, encoded: Tensor, networks: Networks, groups: Groups) -> Tensor:
+def colours(geometry: Tensor, encoded: Tensor, networks: Networks) -> Tensor:
     """See `methods.kernels.grouped_mlp.colours`."""
     layers = [part for name in ("feature", "direction", "colour") for part in networks.layer(name)]
-    _check("computes", hidden, encoded, *layers)
-    raw = torch.full((len(hidden), 3), -torch.inf)  # whose sigmoid is 0
+    _check("computes", geometry, encoded, *layers)
+    groups = order(geometry[:, HIDDEN].int(), networks.count)
+    raw = torch.full((len(geometry), 3), -torch.inf)  # whose sigmoid is 0
     _colours(
-        *_arrays(hidden, encoded, *layers, groups.permutation, groups.offsets),
+        *_arrays(geometry, encoded, *layers, groups.permutation, groups.offsets),
         raw.numpy(),
     )
     return raw.sigmoid_()
@@ -427,20 +433,6 @@ def _encode_all(inputs, frequencies, out):
 
 
 @njit(cache=True)
-def _copy(values, to):
-    for i in range(len(values)):
-        to[i] = values[i]
-
-
-@njit(cache=True, fastmath={"contract", "reassoc"})
-def _dot(one, other):
-    total = ZERO
-    for i in range(HIDDEN):
-        total += one[i] * other[i]
-    return total
-
-
-@njit(cache=True)
 def _block(a, a_row, a_step, w, bias, out, out_row, count, relu):
     """`ROWS` rows times w [count, 32], plus bias [32]: out [ROWS, 32 of `out_row`]."""
     for left in range(0, HIDDEN, LANES):
@@ -450,7 +442,7 @@ def _block(a, a_row, a_step, w, bias, out, out_row, count, relu):
             _six(a, 0, a_row, a_step, w, left, HIDDEN, bias, left, out, left, out_row, count)
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, fastmath={"contract", "reassoc"})
 def _densities(
     positions,
     in_weights,
@@ -463,7 +455,7 @@ def _densities(
     offsets,
     frequencies,
     raw,
-    hidden,
+    geometry,
 ):
     channels = in_weights.shape[1]
     borders = _borders(offsets)
@@ -483,13 +475,17 @@ def _densities(
                 _block(one, HIDDEN, 1, mid, mid_biases[n], two, HIDDEN, HIDDEN, True)
                 for r in range(rows):
                     s = permutation[first + r]
-                    _copy(two[r * HIDDEN : (r + 1) * HIDDEN], hidden[s])
-                    raw[s] = _dot(hidden[s], weights) + density_biases[n, 0]
+                    total = density_biases[n, 0]
+                    for i in range(HIDDEN):
+                        value = two[r * HIDDEN + i]
+                        geometry[s, i] = value
+                        total += value * weights[i]
+                    raw[s] = total
 
 
 @njit(cache=True, parallel=True)
 def _colours(
-    hidden,
+    geometry,
     directions,
     feature_weights,
     feature_biases,
@@ -523,8 +519,10 @@ def _colours(
                 rows = min(ROWS, offsets[n + 1] - first)  # idle ones repeat what was there
                 for r in range(rows):
                     s = permutation[first + r]
-                    _copy(hidden[s], given[r * HIDDEN : (r + 1) * HIDDEN])
-                    _copy(directions[s], joined[r * channels + HIDDEN : (r + 1) * channels])
+                    for i in range(HIDDEN):
+                        given[r * HIDDEN + i] = geometry[s, i]
+                    for i in range(seen):
+                        joined[r * channels + HIDDEN + i] = directions[s, i]
                 of = feature_biases[n]
                 _block(given, HIDDEN, 1, feature, of, joined, channels, HIDDEN, False)
                 of = direction_biases[n]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from methods.kernels.grouped_mlp import Groups, Networks, _composed_colours, _composed_densities
+from methods.kernels.grouped_mlp import Groups, Networks, composed_colours, composed_densities
 
 
 def locate(positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
@@ -43,11 +43,11 @@ def grouped_linear(
     return joined.relu() if relu else joined
 
 
-def densities(positions: Tensor, networks: Networks, groups: Groups) -> tuple[Tensor, Tensor]:
+def densities(positions: Tensor, numbers: Tensor, networks: Networks) -> tuple[Tensor, Tensor]:
     """See `methods.kernels.grouped_mlp.densities`."""
-    return _composed_densities(positions, networks, groups, "reference")
+    return composed_densities(positions, numbers, networks, "reference")
 
 
-def colours(hidden: Tensor, encoded: Tensor, networks: Networks, groups: Groups) -> Tensor:
+def colours(geometry: Tensor, encoded: Tensor, networks: Networks) -> Tensor:
     """See `methods.kernels.grouped_mlp.colours`."""
-    return _composed_colours(hidden, encoded, networks, groups, "reference")
+    return composed_colours(geometry, encoded, networks, "reference")

@@ -40,13 +40,13 @@ def test_they_are_those_of_torch_one_by_one(backend: str) -> None:
     few, modules = networks(4)
     numbers = torch.tensor([2, -1, 0, 2, 3, 0, 2, -1, 2, 2, 2, 2, 2])
     positions, directions = 2 * torch.rand(13, 3) - 1, torch.rand(13, 27)
-    groups = order(numbers, 4, backend=backend)
-    raw, hidden = densities(positions, few, groups, backend=backend)
-    shown = colours(hidden, directions, few, groups, backend=backend)
+    raw, geometry = densities(positions, numbers, few, backend=backend)
+    shown = colours(geometry, directions, few, backend=backend)
+    assert torch.equal(geometry[:, 32].long(), numbers)
     for s, n in enumerate(numbers.tolist()):
         if n < 0:
             assert not raw[s]
-            assert not hidden[s].any()
+            assert not geometry[s, :32].any()
             assert not shown[s].any()
             continue
         layers, x = modules[n], positions[s]
@@ -65,9 +65,8 @@ def test_the_order_of_the_samples_does_not_matter(backend: str) -> None:
     few, _ = networks(5)
     numbers, positions = torch.randint(-1, 5, (200,)), 2 * torch.rand(200, 3) - 1
     mixed = torch.randperm(200)
-    one = densities(positions, few, order(numbers, 5, backend=backend), backend=backend)
-    groups = order(numbers[mixed], 5, backend=backend)
-    other = densities(positions[mixed], few, groups, backend=backend)
+    one = densities(positions, numbers, few, backend=backend)
+    other = densities(positions[mixed], numbers[mixed], few, backend=backend)
     for first, second in zip(one, other, strict=True):
         # Another size of a product may add up in another order: 64 roundings of numbers below 4.
         torch.testing.assert_close(first[mixed], second, rtol=0, atol=256 * U32)
@@ -117,8 +116,7 @@ def test_nan_stays_with_its_sample(backend: str) -> None:
     few, _ = networks(1)
     positions = torch.zeros(12, 3)
     positions[5] = math.nan
-    groups = order(torch.zeros(12, dtype=torch.int32), 1, backend=backend)
-    raw, _ = densities(positions, few, groups, backend=backend)
+    raw, _ = densities(positions, torch.zeros(12, dtype=torch.int32), few, backend=backend)
     assert raw.isnan().nonzero().flatten().tolist() == [5]
 
 
