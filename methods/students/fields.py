@@ -40,8 +40,10 @@ class FieldLessons(MarchOptions):
             from many small steps.
     """
 
+    rate: float = 1e-3
+    final_rate: float = 0.1
     points: float = 0.5
-    batch: float = 1.0
+    batch: float = 0.25
 
     def __post_init__(self) -> None:
         super().__post_init__()
