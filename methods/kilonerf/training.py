@@ -28,7 +28,6 @@ class Lessons(FieldLessons):
     """
 
     rate: float = 3e-3
-    rate: float = 3e-3
     final_rate: float = 1 / 30
     batch: float = 1.0
     points_each: int = 128
