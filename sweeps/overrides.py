@@ -120,6 +120,10 @@ def explain(error: Exception, words: Sequence[str]) -> SteerbenchError:
         group, _, name = error.missing_cfg_file.rpartition("/")
         return unknown(group, name, error.options)
     if key := re.match(r"Could not override '([^']+)'", str(error)):
+        if (CONFIGS / key[1]).is_dir():
+            return SteerbenchError(
+                f"{key[1]}: each method brings its own, and takes no other; choose a method"
+            )
         return unknown("setting", key[1], _settings(words))
     causes = [error, error.__cause__] if error.__cause__ else [error]
     lines = [line.strip() for cause in causes for line in str(cause).splitlines()]

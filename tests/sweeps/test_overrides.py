@@ -30,6 +30,12 @@ def test_settings_of_the_chosen_scene_are_among_the_suggestions(steerbench):
     assert "Did you mean scene.downscale?" in outcome.err
 
 
+def test_the_field_of_a_method_is_not_chosen_for_another(steerbench):
+    outcome = steerbench("run", "method=steernerf", "field=nerf")
+    assert outcome.status == 2
+    assert outcome.err.startswith("steerbench: field: each method brings its own")
+
+
 @pytest.mark.parametrize("argument", ["demo", "a=b=c", "scene.path=["])
 def test_what_is_no_override_is_quoted_with_an_example(run, argument):
     outcome = run(argument)
