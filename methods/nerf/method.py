@@ -15,7 +15,8 @@ from methods.kernels.composite import STOP
 from methods.nerf.dense import every_sample, whole_cube
 from methods.nerf.field import NerfField
 from methods.rendering.frame import render_frame
-from methods.students.fields import FieldLessons, FieldStudent
+from methods.students.fields import FieldStudent
+from methods.students.networks import NetworkLessons
 
 
 class Nerf(FieldStudent):
@@ -38,7 +39,7 @@ class Nerf(FieldStudent):
         self,
         *,
         teacher: Setup,
-        training: FieldLessons,
+        training: NetworkLessons,
         skip: bool = True,
         stop: float = STOP,
         name: str = "nerf",

@@ -16,7 +16,8 @@ from methods.kernels.march import BRICK, Occupancy
 from methods.nsvf.field import EMBEDDING, NsvfField
 from methods.rendering.march import check_step
 from methods.rendering.occupancy import STEP
-from methods.students.fields import FieldLessons, FieldStudent, FieldTraining
+from methods.students.fields import FieldStudent, FieldTraining
+from methods.students.networks import NetworkLessons
 from methods.students.voxels import occupied_voxels
 
 Start = Literal["random", "teacher"]
@@ -38,7 +39,7 @@ class Nsvf(FieldStudent):
         self,
         *,
         teacher: Setup,
-        training: FieldLessons,
+        training: NetworkLessons,
         resolution: int = 128,
         step: float = 0.5,
         start: Start = "teacher",

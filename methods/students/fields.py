@@ -36,21 +36,20 @@ class FieldLessons(MarchOptions):
     Attributes:
         points: share of the steps, at the beginning, that compare densities and colours at random
             points of occupied cells with the teacher's.
-        batch: samples of a step, as a share of those of the budget: a large network learns more
-            from many small steps.
+        share: samples of a step, as a share of those of the budget.
     """
 
-    rate: float = 1e-3
-    final_rate: float = 0.1
     points: float = 0.5
-    batch: float = 0.25
+    share: float = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0 <= self.points <= 1:
             raise ValueError(f"points: expected a share of the steps, 0 to 1, got {self.points}")
-        if not 0 < self.batch <= 1:
-            raise ValueError(f"batch: expected a share of more than 0, up to 1, got {self.batch}")
+        if not 0 < self.share <= 1:
+            raise ValueError(
+                f"share: expected more than 0, up to 1, of the samples, got {self.share}"
+            )
 
 
 class StudentField(nn.Module, ABC):
@@ -114,7 +113,7 @@ class FieldTraining(PixelTraining):
         occupancy: Occupancy | None = None,
     ) -> None:
         device = teacher.field.device
-        samples = math.ceil(options.batch * budget.samples)
+        samples = math.ceil(options.share * budget.samples)
         super().__init__(scene, device, budget.renderer_steps, samples, options, seed)
         self.field, self.teacher = field, teacher.field
         self.occupancy = occupancy or teacher.occupancy

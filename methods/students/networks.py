@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -10,6 +11,16 @@ from torch.nn import functional
 
 from methods.instant_ngp.field import Precision
 from methods.kernels import multiplies_bf16
+from methods.students.fields import FieldLessons
+
+
+@dataclass(frozen=True)
+class NetworkLessons(FieldLessons):
+    """How one large network learns: from many small steps, at a lower rate than a hash grid."""
+
+    rate: float = 1e-3
+    final_rate: float = 0.1
+    share: float = 0.25
 
 
 def positional(

@@ -19,7 +19,7 @@ from methods.kernels.encode import HashGrid
 from methods.nerf.field import NerfField
 from methods.nerf.method import Nerf
 from methods.rendering.march import March
-from methods.students.fields import FieldLessons
+from methods.students.networks import NetworkLessons
 from methods.training import loop
 from tests.methods.conftest import Work
 
@@ -37,7 +37,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
 
 def new_method(**options: Any) -> Nerf:
     setup = Setup.resolved(GRID, TrainingOptions(), "fp32", "auto", "cpu", seed=0)
-    training = FieldLessons(rate=1e-3, batch=0.25, march_step=LONG)
+    training = NetworkLessons(rate=1e-3, march_step=LONG)
     return Nerf(**{"teacher": setup, "training": training} | options)
 
 
@@ -121,6 +121,12 @@ def test_size_is_that_of_the_published_network(ball_scene: Scene, log: Log) -> N
 def test_a_stop_at_which_rays_never_begin_is_refused() -> None:
     with pytest.raises(ValueError, match="stop: expected"):
         new_method(stop=1.0)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.5])
+def test_a_share_of_the_samples_that_is_none_is_refused(share: float) -> None:
+    with pytest.raises(ValueError, match="share: expected more than 0, up to 1"):
+        NetworkLessons(share=share)
 
 
 class PaperNerf(nn.Module):

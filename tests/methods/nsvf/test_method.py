@@ -20,7 +20,7 @@ from methods.kernels.march import Occupancy
 from methods.nsvf.field import NsvfField
 from methods.nsvf.method import Nsvf
 from methods.rendering.occupancy import STEP
-from methods.students.fields import FieldLessons
+from methods.students.networks import NetworkLessons
 from methods.training import loop
 
 GRID = HashGrid(levels=16, log2_table=10, n_min=4, n_max=64)
@@ -36,7 +36,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
 
 def new_method(**options: Any) -> Nsvf:
     setup = Setup.resolved(GRID, TrainingOptions(), "fp32", "auto", "cpu", seed=0)
-    training = FieldLessons(rate=2e-3, batch=0.25)
+    training = NetworkLessons(rate=2e-3)
     return Nsvf(
         **{"teacher": setup, "training": training, "resolution": 32, "start": "random"} | options
     )
@@ -123,13 +123,11 @@ def test_the_network_is_that_of_the_publication() -> None:
 
 
 def test_it_learns_a_ball(ball_scene: Scene, log: Log) -> None:
-    method = fitted(ball_scene, log, steps=40, start="teacher")
+    method = fitted(ball_scene, log, steps=60, start="teacher")
     test = ball_scene.splits["test"]
     truth = test.images[1].float() / 255
     on_white = truth[..., :3] * truth[..., 3:] + 1 - truth[..., 3:]
-    assert (
-        psnr(method.render(test.cameras[1], NullProbe()).rgb, on_white) > 16
-    )  # a white picture has 11.4
+    assert psnr(method.render(test.cameras[1], NullProbe()).rgb, on_white) > 16  # a white one: 11.4
 
 
 def test_a_killed_training_goes_on_as_if_it_had_not_been(
