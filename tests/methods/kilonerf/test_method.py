@@ -91,7 +91,7 @@ def test_wrong_settings_are_refused(wrong: dict[str, float]) -> None:
         method(**wrong)
 
 
-@pytest.mark.parametrize("wrong", [{"batch": 0}, {"view_cost": -1.0}, {"points": 2.0}])
+@pytest.mark.parametrize("wrong", [{"points_each": 0}, {"view_cost": -1.0}, {"points": 2.0}])
 def test_wrong_lessons_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="expected"):
         Lessons(**wrong)
