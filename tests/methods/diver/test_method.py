@@ -9,14 +9,13 @@ import pytest
 import torch
 
 from bench.console import ConsoleLog
-from bench.metrics import psnr
 from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene
 from methods.diver.method import Diver
 from methods.diver.training import DiverTraining, Lessons
 from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.encode import HashGrid
-from methods.training import loop
+from tests.methods.trainings import goes_on_after_a_kill, quality
 
 GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
 SETUP = Setup.resolved(GRID, TrainingOptions(), "bf16", "auto", "cpu", seed=0)
@@ -32,13 +31,6 @@ def fitted(scene: Scene, log: Log, budget: Budget = BUDGET, **options) -> Diver:
     method = method_of(**options)
     method.fit(scene, budget, log)
     return method
-
-
-def quality(method: Diver, scene: Scene) -> float:
-    test = scene.splits["test"]
-    truth = test.images[1].float() / 255
-    on_white = truth[..., :3] * truth[..., 3:] + 1 - truth[..., 3:]
-    return psnr(method.render(test.cameras[1], NullProbe()).rgb, on_white)
 
 
 @pytest.fixture(scope="module")
@@ -97,18 +89,7 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(
     def training() -> DiverTraining:
         return method_of().begin(teacher, ball_scene, BUDGET)
 
-    whole, half = training(), training()
-    while whole.step < 40:
-        whole.advance()
-    while half.step < stop_at:  # before and after the pruning
-        half.advance()
-    loop.save(half, tmp_path / "half")
-    resumed = training()
-    loop.resume(resumed, tmp_path / "half")
-    while resumed.step < 40:
-        resumed.advance()
-    for name, value in whole.result().items():
-        assert torch.equal(resumed.result()[name], value), name
+    goes_on_after_a_kill(training, stop_at, tmp_path)  # before and after the pruning
 
 
 def test_a_training_is_found_again(ball_scene: Scene, log: Log) -> None:

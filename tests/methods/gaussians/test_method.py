@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench.metrics import psnr
 from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene, SteerbenchError
 from methods.gaussians.method import GaussianSplatting
 from methods.gaussians.start import anywhere, on_surfaces, spacing
@@ -15,7 +14,7 @@ from methods.gaussians.training import Fitting, GaussianTraining
 from methods.instant_ngp.stage1 import Setup, train_field
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.encode import HashGrid
-from methods.training import loop
+from tests.methods.trainings import goes_on_after_a_kill, quality
 
 GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
 BUDGET = Budget("test", steps=100, samples=8192, renderer_steps=60)
@@ -26,13 +25,6 @@ def fitted(scene: Scene, log: Log, budget: Budget = BUDGET, **options) -> Gaussi
     method = GaussianSplatting(grid=GRID, training=TrainingOptions(), device="cpu", **settings)
     method.fit(scene, budget, log)
     return method
-
-
-def quality(method: GaussianSplatting, scene: Scene) -> float:
-    test = scene.splits["test"]
-    truth = test.images[1].float() / 255
-    on_white = truth[..., :3] * truth[..., 3:] + 1 - truth[..., 3:]
-    return psnr(method.render(test.cameras[1], NullProbe()).rgb, on_white)
 
 
 def test_they_learn_a_ball(ball_scene: Scene, quiet_log: Log) -> None:
@@ -102,18 +94,7 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(
         gaussians = method._untrained(None, ball_scene, blank=False)
         return GaussianTraining(gaussians, ball_scene, 40, Fitting(every=10), "auto", seed=0)
 
-    whole, half = training(), training()
-    for _ in range(40):
-        whole.advance()
-    for _ in range(23):
-        half.advance()
-    loop.save(half, tmp_path / "half")
-    resumed = training()
-    loop.resume(resumed, tmp_path / "half")
-    while resumed.step < 40:
-        resumed.advance()
-    for name, value in whole.result().items():
-        assert torch.equal(resumed.result()[name], value), name
+    goes_on_after_a_kill(training, 23, tmp_path)
 
 
 def test_a_training_is_found_again_and_left_for_others(

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench.metrics import psnr
 from bench.types import Budget, Log, NullProbe, Scene
 from methods.instant_ngp.stage1 import Setup, train_field
 from methods.instant_ngp.training import TrainingOptions
@@ -16,6 +15,7 @@ from methods.kilonerf.field import SHAPES
 from methods.kilonerf.method import KiloNerf
 from methods.kilonerf.training import Lessons
 from methods.training import loop
+from tests.methods.trainings import goes_on_after_a_kill, quality
 
 GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
 BUDGET = Budget("test", steps=100, samples=8192, renderer_steps=60)
@@ -36,10 +36,8 @@ def fitted(scene: Scene, log: Log, **options) -> KiloNerf:
 def test_it_learns_a_ball(ball_scene: Scene, quiet_log: Log) -> None:
     student = fitted(ball_scene, quiet_log)
     test = ball_scene.splits["test"]
-    truth = test.images[1].float() / 255
-    on_white = truth[..., :3] * truth[..., 3:] + 1 - truth[..., 3:]
     frame = student.render(test.cameras[1], NullProbe())
-    assert psnr(frame.rgb, on_white) > 20
+    assert quality(student, ball_scene) > 20
     assert abs(frame.depth[16, 16].item() - 1.3) < 4 * 1.6 / 40  # the front, to four pixels
 
 
@@ -49,18 +47,10 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(
     teacher = train_field(TEACHER, ball_scene, BUDGET, quiet_log)
     budget = Budget("test", steps=100, samples=2048, renderer_steps=12)
 
-    whole, half = (method().begin(teacher, ball_scene, budget) for _ in range(2))
-    for _ in range(12):
-        whole.advance()
-    for _ in range(8):  # of which six from points
-        half.advance()
-    loop.save(half, tmp_path / "half")
-    resumed = method().begin(teacher, ball_scene, budget)
-    loop.resume(resumed, tmp_path / "half")
-    while resumed.step < 12:
-        resumed.advance()
-    for name, value in whole.result().items():
-        assert torch.equal(resumed.result()[name], value), name
+    def training() -> loop.Training:
+        return method().begin(teacher, ball_scene, budget)
+
+    goes_on_after_a_kill(training, 8, tmp_path)  # of which six from points
 
 
 def test_a_finished_training_is_found_again(ball_scene: Scene, quiet_log: Log) -> None:

@@ -11,7 +11,6 @@ from torch import nn
 from torch.nn import functional
 
 from bench.console import ConsoleLog
-from bench.metrics import psnr
 from bench.types import Budget, Log, NullProbe, Scene
 from methods.instant_ngp.stage1 import Setup, train_field
 from methods.instant_ngp.training import TrainingOptions
@@ -22,6 +21,7 @@ from methods.nsvf.method import Nsvf
 from methods.rendering.occupancy import STEP
 from methods.students.networks import NetworkLessons
 from methods.training import loop
+from tests.methods.trainings import goes_on_after_a_kill, quality
 
 GRID = HashGrid(levels=16, log2_table=10, n_min=4, n_max=64)
 BUDGET = Budget("test", steps=80, samples=4096, renderer_steps=4)
@@ -124,10 +124,7 @@ def test_the_network_is_that_of_the_publication() -> None:
 
 def test_it_learns_a_ball(ball_scene: Scene, log: Log) -> None:
     method = fitted(ball_scene, log, steps=60, start="teacher")
-    test = ball_scene.splits["test"]
-    truth = test.images[1].float() / 255
-    on_white = truth[..., :3] * truth[..., 3:] + 1 - truth[..., 3:]
-    assert psnr(method.render(test.cameras[1], NullProbe()).rgb, on_white) > 16  # a white one: 11.4
+    assert quality(method, ball_scene) > 16
 
 
 def test_a_killed_training_goes_on_as_if_it_had_not_been(
@@ -138,17 +135,7 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(
     def training() -> loop.Training:
         return new_method().begin(teacher, ball_scene, BUDGET)
 
-    whole, half = training(), training()
-    for _ in range(4):
-        whole.advance()
-    for _ in range(3):  # points, then rays
-        half.advance()
-    loop.save(half, tmp_path / "half")
-    resumed = training()
-    loop.resume(resumed, tmp_path / "half")
-    resumed.advance()
-    for name, value in whole.result().items():
-        assert torch.equal(resumed.result()[name], value), name
+    goes_on_after_a_kill(training, 3, tmp_path)  # points, then rays
 
 
 def test_a_training_is_found_again_and_depends_on_its_step(ball_scene: Scene, log: Log) -> None:

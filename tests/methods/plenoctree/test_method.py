@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from bench.console import ConsoleLog
-from bench.metrics import psnr
 from bench.threads import torch_threads
 from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene, SteerbenchError
 from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
@@ -20,8 +19,8 @@ from methods.plenoctree.method import PlenOctree
 from methods.plenoctree.octree import Octree
 from methods.plenoctree.start import Extraction, extract, fibonacci_sphere
 from methods.plenoctree.training import OctreeLessons, OctreeTraining
-from methods.training import loop
 from tests.methods.conftest import Work
+from tests.methods.trainings import goes_on_after_a_kill, quality
 
 GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
 SMALL = {"resolution": 128, "degree": 1, "rays": 20_000, "points": 2, "directions": 8}
@@ -42,14 +41,8 @@ def fitted(scene: Scene, log: Log, steps: int = 20, **others) -> PlenOctree:
     return method
 
 
-def quality(method: PlenOctree, scene: Scene, split: str) -> float:
-    some = scene.splits[split]
-    found = []
-    for camera, picture in list(zip(some.cameras, some.images, strict=True))[:3]:
-        truth = picture.float() / 255
-        on_white = truth[..., :3] * truth[..., 3:] + 1 - truth[..., 3:]
-        found.append(psnr(method.render(camera, NullProbe()).rgb, on_white))
-    return sum(found) / len(found)
+def mean_quality(method: PlenOctree, scene: Scene, split: str) -> float:
+    return sum(quality(method, scene, split, view) for view in range(3)) / 3
 
 
 @pytest.fixture(scope="module")
@@ -125,8 +118,8 @@ def test_directions_are_spread_evenly() -> None:
 
 def test_it_learns_a_ball(ball_scene: Scene, log: Log) -> None:
     before, after = fitted(ball_scene, log, 1), fitted(ball_scene, log, 60)
-    assert quality(after, ball_scene, "train") > quality(before, ball_scene, "train") + 1
-    assert quality(after, ball_scene, "test") > 21
+    assert mean_quality(after, ball_scene, "train") > mean_quality(before, ball_scene, "train") + 1
+    assert mean_quality(after, ball_scene, "test") > 21
     frame = after.render(ball_scene.splits["test"].cameras[1], NullProbe())
     # From the front of the ball, 1.6 - 0.3 from the camera, to its middle: after so few steps the
     # teacher's ball is a mist.
@@ -159,18 +152,7 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(
         octree = extracted(teacher, ball_scene)
         return OctreeTraining(octree, ball_scene, budget, OctreeLessons(samples=4096), seed=0)
 
-    whole, half = training(), training()
-    for _ in range(20):
-        whole.advance()
-    for _ in range(9):
-        half.advance()
-    loop.save(half, tmp_path / "half")
-    resumed = training()
-    loop.resume(resumed, tmp_path / "half")
-    while resumed.step < 20:
-        resumed.advance()
-    for name, value in whole.result().items():
-        assert torch.equal(resumed.result()[name], value), name
+    goes_on_after_a_kill(training, 9, tmp_path)
 
 
 def test_a_training_is_found_again(ball_scene: Scene, log: Log) -> None:
@@ -185,7 +167,9 @@ def test_what_is_stored_is_chosen_afterwards(ball_scene: Scene, log: Log) -> Non
     assert full.train_s == half.train_s  # the same training
     assert full.sizes()["leaves"] == 2 * half.sizes()["leaves"]
     assert half.settings()["precision"] == "fp16"
-    assert abs(quality(half, ball_scene, "test") - quality(full, ball_scene, "test")) < 0.05
+    assert (
+        abs(mean_quality(half, ball_scene, "test") - mean_quality(full, ball_scene, "test")) < 0.05
+    )
 
 
 def test_a_frame_says_its_work(ball_scene: Scene, log: Log) -> None:
