@@ -36,6 +36,7 @@ class Diver(Student):
         faint: weight below which a segment has an opacity but no colour.
         stop: transmittance at which a ray ends when rendering, less than 1.
         name: as it stands in result rows.
+        steps: of its own training; None: `budget.renderer_steps`.
     """
 
     kind = "diver"
@@ -61,8 +62,9 @@ class Diver(Student):
         faint: float = 1e-2,
         stop: float = 1e-2,
         name: str = "diver",
+        steps: int | None = None,
     ) -> None:
-        super().__init__(teacher, training, stop, name)
+        super().__init__(teacher, training, stop, name, steps)
         if resolution % MULTIPLE or not MULTIPLE <= resolution <= FINEST:
             raise ValueError(
                 f"resolution: expected a multiple of {MULTIPLE} up to {FINEST}, got {resolution}"

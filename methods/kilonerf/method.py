@@ -28,6 +28,7 @@ class KiloNerf(FieldStudent):
         networks: how many there are along the longest side of the scene, 1 to 32.
         stop: transmittance at which a ray ends when rendering, less than 1.
         name: as it stands in result rows.
+        steps: of its own training; None: `budget.renderer_steps`.
     """
 
     kind = "kilonerf"
@@ -41,8 +42,9 @@ class KiloNerf(FieldStudent):
         networks: int = 16,
         stop: float = 1e-2,
         name: str = "kilonerf",
+        steps: int | None = None,
     ) -> None:
-        super().__init__(teacher, training, stop, name)
+        super().__init__(teacher, training, stop, name, steps)
         if not 1 <= networks <= MOST:
             raise ValueError(f"networks: expected 1 to {MOST} along an axis, got {networks}")
         self.networks = networks

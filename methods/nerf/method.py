@@ -43,8 +43,9 @@ class Nerf(FieldStudent):
         skip: bool = True,
         stop: float = STOP,
         name: str = "nerf",
+        steps: int | None = None,
     ) -> None:
-        super().__init__(teacher, training, stop, name)
+        super().__init__(teacher, training, stop, name, steps)
         self.training = training
         self.skip = skip
 

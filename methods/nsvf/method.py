@@ -45,6 +45,7 @@ class Nsvf(FieldStudent):
         start: Start = "teacher",
         stop: float = STOP,
         name: str = "nsvf",
+        steps: int | None = None,
     ) -> None:
         check_step("step", step)
         if resolution < 1 or resolution % BRICK**2:
@@ -57,7 +58,7 @@ class Nsvf(FieldStudent):
                 f"{teacher.grid.channels}: use start=random"
             )
         training = replace(training, march_step=step / resolution / STEP)
-        super().__init__(teacher, training, stop, name)
+        super().__init__(teacher, training, stop, name, steps)
         self.training = training
         self.resolution, self.start = resolution, start
 

@@ -33,10 +33,11 @@ class PlenOctree(Student):
     Args:
         teacher: the field that it is taken from.
         extraction: which leaves there are, and what they begin with.
-        training: how they learn, in `budget.renderer_steps` steps.
+        training: how they learn.
         stored: precision of the values in a file, which they are rendered at.
         stop: transmittance at which a ray ends, less than 1.
         name: as it stands in result rows.
+        steps: of its own training; None: `budget.renderer_steps`.
     """
 
     kind = "plenoctree"
@@ -64,10 +65,11 @@ class PlenOctree(Student):
         stored: Stored = "fp16",
         stop: float = 1e-2,
         name: str = "plenoctree",
+        steps: int | None = None,
     ) -> None:
         if stored not in ("fp16", "fp32"):
             raise ValueError(f"stored: expected fp16 or fp32, got {stored!r}")
-        super().__init__(teacher, training, stop, name)
+        super().__init__(teacher, training, stop, name, steps)
         self.extraction, self.lessons, self.stored = extraction, training, stored
 
     def model_settings(self) -> Mapping[str, object]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import ClassVar
 
 import torch
@@ -25,7 +25,7 @@ from methods.training import checkpoint, loop
 class Student(ABC):
     """Base of the methods that start from the Instant-NGP field that all methods share.
 
-    The model learns in `budget.renderer_steps` steps. `train_s` counts the training of the field,
+    `train_s` counts the training of the field,
     the start of the model and its own training.
 
     Args:
@@ -33,6 +33,7 @@ class Student(ABC):
         training: how the model learns.
         stop: transmittance at which a ray ends when rendering, less than 1.
         name: as it stands in result rows.
+        steps: of its own training; None: `budget.renderer_steps`.
     """
 
     memory = 0
@@ -45,10 +46,14 @@ class Student(ABC):
         parts=dict.fromkeys(("rays", "march", "composite"), "field"),
     )
 
-    def __init__(self, teacher: Setup, training: PixelOptions, stop: float, name: str) -> None:
+    def __init__(
+        self, teacher: Setup, training: PixelOptions, stop: float, name: str, steps: int | None
+    ) -> None:
         check_stop(stop)
+        if steps is not None and steps < 1:
+            raise ValueError(f"steps: expected 1 or more, or none, got {steps}")
         self.teacher, self.training, self.stop, self.name = teacher, training, stop, name
-        self.train_s = 0.0
+        self.steps, self.train_s = steps, 0.0
 
     @abstractmethod
     def model_settings(self) -> Mapping[str, object]:
@@ -64,6 +69,7 @@ class Student(ABC):
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Train the field and the model, or load what the same trainings left behind."""
+        budget = replace(budget, renderer_steps=self.steps or budget.renderer_steps)
         with torch_threads(budget.threads):
             teacher = train_field(self.teacher, scene, budget, log)
             folder = log.stage_dir(self.kind, self._key(scene, budget))
