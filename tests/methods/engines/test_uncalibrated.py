@@ -113,8 +113,17 @@ def per_channel(scale: np.ndarray) -> np.ndarray:
     return scale.reshape(-1, 1, 1, 1)
 
 
+def adds_products_exactly() -> bool:
+    """Whether the CPU adds 8-bit products in 32 bits. OpenVINO without VNNI adds two of them in 16,
+    which saturate where weights and activations are both large."""
+    can = torch.cpu.get_capabilities()
+    return any(can.get(name) for name in ("avx512_vnni", "avx_vnni", "amx_int8"))
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_activations_are_rounded_on_the_ranges_of_trtexec(kind: Kind, tmp_path: Path) -> None:
+    if kind is OpenVino and not adds_products_exactly():
+        pytest.skip("this CPU has no VNNI: sums of 8-bit products saturate")
     module, inputs = layers(), (3 * noise(1)[0],)  # beyond all three ranges
     got = built(kind, module, [noise(0)], tmp_path)(*inputs)
     found = weights(kind, tmp_path)
