@@ -25,7 +25,10 @@ from sweeps.jobs import time_left
 from sweeps.measurement import described, trained
 from sweeps.plan import Planned
 
-CHOSEN_AFTERWARDS = {"engine", "precision", "protocol", "rendering", "after", "stored"}
+CHOSEN_AFTERWARDS = {
+    *("engine", "precision", "protocol"),
+    *("rendering", "after", "stored", "stop", "faint", "skip"),
+}
 """Settings of a run and of its method that no training depends on."""
 
 

@@ -68,7 +68,7 @@ def test_choices_come_with_what_they_are() -> None:
 
 
 def test_a_wrong_setting_is_an_error_with_the_nearest_name() -> None:
-    with pytest.raises(steerbench.SteerbenchError, match="did you mean 'ngp'"):
+    with pytest.raises(steerbench.SteerbenchError, match="Did you mean ngp"):
         steerbench.run("method=npg")
 
 

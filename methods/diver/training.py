@@ -32,7 +32,7 @@ class Lessons(PixelOptions):
         sparsity: weight of the mean of log(1 + 2 sigma^2) over all segments.
         prune_at: share of the steps after which voxels go that hardly show.
         prune_below: largest weight, in all rays that were looked along, of a voxel that goes.
-        prune_rays: random training rays that are looked along.
+        prune_rays: random training rays that are looked along, at most as many as there are.
     """
 
     rate: float = 5e-3
@@ -115,8 +115,9 @@ class DiverTraining(PixelTraining):
         Section 4.1)."""
         model, options = self.model, self.options
         largest = torch.zeros(len(model.voxels), device=self.grad.device)
-        for first in range(0, options.prune_rays, CHUNK_RAYS):
-            count = min(CHUNK_RAYS, options.prune_rays - first)
+        rays = min(options.prune_rays, len(self.batches))
+        for first in range(0, rays, CHUNK_RAYS):
+            count = min(CHUNK_RAYS, rays - first)
             rays, _ = self.batches.draw(count, self.generator)
             crossings = walk(rays, model.voxels, backend=model.backend)
             sigma = self._densities(rays, crossings)

@@ -114,6 +114,9 @@ class PixelBatches:
             [(c.fx, c.fy, c.cx, c.cy) for c in cameras], device=device
         )  # [N, 4]
 
+    def __len__(self) -> int:
+        return len(self._pixels)
+
     def draw(self, count: int, generator: torch.Generator) -> tuple[Rays, Tensor]:
         """`count` rays through pixel centres, and their colours [count, 3 or 4] in [0, 1]."""
         total = len(self._pixels)

@@ -37,7 +37,7 @@ class Extraction:
         resolution: leaves along the side of the cube, a multiple of 64, 128 to 2048.
         degree: of the spherical harmonics, 0 to 3.
         least_weight: leaves stay whose weight on any of the training rays is at least this.
-        rays: random training rays that are looked at.
+        rays: random training rays that are looked at, at most as many as there are.
         points: random places of a leaf over which its density is averaged.
         directions: from which its colour is looked at.
         most_leaves: candidates of more are refused before there is memory for them.
@@ -85,7 +85,7 @@ def extract(
     candidates = _candidates(teacher.occupancy, options)
     density = _densities(teacher.field, candidates, options.resolution, options.points, generator)
     voxels = Voxels(candidates, options.resolution)
-    seen = _largest_weights(voxels, density, batches, options.rays, generator)
+    seen = _largest_weights(voxels, density, batches, min(options.rays, len(batches)), generator)
     kept = (seen >= options.least_weight) & (density > 0)
     if not kept.any():
         raise SteerbenchError(

@@ -201,7 +201,7 @@ def _integrals() -> list[Case]:
     }
     return [
         *(exact.case(name, partial(_moment_error, *ends)) for name, ends in kinds.items()),
-        *(parts.case(name, partial(_cut_error, *ends)) for name, ends in kinds.items()),
+        *(parts.case(f"{name}, cut", partial(_cut_error, *ends)) for name, ends in kinds.items()),
         points.case("all corners", _corner_error),
         along.case("rays through a full grid", _way_error),
         spoiled.case("NaN", _spread_of_nan),

@@ -17,7 +17,7 @@ OF_CLASS = {
 METHODS = sorted(OF_CLASS.values())
 """One method of every class: those of one class declare the same."""
 
-AFTERWARDS = ("rendering", "engine", "stop", "stored")
+AFTERWARDS = ("rendering", "engine", "stop", "stored", "faint", "skip")
 """Settings of a method that a training does not depend on."""
 
 
