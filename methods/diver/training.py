@@ -115,9 +115,9 @@ class DiverTraining(PixelTraining):
         Section 4.1)."""
         model, options = self.model, self.options
         largest = torch.zeros(len(model.voxels), device=self.grad.device)
-        rays = min(options.prune_rays, len(self.batches))
-        for first in range(0, rays, CHUNK_RAYS):
-            count = min(CHUNK_RAYS, rays - first)
+        most = min(options.prune_rays, len(self.batches))
+        for first in range(0, most, CHUNK_RAYS):
+            count = min(CHUNK_RAYS, most - first)
             rays, _ = self.batches.draw(count, self.generator)
             crossings = walk(rays, model.voxels, backend=model.backend)
             sigma = self._densities(rays, crossings)
