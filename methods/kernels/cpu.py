@@ -3,6 +3,12 @@
 numba caches compiled code by the file of the calling function alone: after a change of
 `pack_bf16`, or of a constant that such a file imports from another (`PRIMES`, `TAPS`, `PARALLEL`),
 remove the `__pycache__` of its callers.
+
+The process that compiles a function runs another copy of it than the processes that load it from
+the cache: LLVM has optimised one of them twice. Where it may choose how to round, the copies can
+differ in the last bit, and a training then does not repeat. So `fastmath` allows "contract" where
+there is one way to contract, as in a sum of products, and "reassoc" where both copies were seen to
+give the same bits in all cases of the kernel.
 """
 
 from __future__ import annotations

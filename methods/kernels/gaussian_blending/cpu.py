@@ -27,8 +27,9 @@ PATIENCE = 8
 
 FIELDS = 10  # of a packed Gaussian: u, v, A, B, C, opacity, r, g, b, z
 SUMS = 9  # of a Gaussian in a tile: see `_tile_backward`
-LANES = {"contract", "reassoc", "nsz", "arcp"}
-"""Freedoms of the compiler: sums in any order, as vectors need it."""
+IN_LANES = 6 * PIXELS  # where these sums begin in the state of a tile, one for each lane
+LANES = {"contract", "nsz", "arcp"}
+"""Freedoms of the compiler where one result is all it can choose; see `methods.kernels.cpu`."""
 
 LARGEST, LEAST = f32(LARGEST_ALPHA), f32(LEAST_ALPHA)
 ZERO, ONE, HALF = f32(0), f32(1), f32(0.5)
@@ -298,7 +299,7 @@ def _backward(packed, boxes, offsets, ranks, stop, threads, grad, gain, sums):
     across = -(-width // TILE)
     tiles = len(offsets) - 1
     for thread in prange(threads):
-        state = np.empty(6 * PIXELS, np.float32)
+        state = np.empty(IN_LANES + SUMS * TILE, np.float32)
         for tile in range(thread, tiles, threads):
             if offsets[tile] == offsets[tile + 1]:
                 continue
@@ -324,11 +325,12 @@ def _backward(packed, boxes, offsets, ranks, stop, threads, grad, gain, sums):
             )
 
 
-@njit(cache=True, fastmath=LANES, error_model="numpy")  # a branch less at the division
+@njit(cache=True, error_model="numpy")  # a branch less at the division
 def _tile_backward(packed, boxes, ranks, stop, top, left, state, sums):
     """With g_i = dL/dw_i: dL/dalpha_i = T_i g_i - (sum_{j > i} w_j g_j) / (1 - alpha_i).
 
-    `state`: transmittance, the sum behind, dL/dr, dL/dg, dL/db and dL/dalpha of each pixel.
+    `state`: transmittance, the sum behind, dL/dr, dL/dg, dL/db and dL/dalpha of each pixel; then
+    the sums of a Gaussian in each lane.
     `sums` of each Gaussian, with p = alpha_i dL/dalpha_i = dL/d(exponent):
     p, p x, p y, p x^2, p x y, p y^2, dL/dr, dL/dg, dL/db.
     """
@@ -342,8 +344,7 @@ def _tile_backward(packed, boxes, ranks, stop, top, left, state, sums):
         a, b, c = packed[rank, 2], packed[rank, 3], packed[rank, 4]
         opacity = packed[rank, 5]
         red, green, blue = packed[rank, 6], packed[rank, 7], packed[rank, 8]
-        p0, p1, p2, p3, p4 = ZERO, ZERO, ZERO, ZERO, ZERO
-        p5, p6, p7, p8 = ZERO, ZERO, ZERO, ZERO
+        state[IN_LANES:] = ZERO
         for row in range(max(boxes[rank, 2] - top, 0), min(boxes[rank, 3] - top, TILE)):
             y = f32(row) + HALF - v
             for lane in range(TILE):
@@ -366,17 +367,19 @@ def _tile_backward(packed, boxes, ranks, stop, top, left, state, sums):
                 slope = transmittance * gain - behind / (ONE - share)
                 p = raw * slope if shown & (raw < LARGEST) else ZERO
                 px, py = p * x, p * y
-                p0 += p
-                p1 += px
-                p2 += py
-                p3 += px * x
-                p4 += px * y
-                p5 += py * y
-                p6 += weight * to_red
-                p7 += weight * to_green
-                p8 += weight * to_blue
-        for k, total in enumerate((p0, p1, p2, p3, p4, p5, p6, p7, p8)):
-            sums[n, k] = total
+                own = np.uint64(IN_LANES) + np.uint64(lane)
+                state[own] += p
+                state[own + np.uint64(TILE)] += px
+                state[own + np.uint64(2 * TILE)] += py
+                state[own + np.uint64(3 * TILE)] += px * x
+                state[own + np.uint64(4 * TILE)] += px * y
+                state[own + np.uint64(5 * TILE)] += py * y
+                state[own + np.uint64(6 * TILE)] += weight * to_red
+                state[own + np.uint64(7 * TILE)] += weight * to_green
+                state[own + np.uint64(8 * TILE)] += weight * to_blue
+        for k in range(SUMS):
+            for lane in range(TILE):
+                sums[n, k] += state[IN_LANES + k * TILE + lane]
 
 
 @njit(cache=True, parallel=True)

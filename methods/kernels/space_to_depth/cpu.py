@@ -15,7 +15,7 @@ from torch import Tensor
 from methods.kernels.cpu import f32
 from methods.kernels.space_to_depth import TAPS, CellInputs, Layout, Pair
 
-FAST = {"contract", "reassoc", "nsz"}
+FAST = {"contract"}
 
 
 def space_to_depth(inputs: CellInputs, layout: Layout, taps: Tensor, count: int) -> Pair:
