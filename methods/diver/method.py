@@ -7,16 +7,16 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from bench.cameras import place_camera
 from bench.study import Axis, Study, Variant, turned
-from bench.types import Budget, Camera, Frame, Probe, Scene
+from bench.types import Budget, Probe, Rays, Scene
 from methods.diver.decoder import Decoder
 from methods.diver.model import CornerModel
 from methods.diver.rendering import Baked, Stored
 from methods.diver.training import DiverTraining, Lessons
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.kernels.composite import Pixels
-from methods.rendering.frame import FeatureFrame, rays_at_matter
+from methods.kernels.march import Occupancy
+from methods.rendering.frame import Render
 from methods.students.method import Student
 
 MULTIPLE = 16
@@ -93,20 +93,13 @@ class Diver(Student):
         model.load(tensors)
         self.baked = Baked(model, self.stored)
 
-    @torch.no_grad()
-    def render(self, camera: Camera, probe: Probe) -> Frame:
-        """One frame at the camera's full resolution."""
-        camera = place_camera(camera, self.teacher.device)
-        size = camera.height * camera.width
-        with probe.stage("rays"):
-            seen, rays = rays_at_matter(camera, self.baked.occupancy)
-            canvas = Pixels.blank(size, 3, self.teacher.device)
-        probe.count("rays", len(seen), size)
-        rendered = self.baked.render_rays(rays, probe, self.stop, self.faint)
-        with probe.stage("finish"):
-            canvas.put(seen, rendered)
-            frame = FeatureFrame.of(camera, canvas, self.background)
-        return Frame(frame.values, frame.depth, frame.alpha)
+    def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
+        """See `Student`."""
+
+        def render(_: Tensor, rays: Rays) -> Pixels:
+            return self.baked.render_rays(rays, probe, self.stop, self.faint)
+
+        return self.baked.occupancy, render
 
     def sizes(self) -> dict[str, int]:
         """Bytes of what `Baked` renders."""

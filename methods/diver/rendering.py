@@ -41,9 +41,7 @@ class Baked:
         table = functional.linear(model.table, first.weight, first.bias)
         self.table = table.to(torch.bfloat16 if stored == "bf16" else torch.float32)
         self.model, self.decoder = model, Merged.of(model.decoder)
-        cells = torch.zeros([model.resolution] * 3, dtype=torch.bool, device=table.device)
-        cells[model.voxels.coordinates.long().unbind(dim=1)] = True
-        self.occupancy = Occupancy(cells)
+        self.occupancy = Occupancy.at(model.voxels.coordinates, model.resolution)
 
     def sizes(self) -> dict[str, int]:
         """Bytes of features, of a bit a cell that tells which are voxels, and of the decoder."""

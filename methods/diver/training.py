@@ -152,20 +152,12 @@ class DiverTraining(PixelTraining):
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
         """Optimisers, random numbers, size of the batch."""
         tensors, figures = super().state()
-        moments = self.moments
-        tensors |= {
-            "moments.first": moments.first,
-            "moments.second": moments.second,
-            "moments.steps": moments.steps,
-        }
+        tensors |= self.moments.tensors("moments.")
         return tensors | checkpoint.optimiser_tensors(self.networks, "adam."), figures
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
         """See `loop.Training`."""
         super().restore(tensors, figures)
-        device = self.model.table.device
-        self.moments = AdamState(
-            *(tensors[f"moments.{name}"].to(device) for name in ("first", "second", "steps"))
-        )
+        self.moments = AdamState.of(tensors, "moments.", self.model.table.device)
         self.grad = torch.zeros_like(self.model.table)
         checkpoint.restore_optimiser(self.networks, tensors, "adam.")

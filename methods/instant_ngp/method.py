@@ -70,8 +70,7 @@ class InstantNgp:
         field, occupancy = self.trained.field, self.trained.occupancy
         march = self.setup.training.march
         render = everywhere(field, occupancy, probe, replace(march, stop=self.stop))
-        frame = render_frame(field, camera, occupancy, self.background, probe, render)
-        return Frame(frame.values, frame.depth, frame.alpha)
+        return render_frame(camera, occupancy, self.background, probe, render).picture()
 
     def sizes(self) -> dict[str, int]:
         """Bytes of table, networks and occupancy bits."""

@@ -48,14 +48,10 @@ class FieldOptimiser:
 
     def tensors(self) -> dict[str, Tensor]:
         """The state, for a checkpoint."""
-        adam = self._table
-        tensors = {"adam.first": adam.first, "adam.second": adam.second, "adam.steps": adam.steps}
-        return tensors | checkpoint.optimiser_tensors(self._networks, "network.")
+        networks = checkpoint.optimiser_tensors(self._networks, "network.")
+        return self._table.tensors("adam.") | networks
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Put back what `tensors` gave."""
-        device = self._field.table.device
-        self._table = AdamState(
-            *(tensors[f"adam.{name}"].to(device) for name in ("first", "second", "steps"))
-        )
+        self._table = AdamState.of(tensors, "adam.", self._field.table.device)
         checkpoint.restore_optimiser(self._networks, tensors, "network.")

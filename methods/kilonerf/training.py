@@ -12,7 +12,7 @@ from bench.types import Budget, Scene
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kilonerf.field import KiloField
 from methods.kilonerf.grid import Pieces
-from methods.students.fields import REACH, FieldLessons, FieldTraining
+from methods.students.fields import FieldLessons, FieldTraining
 
 LEAK = 0.01
 """Slope of the density below 0 in distillation: where nothing is, its gradient does not vanish."""
@@ -52,9 +52,6 @@ class KiloTraining(FieldTraining):
     ) -> None:
         super().__init__(field, teacher, scene, budget, options, seed)
         self.networks, self.pieces, self.lessons = field, pieces, options
-        self.optimiser = torch.optim.Adam(
-            field.parameters(), betas=(0.9, 0.99), eps=1e-15, fused=True
-        )
 
     def _places(self) -> tuple[Tensor, Tensor]:
         positions = self.pieces.draw(self.lessons.points_each, self.generator)
@@ -63,19 +60,12 @@ class KiloTraining(FieldTraining):
         )
         return positions, functional.normalize(directions, dim=1)
 
-    def _difference(self, positions: Tensor, directions: Tensor) -> Tensor:
+    def _learned(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """As the base has it, with a density that may fall below 0."""
-        with torch.no_grad():
-            sigma, geometry = self.teacher.density(positions)
-            opacity = 1 - torch.exp(-sigma * REACH)
-            encoded = self.teacher.encode_directions(directions)
-            colour = self.teacher.features(geometry, encoded)[:, :3]
-        raw, geometry = self.networks.raw_density(positions)
-        learned = 1 - torch.exp(-functional.leaky_relu(raw, LEAK))
+        thickness, geometry = self.networks.raw_density(positions)
         encoded = self.networks.encode_directions(directions)
-        shown = self.networks.features(geometry, encoded)
-        weighted = opacity[:, None] * (shown - colour).square()
-        return functional.mse_loss(learned, opacity) + weighted.mean()
+        opacity = 1 - torch.exp(-functional.leaky_relu(thickness, LEAK))
+        return opacity, self.networks.features(geometry, encoded)
 
     def _update(self) -> None:
         if self.step >= self.points_until:

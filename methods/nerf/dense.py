@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -11,6 +9,7 @@ from bench.types import Probe, Rays
 from methods.kernels.composite import Pixels, composite
 from methods.kernels.march import Occupancy, march
 from methods.rendering.field import Field, query
+from methods.rendering.frame import Render
 from methods.rendering.march import March
 
 CHUNK_RAYS = 1 << 9
@@ -23,14 +22,14 @@ def whole_cube(occupancy: Occupancy) -> Occupancy:
 
 
 def every_sample(
-    field: Field, occupancy: Occupancy, probe: Probe, how: March
-) -> Callable[[Tensor, Rays], Pixels]:
-    """What renders rays for `render_frame`: density and colour of all their samples in the cube.
+    field: Field, occupancy: Occupancy, cube: Occupancy, probe: Probe, how: March
+) -> Render:
+    """What renders rays for `render_frame`: density and colour of all their samples in `cube`, the
+    whole one.
 
     Samples outside the cells of `occupancy` then count as empty, so that the picture is that of
     `rendering.frame.everywhere`, but for the colours of samples too faint to be seen.
     """
-    cube = whole_cube(occupancy)
 
     def render(_: Tensor, rays: Rays) -> Pixels:
         canvas = Pixels.blank(len(rays.origins), field.channels, field.device)
@@ -44,17 +43,10 @@ def every_sample(
             with probe.stage("field"):
                 encoded = field.encode_directions(some.directions)
                 sigma, values = query(field, samples.positions, samples.ray, encoded)
-                sigma = torch.where(occupied(samples.positions, occupancy), sigma, 0)
+                sigma = torch.where(occupancy.holds(samples.positions), sigma, 0)
             with probe.stage("composite"):
                 pixels = composite(sigma, values, samples, stop=how.stop, backend=field.backend)
                 canvas.put(part, pixels)
         return canvas
 
     return render
-
-
-def occupied(positions: Tensor, occupancy: Occupancy) -> Tensor:
-    """Whether the cells of `positions` [S, 3] in the unit cube are occupied, [S] bool."""
-    size = occupancy.resolution
-    x, y, z = (positions * size).long().clamp(0, size - 1).unbind(dim=-1)
-    return occupancy.cells[x, y, z]

@@ -7,14 +7,12 @@ from dataclasses import replace
 
 import torch
 
-from bench.cameras import place_camera
-from bench.study import Study, turned
-from bench.types import Camera, Frame, Probe
+from bench.types import Probe
 from methods.instant_ngp.stage1 import Setup
-from methods.kernels.composite import STOP
+from methods.kernels.march import Occupancy
 from methods.nerf.dense import every_sample, whole_cube
 from methods.nerf.field import NerfField
-from methods.rendering.frame import render_frame
+from methods.rendering.frame import Render
 from methods.students.fields import FieldStudent
 from methods.students.networks import NetworkLessons
 
@@ -28,12 +26,7 @@ class Nerf(FieldStudent):
     """
 
     kind = "nerf"
-    study = Study(
-        knobs={"stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3"))},
-        exact=("method.stop=1e-4",),
-        skips={"empty cells": "method.skip"},
-        parts=dict.fromkeys(("rays", "march", "composite"), "field"),
-    )
+    study = replace(FieldStudent.study, skips={"empty cells": "method.skip"})
 
     def __init__(
         self,
@@ -41,12 +34,11 @@ class Nerf(FieldStudent):
         teacher: Setup,
         training: NetworkLessons,
         skip: bool = True,
-        stop: float = STOP,
+        stop: float = 1e-2,
         name: str = "nerf",
         steps: int | None = None,
     ) -> None:
         super().__init__(teacher, training, stop, name, steps)
-        self.training = training
         self.skip = skip
 
     def model_settings(self) -> Mapping[str, object]:
@@ -59,14 +51,9 @@ class Nerf(FieldStudent):
         generator = torch.Generator().manual_seed(teacher.seed)
         return NerfField(teacher.precision, teacher.backend, generator).to(teacher.device)
 
-    @torch.no_grad()
-    def render(self, camera: Camera, probe: Probe) -> Frame:
-        """One frame at the camera's full resolution."""
+    def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
+        """See `Student`."""
         if self.skip:
-            return super().render(camera, probe)
-        camera = place_camera(camera, self.teacher.device)
-        march = replace(self.training.march, stop=self.stop)
-        render = every_sample(self.field, self.occupancy, probe, march)
+            return super().renderer(probe)
         cube = whole_cube(self.occupancy)
-        frame = render_frame(self.field, camera, cube, self.background, probe, render)
-        return Frame(frame.values, frame.depth, frame.alpha)
+        return cube, every_sample(self.field, self.occupancy, cube, probe, self.march)

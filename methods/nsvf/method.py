@@ -10,7 +10,6 @@ import torch
 
 from bench.types import Budget, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField
-from methods.kernels.composite import STOP
 from methods.kernels.encode import encode
 from methods.kernels.march import BRICK, Occupancy
 from methods.nsvf.field import EMBEDDING, NsvfField
@@ -43,7 +42,7 @@ class Nsvf(FieldStudent):
         resolution: int = 128,
         step: float = 0.5,
         start: Start = "teacher",
-        stop: float = STOP,
+        stop: float = 1e-2,
         name: str = "nsvf",
         steps: int | None = None,
     ) -> None:
@@ -59,7 +58,6 @@ class Nsvf(FieldStudent):
             )
         training = replace(training, march_step=step / resolution / STEP)
         super().__init__(teacher, training, stop, name, steps)
-        self.training = training
         self.resolution, self.start = resolution, start
 
     def model_settings(self) -> Mapping[str, object]:
@@ -69,10 +67,7 @@ class Nsvf(FieldStudent):
     def occupied(self, teacher: TrainedField) -> Occupancy:
         """See `FieldStudent`; its cells are the voxels."""
         size = self.resolution
-        x, y, z = occupied_voxels(teacher.occupancy, size).long().unbind(dim=1)
-        cells = torch.zeros(size, size, size, dtype=torch.bool, device=x.device)
-        cells[x, y, z] = True
-        return Occupancy(cells)
+        return Occupancy.at(occupied_voxels(teacher.occupancy, size), size)
 
     def new_field(self) -> NsvfField:
         """See `FieldStudent`."""

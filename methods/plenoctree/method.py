@@ -9,17 +9,17 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from bench.cameras import place_camera
 from bench.study import Axis, Study, Variant, turned
-from bench.types import Budget, Camera, Frame, Probe, Scene
+from bench.types import Budget, Probe, Rays, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.instant_ngp.training import PixelBatches
 from methods.kernels.composite import Pixels
+from methods.kernels.march import Occupancy
 from methods.kernels.voxel_walk import render_voxels
 from methods.plenoctree.octree import Octree
 from methods.plenoctree.start import Extraction, extract
 from methods.plenoctree.training import OctreeLessons, OctreeTraining
-from methods.rendering.frame import FeatureFrame, rays_at_matter
+from methods.rendering.frame import Render
 from methods.rendering.march import March
 from methods.students.method import Student
 
@@ -41,6 +41,7 @@ class PlenOctree(Student):
     """
 
     kind = "plenoctree"
+    training: OctreeLessons
     study = Study(
         knobs={
             "stop": turned("stop", "method.stop", ("1e-1", "1e-3", "1e-4")),
@@ -70,7 +71,7 @@ class PlenOctree(Student):
         if stored not in ("fp16", "fp32"):
             raise ValueError(f"stored: expected fp16 or fp32, got {stored!r}")
         super().__init__(teacher, training, stop, name, steps)
-        self.extraction, self.lessons, self.stored = extraction, training, stored
+        self.extraction, self.stored = extraction, stored
 
     def model_settings(self) -> Mapping[str, object]:
         """What is extracted."""
@@ -82,38 +83,33 @@ class PlenOctree(Student):
         generator = torch.Generator(setup.device).manual_seed(setup.seed)
         batches = PixelBatches(scene.splits["train"], setup.device)
         octree = extract(teacher, batches, self.extraction, generator)
-        return OctreeTraining(octree, scene, budget, self.lessons, setup.seed, setup.backend)
+        return OctreeTraining(octree, scene, budget, self.training, setup.seed, setup.backend)
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """See `Student`."""
         octree = Octree.of(tensors, self.teacher.device)
         self.octree = octree.rounded() if self.stored == "fp16" else octree.visible()
 
-    @torch.no_grad()
-    def render(self, camera: Camera, probe: Probe) -> Frame:
-        """One frame at the camera's full resolution."""
-        camera = place_camera(camera, self.teacher.device)
-        octree, size = self.octree, camera.height * camera.width
-        with probe.stage("rays"):
-            seen, rays = rays_at_matter(camera, octree.occupancy)
-            canvas = Pixels.blank(size, 3, self.teacher.device)
-        probe.count("rays", len(seen), size)
-        with probe.stage("render"):
-            pixels, crossed, shaded = render_voxels(
-                rays,
-                octree.voxels,
-                octree.light,
-                stop=self.stop,
-                faint=March(stop=self.stop).least_weight,
-                backend=self.teacher.backend,
-            )
-        with probe.stage("finish"):
-            samples = int(crossed.sum())
+    def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
+        """See `Student`."""
+        octree = self.octree
+
+        def render(_: Tensor, rays: Rays) -> Pixels:
+            with probe.stage("render"):
+                pixels, crossed, shaded = render_voxels(
+                    rays,
+                    octree.voxels,
+                    octree.light,
+                    stop=self.stop,
+                    faint=March(stop=self.stop).least_weight,
+                    backend=self.teacher.backend,
+                )
+                samples, shown = int(crossed.sum()), int(shaded.sum())
             probe.count("samples", samples)
-            probe.count("shaded_samples", int(shaded.sum()), samples)
-            canvas.put(seen, pixels)
-            frame = FeatureFrame.of(camera, canvas, self.background)
-        return Frame(frame.values, frame.depth, frame.alpha)
+            probe.count("shaded_samples", shown, samples)
+            return pixels
+
+        return octree.occupancy, render
 
     def sizes(self) -> dict[str, int]:
         """Bytes of the leaves' values and of the index, as they are stored."""

@@ -33,10 +33,7 @@ class Octree:
     @cached_property
     def occupancy(self) -> Occupancy:
         """The cells of `CELL`^3 leaves that have any."""
-        side = self.voxels.resolution // CELL
-        cells = torch.zeros(side, side, side, dtype=torch.bool, device=self.voxels.bricks.device)
-        cells[tuple((self.voxels.coordinates.long() // CELL).unbind(dim=1))] = True
-        return Occupancy(cells)
+        return Occupancy.at(self.voxels.coordinates // CELL, self.voxels.resolution // CELL)
 
     def visible(self) -> Octree:
         """The same with densities of 0 where they are negative."""

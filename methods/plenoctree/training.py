@@ -125,17 +125,11 @@ class OctreeTraining(PixelTraining):
         """Moments, random numbers, size of the batch."""
         tensors, figures = super().state()
         for name, adam in self.moments.items():
-            tensors |= {f"{name}.first": adam.first, f"{name}.second": adam.second}
-            tensors[f"{name}.steps"] = adam.steps
+            tensors |= adam.tensors(f"{name}.")
         return tensors, figures
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
         """See `loop.Training`."""
         super().restore(tensors, figures)
         device = self.octree.light.density.device
-        self.moments = {
-            name: AdamState(
-                *(tensors[f"{name}.{slot}"].to(device) for slot in ("first", "second", "steps"))
-            )
-            for name in self.tables
-        }
+        self.moments = {name: AdamState.of(tensors, f"{name}.", device) for name in self.tables}

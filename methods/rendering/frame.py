@@ -9,12 +9,15 @@ import torch
 from torch import Tensor
 
 from bench.cameras import cast, project
-from bench.types import EMPTY_ALPHA, Camera, Probe, Rays
+from bench.types import EMPTY_ALPHA, Camera, Frame, Probe, Rays
 from methods.kernels.composite import Pixels
 from methods.kernels.march import BRICK, Occupancy
 from methods.rendering.field import Field
 from methods.rendering.march import March
 from methods.rendering.rays import render_rays
+
+Render = Callable[[Tensor, Rays], Pixels]
+"""Renders some pixels of a frame, [P] indices row by row, by their rays."""
 
 
 @dataclass(frozen=True)
@@ -42,25 +45,28 @@ class FeatureFrame:
         shape = (camera.height, camera.width)
         return cls(camera, values.view(*shape, -1), depth.view(shape), pixels.alpha.view(shape))
 
+    def picture(self) -> Frame:
+        """What is shown of a field without further features."""
+        return Frame(self.values, self.depth, self.alpha)
+
 
 @torch.no_grad()
 def render_frame(
-    field: Field,
     camera: Camera,
     occupancy: Occupancy,
     background: Tensor,
     probe: Probe,
-    render: Callable[[Tensor, Rays], Pixels],
+    render: Render,
 ) -> FeatureFrame:
     """The frame of `camera`, composited on `background` [K].
 
     Args:
-        render: renders the pixels [P], indices row by row, that may see anything, by their rays.
+        render: renders the pixels that may see anything.
     """
     size = camera.height * camera.width
     with probe.stage("rays"):
         seen, rays = rays_at_matter(camera, occupancy)
-        canvas = Pixels.blank(size, field.channels, field.device)
+        canvas = Pixels.blank(size, len(background), background.device)
     probe.count("rays", len(seen), size)
     rendered = render(seen, rays)
     with probe.stage("finish"):
@@ -68,9 +74,7 @@ def render_frame(
         return FeatureFrame.of(camera, canvas, background)
 
 
-def everywhere(
-    field: Field, occupancy: Occupancy, probe: Probe, how: March
-) -> Callable[[Tensor, Rays], Pixels]:
+def everywhere(field: Field, occupancy: Occupancy, probe: Probe, how: March) -> Render:
     """What marches rays for `render_frame`: whole rays, or within `how.window` [h * w, 2], which is
     given for all pixels."""
 

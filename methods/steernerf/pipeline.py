@@ -132,7 +132,7 @@ class Pipeline:
         render = self._marcher(newest, view, rendering, probe)
         with probe.stage("field"):
             occupancy = self._occupied(rendering)
-            return render_frame(self.field, view.low, occupancy, self.background, probe, render)
+            return render_frame(view.low, occupancy, self.background, probe, render)
 
     def _marcher(
         self, newest: Cloud | None, view: View, rendering: Rendering, probe: Probe

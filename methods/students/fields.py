@@ -11,15 +11,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.cameras import place_camera
-from bench.types import Budget, Camera, Frame, Probe, Rays, Scene
+from bench.types import Budget, Probe, Rays, Scene
 from methods.instant_ngp.stage1 import TrainedField
 from methods.instant_ngp.training import MarchOptions, PixelTraining
 from methods.kernels.composite import Pixels
 from methods.kernels.march import Occupancy
 from methods.rendering.batch import render_batch
 from methods.rendering.field import Field
-from methods.rendering.frame import everywhere, render_frame
+from methods.rendering.frame import Render, everywhere
+from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
 from methods.students.method import Student
 from methods.training import checkpoint, loop
@@ -119,7 +119,9 @@ class FieldTraining(PixelTraining):
         self.occupancy = occupancy or teacher.occupancy
         self.march, self.cells = options.march, self.occupancy.cells.nonzero()
         self.points_until = options.points * self.steps if len(self.cells) else 0
-        self.optimiser = torch.optim.Adam(field.parameters(), betas=(0.9, 0.99), eps=1e-15)
+        self.optimiser = torch.optim.Adam(
+            field.parameters(), betas=(0.9, 0.99), eps=1e-15, fused=True
+        )
 
     def advance(self) -> dict[str, float]:
         """One step; its mean squared error, of opacities and colours or of pixels."""
@@ -149,11 +151,15 @@ class FieldTraining(PixelTraining):
         any."""
         with torch.no_grad():
             wanted, shown = _seen(self.teacher, positions, directions)
-        opacity, colour = _seen(self.field, positions, directions)
+        opacity, colour = self._learned(positions, directions)
         return (
             functional.mse_loss(opacity, wanted)
             + (wanted[:, None] * (colour - shown).square()).mean()
         )
+
+    def _learned(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """What is compared with the teacher's: opacity [S] over `REACH` and colour [S, 3]."""
+        return _seen(self.field, positions, directions)
 
     def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
         return render_batch(
@@ -233,14 +239,14 @@ class FieldStudent(Student):
         self.field = self.new_field()
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
 
-    @torch.no_grad()
-    def render(self, camera: Camera, probe: Probe) -> Frame:
-        """One frame at the camera's full resolution."""
-        camera = place_camera(camera, self.teacher.device)
-        march = replace(self.training.march, stop=self.stop)
-        render = everywhere(self.field, self.occupancy, probe, march)
-        frame = render_frame(self.field, camera, self.occupancy, self.background, probe, render)
-        return Frame(frame.values, frame.depth, frame.alpha)
+    @property
+    def march(self) -> March:
+        """How rays are marched when rendering."""
+        return replace(self.training.march, stop=self.stop)
+
+    def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
+        """See `Student`."""
+        return self.occupancy, everywhere(self.field, self.occupancy, probe, self.march)
 
     def sizes(self) -> dict[str, int]:
         """Bytes of the field and of the occupancy bits."""

@@ -11,22 +11,24 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from bench.cameras import place_camera
 from bench.provenance import decisive
 from bench.sources import digest, libraries
 from bench.study import Study, turned
 from bench.threads import torch_threads
-from bench.types import Budget, Log, Scene
+from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
 from methods.instant_ngp.training import PixelOptions
 from methods.kernels.composite import check_stop
+from methods.kernels.march import Occupancy
+from methods.rendering.frame import Render, render_frame
 from methods.training import checkpoint, loop
 
 
 class Student(ABC):
     """Base of the methods that start from the Instant-NGP field that all methods share.
 
-    `train_s` counts the training of the field,
-    the start of the model and its own training.
+    `train_s` counts the training of the field, the start of the model and its own training.
 
     Args:
         teacher: the field that it starts from, and where it runs.
@@ -66,6 +68,17 @@ class Student(ABC):
     @abstractmethod
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Take over what a training had as its `result`, to be rendered."""
+
+    @abstractmethod
+    def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
+        """Where anything may be seen, and what renders the pixels that may see it."""
+
+    @torch.no_grad()
+    def render(self, camera: Camera, probe: Probe) -> Frame:
+        """One frame at the camera's full resolution."""
+        camera = place_camera(camera, self.teacher.device)
+        occupancy, render = self.renderer(probe)
+        return render_frame(camera, occupancy, self.background, probe, render).picture()
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Train the field and the model, or load what the same trainings left behind."""

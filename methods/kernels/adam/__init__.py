@@ -6,6 +6,7 @@ go on moving it by momentum, and would read and write the whole table every step
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +17,8 @@ from methods.kernels.dispatch import implementation
 
 BETAS = (0.9, 0.99)
 EPS = 1e-15
+
+_NAMES = ("first", "second", "steps")
 
 
 @dataclass
@@ -34,6 +37,16 @@ class AdamState:
             torch.zeros_like(table),
             torch.zeros(len(table), dtype=torch.int32, device=table.device),
         )
+
+    @classmethod
+    def of(cls, tensors: Mapping[str, Tensor], prefix: str, device: torch.device) -> AdamState:
+        """What `tensors` of the same prefix gave, on `device`."""
+        first, second, steps = (tensors[f"{prefix}{name}"].to(device) for name in _NAMES)
+        return cls(first, second, steps)
+
+    def tensors(self, prefix: str) -> dict[str, Tensor]:
+        """The state, for a checkpoint; names begin with `prefix`."""
+        return {f"{prefix}{name}": getattr(self, name) for name in _NAMES}
 
 
 def sparse_adam_(

@@ -45,10 +45,23 @@ class Occupancy:
             raise ValueError(f"cells: expected a side that is a multiple of 16, got {size}")
         self.cells = cells.bool()
 
+    @classmethod
+    def at(cls, coordinates: Tensor, resolution: int) -> Occupancy:
+        """With the cells at integer `coordinates` [V, 3] occupied, of `resolution`^3."""
+        cells = torch.zeros([resolution] * 3, dtype=torch.bool, device=coordinates.device)
+        cells[coordinates.long().unbind(dim=1)] = True
+        return cls(cells)
+
     @property
     def resolution(self) -> int:
         """Cells along a side."""
         return self.cells.shape[0]
+
+    def holds(self, positions: Tensor) -> Tensor:
+        """Whether the cells of `positions` [..., 3] are occupied, [...] bool; what is outside the
+        unit cube belongs to the nearest cell."""
+        size = self.resolution
+        return self.cells[(positions * size).long().clamp(0, size - 1).unbind(dim=-1)]
 
     @cached_property
     def words(self) -> Tensor:

@@ -38,7 +38,7 @@ def _march_block(
     t = near[:, None] + (k + segments.jitter[:, None]) * step_t[:, None]  # [R, K]
     positions = origins[:, None] + t[..., None] * directions[:, None]  # [R, K, 3]
     candidate = alive[:, None] & (t >= window[:, :1]) & (t < far[:, None]) & (k >= start[:, None])
-    candidate &= _occupied(torch.where(candidate[..., None], positions, 0), occupancy)
+    candidate &= occupancy.holds(torch.where(candidate[..., None], positions, 0))
 
     rank = candidate.cumsum(dim=1)
     kept = candidate & (rank <= limit)
@@ -70,9 +70,3 @@ def _cross_unit_cube(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tenso
     lower = torch.where(parallel, outside, torch.minimum(first, second))
     upper = torch.where(parallel, -outside, torch.maximum(first, second))
     return lower.amax(dim=-1), upper.amin(dim=-1)
-
-
-def _occupied(positions: Tensor, occupancy: Occupancy) -> Tensor:
-    size = occupancy.resolution
-    cell = (positions * size).long().clamp(0, size - 1)
-    return occupancy.cells[cell[..., 0], cell[..., 1], cell[..., 2]]

@@ -59,5 +59,5 @@ def _picture(trained: TrainedField, camera: Camera, background: Tensor, march: M
     field, probe = trained.field, NullProbe()
     camera, background = place_camera(camera, field.device), background.to(field.device)
     render = everywhere(field, trained.occupancy, probe, march)
-    frame = render_frame(field, camera, trained.occupancy, background, probe, render)
+    frame = render_frame(camera, trained.occupancy, background, probe, render)
     return (frame.values.clamp(0, 1) * 255).round().to(torch.uint8).cpu()

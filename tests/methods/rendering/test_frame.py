@@ -48,7 +48,7 @@ def test_a_frame_is_its_rays_on_the_background(cloud: tuple[HashField, Occupancy
     camera = replace(camera, c2w=camera.c2w.to(field.device), width=20)
     background, work = torch.tensor((0.25, 0.5, 1.0), device=field.device), Work()
     render = everywhere(field, occupancy, work, March())
-    frame = render_frame(field, camera, occupancy, background, work, render)
+    frame = render_frame(camera, occupancy, background, work, render)
     assert frame.values.shape == (32, 20, 3)
     pixels = render_rays(field, cast(camera), occupancy, NullProbe(), March())
     # The same rays among others: sums of float32 in another order.
@@ -73,9 +73,7 @@ def test_a_window_is_that_of_its_pixel(cloud: tuple[HashField, Occupancy]) -> No
     window[:, :16] = 0.0
     black, probe = torch.zeros(3, device=field.device), NullProbe()
     whole, half = (
-        render_frame(
-            field, camera, occupancy, black, probe, everywhere(field, occupancy, probe, how)
-        )
+        render_frame(camera, occupancy, black, probe, everywhere(field, occupancy, probe, how))
         for how in (March(), March(window=window.view(-1, 2)))
     )
     assert whole.alpha[:, :16].any()

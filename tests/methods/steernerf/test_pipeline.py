@@ -110,9 +110,7 @@ def test_where_every_cell_is_refined_the_picture_is_that_of_the_field(mode: Mode
     pipeline, buffer, probe = new_pipeline(), RenderingBuffer(2), NullProbe()
     shown = pipeline.render(CAMERA, buffer, rendering, probe).rgb
     render = everywhere(pipeline.field, pipeline.occupancy, probe, March(step=4.0 * STEP))
-    field = render_frame(
-        pipeline.field, CAMERA, pipeline.occupancy, pipeline.background, probe, render
-    )
+    field = render_frame(CAMERA, pipeline.occupancy, pipeline.background, probe, render)
     low = pipeline.features(pipeline.view(CAMERA), (), rendering, probe)
     drawn = cells_near(low.alpha > 0)
     assert 10 < len(drawn) < 64

@@ -61,7 +61,7 @@ def render(
     else:
         how = how if where is None else how.within(where.view(-1, 2))
         by = everywhere(field, occupancy, probe, how)
-    frame = render_frame(field, camera, occupancy, background, probe, by)
+    frame = render_frame(camera, occupancy, background, probe, by)
     return frame, probe.done["samples"]
 
 

@@ -60,7 +60,7 @@ def test_a_view_is_what_the_field_shows_at_full_resolution(
         field, occupancy, probe = trained.field, trained.occupancy, NullProbe()
         render = everywhere(field, occupancy, probe, March())
         white = ball_scene.background
-        frame = render_frame(field, view.camera, occupancy, white, probe, render)
+        frame = render_frame(view.camera, occupancy, white, probe, render)
         assert (frame.alpha > 0.1).float().mean() > 0.1
         shown = 255 * frame.values
         assert (view.picture.float() - shown).abs().max() <= 0.5 + 1e-4  # rounded, in float32
