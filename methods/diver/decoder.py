@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from methods.students.networks import positional
+
 CHANNELS = 32
 """Features of a corner, and of every layer between input and output."""
 
@@ -18,9 +20,7 @@ DIRECTION_CHANNELS = 3 + 2 * 3 * FREQUENCIES
 def encode_directions(directions: Tensor) -> Tensor:
     """Unit vectors of ray `directions` [R, 3], with sines and cosines of 1, 2, 4 and 8 times them:
     [R, 27]."""
-    unit = functional.normalize(directions, dim=-1)
-    angles = torch.cat([unit * 2**power for power in range(FREQUENCIES)], dim=-1)
-    return torch.cat((unit, angles.sin(), angles.cos()), dim=-1)
+    return positional(functional.normalize(directions, dim=-1), FREQUENCIES, scale=1.0)
 
 
 class Decoder(nn.Module):

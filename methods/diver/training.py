@@ -16,11 +16,9 @@ from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import STOP, Pixels, composite, visible_counts, weights
 from methods.kernels.voxel_walk import Crossings, walk
 from methods.rendering.field import pad
+from methods.students.voxels import largest_weights
 from methods.training import checkpoint
 from methods.training.optimiser import step_at
-
-CHUNK_RAYS = 1 << 15
-"""Rays that are looked along together when voxels are pruned: bounds the memory."""
 
 
 @dataclass(frozen=True)
@@ -114,15 +112,13 @@ class DiverTraining(PixelTraining):
         """Forget the voxels that no ray of many shows with more than a certain weight (their
         Section 4.1)."""
         model, options = self.model, self.options
-        largest = torch.zeros(len(model.voxels), device=self.grad.device)
-        most = min(options.prune_rays, len(self.batches))
-        for first in range(0, most, CHUNK_RAYS):
-            count = min(CHUNK_RAYS, most - first)
-            rays, _ = self.batches.draw(count, self.generator)
-            crossings = walk(rays, model.voxels, backend=model.backend)
+
+        def weigh(rays: Rays, crossings: Crossings) -> Tensor:
             sigma = self._densities(rays, crossings)
-            weight = weights(sigma, as_intervals(crossings), stop=STOP, backend=model.backend)
-            largest.scatter_reduce_(0, crossings.voxel.long(), weight, "amax")
+            return weights(sigma, as_intervals(crossings), stop=STOP, backend=model.backend)
+
+        looked_along = self.batches, options.prune_rays, self.generator
+        largest = largest_weights(model.voxels, weigh, *looked_along, model.backend)
         rows = model.keep(largest >= options.prune_below).long()
         moments = self.moments
         self.moments = AdamState(moments.first[rows], moments.second[rows], moments.steps[rows])

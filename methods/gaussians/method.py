@@ -155,8 +155,7 @@ class GaussianSplatting:
         camera = place_camera(camera, self.setup.device)
         pixels = self.gaussians.render(camera, self.stop, probe, self.setup.backend)
         with probe.stage("finish"):
-            frame = FeatureFrame.of(camera, pixels, self.background)
-        return Frame(frame.values, frame.depth, frame.alpha)
+            return FeatureFrame.of(camera, pixels, self.background).picture()
 
     def sizes(self) -> dict[str, int]:
         """Bytes of the Gaussians' parameters, as they are stored."""

@@ -1,8 +1,8 @@
 """What the numba backends share.
 
 numba caches compiled code by the file of the calling function alone: after a change of
-`pack_bf16`, or of a constant that such a file imports from another (`PRIMES`, `TAPS`, `PARALLEL`),
-remove the `__pycache__` of its callers.
+`pack_bf16`, `sigmoid` or `march.cpu.slope`, or of a constant that such a file imports from another
+(`PRIMES`, `TAPS`), remove the `__pycache__` of its callers.
 
 The process that compiles a function runs another copy of it than the processes that load it from
 the cache: LLVM has optimised one of them twice. Where it may choose how to round, the copies can
@@ -12,6 +12,8 @@ give the same bits in all cases of the kernel.
 """
 
 from __future__ import annotations
+
+import math
 
 import numba
 import numpy as np
@@ -27,6 +29,12 @@ def follow_torch_threads() -> None:
     numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
     if torch.get_num_threads() != threads:  # starting its own, numba changed those of OpenMP
         torch.set_num_threads(threads)
+
+
+@njit(cache=True)
+def sigmoid(x):
+    """1 / (1 + e^-x) of a float32."""
+    return f32(1) / (f32(1) + f32(math.exp(-x)))
 
 
 @njit(cache=True)

@@ -12,15 +12,13 @@ from torch import Tensor
 from bench.types import SteerbenchError
 from methods.instant_ngp.stage1 import TrainedField
 from methods.instant_ngp.training import PixelBatches
-from methods.kernels.composite import STOP, visible_counts, weights
+from methods.kernels.composite import STOP, weights
 from methods.kernels.march import Occupancy
 from methods.kernels.spherical import spherical_harmonics
-from methods.kernels.voxel_walk import BRICK, Light, Voxels, walk
+from methods.kernels.voxel_walk import BRICK, Light, Voxels
 from methods.plenoctree.octree import Octree
 from methods.rendering.field import Field, pad
-
-RAYS = 1 << 15
-"""Training rays whose weights are looked at together."""
+from methods.students.voxels import largest_weights
 
 QUERIES = 1 << 18
 """Places of the field that are looked at together."""
@@ -85,7 +83,13 @@ def extract(
     candidates = _candidates(teacher.occupancy, options)
     density = _densities(teacher.field, candidates, options.resolution, options.points, generator)
     voxels = Voxels(candidates, options.resolution)
-    seen = _largest_weights(voxels, density, batches, min(options.rays, len(batches)), generator)
+    seen = largest_weights(
+        voxels,
+        lambda _, crossings: weights(density[crossings.voxel], crossings, stop=STOP),
+        batches,
+        options.rays,
+        generator,
+    )
     kept = (seen >= options.least_weight) & (density > 0)
     if not kept.any():
         raise SteerbenchError(
@@ -130,21 +134,6 @@ def _densities(
             total += field.density(pad((part + jitter) / resolution))[0][: len(part)]
         found.append(total / points)
     return torch.cat(found)
-
-
-def _largest_weights(
-    voxels: Voxels, density: Tensor, batches: PixelBatches, rays: int, generator: torch.Generator
-) -> Tensor:
-    """The largest weight [V] of each voxel on any of so many random training rays (Section 4)."""
-    largest = torch.zeros_like(density)
-    for first in range(0, rays, RAYS):
-        some, _ = batches.draw(min(RAYS, rays - first), generator)
-        crossings = walk(some, voxels)
-        sigma = density[crossings.voxel]
-        crossings = crossings.front(visible_counts(sigma, crossings, stop=STOP))
-        weight = weights(density[crossings.voxel], crossings, stop=STOP)
-        largest.scatter_reduce_(0, crossings.voxel.long(), weight, "amax")
-    return largest
 
 
 def _harmonics(field: Field, voxels: Voxels, degree: int, directions: int) -> Tensor:

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
-from bench.types import check_shape
+from bench.types import Rays, check_shape
+from methods.instant_ngp.training import PixelBatches
 from methods.kernels.march import Occupancy
+from methods.kernels.voxel_walk import Crossings, Voxels, walk
+
+CHUNK_RAYS = 1 << 15
+"""Rays that are looked along together: bounds the memory."""
 
 OFFSETS = tuple((c & 1, c >> 1 & 1, c >> 2 & 1) for c in range(8))
 """Of a voxel's corners and of its eighths: bit 0 is +x, bit 1 +y, bit 2 +z."""
@@ -56,3 +63,28 @@ def occupied_voxels(occupancy: Occupancy, resolution: int) -> Tensor:
         sums = torch.cat((torch.zeros_like(counts.narrow(axis, 0, 1)), counts.cumsum(axis)), axis)
         counts = (sums.index_select(axis, last) - sums.index_select(axis, first)).int()
     return counts.nonzero().int()
+
+
+@torch.no_grad()
+def largest_weights(
+    voxels: Voxels,
+    weigh: Callable[[Rays, Crossings], Tensor],
+    batches: PixelBatches,
+    rays: int,
+    generator: torch.Generator,
+    backend: str = "auto",
+) -> Tensor:
+    """The largest weight [V] that each voxel has in a pixel, over random training rays.
+
+    Args:
+        weigh: the weights [S] of what rays cross.
+        rays: how many are looked along, at most as many as there are.
+    """
+    largest = torch.zeros(len(voxels), device=voxels.coordinates.device)
+    most = min(rays, len(batches))
+    for first in range(0, most, CHUNK_RAYS):
+        some, _ = batches.draw(min(CHUNK_RAYS, most - first), generator)
+        crossings = walk(some, voxels, backend=backend)
+        weight = weigh(some, crossings)
+        largest.scatter_reduce_(0, crossings.voxel.long(), weight, "amax")
+    return largest

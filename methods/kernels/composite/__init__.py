@@ -38,6 +38,12 @@ class Intervals:
     delta: Tensor
     offsets: Tensor
 
+    def first_of_each(self, counts: Tensor) -> tuple[Tensor, Tensor]:
+        """The first `counts` [R] samples of each ray, as indices, and their own `offsets`."""
+        offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
+        shift = (self.offsets - offsets)[:-1].repeat_interleave(counts)
+        return torch.arange(len(shift), device=shift.device) + shift, offsets
+
 
 @dataclass(frozen=True)
 class Pixels:

@@ -121,9 +121,7 @@ class Samples(Intervals):
 
     def front(self, counts: Tensor) -> Samples:
         """Only the first `counts` [R] samples of each ray, which then has no more."""
-        offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
-        shift = (self.offsets - offsets)[:-1].repeat_interleave(counts)
-        kept = torch.arange(len(shift), device=shift.device) + shift
+        kept, offsets = self.first_of_each(counts)
         return Samples(
             self.t[kept],
             self.delta[kept],

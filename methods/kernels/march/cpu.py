@@ -68,7 +68,7 @@ def march(segments: Segments, occupancy: Occupancy, step: float, limit: int) -> 
 
 
 @njit(cache=True)
-def _slope(direction):
+def slope(direction):
     """t by length along an axis; 0 for a ray that does not move along it."""
     return f32(1) / direction if abs(direction) >= PARALLEL else f32(0)
 
@@ -78,13 +78,13 @@ def _cross(origin, direction, box):
     """Where a ray enters and leaves a box; enter > leave where it misses (slab test)."""
     enter, leave = f32(-np.inf), f32(np.inf)
     for axis in range(3):
-        slope = _slope(direction[axis])
-        if slope == 0:
+        along = slope(direction[axis])
+        if along == 0:
             if origin[axis] < box[0, axis] or origin[axis] > box[1, axis]:
                 return f32(np.inf), f32(-np.inf)
         else:
-            a = (box[0, axis] - origin[axis]) * slope
-            b = (box[1, axis] - origin[axis]) * slope
+            a = (box[0, axis] - origin[axis]) * along
+            b = (box[1, axis] - origin[axis]) * along
             enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
     return enter, leave
 
@@ -128,7 +128,7 @@ def _march_ray(origin, direction, words, clearance, bounds, step, window, phase,
     step_t, steps_per_t = step / length, length / step
     size = words.shape[0] * 4
     width = f32(1) / f32(size)
-    sx, sy, sz = _slope(dx), _slope(dy), _slope(dz)
+    sx, sy, sz = slope(dx), slope(dy), slope(dz)
 
     # Skip what lies before the window and the box of occupied cells, with a step to spare for
     # rounding.

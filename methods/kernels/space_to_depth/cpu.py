@@ -6,13 +6,11 @@ sums every time. It takes as long to read what is added as to add it.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from numba import njit, prange
 from torch import Tensor
 
-from methods.kernels.cpu import f32
+from methods.kernels.cpu import f32, sigmoid
 from methods.kernels.space_to_depth import TAPS, CellInputs, Layout, Pair
 
 FAST = {"contract"}
@@ -296,7 +294,7 @@ def _pixels(base, rows, output, matrix, channels, history, surface, pixels):
                 pixels[n, sub, c] = base[n, sub, c] + output[n, sub * outputs + c]
             if history >= 0:
                 column = history + 4 * sub
-                share = _sigmoid(output[n, sub * outputs + 3]) * rows[n, column + 3]
+                share = sigmoid(output[n, sub * outputs + 3]) * rows[n, column + 3]
                 for c in range(3):
                     pixels[n, sub, c] += share * rows[n, column + c]
             if surface >= 0:
@@ -322,7 +320,7 @@ def _pixels_back(
                 grad_output[n, sub * outputs + c] = grad[n, sub, c]
             if history >= 0:
                 column = history + 4 * sub
-                share, known = _sigmoid(output[n, sub * outputs + 3]), rows[n, column + 3]
+                share, known = sigmoid(output[n, sub * outputs + 3]), rows[n, column + 3]
                 along = f32(0)
                 for c in range(3):
                     grad_rows[n, column + c] = share * known * grad[n, sub, c]
@@ -342,8 +340,3 @@ def _pixels_back(
                     grad_rows[n, column + i] += weight * along
                     if i < 3:
                         grad_rows[n, column + 3] += value * along
-
-
-@njit(cache=True)
-def _sigmoid(x):
-    return f32(1) / (f32(1) + math.exp(-x))

@@ -6,13 +6,11 @@ are the same every time.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from numba import get_num_threads, njit, prange
 from torch import Tensor
 
-from methods.kernels.cpu import f32
+from methods.kernels.cpu import f32, sigmoid
 from methods.kernels.spherical import spherical_harmonics
 
 CHUNK = 1 << 12  # voxels
@@ -56,11 +54,6 @@ class _Shade(torch.autograd.Function):
         return target if buffer is None else None, None, None, None, None
 
 
-@njit(cache=True)
-def _sigmoid(x):
-    return f32(1) / (f32(1) + f32(math.exp(-x)))
-
-
 @njit(cache=True, parallel=True)
 def _shade(harmonics, voxel, ray, basis, colours):
     total, size = len(voxel), harmonics.shape[1]
@@ -73,9 +66,9 @@ def _shade(harmonics, voxel, ray, basis, colours):
                 green += values[k] * coefficients[k, 1]
                 blue += values[k] * coefficients[k, 2]
             colours[i, 0], colours[i, 1], colours[i, 2] = (
-                _sigmoid(red),
-                _sigmoid(green),
-                _sigmoid(blue),
+                sigmoid(red),
+                sigmoid(green),
+                sigmoid(blue),
             )
 
 

@@ -20,7 +20,6 @@ from torch.nn import functional
 from bench.types import Rays, check_shape
 from methods.kernels.composite import STOP, Intervals, Pixels, check_stop
 from methods.kernels.dispatch import implementation
-from methods.kernels.march import PARALLEL as PARALLEL
 from methods.kernels.spherical import SIZES
 
 BRICK = 8
@@ -131,9 +130,7 @@ class Crossings(Intervals):
 
     def front(self, counts: Tensor) -> Crossings:
         """Only the first `counts` [R] of each ray, which then has no more."""
-        offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
-        shift = (self.offsets - offsets)[:-1].repeat_interleave(counts)
-        kept = torch.arange(len(shift), device=shift.device) + shift
+        kept, offsets = self.first_of_each(counts)
         return Crossings(
             self.t[kept],
             self.delta[kept],

@@ -18,9 +18,10 @@ from torch.nn.functional import normalize
 
 from bench.types import Rays
 from methods.kernels.composite import Pixels
-from methods.kernels.cpu import f32, i32
+from methods.kernels.cpu import f32, i32, sigmoid
+from methods.kernels.march.cpu import slope
 from methods.kernels.spherical import spherical_harmonics
-from methods.kernels.voxel_walk import PARALLEL, Crossings, Light, Voxels
+from methods.kernels.voxel_walk import Crossings, Light, Voxels
 
 CHUNK = 64  # rays
 ROUND = 16
@@ -99,12 +100,6 @@ def render_voxels(
 
 
 @njit(cache=True)
-def _slope(direction):
-    """t by length along an axis; 0 for a ray that does not move along it."""
-    return f32(1) / direction if abs(direction) >= PARALLEL else f32(0)
-
-
-@njit(cache=True)
 def _length(dx, dy, dz):
     """Of a direction."""
     return f32(math.sqrt(f64(dx) ** 2 + f64(dy) ** 2 + f64(dz) ** 2))
@@ -167,7 +162,7 @@ def _walk_ray(
     width = f32(1) / f32(size)
     ox, oy, oz = origin[0], origin[1], origin[2]
     dx, dy, dz = direction[0], direction[1], direction[2]
-    sx, sy, sz = _slope(dx), _slope(dy), _slope(dz)
+    sx, sy, sz = slope(dx), slope(dy), slope(dz)
     ax, bx = _slab(ox, sx, size, width)
     ay, by = _slab(oy, sy, size, width)
     az, bz = _slab(oz, sz, size, width)
@@ -296,11 +291,6 @@ def _place(
 
 
 @njit(cache=True)
-def _sigmoid(x):
-    return f32(1) / (f32(1) + f32(math.exp(-x)))
-
-
-@njit(cache=True)
 def _colour(coefficients, basis):
     size = coefficients.shape[0]
     red, green, blue = f32(0), f32(0), f32(0)
@@ -308,7 +298,7 @@ def _colour(coefficients, basis):
         red += basis[k] * coefficients[k, 0]
         green += basis[k] * coefficients[k, 1]
         blue += basis[k] * coefficients[k, 2]
-    return _sigmoid(red), _sigmoid(green), _sigmoid(blue)
+    return sigmoid(red), sigmoid(green), sigmoid(blue)
 
 
 @njit(cache=True, parallel=True)

@@ -11,8 +11,9 @@ from torch.nn.functional import normalize
 
 from bench.types import Rays
 from methods.kernels.composite import Pixels, composite, visible_counts, weights
+from methods.kernels.march import PARALLEL
 from methods.kernels.spherical import shade
-from methods.kernels.voxel_walk import BRICK, PARALLEL, Crossings, Light, Voxels
+from methods.kernels.voxel_walk import BRICK, Crossings, Light, Voxels
 
 BLOCK = 1 << 11
 """Rays whose planes are sorted at once."""

@@ -42,8 +42,9 @@ def test_it_has_the_parameters_of_the_published_one() -> None:
 def test_directions_are_encoded_by_sines_and_cosines() -> None:
     encoded = encode_directions(torch.tensor([[0.0, 3.0, 4.0]]))
     want = [0.0, 0.6, 0.8]
-    for function in (math.sin, math.cos):
-        want += [function(2**k * x) for k in range(4) for x in (0.0, 0.6, 0.8)]
+    for k in range(4):
+        for function in (math.sin, math.cos):
+            want += [function(2**k * x) for x in (0.0, 0.6, 0.8)]
     torch.testing.assert_close(encoded, torch.tensor([want]), rtol=0, atol=1e-6)
     assert encoded.shape == (1, 27)
 

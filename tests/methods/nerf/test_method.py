@@ -57,7 +57,7 @@ def test_it_learns_a_ball(ball_scene: Scene, log: Log) -> None:
 
 
 def test_skipping_changes_no_picture_and_saves_products(ball_scene: Scene, log: Log) -> None:
-    method = fitted(ball_scene, log, steps=20)
+    method = fitted(ball_scene, log, steps=20, stop=STOP)
     camera = ball_scene.splits["test"].cameras[0]
     skipping, dense = Work(), Work()
     fast = method.render(camera, skipping)
