@@ -127,6 +127,17 @@ ARGUMENTS = {
         *_one("--fps", help="frames a second of it (default 30)", type=float, default=30.0),
         *_words("method=ngp scene=totem trajectory=test budget=small"),
     ],
+    "view": [
+        *_one("--run", help="take the settings of this run of the store", metavar="KEY"),
+        *_one("--beside", help="compare with this method", metavar="METHOD"),
+        *_one(
+            "--host",
+            help="address to serve (default 127.0.0.1: this machine alone; 0.0.0.0: everyone)",
+            default="127.0.0.1",
+        ),
+        *_one("--port", help="(default 8080)", type=positive_int, default=8080, metavar="N"),
+        *_words("method=ngp scene=totem trajectory=test budget=small"),
+    ],
     "pretrain": [
         *_count("--scenes", 8, "random scenes"),
         *_one(

@@ -78,6 +78,20 @@ def dispatch(argv: Sequence[str]) -> int:
         from sweeps import run
 
         return run.main(argv[1:] if argv[0] == "run" else argv)
+    options = parsed(argv)
+    if options.command is None:
+        options.parser.print_help()
+        return 0
+    module = COMMANDS[options.command].get("module", options.command)
+    return importlib.import_module(f"sweeps.{module}").main(options)
+
+
+def parsed(argv: Sequence[str]) -> argparse.Namespace:
+    """The arguments of a command other than `run`; see `sweeps.arguments`.
+
+    Raises:
+        SteerbenchError: there is no such command, or no such argument.
+    """
     parser = _parser()
     if argv and not argv[0].startswith("-") and argv[0] not in COMMANDS:
         raise unknown("command", argv[0], COMMANDS)
@@ -89,11 +103,7 @@ def dispatch(argv: Sequence[str]) -> int:
     if unread:
         known = re.findall(r"--[\w-]+", options.parser.format_help())
         raise unknown("argument", unread[0], set(known))
-    if options.command is None:
-        parser.print_help()
-        return 0
-    module = COMMANDS[options.command].get("module", options.command)
-    return importlib.import_module(f"sweeps.{module}").main(options)
+    return options
 
 
 def _parser() -> Parser:

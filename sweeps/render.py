@@ -28,7 +28,7 @@ from sweeps.overrides import composed, setting
 
 def main(options: argparse.Namespace) -> int:
     """Render, write `0000.png` and so on, the path and the video; say where they are."""
-    words = [*_of_run(options.run, options.overrides), *options.overrides]
+    words = [*words_of_run(options.run, options.overrides), *options.overrides]
     if options.path:
         place = setting("trajectory.path", str(options.path.resolve()))
         words = [*words, "trajectory=path", place]
@@ -69,7 +69,7 @@ def _drawn(method: Method, camera: Camera, index: int) -> np.ndarray:
     return (255 * quantise(frame.rgb.cpu())).round().byte().numpy()
 
 
-def _of_run(key: str | None, words: Sequence[str]) -> list[str]:
+def words_of_run(key: str | None, words: Sequence[str]) -> list[str]:
     """The words of the command that measured a run of the store."""
     if key is None:
         return []

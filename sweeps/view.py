@@ -1,0 +1,77 @@
+"""`steerbench view`: methods in a browser, their camera steered with the mouse."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from bench.console import ConsoleLog
+from bench.study import Variant, study_of
+from bench.viewing import Painter
+from sweeps.build import build
+from sweeps.measurement import scene_of, trained
+from sweeps.overrides import composed
+from sweeps.render import words_of_run
+from sweeps.viewer import AS_GIVEN, Viewer
+
+
+def main(options: argparse.Namespace) -> int:
+    """Train the methods or find them, serve the page, draw until interrupted."""
+    viewer = opened(options)
+    try:
+        while True:
+            viewer.draw()
+    finally:
+        viewer.stop()
+
+
+def opened(options: argparse.Namespace) -> Viewer:
+    """The viewer that the command describes; it says where it is.
+
+    Raises:
+        SteerbenchError: a setting is wrong, the training failed, or viser is not there.
+    """
+    words = [*words_of_run(options.run, options.overrides), *options.overrides]
+    beside = [[*words, f"method={options.beside}"]] if options.beside else []
+    wanted = [_Tuned(each) for each in (words, *beside)]
+    config = composed(words)
+    log, scene = ConsoleLog(Path(config.outputs)), scene_of(config)
+    first = build(config, "trajectory", scene).steps[0].camera
+    painter = Painter([trained(composed(one.words()), log) for one in wanted])
+    for method, one in zip(painter.methods, wanted, strict=True):
+        one.knobs = dict(study_of(method).knobs)
+    names = [{name: [v.name for v in one.knobs[name]] for name in one.knobs} for one in wanted]
+
+    def turn(place: int, knob: str, setting: str) -> None:
+        one = wanted[place]
+        before = dict(one.chosen)
+        one.chosen[knob] = setting
+        try:
+            painter.put(place, trained(composed(one.words()), log))
+        except Exception:
+            one.chosen = before
+            raise
+
+    address, folder = (options.host, options.port), Path(config.outputs) / "view"
+    viewer = Viewer(painter, scene, first, names, turn, folder, log, address)
+    log.info(f"open http://{options.host}:{viewer.port} in a browser; Ctrl-C ends it")
+    return viewer
+
+
+class _Tuned:
+    """The words that describe a method, and what its knobs were turned to."""
+
+    def __init__(self, words: Sequence[str]) -> None:
+        self._words = words
+        self.knobs: dict[str, Sequence[Variant]] = {}
+        self.chosen: dict[str, str] = {}
+
+    def words(self) -> list[str]:
+        """Of the method with its knobs as they are."""
+        words = [*self._words]
+        for knob, setting in self.chosen.items():
+            if setting != AS_GIVEN:
+                (variant,) = [v for v in self.knobs[knob] if v.name == setting]
+                words += variant.settings
+        return words

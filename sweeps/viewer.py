@@ -1,0 +1,278 @@
+"""The page of `steerbench view`, on viser: a camera for the mouse, settings and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stdout
+from dataclasses import dataclass, field
+from io import StringIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from bench import paths
+from bench.compositing import composite
+from bench.errors import SteerbenchError, Unavailable
+from bench.metrics import psnr
+from bench.types import Camera, Log, Scene
+from bench.viewing import (
+    Ask,
+    Drawn,
+    Painter,
+    Turns,
+    as_bytes,
+    difference,
+    divided,
+    seen_from,
+)
+
+if TYPE_CHECKING:
+    from viser import CameraHandle, ClientHandle, ViserServer
+
+TALLEST = 2160
+"""Rows of a picture at most."""
+
+LAST = 1e6
+"""Place of what stands below all that has no place of its own."""
+
+JPEG_QUALITY = 90
+
+AS_GIVEN = "as given"
+"""The setting of a knob that nobody has turned."""
+
+SIDE, DIFFERENCE, ERROR, TRUTH = "side by side", "difference x 4", "error x 4", "exact picture"
+
+
+@dataclass
+class Browser:
+    """What one browser has chosen, and the cameras that it records."""
+
+    client: ClientHandle
+    shown: Any
+    split: Any
+    height: Any
+    exact: Any
+    record: Any
+    figures: Any
+    path: list[Camera] = field(default_factory=list)
+
+
+class Viewer:
+    """Serves the page and draws, until it is stopped.
+
+    Args:
+        painter: with one method, or with two to compare.
+        knobs: by method and knob, the names of its settings.
+        turn: is called with method, knob and setting; it gives the painter another method.
+        folder: where recorded paths go.
+
+    Raises:
+        Unavailable: viser is not installed.
+        SteerbenchError: the address cannot be served.
+    """
+
+    def __init__(
+        self,
+        painter: Painter,
+        scene: Scene,
+        first: Camera,
+        knobs: Sequence[Mapping[str, Sequence[str]]],
+        turn: Callable[[int, str, str], None],
+        folder: Path,
+        log: Log,
+        address: tuple[str, int],
+    ) -> None:
+        self.painter, self.scene, self.first, self.log = painter, scene, first, log
+        self.knobs, self.turn, self.folder = knobs, turn, folder
+        self.turns, self.browsers = Turns(), dict[int, Browser]()
+        self._turned: list[tuple[int, str, str]] = []
+        self.server = _serve(*address)
+        up = -torch.stack([camera.c2w[:, 1] for camera in scene.splits["train"].cameras]).sum(dim=0)
+        self.server.scene.set_up_direction(_three(functional.normalize(up, dim=0)))
+        self._look(self.server.initial_camera, first)
+        self._add_knobs()
+        self.server.on_client_connect(self._join)
+        self.server.on_client_disconnect(self._leave)
+
+    @property
+    def port(self) -> int:
+        """On which it is served: the next free one where the one asked for was taken."""
+        return self.server.get_port()
+
+    def draw(self, timeout: float | None = None) -> bool:
+        """Draw for the browser that has waited longest; whether there was one within `timeout`
+        seconds."""
+        found = self.turns.next(timeout)
+        while self._turned:
+            self._turn(*self._turned.pop(0))
+        if found is None:
+            return False
+        who, ask = found
+        browser = self.browsers.get(who) if isinstance(who, int) else None
+        if browser is None:  # it left
+            return True
+        camera = self.painter.sized(ask)
+        drawn = self.painter.draw(who, camera)
+        whole = camera is ask.camera
+        truth = None
+        if self.scene.exact and whole and (browser.exact.value or browser.shown.value in _EXACT):
+            truth = composite(self.scene.exact(camera), self.scene.background)
+        self._show(browser, drawn, truth)
+        if not whole:
+            self.turns.offer(who, Ask(ask.camera, still=True))
+        elif browser.record.value:
+            if not (browser.path and torch.equal(browser.path[-1].c2w, camera.c2w)):
+                browser.path.append(camera)
+        elif browser.path:
+            self._save(browser)
+        return True
+
+    def stop(self) -> None:
+        """Serve no longer."""
+        with redirect_stdout(StringIO()):
+            self.server.stop()
+
+    def _look(self, at: Any, camera: Camera) -> None:
+        """Point a camera of viser, that of a browser or the initial one."""
+        position, middle = camera.c2w[:, 3], self.scene.bounds.mean(dim=0)
+        ahead = camera.c2w[:, 2]
+        distance = torch.dot(middle - position, ahead).clamp(min=0.1)
+        at.position, at.look_at = _three(position), _three(position + distance * ahead)
+        at.fov = 2 * float(np.arctan(camera.height / 2 / camera.fy))
+
+    def _add_knobs(self) -> None:
+        gui = self.server.gui
+        for place, (method, knobs) in enumerate(zip(self.painter.methods, self.knobs, strict=True)):
+            if not knobs:
+                continue
+            with gui.add_folder(f"knobs of {method.name}", order=LAST, expand_by_default=False):
+                for knob, settings in knobs.items():
+                    choice = gui.add_dropdown(knob, (AS_GIVEN, *settings))
+                    choice.on_update(self._turner(place, knob, choice))
+
+    def _turner(self, place: int, knob: str, choice: Any) -> Callable[[Any], None]:
+        def turned(_: Any) -> None:
+            self._turned.append((place, knob, choice.value))
+            self._redraw()
+
+        return turned
+
+    def _turn(self, place: int, knob: str, setting: str) -> None:
+        try:
+            self.turn(place, knob, setting)
+        except SteerbenchError as error:
+            self.log.info(str(error))
+            for browser in self.browsers.values():
+                browser.client.add_notification(knob, str(error), color="red")
+
+    def _redraw(self) -> None:
+        for who in list(self.browsers):
+            self._want(who)
+
+    def _join(self, client: ClientHandle) -> None:
+        gui, names = client.gui, [method.name for method in self.painter.methods]
+        two = len(names) == 2
+        choices = [*dict.fromkeys(names), *((SIDE, DIFFERENCE) if two else ())]
+        choices += [TRUTH, ERROR] if self.scene.exact else []
+        browser = Browser(
+            client,
+            shown=gui.add_dropdown("picture", choices, initial_value=SIDE if two else choices[0]),
+            split=gui.add_slider("divided at", 0.0, 1.0, 0.01, 0.5, visible=two),
+            height=gui.add_slider("rows", 16, TALLEST, 8, self.first.height),
+            exact=gui.add_checkbox("PSNR", False, visible=self.scene.exact is not None),
+            record=gui.add_checkbox("record a path", False),
+            figures=gui.add_markdown("drawing the first picture ..."),
+        )
+        controls = browser.shown, browser.split, browser.height, browser.exact, browser.record
+        for control in controls:
+            control.on_update(lambda _: self._want(client.client_id))
+        gui.add_button("first view").on_click(lambda _: self._look(client.camera, self.first))
+        self.browsers[client.client_id] = browser
+        client.camera.on_update(lambda _: self._want(client.client_id))
+        self._want(client.client_id)
+
+    def _leave(self, client: ClientHandle) -> None:
+        self.turns.forget(client.client_id)
+        self.browsers.pop(client.client_id, None)
+
+    def _want(self, who: int) -> None:
+        if browser := self.browsers.get(who):
+            self.turns.want(who, Ask(_camera(browser.client.camera, int(browser.height.value))))
+
+    def _save(self, browser: Browser) -> None:
+        """Write the path that was recorded, and forget it."""
+        last = browser.path[-1]
+        cameras = [c for c in browser.path if (c.width, c.height) == (last.width, last.height)]
+        self.folder.mkdir(parents=True, exist_ok=True)
+        number = len(list(self.folder.glob("path-*.json"))) + 1
+        file = self.folder / f"path-{number}.json"
+        paths.write(file, cameras, self.scene)
+        note = f"{len(cameras)} views: trajectory=path trajectory.path={file}"
+        self.log.info(note)
+        browser.client.add_notification("path saved", note)
+        browser.path.clear()
+
+    def _show(self, browser: Browser, drawn: Sequence[Drawn], truth: Tensor | None) -> None:
+        picture = self._picture(browser, drawn, truth)
+        client = browser.client
+        if client.client_id in self.browsers:  # it did not leave while this was drawn
+            client.scene.set_background_image(as_bytes(picture), "jpeg", jpeg_quality=JPEG_QUALITY)
+            browser.figures.content = _figures(self.painter, drawn, truth)
+
+    def _picture(self, browser: Browser, drawn: Sequence[Drawn], truth: Tensor | None) -> Tensor:
+        shown, first, last = browser.shown.value, drawn[0].rgb, drawn[-1].rgb
+        if shown == SIDE:
+            return divided(first, last, browser.split.value)
+        if shown == DIFFERENCE:
+            return difference(first, last)
+        if shown in _EXACT and truth is not None:
+            return truth if shown == TRUTH else difference(first, truth)
+        names = [method.name for method in self.painter.methods]
+        return drawn[names.index(shown)].rgb if shown in names else first
+
+
+_EXACT = (TRUTH, ERROR)
+
+
+def _serve(host: str, port: int) -> ViserServer:
+    try:
+        import viser
+    except ImportError as error:
+        raise Unavailable("view needs viser: pip install 'steerbench[viewer]'") from error
+    try:
+        with redirect_stdout(StringIO()):  # it would print its address in a frame
+            server = viser.ViserServer(host=host, port=port, label="steerbench", verbose=False)
+    except OSError as error:
+        raise SteerbenchError(f"cannot serve {host}:{port}: {error}") from error
+    server.gui.configure_theme(show_logo=False, show_share_button=False)
+    return server
+
+
+def _camera(handle: CameraHandle, height: int) -> Camera:
+    """The camera of a browser, with so many rows and square pixels."""
+    import viser.transforms
+
+    rotation = viser.transforms.SO3(handle.wxyz).as_matrix()
+    width = max(round(height * handle.aspect), 1)
+    return seen_from(rotation, handle.position, handle.fov, width, height)
+
+
+def _three(vector: Tensor) -> tuple[float, float, float]:
+    x, y, z = vector.tolist()
+    return x, y, z
+
+
+def _figures(painter: Painter, drawn: Sequence[Drawn], truth: Tensor | None) -> str:
+    """Frame times, the stages of each and PSNR, as Markdown."""
+    height, width = drawn[0].rgb.shape[:2]
+    lines = [f"{width} x {height} pixels", ""]
+    for method, one in zip(painter.methods, drawn, strict=True):
+        quality = "" if truth is None else f", {psnr(one.rgb, truth):.2f} dB"
+        lines += [f"**{method.name}** {one.ms:.0f} ms{quality}", "", "| stage | ms |", "|---|---|"]
+        lines += [f"| {stage} | {ms:.1f} |" for stage, ms in one.stages_ms.items()]
+        lines.append("")
+    return "\n".join(lines)

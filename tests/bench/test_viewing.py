@@ -1,0 +1,146 @@
+"""What a viewer draws, and for whom."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from bench.cameras import look_at
+from bench.types import Camera, Frame, NullProbe, Probe
+from bench.viewing import (
+    COARSE,
+    FLUENT_MS,
+    Ask,
+    Painter,
+    Turns,
+    as_bytes,
+    difference,
+    divided,
+    seen_from,
+)
+
+CAMERA = Camera(torch.eye(3, 4), 40.0, 40.0, 16.0, 12.0, 32, 24)
+
+
+class Counting:
+    """Paints how many frames of a sequence there were, in 256ths."""
+
+    name, train_s, memory = "counting", 0.0, 1
+
+    def __init__(self) -> None:
+        self.frames = 0
+
+    def reset(self) -> None:
+        self.frames = 0
+
+    def render(self, camera: Camera, probe: Probe) -> Frame:
+        size = (camera.height, camera.width)
+        self.frames += 1
+        with probe.stage("count"):
+            rgb = torch.full((*size, 3), self.frames / 255)
+        return Frame(rgb, torch.full(size, torch.inf), torch.zeros(size))
+
+    def sizes(self) -> Mapping[str, int]:
+        return {}
+
+    def settings(self) -> Mapping[str, str]:
+        return {"device": "cpu"}
+
+
+def test_only_the_newest_camera_of_a_browser_is_drawn() -> None:
+    turns = Turns()
+    older, newer = Ask(CAMERA), Ask(replace(CAMERA, fx=50.0))
+    turns.want("a", older)
+    turns.want("b", older)
+    turns.want("a", newer)
+    assert turns.next(0) == ("a", newer)  # who has waited longest
+    assert turns.next(0) == ("b", older)
+    assert turns.next(0) is None
+
+
+def test_a_still_picture_gives_way_to_a_camera_that_moves() -> None:
+    turns = Turns()
+    moving, still = Ask(CAMERA), Ask(CAMERA, still=True)
+    turns.want("a", moving)
+    turns.offer("a", still)
+    assert turns.next(0) == ("a", moving)
+    turns.offer("a", still)
+    assert turns.next(0) == ("a", still)
+
+
+def test_who_has_gone_waits_no_longer() -> None:
+    turns = Turns()
+    turns.want("a", Ask(CAMERA))
+    turns.forget("a")
+    turns.forget("nobody")
+    assert turns.next(0) is None
+
+
+def test_who_waits_for_an_ask_wakes_up() -> None:
+    turns, found = Turns(), []
+    waiting = threading.Thread(target=lambda: found.append(turns.next()))
+    waiting.start()
+    turns.want("a", Ask(CAMERA))
+    waiting.join(timeout=60)
+    assert found == [("a", Ask(CAMERA))]
+
+
+def test_a_method_forgets_the_frames_of_another_browser_and_of_another_size() -> None:
+    painter = Painter([Counting()])
+    small = replace(CAMERA, width=16)
+    asked = [("a", CAMERA), ("a", CAMERA), ("b", CAMERA), ("a", CAMERA), ("a", small)]
+    shown = [painter.draw(who, camera)[0].rgb[0, 0, 0].item() for who, camera in asked]
+    assert [round(255 * value) for value in shown] == [1, 2, 1, 1, 1]
+    painter.draw("a", small)
+    painter.put(0, painter.methods[0])
+    assert round(255 * painter.draw("a", small)[0].rgb[0, 0, 0].item()) == 1
+
+
+def test_stages_are_timed() -> None:
+    (drawn,) = Painter([Counting()]).draw("a", CAMERA)
+    assert set(drawn.stages_ms) == {"count", "other"}
+    assert drawn.ms == sum(drawn.stages_ms.values())
+
+
+def test_only_a_slow_method_draws_coarsely_and_only_while_the_camera_moves() -> None:
+    painter = Painter([Counting()])
+    painter._full_ms[CAMERA.width * CAMERA.height] = FLUENT_MS
+    assert painter.sized(Ask(CAMERA)) is CAMERA
+    painter._full_ms[CAMERA.width * CAMERA.height] = 2 * FLUENT_MS
+    coarse = painter.sized(Ask(CAMERA))
+    assert (coarse.width, coarse.height) == (32 // COARSE, 24 // COARSE)
+    assert coarse.fx == CAMERA.fx / COARSE
+    assert painter.sized(Ask(CAMERA, still=True)) is CAMERA
+
+
+def test_a_divided_picture_has_one_method_on_either_side() -> None:
+    left, right = torch.zeros(4, 10, 3), torch.ones(4, 10, 3)
+    both = divided(left, right, 0.3)
+    assert (both[:, :2] == 0).all()
+    assert (both[:, 4:] == 1).all()
+    assert torch.equal(divided(left, right, 0.0)[:, 1:], right[:, 1:])
+
+
+def test_a_difference_shows_where_pictures_differ() -> None:
+    one = torch.full((2, 2, 3), 0.5)
+    other = one.clone()
+    other[0, 0] += 0.1
+    shown = difference(one, other, gain=4.0)
+    torch.testing.assert_close(shown[0, 0], torch.full((3,), 0.4))
+    assert (shown[1] == 0).all()
+    assert as_bytes(shown).dtype == np.uint8
+
+
+def test_the_camera_of_a_browser_is_the_pinhole_camera_of_its_pose() -> None:
+    pose = look_at(*(torch.tensor(x) for x in ([0.5, -1.0, 0.5], [0.5] * 3, [0.0, 0.0, 1.0])))
+    rotation, position = pose[:, :3].numpy(), pose[:, 3].numpy()
+    camera = seen_from(rotation, position, fov=np.pi / 2, width=40, height=20)
+    assert torch.equal(camera.c2w, pose)
+    assert abs(camera.fy - 10) < 1e-9  # 90 degrees: as far away as half of the rows
+    assert (camera.cx, camera.cy, camera.fx) == (20, 10, camera.fy)
+    frame = Counting().render(camera, NullProbe())
+    assert frame.rgb.shape == (20, 40, 3)
