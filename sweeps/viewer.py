@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from io import StringIO
@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench import paths
+from bench.cameras import pack_camera
 from bench.compositing import composite
 from bench.errors import SteerbenchError, Unavailable
 from bench.metrics import psnr
@@ -45,6 +46,8 @@ AS_GIVEN = "as given"
 """The setting of a knob that nobody has turned."""
 
 SIDE, DIFFERENCE, ERROR, TRUTH = "side by side", "difference x 4", "error x 4", "exact picture"
+EXACT = (ERROR, TRUTH)
+"""What needs the exact picture."""
 
 
 @dataclass
@@ -59,6 +62,9 @@ class Browser:
     record: Any
     figures: Any
     path: list[Camera] = field(default_factory=list)
+    camera: Camera | None = None
+    drawn: list[Drawn] | None = None
+    """What `camera` saw last; None: the methods are others now."""
 
 
 class Viewer:
@@ -88,7 +94,7 @@ class Viewer:
     ) -> None:
         self.painter, self.scene, self.first, self.log = painter, scene, first, log
         self.knobs, self.turn, self.folder = knobs, turn, folder
-        self.turns, self.browsers = Turns(), dict[int, Browser]()
+        self.turns, self.browsers = Turns(), dict[Hashable, Browser]()
         self._turned: list[tuple[int, str, str]] = []
         self.server = _serve(*address)
         up = -torch.stack([camera.c2w[:, 1] for camera in scene.splits["train"].cameras]).sum(dim=0)
@@ -112,24 +118,31 @@ class Viewer:
         if found is None:
             return False
         who, ask = found
-        browser = self.browsers.get(who) if isinstance(who, int) else None
-        if browser is None:  # it left
-            return True
-        camera = self.painter.sized(ask)
-        drawn = self.painter.draw(who, camera)
+        browser = self.browsers.get(who)
+        if browser is not None:  # it did not leave
+            try:
+                self._draw(browser, ask)
+            except SteerbenchError as error:
+                self._refuse("no picture", error)
+        return True
+
+    def _draw(self, browser: Browser, ask: Ask) -> None:
+        """Draw what a browser asks for, unless its last picture was of the same camera."""
+        who, camera = browser.client.client_id, self.painter.sized(ask)
         whole = camera is ask.camera
+        if not (browser.drawn and browser.camera and _same(browser.camera, camera)):
+            browser.drawn, browser.camera = self.painter.draw(who, camera), camera
         truth = None
-        if self.scene.exact and whole and (browser.exact.value or browser.shown.value in _EXACT):
+        if self.scene.exact and whole and (browser.exact.value or browser.shown.value in EXACT):
             truth = composite(self.scene.exact(camera), self.scene.background)
-        self._show(browser, drawn, truth)
+        self._show(browser, browser.drawn, truth)
         if not whole:
             self.turns.offer(who, Ask(ask.camera, still=True))
         elif browser.record.value:
-            if not (browser.path and torch.equal(browser.path[-1].c2w, camera.c2w)):
+            if not (browser.path and _same(browser.path[-1], camera)):
                 browser.path.append(camera)
         elif browser.path:
             self._save(browser)
-        return True
 
     def stop(self) -> None:
         """Serve no longer."""
@@ -165,9 +178,15 @@ class Viewer:
         try:
             self.turn(place, knob, setting)
         except SteerbenchError as error:
-            self.log.info(str(error))
-            for browser in self.browsers.values():
-                browser.client.add_notification(knob, str(error), color="red")
+            self._refuse(knob, error)
+        for browser in self.browsers.values():
+            browser.drawn = None
+
+    def _refuse(self, what: str, error: SteerbenchError) -> None:
+        """Say, here and in all browsers, what did not work."""
+        self.log.info(f"{what}: {error}")
+        for browser in list(self.browsers.values()):
+            browser.client.add_notification(what, str(error), color="red")
 
     def _redraw(self) -> None:
         for who in list(self.browsers):
@@ -199,7 +218,7 @@ class Viewer:
         self.turns.forget(client.client_id)
         self.browsers.pop(client.client_id, None)
 
-    def _want(self, who: int) -> None:
+    def _want(self, who: Hashable) -> None:
         if browser := self.browsers.get(who):
             self.turns.want(who, Ask(_camera(browser.client.camera, int(browser.height.value))))
 
@@ -229,13 +248,10 @@ class Viewer:
             return divided(first, last, browser.split.value)
         if shown == DIFFERENCE:
             return difference(first, last)
-        if shown in _EXACT and truth is not None:
+        if shown in EXACT and truth is not None:
             return truth if shown == TRUTH else difference(first, truth)
         names = [method.name for method in self.painter.methods]
         return drawn[names.index(shown)].rgb if shown in names else first
-
-
-_EXACT = (TRUTH, ERROR)
 
 
 def _serve(host: str, port: int) -> ViserServer:
@@ -259,6 +275,10 @@ def _camera(handle: CameraHandle, height: int) -> Camera:
     rotation = viser.transforms.SO3(handle.wxyz).as_matrix()
     width = max(round(height * handle.aspect), 1)
     return seen_from(rotation, handle.position, handle.fov, width, height)
+
+
+def _same(one: Camera, other: Camera) -> bool:
+    return torch.equal(pack_camera(one), pack_camera(other))
 
 
 def _three(vector: Tensor) -> tuple[float, float, float]:

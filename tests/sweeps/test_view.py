@@ -161,6 +161,20 @@ def test_a_browser_that_leaves_takes_nothing_with_it(opened: Callable[..., Viewe
         other.until(lambda: other.picture.size > 0 and len(viewer.browsers) == 1)
 
 
+def test_a_picture_that_fails_is_named_and_the_next_is_drawn(
+    opened: Callable[..., Viewer], capfd: pytest.CaptureFixture[str]
+) -> None:
+    viewer = opened()
+    (method,) = viewer.painter.methods
+    method.level = float("nan")
+    with browser(viewer) as page:
+        page.look()
+        page.until(lambda: "as NaN or infinite" in capfd.readouterr().err)
+        method.level = 0.5
+        page.look(0.4)
+        page.until(lambda: page.picture.size > 0)
+
+
 def test_two_browsers_get_their_own_pictures(opened: Callable[..., Viewer]) -> None:
     viewer = opened()
     with browser(viewer) as one, browser(viewer) as two:
