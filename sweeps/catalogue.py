@@ -11,6 +11,7 @@ from typing import Any
 from bench.errors import SteerbenchError, Unavailable
 from reports.tables import Table
 from sweeps.overrides import choices
+from sweeps.plug_ins import PlugIn, installed
 from sweeps.studies.variants import engine_kinds
 from sweeps.terminal import show
 
@@ -30,18 +31,32 @@ def main(options: argparse.Namespace) -> int:
     engines = [
         (name, _state(name, kind)) for name, kind in engine_kinds(options.config_dir).items()
     ]
+    extra = [(one.name, _brings(one, options.config_dir)) for one in installed()]
     for title, columns, lines in (
         ("Choices", ("choice", "what it is"), files),
         ("Backends of the kernels", ("backend", "here"), backends),
         ("Engines of the networks", ("engine", "here"), engines),
+        ("Installed plug-ins", ("plug-in", "what it brings"), extra),
     ):
-        show(Table(title, columns, tuple(lines), figures=False))
+        if lines:
+            show(Table(title, columns, tuple(lines), figures=False))
     return 0
 
 
 def described(group: str, words: Sequence[str] = ()) -> dict[str, str]:
     """Every choice of `group`, also of the folders that `words` name, and what it is."""
     return {name: _comment(path.read_text()) for name, path in choices(group, words).items()}
+
+
+def _brings(plug_in: PlugIn, words: Sequence[str]) -> str:
+    """The choices of a plug-in, or why there are none."""
+    if plug_in.folder is None:
+        return f"cannot be used: {plug_in.fault}"
+    found = []
+    for path in plug_in.files():
+        group, hidden = path.parent.name, choices(path.parent.name, words)[path.stem] != path
+        found.append(f"{group}={path.stem}" + (" (hidden: the name is taken)" if hidden else ""))
+    return ", ".join(found) or f"nothing: there are no GROUP/NAME.yaml in {plug_in.folder}"
 
 
 def _state(name: str, kind: Any) -> str:

@@ -20,6 +20,7 @@ from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import SteerbenchError
+from sweeps import plug_ins
 from sweeps.names import unknown
 
 CONFIGS = Path(__file__).parent / "configs"
@@ -36,7 +37,7 @@ def composed(words: Sequence[str], **options: bool) -> DictConfig:
         SteerbenchError: a setting or a choice does not exist, or cannot be read.
     """
     overrides = _overrides(words)
-    if further := [str(folder).replace("'", r"\'") for folder in _folders(words)[1:]]:
+    if further := [str(folder).replace("'", r"\'") for folder in _typed(words)]:
         paths = ",".join(f"'file://{folder}'" for folder in further)
         overrides.append(f"hydra.searchpath=[{paths}]")
     try:
@@ -136,7 +137,7 @@ def _settings(words: Sequence[str]) -> list[str]:
     groups = {path.name for folder in folders for path in folder.iterdir() if path.is_dir()}
     there = {f"{group}={name}" for group in groups for name in choices(group, words)}
     chosen = [word for word in words if word in there]
-    config: Any = composed([*(f"{FLAGS[0]}={folder}" for folder in folders[1:]), *chosen])
+    config: Any = composed([*(f"{FLAGS[0]}={folder}" for folder in _typed(words)), *chosen])
     return [*groups, *leaves(OmegaConf.to_container(config, resolve=False))]
 
 
@@ -154,11 +155,15 @@ def _overrides(words: Sequence[str]) -> list[str]:
 
 
 def _folders(words: Sequence[str]) -> list[Path]:
-    """Our configurations and the folders that `words` name: `--config-dir=DIR` or, as Hydra takes
-    it too, in two words."""
+    """Our configurations, the folders that `words` name, and those of installed plug-ins."""
+    return [CONFIGS, *_typed(words), *plug_ins.folders()]
+
+
+def _typed(words: Sequence[str]) -> list[Path]:
+    """The folders that `words` name: `--config-dir=DIR` or, as Hydra takes it too, in two words."""
     further = []
     for word, after in pairwise([*words, ""]):
         name, equals, value = word.partition("=")
         if name in FLAGS:
             further.append(Path(value if equals else after).resolve())
-    return [CONFIGS, *further]
+    return further

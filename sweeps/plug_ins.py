@@ -1,0 +1,70 @@
+"""Choices of installed packages: folders like `sweeps/configs` that their entry points name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from importlib import metadata, util
+from pathlib import Path
+
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.plugins import Plugins
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+
+GROUP = "steerbench.configs"
+"""Of the entry points; the value of one is the package that holds the YAML files."""
+
+
+@dataclass(frozen=True)
+class PlugIn:
+    """What an entry point leads to.
+
+    Attributes:
+        name: of the entry point, and the distribution that has it: "mine (mine-renderers 1.0)".
+        folder: with a folder of YAML files for each group; None: it cannot be used.
+        fault: why not.
+    """
+
+    name: str
+    folder: Path | None
+    fault: str = ""
+
+    def files(self) -> list[Path]:
+        """Its choices, `GROUP/NAME.yaml`."""
+        return [] if self.folder is None else sorted(self.folder.glob("*/*.yaml"))
+
+
+@cache
+def installed() -> tuple[PlugIn, ...]:
+    """All of this environment, those that cannot be used too."""
+    entries = sorted(metadata.entry_points(group=GROUP), key=lambda entry: entry.name)
+    return tuple(_found(entry) for entry in entries)
+
+
+def folders() -> list[Path]:
+    """Of all that can be used."""
+    return [one.folder for one in installed() if one.folder]
+
+
+def _found(entry: metadata.EntryPoint) -> PlugIn:
+    name = entry.name
+    if entry.dist is not None:
+        name = f"{name} ({entry.dist.name} {entry.dist.version})"
+    try:
+        spec = util.find_spec(entry.value)  # it imports the packages above
+    except Exception as error:  # whatever their code raises
+        return PlugIn(name, None, f"{type(error).__name__}: {error}")
+    if spec is None or not spec.submodule_search_locations:
+        return PlugIn(name, None, f"there is no package {entry.value}")
+    return PlugIn(name, Path(next(iter(spec.submodule_search_locations))))
+
+
+class _InstalledChoices(SearchPathPlugin):
+    """Shows their folders to Hydra, behind its own: a name that exists already stays ours."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for folder in folders():
+            search_path.append("steerbench-plug-in", f"file://{folder}")
+
+
+Plugins.instance().register(_InstalledChoices)
