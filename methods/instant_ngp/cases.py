@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bench.cameras import look_at
 from bench.case import U16, U32, Agreement, Case, Property
-from bench.types import Budget, Camera, Scene, Split, SteerbenchError
+from bench.types import Budget, Camera, Scene, Split, SteerbenchError, Unavailable
 from methods.instant_ngp.field import LOG_DENSITY_CLAMP, HashField, Precision
 from methods.instant_ngp.training import MIN_RAYS, FieldTraining, TrainingOptions
 from methods.kernels import BACKENDS
@@ -187,6 +187,8 @@ def _keeps_a_good_state(rate: float, backend: str, device: str, precision: str) 
             for _ in range(STEPS):
                 training.advance()
                 loop.save(training, kept)
+        except Unavailable:  # which is no breakdown of a training
+            raise
         except SteerbenchError:
             training = new()
             loop.resume(training, kept)
@@ -201,6 +203,8 @@ def _reports(value: float, backend: str, device: str, precision: str) -> float:
         training.field.repack()
     try:
         training.advance()
+    except Unavailable:
+        raise
     except SteerbenchError as error:
         return 0.0 if "table" in str(error) else math.inf
     return math.inf
