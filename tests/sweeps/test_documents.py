@@ -39,7 +39,7 @@ OLD = {"CHANGELOG.md", "RESULTS.md", "RESULTS-mic.md", "log.md"}
 
 PRESENT = [path for path in DOCUMENTS if path.name not in OLD]
 
-ELSEWHERE = ("hydra", "--config-dir", "data=", "method=mean_colour")
+ELSEWHERE = ("hydra", "--config-dir", "data=", "method=mean_", "scene=npz", "scene.path=views.npz")
 """What the words of a command begin with that need something that is not here."""
 
 
