@@ -1,8 +1,8 @@
 """What the numba backends share.
 
 numba caches compiled code by the file of the calling function alone: after a change of
-`pack_bf16`, `sigmoid` or `march.cpu.slope`, or of a constant that such a file imports from another
-(`PRIMES`, `TAPS`), remove the `__pycache__` of its callers.
+a function of this file, or of a constant that such a file imports from another (`PRIMES`, `TAPS`),
+remove the `__pycache__` of its callers.
 
 The process that compiles a function runs another copy of it than the processes that load it from
 the cache: LLVM has optimised one of them twice. Where it may choose how to round, the copies can
@@ -20,6 +20,8 @@ import numpy as np
 import torch
 from numba import njit
 
+from methods.kernels.march import PARALLEL
+
 f32, i32, u32 = np.float32, np.int32, np.uint32
 
 
@@ -35,6 +37,12 @@ def follow_torch_threads() -> None:
 def sigmoid(x):
     """1 / (1 + e^-x) of a float32."""
     return f32(1) / (f32(1) + f32(math.exp(-x)))
+
+
+@njit(cache=True)
+def slope(direction):
+    """t by length along an axis; 0 for a ray that does not move along it."""
+    return f32(1) / direction if abs(direction) >= PARALLEL else f32(0)
 
 
 @njit(cache=True)

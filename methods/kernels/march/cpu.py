@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from numba import njit, prange
 
-from methods.kernels.cpu import f32
-from methods.kernels.march import PARALLEL, Occupancy, Samples, Segments
+from methods.kernels.cpu import f32, slope
+from methods.kernels.march import Occupancy, Samples, Segments
 
 CHUNK = 64  # rays
 f64 = np.float64
@@ -65,12 +65,6 @@ def march(segments: Segments, occupancy: Occupancy, step: float, limit: int) -> 
         ray.numpy(),
     )
     return Samples(t, torch.full((total,), step), offsets, ray, positions, resume)
-
-
-@njit(cache=True)
-def slope(direction):
-    """t by length along an axis; 0 for a ray that does not move along it."""
-    return f32(1) / direction if abs(direction) >= PARALLEL else f32(0)
 
 
 @njit(cache=True)

@@ -18,8 +18,7 @@ from torch.nn.functional import normalize
 
 from bench.types import Rays
 from methods.kernels.composite import Pixels
-from methods.kernels.cpu import f32, i32, sigmoid
-from methods.kernels.march.cpu import slope
+from methods.kernels.cpu import f32, i32, sigmoid, slope
 from methods.kernels.spherical import spherical_harmonics
 from methods.kernels.voxel_walk import Crossings, Light, Voxels
 
