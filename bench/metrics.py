@@ -12,6 +12,7 @@ import warnings
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import torch
 from skimage.metrics import structural_similarity
 from torch import Tensor
@@ -36,6 +37,11 @@ def check_size(metric: str, width: int, height: int) -> None:
 def quantise(image: Tensor) -> Tensor:
     """Clip to [0, 1] and round to the 256 levels of an 8-bit file, halves to the even level."""
     return image.clamp(0.0, 1.0).mul(255.0).round().div(255.0)
+
+
+def as_bytes(image: Tensor) -> np.ndarray:
+    """A picture in [0, 1], on the CPU, as 8-bit integers."""
+    return image.mul(255.0).round().to(torch.uint8).numpy()
 
 
 def psnr(image: Tensor, reference: Tensor) -> float:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from bench.compositing import composite
-from bench.metrics import Lpips, flicker, quantise
+from bench.metrics import Lpips, as_bytes, flicker, quantise
 from bench.protocol import EvaluationProtocol
 from bench.trajectories import Step, Trajectory, spread
 from bench.types import Camera, Frame, Scene, SteerbenchError, check_shape
@@ -106,11 +106,7 @@ def kept_pictures(index: int, rgb: Tensor, truth: Tensor) -> dict[str, np.ndarra
     rendering, truth = quantise(rgb).cpu(), truth.cpu()
     error = (rendering - truth).abs().mean(dim=-1) / ERROR_RANGE
     return {
-        f"{index:04d}-truth": _bytes(truth),
-        f"{index:04d}-rendered": _bytes(rendering),
+        f"{index:04d}-truth": as_bytes(truth),
+        f"{index:04d}-rendered": as_bytes(rendering),
         f"{index:04d}-error": matplotlib.colormaps["inferno"](error.numpy(), bytes=True)[..., :3],
     }
-
-
-def _bytes(image: Tensor) -> np.ndarray:
-    return image.mul(255.0).round().to(torch.uint8).numpy()

@@ -149,11 +149,6 @@ def difference(one: Tensor, other: Tensor, gain: float = 4.0) -> Tensor:
     return (gain * (one - other).abs()).clamp(0, 1)
 
 
-def as_bytes(rgb: Tensor) -> np.ndarray:
-    """uint8 [H, W, 3]."""
-    return (255 * rgb).round().byte().numpy()
-
-
 def seen_from(
     rotation: np.ndarray, position: np.ndarray, fov: float, width: int, height: int
 ) -> Camera:

@@ -15,7 +15,7 @@ from PIL import Image
 from bench import paths
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, explained
-from bench.metrics import quantise
+from bench.metrics import as_bytes, quantise
 from bench.results import Store
 from bench.scoring import check_frame
 from bench.trajectories import MIXED
@@ -66,7 +66,7 @@ def _drawn(method: Method, camera: Camera, index: int) -> np.ndarray:
     """The next frame of `method`, uint8 [H, W, 3]."""
     frame = method.render(camera, NullProbe())
     check_frame(frame, camera, method.name, index)
-    return (255 * quantise(frame.rgb.cpu())).round().byte().numpy()
+    return as_bytes(quantise(frame.rgb.cpu()))
 
 
 def words_of_run(key: str | None, words: Sequence[str]) -> list[str]:

@@ -18,14 +18,13 @@ from bench import paths
 from bench.cameras import pack_camera
 from bench.compositing import composite
 from bench.errors import SteerbenchError, Unavailable
-from bench.metrics import psnr
+from bench.metrics import as_bytes, psnr
 from bench.types import Camera, Log, Scene
 from bench.viewing import (
     Ask,
     Drawn,
     Painter,
     Turns,
-    as_bytes,
     difference,
     divided,
     seen_from,

@@ -50,7 +50,7 @@ class OctreeTraining(PixelTraining):
         visited: [S] int32 leaves that the rays of the last step saw.
     """
 
-    advice = "Try a smaller learning rate (method.training.rate)."
+    options: OctreeLessons
 
     def __init__(
         self,
@@ -63,7 +63,7 @@ class OctreeTraining(PixelTraining):
     ) -> None:
         device = octree.light.density.device
         super().__init__(scene, device, budget.renderer_steps, options.samples, options, seed)
-        self.lessons, self.backend = options, backend
+        self.backend = backend
         self._take(octree)
 
     def _take(self, octree: Octree) -> None:
@@ -103,7 +103,7 @@ class OctreeTraining(PixelTraining):
         # A leaf's optical thickness is its density times its width.
         width = 1 / self.octree.voxels.resolution
         rates = {"harmonics": rate, "density": rate / self.options.rate}
-        rates["density"] *= self.lessons.density_rate / width
+        rates["density"] *= self.options.density_rate / width
         for name, table in self.tables.items():
             sparse_adam_(
                 table, self.gradients[name], self.moments[name], rates[name], backend=self.backend

@@ -15,7 +15,7 @@ estimated error are rendered by the field after all (`refinement`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 
 import torch
@@ -23,12 +23,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench.cameras import place_camera
-from bench.types import Camera, Frame, NullProbe, Probe, Rays
-from methods.kernels.composite import Pixels
+from bench.types import Camera, Frame, NullProbe, Probe
 from methods.kernels.march import Occupancy
 from methods.kernels.warp import enlarge, warp
 from methods.rendering.field import Field
-from methods.rendering.frame import FeatureFrame, everywhere, render_frame
+from methods.rendering.frame import FeatureFrame, Render, everywhere, render_frame
 from methods.rendering.rays import render_rays
 from methods.steernerf.beyond import window
 from methods.steernerf.beyond.cells import put_pixels
@@ -136,7 +135,7 @@ class Pipeline:
 
     def _marcher(
         self, newest: Cloud | None, view: View, rendering: Rendering, probe: Probe
-    ) -> Callable[[Tensor, Rays], Pixels]:
+    ) -> Render:
         """What marches the rays at low resolution: the argument `render` of `render_frame`."""
         occupancy, how, reduction = self._occupied(rendering), rendering.march, rendering.range
         if newest is None or reduction.mode == "off":

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from bench.cameras import look_at
+from bench.metrics import as_bytes
 from bench.types import Camera, Frame, NullProbe, Probe
 from bench.viewing import (
     COARSE,
@@ -18,7 +19,6 @@ from bench.viewing import (
     Ask,
     Painter,
     Turns,
-    as_bytes,
     difference,
     divided,
     seen_from,

@@ -5,7 +5,6 @@ Not in the paper: its interval leaves holes where the reprojected depth is that 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +15,7 @@ from bench.types import Camera, Probe, Rays
 from methods.kernels.composite import Pixels
 from methods.kernels.march import Occupancy
 from methods.rendering.field import Field
+from methods.rendering.frame import Render
 from methods.rendering.march import FAINT, March
 from methods.rendering.rays import render_rays
 from methods.steernerf.buffer import Cloud
@@ -75,7 +75,7 @@ def _highest(image: Tensor) -> Tensor:
 
 def within(
     field: Field, occupancy: Occupancy, probe: Probe, how: March, prior: DepthPrior
-) -> Callable[[Tensor, Rays], Pixels]:
+) -> Render:
     """For `rendering.frame.render_frame`: a ray looks in its window of `prior`, and behind it where
     it does not reach the expected opacity."""
 
