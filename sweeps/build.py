@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import pkgutil
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import is_dataclass
 from types import UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.errors import SteerbenchError
 from sweeps.names import unknown
+from sweeps.overrides import choices
 
 STANDS_FOR = {"Path": str, "tuple": list, "Sequence": list, "Mapping": dict, "float": float | int}
 """What a configuration holds where a signature has a type of the name on the left."""
@@ -34,6 +35,17 @@ def target_of(node: Mapping[str, Any] | DictConfig) -> Any:
             f"cannot import {node['_target_']}: {error}; PYTHONPATH must name the folder of a "
             "package that is not installed"
         ) from error
+
+
+def engine_kinds(words: Sequence[str] = ()) -> dict[str, Any]:
+    """The class of each engine by its name; torch, the standard, first.
+
+    Args:
+        words: they may name folders with further engines.
+    """
+    files = choices("engine", words)
+    names = sorted(files, key=lambda name: (name != "torch", name))
+    return {name: target_of(OmegaConf.load(files[name])) for name in names}  # type: ignore[arg-type]
 
 
 def build(config: DictConfig, group: str, *args: Any, **extra: Any) -> Any:

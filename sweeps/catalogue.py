@@ -10,42 +10,49 @@ from typing import Any
 
 from bench.errors import SteerbenchError, Unavailable
 from reports.tables import Table
+from sweeps.build import engine_kinds
 from sweeps.overrides import choices
 from sweeps.plug_ins import PlugIn, installed
-from sweeps.studies.variants import engine_kinds
 from sweeps.terminal import show
 
 GROUPS = ("method", "engine", "scene", "trajectory", "protocol", "budget", "experiment")
 
 
 def main(options: argparse.Namespace) -> int:
-    """Print the choices of `steerbench run`, then the backends of the kernels and the engines."""
-    from methods.kernels import availability
+    """Print the choices of `steerbench run`, then the backends of the kernels and the engines.
 
+    The choices come first: what follows imports torch and every engine, which takes seconds.
+    """
+    words = options.config_dir
     files = [
         (f"{'+' if group == 'experiment' else ''}{group}={name}", about)
         for group in GROUPS
-        for name, about in described(group, options.config_dir).items()
+        for name, about in described(group, words).items()
     ]
+    _show("Choices", ("choice", "what it is"), files)
+    _show("Installed plug-ins", ("plug-in", "what it brings"), _plug_ins(words))
+
+    from methods.kernels import availability
+
     backends = [(name, why or "usable") for name, why in availability().items()]
-    engines = [
-        (name, _state(name, kind)) for name, kind in engine_kinds(options.config_dir).items()
-    ]
-    extra = [(one.name, _brings(one, options.config_dir)) for one in installed()]
-    for title, columns, lines in (
-        ("Choices", ("choice", "what it is"), files),
-        ("Backends of the kernels", ("backend", "here"), backends),
-        ("Engines of the networks", ("engine", "here"), engines),
-        ("Installed plug-ins", ("plug-in", "what it brings"), extra),
-    ):
-        if lines:
-            show(Table(title, columns, tuple(lines), figures=False))
+    _show("Backends of the kernels", ("backend", "here"), backends)
+    engines = [(name, _state(name, kind)) for name, kind in engine_kinds(words).items()]
+    _show("Engines of the networks", ("engine", "here"), engines)
     return 0
+
+
+def _show(title: str, columns: tuple[str, str], lines: Sequence[tuple[str, str]]) -> None:
+    if lines:
+        show(Table(title, columns, tuple(lines), figures=False))
 
 
 def described(group: str, words: Sequence[str] = ()) -> dict[str, str]:
     """Every choice of `group`, also of the folders that `words` name, and what it is."""
     return {name: _comment(path.read_text()) for name, path in choices(group, words).items()}
+
+
+def _plug_ins(words: Sequence[str]) -> list[tuple[str, str]]:
+    return [(one.name, _brings(one, words)) for one in installed()]
 
 
 def _brings(plug_in: PlugIn, words: Sequence[str]) -> str:

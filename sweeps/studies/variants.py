@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from bench.accuracy import render_in_turns, steady_frames
 from bench.console import ConsoleLog
@@ -20,10 +20,10 @@ from bench.study import Study, Variant, study_of
 from bench.trajectories import Trajectory
 from bench.types import Log, Method, Scene
 from reports.tables import decimal
-from sweeps.build import build, target_of
+from sweeps.build import build, engine_kinds, target_of
 from sweeps.device_lock import device_lock
 from sweeps.measurement import checked_settings, scene_of
-from sweeps.overrides import choices, composed
+from sweeps.overrides import composed
 
 Row = dict[str, Any]
 
@@ -192,13 +192,6 @@ def engines(words: Sequence[str] = ()) -> list[Variant]:
         for name, kind in engine_kinds(words).items()
         for precision in kind.precisions
     ]
-
-
-def engine_kinds(words: Sequence[str] = ()) -> dict[str, Any]:
-    """The class of each engine by its name; torch, the standard, first."""
-    files = choices("engine", words)
-    names = sorted(files, key=lambda name: (name != "torch", name))
-    return {name: target_of(OmegaConf.load(files[name])) for name in names}  # type: ignore[arg-type]
 
 
 def print_rows(rows: Iterable[Mapping[str, Any]]) -> None:
