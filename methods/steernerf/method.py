@@ -106,7 +106,7 @@ class SteerNerf:
         `rendering`.
         """
         renderer, engine, joint = second.pipeline.renderer, self.engine, self.stage2.joint
-        rendering = Rendering.in_training(self.stage2.model, joint.refined)
+        rendering = Rendering.in_training(self.stage2.model, joint.refined, joint.refined_step)
         calibration = Calibration(
             second.pipeline, rendering, scene, joint.motion.degrees, self.setup.seed
         )

@@ -116,7 +116,7 @@ class Rendering:
             is not used; see `buffer.Cloud.overlap`.
         refined: share of the cells whose pixels are rendered by the field after all: those with the
             largest estimated error (not in the paper).
-        refined_step: of the rays there; 1 when it is trained.
+        refined_step: of the rays there.
         skip: what is not computed.
     """
 
@@ -137,16 +137,17 @@ class Rendering:
         check_stop(self.stop)
 
     @classmethod
-    def in_training(cls, model: Model, refined: float) -> Rendering:
+    def in_training(cls, model: Model, refined: float, refined_step: float = 1.0) -> Rendering:
         """How `model` is rendered while it is trained: rays look everywhere, so that one training
-        serves all choices; a share `refined` of the cells is refined."""
+        serves all choices; a share `refined` of the cells is refined, in steps of
+        `refined_step`."""
         return cls(
             model.step,
             model.stop,
             RangeReduction(mode="off"),
             overlap=0.0,
             refined=refined,
-            refined_step=1.0,
+            refined_step=refined_step,
             skip=Skips(),
         )
 

@@ -10,11 +10,14 @@ import torch
 import triton
 import triton.language as tl
 
+from methods.kernels.dispatch import interpreted
 from methods.kernels.gpu import check_types, launch
 from methods.kernels.march import BRICK, PARALLEL, Occupancy, Samples, Segments
 from methods.kernels.march.reference import clip
 
-BLOCK = 32  # rays: those of a warp, which waits for the longest of them
+BLOCK = 128 if interpreted() else 32
+"""Rays of a program: those of a warp, which waits for the longest of them. The interpreter takes as
+long for many as for few."""
 
 
 def march(segments: Segments, occupancy: Occupancy, step: float, limit: int) -> Samples:

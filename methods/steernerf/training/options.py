@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from methods.rendering.march import check_step
 from methods.steernerf.training.sequences import MotionOptions
 
 
@@ -30,6 +31,7 @@ class JointOptions:
         opacity_entropy: weight of -o ln o of the rays.
         error_weight: of the squared difference between the estimated log error and the true one.
         refined: share of the cells that are refined while it is trained.
+        refined_step: of their rays, in diagonals of the cube / 1024.
         refined_rays: pixels of those that the field learns from in a step.
         clip: largest norm of the 2D renderer's gradient; None: as it is.
         average: decay of the running mean of the 2D renderer's weights, which is the result; 0: the
@@ -56,6 +58,7 @@ class JointOptions:
     opacity_entropy: float = 1e-3
     error_weight: float = 1e-4
     refined: float = 0.2
+    refined_step: float = 1.0
     refined_rays: int = 2048
     clip: float | None = 1.0
     average: float = 0.999
@@ -65,6 +68,7 @@ class JointOptions:
     motion: MotionOptions = MotionOptions()
 
     def __post_init__(self) -> None:
+        check_step("joint.refined_step", self.refined_step)
         for wanted, fits, names in (
             ("more than 0", lambda x: x > 0, ("rate", "field_rate", "final_rate")),
             ("more than 0, or null", lambda x: x is None or x > 0, ("clip",)),

@@ -127,7 +127,7 @@ def _prepared(
     renderer = stage2.new_renderer(seed, field.device)
     pipeline = Pipeline(field, trained.occupancy, background, renderer, model)
     generator = torch.Generator().manual_seed(seed)
-    rendering = Rendering.in_training(model, joint.refined)
+    rendering = Rendering.in_training(model, joint.refined, joint.refined_step)
     pool = SequencePool(pipeline, rendering, views, joint.motion, generator)
     learning = joint.field == "joint"
     through = joint.through if learning else "none"
