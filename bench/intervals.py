@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy import fft, stats
+from scipy import fft, special
 
 CONFIDENCE = 0.95
 
@@ -41,4 +41,4 @@ def path_interval(values: np.ndarray) -> float:
 
 def _quantile(freedom: int) -> float:
     """Of Student's t: the half-width, in standard errors, of an interval with `CONFIDENCE`."""
-    return float(stats.t.ppf(0.5 + CONFIDENCE / 2, freedom))
+    return float(special.stdtrit(freedom, 0.5 + CONFIDENCE / 2))

@@ -96,5 +96,7 @@ def test_a_name_that_was_removed_may_be_used_again_by_a_plug_in(steerbench, tmp_
     folder = tmp_path / "configs" / "method"
     folder.mkdir(parents=True)
     (folder / "ngp_guided.yaml").write_text("defaults: [ngp, _self_]\nname: other\n")
-    outcome = steerbench("report", "--config-dir", "configs", "--with", "ngp_guided")
+    outcome = steerbench(
+        "report", "--table", "table1", "--config-dir", "configs", "--with", "ngp_guided"
+    )
     assert outcome.status == 0, outcome.err

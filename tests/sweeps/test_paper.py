@@ -7,6 +7,7 @@ import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pandas as pd
@@ -19,16 +20,22 @@ from reports.paper_tables import paper_tables
 from sweeps import failures, jobs
 from sweeps.measurement import Obtained, described
 from sweeps.overrides import composed
-from sweeps.plan import plan
+from sweeps.plan import Planned, plan
 
 CURVED = {table.name: table for table in paper_tables()}
 TABLES = {name: replace(table, curve=False) for name, table in CURVED.items()}
 """Their lines alone."""
 
 
+@cache
+def with_one_seed(name: str) -> tuple[Planned, ...]:
+    """The jobs of the lines of a table; composing them takes seconds."""
+    return tuple(plan(TABLES[name], ["seed=0"]))
+
+
 @pytest.mark.parametrize("name", TABLES)
 def test_every_line_that_can_be_measured_has_its_job(name: str) -> None:
-    jobs = plan(TABLES[name], ["seed=0"])
+    jobs = with_one_seed(name)
     lines = [
         line.label for block in TABLES[name].blocks for line in block.lines if line.job is not None
     ]
@@ -61,8 +68,8 @@ def test_ours_is_repeated_only_with_seeds_that_are_asked_for() -> None:
 
 def test_only_the_table_of_times_is_measured_in_turns() -> None:
     """The lines of a method with one seed together."""
-    for name, table in TABLES.items():
-        jobs = plan(table, ["budget=demo"])
+    for name in TABLES:
+        jobs = with_one_seed(name)
         turns = {job.turns for job in jobs}
         assert (turns == {""}) == (name != "table2")
         for turn in turns - {""}:
@@ -81,7 +88,7 @@ def test_settings_hold_for_every_job() -> None:
 
 @pytest.mark.parametrize("name", TABLES)
 def test_a_table_is_of_the_papers_method_and_then_of_ours(name: str) -> None:
-    configs = [job.config for job in plan(TABLES[name], ["seed=0"])]
+    configs = [job.config for job in with_one_seed(name)]
     methods = [
         config.method.name for config in configs if "name" in config.method
     ]  # not Instant-NGP
@@ -90,7 +97,7 @@ def test_a_table_is_of_the_papers_method_and_then_of_ours(name: str) -> None:
 
 
 def test_the_lines_of_table_3_differ_in_l_alone() -> None:
-    of_paper = plan(TABLES["table3"], ["seed=0"])[:4]
+    of_paper = with_one_seed("table3")[:4]
     settings = [described(job.config) for job in of_paper]
     for number, setting in enumerate(settings):
         assert setting["method"]["rendering"]["range"]["mode"] == "off"
@@ -120,7 +127,7 @@ def test_every_seed_is_a_job_of_its_own_and_a_command_that_makes_it() -> None:
 def test_tables_share_the_run_that_they_have_in_common() -> None:
     """But for the table of times: a time in turns is another figure than one alone."""
     lines = [("table3", 2), ("table4", 1), ("table5", 0), ("table2", 0)]
-    *jobs, timed = (plan(TABLES[name], ["seed=0"])[place] for name, place in lines)
+    *jobs, timed = (with_one_seed(name)[place] for name, place in lines)
     assert len({job.key for job in jobs}) == 1
     assert described(timed.config) == described(jobs[0].config)
     assert timed.key != jobs[0].key
@@ -140,7 +147,7 @@ def test_what_the_figures_show_is_what_the_tables_measure(
     method: str, name: str, line: str
 ) -> None:
     shown = composed(["+experiment=figures", f"method={method}"])
-    (job,) = (job for job in plan(TABLES[name], ["seed=0"]) if job.line == line)
+    (job,) = (job for job in with_one_seed(name) if job.line == line)
     assert described(shown) == described(job.config)
 
 

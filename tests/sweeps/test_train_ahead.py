@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from concurrent.futures import Future
 from dataclasses import replace
+from functools import cache
 
 import pytest
 
@@ -19,8 +20,14 @@ TABLES = {table.name: replace(table, curve=False) for table in paper_tables()}
 
 def trainings(*names: str) -> int:
     """How many different ones the jobs of the tables `names` have with one seed."""
-    jobs = [job for name in names for job in plan(TABLES[name], ["budget=paper", "seed=0"])]
-    return len({train_ahead._training(job.config) for job in jobs})
+    return len({key for name in names for key in _trainings(name)})
+
+
+@cache
+def _trainings(name: str) -> set[str]:
+    """Composing a table takes seconds."""
+    jobs = plan(TABLES[name], ["budget=paper", "seed=0"])
+    return {train_ahead._training(job.config) for job in jobs}
 
 
 def test_what_is_chosen_afterwards_is_no_training_of_its_own() -> None:
