@@ -49,9 +49,11 @@ def comparison(runs: Sequence[Run], failures: Mapping[str, str]) -> Table:
         if place == 1
     )
     blank = ("",) * len(columns)
+    sources = (*((part.key,) for part in parts), *(() for _ in failures))
     lines += [(f"{label}: failed: {reason}", *blank) for label, reason in failures.items()]
     title = f"Comparison: {conditions_of(runs)}" if runs else "Comparison"
-    return Table(title, ("run", *(label for label, _ in columns.values())), tuple(lines), bold=bold)
+    heads = ("run", *(label for label, _ in columns.values()))
+    return Table(title, heads, tuple(lines), bold=bold, sources=sources)
 
 
 def metric_format(metric: str) -> tuple[str, Write]:

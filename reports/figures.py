@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, ScalarFormat
 from numpy.typing import ArrayLike
 
 from bench.results import COLD
+from reports.comparison import written
+from reports.parts import Mark, Plot
 from reports.runs import Repeated, Run
 
 STAGE = "stage_ms."
@@ -23,6 +26,9 @@ LEGEND_COLUMNS = 4
 MARKERS = "osD^vP*X<>"
 COLOURS = [matplotlib.colormaps["tab20"](index) for index in (*range(0, 20, 2), *range(1, 20, 2))]
 COLOURS = [colour for colour in COLOURS if len(set(colour[:3])) > 1]  # grey is for "other"
+
+MARK = "mark-{}"
+"""The `gid` of the mark of a line of `quality_against`, by its number."""
 
 NAME_SIZE = (160, 13)
 """Pixels that the name of a setting takes on a plot."""
@@ -69,6 +75,19 @@ def _stages(run: Run) -> dict[str, float]:
     return stages
 
 
+def quality_plot(
+    lines: Sequence[Repeated], metric: str, unit: float, axis: str, stem: str, shows: str
+) -> Plot:
+    """`quality_against` as a part of a page: a mark says its label, its PSNR and its `metric`."""
+    marks = {
+        MARK.format(number): Mark(f"{line.label}: PSNR {quality} dB, {axis}: {cost}", line.keys)
+        for number, line in enumerate(lines)
+        if (quality := written(line, "psnr")) and (cost := written(line, metric))
+    }
+    draw = partial(quality_against, lines, metric, unit, axis)
+    return Plot(stem, shows, draw, marks)
+
+
 def quality_against(
     lines: Sequence[Repeated], metric: str, unit: float, axis: str, path: Path
 ) -> None:
@@ -82,7 +101,7 @@ def quality_against(
         if across is None or up is None:
             continue
         bars = [half if half > 0 else None for half in (line.half(metric), line.half("psnr"))]
-        axes.errorbar(
+        drawn = axes.errorbar(
             across / unit,
             up,
             xerr=bars[0] and bars[0] / unit,
@@ -92,6 +111,7 @@ def quality_against(
             markersize=8,
             label=line.label,
         )
+        drawn[0].set_gid(MARK.format(number))
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5, 7)))
     axes.xaxis.set_major_formatter(ScalarFormatter())

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import uniform_filter
 
 from bench.results import COLD
-from reports.publish import add_picture
+from reports.parts import Detail, Frame, Picture, View
 from reports.runs import Run
 
 MOST_RENDERINGS = 4
@@ -31,23 +31,6 @@ ZOOM = 4
 
 
 @dataclass(frozen=True)
-class View:
-    """A frame as one run rendered it: titles, and uint8 [H, W, 3] with its error map."""
-
-    titles: tuple[str, ...]
-    rendering: np.ndarray
-    error: np.ndarray
-
-
-@dataclass(frozen=True)
-class Detail:
-    """The part of a frame that is enlarged: left, top, right, bottom, and why this part."""
-
-    box: tuple[int, int, int, int]
-    where: str
-
-
-@dataclass(frozen=True)
 class Band:
     """One line of panels below a caption; None leaves a place empty."""
 
@@ -60,25 +43,32 @@ def kept_frames(run: Run) -> list[str]:
     return sorted(path.name.split("-")[0] for path in run.pictures.glob("*-truth.png"))
 
 
-def frame_section(runs: Sequence[Run], frame: str, stem: str, folder: Path) -> Iterator[str]:
-    """Draw `frame` of `runs` for the page in `folder`; yield its heading, images and caption."""
+def frame_section(runs: Sequence[Run], frame: str, stem: str) -> Iterator[str | Frame]:
+    """`frame` of `runs` as parts of a page: its heading, its pictures and a caption."""
     truth = _read(runs[0].pictures / f"{frame}-truth.png")
     views = [_view(run, frame) for run in runs]
     detail = find_detail(truth, [view.rendering for view in views])
-    name = runs[0].frames.set_index("frame")["name"][int(frame)]
-    yield (f"### {runs[0].facts['scene']}, {name}, frame {int(frame) + 1} of {len(runs[0].frames)}")
-    errors = runs[0].record["error_map"]
-    width = math.ceil(len(views) / math.ceil(len(views) / MOST_RENDERINGS))  # all about as wide
-    for first in range(0, len(views), width):
-        group = views[first : first + width]
-        draw = partial(write_image, truth, group, detail, errors)
-        file = add_picture(folder, f"{stem}-{frame}-{first}", draw)
-        shown = ", ".join(view.titles[0] for view in group)
-        yield f"![Ground truth, {shown}; a detail of each; error maps]({file})"
+    view = runs[0].frames.set_index("frame")["name"][int(frame)]
+    number = f"frame {int(frame) + 1} of {len(runs[0].frames)}"
+    name, errors = f"{runs[0].facts['scene']}, {view}, {number}", runs[0].record["error_map"]
+    yield f"### {name}"
+    yield Frame(name, f"{stem}-{frame}", truth, views, detail, errors)
     yield (
-        f"PSNR and time above a picture are of this frame alone. The framed part, where"
-        f" {detail.where}, is enlarged {ZOOM} times. Error maps show the {errors}."
+        "PSNR and time of a picture are of this frame alone. The framed part, where"
+        f" {detail.where}, can be seen {ZOOM} times enlarged. Error maps show the {errors}."
     )
+
+
+def still_images(frame: Frame) -> Iterator[Picture]:
+    """Images that show all of `frame` without a click, at most `MOST_RENDERINGS` in each."""
+    count = len(frame.views)
+    width = math.ceil(count / math.ceil(count / MOST_RENDERINGS))  # all about as wide
+    for first in range(0, count, width):
+        group = frame.views[first : first + width]
+        draw = partial(write_image, frame.truth, group, frame.detail, frame.errors)
+        shown = ", ".join(view.titles[0] for view in group)
+        shows = f"Ground truth, {shown}; a detail of each; error maps"
+        yield Picture(f"{frame.stem}-{first}", shows, draw)
 
 
 def _view(run: Run, frame: str) -> View:

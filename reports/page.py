@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-from bench.errors import explained
 from bench.results import Store
 from reports import figures
 from reports.comparison import comparison, conditions_of
 from reports.images import MOST_RENDERINGS, frame_section, kept_frames
-from reports.publish import add_picture, publish
-from reports.runs import Run, load
+from reports.parts import Part, Plot
+from reports.provenance import facts
+from reports.publish import publish
+from reports.runs import Repeated, Run, load
 from reports.tables import Table, run_tables
 
 
@@ -37,28 +38,18 @@ def write_page(
         SteerbenchError: a run is not in the store, or `folder` cannot be written to.
     """
     runs = load(store, labels)
-    with explained(folder):
-        stages = add_picture(folder, "stages", partial(figures.stage_bars, runs))
-        parts = [
-            _heading(runs, failures or {}),
-            TIME.format(stages=stages),
-            _pictures(runs, folder),
-            *map(_figures, runs),
-            _provenance(runs),
-        ]
-    return publish("\n\n".join(parts), folder)
+    parts = [
+        *_heading(runs, failures or {}),
+        *_tradeoffs(runs),
+        *_time(runs),
+        *_pictures(runs),
+        *(part for run in runs for part in _figures(run)),
+        *_provenance(runs),
+    ]
+    return publish(parts, folder, runs)
 
 
-TIME = """\
-## Where the time goes
-
-![Mean time of a frame in ms, one bar per run, divided into stages]({stages})
-
-One bar per run: the mean time of a frame, divided into the stages of the method; a stage includes
-the stages inside it. Time outside all stages is `other`."""
-
-
-def _heading(runs: Sequence[Run], failures: Mapping[str, str]) -> str:
+def _heading(runs: Sequence[Run], failures: Mapping[str, str]) -> Iterator[Part]:
     """Title, the table of all runs and how to read it."""
     few = len(runs) <= MOST_RENDERINGS
     labels = ", ".join(run.label for run in runs) if few else f"{len(runs)} runs"
@@ -75,7 +66,11 @@ def _heading(runs: Sequence[Run], failures: Mapping[str, str]) -> str:
             " and machine."
         )
     title, conditions = f"# {labels} on {scenes}", f"Measured: {conditions_of(runs)}."
-    return "\n\n".join((title, conditions, table.markdown(), reading, *missing_figures(runs)))
+    yield title
+    yield conditions
+    yield table
+    yield reading
+    yield from missing_figures(runs)
 
 
 def missing_figures(runs: Sequence[Run]) -> list[str]:
@@ -84,76 +79,68 @@ def missing_figures(runs: Sequence[Run]) -> list[str]:
     return list(dict.fromkeys(notes))
 
 
-def _pictures(runs: Sequence[Run], folder: Path) -> str:
+def _tradeoffs(runs: Sequence[Run]) -> Iterator[Part]:
+    """Plots of the quality against what it costs, where there are runs to compare."""
+    if len(runs) > 1:
+        lines = [Repeated(run.label, [run]) for run in runs]
+        for title, stem, metric, unit, axis, better in TRADEOFFS:
+            shows = f"PSNR in dB against {axis}, one mark a run"
+            yield f"## {title}"
+            yield figures.quality_plot(lines, metric, unit, axis, stem, shows)
+            yield f"One mark a run: further up is better, further left is {better}."
+
+
+TRADEOFFS = (
+    ("Quality against time", "psnr-ms", "frame_ms", 1.0, "ms a frame", "faster"),
+    ("Quality against memory", "psnr-bytes", "size_bytes.total", 1e6, "MB of the model", "smaller"),
+)
+
+
+def _time(runs: Sequence[Run]) -> Iterator[Part]:
+    yield "## Where the time goes"
+    shows = "Mean time of a frame in ms, one bar per run, divided into stages"
+    yield Plot("stages", shows, partial(figures.stage_bars, runs))
+    yield (
+        "One bar per run: the mean time of a frame, divided into the stages of the method; a stage"
+        " includes the stages inside it. Time outside all stages is `other`."
+    )
+
+
+def _pictures(runs: Sequence[Run]) -> Iterator[Part]:
     """Images of the kept frames; runs that rendered the same frames share them."""
     groups: dict[tuple[object, ...], list[Run]] = {}
     for run in runs:
         groups.setdefault(run.views, []).append(run)
     parts = [
-        text
+        part
         for number, group in enumerate(groups.values(), 1)
         for frame in kept_frames(group[0])
-        for text in frame_section(group, frame, f"frames-{number}", folder)
+        for part in frame_section(group, frame, f"frames-{number}")
     ]
-    return "\n\n".join(("## Pictures", *(parts or ["No frame has a ground truth."])))
+    yield from ("## Pictures", *(parts or ["No frame has a ground truth."]))
 
 
-def _figures(run: Run) -> str:
+def _figures(run: Run) -> Iterator[Part]:
     """All figures of one run."""
-    tables = (table.section(level=3) for table in run_tables(run.rows))
-    return "\n\n".join((f"## {run.label}, run {run.key}", *tables))
+    yield f"## {run.label}, run {run.key}"
+    for table in run_tables(run.rows):
+        yield f"### {table.title}"
+        yield replace(table, sources=((run.key,),) * len(table.lines))
 
 
-def _provenance(runs: Sequence[Run]) -> str:
+def _provenance(runs: Sequence[Run]) -> Iterator[Part]:
     """The commands, then one line for each fact that all runs share, one per run for others."""
     commands = "\n".join(dict.fromkeys(run.record["command"] for run in runs))
-    facts = [_facts(run) for run in runs]
+    of_runs = [facts(run) for run in runs]
     lines = []
-    for name in facts[0]:
-        values = [of_run[name] for of_run in facts]
+    for name in of_runs[0]:
+        values = [of_run[name] for of_run in of_runs]
         if len(set(values)) == 1:
             lines.append((name, values[0]))
         else:
             lines += [
                 (f"{name}, {run.label}", value) for run, value in zip(runs, values, strict=True)
             ]
-    table = Table("Provenance", ("", ""), tuple(lines), figures=False)
-    return f"""\
-## Provenance
-
-Every figure and picture on this page was made by
-
-```sh
-{commands}
-```
-
-{table.markdown()}"""
-
-
-def _facts(run: Run) -> dict[str, str]:
-    """Where the figures of a run come from, by name."""
-    machine, record, row = run.record["machine"], run.record, run.facts
-    memory = f"{machine['memory_bytes'] / 2**30:.0f} GiB"
-    computed = {name: row[name] for name in ("device", "backend", "engine", "precision")}
-    return {
-        "run": run.key,
-        "scene": f"{row['scene']}, digest {record['scene']['digest'][:16]}",
-        "frames": f"{row['trajectory']} at {row['resolution']}",
-        "protocol": _listed(record["protocol"]),
-        "budget": _listed(record["budget"]),
-        "seed": str(row["seed"]),
-        "commit": row["commit"],
-        "computed on": _listed(computed),
-        "peak memory": record["peak_bytes"],
-        "machine": f"{machine['cpu']}, {machine['threads']} threads, {memory}",
-        "GPU": ", ".join(machine["gpus"]) or "none",
-        "system": f"{machine['system']}, Python {machine['python']}",
-        "versions": _listed(record["made_of"].get("libraries", {})),
-    }
-
-
-def _listed(values: Mapping[str, Any]) -> str:
-    return ", ".join(
-        f"{name} {' + '.join(value) if isinstance(value, list) else value}"
-        for name, value in values.items()
-    )
+    yield "## Provenance\n\nEvery figure and picture on this page was made by"
+    yield f"```sh\n{commands}\n```"
+    yield Table("Provenance", ("", ""), tuple(lines), figures=False)

@@ -6,18 +6,18 @@ Its words, and which lines its plots and images show, stand in `paper/page.toml`
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bench.errors import explained
 from reports import figures
 from reports.images import frame_section, kept_frames
 from reports.outliers import Outlier, outlier_table
 from reports.paper_tables import SHARES, Lines, PaperTable, section
-from reports.publish import add_picture, publish
+from reports.parts import Part, Plot
+from reports.publish import publish
 from reports.runs import Run
 
 PAGE: Mapping[str, Any] = tomllib.loads(
@@ -50,25 +50,22 @@ def write_paper_page(
     left_out = "\n".join(f"- missing: {name}: {why}" for name, why in (missing or {}).items())
     listed = outlier_table(found, runs)
     sources = "\n".join(f"{run.key}  {run.record['command']}" for run in runs)
-    with explained(folder):
-        parts = [
-            f"# {PAGE['title']}",
-            PAGE["reading"].strip(),
-            *([f"## Scenes that are left out\n\n{left_out}"] if left_out else []),
-            *([listed.section()] if listed.lines else []),
-            *(section(table, lines.get(table.name, ())) for table in tables),
-            *(text for plot in PAGE["plot"] for text in _plot(plot, tables, lines, folder)),
-            *(text for images in PAGE["images"] for text in _images(images, lines, folder)),
-            f"## Runs\n\nTheir keys in the store, and the commands:\n\n```\n{sources}\n```",
-        ]
-    return publish("\n\n".join(parts), folder)
+    parts = [
+        f"# {PAGE['title']}",
+        PAGE["reading"].strip(),
+        *([f"## Scenes that are left out\n\n{left_out}"] if left_out else []),
+        *([f"## {listed.title}", listed] if listed.lines else []),
+        *(part for table in tables for part in section(table, lines.get(table.name, ()))),
+        *(part for plot in PAGE["plot"] for part in _plot(plot, tables, lines)),
+        *(part for images in PAGE["images"] for part in _images(images, lines)),
+        f"## Runs\n\nTheir keys in the store, and the commands:\n\n```\n{sources}\n```",
+    ]
+    return publish(parts, folder, runs)
 
 
-def _plot(
-    plot: Mapping[str, Any], tables: Sequence[PaperTable], lines: Lines, folder: Path
-) -> Iterator[str]:
+def _plot(plot: Mapping[str, Any], tables: Sequence[PaperTable], lines: Lines) -> Iterator[Part]:
     """A plot with its heading and caption, if anything that it shows was measured."""
-    draw: Callable[[Path], None]
+    stem, title = plot["file"], plot["title"]
     if "metric" in plot:
         shown = [
             replace(line, label=label.format(line.label))
@@ -76,20 +73,19 @@ def _plot(
             for line in lines.get(table, ())
             if line.runs
         ]
-        draw = partial(figures.quality_against, shown, plot["metric"], plot["unit"], plot["axis"])
+        axis = plot["metric"], plot["unit"], plot["axis"]
+        drawn = figures.quality_plot(shown, *axis, stem, title)
         some = bool(shown)
     elif "curves" in plot:
         curves = [curve for table in tables for curve in _curves(table, lines)]
-        draw = partial(figures.quality_over_training, curves)
+        drawn = Plot(stem, title, partial(figures.quality_over_training, curves))
         some = bool(curves)
     else:
         runs = _chosen(plot["lines"], lines, one_scene=plot.get("one_scene", False))
-        draw = partial(getattr(figures, plot["draw"]), runs)
+        drawn = Plot(stem, title, partial(getattr(figures, plot["draw"]), runs))
         some = bool(runs)
     if some:
-        file = add_picture(folder, plot["file"], draw)
-        title, caption = plot["title"], plot["caption"].strip()
-        yield f"## {title}\n\n![{title}]({file})\n\n{caption}"
+        yield from (f"## {title}", drawn, plot["caption"].strip())
 
 
 def _curves(table: PaperTable, lines: Lines) -> Iterator[figures.Curve]:
@@ -109,14 +105,14 @@ def _curves(table: PaperTable, lines: Lines) -> Iterator[figures.Curve]:
             yield figures.Curve(table.number, line.label, points)
 
 
-def _images(images: Mapping[str, Any], lines: Lines, folder: Path) -> Iterator[str]:
+def _images(images: Mapping[str, Any], lines: Lines) -> Iterator[Part]:
     """The middle one of the frames that all runs kept."""
     runs = _chosen(images["lines"], lines, one_scene=True)
     runs = [run for run in runs if run.views == runs[0].views]
     if runs and (frames := kept_frames(runs[0])):
         title, stem = images["title"], f"frames-{images['title'].lower()}"
         yield f"## {title}\n\nThe middle one of the {len(frames)} frames that were kept."
-        yield from frame_section(runs, frames[len(frames) // 2], stem, folder)
+        yield from frame_section(runs, frames[len(frames) // 2], stem)
 
 
 def _chosen(

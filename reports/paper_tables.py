@@ -172,33 +172,37 @@ def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
     names = [": ".join((line.label, *line.gaps)) for line in lines]
     labels = (metric_format(metric)[0] for metric in table.metrics)
     heads = ("measured / paper / difference" if beside else "measured", *labels)
-    return Table(table.title, heads, tuple(zip(names, *columns, strict=True)))
+    cells = tuple(zip(names, *columns, strict=True))
+    return Table(table.title, heads, cells, sources=tuple(line.keys for line in lines))
 
 
-def section(table: PaperTable, lines: Sequence[Repeated]) -> str:
-    """A table as a part of a page: the paper's, the lines of a method beyond it, each scene."""
+def section(table: PaperTable, lines: Sequence[Repeated]) -> list[str | Table]:
+    """A table as parts of a page: the paper's, the lines of a method beyond it, each scene."""
     measured = {line.label: line for line in lines}
     first, *further = table.shown(measured)
     heading = f"## {table.number}: {table.title}"
-    parts = [heading, *_block(first, measured, f"Paper: {table.published_on}.")]
+    parts: list[str | Table] = [heading, *_block(first, measured, f"Paper: {table.published_on}.")]
     for block in further:
         parts += [f"### {block.title}", *_block(block, measured)]
     if table.scenes and len({scene for line in lines for scene in line.by_scene}) > 1:
-        parts.append(scene_table(table.scenes, lines).section(level=3))
-    return "\n\n".join(parts)
+        each = scene_table(table.scenes, lines)
+        parts += [f"### {each.title}", each]
+    return parts
 
 
-def _block(table: PaperTable, measured: Mapping[str, Repeated], published: str = "") -> list[str]:
+def _block(
+    table: PaperTable, measured: Mapping[str, Repeated], published: str = ""
+) -> list[str | Table]:
     """Conditions of the measured and of the published figures, the figures, trends, notes."""
     labels = [line.label for line in table.lines]
     runs = [run for label in labels if label in measured for run in measured[label].runs]
     where = f"Measured: {conditions_of(runs)}, {_origin(runs)}." if runs else ""
     figures = {line.label: line.published for line in table.lines}
     found = [step for trend in table.trends for step in steps(trend, measured, figures)]
-    trends = trend_table(found).markdown() if found else ""
+    trends = trend_table(found) if found else ""
     notes = dict.fromkeys((*table.notes, *missing_figures(runs)))
     listed = "\n".join(f"- {note}" for note in notes)
-    shown = with_published(table, measured).markdown()
+    shown = with_published(table, measured)
     return [part for part in (where, published, shown, trends, listed) if part]
 
 

@@ -111,6 +111,11 @@ class Repeated:
         """The runs of the store behind the figures, each of one scene."""
         return [run for runs in self.by_scene.values() for run in runs] or list(self.runs)
 
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The keys of the runs of the store behind the figures."""
+        return tuple(run.key for run in self.measured)
+
     @cached_property
     def values(self) -> dict[str, float]:
         """Means by metric, of the metrics that all runs have."""

@@ -63,7 +63,7 @@ def scene_table(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:
         for name, of_scene in shown
     )
     heads = ("measured", *(metric_format(metric)[0] for metric in metrics))
-    return Table("Each scene", heads, cells)
+    return Table("Each scene", heads, cells, sources=tuple(of_scene.keys for _, of_scene in shown))
 
 
 def _frames(by_scene: Mapping[str, Run]) -> pd.DataFrame:

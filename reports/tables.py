@@ -39,6 +39,7 @@ class Table:
     Attributes:
         columns: the first is a label; the others are figures, or text when `figures` is False.
         bold: line and column, both from 0, of every bold cell.
+        sources: the keys of the runs behind each line; empty: of none.
     """
 
     title: str
@@ -46,6 +47,7 @@ class Table:
     lines: tuple[tuple[str, ...], ...]
     figures: bool = True
     bold: frozenset[tuple[int, int]] = frozenset()
+    sources: tuple[tuple[str, ...], ...] = ()
 
     def markdown(self) -> str:
         """The table in GitHub's Markdown, without its title."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from bench.errors import explained
 from bench.provenance import commit, machine
 from bench.sharing import whole
 from reports.figures import frontier_plot
+from reports.parts import Part, Plot
 from reports.publish import publish
 from reports.tables import Table, decimal
 
@@ -86,15 +88,14 @@ def write_tradeoff(
         folder.mkdir(parents=True, exist_ok=True)
         _write_csv(experiments, folder / "kernels.csv")
         made = f"```sh\n{command}\n```\n\nCommit {commit()}, {machine()['cpu']}."
-        parts = ["# Run time against error", made]
+        parts: list[Part] = ["# Run time against error", made]
         if settings:
             _write_csv(settings, folder / "settings.csv")
-            with whole(folder / "frontier.png") as new:
-                frontier_plot(settings, new)
-            parts.append("![Error of a frame against its time, one point a setting](frontier.png)")
+            shows = "Error of a frame against its time, one point a setting"
+            parts.append(Plot("frontier", shows, partial(frontier_plot, settings)))
             tables.insert(0, setting_table(settings))
-        parts += [table.section() for table in tables]
-    return publish("\n\n".join(parts), folder)
+    parts += [part for table in tables for part in (f"## {table.title}", table)]
+    return publish(parts, folder)
 
 
 def _write_csv(rows: Sequence[Row], path: Path) -> None:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from reports.images import View, find_detail, write_image
+from reports.images import find_detail, write_image
+from reports.parts import View
 
 HEIGHT, WIDTH = 64, 96
 

@@ -96,7 +96,7 @@ def test_a_page_that_is_interrupted_leaves_the_earlier_one_with_its_pictures(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("reports.page.publish", killed)
+        patch.setattr("reports.publish.html_page", killed)
         with pytest.raises(KeyboardInterrupt):
             write_page(*several, page.parent)
     assert {path: path.read_bytes() for path in linked(page)} == before
@@ -121,8 +121,10 @@ def test_a_page_of_several_runs_has_all_of_them_beside_each_other(several, tmp_p
     page = write_page(store, labels, tmp_path / "page", {"gone": "no memory"})
     text = page.read_text()
     assert text.startswith("# 6 runs on tiny\n")
-    assert len(linked(page)) == 1 + 3 * 2  # the bars, then three frames, at most four runs in each
-    firsts = {path.stem.split("-")[-2] for path in linked(page)[1:]}
+    plots, frames = linked(page)[:3], linked(page)[3:]
+    assert [path.stem[:-13] for path in plots] == ["psnr-ms", "psnr-bytes", "stages"]
+    assert len(frames) == 3 * 2  # at most four runs in each
+    firsts = {path.stem.split("-")[-2] for path in frames}
     assert firsts == {"0", "3"}  # and as many in either
     assert {path.resolve() for path in (page.parent / "pictures").iterdir()} == {
         path.resolve() for path in linked(page)
@@ -148,7 +150,7 @@ def test_runs_of_different_frames_are_not_put_into_one_picture(several, tmp_path
     record["scene"]["digest"] = "of another scene"
     (store.folder / other / "record.json").write_text(json.dumps(record))
     page = write_page(store, {key: "one", other: "two"}, tmp_path / "page")
-    assert len(linked(page)) == 1 + 2 * 3
+    assert len(linked(page)) == 3 + 2 * 3
     assert "**" not in page.read_text()
 
 

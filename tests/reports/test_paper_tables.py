@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -16,6 +17,7 @@ from reports.paper_tables import (
     section,
     with_published,
 )
+from reports.publish import markdown
 from reports.runs import Repeated, Run, load
 from reports.tables import QUALITY
 from reports.trends import Trend
@@ -90,11 +92,12 @@ def test_weights_from_other_scenes_are_a_matter_of_the_block_beyond_the_paper() 
         assert "other scenes" not in " ".join(table.notes)
 
 
-def test_a_section_shows_both_blocks_each_with_its_trends(run: Run) -> None:
+def test_a_section_shows_both_blocks_each_with_its_trends(run: Run, tmp_path: Path) -> None:
     (table,) = (table for table in paper_tables() if table.name == "table5")
     labels = [line.label for block in table.blocks for line in block.lines]
     lines = [Repeated(label, [run]) for label in labels]
-    paper, beyond = section(table, lines).split("### Beyond the paper: steernerf_lean")
+    text = markdown(section(table, lines), tmp_path)
+    paper, beyond = text.split("### Beyond the paper: steernerf_lean")
     assert "PSNR, dB: without joint training < with joint training |" in paper
     assert "(steernerf_lean)" not in paper
     shown = "without joint training (steernerf_lean) < with joint training (steernerf_lean)"
@@ -160,11 +163,14 @@ def test_lines_of_which_nothing_is_published_show_what_was_measured_alone(
     assert shown.lines[0][1] == ("30.00 / 31.00 / -1.00" if published else "30.00")
 
 
-def test_a_section_says_on_what_and_what_to_mind_and_whether_trends_hold(run: Run) -> None:
+def test_a_section_says_on_what_and_what_to_mind_and_whether_trends_hold(
+    run: Run, tmp_path: Path
+) -> None:
     trend = Trend("psnr", ["elsewhere", "here"])
     lines = [Repeated("here", [with_psnr(run, 31.0)]), Repeated("elsewhere", [run])]
     published = [TABLE.lines[0], replace(TABLE.lines[1], published={"psnr": 30.4})]
-    text = section(replace(TABLE, lines=published, trends=[trend]), lines)
+    parts = section(replace(TABLE, lines=published, trends=[trend]), lines)
+    text = markdown(parts, tmp_path)
     assert text.startswith("## Table 9: What is shown")
     assert "Paper: Chair." in text
     assert f"scene {run.facts['scene']}" in text

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from bench.results import Store
 from reports.paper_tables import Line, PaperTable, section
+from reports.publish import markdown
 from reports.runs import Repeated, Run, load
 from reports.scenes import over_scenes
 from reports.trends import SEEN, Trend, steps
@@ -79,10 +81,12 @@ def test_one_seed_is_compared_over_the_frames_of_all_scenes(run: Run) -> None:
 
 
 @pytest.mark.parametrize("scenes", ["ab", "a"])
-def test_each_scene_has_its_line_where_there_are_several(run: Run, scenes: str) -> None:
+def test_each_scene_has_its_line_where_there_are_several(
+    run: Run, scenes: str, tmp_path: Path
+) -> None:
     table = PaperTable("table9", "t", "p", ["psnr"], [Line("x", {})], [], scenes=["psnr"])
     by_scene = {name: [of_scene(run, name, place)] for place, name in enumerate(scenes)}
     mean = over_scenes([of_one for (of_one,) in by_scene.values()])
-    shown = section(table, [Repeated("x", [mean], by_scene=by_scene)])
+    shown = markdown(section(table, [Repeated("x", [mean], by_scene=by_scene)]), tmp_path)
     lines = [f"| {name}: x | {run.values['psnr'] + place:.2f} |" for place, name in enumerate("ab")]
     assert all((line in shown) == (len(scenes) > 1) for line in lines)

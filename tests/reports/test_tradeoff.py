@@ -59,7 +59,7 @@ def test_the_page_shows_both_tables_and_the_plot(tmp_path):
         EXPERIMENTS, SETTINGS, tmp_path / "accuracy", "steerbench accuracy seed=3"
     )
     text = page.read_text()
-    assert "](frontier.png)" in text
+    assert "](pictures/frontier-" in text
     assert "steerbench accuracy seed=3" in text
     assert setting_table(SETTINGS).markdown() in text
     assert experiment_table(EXPERIMENTS).markdown() in text
@@ -68,7 +68,7 @@ def test_the_page_shows_both_tables_and_the_plot(tmp_path):
 
 def test_a_plot_that_is_interrupted_leaves_the_earlier_one(tmp_path, monkeypatch):
     write_tradeoff(EXPERIMENTS, SETTINGS, tmp_path, "steerbench accuracy")
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
 
     def half(rows: list[dict], path: Path) -> None:
         path.write_bytes(b"half")
@@ -77,7 +77,7 @@ def test_a_plot_that_is_interrupted_leaves_the_earlier_one(tmp_path, monkeypatch
     monkeypatch.setattr("reports.tradeoff.frontier_plot", half)
     with pytest.raises(KeyboardInterrupt):
         write_tradeoff(EXPERIMENTS, SETTINGS, tmp_path, "steerbench accuracy")
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
 
 
 def test_without_settings_the_page_is_that_of_the_kernels(tmp_path):

@@ -93,7 +93,7 @@ def test_where_nothing_faster_keeps_within_it_everything_off_is_recommended(stee
 def test_a_report_a_plot_and_the_rows_are_left_in_outputs(steerbench, measured, tmp_path):
     steerbench("accuracy", "outputs=here")
     names = {path.name for path in (tmp_path / "here" / "accuracy").iterdir()}
-    assert names == {"report.md", "report.html", "frontier.png", "kernels.csv", "settings.csv"}
+    assert names == {"report.md", "report.html", "pictures", "kernels.csv", "settings.csv"}
 
 
 def test_a_filter_leaves_the_knobs_with_it_in_their_name_and_what_they_are_compared_with(

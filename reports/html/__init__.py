@@ -1,0 +1,194 @@
+"""A page for a browser, in one file that loads nothing from elsewhere.
+
+Texts and tables are the Markdown of the other page, rendered; plots are drawn by the same code, as
+SVG. The files beside this module are the frame of the page, its style and what it does on a click.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+import tempfile
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import matplotlib
+import numpy as np
+from jinja2 import Environment, FileSystemLoader
+from markdown_it import MarkdownIt
+from markdown_it.token import Token
+from PIL import Image
+
+from reports.comparison import COST, metric_format
+from reports.images import ZOOM
+from reports.parts import Frame, Mark, Part, Plot
+from reports.provenance import facts, settings
+from reports.runs import Run
+from reports.tables import QUALITY, Table
+
+FOLDER = Path(__file__).parent
+TEMPLATES = Environment(
+    loader=FileSystemLoader(FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True
+)
+
+LOSSLESS_PIXELS = 800 * 800
+"""Pictures up to this size lose nothing; larger ones would make a page too large to send."""
+
+LOSSY_QUALITY = 90
+
+PARSER = MarkdownIt("commonmark", {"html": False}).enable("table").disable("image")
+"""Pictures are parts of their own, so none in a text is loaded."""
+
+
+def html_page(parts: Sequence[Part], runs: Sequence[Run]) -> str:
+    """The page of `parts` as HTML.
+
+    Args:
+        parts: from top to bottom; the first begins with the title as a heading.
+        runs: those whose keys tables and marks name.
+    """
+    origins = {run.key: _origin(run) for run in runs}
+    headings: dict[str, str] = {}
+    title = str(parts[0]).partition("\n")[0].lstrip("# ")
+    return TEMPLATES.get_template("page.html").render(
+        title=title,
+        parts=[_html(part, origins, headings) for part in parts],
+        headings=headings,
+        origins=origins,
+        style=(FOLDER / "page.css").read_text(encoding="utf-8"),
+        script=(FOLDER / "page.js").read_text(encoding="utf-8"),
+    )
+
+
+def _origin(run: Run) -> dict[str, str]:
+    """Figures of a run, and where they come from, by name."""
+    formats = {metric: metric_format(metric) for metric in (*QUALITY, *COST)}
+    figures = [
+        f"{label.rstrip(' ↑↓')} {write(run.values[metric])}"
+        for metric, (label, write) in formats.items()
+        if metric in run.values
+    ]
+    chosen = ", ".join(f"{name}={value}" for name, value in settings(run).items())
+    return {
+        "label": run.label,
+        "method": str(run.facts["method"]),
+        "command": run.record["command"],
+        "figures": "; ".join(figures),
+        **facts(run),
+        **({"settings": chosen} if chosen else {}),
+    }
+
+
+def _html(part: Part, origins: dict[str, dict[str, str]], headings: dict[str, str]) -> str:
+    """A part of the page; second headings are entered into `headings` by their ids."""
+    match part:
+        case Table():
+            return _table(part, origins)
+        case Plot():
+            return f'<div class="plot scrolls">{_svg(part)}</div>'
+        case Frame():
+            return TEMPLATES.get_template("frame.html").render(_frame(part))
+    tokens = PARSER.parse(part)
+    for heading, text in pairwise(tokens):
+        if heading.type == "heading_open" and heading.tag == "h2":
+            heading.attrSet("id", name := f"part-{len(headings) + 1}")
+            headings[name] = text.content
+    return _rendered(tokens)
+
+
+def _rendered(tokens: Sequence[Token]) -> str:
+    return str(PARSER.renderer.render(tokens, PARSER.options, {}))
+
+
+def _table(table: Table, origins: dict[str, dict[str, str]]) -> str:
+    """The Markdown of `table`, rendered; a line names the runs behind it, its first cell links to
+    the first of them."""
+    tokens = PARSER.parse(table.markdown())
+    _, *lines = (n for n, token in enumerate(tokens) if token.type == "tr_open")
+    for line, sources in zip(lines, table.sources, strict=False):
+        known = [key for key in sources if key in origins]
+        if known:
+            tokens[line].attrSet("data-runs", " ".join(known))
+            tokens[line].attrSet("title", _in_short(known, origins))
+            label = tokens[line + 2]  # after those that open the line and its first cell
+            link = Token("link_open", "a", 1, attrs={"href": f"#run-{known[0]}", "class": "origin"})
+            label.children = [link, *(label.children or ()), Token("link_close", "a", -1)]
+    return f'<div class="table scrolls">{_rendered(tokens)}</div>'
+
+
+def _in_short(keys: Sequence[str], origins: dict[str, dict[str, str]]) -> str:
+    """Where the figures of a line come from, in a few lines."""
+    shown = [
+        "run {run}, commit {commit}, {machine}: {command}".format(**origins[key])
+        for key in keys[:3]
+    ]
+    more = [f"and {len(keys) - 3} more runs"] if len(keys) > 3 else []
+    return "\n".join([*shown, *more])
+
+
+def _svg(plot: Plot) -> str:
+    """`plot` as SVG; its marks can be focused and say what they are."""
+    with (
+        tempfile.TemporaryDirectory() as place,
+        matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": plot.stem}),
+    ):
+        plot.draw(drawn := Path(place) / "plot.svg")
+        content = drawn.read_text(encoding="utf-8")
+    root = ElementTree.fromstring(content)
+    used = set(re.findall(r"#([\w-]+)", content))
+    for element in root.iter():
+        element.tag = element.tag.rpartition("}")[2]  # HTML knows what lies in an <svg>
+        element.attrib = {name.rpartition("}")[2]: of for name, of in element.attrib.items()}
+        name = element.get("id", "")
+        if name in plot.marks:
+            _name_mark(element, plot.marks[name])
+        if name not in used:  # another plot of the page may have the same
+            element.attrib.pop("id", None)
+    root.remove(next(child for child in root if child.tag == "metadata"))
+    for size in ("width", "height"):
+        del root.attrib[size]
+    root.attrib |= {"role": "group" if plot.marks else "img", "aria-label": plot.shows}
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _name_mark(element: ElementTree.Element, mark: Mark) -> None:
+    attributes = {"class": "mark", "tabindex": "0", "role": "button", "aria-label": mark.says}
+    element.attrib |= {**attributes, "data-runs": " ".join(mark.sources)}
+    title = ElementTree.Element("title")
+    title.text = mark.says
+    element.insert(0, title)
+
+
+def _frame(frame: Frame) -> dict[str, Any]:
+    """What the template shows of `frame`."""
+    height, width = frame.truth.shape[:2]
+    left, top, right, bottom = frame.detail.box
+    views = [{"titles": ("ground truth",), "rendering": _uri(frame.truth)}]
+    views += [
+        {"titles": view.titles, "rendering": _uri(view.rendering), "error": _uri(view.error)}
+        for view in frame.views
+    ]
+    box = (left / width, top / height, (right - left) / width, (bottom - top) / height)
+    lossy = LOSSY_QUALITY if height * width > LOSSLESS_PIXELS else None
+    return {
+        "frame": frame,
+        "views": views,
+        "width": width,
+        "height": height,
+        "box": " ".join(f"{edge:.4f}" for edge in box),
+        "zoom": ZOOM,
+        "lossy": lossy,
+    }
+
+
+def _uri(picture: np.ndarray) -> str:
+    """uint8 [H, W, 3] as a data URI."""
+    content = io.BytesIO()
+    large = picture.shape[0] * picture.shape[1] > LOSSLESS_PIXELS
+    how: dict[str, Any] = {"quality": LOSSY_QUALITY} if large else {"lossless": True}
+    Image.fromarray(picture).save(content, "webp", **how)
+    return f"data:image/webp;base64,{base64.b64encode(content.getvalue()).decode()}"
