@@ -80,7 +80,7 @@ def quality_plot(
 ) -> Plot:
     """`quality_against` as a part of a page: a mark says its label, its PSNR and its `metric`."""
     marks = {
-        MARK.format(number): Mark(f"{line.label}: PSNR {quality} dB, {axis}: {cost}", line.keys)
+        MARK.format(number): Mark(f"{line.label}: PSNR {quality} dB, {cost} {axis}", line.keys)
         for number, line in enumerate(lines)
         if (quality := written(line, "psnr")) and (cost := written(line, metric))
     }
@@ -95,7 +95,7 @@ def quality_against(
 
     Bars show the intervals of both where there are several seeds.
     """
-    figure, axes = _psnr_axes(4.0, axis)
+    figure, axes = _psnr_axes(max(4.0, 0.2 * len(lines)), axis)  # room for the legend
     for number, line in enumerate(lines):
         across, up = line.mean(metric), line.mean("psnr")
         if across is None or up is None:
@@ -116,7 +116,7 @@ def quality_against(
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5, 7)))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_locator(NullLocator())
-    figure.legend(loc="outside right upper", frameon=False)
+    figure.legend(loc="outside right upper", frameon=False, fontsize="small")
     figure.savefig(path, dpi=150)
 
 

@@ -62,11 +62,19 @@ def test_every_package_on_disk_is_listed_and_nothing_else():
     assert sorted(listed) == sorted(found)
 
 
-def test_every_configuration_is_shipped():
-    patterns = PYPROJECT["tool"]["setuptools"]["package-data"]["sweeps"]
-    shipped = {path for pattern in patterns for path in (ROOT / "sweeps").glob(pattern)}
-    configurations = {path for path in CONFIGS.rglob("*") if path.is_file()}
-    assert shipped == {ROOT / "sweeps" / "commands.toml", *configurations}
+def test_every_file_beside_the_sources_is_shipped():
+    of_package = PYPROJECT["tool"]["setuptools"]["package-data"]
+    folders = {name: ROOT / name.replace(".", os.sep) for name in of_package}
+    shipped = {
+        path for name, patterns in of_package.items() for of in patterns
+        for path in folders[name].glob(of)
+    }  # fmt: skip
+    found = {
+        path for top in ("bench", "methods", "reports", "sweeps")
+        for path in (ROOT / top).rglob("*.*")
+        if path.suffix not in (".py", ".pyc")
+    }  # fmt: skip
+    assert shipped == found
 
 
 def test_everything_that_is_installed_for_the_project_is_pinned():

@@ -74,10 +74,9 @@ def _origin(run: Run) -> dict[str, str]:
     ]
     chosen = ", ".join(f"{name}={value}" for name, value in settings(run).items())
     return {
-        "label": run.label,
         "method": str(run.facts["method"]),
-        "command": run.record["command"],
         "figures": "; ".join(figures),
+        "command": run.record["command"],
         **facts(run),
         **({"settings": chosen} if chosen else {}),
     }
@@ -149,8 +148,8 @@ def _svg(plot: Plot) -> str:
         if name not in used:  # another plot of the page may have the same
             element.attrib.pop("id", None)
     root.remove(next(child for child in root if child.tag == "metadata"))
-    for size in ("width", "height"):
-        del root.attrib[size]
+    root.attrib["style"] = f"--width: {root.attrib.pop('width')}"
+    del root.attrib["height"]
     root.attrib |= {"role": "group" if plot.marks else "img", "aria-label": plot.shows}
     return ElementTree.tostring(root, encoding="unicode")
 

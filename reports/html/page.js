@@ -24,7 +24,7 @@ function valueOf(cell) {
 function compare(a, b, sign) {
   if (a === null || b === null) return (a === null) - (b === null);
   if (typeof a !== typeof b) return typeof a === "number" ? -1 : 1;
-  return sign * (typeof a === "number" ? a - b : a.localeCompare(b));
+  return sign * (typeof a === "number" ? a - b : a.localeCompare(b, "en", { numeric: true }));
 }
 
 function makeSortable(table) {
@@ -32,6 +32,7 @@ function makeSortable(table) {
   const original = [...body.rows];
   const heads = [...table.tHead.rows[0].cells];
   heads.forEach((head, column) => {
+    if (!head.textContent.trim()) return;
     const first = head.textContent.endsWith("↑") ? "descending" : "ascending"; // the best above
     const second = first === "ascending" ? "descending" : "ascending";
     const button = make("button", { type: "button" }, ...head.childNodes);
@@ -77,6 +78,7 @@ for (const table of document.querySelectorAll(".table table")) {
 // Where a figure comes from: a panel below, for a row of a table and a mark of a plot.
 
 const panel = document.getElementById("origin");
+const closer = panel.querySelector(".close");
 let opener = null;
 
 function closePanel() {
@@ -111,10 +113,11 @@ function rowInWords(row) {
 }
 
 document.addEventListener("click", (event) => {
-  const link = event.target.closest("a.origin");
-  const place = event.target.closest("[data-runs]");
-  if (link) event.preventDefault();
-  if (place?.matches("tr")) showOrigin(place, rowInWords(place));
+  const row = event.target.closest("tr[data-runs]");
+  if (!row || String(getSelection())) return; // the click ends the selection of a text
+  event.preventDefault(); // of the link to the run
+  showOrigin(row, rowInWords(row));
+  closer.focus();
 });
 for (const mark of document.querySelectorAll(".mark")) {
   const show = () => showOrigin(mark, mark.getAttribute("aria-label"));
@@ -123,16 +126,18 @@ for (const mark of document.querySelectorAll(".mark")) {
   mark.addEventListener("keydown", (event) => {
     if (event.key === "Enter" || event.key === " ") {
       event.preventDefault();
-      panel.querySelector(".close").focus();
+      closer.focus();
     }
   });
 }
-panel.querySelector(".close").addEventListener("click", () => {
+/** Go back to where the panel was opened. */
+function leavePanel() {
+  (opener.querySelector("a.origin") ?? opener).focus();
   closePanel();
-  opener.querySelector("a.origin")?.focus();
-});
+}
+closer.addEventListener("click", leavePanel);
 document.addEventListener("keydown", (event) => {
-  if (event.key === "Escape" && !panel.hidden) closePanel();
+  if (event.key === "Escape" && !panel.hidden) leavePanel();
 });
 
 // Frames: two pictures under a divider, an enlarged detail, error maps.
@@ -163,7 +168,7 @@ function makeComparison(frame) {
   const [left, leftLabel] = choose("left", two ? 1 : 0);
   const [right, rightLabel] = choose("right", two ? 2 : 1);
   const errors = press("error maps", update);
-  const zoomed = press(`detail, ${zoom} times`, () => enlarge(x + width / 2, y + height / 2));
+  const zoomed = press(`enlarge ${zoom} times`, () => enlarge(x + width / 2, y + height / 2));
   zoomed.title = `where ${frame.dataset.where}`;
 
   const images = [make("img"), make("img")];
@@ -177,6 +182,7 @@ function makeComparison(frame) {
   const [wide, high] = ["width", "height"].map((name) => original.getAttribute(name));
   stage.style.aspectRatio = `${wide} / ${high}`;
   stage.style.setProperty("--zoom", zoom);
+  stage.title = "Drag to move the line between the pictures, click to enlarge";
   const names = make("div", { className: "names" }, make("span"), make("span"));
   const slider = make("input", { type: "range", min: 0, max: 100, step: 0.5, value: 50 });
   slider.ariaLabel = "where the left picture ends";
