@@ -25,10 +25,10 @@ help: ## show this list
 
 install: $(VENV)/.installed ## make $(VENV) and install steerbench into it, versions pinned
 
-demo: install ## build a scene, train on it, render it, write outputs/demo/report.md
+demo: install ## build a scene, train on it, render it, write outputs/demo/report.html
 	@$(BIN)/steerbench run +experiment=demo $(DEMO_ARGS)
 
-paper: install ## measure every table of the SteerNeRF paper, write outputs/paper/report.md
+paper: install ## measure every table of the SteerNeRF paper, write outputs/paper/report.html
 	@$(BIN)/steerbench paper $(PAPER_ARGS)
 
 # A process for each core, a file of tests in one of them, in the order of tests/conftest.py.

@@ -116,7 +116,9 @@ def quality_against(
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5, 7)))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_locator(NullLocator())
-    figure.legend(loc="outside right upper", frameon=False, fontsize="small")
+    figure.legend(
+        loc="outside right upper", frameon=False, fontsize="small" if len(lines) > 15 else None
+    )
     figure.savefig(path, dpi=150)
 
 

@@ -20,11 +20,13 @@ function valueOf(cell) {
   return number ? Number(number[0].replaceAll(",", "")) : text;
 }
 
+const alphabet = new Intl.Collator("en", { numeric: true });
+
 /** Numbers before texts; `sign` is -1 for the largest first. What is missing comes last. */
 function compare(a, b, sign) {
   if (a === null || b === null) return (a === null) - (b === null);
   if (typeof a !== typeof b) return typeof a === "number" ? -1 : 1;
-  return sign * (typeof a === "number" ? a - b : a.localeCompare(b, "en", { numeric: true }));
+  return sign * (typeof a === "number" ? a - b : alphabet.compare(a, b));
 }
 
 function makeSortable(table) {
@@ -72,7 +74,8 @@ for (const table of document.querySelectorAll(".table table")) {
   const grouped = rows.some((row) => !row.cells[0].textContent); // belong to the row above
   const named = table.tHead.textContent.trim();
   if (rows.length > 1 && named && !grouped) makeSortable(table);
-  if (rows.length > 4 && named) makeFilterable(table);
+  const ofOneRun = rows[0]?.dataset.runs && new Set(rows.map((row) => row.dataset.runs)).size === 1;
+  if (rows.length > 4 && named && !ofOneRun) makeFilterable(table);
 }
 
 // Where a figure comes from: a panel below, for a row of a table and a mark of a plot.
@@ -83,6 +86,7 @@ let opener = null;
 
 function closePanel() {
   panel.hidden = true;
+  document.documentElement.classList.remove("explaining");
   document.querySelectorAll(".shown").forEach((element) => element.classList.remove("shown"));
 }
 
@@ -101,6 +105,7 @@ function showOrigin(element, title) {
   panel.querySelector("h2").textContent = title;
   panel.querySelector(".runs").replaceChildren(...copies);
   panel.hidden = false;
+  document.documentElement.classList.add("explaining"); // there is room to scroll above the panel
   panel.scrollTop = 0;
 }
 
@@ -230,7 +235,7 @@ function makeComparison(frame) {
 
   const controls = make("div", { className: "controls" }, leftLabel, rightLabel, zoomed, errors);
   const comparison = make("div", { className: "comparison" }, controls, names, stage, slider);
-  comparison.style.maxWidth = `${Math.max(wide, 480)}px`;
+  comparison.style.maxWidth = `${Math.max(wide, 560)}px`;
   frame.prepend(comparison);
   frame.classList.add("live");
   update();
