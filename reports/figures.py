@@ -20,6 +20,7 @@ from bench.results import COLD
 from reports.comparison import written
 from reports.parts import Mark, Plot
 from reports.runs import Repeated, Run
+from reports.tables import NOT_AVAILABLE
 
 STAGE = "stage_ms."
 LEGEND_COLUMNS = 4
@@ -78,11 +79,15 @@ def _stages(run: Run) -> dict[str, float]:
 def quality_plot(
     lines: Sequence[Repeated], metric: str, unit: float, axis: str, stem: str, shows: str
 ) -> Plot:
-    """`quality_against` as a part of a page: a mark says its label, its PSNR and its `metric`."""
+    """`quality_against` as a part of a page: a mark says its label, its PSNR and its `metric`.
+
+    A line without one of the two has no mark.
+    """
     marks = {
         MARK.format(number): Mark(f"{line.label}: PSNR {quality} dB, {cost} {axis}", line.keys)
         for number, line in enumerate(lines)
-        if (quality := written(line, "psnr")) and (cost := written(line, metric))
+        if (quality := written(line, "psnr") or NOT_AVAILABLE) != NOT_AVAILABLE
+        and (cost := written(line, metric) or NOT_AVAILABLE) != NOT_AVAILABLE
     }
     draw = partial(quality_against, lines, metric, unit, axis)
     return Plot(stem, shows, draw, marks)

@@ -81,12 +81,13 @@ def missing_figures(runs: Sequence[Run]) -> list[str]:
 
 def _tradeoffs(runs: Sequence[Run]) -> Iterator[Part]:
     """Plots of the quality against what it costs, where there are runs to compare."""
-    if len(runs) > 1:
-        lines = [Repeated(run.label, [run]) for run in runs]
-        for title, stem, metric, unit, axis, better in TRADEOFFS:
-            shows = f"PSNR in dB against {axis}, one mark a run"
+    lines = [Repeated(run.label, [run]) for run in runs]
+    for title, stem, metric, unit, axis, better in TRADEOFFS:
+        shows = f"PSNR in dB against {axis}, one mark a run"
+        plot = figures.quality_plot(lines, metric, unit, axis, stem, shows)
+        if len(plot.marks) > 1:
             yield f"## {title}"
-            yield figures.quality_plot(lines, metric, unit, axis, stem, shows)
+            yield plot
             yield f"One mark a run: further up is better, further left is {better}."
 
 

@@ -143,6 +143,17 @@ def test_provenance_lists_once_what_all_runs_have_in_common(several, tmp_path):
     assert "| machine, copy 4 | another," in text
 
 
+def test_quality_is_plotted_against_cost_only_where_two_runs_have_both(several, tmp_path):
+    store, labels = several
+    key, other = list(labels)[:2]
+    rows = pd.read_csv(store.folder / other / "rows.csv")
+    rows.loc[rows["metric"] == "size_bytes.total", "value"] = float("nan")
+    rows.to_csv(store.folder / other / "rows.csv", index=False)
+    text = write_page(store, {key: "one", other: "two"}, tmp_path / "page").read_text()
+    assert "## Quality against time" in text
+    assert "## Quality against memory" not in text
+
+
 def test_runs_of_different_frames_are_not_put_into_one_picture(several, tmp_path):
     store, labels = several
     key, other = list(labels)[:2]

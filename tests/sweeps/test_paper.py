@@ -254,7 +254,7 @@ def test_a_report_has_what_is_there_and_measures_nothing(
         f"L = 3: {missing}",
     ]
     written = page.with_suffix(".html").read_text()
-    assert "<td>L = 1</td>" in written
+    assert ">L = 1</a></td>" in written
     assert not re.search(r'src="(?!data:)', written)
 
 

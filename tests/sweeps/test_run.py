@@ -149,7 +149,7 @@ def test_a_sweep_writes_one_page_about_all_its_jobs(run, tmp_path):
     assert outcome.err.count("report: ") == 1
     text = (tmp_path / "page/report.md").read_text()
     assert text.startswith("# grey, dark on white")
-    assert len(list((tmp_path / "page/pictures").iterdir())) == 1 + 2  # the bars, two frames
+    assert len(list((tmp_path / "page/pictures").iterdir())) == 3 + 2  # the plots, two frames
 
 
 def test_a_folder_named_after_what_is_swept_gets_a_page_of_its_own(run, tmp_path):

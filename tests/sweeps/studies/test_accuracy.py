@@ -7,6 +7,7 @@ import math
 from types import SimpleNamespace
 
 import pytest
+from matplotlib.figure import Figure
 
 from bench.errors import SteerbenchError
 from bench.study import Study, Variant
@@ -45,7 +46,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(f"{VARIANTS}.render_in_turns", rendered)
     monkeypatch.setattr("sweeps.studies.accuracy.experiment_rows", lambda *arguments: [ERROR])
     monkeypatch.setattr("methods.checks.found", lambda name: [])
-    monkeypatch.setattr("reports.tradeoff.frontier_plot", lambda rows, path: path.touch())
+    monkeypatch.setattr("reports.tradeoff.frontier_plot", lambda rows, path: Figure().savefig(path))
 
 
 @pytest.mark.parametrize("text", ["0.1dB", "0.1 dB", ".1", "0.1", "0.10db"])
