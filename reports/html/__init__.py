@@ -188,6 +188,7 @@ def _uri(picture: np.ndarray) -> str:
     """uint8 [H, W, 3] as a data URI."""
     content = io.BytesIO()
     large = picture.shape[0] * picture.shape[1] > LOSSLESS_PIXELS
-    how: dict[str, Any] = {"quality": LOSSY_QUALITY} if large else {"lossless": True}
+    quick = {"lossless": True, "method": 1}  # twice as fast as the default, 5 % larger
+    how: dict[str, Any] = {"quality": LOSSY_QUALITY} if large else quick
     Image.fromarray(picture).save(content, "webp", **how)
     return f"data:image/webp;base64,{base64.b64encode(content.getvalue()).decode()}"
