@@ -61,11 +61,11 @@ class MarchOptions(PixelOptions):
     """How a field learns that is sampled along rays.
 
     Attributes:
-        march_step: length of a ray-marching step, in diagonals of the cube / 1024, as the release
-            has it.
+        march_step: length of a ray-marching step, in diagonals of the cube / 1024; the release
+            has 1.
     """
 
-    march_step: float = 1.0
+    march_step: float = 2.0
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -137,7 +137,7 @@ class Rendering:
         check_stop(self.stop)
 
     @classmethod
-    def in_training(cls, model: Model, refined: float, refined_step: float = 1.0) -> Rendering:
+    def in_training(cls, model: Model, refined: float, refined_step: float) -> Rendering:
         """How `model` is rendered while it is trained: rays look everywhere, so that one training
         serves all choices; a share `refined` of the cells is refined, in steps of
         `refined_step`."""

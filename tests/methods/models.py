@@ -38,7 +38,7 @@ def small_model(**others: Any) -> Model:
 
 def small_rendering(**others: Any) -> Rendering:
     """As `small_model()` is trained, but without refinement; `others` replace fields."""
-    return replace(Rendering.in_training(small_model(), refined=0.0), **others)
+    return replace(Rendering.in_training(small_model(), refined=0.0, refined_step=1.0), **others)
 
 
 def shell() -> Occupancy:

@@ -58,7 +58,7 @@ class JointOptions:
     opacity_entropy: float = 1e-3
     error_weight: float = 1e-4
     refined: float = 0.2
-    refined_step: float = 1.0
+    refined_step: float = 2.0
     refined_rays: int = 2048
     clip: float | None = 1.0
     average: float = 0.999

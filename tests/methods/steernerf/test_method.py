@@ -219,9 +219,10 @@ def test_an_unknown_share_of_the_steps_is_refused() -> None:
 
 
 def test_training_renders_everywhere_whatever_is_chosen_afterwards() -> None:
-    rendering = Rendering.in_training(small_model(step=2.0, stop=1e-2), refined=0.2)
+    model = small_model(step=2.0, stop=1e-2)
+    rendering = Rendering.in_training(model, refined=0.2, refined_step=3.0)
     assert (rendering.step, rendering.stop, rendering.refined) == (2.0, 1e-2, 0.2)
-    assert (rendering.range.mode, rendering.overlap, rendering.refined_step) == ("off", 0.0, 1.0)
+    assert (rendering.range.mode, rendering.overlap, rendering.refined_step) == ("off", 0.0, 3.0)
     assert rendering.skip == Skips()
 
 

@@ -48,7 +48,7 @@ def new_training(
     renderer = renderer or small_renderer(model)
     generator = torch.Generator().manual_seed(1)
     pipeline = Pipeline(field, shell(), scene.background, renderer, model)
-    rendering = Rendering.in_training(model, options.refined)
+    rendering = Rendering.in_training(model, options.refined, options.refined_step)
     pool = SequencePool(pipeline, rendering, TrainingViews.of(scene), options.motion, generator)
     learning = options.field == "joint"
     through = options.through if learning else "none"

@@ -24,7 +24,7 @@ def new_pool(scene: Scene, motion: MotionOptions, share: float = 0.0, frames: in
     real = TrainingViews.of(scene).real
     views = TrainingViews(real[:12], TARGET, real[12:], share)
     pipeline = new_pipeline(small_model(frames=frames))
-    rendering = Rendering.in_training(pipeline.model, refined=0.0)
+    rendering = Rendering.in_training(pipeline.model, refined=0.0, refined_step=1.0)
     generator = torch.Generator().manual_seed(0)
     return SequencePool(pipeline, rendering, views, motion, generator)
 
@@ -74,7 +74,7 @@ def test_a_preceding_frame_is_drawn_only_if_its_picture_is_read(
     monkeypatch.setattr(
         pipeline.renderer, "forward", lambda *given: (drawn.append(given), forward(*given))[1]
     )
-    rendering = Rendering.in_training(pipeline.model, refined=0.0)
+    rendering = Rendering.in_training(pipeline.model, refined=0.0, refined_step=1.0)
     remembered, rendered = RenderingBuffer(2), RenderingBuffer(2)
     pipeline.remember(camera, remembered, rendering)
     assert len(drawn) == int(history)
