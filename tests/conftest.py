@@ -28,6 +28,7 @@ from bench.results import Store
 from bench.run import Task, measure
 from bench.trajectories import from_split
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene, Split
+from tests.pretended_gpu import PretendedGpu, pretended_gpu
 
 hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True)
 hypothesis.settings.register_profile("fuzz", max_examples=10_000, deadline=5000)  # ms; no hang
@@ -56,6 +57,15 @@ DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
 def device(request: pytest.FixtureRequest) -> str:
     """Every device of this machine in turn."""
     return request.param
+
+
+@pytest.fixture
+def gpu() -> Iterator[PretendedGpu]:
+    """A GPU, pretended: `device="cuda"` is there. Skips on a machine that has one."""
+    if torch.cuda.is_available():
+        pytest.skip("this machine has a GPU")
+    with pretended_gpu() as gpu:
+        yield gpu
 
 
 @pytest.fixture(scope="session", autouse=True)

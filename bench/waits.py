@@ -1,0 +1,63 @@
+"""Where the host waits for a GPU, counted by the lines of Python that make it wait."""
+
+from __future__ import annotations
+
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import dropwhile
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from bench.errors import Unavailable
+
+TORCH = str(Path(torch.__file__).parent)
+
+
+class Line(NamedTuple):
+    """A line of a source file."""
+
+    path: str
+    number: int
+
+
+@contextmanager
+def device_waits() -> Iterator[Counter[Line]]:
+    """Count how often the host waits for the GPU in here, by the line that made it wait.
+
+    Torch tells of them (`torch.cuda.set_sync_debug_mode`). That a clock waits for the device to
+    finish is not counted.
+
+    Raises:
+        Unavailable: there is no GPU.
+    """
+    if not torch.cuda.is_available():
+        raise Unavailable("to count how often the host waits for the device, a GPU is needed")
+    waits: Counter[Line] = Counter()
+
+    def note(message, category, filename, lineno, file=None, line=None):
+        if "synchronizing CUDA operation" in str(message):
+            waits[_cause(Line(filename, lineno))] += 1
+        else:
+            show(message, category, filename, lineno, file, line)
+
+    before = torch.cuda.get_sync_debug_mode()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("always", "called a synchronizing CUDA operation")
+        show, warnings.showwarning = warnings.showwarning, note
+        torch.cuda.set_sync_debug_mode("warn")
+        try:
+            yield waits
+        finally:
+            torch.cuda.set_sync_debug_mode(before)
+
+
+def _cause(warned: Line) -> Line:
+    """The innermost line outside of torch on the way to the one that was warned of."""
+    lines = (Line(f.f_code.co_filename, number) for f, number in traceback.walk_stack(None))
+    outwards = dropwhile(lambda line: line != warned, lines)
+    return next((line for line in outwards if not line.path.startswith(TORCH)), warned)

@@ -1,0 +1,390 @@
+"""A pretended GPU: what is meant for CUDA runs here, with numbers that lie on the CPU.
+
+A tensor on `cuda:0` holds one on the CPU. Python is told the one device; torch's C++ sees the
+other, because a torch without CUDA cannot differentiate anywhere else. Every operation is computed
+on what its tensors hold, after it was checked for what CUDA refuses: tensors or random numbers of
+two devices, `.numpy()`, a tensor of the CPU in a Triton kernel, and waiting while a graph is
+captured. `torch.cuda.set_sync_debug_mode` tells of every operation for which the host waits.
+
+Not pretended: time, memory, streams, the order of atomics, types that CUDA has no kernel for, which
+operations autocast lowers there, and Triton's compiler. Only one thread sees the GPU.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from types import FrameType, SimpleNamespace
+from typing import Any
+from unittest.mock import MagicMock
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map
+
+from methods.kernels.dispatch import availability, multiplies_bf16
+
+GPU, CPU = torch.device("cuda", 0), torch.device("cpu")
+
+TORCH = str(Path(torch.__file__).parent)
+AUTOGRAD = torch.autograd.graph.__file__
+"""Where Python hands a backward pass to C++."""
+
+KNOWN_TO_HOST = {
+    *("_local_scalar_dense", "is_nonzero", "equal", "_linalg_check_errors", "nonzero", "bincount"),
+    *("masked_select", "_unique2", "unique_dim", "unique_consecutive"),
+}
+"""Operations of which the host has to know the result, or its size."""
+
+INDEXED = {"index", "_unsafe_index", "index_put", "index_put_", "_index_put_impl_"}
+
+
+class GpuTensor(Tensor):
+    """A tensor that says it is on `cuda:0`, around the CPU tensor `held`."""
+
+    held: Tensor
+    device, is_cuda, is_cpu = GPU, True, False  # type: ignore[assignment]
+
+    @staticmethod
+    def __new__(cls, held: Tensor) -> GpuTensor:
+        new = Tensor._make_wrapper_subclass(
+            cls,
+            held.shape,
+            strides=held.stride(),
+            storage_offset=held.storage_offset(),
+            dtype=held.dtype,
+            device=CPU,
+        )
+        new.held = held
+        return new
+
+    @classmethod
+    def __torch_function__(cls, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        inside = _gpu.inside(_kind(kwargs.get("device")) != "cpu")
+        with inside, torch._C.DisableTorchFunctionSubclass():
+            return func(*args, **kwargs)
+
+    @classmethod
+    def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
+        raise RuntimeError(f"{func}: the pretended GPU is gone, or in another thread")
+
+    def backward(self, *args: Any, **kwargs: Any) -> None:
+        """Outside of `__torch_function__`: what Python makes on the way is not made by C++."""
+        with _gpu.differentiating():
+            torch.autograd.backward(self, *args, **kwargs)
+
+    def numpy(self, *args: object, **kwargs: object) -> Any:
+        raise TypeError(
+            "can't convert cuda:0 device type tensor to numpy. Use Tensor.cpu() to copy the tensor "
+            "to host memory first."
+        )
+
+    __array__ = numpy
+
+    def tolist(self) -> Any:
+        return self.cpu().tolist()
+
+    def new_tensor(self, data: Any, **kwargs: Any) -> Tensor:
+        return torch.tensor(data, **{"dtype": self.dtype, "device": GPU} | kwargs)
+
+    def untyped_storage(self) -> torch.UntypedStorage:
+        return self.held.untyped_storage()
+
+    def __repr__(self) -> str:  # type: ignore[override]
+        return f"GpuTensor({self.held})"
+
+
+class Graph(list[tuple[Callable[..., Any], tuple, dict, Any]]):
+    """The operations that were captured, with their results."""
+
+    def replay(self) -> None:
+        """Compute them again, into the same memory."""
+        for func, args, kwargs, results in self:
+            again = tree_leaves(func(*args, **kwargs))
+            for old, new in zip(tree_leaves(results), again, strict=True):
+                if isinstance(old, Tensor) and old.data_ptr() != new.data_ptr():
+                    old.copy_(new)
+
+
+class PretendedGpu(TorchDispatchMode):
+    """Computes every operation of torch, those of the CPU as if it were not there."""
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # nothing is compiled, and to import the compiler takes seconds
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.generators: dict[int, torch.Generator] = {}  # kept: the address of one is its key
+        self.sync_debug_mode = 0
+        self._graph: Graph | None = None
+        self._inside = False  # a function of C++ that works on the GPU
+        self._differentiating = False  # C++ at work there; between, functions of Python
+
+    @contextmanager
+    def inside(self, inside: bool) -> Iterator[None]:
+        """What C++ makes in here "on the CPU" belongs on the GPU."""
+        before, self._inside = self._inside, inside
+        try:
+            yield
+        finally:
+            self._inside = before
+
+    @contextmanager
+    def differentiating(self) -> Iterator[None]:
+        """The same for what autograd makes, and not for what Python makes that it calls."""
+        self._differentiating = True
+        try:
+            yield
+        finally:
+            self._differentiating = False
+
+    @contextmanager
+    def capturing(self, graph: Graph, **options: object) -> Iterator[None]:
+        """As `torch.cuda.graph`."""
+        self._graph = graph
+        try:
+            yield
+        finally:
+            self._graph = None
+
+    def wait(self) -> None:
+        """The host waits for the GPU: refused while a graph is captured."""
+        if self._graph is not None:
+            raise RuntimeError("CUDA error: operation not permitted when stream is capturing")
+        if self.sync_debug_mode == 2:
+            raise RuntimeError("called a synchronizing CUDA operation")
+        if self.sync_debug_mode == 1:
+            frame = _caller(TORCH)
+            warnings.warn_explicit(
+                "called a synchronizing CUDA operation",
+                UserWarning,
+                frame.f_code.co_filename,
+                frame.f_lineno,
+            )
+
+    def moved(self, tensor: Tensor, device: torch.device, waits: bool = True) -> Tensor:
+        """A copy of `tensor` on the other device."""
+        if tensor.requires_grad and torch.is_grad_enabled():
+            raise NotImplementedError("the pretended GPU differentiates no copies between devices")
+        if waits:
+            self.wait()
+        copy = _held(tensor).detach().clone()
+        return GpuTensor(copy) if device.type == "cuda" else copy
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        tensors = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
+        ours = [x for x in tensors if isinstance(x, GpuTensor)]
+        on_gpu = self._computes(kwargs.get("device"), tensors, ours)
+        if ours:
+            others = [x for x in tensors if not isinstance(x, GpuTensor)]
+            self._refuse_or_wait(func, args, kwargs, others)
+        self._check_generator(kwargs.get("generator"), on_gpu)
+        if _kind(kwargs.get("device")) == "cuda":
+            kwargs = {**kwargs, "device": CPU}
+        inputs = {id(_held(x)): x for x in tensors}
+        args, kwargs = tree_map(_held, (args, kwargs))
+        results = func(*args, **kwargs)
+        if self._graph is not None and on_gpu:
+            self._graph.append((func, args, kwargs, results))
+
+        def returned(x: Any) -> Any:
+            """What was changed in place is the same object as before."""
+            if id(x) in inputs:
+                return inputs[id(x)]
+            return GpuTensor(x) if on_gpu and isinstance(x, Tensor) else x
+
+        return tree_map(returned, results)
+
+    def _computes(self, device: Any, tensors: list[Tensor], ours: list[Tensor]) -> bool:
+        """Whether an operation of `tensors` that was asked for on `device` gives one on the GPU."""
+        if _kind(device) != "cpu":
+            return bool(ours) if device is None else _kind(device) == "cuda"
+        # Python asks for the CPU where it says nothing, C++ where it saw the tensors that we hold.
+        inside = self._inside or (
+            self._differentiating and _caller().f_code.co_filename == AUTOGRAD
+        )
+        return inside and (bool(ours) or not tensors)
+
+    def _check_generator(self, generator: torch.Generator | None, on_gpu: bool) -> None:
+        if generator is not None and (generator._cdata in self.generators) != on_gpu:
+            raise RuntimeError("the random numbers and their generator are on two devices")
+
+    def _refuse_or_wait(self, func: Any, args: Any, kwargs: Any, others: list[Tensor]) -> None:
+        """What an operation of our tensors does with `others`, of the CPU, and for the host."""
+        name, first = func.overloadpacket.__name__, args[0]
+        summed = name == "repeat_interleave" and kwargs.get("output_size") is None
+        if summed or name in KNOWN_TO_HOST:
+            self.wait()
+        elif name == "copy_" and others:
+            return self.wait()
+        elif name == "where":
+            for _ in others:
+                self.wait()  # for a number of the CPU, which is copied
+        elif name in INDEXED and isinstance(first, GpuTensor):
+            others = self._wait_for_indices(args, others)
+        changed = func._schema.is_mutable and isinstance(first, Tensor) and _held(first) is first
+        if changed or any(x.dim() or name in ("cat", "stack") for x in others):
+            raise RuntimeError(
+                "Expected all tensors to be on the same device, but found at least two devices, "
+                f"cuda:0 and cpu! (when computing {func})"
+            )
+        return None
+
+    def _wait_for_indices(self, args: Any, others: list[Tensor]) -> list[Tensor]:
+        """Wait for the number of true ones in a mask, and for what is copied from the CPU: indices
+        and a number to be put; return the rest of `others`."""
+        indices = [x for x in args[1] if x is not None]
+        masks = [x for x in indices if x.dtype in (torch.bool, torch.uint8)]
+        numbers = [x for x in others if len(args) > 2 and x is args[2] and not x.dim()]
+        if not (numbers and len(masks) == len(indices) == 1):  # else the mask is filled
+            for _ in [*masks, *numbers, *(x for x in indices if not isinstance(x, GpuTensor))]:
+                self.wait()
+        return [x for x in others if len(args) > 2 and x is args[2]]
+
+
+_gpu: PretendedGpu
+"""The one there is."""
+
+
+def _held(x: Any) -> Any:
+    return x.held if isinstance(x, GpuTensor) else x
+
+
+def _kind(device: Any) -> str | None:
+    return None if device is None else torch.device(device).type
+
+
+def _caller(*but: str) -> FrameType:
+    """The innermost frame outside of this file and of files whose paths begin with `but`."""
+    frame = sys._getframe(1)
+    while frame.f_code.co_filename.startswith((__file__, *but)):
+        assert frame.f_back is not None
+        frame = frame.f_back
+    return frame
+
+
+@contextmanager
+def pretended_gpu() -> Iterator[PretendedGpu]:
+    """Everything in here, in this thread, sees a GPU."""
+    global _gpu
+    _gpu = PretendedGpu()
+    with pytest.MonkeyPatch.context() as patch:
+        for name, what in _of_torch_cuda(_gpu).items():
+            patch.setattr(torch.cuda, name, what)
+        for name, what in _of_tensors(_gpu).items():
+            patch.setattr(Tensor, name, what)
+        patch.setattr(torch, "tensor", _tensor(torch.tensor))
+        patch.setattr(torch, "Generator", _generator(_gpu))
+        # So that a module moves to the GPU and back in place, as it does on a real one.
+        patch.setattr(torch.__future__, "get_swap_module_params_on_conversion", lambda: True)
+        patch.setattr(torch.autocast, "__init__", _autocast(torch.autocast.__init__))
+        _patch_triton(patch)
+        for cached in (availability, multiplies_bf16):
+            cached.cache_clear()
+        with _gpu:
+            yield _gpu
+    for cached in (availability, multiplies_bf16):
+        cached.cache_clear()
+
+
+def _of_torch_cuda(gpu: PretendedGpu) -> dict[str, Any]:
+    modes = {"default": 0, "warn": 1, "error": 2}
+
+    def set_sync_debug_mode(mode: int | str) -> None:
+        gpu.sync_debug_mode = modes[mode] if isinstance(mode, str) else mode
+
+    return {
+        "_lazy_init": lambda: None,
+        "is_available": lambda: True,
+        "device_count": lambda: 1,
+        "get_device_name": lambda *device: "pretended GPU",
+        "get_device_properties": lambda *device: SimpleNamespace(uuid="pretended"),
+        "is_bf16_supported": lambda **kwargs: True,
+        "max_memory_allocated": lambda *device: 1,
+        "reset_peak_memory_stats": lambda *device: None,
+        "synchronize": lambda *device: None,
+        "set_sync_debug_mode": set_sync_debug_mode,
+        "get_sync_debug_mode": lambda: gpu.sync_debug_mode,
+        "device_of": lambda tensor: nullcontext(),
+        "Stream": MagicMock,
+        "current_stream": MagicMock,
+        "stream": lambda stream: nullcontext(),
+        "graph_pool_handle": lambda: None,
+        "CUDAGraph": Graph,
+        "graph": gpu.capturing,
+    }
+
+
+def _of_tensors(gpu: PretendedGpu) -> dict[str, Any]:
+    convert = Tensor.to
+
+    def to(self, *args, copy=False, **kwargs):
+        if args and isinstance(args[0], Tensor):
+            args = args[0].device, args[0].dtype, *args[1:]
+        device, dtype, non_blocking, layout = torch._C._nn._parse_to(*args, **kwargs)
+        layout = layout or torch.preserve_format
+        new = convert(self, dtype=dtype or self.dtype, copy=copy, memory_format=layout)
+        if device is None or device.type in (self.device.type, "meta"):
+            return new if device is None or device.type != "meta" else convert(new, device)
+        return gpu.moved(new, device, waits=not non_blocking)
+
+    return {
+        "to": to,
+        "cuda": lambda self, *args, **kwargs: self.to(GPU),
+        "cpu": lambda self, *args, **kwargs: self.to(CPU),
+    }
+
+
+def _tensor(make: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    def tensor(data, *, device=None, **kwargs):
+        if _kind(device) == "cuda":
+            return make(data, **kwargs).to(GPU)
+        return make(data, device=device, **kwargs)
+
+    return tensor
+
+
+def _generator(gpu: PretendedGpu) -> type:
+    class Generator(torch.Generator):
+        device = property(lambda self: GPU if self._cdata in gpu.generators else CPU)
+
+        def __new__(cls, device="cpu"):
+            new = super().__new__(cls)
+            if _kind(device) == "cuda":
+                gpu.generators[new._cdata] = new
+            return new
+
+    return Generator
+
+
+def _autocast(begin: Callable[..., None]) -> Callable[..., None]:
+    """C++, which sees the CPU, lowers what it would lower there."""
+
+    def init(self, device_type, *args, **kwargs):
+        begin(self, "cpu", *args, **kwargs)
+
+    return init
+
+
+def _patch_triton(patch: pytest.MonkeyPatch) -> None:
+    """Where Triton is installed, its interpreter takes tensors of the GPU, and no others."""
+    try:
+        from triton.runtime.interpreter import GridExecutor
+    except ImportError:
+        return
+    run = GridExecutor.__call__
+
+    def launch(self, *args, **kwargs):
+        if any(isinstance(x, Tensor) and not isinstance(x, GpuTensor) for x in args):
+            raise ValueError("Pointer argument cannot be accessed from Triton (cpu tensor?)")
+        return run(self, *map(_held, args), **kwargs)
+
+    patch.setattr(GridExecutor, "__call__", launch)

@@ -1,0 +1,246 @@
+"""The pretended GPU: it refuses what CUDA refuses, and waits where CUDA waits.
+
+The last tests plant bugs in the project, each of a kind that only a GPU shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from bench.cameras import place_camera
+from bench.types import Log, NullProbe
+from bench.waits import device_waits
+from methods.engines.torch_engine import TorchEngine
+from methods.kernels import dispatch
+from methods.kernels.encode import HashGrid, encode
+from methods.kernels.march import Occupancy
+from methods.rendering import rays
+from methods.rendering.frame import everywhere, render_frame
+from methods.rendering.march import March
+from tests.methods.conftest import look_at_the_middle
+from tests.methods.models import misty_field, shell
+from tests.pretended_gpu import PretendedGpu, pretended_gpu
+
+
+def there(*values: float) -> Tensor:
+    return torch.tensor(values, device="cuda")
+
+
+HERE = torch.tensor([1.0, 2.0, 3.0])
+
+
+def test_a_tensor_there_says_so_and_so_does_what_is_computed_from_it(gpu: PretendedGpu) -> None:
+    x = torch.arange(3.0, device="cuda")
+    for result in (x + 1, x.sum(), x.new_zeros(2), torch.zeros_like(x), x.view(3, 1), x[1:]):
+        assert result.device == torch.device("cuda", 0)
+        assert result.is_cuda
+    assert torch.arange(3.0).device.type == "cpu"
+    assert x.new_zeros(2, device="cpu").device.type == "cpu"
+
+
+def test_numbers_are_those_of_the_cpu(gpu: PretendedGpu) -> None:
+    def gradient(device: str) -> Tensor:
+        x = torch.linspace(-2, 2, 7, device=device, requires_grad=True)
+        noise = torch.rand(7, generator=torch.Generator(device).manual_seed(1), device=device)
+        (nn.functional.normalize(x * noise, dim=0).sin().cumsum(0) ** 2).sum().backward()
+        assert x.grad is not None
+        return x.grad.cpu()
+
+    assert torch.equal(gradient("cuda"), gradient("cpu"))
+
+
+def test_what_is_changed_in_place_is_the_same_memory(gpu: PretendedGpu) -> None:
+    x = torch.zeros(4, device="cuda")
+    assert x.add_(1) is x
+    x[1:3].mul_(5)
+    assert x.tolist() == [1, 5, 5, 1]
+
+
+def test_a_module_moves_there_and_back_with_its_optimiser(gpu: PretendedGpu) -> None:
+    module = nn.Linear(3, 1)
+    weight = module.weight
+    module.to("cuda")
+    assert module.weight is weight
+    assert weight.device.type == "cuda"
+    optimiser = torch.optim.Adam(module.parameters(), fused=True)
+    before = weight.detach().cpu()
+    module(there(1.0, 2.0, 3.0)).sum().backward()
+    optimiser.step()
+    module.cpu()
+    assert module.weight.device.type == "cpu"
+    assert (module.weight < before).all()
+
+
+REFUSED: dict[str, tuple[type[Exception], Callable[[], object]]] = {
+    "a sum with the CPU": (RuntimeError, lambda: there(1, 2, 3) + HERE),
+    "one tensor of both": (RuntimeError, lambda: torch.stack((there(1).sum(), HERE.sum()))),
+    "a CPU tensor changed": (RuntimeError, lambda: torch.zeros(3).add_(there(1, 2, 3))),
+    "a CPU tensor's elements": (RuntimeError, lambda: HERE[there(1).long()]),
+    "a product by an output": (RuntimeError, lambda: torch.mul(there(1), 2, out=torch.zeros(1))),
+    "numpy": (TypeError, lambda: there(1).numpy()),
+    "an array": (TypeError, lambda: np.asarray(there(1))),
+    "random numbers of the CPU": (
+        RuntimeError,
+        lambda: torch.rand(2, generator=torch.Generator(), device="cuda"),
+    ),
+    "random numbers for the CPU": (
+        RuntimeError,
+        lambda: torch.rand(2, generator=torch.Generator("cuda")),
+    ),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_cuda_refuses_is_refused(gpu: PretendedGpu, what: str) -> None:
+    error, act = REFUSED[what]
+    with pytest.raises(error, match=r"same device|numpy|generator"):
+        act()
+
+
+def test_a_triton_kernel_takes_no_tensor_of_the_cpu(gpu: PretendedGpu) -> None:
+    pytest.importorskip("triton")
+    grid = HashGrid(levels=1, log2_table=6, n_min=4, n_max=4)
+    table = torch.ones(grid.entries, 2)
+    positions = torch.full((2, 3), 0.5, device="cuda")
+    assert encode(positions, table.cuda(), grid, backend="gpu").tolist() == [[1, 1], [1, 1]]
+    with pytest.raises(ValueError, match="cannot be accessed from Triton"):
+        encode(positions, table, grid, backend="gpu")
+
+
+def masked(x: Tensor, value: float | Tensor, mask: Tensor) -> None:
+    x[mask] = value
+
+
+WAITS: dict[str, tuple[int, Callable[[Tensor], object]]] = {
+    "arithmetic": (0, lambda x: (x + 1).sum() * 2),
+    "item": (1, lambda x: x.sum().item()),
+    "a condition": (1, lambda x: 1 if (x > 0).any() else 0),
+    "tolist": (1, lambda x: x.tolist()),
+    "cpu": (1, lambda x: x.cpu()),
+    "from the CPU": (1, lambda x: x.copy_(HERE)),
+    "from the CPU, not to wait for": (0, lambda x: HERE.to("cuda", non_blocking=True)),
+    "a constant": (1, lambda x: torch.tensor(0.5, device="cuda")),
+    "a constant that is filled in": (0, lambda x: x.new_full((1,), 0.5)),
+    "nonzero": (1, lambda x: x.nonzero()),
+    "a mask": (1, lambda x: x[x > 0]),
+    "two masks": (2, lambda x: x.expand(3, 3)[x > 0, x > 0]),
+    "indices": (0, lambda x: x[x.long() % 3]),
+    "indices from the CPU": (1, lambda x: x[HERE.long() % 3]),
+    "a mask that is filled": (0, lambda x: masked(x, 0.0, x > 0)),
+    "a number put at indices": (1, lambda x: masked(x, 0.0, x.long() % 3)),
+    "where": (0, lambda x: torch.where(x > 0, x, 0.0)),
+    "where, with a number of the CPU": (1, lambda x: torch.where(x > 0, x, HERE.sum())),
+    "unique": (1, lambda x: x.unique()),
+    "repeated by a tensor": (1, lambda x: x.repeat_interleave(x.long())),
+    "repeated, how often is known": (
+        0,
+        lambda x: x.repeat_interleave(x.long(), output_size=6),
+    ),
+}
+
+
+@pytest.mark.parametrize("what", WAITS)
+def test_the_host_waits_as_often_as_for_cuda(gpu: PretendedGpu, what: str) -> None:
+    expected, act = WAITS[what]
+    x = there(1, 2, 3)
+    with device_waits() as waits:
+        act(x)
+    assert waits.total() == expected
+
+
+def test_told_to_raise_it_raises_where_it_would_wait(gpu: PretendedGpu) -> None:
+    torch.cuda.set_sync_debug_mode("error")
+    with pytest.raises(RuntimeError, match="synchronizing"):
+        there(1)
+
+
+def captured(compute: Callable[[], Tensor]) -> tuple[torch.cuda.CUDAGraph, Tensor]:
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        return graph, compute()
+
+
+def test_a_graph_computes_again_from_what_is_in_its_memory(gpu: PretendedGpu) -> None:
+    x = there(1, 2, 3)
+    graph, result = captured(lambda: (x * 2).sum().expand(2) + torch.ones(2, device="cuda"))
+    x.fill_(10)
+    assert result.tolist() == [13, 13]
+    graph.replay()
+    assert result.tolist() == [61, 61]
+
+
+def test_while_a_graph_is_captured_nothing_may_wait(gpu: PretendedGpu) -> None:
+    x = there(1, 2, 3)
+    with pytest.raises(RuntimeError, match="stream is capturing"):
+        captured(lambda: x[x > 1])
+    x.tolist()  # afterwards it may
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_afterwards_there_is_none() -> None:
+    with pretended_gpu():
+        x = there(1)
+    assert not torch.cuda.is_available()
+    with pytest.raises(RuntimeError, match="is gone"):
+        x + 1
+
+
+def draw(background: Tensor) -> Tensor:
+    """A frame of a field on the GPU."""
+    field = misty_field(backend="reference").to("cuda")
+    occupancy = Occupancy(shell().cells.cuda())
+    camera = place_camera(look_at_the_middle(0.1, 0.2), "cuda")
+    render = everywhere(field, occupancy, NullProbe(), March(step=0.05))
+    return render_frame(camera, occupancy, background, NullProbe(), render).values
+
+
+def test_a_frame_is_drawn(gpu: PretendedGpu) -> None:
+    assert draw(torch.ones(4, device="cuda")).device.type == "cuda"
+
+
+def test_planted_a_background_on_the_cpu_is_found(gpu: PretendedGpu) -> None:
+    with pytest.raises(RuntimeError, match="same device"):
+        draw(torch.ones(4))
+
+
+def test_planted_a_range_on_the_cpu_is_found(
+    gpu: PretendedGpu, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    background, arange = torch.ones(4, device="cuda"), torch.arange
+    monkeypatch.setattr(rays.torch, "arange", lambda *of, device=None: arange(*of))
+    with pytest.raises(RuntimeError, match="same device"):
+        draw(background)
+
+
+def test_planted_a_kernel_of_the_cpu_is_found(
+    gpu: PretendedGpu, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dispatch, "resolve", lambda backend, device: "cpu")
+    with pytest.raises(TypeError, match="numpy"):
+        draw(torch.ones(4, device="cuda"))
+
+
+class Asking(nn.Module):
+    """A network that asks for a number."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.factor = nn.Parameter(torch.ones(1))
+        self.varying: tuple[tuple[int, ...], ...] = ((),)
+
+    def forward(self, x: Tensor) -> tuple[Tensor]:
+        return (x * self.factor.item(),)
+
+
+def test_planted_a_wait_in_a_network_is_found(
+    gpu: PretendedGpu, tmp_path: Path, quiet_log: Log
+) -> None:
+    network, inputs = Asking().to("cuda"), [(torch.ones(2, 3, device="cuda"),)]
+    with pytest.raises(RuntimeError, match="stream is capturing"):
+        TorchEngine().build(network, lambda: inputs, lambda: tmp_path, quiet_log)
