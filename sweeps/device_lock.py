@@ -25,15 +25,19 @@ def device_lock(device: str, log: Log) -> AbstractContextManager[None]:
     return locked(lock_file(device), waiting, log)
 
 
+def on_gpu(device: str) -> bool:
+    """Whether `device`, as `steerbench run` names it, is a GPU."""
+    return device.startswith("cuda") or (device == "auto" and torch.cuda.is_available())
+
+
 def lock_file(device: str) -> Path:
     """The file to lock. It is not in `outputs`, which may lie on a file system without locks.
 
     GPUs are told apart by their UUID: each job may see its own as the first.
     """
     if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    on_gpu = device.startswith("cuda")
-    which = torch.cuda.get_device_properties(device).uuid if on_gpu else device
+        device = "cuda" if on_gpu(device) else "cpu"
+    which = torch.cuda.get_device_properties(device).uuid if on_gpu(device) else device
     name = hashlib.sha256(f"{platform.node()} {which}".encode()).hexdigest()[:16]
     return _folder() / f"steerbench-{name}.lock"
 

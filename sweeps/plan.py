@@ -12,8 +12,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import SteerbenchError
 from reports.paper_tables import AFTER, METHOD, Line, PaperTable, paper_tables
-from sweeps.build import build
+from sweeps.build import build, target_of
 from sweeps.data_sets import DataSet
+from sweeps.device_lock import on_gpu
 from sweeps.measurement import described, job_key
 from sweeps.names import unknown
 from sweeps.overrides import composed, setting, swept
@@ -78,7 +79,8 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     method beyond the paper the first of these), and for each scene of `data`.
 
     What a line does not set is as the experiment has it. A job of the sweep that no line names is
-    left out: Instant-NGP has no 2D renderer to compute in int8.
+    left out: Instant-NGP has no 2D renderer to compute in int8. So is a line at a precision that
+    the engine does not have. On a GPU the engine is torch, unless `words` choose one.
 
     Raises:
         SteerbenchError: a word cannot be read, names nothing, or gives several values to another
@@ -88,13 +90,17 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     fixed += [f"scene={data.layout}"] if data else []
     scenes = {name: str(folder) for name, folder in data.scenes.items()} if data else {"": ""}
     experiment = composed([f"+experiment={table.name}", *fixed], return_hydra_config=True)
+    if on_gpu(str(experiment.get("device"))):
+        fixed = ["engine=torch", *fixed]  # Table 1 has OpenVINO, which computes on a CPU
+    engine = composed([f"+experiment={table.name}", *fixed]).engine
+    precisions = target_of(engine).precisions
     budget = build(experiment, "budget")
     usual = [str(seed) for seed in range(budget.seeds)]
     params = experiment.hydra.sweeper.params
     grid = swept([f"{name}={values}" for name, values in params.items()])
     jobs = []
     for block, line, repeated in _lines(table, budget.beyond):
-        if line.job is None:
+        if line.job is None or line.job.get("precision", engine.precision) not in precisions:
             continue
         added = line.job == {METHOD: line.label}
         swept_here = {name: value for name, value in line.job.items() if name != AFTER}

@@ -13,13 +13,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import DictConfig
 
 from bench.console import ConsoleLog
 from bench.results import content_key
 from sweeps.build import build
-from sweeps.device_lock import device_lock
+from sweeps.device_lock import device_lock, on_gpu
 from sweeps.failures import reason
 from sweeps.jobs import time_left
 from sweeps.measurement import described, trained
@@ -58,10 +57,9 @@ def room(config: DictConfig) -> int:
     """How many trainings the cores have room for; 1 on a GPU, or where the budget does not say how
     many threads one has."""
     threads = build(config, "budget").threads
-    on_gpu = config.device.startswith("cuda") or (
-        config.device == "auto" and torch.cuda.is_available()
+    return (
+        1 if on_gpu(config.device) or threads is None else len(os.sched_getaffinity(0)) // threads
     )
-    return 1 if on_gpu or threads is None else len(os.sched_getaffinity(0)) // threads
 
 
 def _training(config: DictConfig) -> str:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType, SimpleNamespace
@@ -25,7 +25,6 @@ import pytest
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map
 
 from methods.kernels.dispatch import availability, multiplies_bf16
 
@@ -66,9 +65,12 @@ class GpuTensor(Tensor):
     @classmethod
     def __torch_function__(cls, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
-        inside = _gpu.inside(_kind(kwargs.get("device")) != "cpu")
-        with inside, torch._C.DisableTorchFunctionSubclass():
-            return func(*args, **kwargs)
+        before, _gpu.inside = _gpu.inside, _kind(kwargs.get("device")) != "cpu"
+        try:
+            with torch._C.DisableTorchFunctionSubclass():
+                return func(*args, **kwargs)
+        finally:
+            _gpu.inside = before
 
     @classmethod
     def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
@@ -106,9 +108,9 @@ class Graph(list[tuple[Callable[..., Any], tuple, dict, Any]]):
     def replay(self) -> None:
         """Compute them again, into the same memory."""
         for func, args, kwargs, results in self:
-            again = tree_leaves(func(*args, **kwargs))
-            for old, new in zip(tree_leaves(results), again, strict=True):
-                if isinstance(old, Tensor) and old.data_ptr() != new.data_ptr():
+            again = _tensors([func(*args, **kwargs)])
+            for old, new in zip(_tensors([results]), again, strict=True):
+                if old.data_ptr() != new.data_ptr():
                     old.copy_(new)
 
 
@@ -124,21 +126,12 @@ class PretendedGpu(TorchDispatchMode):
         self.generators: dict[int, torch.Generator] = {}  # kept: the address of one is its key
         self.sync_debug_mode = 0
         self._graph: Graph | None = None
-        self._inside = False  # a function of C++ that works on the GPU
-        self._differentiating = False  # C++ at work there; between, functions of Python
-
-    @contextmanager
-    def inside(self, inside: bool) -> Iterator[None]:
-        """What C++ makes in here "on the CPU" belongs on the GPU."""
-        before, self._inside = self._inside, inside
-        try:
-            yield
-        finally:
-            self._inside = before
+        self.inside = False  # a function that works on the GPU: what C++ makes belongs there
+        self._differentiating = False  # the same of C++ alone, but not of Python that it calls
 
     @contextmanager
     def differentiating(self) -> Iterator[None]:
-        """The same for what autograd makes, and not for what Python makes that it calls."""
+        """A backward pass."""
         self._differentiating = True
         try:
             yield
@@ -180,7 +173,7 @@ class PretendedGpu(TorchDispatchMode):
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
-        tensors = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
+        tensors = _tensors((args, *kwargs.values()))
         ours = [x for x in tensors if isinstance(x, GpuTensor)]
         on_gpu = self._computes(kwargs.get("device"), tensors, ours)
         if ours:
@@ -190,27 +183,24 @@ class PretendedGpu(TorchDispatchMode):
         if _kind(kwargs.get("device")) == "cuda":
             kwargs = {**kwargs, "device": CPU}
         inputs = {id(_held(x)): x for x in tensors}
-        args, kwargs = tree_map(_held, (args, kwargs))
+        args = _each(_held, args)
+        kwargs = {name: _each(_held, x) for name, x in kwargs.items()}
         results = func(*args, **kwargs)
         if self._graph is not None and on_gpu:
             self._graph.append((func, args, kwargs, results))
 
-        def returned(x: Any) -> Any:
+        def returned(x: Tensor) -> Tensor:
             """What was changed in place is the same object as before."""
-            if id(x) in inputs:
-                return inputs[id(x)]
-            return GpuTensor(x) if on_gpu and isinstance(x, Tensor) else x
+            return inputs[id(x)] if id(x) in inputs else GpuTensor(x) if on_gpu else x
 
-        return tree_map(returned, results)
+        return _each(returned, results)
 
     def _computes(self, device: Any, tensors: list[Tensor], ours: list[Tensor]) -> bool:
         """Whether an operation of `tensors` that was asked for on `device` gives one on the GPU."""
         if _kind(device) != "cpu":
             return bool(ours) if device is None else _kind(device) == "cuda"
         # Python asks for the CPU where it says nothing, C++ where it saw the tensors that we hold.
-        inside = self._inside or (
-            self._differentiating and _caller().f_code.co_filename == AUTOGRAD
-        )
+        inside = self.inside or (self._differentiating and _caller().f_code.co_filename == AUTOGRAD)
         return inside and (bool(ours) or not tensors)
 
     def _check_generator(self, generator: torch.Generator | None, on_gpu: bool) -> None:
@@ -254,7 +244,25 @@ _gpu: PretendedGpu
 """The one there is."""
 
 
-def _held(x: Any) -> Any:
+def _each(function: Callable[[Tensor], Tensor], x: Any) -> Any:
+    """`x` with `function` of each of its tensors."""
+    if isinstance(x, Tensor):
+        return function(x)
+    return type(x)([_each(function, part) for part in x]) if isinstance(x, list | tuple) else x
+
+
+def _tensors(x: Iterable[Any]) -> list[Tensor]:
+    """All tensors in `x`."""
+    found: list[Tensor] = []
+    for part in x:
+        if isinstance(part, Tensor):
+            found.append(part)
+        elif isinstance(part, list | tuple):
+            found += _tensors(part)
+    return found
+
+
+def _held(x: Tensor) -> Tensor:
     return x.held if isinstance(x, GpuTensor) else x
 
 
@@ -307,7 +315,7 @@ def _of_torch_cuda(gpu: PretendedGpu) -> dict[str, Any]:
         "device_count": lambda: 1,
         "get_device_name": lambda *device: "pretended GPU",
         "get_device_properties": lambda *device: SimpleNamespace(uuid="pretended"),
-        "is_bf16_supported": lambda **kwargs: True,
+        "is_bf16_supported": lambda **kwargs: multiplies_bf16("cpu"),
         "max_memory_allocated": lambda *device: 1,
         "reset_peak_memory_stats": lambda *device: None,
         "synchronize": lambda *device: None,
@@ -385,6 +393,6 @@ def _patch_triton(patch: pytest.MonkeyPatch) -> None:
     def launch(self, *args, **kwargs):
         if any(isinstance(x, Tensor) and not isinstance(x, GpuTensor) for x in args):
             raise ValueError("Pointer argument cannot be accessed from Triton (cpu tensor?)")
-        return run(self, *map(_held, args), **kwargs)
+        return run(self, *_each(_held, args), **kwargs)
 
     patch.setattr(GridExecutor, "__call__", launch)

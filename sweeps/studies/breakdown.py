@@ -11,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from bench.probes import OTHER
 from bench.study import Study, Variant
 from reports.tables import Table, decimal, share
+from sweeps.device_lock import on_gpu
 from sweeps.overrides import composed
 from sweeps.studies.skips import nothing_skipped
 from sweeps.studies.variants import (
@@ -27,7 +28,7 @@ from sweeps.studies.variants import (
 )
 from sweeps.terminal import show
 
-SETTINGS = (METHOD, "trajectory=smooth", "engine=openvino")
+SETTINGS = (METHOD, "trajectory=smooth")
 
 DENSE = ", nothing skipped"
 """How the name of a line ends whose method skips nothing."""
@@ -35,7 +36,7 @@ DENSE = ", nothing skipped"
 
 def main(options: argparse.Namespace) -> int:
     """Print two tables and, as the last line, the rows of the first as JSON."""
-    words = [*SETTINGS, *options.overrides]
+    words = with_engine([*SETTINGS, *options.overrides])
     config = composed(words)
     study = declared(config)
     usual = _precisions(words) or [Variant("as it is")]
@@ -57,6 +58,12 @@ def main(options: argparse.Namespace) -> int:
         show(compared)
     print_rows(rows.values())
     return 0
+
+
+def with_engine(words: Sequence[str]) -> list[str]:
+    """`words`, and before them the fastest engine that computes on the device they name."""
+    device = str(composed(words).get("device"))
+    return ["engine=torch" if on_gpu(device) else "engine=openvino", *words]
 
 
 def _precisions(words: Sequence[str]) -> list[Variant]:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from bench.errors import SteerbenchError
 from bench.results import Store
@@ -18,7 +19,9 @@ from reports.paper_tables import paper_tables
 from sweeps import failures, measurement
 from sweeps.gather import gather, newest
 from sweeps.measurement import described
+from sweeps.overrides import composed
 from sweeps.plan import Planned, plan
+from sweeps.studies.breakdown import with_engine
 
 (TABLE,) = (
     replace(table, curve=False, beyond=None) for table in paper_tables() if table.name == "table5"
@@ -118,3 +121,16 @@ def test_a_line_that_no_job_fills_is_named() -> None:
     wrong = replace(first, job={"method.joint.field": "frosen"})
     with pytest.raises(SteerbenchError, match=rf"no job .* fills the line '{first.label}'; expec"):
         plan(replace(TABLE, lines=[wrong, *others]), [])
+
+
+@pytest.mark.parametrize(("gpu", "engine"), [(False, "OpenVino"), (True, "TorchEngine")])
+@pytest.mark.parametrize("asked", [[], ["engine=onnxruntime"]])
+def test_the_engine_of_the_first_table_is_one_for_the_device(
+    gpu: bool, engine: str, asked: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
+    (table,) = (table for table in paper_tables() if table.name == "table1")
+    targets = {job.config.engine._target_.split(".")[-1] for job in plan(table, asked)}
+    assert targets == {"OnnxRuntime" if asked else engine}
+    words = with_engine([*asked, "device=auto"])
+    assert composed(words).engine._target_.split(".")[-1] in targets

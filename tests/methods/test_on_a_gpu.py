@@ -1,0 +1,256 @@
+"""Every method on a pretended GPU: it trains and renders there, with the numbers of the CPU."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+import torch
+
+from bench.cameras import cast, place_camera, scale_camera
+from bench.console import ConsoleLog
+from bench.protocol import EvaluationProtocol
+from bench.run import Task, measure
+from bench.trajectories import from_split
+from bench.types import Budget, Method, NullProbe, Scene, Split
+from methods.diver.method import Diver
+from methods.diver.training import Lessons as DiverLessons
+from methods.engines import cuda_graphs
+from methods.engines.torch_engine import TorchEngine
+from methods.gaussians.method import GaussianSplatting
+from methods.gaussians.training import Fitting
+from methods.instant_ngp.field import HashField
+from methods.instant_ngp.method import InstantNgp
+from methods.instant_ngp.stage1 import Setup
+from methods.instant_ngp.training import FieldTraining, TrainingOptions
+from methods.kernels import availability
+from methods.kernels.encode import HashGrid
+from methods.kernels.march import Occupancy
+from methods.kernels.splat import splat
+from methods.kilonerf.method import KiloNerf
+from methods.kilonerf.training import Lessons as KiloLessons
+from methods.nerf.method import Nerf
+from methods.nsvf.method import Nsvf
+from methods.plenoctree.method import PlenOctree
+from methods.plenoctree.start import Extraction
+from methods.plenoctree.training import OctreeLessons
+from methods.rendering import rays
+from methods.rendering.batch import render_batch
+from methods.rendering.march import March
+from methods.steernerf.beyond.lean_renderer import LeanRenderer
+from methods.steernerf.beyond.method import SteerNerfLean
+from methods.steernerf.method import SteerNerf
+from methods.steernerf.options import RangeReduction, Reprojection
+from methods.steernerf.training.joint import JointTraining
+from methods.steernerf.training.options import JointOptions
+from methods.steernerf.training.sequences import MotionOptions
+from methods.steernerf.unet import UNet
+from methods.students.networks import NetworkLessons
+from methods.training import loop
+from tests.methods.conftest import look_at_the_middle
+from tests.methods.models import misty_field, small_model, small_rendering
+from tests.pretended_gpu import PretendedGpu, pretended_gpu
+
+pytestmark = pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+
+BUDGET = Budget("test", steps=4, samples=512, renderer_steps=2)
+GRID = HashGrid(levels=4, log2_table=10, n_min=4, n_max=32)
+STAGE1 = TrainingOptions(march_step=8.0, grid_samples=4096, max_rays=64)
+MOTION = MotionOptions(pool=1, length=2, least=2, uses=3, longer=0.0)
+
+
+def joint(**others: Any) -> JointOptions:
+    few = {"batch": 1, "patch": 4, "distilled_views": 1, "grid_samples": 512, "refined_rays": 64}
+    return JointOptions(**{"motion": MOTION, "refined": 0.0} | few | others)
+
+
+def steernerf(field: str, **where: Any) -> Method:
+    """The paper's, with its reprojection and range reduction."""
+    release = Reprojection("last", "paper", "sum")
+    return SteerNerf(
+        grid=GRID,
+        training=STAGE1,
+        model=small_model(reprojection=release, history=False, surface=False),
+        rendering=small_rendering(range=RangeReduction("paper")),
+        renderer=partial(UNet, width=4),
+        joint=joint(field=field),
+        engine=TorchEngine(),
+        **where,
+    )
+
+
+def steernerf_lean(**where: Any) -> Method:
+    return SteerNerfLean(
+        grid=GRID,
+        training=STAGE1,
+        model=small_model(),
+        rendering=small_rendering(range=RangeReduction("window"), refined=0.1, overlap=0.1),
+        renderer=partial(LeanRenderer, width=8, blocks=1, init="scratch"),
+        joint=joint(refined=0.1),
+        engine=TorchEngine(),
+        **where,
+    )
+
+
+def student(make: Callable[..., Method], device: str, backend: str, **options: Any) -> Method:
+    teacher = Setup.resolved(GRID, STAGE1, "fp32", backend, device, seed=0)
+    return make(teacher=teacher, **options)
+
+
+def gaussians(**where: Any) -> Method:
+    return GaussianSplatting(grid=GRID, training=STAGE1, count=40, fitting=Fitting(), **where)
+
+
+NETWORK = NetworkLessons(march_step=16.0, max_rays=64)
+EXTRACTION = Extraction(resolution=128, degree=1, rays=200, points=1, directions=4)
+METHODS: Mapping[str, Callable[..., Method]] = {
+    "ngp": partial(InstantNgp, grid=GRID, training=STAGE1),
+    "steernerf": partial(steernerf, "joint"),
+    "steernerf, frozen": partial(steernerf, "frozen"),
+    "steernerf_lean": steernerf_lean,
+    "gaussians": gaussians,
+    "plenoctree": partial(
+        student, PlenOctree, extraction=EXTRACTION, training=OctreeLessons(samples=512)
+    ),
+    "diver": partial(student, Diver, resolution=32, training=DiverLessons(prune_rays=256)),
+    "kilonerf": partial(
+        student, KiloNerf, training=KiloLessons(points_each=8, max_rays=64), networks=2
+    ),
+    "nsvf": partial(student, Nsvf, training=NETWORK, resolution=32, start="random"),
+    "nerf": partial(student, Nerf, training=NETWORK),
+}
+
+
+def fitted(name: str, device: str, scene: Scene, folder: Path) -> Method:
+    method = METHODS[name](device=device, backend="reference")
+    method.fit(scene, BUDGET, ConsoleLog(folder, quiet=True))
+    return method
+
+
+def frames(method: Method, scene: Scene) -> list[torch.Tensor]:
+    """What two frames in sequence show, brought to the CPU."""
+    method.reset()
+    found = [method.render(camera, NullProbe()) for camera in scene.splits["test"].cameras]
+    return [part.cpu() for x in found for part in (x.rgb, x.depth, x.alpha)]
+
+
+def equal(some: list[torch.Tensor], others: list[torch.Tensor]) -> bool:
+    return all(torch.equal(x, y) for x, y in zip(some, others, strict=True))
+
+
+def fewer(split: Split, count: int) -> Split:
+    """The first `count` pictures, with every other of their pixels."""
+    cameras = [scale_camera(camera, 16, 16) for camera in split.cameras[:count]]
+    pictures = [picture[::2, ::2] for picture in split.images[:count]]
+    return Split(cameras, pictures, split.names[:count])
+
+
+@pytest.fixture(scope="module")
+def scene(ball_scene: Scene) -> Scene:
+    """A few small pictures of the ball."""
+    splits = {"train": fewer(ball_scene.splits["train"], 4)}
+    splits["test"] = fewer(ball_scene.splits["test"], 2)
+    return replace(ball_scene, splits=splits)
+
+
+@pytest.fixture(autouse=True)
+def few_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of long rays through a field that has hardly learned anything; and as few runs of a network
+    before it is recorded."""
+    monkeypatch.setattr(rays, "ROUND_SAMPLES", 64)
+    monkeypatch.setattr(cuda_graphs, "WARM_UP", 1)
+    monkeypatch.setattr(TorchEngine, "samples", lambda engine, network: 1)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_it_trains_and_renders_as_on_the_cpu(name: str, scene: Scene, tmp_path: Path) -> None:
+    here = frames(fitted(name, "cpu", scene, tmp_path / "cpu"), scene)
+    with pretended_gpu():
+        there = frames(fitted(name, "cuda", scene, tmp_path / "cuda"), scene)
+    assert equal(here, there)
+
+
+def test_its_rows_are_those_of_the_cpu(scene: Scene, tmp_path: Path) -> None:
+    def rows(device: str) -> pd.DataFrame:
+        protocol = EvaluationProtocol(name="quick", lpips=(), warmup=0)
+        task = Task(scene, from_split(scene), protocol, BUDGET, seed=0)
+        method = METHODS["ngp"](device=device, backend="reference")
+        found = measure(method, task, ConsoleLog(tmp_path / device, quiet=True)).rows
+        timed = found["metric"].str.startswith(("frame_ms", "fps", "stage_ms", "train_s", "peak"))
+        assert timed.any()
+        return found[~timed]
+
+    here = rows("cpu")
+    with pretended_gpu():
+        there = rows("cuda")
+    differing = [name for name in here if not here[name].equals(there[name])]
+    assert differing == ["device"]
+    assert set(there["device"]) == {"cuda"}
+
+
+def test_killed_in_stage_2_it_goes_on_as_if_it_had_not_been(
+    gpu: PretendedGpu, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = frames(fitted("steernerf", "cuda", scene, tmp_path / "whole"), scene)
+    monkeypatch.setattr(loop, "CHECKPOINT_S", 0.0)
+    advance = JointTraining.advance
+
+    def killed(training: JointTraining) -> dict[str, float]:
+        if training.step == 1:
+            raise KeyboardInterrupt
+        return advance(training)
+
+    monkeypatch.setattr(JointTraining, "advance", killed)
+    with pytest.raises(KeyboardInterrupt):
+        fitted("steernerf", "cuda", scene, tmp_path / "killed")
+    monkeypatch.setattr(JointTraining, "advance", advance)
+    assert list((tmp_path / "killed").glob("stages/steernerf-*/checkpoint.safetensors"))
+    assert equal(whole, frames(fitted("steernerf", "cuda", scene, tmp_path / "killed"), scene))
+
+
+@pytest.mark.parametrize("places", [("cuda", "cpu"), ("cpu", "cuda")])
+def test_what_was_trained_at_one_place_goes_on_at_the_other(
+    gpu: PretendedGpu, places: tuple[str, str], scene: Scene, tmp_path: Path
+) -> None:
+    def training(device: str) -> FieldTraining:
+        generator = torch.Generator().manual_seed(0)
+        field = HashField(GRID, backend="reference", generator=generator).to(device)
+        return FieldTraining(field, scene, BUDGET, STAGE1, seed=0)
+
+    first, second = map(training, places)
+    first.advance()
+    loop.save(first, tmp_path / "half")
+    loop.resume(second, tmp_path / "half")
+    for one in (first, second):
+        one.advance()
+    assert second.field.device.type == places[1]
+    for name, value in first.result().items():
+        assert torch.equal(value.cpu(), second.result()[name].cpu()), name
+
+
+def by_triton(device: str) -> list[torch.Tensor]:
+    """A pixel of a field and the gradient of its table, and which of two points a picture shows."""
+    field = misty_field("fp32", backend="gpu").to(device)
+    camera = place_camera(scale_camera(look_at_the_middle(0.1, 0.2), 1, 1), device)
+    middle = torch.cartesian_prod(*[torch.arange(6, 10, device=device)] * 3)
+    pixels, count = render_batch(field, cast(camera), Occupancy.at(middle, 16), March(step=0.1))
+    assert count > 1
+    pixels.values.sum().backward()
+    assert field.table.grad is not None
+    points = torch.full((2, 2), 0.5, device=device)
+    index = splat(points, torch.arange(2.0, 0.0, -1.0, device=device), 1, 1, backend="gpu")
+    return [pixels.values.detach(), pixels.depth_sum.detach(), field.table.grad, index]
+
+
+@pytest.mark.skipif(bool(availability()["gpu"]), reason="Triton has no build for this platform")
+def test_kernels_of_triton_compute_there_as_on_the_cpu() -> None:
+    here = by_triton("cpu")
+    with pretended_gpu():
+        there = by_triton("cuda")
+        assert all(x.device.type == "cuda" for x in there)
+        assert all(torch.equal(x.cpu(), y) for x, y in zip(there, here, strict=True))
