@@ -29,8 +29,9 @@ from methods.instant_ngp.method import InstantNgp
 from methods.instant_ngp.stage1 import Setup
 from methods.instant_ngp.training import FieldTraining, TrainingOptions
 from methods.kernels import availability
-from methods.kernels.encode import HashGrid
-from methods.kernels.march import Occupancy
+from methods.kernels.composite import composite
+from methods.kernels.encode import HashGrid, encode
+from methods.kernels.march import Occupancy, march
 from methods.kernels.splat import splat
 from methods.kilonerf.method import KiloNerf
 from methods.kilonerf.training import Lessons as KiloLessons
@@ -40,8 +41,6 @@ from methods.plenoctree.method import PlenOctree
 from methods.plenoctree.start import Extraction
 from methods.plenoctree.training import OctreeLessons
 from methods.rendering import rays
-from methods.rendering.batch import render_batch
-from methods.rendering.march import March
 from methods.steernerf.beyond.lean_renderer import LeanRenderer
 from methods.steernerf.beyond.method import SteerNerfLean
 from methods.steernerf.method import SteerNerf
@@ -53,7 +52,7 @@ from methods.steernerf.unet import UNet
 from methods.students.networks import NetworkLessons
 from methods.training import loop
 from tests.methods.conftest import look_at_the_middle
-from tests.methods.models import misty_field, small_model, small_rendering
+from tests.methods.models import small_model, small_rendering
 from tests.pretended_gpu import PretendedGpu, pretended_gpu
 
 pytestmark = pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
@@ -234,17 +233,19 @@ def test_what_was_trained_at_one_place_goes_on_at_the_other(
 
 
 def by_triton(device: str) -> list[torch.Tensor]:
-    """A pixel of a field and the gradient of its table, and which of two points a picture shows."""
-    field = misty_field("fp32", backend="gpu").to(device)
+    """A pixel, the gradient of the table it is drawn from, and which of two points it shows."""
+    table = torch.rand(GRID.entries, 2, generator=torch.Generator().manual_seed(0)).to(device)
     camera = place_camera(scale_camera(look_at_the_middle(0.1, 0.2), 1, 1), device)
     middle = torch.cartesian_prod(*[torch.arange(6, 10, device=device)] * 3)
-    pixels, count = render_batch(field, cast(camera), Occupancy.at(middle, 16), March(step=0.1))
-    assert count > 1
+    samples = march(cast(camera), Occupancy.at(middle, 16), 0.05, backend="gpu")
+    assert len(samples) > 1
+    features = encode(samples.positions, table.requires_grad_(), GRID, backend="gpu")
+    pixels = composite(features[:, 0], features, samples, backend="gpu")
     pixels.values.sum().backward()
-    assert field.table.grad is not None
+    assert table.grad is not None
     points = torch.full((2, 2), 0.5, device=device)
     index = splat(points, torch.arange(2.0, 0.0, -1.0, device=device), 1, 1, backend="gpu")
-    return [pixels.values.detach(), pixels.depth_sum.detach(), field.table.grad, index]
+    return [pixels.values.detach(), pixels.depth_sum.detach(), table.grad, index]
 
 
 @pytest.mark.skipif(bool(availability()["gpu"]), reason="Triton has no build for this platform")
