@@ -65,6 +65,7 @@ def render_rays(
                 )
                 canvas.put(open_, pixels)
                 left = (samples.resume >= 0) & (1 - pixels.alpha > how.stop)
+                left = left.nonzero().squeeze(1)  # once: a GPU is waited for
                 open_, start = open_[left], samples.resume[left]
     return canvas
 

@@ -121,7 +121,8 @@ def encode(
     features = implementation("encode", backend, positions.device).encode(
         positions, table, grid, packed=packed, grad_buffer=grad_buffer
     )
-    if positions.sum().isnan():  # hardly ever: one sum is cheap to test
+    # Hardly ever: one sum is cheap to test, but on a GPU dearer to wait for.
+    if positions.device.type != "cpu" or positions.sum().isnan():
         features = torch.where(positions.isnan().any(dim=1, keepdim=True), torch.nan, features)
     return features
 

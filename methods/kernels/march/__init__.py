@@ -182,7 +182,8 @@ def march(
     check_shape("origins", origins, None, 3)
     check_shape("directions", rays.directions, count, 3)
     if window is None:
-        window = origins.new_tensor((0.0, torch.inf)).expand(count, 2)
+        ends = origins.new_zeros(()), origins.new_full((), torch.inf)
+        window = torch.stack(ends).expand(count, 2)
     if jitter is None:
         jitter = origins.new_full((1,), 0.5).expand(count)
     if start is None:

@@ -20,7 +20,7 @@ def march(segments: Segments, occupancy: Occupancy, step: float, limit: int) -> 
         for first in range(0, max(rays, 1), BLOCK)
     ]
     t, positions, per_ray, resume = (torch.cat(column) for column in zip(*parts, strict=True))
-    ray = torch.arange(rays, device=t.device).repeat_interleave(per_ray)
+    ray = torch.arange(rays, device=t.device).repeat_interleave(per_ray, output_size=len(t))
     offsets = torch.cat((per_ray.new_zeros(1), per_ray.cumsum(dim=0)))
     return Samples(t, torch.full_like(t, step), offsets, ray.int(), positions, resume)
 
@@ -45,7 +45,9 @@ def _march_block(
     per_ray = kept.sum(dim=1)
     full = (per_ray == limit) & (per_ray > 0)
     last = (kept * (k + 1)).amax(dim=1) if len(k) else per_ray
-    return t[kept], positions[kept], per_ray, torch.where(full, last, -1).int()
+    place = kept.flatten().nonzero().squeeze(1)
+    resume = torch.where(full, last, -1).int()
+    return t.flatten()[place], positions.flatten(0, 1)[place], per_ray, resume
 
 
 def clip(rays: Rays, step: float, farthest: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
