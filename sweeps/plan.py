@@ -92,7 +92,8 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     experiment = composed([f"+experiment={table.name}", *fixed], return_hydra_config=True)
     if on_gpu(str(experiment.get("device"))):
         fixed = ["engine=torch", *fixed]  # Table 1 has OpenVINO, which computes on a CPU
-    engine = composed([f"+experiment={table.name}", *fixed]).engine
+        experiment = composed([f"+experiment={table.name}", *fixed], return_hydra_config=True)
+    engine = experiment.engine
     precisions = target_of(engine).precisions
     budget = build(experiment, "budget")
     usual = [str(seed) for seed in range(budget.seeds)]
