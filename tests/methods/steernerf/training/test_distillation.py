@@ -13,7 +13,6 @@ from bench.types import Budget, NullProbe, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.instant_ngp.training import TrainingOptions
 from methods.rendering.frame import everywhere, render_frame
-from methods.rendering.march import March
 from methods.steernerf.training import distillation
 from methods.steernerf.training.distillation import distilled_views
 from methods.steernerf.training.sequences import TrueView
@@ -58,7 +57,7 @@ def test_a_view_is_what_the_field_shows_at_full_resolution(
         assert view.picture.shape == (SIZE, SIZE, 3)
         assert view.picture.dtype == torch.uint8
         field, occupancy, probe = trained.field, trained.occupancy, NullProbe()
-        render = everywhere(field, occupancy, probe, March())
+        render = everywhere(field, occupancy, probe, TrainingOptions().march)
         white = ball_scene.background
         frame = render_frame(view.camera, occupancy, white, probe, render)
         assert (frame.alpha > 0.1).float().mean() > 0.1
