@@ -131,7 +131,7 @@ def _check(stage2: Stage2, rendering: Rendering) -> None:
             "rendering.range.mode: expected off without preceding frames (L = 0), got "
             f"{rendering.range.mode}"
         )
-    with torch.device("meta"):  # shapes alone
+    with torch.random.fork_rng(devices=()):  # asked for what it can do; another one is trained
         renderer = stage2.make_renderer(model.channels, model.frames, model.scale)
     for name in ("history", "surface"):
         if getattr(model, name) and not renderer.reads_details:
