@@ -57,9 +57,9 @@ def room(config: DictConfig) -> int:
     """How many trainings the cores have room for; 1 on a GPU, or where the budget does not say how
     many threads one has."""
     threads = build(config, "budget").threads
-    return (
-        1 if on_gpu(config.device) or threads is None else len(os.sched_getaffinity(0)) // threads
-    )
+    if threads is None or on_gpu(config.device):
+        return 1
+    return len(os.sched_getaffinity(0)) // threads
 
 
 def _training(config: DictConfig) -> str:

@@ -53,6 +53,7 @@ from methods.students.networks import NetworkLessons
 from methods.training import loop
 from tests.methods.conftest import look_at_the_middle
 from tests.methods.models import small_model, small_rendering
+from tests.methods.trainings import killed
 from tests.pretended_gpu import PretendedGpu, pretended_gpu
 
 pytestmark = pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
@@ -193,21 +194,11 @@ def test_its_rows_are_those_of_the_cpu(scene: Scene, tmp_path: Path) -> None:
 
 
 def test_killed_in_stage_2_it_goes_on_as_if_it_had_not_been(
-    gpu: PretendedGpu, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    gpu: PretendedGpu, scene: Scene, tmp_path: Path
 ) -> None:
     whole = frames(fitted("steernerf", "cuda", scene, tmp_path / "whole"), scene)
-    monkeypatch.setattr(loop, "CHECKPOINT_S", 0.0)
-    advance = JointTraining.advance
-
-    def killed(training: JointTraining) -> dict[str, float]:
-        if training.step == 1:
-            raise KeyboardInterrupt
-        return advance(training)
-
-    monkeypatch.setattr(JointTraining, "advance", killed)
-    with pytest.raises(KeyboardInterrupt):
+    with killed(JointTraining, 1):
         fitted("steernerf", "cuda", scene, tmp_path / "killed")
-    monkeypatch.setattr(JointTraining, "advance", advance)
     assert list((tmp_path / "killed").glob("stages/steernerf-*/checkpoint.safetensors"))
     assert equal(whole, frames(fitted("steernerf", "cuda", scene, tmp_path / "killed"), scene))
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+import pytest
 import torch
 
 from bench.compositing import composite
@@ -37,3 +40,21 @@ def goes_on_after_a_kill(new: Callable[[], loop.Training], killed_at: int, folde
     assert found.keys() == expected.keys()
     for name, value in expected.items():
         assert torch.equal(found[name], value), name
+
+
+@contextmanager
+def killed(kind: Any, step: int) -> Iterator[None]:
+    """In here the trainings of a class `kind`, which leave a checkpoint behind at every step, are
+    interrupted before they take `step`; assert that one was."""
+    advance = kind.advance
+
+    def advance_or_die(training: Any) -> dict[str, float]:
+        if training.step == step:
+            raise KeyboardInterrupt
+        return advance(training)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "CHECKPOINT_S", -1.0)
+        patch.setattr(kind, "advance", advance_or_die)
+        with pytest.raises(KeyboardInterrupt):
+            yield

@@ -23,6 +23,7 @@ from methods.instant_ngp.training import (
 )
 from methods.kernels.encode import HashGrid
 from methods.training import checkpoint, loop
+from tests.methods.trainings import killed
 
 GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
 BUDGET = Budget("test", steps=40, samples=4096)
@@ -88,26 +89,14 @@ def test_the_same_seed_gives_the_same_bits(ball_scene: Scene, tmp_path: Path) ->
 
 
 def test_a_killed_training_ends_as_if_it_had_never_stopped(
-    ball_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ball_scene: Scene, tmp_path: Path
 ) -> None:
     whole = trained(ball_scene, tmp_path / "whole")
-
-    monkeypatch.setattr(loop, "CHECKPOINT_S", -1.0)  # after every step
-    advance = FieldTraining.advance
-
-    def killed_at_23(training: FieldTraining) -> dict[str, float]:
-        if training.step == 23:
-            raise KeyboardInterrupt
-        return advance(training)
-
-    monkeypatch.setattr(FieldTraining, "advance", killed_at_23)
     root = tmp_path / "killed"
-    with pytest.raises(KeyboardInterrupt):
+    with killed(FieldTraining, 23):
         trained(ball_scene, root)
     folder = stage(ball_scene, root)
     assert {path.name for path in folder.iterdir()} == {"checkpoint.safetensors", "lock"}
-
-    monkeypatch.setattr(FieldTraining, "advance", advance)
     resumed = trained(ball_scene, root)
     assert torch.equal(resumed.table, whole.table)
     assert {path.name for path in folder.iterdir()} == {"field.safetensors", "lock"}

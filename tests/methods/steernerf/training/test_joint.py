@@ -28,6 +28,7 @@ from methods.training import loop
 from tests.methods.conftest import ball
 from tests.methods.models import misty_field, shell, small_model, small_renderer, trained_field
 from tests.methods.observations import shaken
+from tests.methods.trainings import killed
 
 MOTION = MotionOptions(pool=3, uses=4, length=2)
 OPTIONS = JointOptions(patch=4, batch=2, motion=MOTION, refined=0.0)
@@ -375,18 +376,9 @@ def test_a_patch_shows_what_the_picture_shows_there(ball_scene: Scene) -> None:
 def test_a_killed_training_goes_on_with_the_same_state(
     ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(loop, "CHECKPOINT_S", -1.0)  # after every step
     training = new_training(ball_scene)
-    advance = RendererTraining.advance
-
-    def killed_at_5(training: RendererTraining) -> dict[str, float]:
-        if training.step == 5:
-            raise KeyboardInterrupt
-        return advance(training)
-
     finished = tmp_path / "steernerf.safetensors"
-    monkeypatch.setattr(RendererTraining, "advance", killed_at_5)
-    with pytest.raises(KeyboardInterrupt):
+    with killed(RendererTraining, 5):
         loop.train(training, finished, "training", quiet_log)
     again = new_training(ball_scene)
     loop.resume(again, tmp_path / "checkpoint.safetensors")
@@ -396,7 +388,6 @@ def test_a_killed_training_goes_on_with_the_same_state(
     for name, tensor in training.state()[0].items():
         assert torch.equal(tensor, again.state()[0][name])
 
-    monkeypatch.setattr(RendererTraining, "advance", advance)
     loop.train(again, finished, "training", quiet_log)
     assert {path.name for path in tmp_path.iterdir()} == {"steernerf.safetensors", "lock"}
     found = new_training(ball_scene)
