@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 
-from bench.errors import SteerbenchError
+from bench.errors import SteerbenchError, Unavailable
 from bench.results import Store
 from reports import export
 from reports.outliers import outlier_table, outliers
@@ -30,7 +30,7 @@ DATA = "data="
 
 def main(options: argparse.Namespace) -> int:
     """Measure what the store does not have, unless a report is enough, and write the page; return 1
-    if a job failed. With `check`, name the runs that look broken, and return 1 if there are any."""
+    if a job failed that can run here. With `check`, name the runs that look broken, and return 1 if there are any."""
     words, data = data_set(options.overrides)
     if options.command == "report" and options.check:
         return _check(Store(Path(composed(words).outputs)))
@@ -71,7 +71,7 @@ def data_set(words: Sequence[str]) -> tuple[list[str], DataSet | None]:
 
 
 def _run(jobs: Sequence[Planned]) -> int:
-    """Run the jobs, equal ones once; return how many failed.
+    """Run the jobs, equal ones once; return how many failed, of those that can run here.
 
     Of one scene after the other, all models are trained that can be trained side by side; then all
     lines of all tables are measured with the first seed, then with the next.
@@ -93,9 +93,10 @@ def _run(jobs: Sequence[Planned]) -> int:
                 print(f"{number} of {len(jobs)}, {job.name}", file=sys.stderr)
             ended += len(group)
             begun = time.monotonic()
-            obtained = _obtained(group, there)
-            failed += len(group) - len(obtained)
-            if not obtained:
+            try:
+                obtained = _obtained(group, there)
+            except Exception as error:  # it was printed: the other jobs still run
+                failed += 0 if isinstance(error, Unavailable) else len(group)
                 continue
             measured += sum(of_job.measured for of_job in obtained)
             seconds += time.monotonic() - begun
@@ -106,15 +107,11 @@ def _run(jobs: Sequence[Planned]) -> int:
 
 
 def _obtained(group: Sequence[Planned], there: Mapping[str, Obtained]) -> list[Obtained]:
-    """What is `there` of all jobs of a group, by their keys, or else is measured now; nothing if
-    that fails."""
+    """What is `there` of all jobs of a group, by their keys, or else is measured now."""
     if all(job.key in there for job in group):
         return [there[job.key] for job in group]
-    try:
-        wanted = [(job.config, job.command, job.name) for job in group]
-        return attempt_in_turns(wanted, group[0].turns)
-    except Exception:  # which `attempt_in_turns` has printed: the other jobs still run
-        return []
+    wanted = [(job.config, job.command, job.name) for job in group]
+    return attempt_in_turns(wanted, group[0].turns)
 
 
 def _stored(job: Planned) -> Obtained | None:

@@ -15,7 +15,7 @@ import pytest
 from omegaconf import DictConfig
 
 from bench.results import Store
-from bench.types import SteerbenchError
+from bench.types import SteerbenchError, Unavailable
 from reports.paper_tables import paper_tables
 from sweeps import failures, jobs
 from sweeps.measurement import Obtained, described
@@ -235,6 +235,19 @@ def test_a_job_that_fails_stands_in_its_line_and_the_others_run(
     page = Path(re.search(r"report: (.*)", outcome.err)[1])
     assert labels(page) == ["L = 0", "L = 1", "L = 2", "L = 3: failed: no room for L = 3"]
     assert "/ 33.14 /" in page.read_text()
+
+
+def test_what_cannot_run_here_says_so_in_its_line_and_is_no_failure(
+    steerbench, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def obtain(*_: object) -> list[Obtained]:
+        raise Unavailable("no bfloat16 on this CPU")
+
+    monkeypatch.setattr(jobs, "obtain_in_turns", obtain)
+    outcome = steerbench("paper", "--table", "table3", "seed=0", f"outputs={store.folder.parent}")
+    assert outcome.status == 0
+    page = Path(re.search(r"report: (.*)", outcome.err)[1])
+    assert labels(page)[0] == "L = 0: failed: no bfloat16 on this CPU"
 
 
 def test_a_report_has_what_is_there_and_measures_nothing(
