@@ -30,7 +30,8 @@ DATA = "data="
 
 def main(options: argparse.Namespace) -> int:
     """Measure what the store does not have, unless a report is enough, and write the page; return 1
-    if a job failed that can run here. With `check`, name the runs that look broken, and return 1 if there are any."""
+    if a job failed that can run here. With `check`, name the runs that look broken, and return 1 if
+    there are any."""
     words, data = data_set(options.overrides)
     if options.command == "report" and options.check:
         return _check(Store(Path(composed(words).outputs)))
