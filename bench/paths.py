@@ -9,12 +9,14 @@ import json
 import math
 from collections import ChainMap
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from bench import motion
 from bench.cameras import move_camera
 from bench.scenes.files import (
     describe,
@@ -27,8 +29,8 @@ from bench.scenes.files import (
     whole_number,
 )
 from bench.scenes.transforms import focal
-from bench.trajectories import Step, Trajectory
-from bench.types import Camera, Scene
+from bench.trajectories import Step, Trajectory, from_split
+from bench.types import Camera, Scene, SteerbenchError
 
 KEYFRAMES = "camera_path"
 """What a file of nerfstudio's viewer has its cameras under."""
@@ -56,6 +58,35 @@ def follow(scene: Scene, path: str, limit: int = 0) -> Trajectory:
     moved = [move_camera(camera, scale, offset) for camera in cameras[: limit or None]]
     steps = tuple(Step(camera, truth=None) for camera in moved)
     return Trajectory(file.stem, "test", steps, reads=(file,))
+
+
+def spline(
+    scene: Scene, path: str | None, split: str = "test", keys: int = 6, degrees: float = 1.0
+) -> Trajectory:
+    """A path without corners through a few cameras; see `motion.spline`.
+
+    Args:
+        path: a file of cameras, as `follow` reads it; all of them are keys. None: the scene's own.
+        split: whose cameras are keys then; they alone have ground truth.
+        keys: how many, evenly spread over the split.
+        degrees: the longest way from frame to frame.
+
+    Raises:
+        SteerbenchError: as `follow`; as `from_split`; `degrees` is not positive; fewer than two
+            keys, two in a row at one pose, or their pictures differ in size.
+    """
+    if not degrees > 0:
+        raise SteerbenchError(f"trajectory.degrees: expected more than 0, got {degrees}")
+    whole_number(keys, "trajectory.keys", 2)
+    through = follow(scene, path) if path else from_split(scene, split, keys)
+    first, *others = through.steps
+    cameras = [step.camera for step in through.steps]
+    pieces = motion.spline(cameras, motion.viewing_target(scene), degrees)
+    steps = [first]
+    for key, piece in zip(others, pieces, strict=True):
+        steps += [*(Step(camera, truth=None) for camera in piece[:-1]), replace(key, cut=False)]
+    name = f"{through.name}-spline{degrees:g}deg"
+    return Trajectory(name, through.split, tuple(steps), through.reads)
 
 
 def write(path: Path, cameras: Sequence[Camera], scene: Scene, fps: float = 30.0) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from bench.paths import follow, write
+from bench.paths import follow, spline, write
 from bench.types import Camera, Scene, Split, SteerbenchError
 
 POSE = torch.tensor([[1.0, 0, 0, 0.5], [0, -1, 0, 0.25], [0, 0, -1, 2.0]])
@@ -103,3 +103,32 @@ def test_a_damaged_path_is_named_with_what_was_expected(
 def test_a_path_that_is_not_there_is_named(scene: Scene, tmp_path: Path) -> None:
     with pytest.raises(SteerbenchError, match=r"gone\.json: expected a file, got nothing there"):
         follow(scene, str(tmp_path / "gone.json"))
+
+
+def moved(camera: Camera, along: float) -> Camera:
+    return replace(camera, c2w=camera.c2w + torch.tensor([0.0, 0, 0, along]))
+
+
+def test_the_keys_of_a_spline_are_a_splits_cameras_or_those_of_a_file(
+    scene: Scene, tmp_path: Path
+) -> None:
+    first = scene.splits["test"].cameras[0]
+    cameras = [moved(first, 0.1 * index) for index in range(5)]
+    images = scene.splits["test"].images * 5
+    splits = scene.splits | {"test": Split(cameras, images, list("abcde"))}
+    scene = replace(scene, splits=splits)
+    of_split = spline(scene, None, keys=3)
+    assert [step.truth for step in of_split.steps if step.truth is not None] == [0, 2, 4]
+    assert of_split.preceding[-1] == len(of_split.steps) - 1 > 2
+    assert of_split.name == "test-3of5-spline1deg"
+    write(tmp_path / "keys.json", cameras[:2], scene)
+    of_file = spline(scene, str(tmp_path / "keys.json"))
+    assert len(of_file.steps) > 2
+    assert {step.truth for step in of_file.steps} == {None}
+    assert of_file.reads == (tmp_path / "keys.json",)
+
+
+@pytest.mark.parametrize(("option", "value"), [("degrees", 0.0), ("keys", 1)])
+def test_a_spline_refuses_what_is_no_path(scene: Scene, option: str, value: float) -> None:
+    with pytest.raises(SteerbenchError, match=f"trajectory.{option}: expected"):
+        spline(scene, None, **{option: value})
