@@ -16,8 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bench import motion
 from bench.cameras import move_camera
+from bench.motion import viewing_target
 from bench.scenes.files import (
     describe,
     number,
@@ -29,6 +29,7 @@ from bench.scenes.files import (
     whole_number,
 )
 from bench.scenes.transforms import focal
+from bench.splines import leading
 from bench.trajectories import Step, Trajectory, from_split
 from bench.types import Camera, Scene, SteerbenchError
 
@@ -63,7 +64,7 @@ def follow(scene: Scene, path: str, limit: int = 0) -> Trajectory:
 def spline(
     scene: Scene, path: str | None, split: str = "test", keys: int = 6, degrees: float = 1.0
 ) -> Trajectory:
-    """A path without corners through a few cameras; see `motion.spline`.
+    """A path without corners through a few cameras; see `splines.leading`.
 
     Args:
         path: a file of cameras, as `follow` reads it; all of them are keys. None: the scene's own.
@@ -81,7 +82,7 @@ def spline(
     through = follow(scene, path) if path else from_split(scene, split, keys)
     first, *others = through.steps
     cameras = [step.camera for step in through.steps]
-    pieces = motion.spline(cameras, motion.viewing_target(scene), degrees)
+    pieces = leading(cameras, viewing_target(scene), degrees)
     steps = [first]
     for key, piece in zip(others, pieces, strict=True):
         steps += [*(Step(camera, truth=None) for camera in piece[:-1]), replace(key, cut=False)]
