@@ -20,7 +20,7 @@ from bench.metrics import Lpips
 from bench.probes import FrameRecord, MemoryMeter, StageClock
 from bench.protocol import EvaluationProtocol
 from bench.results import COLD, STEADY, WHOLE, Measurement
-from bench.scoring import ERROR_RANGE, Scoring, check_frame
+from bench.scoring import ERROR_RANGE, PICTURES, Scoring, check_frame
 from bench.trajectories import Trajectory, spread
 from bench.types import Budget, Log, Method, Scene
 
@@ -45,6 +45,7 @@ class Task:
     Attributes:
         seed: for the rows; the method was made with it.
         weights_dir: where to look first for the backbones of LPIPS.
+        pictures: scored frames whose pictures are kept.
     """
 
     scene: Scene
@@ -53,6 +54,7 @@ class Task:
     budget: Budget
     seed: int
     weights_dir: Path | None = None
+    pictures: int = PICTURES
 
 
 def measure(method: Method, task: Task, log: Log) -> Measurement:
@@ -93,7 +95,7 @@ class _Take:
     @classmethod
     def of(cls, method: Method, task: Task, lpips: Mapping[str, Lpips]) -> _Take:
         device = method.settings()["device"]
-        scoring = Scoring(task.scene, task.trajectory, task.protocol, lpips)
+        scoring = Scoring(task.scene, task.trajectory, task.protocol, lpips, task.pictures)
         return cls(method, StageClock(device), MemoryMeter(device), scoring, [])
 
 

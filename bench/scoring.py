@@ -17,6 +17,7 @@ from bench.trajectories import Step, Trajectory, spread
 from bench.types import Camera, Frame, Scene, SteerbenchError, check_shape
 
 PICTURES = 3
+"""Scored frames whose pictures are kept, unless something else is asked for."""
 
 ERROR_RANGE = 0.1
 """Absolute error, mean over the channels, that the brightest colour of an error map stands for."""
@@ -60,7 +61,7 @@ class Scoring:
     """Scores the frames of a trajectory in their order; keeps the last one for the flicker.
 
     Attributes:
-        images: of `PICTURES` scored frames, evenly spread: ground truth, rendering and error map
+        images: of some scored frames, evenly spread: ground truth, rendering and error map
             as 8-bit pictures by file name; filled as the frames come.
     """
 
@@ -70,12 +71,13 @@ class Scoring:
         trajectory: Trajectory,
         protocol: EvaluationProtocol,
         lpips: Mapping[str, Lpips],
+        pictures: int = PICTURES,
     ) -> None:
         self.images: dict[str, np.ndarray] = {}
         self._scene, self._protocol, self._lpips = scene, protocol, lpips
         self._split = scene.splits[trajectory.split]
         scored = [index for index, step in enumerate(trajectory.steps) if step.truth is not None]
-        self._shown = {scored[i] for i in spread(len(scored), PICTURES)}
+        self._shown = {scored[i] for i in spread(len(scored), pictures)}
         self._flicker = Flicker()
 
     def score(self, index: int, step: Step, rgb: Tensor) -> dict[str, Any]:

@@ -13,8 +13,12 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import uniform_filter
 
 from bench.results import COLD
+from bench.trajectories import spread
 from reports.parts import Detail, Frame, Picture, View
 from reports.runs import Run
+
+MOST_FRAMES = 3
+"""Frames of a run on a page, however many it kept."""
 
 MOST_RENDERINGS = 4
 """Renderings in one image, beside the ground truth; more runs get further images."""
@@ -38,9 +42,12 @@ class Band:
     panels: Sequence[Image.Image | None]
 
 
-def kept_frames(run: Run) -> list[str]:
-    """The frames whose pictures `run` kept: how the names of their files begin."""
-    return sorted(path.name.split("-")[0] for path in run.pictures.glob("*-truth.png"))
+def kept_frames(runs: Sequence[Run]) -> list[str]:
+    """Frames whose pictures all `runs` kept, at most `MOST_FRAMES` of them, evenly spread: how the
+    names of their files begin."""
+    kept = [{path.name.split("-")[0] for path in run.pictures.glob("*-truth.png")} for run in runs]
+    common = sorted(set.intersection(*kept))
+    return [common[index] for index in spread(len(common), MOST_FRAMES)]
 
 
 def frame_section(runs: Sequence[Run], frame: str, stem: str) -> Iterator[str | Frame]:
@@ -94,12 +101,12 @@ def find_detail(truth: np.ndarray, renderings: Sequence[np.ndarray]) -> Detail:
     """
     alone = len(renderings) == 1
     stack = np.stack([*renderings, truth] if alone else renderings).astype(float)
-    spread = (stack.max(axis=0) - stack.min(axis=0)).mean(axis=-1)  # [H, W]
-    height, width = spread.shape
+    difference = (stack.max(axis=0) - stack.min(axis=0)).mean(axis=-1)  # [H, W]
+    height, width = difference.shape
     high, wide = max(1, height // ZOOM), max(1, width // ZOOM)
     middle = (height // 2, width // 2)
-    if spread.any():
-        mean = uniform_filter(spread, (high, wide), mode="constant")
+    if difference.any():
+        mean = uniform_filter(difference, (high, wide), mode="constant")
         middle = divmod(int(mean.argmax()), width)
     top = min(max(0, middle[0] - high // 2), height - high)
     left = min(max(0, middle[1] - wide // 2), width - wide)

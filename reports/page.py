@@ -115,7 +115,7 @@ def _pictures(runs: Sequence[Run]) -> Iterator[Part]:
     parts = [
         part
         for number, group in enumerate(groups.values(), 1)
-        for frame in kept_frames(group[0])
+        for frame in kept_frames(group)
         for part in frame_section(group, frame, f"frames-{number}")
     ]
     yield from ("## Pictures", *(parts or ["No frame has a ground truth."]))

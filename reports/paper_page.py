@@ -109,9 +109,9 @@ def _images(images: Mapping[str, Any], lines: Lines) -> Iterator[Part]:
     """The middle one of the frames that all runs kept."""
     runs = _chosen(images["lines"], lines, one_scene=True)
     runs = [run for run in runs if run.views == runs[0].views]
-    if runs and (frames := kept_frames(runs[0])):
+    if runs and (frames := kept_frames(runs)):
         title, stem = images["title"], f"frames-{images['title'].lower()}"
-        yield f"## {title}\n\nThe middle one of the {len(frames)} frames that were kept."
+        yield f"## {title}\n\nThe middle one of {len(frames)} frames that all runs kept."
         yield from frame_section(runs, frames[len(frames) // 2], stem)
 
 

@@ -53,6 +53,7 @@ class Settings:
     device: str
     backend: str
     threads: int | None
+    pictures: int
     outputs: str
     weights_dir: str | None
     report: str | None
@@ -174,7 +175,7 @@ class _Ready:
             "lpips": protocol.find_lpips(weights, log)
         }
         parts |= {"turns": turns} if turns else {}
-        task = Task(scene, trajectory, protocol, budget, settings.seed, weights)
+        task = Task(scene, trajectory, protocol, budget, settings.seed, weights, settings.pictures)
         return cls(config, command, method, task, parts, Store(Path(settings.outputs)))
 
     @cached_property
@@ -239,6 +240,8 @@ def checked_settings(config: DictConfig) -> Settings:
         raise SteerbenchError(f"seed: expected 0 or more, got {settings.seed}")
     if settings.threads is not None and settings.threads < 1:
         raise SteerbenchError(f"threads: expected 1 or more, or null, got {settings.threads}")
+    if settings.pictures < 0:
+        raise SteerbenchError(f"pictures: expected 0 or more, got {settings.pictures}")
     if not DEVICE.fullmatch(settings.device):
         raise SteerbenchError(f"device: expected auto, cpu, cuda or cuda:N, got {settings.device}")
     _, _, number = settings.device.partition(":")

@@ -25,7 +25,7 @@ from sweeps.measurement import described, trained
 from sweeps.plan import Planned
 
 CHOSEN_AFTERWARDS = {
-    *("engine", "precision", "protocol"),
+    *("engine", "precision", "protocol", "pictures"),
     *("rendering", "after", "stored", "stop", "faint", "skip"),
 }
 """Settings of a run and of its method that no training depends on."""

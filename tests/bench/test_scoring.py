@@ -94,3 +94,13 @@ def test_a_prediction_equal_to_the_truth_does_not_flicker(tiny_scene):
         figures = scoring.score(index, step, truth)
         assert figures["psnr"] == math.inf
         assert figures.get("flicker", 0.0) == 0
+
+
+@pytest.mark.parametrize(("pictures", "kept"), [(0, []), (2, [0, 5]), (99, [0, 1, 2, 3, 4, 5])])
+def test_as_many_pictures_are_kept_as_asked_for(tiny_scene, pictures: int, kept: list[int]) -> None:
+    trajectory = from_split(tiny_scene)
+    scoring = Scoring(tiny_scene, trajectory, QUICK, {}, pictures)
+    for index, step in enumerate(trajectory.steps):
+        scoring.score(index, step, composite(tiny_scene.splits["test"].images[index], WHITE))
+    kinds = ("truth", "rendered", "error")
+    assert list(scoring.images) == [f"{index:04d}-{kind}" for index in kept for kind in kinds]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from PIL import Image
 
-from reports.images import find_detail, write_image
+from reports.images import MOST_FRAMES, find_detail, kept_frames, write_image
 from reports.parts import View
 
 HEIGHT, WIDTH = 64, 96
@@ -56,3 +59,13 @@ def test_an_image_has_a_place_for_every_picture(tmp_path, runs, columns, lines):
     assert lines * panel[0] < pixels.shape[0] < (lines + 1) * panel[0]
     for number in range(runs):
         assert np.count_nonzero((pixels == 50 * number).all(axis=-1)) > panel[0] * panel[1]
+
+
+def test_a_page_has_a_few_of_the_frames_that_all_runs_kept(tmp_path: Path) -> None:
+    runs = [SimpleNamespace(pictures=tmp_path / name) for name in ("many", "some")]
+    for run, kept in zip(runs, (range(9), range(0, 9, 2)), strict=True):
+        run.pictures.mkdir()
+        for frame in kept:
+            (run.pictures / f"{frame:04}-truth.png").touch()
+    assert len(kept_frames(runs[:1])) == MOST_FRAMES == 3
+    assert kept_frames(runs) == ["0000", "0004", "0008"]
