@@ -8,7 +8,7 @@
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help install demo paper test fuzz lint format clean
+.PHONY: help install demo paper test test-all fuzz lint format clean
 
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -21,7 +21,7 @@ PAPER_ARGS ?= budget=paper scene=totem scene.downscale=2
 SUITS := import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))
 
 help: ## show this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' Makefile
 
 install: $(VENV)/.installed ## make $(VENV) and install steerbench into it, versions pinned
 
@@ -32,8 +32,13 @@ paper: install ## measure every table of the SteerNeRF paper, write outputs/pape
 	@$(BIN)/steerbench paper $(PAPER_ARGS)
 
 # A process for each core, a file of tests in one of them, in the order of tests/conftest.py.
-test: lint ## lint, then all tests
-	$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+PYTEST = $(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+
+test: lint ## lint, then all tests that take no more than a few seconds
+	$(PYTEST) -m "not slow"
+
+test-all: lint ## lint, then all tests: what continuous integration runs
+	$(PYTEST)
 
 fuzz: install ## loaders and settings on whatever comes, for some minutes
 	$(BIN)/python -m pytest --hypothesis-profile=fuzz tests/bench/scenes/test_fuzz.py tests/sweeps/test_fuzz.py

@@ -61,6 +61,14 @@ def settled(config: DictConfig) -> DictConfig:
     return config
 
 
+def changed(config: DictConfig, words: Sequence[str]) -> DictConfig:
+    """A copy of `config` with other values, read as Hydra reads them: composing anew is slower."""
+    copy = config.copy()
+    for override in OverridesParser.create().parse_overrides(list(words)):
+        OmegaConf.update(copy, override.get_key_element(), override.value())
+    return copy
+
+
 def choices(group: str, words: Sequence[str] = ()) -> dict[str, Path]:
     """The file of every choice of `group` by its name, also of the folders that `words` name."""
     found = {

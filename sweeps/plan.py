@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import product
-from typing import cast
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from bench.errors import SteerbenchError
 from reports.paper_tables import AFTER, METHOD, Line, PaperTable, paper_tables
@@ -17,7 +16,7 @@ from sweeps.data_sets import DataSet
 from sweeps.device_lock import on_gpu
 from sweeps.measurement import described, job_key
 from sweeps.names import unknown
-from sweeps.overrides import composed, setting, swept
+from sweeps.overrides import changed, choices, composed, setting, swept
 
 REPEATED = "seed"
 """The setting that may have several values: a cell then has a mean and an interval."""
@@ -99,6 +98,11 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     usual = [str(seed) for seed in range(budget.seeds)]
     params = experiment.hydra.sweeper.params
     grid = swept([f"{name}={values}" for name, values in params.items()])
+
+    @cache  # values are changed afterwards, without composing anew
+    def with_choices(*groups: str) -> DictConfig:
+        return composed([f"+experiment={table.name}", *fixed, *groups])
+
     jobs = []
     for block, line, repeated in _lines(table, budget.beyond):
         if line.job is None or line.job.get("precision", engine.precision) not in precisions:
@@ -106,22 +110,24 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
         added = line.job == {METHOD: line.label}
         swept_here = {name: value for name, value in line.job.items() if name != AFTER}
         if not added and any(value not in grid.get(name, ()) for name, value in swept_here.items()):
-            choices = "; ".join(f"{name}={','.join(some)}" for name, some in grid.items())
+            there = "; ".join(f"{name}={','.join(some)}" for name, some in grid.items())
             raise SteerbenchError(
                 f"{table.name}: no job of its experiment fills the line {line.label!r}; expected "
-                f"the settings of its job among {choices}"
+                f"the settings of its job among {there}"
             )
         settings = [f"{name}={value}" for name, value in line.job.items()]
-        together = [f"+experiment={table.name}", *fixed, *settings]
-        config = composed(together)
+        groups = [word for word in settings if choices(word.partition("=")[0], fixed)]
+        config = with_choices(*groups)
+        values = [word for word in settings if word not in groups]
         of_line = seeds or (usual if repeated else usual[:1])
         for seed, (scene, folder) in product(of_line, scenes.items()):
             word = f"{REPEATED}={seed}"
-            job = cast(DictConfig, OmegaConf.merge(config, OmegaConf.from_dotlist([word])))
+            job = changed(config, [*values, word])
             if data:
                 job.scene.path = folder
             place = [setting("scene.path", folder)] if data else []
-            command = ["steerbench", "run", *together, *place, word, "hydra.mode=RUN"]
+            given = [f"+experiment={table.name}", *fixed, *settings, *place, word]
+            command = ["steerbench", "run", *given, "hydra.mode=RUN"]
             turns = f"{table.name}, {block}, {seed}, {scene}" if table.in_turns else ""
             jobs.append(Planned(table.name, block, line.label, job, command, scene, turns))
     return jobs

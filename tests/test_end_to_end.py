@@ -16,6 +16,8 @@ import pytest
 from bench.results import Store
 from sweeps.studies.breakdown import DENSE
 
+pytestmark = pytest.mark.slow
+
 SMALL = ["scene.width=64", "scene.train=6", "scene.test=3", "budget=tiny", "budget.frames=0"]
 METHODS = ("ngp", "steernerf_lean", "steernerf")
 MEASURED_ANEW = ("frame_ms", "fps", "stage_ms", "train_s", "peak_bytes")

@@ -77,6 +77,7 @@ def cells() -> list[str]:
     return ["".join(c["source"]) for c in notebook["cells"] if c["cell_type"] == "code"]
 
 
+@pytest.mark.slow
 def test_the_tour_runs(tmp_path: Path) -> None:
     """Its cells one after the other; what the last line of a cell is, a notebook would show."""
     done = subprocess.run(

@@ -16,8 +16,22 @@ from methods.kernels import BACKENDS, availability
 
 CASES = found("cases")
 QUICK = [case for case in CASES if not (case.slow or case.timed)]
+LOOPS = ("march", "composite backward")
+"""Subjects whose kernels of the GPU have loops, which cost seconds where they are interpreted."""
+
+
+def marks(case: Case, cell: Cell) -> list[pytest.MarkDecorator]:
+    """Of an interpreted loop `make test` takes the first case."""
+    interpreted = cell[0] == "gpu" and not torch.cuda.is_available()
+    first = next(other for other in QUICK if other.subject == case.subject)
+    slow = interpreted and case.subject in LOOPS and case is not first
+    return [pytest.mark.slow] if slow else []
+
+
 CELLS = [
-    pytest.param(case, cell, id=f"{case.subject}: {case.name}: {' '.join(cell)}")
+    pytest.param(
+        case, cell, id=f"{case.subject}: {case.name}: {' '.join(cell)}", marks=marks(case, cell)
+    )
     for case in QUICK
     for cell in case.tolerances
 ]

@@ -49,6 +49,7 @@ def test_a_run_that_was_killed_can_be_run_again(hanging, run, tmp_path):
     assert len(runs(tmp_path)) == 1
 
 
+@pytest.mark.slow
 def test_a_reader_that_goes_away_ends_the_run_quietly(spawn):
     process = spawn()
     process.stdout.close()

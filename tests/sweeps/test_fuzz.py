@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
@@ -32,6 +33,7 @@ OVERRIDES = st.one_of(
 )
 
 
+@pytest.mark.slow
 @given(st.lists(OVERRIDES, max_size=3))
 def test_any_overrides_compose_and_build_or_are_refused(overrides: list[str]) -> None:
     with contextlib.suppress(SteerbenchError):

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
+
+from sweeps.overrides import composed
 
 
 @pytest.mark.parametrize(
@@ -92,11 +96,8 @@ def test_an_old_name_is_answered_with_the_new_one(steerbench, argv, said):
     assert outcome.err.count("\n") == 1
 
 
-def test_a_name_that_was_removed_may_be_used_again_by_a_plug_in(steerbench, tmp_path):
-    folder = tmp_path / "configs" / "method"
-    folder.mkdir(parents=True)
+def test_a_name_that_was_removed_may_be_used_again_by_a_plug_in(tmp_path: Path) -> None:
+    folder = tmp_path / "method"
+    folder.mkdir()
     (folder / "ngp_guided.yaml").write_text("defaults: [ngp, _self_]\nname: other\n")
-    outcome = steerbench(
-        "report", "--table", "table1", "--config-dir", "configs", "--with", "ngp_guided"
-    )
-    assert outcome.status == 0, outcome.err
+    assert composed(["method=ngp_guided", f"--config-dir={tmp_path}"]).method.name == "other"

@@ -164,6 +164,7 @@ def line_of(err: str) -> str:
     return line
 
 
+@pytest.mark.slow
 def test_table_1_has_a_line_for_it_that_is_measured_and_reported(call, only_mine, tmp_path):
     words = ("--table", "table1", "--with", "mine", *SMALL)
     measured = call("paper", *words)

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from bench.results import Store
@@ -19,6 +20,7 @@ def pictures(folder: str) -> list[np.ndarray]:
     return [np.asarray(Image.open(path)).astype(int) for path in sorted(Path(folder).glob("*.png"))]
 
 
+@pytest.mark.slow
 def test_every_frame_of_a_run_is_written_and_its_path_can_be_followed(steerbench) -> None:
     assert steerbench("run", "method=ngp", *SCENE, *QUICK, *PROTOCOL).status == 0
     (run,) = Store(Path("outputs")).rows()["run"].unique()
@@ -43,6 +45,7 @@ def test_every_frame_of_a_run_is_written_and_its_path_can_be_followed(steerbench
         assert np.abs(left - before).mean() < 0.5
 
 
+@pytest.mark.slow
 def test_a_path_file_may_be_timed(steerbench) -> None:
     assert steerbench("render", "method=ngp", *SCENE, *QUICK, "--output", "there").status == 0
     words = ("trajectory=path", "trajectory.path=there/path.json")

@@ -76,6 +76,7 @@ SMALL = [
 ]
 
 
+@pytest.mark.slow
 def test_what_was_trained_ahead_is_found_when_it_is_measured(
     steerbench, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -44,6 +44,7 @@ def teacher(ball_scene: Scene, log: Log) -> TrainedField:
     return train_field(SETUP, ball_scene, BUDGET, log)
 
 
+@pytest.mark.slow
 def test_it_learns_a_ball(ball_scene: Scene, log: Log) -> None:
     method = fitted(ball_scene, log, replace(BUDGET, renderer_steps=200))
     assert quality(method, ball_scene) > 24

@@ -27,6 +27,7 @@ def fitted(scene: Scene, log: Log, budget: Budget = BUDGET, **options) -> Gaussi
     return method
 
 
+@pytest.mark.slow
 def test_they_learn_a_ball(ball_scene: Scene, quiet_log: Log) -> None:
     budget = Budget("test", steps=100, samples=8192, renderer_steps=300)
     method = fitted(ball_scene, quiet_log, budget)
@@ -58,6 +59,7 @@ def test_they_learn_from_scratch(ball_scene: Scene, quiet_log: Log) -> None:
     assert quality(after, ball_scene) > quality(before, ball_scene) + 3
 
 
+@pytest.mark.slow
 def test_they_begin_on_surfaces_with_their_colours(ball_scene: Scene, quiet_log: Log) -> None:
     setup = Setup.resolved(GRID, TrainingOptions(), "bf16", "auto", "cpu", seed=0)
     budget = Budget("test", steps=400, samples=8192)

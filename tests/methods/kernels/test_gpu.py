@@ -49,6 +49,7 @@ def test_a_table_of_half_precision_gives_features_of_its_type() -> None:
         assert (table.grad - exact.grad).abs().max() <= most * unit + 57 * 6 * U32 * grid.n_max
 
 
+@pytest.mark.slow
 def test_told_to_be_deterministic_it_adds_up_in_an_order_that_repeats() -> None:
     """In another order than the atomics', so that only the last bits may differ from theirs."""
     torch.manual_seed(0)
@@ -137,6 +138,7 @@ def test_a_thin_haze_keeps_its_light_to_the_last_digits() -> None:
     assert ((found - exact).abs() / exact).max() <= (12 + 3 / 0.06) * U32
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(platform.system() != "Linux", reason="Triton brings its assembler for Linux")
 def test_every_kernel_compiles_for_a_gpu_that_is_not_here(tmp_path: Path) -> None:
     environment = {name: text for name, text in os.environ.items() if name != "TRITON_INTERPRET"}

@@ -33,6 +33,7 @@ def fitted(scene: Scene, log: Log, **options) -> KiloNerf:
     return student
 
 
+@pytest.mark.slow
 def test_it_learns_a_ball(ball_scene: Scene, quiet_log: Log) -> None:
     student = fitted(ball_scene, quiet_log)
     test = ball_scene.splits["test"]

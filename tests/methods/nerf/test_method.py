@@ -51,6 +51,7 @@ def trained_teacher(scene: Scene, log: Log) -> TrainedField:
     return train_field(new_method().teacher, scene, BUDGET, log)
 
 
+@pytest.mark.slow
 def test_it_learns_a_ball(ball_scene: Scene, log: Log) -> None:
     method = fitted(ball_scene, log, steps=60)
     assert quality(method, ball_scene) > 16

@@ -122,6 +122,7 @@ def test_the_network_is_that_of_the_publication() -> None:
     torch.testing.assert_close(2 * shown - 1, colour(torch.cat((feature, seen), dim=1)), **close)
 
 
+@pytest.mark.slow
 def test_it_learns_a_ball(ball_scene: Scene, log: Log) -> None:
     method = fitted(ball_scene, log, steps=60, start="teacher")
     assert quality(method, ball_scene) > 16

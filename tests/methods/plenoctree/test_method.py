@@ -116,6 +116,7 @@ def test_directions_are_spread_evenly() -> None:
     assert 0.6 * 0.44 < nearest.min() <= nearest.max() < 1.4 * 0.44
 
 
+@pytest.mark.slow
 def test_it_learns_a_ball(ball_scene: Scene, log: Log) -> None:
     before, after = fitted(ball_scene, log, 1), fitted(ball_scene, log, 60)
     assert mean_quality(after, ball_scene, "train") > mean_quality(before, ball_scene, "train") + 1

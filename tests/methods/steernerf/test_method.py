@@ -116,6 +116,7 @@ def test_sizes_are_those_of_all_that_a_frame_needs(ball_scene: Scene, log: Conso
     assert set(method.sizes()) == {"hash_table", "field_networks", "occupancy", "renderer2d"}
 
 
+@pytest.mark.slow
 def test_a_network_is_built_once_for_each_training_and_for_no_other(
     ball_scene: Scene, log: ConsoleLog, tmp_path: Path
 ) -> None:
@@ -199,6 +200,7 @@ def test_no_field_of_a_rendering_is_in_the_key_of_a_training(name: str) -> None:
     assert key_of(small_model(), other) == key_of(small_model(), usual)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", [0.125, 0.5, 1.0])
 def test_the_weights_after_a_share_of_the_steps_are_of_the_same_training(
     ball_scene: Scene, log: ConsoleLog, tmp_path: Path, after: float

@@ -48,6 +48,7 @@ def test_no_two_settings_have_one_name(name: str) -> None:
     assert len(set(names)) == len(names)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", METHODS)
 def test_one_training_serves_all_that_is_chosen_afterwards(name: str) -> None:
     found = study(name)

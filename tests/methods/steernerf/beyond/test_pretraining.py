@@ -41,6 +41,7 @@ def train(scenes: list[Scene], output: Path, log: Log, channels: int = 3) -> dic
     return load_file(output)
 
 
+@pytest.mark.slow
 def test_the_weights_of_several_scenes_are_what_a_renderer_starts_from(
     ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -62,6 +63,7 @@ def test_the_weights_of_several_scenes_are_what_a_renderer_starts_from(
         assert torch.equal(other.network.trunk[0].spread, started.network.trunk[0].spread)
 
 
+@pytest.mark.slow
 def test_the_same_training_results_in_the_same_weights(ball_scene: Scene, tmp_path: Path) -> None:
     first, second = (
         train([ball_scene], tmp_path / f"{name}.safetensors", ConsoleLog(tmp_path / name, True))

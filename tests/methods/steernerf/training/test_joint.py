@@ -159,6 +159,7 @@ def test_joint_trains_table_networks_and_renderer(ball_scene: Scene) -> None:
     } <= changed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frames", [0, 2])
 def test_the_error_falls(ball_scene: Scene, frames: int) -> None:
     """On patches that are kept: one patch is much harder than another."""
