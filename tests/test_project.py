@@ -93,7 +93,18 @@ def test_every_pin_suits_the_range_in_pyproject():
 
 def test_extras_are_those_that_are_promised():
     assert set(EXTRAS) == {
-        *("openvino", "onnx", "tensorrt", "video", "viewer", "joblib", "ray", "slurm", "dev")
+        *(
+            "openvino",
+            "onnx",
+            "tensorrt",
+            "video",
+            "viewer",
+            "colmap",
+            "joblib",
+            "ray",
+            "slurm",
+            "dev",
+        )
     }
 
 

@@ -10,12 +10,39 @@ import torch
 
 from bench.cameras import move_camera
 from bench.scenes.bounds import Box
-from bench.scenes.files import whole_number
+from bench.scenes.files import unexpected, whole_number
 from bench.scenes.images import Picture, View, decode_all
 from bench.types import BACKGROUNDS, Log, Scene, Split, SteerbenchError
 
 SMALLEST, LARGEST = torch.finfo(torch.float32).tiny, torch.finfo(torch.float32).max
 """Lengths that float32 has at its full precision."""
+
+
+def every_nth(views: Sequence[View], step: int, where: Path) -> dict[str, list[View]]:
+    """Views in the order of their names: 0, step, 2 * step ... as test, all others as train.
+
+    Raises:
+        SteerbenchError: `step` is less than 2, or nothing is left to train on; `where` is named.
+    """
+    whole_number(step, "split_every", 2)
+    views = sorted(views, key=lambda view: view.name)
+    if len(views) < 2:
+        got = f"{len(views)} pictures, each of which split_every={step} makes a test"
+        raise unexpected(where, "a picture to train on", got)
+    return {"train": [v for i, v in enumerate(views) if i % step], "test": views[::step]}
+
+
+def leave_out(missing: Sequence[str], views: Sequence[View], where: str, log: Log) -> None:
+    """Log the names of pictures that are `missing` beside `views`.
+
+    Raises:
+        SteerbenchError: there are no views.
+    """
+    if not views:
+        raise unexpected(where, "pictures", f"none of {len(missing)} files is there")
+    if missing:
+        count = f"{len(missing)} of {len(views) + len(missing)}"
+        log.info(f"{where}: {count} pictures are not there, left out: {', '.join(missing)}")
 
 
 def decode_splits(

@@ -1,12 +1,19 @@
-"""Undoes a lens distortion: gives the picture of a pinhole with the same intrinsics."""
+"""Lenses, and how a picture becomes that of a pinhole with the same intrinsics.
+
+A lens takes points [N, 2] of a pinhole's image plane at distance 1, float64, to where it shows them
+in that plane. It is hashable.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 import torch
 from kornia.geometry.calibration import distort_points
+from kornia.geometry.camera import distort_points_kannala_brandt
 from kornia.geometry.transform import remap
 from torch import Tensor
 from torch.nn.functional import pad
@@ -15,27 +22,48 @@ from bench.cameras import crop_camera, pixel_grid
 from bench.scenes.files import unexpected
 from bench.types import Camera
 
+Lens = Callable[[Tensor], Tensor]
 
-def undistort(
-    image: Tensor, camera: Camera, coefficients: tuple[float, ...], where: Path
-) -> tuple[Tensor, Camera]:
+
+@dataclass(frozen=True)
+class RadialTangential:
+    """OpenCV's lens with `coefficients` (k1, k2, p1, p2, k3), or with (k4, k5, k6) besides."""
+
+    coefficients: tuple[float, ...]
+
+    def __call__(self, points: Tensor) -> Tensor:
+        return distort_points(points, torch.eye(3).double(), points.new_tensor(self.coefficients))
+
+
+@dataclass(frozen=True)
+class Fisheye:
+    """OpenCV's fisheye (Kannala and Brandt 2006) with `coefficients` (k1, k2, k3, k4)."""
+
+    coefficients: tuple[float, ...]
+
+    def __call__(self, points: Tensor) -> Tensor:
+        plain = (1.0, 1.0, 0.0, 0.0)  # fx, fy, cx, cy
+        return distort_points_kannala_brandt(points, points.new_tensor(plain + self.coefficients))
+
+
+def undistort(image: Tensor, camera: Camera, lens: Lens, where: Path) -> tuple[Tensor, Camera]:
     """The pinhole picture and its camera.
 
     Args:
         image: uint8 [H, W, C].
         camera: intrinsics of the distorted picture; they stay those of the pinhole.
-        coefficients: OpenCV's (k1, k2, p1, p2, k3).
+        lens: that the picture was taken with.
         where: the picture, for messages.
 
     The result is cropped to a rectangle in which every pixel was seen: no invented border.
-    Raises SteerbenchError when the coefficients fold the picture over itself.
+    Raises SteerbenchError when the lens folds the picture over itself.
     """
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     try:
-        source, left, top = pinhole_window(camera.width, camera.height, intrinsics, coefficients)
+        source, left, top = pinhole_window(camera.width, camera.height, intrinsics, lens)
     except ValueError as error:
         expected = "a lens distortion that can be undone"
-        raise unexpected(where, expected, f"{coefficients}: {error}") from error
+        raise unexpected(where, expected, f"{lens}: {error}") from error
     planes = image.permute(2, 0, 1)[None].float()
     alpha = planes[:, 3:] / 255
     planes[:, :3] *= alpha if alpha.numel() else 1  # between pixels, colours weigh by their alpha
@@ -50,17 +78,15 @@ def undistort(
 
 @lru_cache(maxsize=2)  # most captures have one lens
 def pinhole_window(
-    width: int, height: int, intrinsics: tuple[float, ...], coefficients: tuple[float, ...]
+    width: int, height: int, intrinsics: tuple[float, float, float, float], lens: Lens
 ) -> tuple[Tensor, int, int]:
     """Where the pinhole's pixels lie in the distorted picture, for those that lie inside.
 
     Returns [h, w, 2] as (u, v), and the column and row of its first pixel.
     """
-    fx, fy, cx, cy = intrinsics
-    matrix = torch.tensor(((fx, 0, cx), (0, fy, cy), (0, 0, 1)), dtype=torch.float64)
-    lens = torch.tensor(coefficients, dtype=torch.float64)
-    points = distort_points(pixel_grid(width, height).double(), matrix, lens)
-    source = points.reshape(height, width, 2).float()
+    focal, centre = torch.tensor(intrinsics, dtype=torch.float64).split(2)
+    points = lens((pixel_grid(width, height).double() - centre) / focal)
+    source = (points * focal + centre).reshape(height, width, 2).float()
     if not (area_of_cells(source) > 0).all():  # nor is what is no number
         raise ValueError("it folds the picture over itself")
     left, top, right, bottom = seen_rectangle(source)

@@ -15,7 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from bench.cameras import crop_camera, scale_camera
-from bench.scenes.distortion import undistort
+from bench.scenes.distortion import Lens, undistort
 from bench.scenes.files import unexpected
 from bench.scenes.parallel import in_parallel
 from bench.types import Camera, Log
@@ -30,13 +30,13 @@ class View:
     """A picture that a data set describes: `camera` in the data set's units, OpenCV axes, float64,
     because a scene may lie far from its data set's origin.
 
-    `distortion` is (k1, k2, p1, p2, k3) of OpenCV's lens model, empty for a pinhole.
+    `lens` is None for a pinhole.
     """
 
     name: str
     path: Path
     camera: Camera
-    distortion: tuple[float, ...] = ()
+    lens: Lens | None = None
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,8 @@ def decode(view: View, downscale: int) -> Picture:
     if image.shape[:2] != (camera.height, camera.width):
         expected = f"{camera.width} x {camera.height} pixels"
         raise unexpected(view.path, expected, f"{image.shape[1]} x {image.shape[0]}")
-    if any(view.distortion):
-        image, camera = undistort(image, camera, view.distortion, view.path)
+    if view.lens:
+        image, camera = undistort(image, camera, view.lens, view.path)
     image, camera = shrink(image, camera, downscale, view.path)
     return Picture(image, camera, hashlib.sha256(content).hexdigest())
 

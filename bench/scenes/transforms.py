@@ -8,8 +8,9 @@ from pathlib import Path
 
 import torch
 
-from bench.scenes.assemble import assemble, decode_splits
+from bench.scenes.assemble import assemble, decode_splits, every_nth, leave_out
 from bench.scenes.bounds import Box
+from bench.scenes.distortion import Fisheye, Lens, RadialTangential
 from bench.scenes.files import (
     data_folder,
     describe,
@@ -20,7 +21,6 @@ from bench.scenes.files import (
     opengl_pose,
     read_json,
     unexpected,
-    whole_number,
 )
 from bench.scenes.images import View, image_size
 from bench.types import Camera, Log, Scene
@@ -30,10 +30,19 @@ CAMERA_FILE = "transforms.json"
 NGP_SCALE, NGP_OFFSET = 0.33, (0.5, 0.5, 0.5)
 """instant-ngp's unit cube holds scale * x + offset of the file's coordinates x."""
 
-PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
+USUAL = ("k1", "k2", "p1", "p2", "k3")
+LENSES: Mapping[str, tuple[type[RadialTangential | Fisheye], tuple[str, ...]]] = {
+    **dict.fromkeys(
+        ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"),
+        (RadialTangential, USUAL),
+    ),
+    "FULL_OPENCV": (RadialTangential, (*USUAL, "k4", "k5", "k6")),
+    "OPENCV_FISHEYE": (Fisheye, ("k1", "k2", "k3", "k4")),
+}
+"""The lens of a `camera_model`, and the names of its coefficients."""
 
-LENS = ("k1", "k2", "p1", "p2", "k3")
-OTHER_LENSES = ("k4", "k5", "k6", "is_fisheye", "ftheta_p0", "rolling_shutter")
+OTHER_TERMS = ("k3", "k4", "k5", "k6", "p1", "p2", "ftheta_p0", "rolling_shutter")
+"""What would bend a picture, too, and is refused where a lens does not have it."""
 
 
 def load(
@@ -59,18 +68,9 @@ def load(
     cropped to what the lens saw. Frames without a picture are logged and left out.
     Raises SteerbenchError naming file and field when anything is not as it should be.
     """
-    whole_number(split_every, "split_every", 2)
     root = data_folder(path)
-    record = read_json(root, CAMERA_FILE)
-    views = sorted(read_views(root, record, log), key=lambda view: view.name)
-    splits = {
-        "train": [view for i, view in enumerate(views) if i % split_every],
-        "test": views[::split_every],
-    }
-    path = root / CAMERA_FILE
-    if not splits["train"]:
-        got = f"{len(views)} pictures, each of which split_every={split_every} makes a test"
-        raise unexpected(path, "a picture to train on", got)
+    record, path = read_json(root, CAMERA_FILE), root / CAMERA_FILE
+    splits = every_nth(read_views(root, record, log), split_every, path)
     box = capture_box(path, record, aabb_scale)
     pictures = decode_splits(splits, downscale, log)
     return assemble(root.name, splits, pictures, box, background=background, camera_files=[path])
@@ -87,14 +87,9 @@ def read_views(root: Path, record: dict, log: Log) -> list[View]:
             continue
         settings = ChainMap(frame, record)
         camera = read_camera(settings, opengl_pose(frame, where), file, where)
-        lens = tuple(number(settings.get(name, 0.0), f"{where}.{name}") for name in LENS)
-        refuse_other_lenses(settings, where)
-        views.append(View(str(file.relative_to(root)), file, camera, lens if any(lens) else ()))
-    if not views:
-        raise unexpected(f"{path}: frames", "pictures", f"none of {len(missing)} files is there")
-    if missing:
-        count = f"{len(missing)} of {len(views) + len(missing)}"
-        log.info(f"{path}: {count} pictures are not there, left out: {', '.join(missing)}")
+        lens = read_lens(settings, where)
+        views.append(View(str(file.relative_to(root)), file, camera, lens))
+    leave_out(missing, views, f"{path}: frames", log)
     return views
 
 
@@ -129,19 +124,24 @@ def focal(settings: ChainMap, axis: str, size: float, where: str) -> float | Non
     return None
 
 
-def refuse_other_lenses(settings: Mapping, where: str) -> None:
-    """Raise when the lens needs more than OpenCV's k1 k2 p1 p2 k3.
+def read_lens(settings: Mapping, where: str) -> Lens | None:
+    """The lens of a frame, None for a pinhole. `is_fisheye`, of instant-ngp, means OPENCV_FISHEYE.
 
-    nerfstudio and OpenCV mean different things by k4 and above: undoing one for the other would
-    bend every picture.
+    Raises:
+        SteerbenchError: the model is none of `LENSES`, or the lens has a further term. By k4 of
+            the model OPENCV nerfstudio and OpenCV mean different things.
     """
     model = settings.get("camera_model", "OPENCV")
-    if model not in PINHOLE_MODELS:
-        expected = f"one of {', '.join(PINHOLE_MODELS)}"
-        raise unexpected(f"{where}.camera_model", expected, describe(model))
-    for name in OTHER_LENSES:
-        if settings.get(name):
-            raise unexpected(f"{where}.{name}", "a lens of k1 k2 p1 p2 k3", settings[name])
+    if settings.get("is_fisheye"):
+        model = "OPENCV_FISHEYE"
+    if not isinstance(model, str) or model not in LENSES:
+        raise unexpected(f"{where}.camera_model", f"one of {', '.join(LENSES)}", describe(model))
+    kind, names = LENSES[model]
+    coefficients = tuple(number(settings.get(name, 0.0), f"{where}.{name}") for name in names)
+    for name in OTHER_TERMS:
+        if name not in names and settings.get(name):
+            raise unexpected(f"{where}.{name}", f"a lens of {' '.join(names)}", settings[name])
+    return kind(coefficients) if kind is Fisheye or any(coefficients) else None
 
 
 def capture_box(path: Path, record: dict, aabb_scale: float | None) -> Box:

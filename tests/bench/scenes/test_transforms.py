@@ -14,7 +14,7 @@ from PIL import Image
 
 from bench.cameras import pixel_grid
 from bench.scenes import transforms
-from bench.scenes.distortion import undistort
+from bench.scenes.distortion import Fisheye, RadialTangential, undistort
 from bench.types import Camera, SteerbenchError
 
 HERE = Path("picture.png")
@@ -141,11 +141,11 @@ def first(name: str, value: object) -> Callable[[dict], object]:
         (first("w", 0), r"frames\[0\].w: .* above 0"),
         (first("k1", None), r"frames\[0\].k1: expected a finite number, got nothing"),
         (every("k4", 0.1), r"frames\[0\].k4: expected a lens of k1 k2 p1 p2 k3"),
-        (every("is_fisheye", True), r"frames\[0\].is_fisheye: expected a lens"),
         (
-            every("camera_model", "OPENCV_FISHEYE"),
-            r"frames\[0\].camera_model: expected one of OPENCV",
+            lambda record: record.update(is_fisheye=True, p1=0.1),
+            r"frames\[0\].p1: expected a lens of k1 k2 k3 k4",
         ),
+        (every("camera_model", "EQUIRECTANGULAR"), r"frames\[0\].camera_model: expected one of OP"),
         (every("aabb_scale", 0), r"aabb_scale: .* above 0"),
         (every("scale", -1), r"scale: .* above 0"),
         (every("offset", [1, 2]), r"offset: expected three numbers"),
@@ -220,7 +220,7 @@ def test_undistortion_recovers_the_pinhole_picture(name) -> None:
     seen = undistort_points(grid, matrix, torch.tensor(lens, dtype=torch.float64), num_iters=60)
     x, y = (seen[:, 0] - camera.cx) / camera.fx, (seen[:, 1] - camera.cy) / camera.fy
     distorted = wave(x, y).reshape(camera.height, camera.width, 3).round().to(torch.uint8)
-    straight, cropped = undistort(distorted, camera, lens, HERE)
+    straight, cropped = undistort(distorted, camera, RadialTangential(lens), HERE)
     assert straight.shape == (cropped.height, cropped.width, 3)
     # The crop loses a border only: most of the picture stays.
     assert cropped.width * cropped.height > 0.85 * camera.width * camera.height
@@ -235,7 +235,9 @@ def test_undistortion_recovers_the_pinhole_picture(name) -> None:
 
 def test_a_lens_that_does_nothing_returns_the_inner_picture(picture) -> None:
     image = torch.from_numpy(picture(1, 100, 76, 3))
-    straight, cropped = undistort(image, pinhole(), (1e-12, 0.0, 0.0, 0.0, 0.0), HERE)
+    straight, cropped = undistort(
+        image, pinhole(), RadialTangential((1e-12, 0.0, 0.0, 0.0, 0.0)), HERE
+    )
     left, top = round(52.3 - cropped.cx), round(37.1 - cropped.cy)
     assert cropped.width >= 98
     inner = image[top : top + cropped.height, left : left + cropped.width]
@@ -247,7 +249,7 @@ def test_colours_between_pixels_weigh_by_their_alpha() -> None:
     image[..., 0] = 200
     image[:, 50:, 3] = 255
     image[:, :50, :3] = 90  # not seen: alpha is 0
-    straight, _ = undistort(image, pinhole(), LENSES["pincushion"], HERE)
+    straight, _ = undistort(image, pinhole(), RadialTangential(LENSES["pincushion"]), HERE)
     colours = straight[straight[..., 3] > 0][:, :3]
     assert (colours.float() - torch.tensor([200.0, 0, 0])).abs().max() <= 1
 
@@ -255,7 +257,7 @@ def test_colours_between_pixels_weigh_by_their_alpha() -> None:
 def test_a_lens_that_folds_the_picture_is_refused() -> None:
     image = torch.zeros(76, 100, 3, dtype=torch.uint8)
     with pytest.raises(SteerbenchError, match=r"picture.png: .* it folds the picture"):
-        undistort(image, pinhole(), (-2.0, 0.0, 0.0, 0.0, 0.0), HERE)
+        undistort(image, pinhole(), RadialTangential((-2.0, 0.0, 0.0, 0.0, 0.0)), HERE)
 
 
 def test_a_capture_with_a_lens_is_cropped_alike_everywhere(folder, edit_json, picture, log) -> None:
@@ -300,3 +302,20 @@ def test_a_camera_too_far_away_for_float32_is_refused(folder, edit_json, log) ->
     )
     with pytest.raises(SteerbenchError, match=r"images/009.png: expected lengths that float32 has"):
         transforms.load(folder, log=log)
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({}, None),
+        ({"k1": 0.1, "p2": 0.2}, RadialTangential((0.1, 0.0, 0.0, 0.2, 0.0))),
+        (
+            {"camera_model": "FULL_OPENCV", "k1": 0.1, "k6": 0.2},
+            RadialTangential((0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.2)),
+        ),
+        ({"camera_model": "OPENCV_FISHEYE", "k4": 0.1}, Fisheye((0.0, 0.0, 0.0, 0.1))),
+        ({"is_fisheye": True}, Fisheye((0.0, 0.0, 0.0, 0.0))),
+    ],
+)
+def test_the_lens_is_that_of_the_camera_model(settings: dict, expected: object) -> None:
+    assert transforms.read_lens(settings, "here") == expected

@@ -1,0 +1,212 @@
+"""A capture that COLMAP has put together: its sparse model beside the pictures."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bench.cameras import scale_camera
+from bench.errors import Unavailable
+from bench.scenes.assemble import assemble, decode_splits, every_nth, leave_out
+from bench.scenes.bounds import MARGIN, Box, parse_box
+from bench.scenes.distortion import Lens
+from bench.scenes.files import data_folder, inside, rigid_pose, unexpected
+from bench.scenes.images import View, image_size
+from bench.types import Camera, Log, Scene
+
+MODELS = ("sparse/0", "colmap/sparse/0", "sparse", ".")
+"""Where a model may lie in a capture's folder; the first that is there is taken."""
+
+LISTS = {"frames": (64, "<I", 16), "images": (64, "<Q", 24), "points3D": (43, "<Q", 8)}
+"""Of an entry of a binary list: the bytes before the number of its parts (of an image a name, too),
+the type of that number, the bytes of a part."""
+
+STRAY = 0.01
+"""Share of the points, at either end of an axis, that the box need not hold."""
+
+ASPECT = 0.01
+"""Largest difference between the aspect ratios of a picture and its camera, as a share."""
+
+
+def load(
+    path: str | Path,
+    *,
+    images: str = "images",
+    model: str | None = None,
+    split_every: int = 8,
+    bounds: str | list = "auto",
+    downscale: int = 1,
+    background: str = "white",
+    log: Log,
+) -> Scene:
+    """Read a capture folder.
+
+    Args:
+        path: the folder.
+        images: its folder of pictures. They may be smaller than those that COLMAP saw.
+        model: its folder with `cameras`, `images` and `points3D`, `.bin` or `.txt`; None: the first
+            of `MODELS` that has them.
+        split_every: as of `bench.scenes.transforms.load`.
+        bounds: what fills the unit cube. "auto": the box of the points, but for the outermost;
+            or [[x, y, z], [x, y, z]].
+        downscale, background: as of `bench.scenes.blender.load`.
+
+    Every camera model of COLMAP that has a focal length is undone, and pictures are cropped to what
+    the lens saw. Pictures that COLMAP did not register do not count. Registered ones that are not
+    there are logged and left out.
+
+    Raises:
+        Unavailable: pycolmap is not installed.
+        SteerbenchError: naming the file, when anything is not as it should be.
+    """
+    root = data_folder(path)
+    folder = model_folder(root, model)
+    found = read_model(folder)
+    splits = every_nth(read_views(root, images, folder, found, log), split_every, folder)
+    box = points_box(found, folder) if bounds == "auto" else parse_box(bounds)
+    pictures = decode_splits(splits, downscale, log)
+    files = sorted(folder.glob(f"*{_kind(folder)}"))
+    return assemble(root.name, splits, pictures, box, background=background, camera_files=files)
+
+
+def model_folder(root: Path, model: str | None) -> Path:
+    """The folder of the sparse model in `root`."""
+    places = MODELS if model is None else (model,)
+    for place in places:
+        folder = inside(root, place, "scene.model")
+        if _kind(folder):
+            return folder
+    raise unexpected(root, f"cameras.bin or cameras.txt in {' or '.join(places)}", "neither")
+
+
+def _kind(folder: Path) -> str:
+    """The ending of the files of a model: binary before text, as COLMAP reads them; or nothing."""
+    return next((end for end in (".bin", ".txt") if (folder / f"cameras{end}").is_file()), "")
+
+
+def read_model(folder: Path) -> Any:
+    """The `pycolmap.Reconstruction` in `folder`."""
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise Unavailable(
+            f"{folder}: models of COLMAP need pycolmap: pip install 'steerbench[colmap]'"
+        ) from error
+    for name in LISTS:
+        check_length(folder / f"{name}.bin")
+    try:
+        return pycolmap.Reconstruction(folder)
+    except (ValueError, RuntimeError, LookupError, MemoryError) as error:
+        raise unexpected(folder, "a whole model of COLMAP", str(error).splitlines()[-1]) from error
+
+
+def check_length(file: Path) -> None:
+    """Raise if a binary list is shorter than it says: pycolmap would read on for minutes, and take
+    gigabytes."""
+    if not file.is_file():
+        return
+    content = file.read_bytes()
+    head, count, size = LISTS[file.stem]
+    try:
+        (entries,) = struct.unpack_from("<Q", content)
+        end = 8
+        for _ in range(entries):
+            end += head
+            if file.stem == "images":
+                end = content.index(0, end) + 1  # the end of its name
+            (parts,) = struct.unpack_from(count, content, end)
+            end += struct.calcsize(count) + parts * size
+        whole = end <= len(content)
+    except (struct.error, ValueError, OverflowError):
+        whole = False
+    if not whole:
+        raise unexpected(file.parent, "a whole model of COLMAP", f"{file.name} cut short")
+
+
+def read_views(root: Path, images: str, folder: Path, found: Any, log: Log) -> list[View]:
+    """The views of all registered images whose picture is there."""
+    pictures = inside(root, images, "scene.images")
+    views, missing = [], []
+    for image in found.images.values():
+        if not image.has_pose:
+            continue
+        where = f"{folder}: {image.name}"
+        file = inside(pictures, image.name, where)
+        if not file.is_file():
+            missing.append(image.name)
+            continue
+        camera, lens = read_camera(image, file, where)
+        views.append(View(image.name, file, camera, lens))
+    leave_out(missing, views, str(folder), log)
+    return views
+
+
+def read_camera(image: Any, file: Path, where: str) -> tuple[Camera, Lens | None]:
+    """The pinhole of an image, of the size of its picture, and its lens."""
+    of_image = image.camera
+    if not of_image.focal_length_idxs():
+        raise unexpected(where, "a camera model with a focal length", of_image.model_name)
+    pose = image.cam_from_world().inverse().matrix().tolist()
+    camera = Camera(
+        rigid_pose([*pose, [0, 0, 0, 1]], where),
+        of_image.focal_length_x,
+        of_image.focal_length_y,
+        of_image.principal_point_x,
+        of_image.principal_point_y,
+        of_image.width,
+        of_image.height,
+    )
+    width, height = image_size(file)
+    stretched = (width / camera.width) / (height / camera.height)
+    if abs(stretched - 1) > ASPECT:
+        expected = (
+            f"a picture of {camera.width} x {camera.height} pixels, or as wide for its height"
+        )
+        raise unexpected(file, expected, f"{width} x {height}")
+    lens = (
+        None
+        if of_image.is_perspective_pinhole() and of_image.is_undistorted()
+        else ColmapLens.of(of_image)
+    )
+    return scale_camera(camera, width, height), lens
+
+
+@dataclass(frozen=True)
+class ColmapLens:
+    """A lens of COLMAP's: `model` by name, with its `params`."""
+
+    model: str
+    params: tuple[float, ...]
+
+    @classmethod
+    def of(cls, camera: Any) -> ColmapLens:
+        return cls(camera.model_name, tuple(camera.params))
+
+    @cached_property
+    def _camera(self) -> Any:
+        import pycolmap
+
+        return pycolmap.Camera(model=self.model, width=1, height=1, params=self.params)
+
+    def __call__(self, points: Tensor) -> Tensor:
+        camera = self._camera
+        rays = np.column_stack((points.numpy(), np.ones(len(points))))
+        seen = camera.img_from_cam(rays)
+        centre = camera.principal_point_x, camera.principal_point_y
+        focal = camera.focal_length_x, camera.focal_length_y
+        return (torch.from_numpy(seen) - points.new_tensor(centre)) / points.new_tensor(focal)
+
+
+def points_box(found: Any, folder: Path) -> Box:
+    """The box of the points of a model, but for the outermost."""
+    if not found.num_points3D():
+        raise unexpected(folder, "points, or scene.bounds=[[x,y,z],[x,y,z]]", "no point")
+    box = found.compute_bounding_box(STRAY, 1 - STRAY)
+    return Box(torch.tensor(box.min), torch.tensor(box.max)).grown(MARGIN)

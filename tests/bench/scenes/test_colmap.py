@@ -1,0 +1,192 @@
+"""Models of COLMAP: cameras, lenses, pictures of another size, and what is refused."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from bench.cameras import pixel_grid, project
+from bench.errors import SteerbenchError, Unavailable
+from bench.scenes import colmap
+from bench.scenes.distortion import Fisheye, RadialTangential
+from bench.types import Camera
+
+pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is an extra")
+
+PINHOLE = ("PINHOLE", (9.0, 8.0, 4.5, 2.5))
+POINTS = np.random.default_rng(0).uniform((-1, -2, -3), (1, 2, 3), (400, 3))
+
+
+def written(root: Path, model: str, params: tuple, kind: str, turns: list) -> Path:
+    """A model with one camera of 8 x 6 pixels and an image for each pose, OpenGL, of `turns`."""
+    found = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(camera_id=1, model=model, width=8, height=6, params=params)
+    found.add_camera_with_trivial_rig(camera)
+    for number, pose in enumerate(turns):
+        pose = np.array(pose)[:3] * (1, -1, -1, 1)
+        image = pycolmap.Image(image_id=number + 1, camera_id=1, name=f"{number:03}.png")
+        found.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose).inverse())
+    for point in POINTS:
+        found.add_point3D(point, pycolmap.Track(), np.zeros(3, np.uint8))
+    folder = root / "sparse" / "0"
+    folder.mkdir(parents=True, exist_ok=True)
+    getattr(found, f"write_{kind}")(folder)
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path: Path, picture, pose) -> Callable[..., Path]:
+    """A capture of ten pictures, with a model of the camera and the kind that is asked for."""
+
+    def make(model: str = "PINHOLE", params: tuple = PINHOLE[1], kind: str = "binary") -> Path:
+        root = tmp_path / kind
+        (root / "images").mkdir(parents=True)
+        for number in range(10):
+            file = root / "images" / f"{number:03}.png"
+            Image.fromarray(picture(number, channels=3)).save(file)
+        written(root, model, params, kind, [pose(number) for number in range(10)])
+        return root
+
+    return make
+
+
+def test_cameras_see_the_points_where_colmap_does(folder, log) -> None:
+    root = folder()
+    scene = colmap.load(root, log=log)
+    found = pycolmap.Reconstruction(root / "sparse" / "0")
+    assert list(scene.splits["test"].names) == ["000.png", "008.png"]
+    assert len(scene.splits["train"]) == 8
+    split = scene.splits["train"]
+    for name, camera in zip(split.names, split.cameras, strict=True):
+        image = found.find_image_with_name(name)
+        points = (torch.from_numpy(POINTS) - scene.origin) / scene.unit_length
+        pixels, depth = project(camera, points.float())
+        seen = image.camera.img_from_cam(image.cam_from_world() * POINTS, check_cheirality=False)
+        ahead = depth > 0
+        torch.testing.assert_close(
+            pixels[ahead], torch.from_numpy(seen).float()[ahead], rtol=1e-4, atol=1e-3
+        )
+
+
+def test_the_box_holds_all_points_but_the_outermost(folder, log) -> None:
+    scene = colmap.load(folder(), log=log)
+    low = scene.origin + scene.unit_length * scene.bounds[0]
+    high = scene.origin + scene.unit_length * scene.bounds[1]
+    inside = ((torch.from_numpy(POINTS) >= low) & (torch.from_numpy(POINTS) <= high)).all(dim=1)
+    assert inside.double().mean() > 0.94  # of three axes
+    assert scene.unit_length < 1.06 * 6
+
+
+def test_text_says_the_same_as_binary(folder, log) -> None:
+    binary, text = (colmap.load(folder(kind=kind), log=log) for kind in ("binary", "text"))
+    for one, other in zip(
+        binary.splits["train"].cameras, text.splits["train"].cameras, strict=True
+    ):
+        torch.testing.assert_close(one.c2w, other.c2w)
+        assert (one.fx, one.fy, one.cx, one.cy) == (other.fx, other.fy, other.cx, other.cy)
+
+
+def test_smaller_pictures_have_smaller_cameras(folder, picture, log) -> None:
+    root = folder()
+    (root / "images_2").mkdir()
+    for number in range(10):
+        Image.fromarray(picture(number, 4, 3, 3)).save(root / "images_2" / f"{number:03}.png")
+    full, half = (colmap.load(root, images=name, log=log) for name in ("images", "images_2"))
+    first, second = (scene.splits["test"].cameras[0] for scene in (full, half))
+    assert (second.width, second.height) == (4, 3)
+    assert (second.fx, second.cy) == (first.fx / 2, first.cy / 2)
+
+
+def test_missing_pictures_are_named_once_and_left_out(folder, log) -> None:
+    root = folder()
+    (root / "images" / "003.png").unlink()
+    scene = colmap.load(root, log=log)
+    assert sum(map(len, scene.splits.values())) == 9
+    assert log.messages[0].endswith("1 of 10 pictures are not there, left out: 003.png")
+
+
+LENSES = {
+    "SIMPLE_RADIAL": (9.0, 4.0, 3.0, 0.05),
+    "OPENCV": (9.0, 8.0, 4.0, 3.0, 0.05, -0.02, 0.001, 0.002),
+    "FULL_OPENCV": (9.0, 8.0, 4.0, 3.0, 0.05, -0.02, 0.001, 0.002, 0.01, 0.02, 0.01, 0.01),
+    "OPENCV_FISHEYE": (9.0, 8.0, 4.0, 3.0, 0.05, -0.02, 0.01, 0.002),
+    "FOV": (9.0, 8.0, 4.0, 3.0, 0.3),
+}
+GRID = (pixel_grid(8, 6).double() - torch.tensor([4.0, 3.0])) / torch.tensor([9.0, 8.0])
+
+
+@pytest.mark.parametrize(
+    ("model", "ours"),
+    [
+        ("OPENCV", RadialTangential((*LENSES["OPENCV"][4:], 0.0))),
+        ("FULL_OPENCV", RadialTangential(LENSES["FULL_OPENCV"][4:])),
+        ("OPENCV_FISHEYE", Fisheye(LENSES["OPENCV_FISHEYE"][4:])),
+    ],
+)
+def test_our_lenses_are_those_of_colmap(model: str, ours: object) -> None:
+    theirs = colmap.ColmapLens(model, LENSES[model])
+    torch.testing.assert_close(ours(GRID), theirs(GRID), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_every_lens_is_undone(model: str, folder, log) -> None:
+    plain = colmap.load(folder(kind="text"), log=log)
+    bent = colmap.load(folder(model, LENSES[model]), log=log)
+    first, second = (scene.splits["test"].images[0] for scene in (plain, bent))
+    assert first.shape != second.shape or not torch.equal(first, second)
+    camera: Camera = bent.splits["test"].cameras[0]
+    assert (camera.height, camera.width) == second.shape[:2]
+    assert camera.fx == pytest.approx(9.0)
+
+
+def test_a_camera_without_a_focal_length_is_refused(folder, log) -> None:
+    root = folder("EQUIRECTANGULAR", (8.0, 6.0))
+    with pytest.raises(SteerbenchError, match=r"\.png: expected a camera model with a focal"):
+        colmap.load(root, log=log)
+
+
+def test_a_picture_of_another_shape_is_named(folder, picture, log) -> None:
+    root = folder()
+    Image.fromarray(picture(5, 9, 9, 3)).save(root / "images" / "005.png")
+    with pytest.raises(SteerbenchError, match=r"005.png: expected a picture of 8 x 6 .* got 9 x 9"):
+        colmap.load(root, log=log)
+
+
+def test_no_model_is_named_with_where_it_was_looked_for(folder, log) -> None:
+    root = folder()
+    with pytest.raises(SteerbenchError, match=r"expected cameras.bin or cameras.txt in sparse/1"):
+        colmap.load(root, model="sparse/1", log=log)
+
+
+@pytest.mark.parametrize("kind", ["binary", "text"])
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_a_damaged_model_is_an_error_that_names_it(folder, log, kind: str, name: str) -> None:
+    root = folder(kind=kind)
+    (path,) = (root / "sparse" / "0").glob(f"{name}.*")
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    # Of a shortened list of cameras pycolmap takes what was in memory: no camera then suits.
+    with pytest.raises(SteerbenchError, match=r"sparse/0: expected a whole model|\.png: expected"):
+        colmap.load(root, log=log)
+
+
+def test_without_points_the_box_must_be_given(folder, log) -> None:
+    root = folder(kind="text")
+    (root / "sparse" / "0" / "points3D.txt").write_text("")
+    with pytest.raises(SteerbenchError, match=r"expected points, or scene\.bounds"):
+        colmap.load(root, log=log)
+    scene = colmap.load(root, bounds=[[-2, -2, -2], [2, 2, 2]], log=log)
+    assert scene.unit_length == 4
+
+
+def test_without_pycolmap_it_says_what_to_install(folder, log, monkeypatch) -> None:
+    root = folder()
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(Unavailable, match=r"pip install 'steerbench\[colmap\]'"):
+        colmap.load(root, log=log)
