@@ -104,7 +104,7 @@ def read_model(folder: Path) -> Any:
     try:
         return pycolmap.Reconstruction(folder)
     except (ValueError, RuntimeError, LookupError, MemoryError) as error:
-        raise unexpected(folder, "a whole model of COLMAP", str(error).splitlines()[-1]) from error
+        raise unexpected(folder, "a whole model of COLMAP", " ".join(str(error).split())) from error
 
 
 def check_length(file: Path) -> None:
