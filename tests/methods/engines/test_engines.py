@@ -106,6 +106,7 @@ def test_int8_weights_take_a_quarter(
     assert 0.25 * exact <= sizes["int8"] < 0.27 * exact  # biases and scales stay as they are
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [partial(OpenVino, "int8"), partial(OnnxRuntime, "int8")])
 def test_what_was_built_is_found_again(
     make: Callable[[], Engine], folder: Callable[[], Path], quiet_log: ConsoleLog

@@ -40,6 +40,7 @@ def test_they_learn_a_ball(ball_scene: Scene, quiet_log: Log) -> None:
     assert (frame.rgb[frame.alpha == 0] == 1).all()
 
 
+@pytest.mark.slow
 def test_they_learn_from_scratch(ball_scene: Scene, quiet_log: Log) -> None:
     fast = Fitting(means=1e-3, size=1.0)
     before = fitted(

@@ -100,6 +100,7 @@ def test_a_cell_is_occupied_until_it_was_visited_and_keeps_its_value_in_between(
     assert torch.equal(grid.occupancy.cells, ~visited)
 
 
+@pytest.mark.slow
 def test_matter_that_is_thin_everywhere_is_kept_where_it_is_denser_than_the_mean() -> None:
     thin = Slab(0.1 * THRESHOLD)
     cells = swept(DensityGrid(WHOLE), thin, sweeps=24).occupancy.cells  # 1.2 * 0.8^24 < 0.1
