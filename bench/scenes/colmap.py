@@ -170,11 +170,8 @@ def read_camera(image: Any, file: Path, where: str) -> tuple[Camera, Lens | None
             f"a picture of {camera.width} x {camera.height} pixels, or as wide for its height"
         )
         raise unexpected(file, expected, f"{width} x {height}")
-    lens = (
-        None
-        if of_image.is_perspective_pinhole() and of_image.is_undistorted()
-        else ColmapLens.of(of_image)
-    )
+    pinhole = of_image.is_perspective_pinhole() and of_image.is_undistorted()
+    lens = None if pinhole else ColmapLens(of_image.model_name, tuple(of_image.params))
     return scale_camera(camera, width, height), lens
 
 
@@ -184,10 +181,6 @@ class ColmapLens:
 
     model: str
     params: tuple[float, ...]
-
-    @classmethod
-    def of(cls, camera: Any) -> ColmapLens:
-        return cls(camera.model_name, tuple(camera.params))
 
     @cached_property
     def _camera(self) -> Any:

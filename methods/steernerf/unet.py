@@ -141,8 +141,6 @@ def _conv(inputs: int, outputs: int) -> nn.Conv2d:
 
 def _kaiming(layer: nn.Conv2d, scale: float) -> None:
     """Start from `scale` times the weights of He et al. 2015 for ReLU, and from no bias."""
-    if layer.weight.is_meta:  # shapes alone; torch would load its compiler for it
-        return
     nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
     assert layer.bias is not None
     nn.init.zeros_(layer.bias)
