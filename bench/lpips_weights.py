@@ -8,24 +8,20 @@ downloaded into the cache. A file that carries its SHA-256 in its name is checke
 from __future__ import annotations
 
 import hashlib
-import http.client
 import os
 import pickle
 import re
-import tempfile
-import urllib.error
-import urllib.request
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from bench.download import fetch
+from bench.sharing import locked
 from bench.types import Log, SteerbenchError, Unavailable
 
 ADDRESS = "https://download.pytorch.org/models/"
-TIMEOUT_S = 10.0
-CHUNK_BYTES = 1 << 20
 
 
 class Backbone(NamedTuple):
@@ -62,13 +58,12 @@ def locate(net: str, weights_dir: Path | None, log: Log) -> Path:
                 return _verified(folder / name)
     try:
         return _download(backbone.published, log)
-    except OSError as error:
+    except Unavailable as error:
         raise Unavailable(
             f"LPIPS ({net}) has no backbone weights: neither {backbone.published} nor "
             f"{backbone.features} lies in {', '.join(map(str, _folders(weights_dir)))}, and "
-            f"the download of {ADDRESS}{backbone.published} failed ({error}). Fetch that file on "
-            "a machine with a network and pass its folder as weights_dir=DIR or in "
-            "$STEERBENCH_WEIGHTS."
+            f"{error}. Fetch that file on a machine with a network and pass its folder as "
+            "weights_dir=DIR or in $STEERBENCH_WEIGHTS."
         ) from error
 
 
@@ -109,24 +104,19 @@ def _verified(path: Path) -> Path:
 
 
 def _download(name: str, log: Log) -> Path:
-    """Fetch a published file into torch's hub cache; raises OSError, at once after a failure."""
+    """Fetch a file into torch's hub cache; raises Unavailable, at once after a failure."""
     if _unreachable:
-        raise OSError(_unreachable[0])
-    target = Path(torch.hub.get_dir()) / "checkpoints" / name
+        raise Unavailable(_unreachable[0])
+    folder = Path(torch.hub.get_dir()) / "checkpoints"
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with (
-            tempfile.TemporaryDirectory(dir=target.parent) as folder,
-            urllib.request.urlopen(ADDRESS + name, timeout=TIMEOUT_S) as response,
-        ):
-            partial = Path(folder) / name
-            size = int(response.headers.get("Content-Length", 0))
-            with partial.open("wb") as file, log.progress(f"downloading {name}", size) as progress:
-                while chunk := response.read(CHUNK_BYTES):
-                    file.write(chunk)
-                    progress.advance(len(chunk))
-            _verified(partial).replace(target)
-    except (OSError, http.client.HTTPException) as error:
+        folder.mkdir(parents=True, exist_ok=True)
+        with locked(folder / f".{name}.lock", f"waits for another download of {name}", log):
+            path = fetch(ADDRESS + name, folder / name, None, log)
+            try:
+                return _verified(path)
+            except Unavailable:
+                path.unlink()
+                raise
+    except (OSError, SteerbenchError) as error:
         _unreachable.append(str(error))
-        raise OSError(str(error)) from error
-    return target
+        raise Unavailable(str(error)) from error

@@ -205,8 +205,15 @@ ARGUMENTS = {
         ),
     ],
     "scenes": [
-        *_one("action", help="what to do", choices=["verify"]),
-        *_one("path", help="folder of one scene or of all of NeRF-Synthetic", type=Path),
+        *_one("action", help="what to do", choices=["get", "verify"]),
+        *_one("name", help="a scene or data set to get, or a folder of scenes to verify"),
+        *_one(
+            "--to",
+            help="folder that they are put into (default data)",
+            type=Path,
+            default="data",
+            metavar="DIR",
+        ),
     ],
 }
 """Of each command but `run`, whose arguments Hydra reads."""

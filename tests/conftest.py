@@ -29,6 +29,7 @@ from bench.run import Task, measure
 from bench.trajectories import from_split
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene, Split
 from tests.pretended_gpu import PretendedGpu, pretended_gpu
+from tests.web import Web, served
 
 hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True)
 hypothesis.settings.register_profile("fuzz", max_examples=10_000, deadline=5000)  # ms; no hang
@@ -66,6 +67,13 @@ def gpu() -> Iterator[PretendedGpu]:
         pytest.skip("this machine has a GPU")
     with pretended_gpu() as gpu:
         yield gpu
+
+
+@pytest.fixture
+def web() -> Iterator[Web]:
+    """A web server on the loopback address, with nothing on it."""
+    with served() as web:
+        yield web
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -1,17 +1,15 @@
-"""Compares a copy of NeRF-Synthetic with the SHA-256 list of the release."""
+"""Compares a copy of a published data set with the SHA-256 list of the release."""
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from bench.scenes.files import data_folder, unexpected
 from bench.scenes.parallel import in_parallel
+from bench.scenes.published import published, sha256
 from bench.types import Log
-
-LIST = Path(__file__).with_name("nerf_synthetic.sha256.txt")
 
 
 @dataclass(frozen=True)
@@ -45,16 +43,8 @@ def verify(path: str | Path, log: Log) -> VerifyReport:
 
     Raises SteerbenchError when `path` does not look like either.
     """
-    root, expected = data_folder(path), official_hashes()
-    scenes = {name.split("/")[0] for name in expected}
-    if any((root / scene).is_dir() for scene in scenes):
-        base = root
-    elif root.name in scenes:
-        base = root.parent
-        expected = {k: v for k, v in expected.items() if k.split("/")[0] == root.name}
-    else:
-        expected_text = f"NeRF-Synthetic: a folder {' or '.join(sorted(scenes))}, or one above"
-        raise unexpected(root, expected_text, "none of these names")
+    root = data_folder(path)
+    base, expected = _expected(root)
     present = {
         file.relative_to(base).as_posix()
         for file in root.rglob("*")
@@ -71,16 +61,13 @@ def verify(path: str | Path, log: Log) -> VerifyReport:
     )
 
 
-def official_hashes() -> dict[str, str]:
-    """SHA-256 by path in the release."""
-    lines = (line.split(maxsplit=1) for line in LIST.read_text().splitlines())
-    return {name: digest for digest, name in lines}
-
-
-def sha256(path: Path) -> str | None:
-    """SHA-256 of a file's content; None when it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError:
-        return None
+def _expected(root: Path) -> tuple[Path, Mapping[str, str]]:
+    """The folder that the paths of a list begin in, and the list."""
+    known = published()
+    for data in known:
+        if root.name in data.scenes:
+            return root.parent, data.of(root.name)
+        if any((root / scene).is_dir() for scene in data.scenes):
+            return root, data.hashes
+    folders = sorted(scene for data in known for scene in data.scenes)
+    raise unexpected(root, f"a folder {' or '.join(folders)}, or one above", "none of these names")

@@ -1,11 +1,9 @@
-"""Where LPIPS finds its backbones, and what it says when it does not. No test uses a network."""
+"""Where LPIPS finds its backbones, and what it says when it does not."""
 
 from __future__ import annotations
 
 import hashlib
 import io
-import urllib.error
-import urllib.request
 from pathlib import Path
 
 import pytest
@@ -19,19 +17,13 @@ STATE = {"features.0.weight": torch.ones(2), "classifier.1.weight": torch.zeros(
 
 
 @pytest.fixture(autouse=True)
-def offline(monkeypatch, tmp_path):
-    """An empty cache, no environment, a network that is down; lists the addresses asked for."""
-    asked: list[str] = []
-
-    def refuse(address: str, timeout: float):
-        asked.append(address)
-        raise urllib.error.URLError("no route to host")
-
-    monkeypatch.setattr(urllib.request, "urlopen", refuse)
+def publisher(monkeypatch, tmp_path, web):
+    """An empty cache, no environment, and a publisher with no file."""
+    monkeypatch.setattr(lpips_weights, "ADDRESS", web.address)
     monkeypatch.setattr(lpips_weights, "_unreachable", [])
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     monkeypatch.delenv("STEERBENCH_WEIGHTS", raising=False)
-    return asked
+    return web
 
 
 @pytest.fixture
@@ -93,50 +85,38 @@ def test_a_file_that_would_run_code_is_refused_and_runs_none(tmp_path, quiet_log
     assert not (tmp_path / "attacked").exists()
 
 
-def test_without_a_network_the_message_says_what_to_fetch_and_where_to_put_it(
-    tmp_path, quiet_log, offline
-):
+def test_without_a_download_the_message_says_what_to_fetch_and_where_to_put_it(quiet_log, web):
     with pytest.raises(Unavailable) as caught:
         locate("vgg", None, quiet_log)
-    address = "https://download.pytorch.org/models/vgg16-397923af.pth"
-    assert offline == [address]
-    for part in (address, "no route to host", "weights_dir=", "STEERBENCH_WEIGHTS"):
+    assert web.asked == [("/vgg16-397923af.pth", 0)]
+    address = f"{web.address}vgg16-397923af.pth"
+    for part in (address, "404", "weights_dir=", "STEERBENCH_WEIGHTS"):
         assert part in str(caught.value)
-    assert not list(cache(tmp_path).iterdir())
 
 
-def test_a_download_that_failed_is_not_tried_again_in_the_same_process(quiet_log, offline):
+def test_a_download_that_failed_is_not_tried_again_in_the_same_process(quiet_log, web):
     for net in ("alex", "vgg", "vgg"):
         with pytest.raises(Unavailable):
             locate(net, None, quiet_log)
-    assert len(offline) == 1
-
-
-class Response(io.BytesIO):
-    """What `urlopen` returns, as far as it is used."""
-
-    def __init__(self, content: bytes) -> None:
-        super().__init__(content)
-        self.headers = {"Content-Length": str(len(content))}
+    assert len(web.asked) == 1
 
 
 def test_a_download_lands_in_the_cache_and_is_found_there_next_time(
-    monkeypatch, tmp_path, published, quiet_log
+    tmp_path, published, quiet_log, web
 ):
     name, content = published
-    answers = [Response(content)]
-    monkeypatch.setattr(urllib.request, "urlopen", lambda address, timeout: answers.pop())
+    web.files[f"/{name}"] = content
     assert locate("alex", None, quiet_log) == cache(tmp_path) / name
     assert locate("alex", None, quiet_log).read_bytes() == content
-    assert [path.name for path in cache(tmp_path).iterdir()] == [name]
+    assert len(web.asked) == 1
 
 
-def test_a_download_cut_short_leaves_nothing_behind(monkeypatch, tmp_path, published, quiet_log):
-    short = published[1][:-1]
-    monkeypatch.setattr(urllib.request, "urlopen", lambda address, timeout: Response(short))
+def test_another_content_is_refused_and_not_kept(tmp_path, published, quiet_log, web):
+    name, content = published
+    web.files[f"/{name}"] = content[:-1]
     with pytest.raises(Unavailable, match="SHA-256"):
         locate("alex", None, quiet_log)
-    assert not list(cache(tmp_path).iterdir())
+    assert not (cache(tmp_path) / name).exists()
 
 
 def test_an_unknown_network_and_a_missing_folder_are_errors_not_gaps(tmp_path, quiet_log):

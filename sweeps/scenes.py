@@ -1,0 +1,57 @@
+"""`steerbench scenes`: gets published data sets, and checks copies of them."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from bench.console import ConsoleLog
+from bench.scenes.integrity import verify
+from bench.scenes.published import Published, get, published
+from sweeps.names import unknown
+
+SHOWN = 5
+"""Names printed of files that are missing or extra: there may be hundreds."""
+
+
+def main(options: argparse.Namespace) -> int:
+    """Do what `options.action` says; 1 if a file is not the official one, or none is there."""
+    log = ConsoleLog(Path("outputs"))
+    if options.action == "get":
+        return _get(options.name, options.to, log)
+    return _verify(Path(options.name), log)
+
+
+def _get(name: str, to: Path, log: ConsoleLog) -> int:
+    data, scenes = _found(name)
+    folder = to / data.name if len(data.scenes) > 1 else to
+    for scene in scenes:
+        path = get(data, scene, folder, log)
+        print(f"{path}: scene={data.layout} scene.path={path}")
+    print(f"licence: {data.licence}")
+    return 0
+
+
+def _found(name: str) -> tuple[Published, Sequence[str]]:
+    """The data set of this name with all of its scenes, or the one with a scene of this name."""
+    known = published()
+    for data in known:
+        if name == data.name:
+            return data, sorted(data.scenes)
+        if name in data.scenes:
+            return data, [name]
+    raise unknown("scene", name, {name for data in known for name in (data.name, *data.scenes)})
+
+
+def _verify(path: Path, log: ConsoleLog) -> int:
+    report = verify(path, log)
+    for name in report.wrong:
+        print(f"wrong    {name}")
+    for kind, names in (("missing", report.missing), ("extra", report.extra)):
+        for name in names[:SHOWN]:
+            print(f"{kind:8} {name}")
+        if len(names) > SHOWN:
+            print(f"{kind:8} ... and {len(names) - SHOWN} more")
+    print(f"{path}: {report}")
+    return 0 if report.passed else 1

@@ -1,0 +1,44 @@
+"""`steerbench scenes`: exit status and what is printed; the web server is a stand-in."""
+
+from __future__ import annotations
+
+from tests.bench.scenes.releases import publish
+
+
+def test_a_damaged_file_is_named_and_fails(steerbench, tmp_path, monkeypatch):
+    publish(monkeypatch, {"mic/good.png": b"good", "mic/bad.png": b"good", "mic/absent.png": b""})
+    scene = tmp_path / "mic"
+    scene.mkdir()
+    (scene / "good.png").write_bytes(b"good")
+    (scene / "bad.png").write_bytes(b"bad")
+    outcome = steerbench("scenes", "verify", "mic")
+    assert outcome.status == 1
+    assert "wrong    mic/bad.png" in outcome.out
+    assert "missing  mic/absent.png" in outcome.out
+    assert "1 ok, 1 wrong, 1 missing, 0 extra" in outcome.out
+
+    (scene / "bad.png").write_bytes(b"good")
+    assert steerbench("scenes", "verify", "mic").status == 0
+
+
+def test_a_folder_of_something_else_is_an_error(steerbench, tmp_path):
+    outcome = steerbench("scenes", "verify", str(tmp_path))
+    assert outcome.status == 2
+    assert "expected a folder chair or drums or" in outcome.err
+
+
+def test_get_says_how_to_run_on_what_it_got(steerbench, monkeypatch, web, tmp_path):
+    publish(monkeypatch, {"mic/a.png": b"a", "lego/a.png": b"b"}, folder=web.address)
+    web.files = {"/mic/a.png": b"a", "/lego/a.png": b"b"}
+    outcome = steerbench("scenes", "get", "release", "--to", "mine")
+    assert outcome.status == 0
+    assert "scene=blender scene.path=mine/release/lego\n" in outcome.out
+    assert "licence: free" in outcome.out
+    assert (tmp_path / "mine/release/mic/a.png").read_bytes() == b"a"
+    assert steerbench("scenes", "verify", "mine/release").status == 0
+
+
+def test_the_nearest_name_of_a_scene_is_proposed(steerbench):
+    outcome = steerbench("scenes", "get", "lgeo")
+    assert outcome.status == 2
+    assert "lego" in outcome.err
