@@ -70,5 +70,5 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	  fi; \
 	  echo "making $(VENV) with $$($$found --version)"; \
 	  $$found -m venv --clear $(VENV); }
-	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e ".[dev,openvino,onnx,video,viewer,colmap]"
+	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e ".[dev,openvino,onnx,video,viewer,colmap,tensorboard]"
 	@touch $@

@@ -28,13 +28,14 @@ from bench.types import DEVICE, Log, Method, Scene
 from reports.page import write_page
 from reports.runs import Run, load
 from reports.tables import run_tables
+from reports.trackers import Tracker, tracker
 from sweeps import failures
 from sweeps.build import build, check_settings, target_of
 from sweeps.device_lock import device_lock
 from sweeps.overrides import VALIDATION
 from sweeps.terminal import console, rich_table
 
-PLACES = ("outputs", "report", "weights_dir")
+PLACES = ("outputs", "report", "tracker", "weights_dir")
 """Settings that say where things lie: they do not change a row."""
 
 HELD_OUT = 8
@@ -56,6 +57,7 @@ class Settings:
     pictures: int
     outputs: str
     weights_dir: str | None
+    tracker: str | None
     report: str | None
 
 
@@ -121,8 +123,20 @@ def obtain_in_turns(
                         one.keep(measurement)
     for config, _ in jobs:
         failures.forget(Path(config.outputs), described(config))
+    for one in ready:
+        if one.config.tracker:
+            _send(one, tracker(one.config.tracker), log)
     measured = {one.run for one in missing}
     return [Obtained(one.store, one.run, one.run in measured) for one in ready]
+
+
+def _send(one: _Ready, to: Tracker, log: Log) -> None:
+    """Send a stored run to a tracker. What goes wrong there is said: the measurement stands."""
+    try:
+        to.send(load(one.store, {one.run: one.method.name})[0], Path(one.config.outputs))
+        log.info(f"sent to {one.config.tracker}: {one.run}")
+    except Exception as error:  # of a library that we do not know
+        log.info(f"not sent to {one.config.tracker}: {one.run}: {failures.reason(error)}")
 
 
 def stored(config: DictConfig, command: Sequence[str], turns: str = "") -> Obtained | None:
@@ -242,6 +256,8 @@ def checked_settings(config: DictConfig) -> Settings:
         raise SteerbenchError(f"threads: expected 1 or more, or null, got {settings.threads}")
     if settings.pictures < 0:
         raise SteerbenchError(f"pictures: expected 0 or more, got {settings.pictures}")
+    if settings.tracker is not None:
+        tracker(settings.tracker)
     if not DEVICE.fullmatch(settings.device):
         raise SteerbenchError(f"device: expected auto, cpu, cuda or cuda:N, got {settings.device}")
     _, _, number = settings.device.partition(":")

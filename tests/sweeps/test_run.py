@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from reports.trackers import TRACKERS
+
 
 def stored(tmp_path: Path) -> list[Path]:
     """The folders of whole runs."""
@@ -84,6 +86,40 @@ def test_a_report_is_written_where_it_is_asked_for(run, tmp_path):
     outcome = run("report=pages/first")
     assert "pages/first/report.md" in outcome.err
     assert "6.05" in (tmp_path / "pages/first/report.md").read_text()
+
+
+class Broken:
+    """A tracker that cannot be reached."""
+
+    package = "sys"
+
+    def send(self, run, outputs):
+        raise ConnectionError("no route to host")
+
+
+def test_a_run_is_stored_and_then_sent_and_a_stored_one_is_sent_again(run, tmp_path, monkeypatch):
+    sent = []
+
+    class Remembering(Broken):
+        def send(self, run, outputs):
+            sent.append((run.key, run.label, outputs / "runs" / run.key))
+
+    monkeypatch.setitem(TRACKERS, "wandb", Remembering())
+    for _ in range(2):
+        assert run("tracker=wandb").status == 0
+    (folder,) = stored(tmp_path)
+    assert sent == [(folder.name, "grey", Path("outputs/runs") / folder.name)] * 2
+
+
+def test_a_tracker_that_cannot_be_reached_is_one_line_and_the_run_stands(
+    run, tmp_path, monkeypatch
+):
+    monkeypatch.setitem(TRACKERS, "wandb", Broken())
+    outcome = run("tracker=wandb")
+    assert outcome.status == 0
+    (folder,) = stored(tmp_path)
+    assert f"not sent to wandb: {folder.name}: no route to host" in outcome.err
+    assert run("tracker=comet").status == 2
 
 
 def test_nothing_but_outputs_is_left_behind(run, tmp_path):

@@ -1,0 +1,159 @@
+"""Sends a run of the store to an experiment tracker, under the run's key.
+
+One class a tracker. Each takes the figures of every frame as a series, the headline as its summary,
+the pictures, and where all of it comes from. What was sent under the same key is replaced or kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from PIL import Image
+
+from bench.errors import SteerbenchError, Unavailable
+from reports.runs import Run
+
+PROJECT = "steerbench"
+"""The name of the project, or of the experiment, in a tracker."""
+
+FACTS = ("method", "scene", "resolution", "trajectory", "budget", "protocol", "seed", "device")
+"""Columns of the rows that say what was measured."""
+
+
+class Tracker(Protocol):
+    """Where runs are sent.
+
+    Attributes:
+        package: what must be installed for it.
+    """
+
+    package: str
+
+    def send(self, run: Run, outputs: Path) -> None:
+        """Send the figures and pictures of `run`; `outputs` is the folder of its store."""
+
+
+class WandB:
+    """Weights & Biases: a run whose id is the key. Its own environment variables say where to."""
+
+    package = "wandb"
+
+    def send(self, run: Run, outputs: Path) -> None:
+        import wandb
+
+        with wandb.init(
+            project=PROJECT,
+            id=run.key,
+            name=run.label,
+            config=settings(run),
+            dir=outputs,
+            resume="allow",
+        ) as sent:
+            for frame, figures in series(run):
+                sent.log(figures, step=frame)
+            sent.log({name: wandb.Image(str(path)) for name, path in pictures(run)})
+            sent.summary.update(headline(run))
+
+
+class MLflow:
+    """MLflow: a run with the key as its tag. Its own environment variables say where to."""
+
+    package = "mlflow"
+
+    def send(self, run: Run, outputs: Path) -> None:
+        import mlflow
+
+        mlflow.set_experiment(PROJECT)
+        tag = f"tags.`{PROJECT}.run` = '{run.key}'"
+        for old in mlflow.search_runs(filter_string=tag, output_format="list"):
+            mlflow.delete_run(old.info.run_id)
+        with mlflow.start_run(run_name=run.label, tags={f"{PROJECT}.run": run.key}):
+            mlflow.log_params(settings(run))
+            for frame, figures in series(run):
+                figures = {f"frame.{name}": value for name, value in figures.items()}
+                mlflow.log_metrics(_flat(figures), step=frame)
+            mlflow.log_metrics(_flat(headline(run)))
+            mlflow.log_artifacts(str(run.pictures), "pictures")
+
+
+def _flat(figures: Mapping[str, float]) -> dict[str, float]:
+    """For MLflow, to which a name with a slash is a file in a folder."""
+    return {name.replace("/", "."): value for name, value in figures.items()}
+
+
+class TensorBoard:
+    """TensorBoard: event files in OUTPUTS/tensorboard/KEY, written once."""
+
+    package = "tensorboard"
+
+    def send(self, run: Run, outputs: Path) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        folder = outputs / "tensorboard" / run.key
+        if folder.exists():
+            return
+        with SummaryWriter(str(folder)) as writer:
+            lines = [f"{name}: {value}" for name, value in settings(run).items()]
+            writer.add_text("settings", "  \n".join(lines))
+            for frame, figures in series(run):
+                for name, value in figures.items():
+                    writer.add_scalar(f"frame/{name}", value, frame)
+            for name, value in headline(run).items():
+                writer.add_scalar(f"run/{name}", value)
+            for name, path in pictures(run):
+                with Image.open(path) as image:
+                    writer.add_image(name, np.asarray(image.convert("RGB")), dataformats="HWC")
+
+
+TRACKERS: Mapping[str, Tracker] = {
+    "wandb": WandB(),
+    "mlflow": MLflow(),
+    "tensorboard": TensorBoard(),
+}
+
+
+def tracker(name: str) -> Tracker:
+    """The tracker of this name.
+
+    Raises:
+        SteerbenchError: there is none.
+        Unavailable: its package is not installed.
+    """
+    if name not in TRACKERS:
+        raise SteerbenchError(f"tracker: expected one of {', '.join(TRACKERS)}, got {name!r}")
+    found = TRACKERS[name]
+    if find_spec(found.package) is None:
+        raise Unavailable(
+            f"tracker={name} needs the package {found.package}: pip install 'steerbench[{name}]'"
+        )
+    return found
+
+
+def settings(run: Run) -> dict[str, Any]:
+    """What was measured, with which command, from which commit and on which machine."""
+    facts = {name: str(run.facts[name]) for name in FACTS}
+    record = {name: run.record[name] for name in ("command", "commit")}
+    return facts | record | {"cpu": run.record["machine"]["cpu"]}
+
+
+def headline(run: Run) -> dict[str, float]:
+    """The figures of the whole run, without those that it lacks."""
+    return {name: value for name, value in run.values.items() if np.isfinite(value)}
+
+
+def series(run: Run) -> Iterator[tuple[int, dict[str, float]]]:
+    """The number of each frame and its figures, without those that it lacks."""
+    for row in run.frames.select_dtypes("number").to_dict("records"):
+        frame = int(row.pop("frame"))
+        yield frame, {str(name): float(x) for name, x in row.items() if np.isfinite(x)}
+
+
+def pictures(run: Run) -> Iterator[tuple[str, Path]]:
+    """The files of the pictures by names such as "rendered/0012"."""
+    for path in sorted(run.pictures.glob("*.png")):
+        frame, what = path.stem.split("-")
+        yield f"{what}/{frame}", path
