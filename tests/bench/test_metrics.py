@@ -206,6 +206,33 @@ def test_lpips_is_the_published_formula_on_the_named_backbone(
     assert measured == pytest.approx(plain_lpips(net, features, heads, a, b), rel=1e-3)
 
 
+NERFBASELINES = {
+    "psnr": 25.050917,
+    "ssim": 0.894081,
+    "lpips_alex": 0.017315,
+    "lpips_vgg": 0.056838,
+}
+"""What the functions of nerfbaselines/metrics.py say of `waves`, at commit cde53bda36e6."""
+
+
+def waves() -> tuple[Tensor, Tensor]:
+    """A picture and one that differs a little, 8-bit levels over 255."""
+    y, x = np.mgrid[0:64, 0:96]
+    truth = np.stack([np.sin(x / 7), np.sin(y / 5 + x / 11), np.sin(x * y / 200)], -1)
+    change = np.stack([np.sin(y / 3), np.sin(x / 4), np.cos(x * y / 90)], -1)
+    levels = (np.rint(127.5 + values) for values in (100 * truth + 20 * change, 100 * truth))
+    first, second = (torch.from_numpy(values / 255).float() for values in levels)
+    return first, second
+
+
+def test_figures_are_those_of_nerfbaselines(lpips_weights, quiet_log):
+    pictures = waves()
+    found = {"psnr": psnr(*pictures), "ssim": ssim(*pictures, "gaussian")}
+    for net in ("alex", "vgg"):
+        found[f"lpips_{net}"] = Lpips(net, lpips_weights, quiet_log)(*pictures)
+    assert found == pytest.approx(NERFBASELINES, abs=2e-6, rel=1e-6)
+
+
 @pytest.mark.parametrize("net", ["alex", "vgg", "squeeze"])
 def test_lpips_is_zero_for_equal_pictures_down_to_the_smallest_size(net, lpips_weights, quiet_log):
     lpips, side = Lpips(net, lpips_weights, quiet_log), SMALLEST_SIDE[f"lpips_{net}"]
