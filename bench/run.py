@@ -17,6 +17,7 @@ import torch
 
 from bench.intervals import path_interval
 from bench.metrics import Lpips
+from bench.neighbours import Neighbours, Watch
 from bench.probes import FrameRecord, MemoryMeter, StageClock
 from bench.protocol import EvaluationProtocol
 from bench.results import COLD, STEADY, WHOLE, Measurement
@@ -78,8 +79,10 @@ def measure_in_turns(methods: Sequence[Method], task: Task, log: Log) -> list[Me
     for method in methods:
         method.fit(task.scene, task.budget, log)
     takes = [_Take.of(method, task, lpips) for method in methods]
-    _render(takes, task, log)
-    return [_measurement(take, task, missing) for take in takes]
+    neighbours = _render(takes, task, log)
+    if neighbours.notable:
+        log.info(f"{neighbours} while frames were timed: times are longer than they need be")
+    return [_measurement(take, task, missing, neighbours) for take in takes]
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,9 @@ class _Take:
         return cls(method, StageClock(device), MemoryMeter(device), scoring, [])
 
 
-def _measurement(take: _Take, task: Task, missing: Mapping[str, str]) -> Measurement:
+def _measurement(
+    take: _Take, task: Task, missing: Mapping[str, str], neighbours: Neighbours
+) -> Measurement:
     """What is kept of a method that has drawn all frames."""
     scene, trajectory, protocol, budget = task.scene, task.trajectory, task.protocol, task.budget
     method, meter, scoring = take.method, take.meter, take.scoring
@@ -128,14 +133,16 @@ def _measurement(take: _Take, task: Task, missing: Mapping[str, str]) -> Measure
         "budget": asdict(budget),
         "scene": {"name": scene.name, "digest": scene.digest, "unit_length": scene.unit_length},
         "missing": missing,
+        "neighbours": neighbours._asdict(),
         "peak_bytes": meter.source,
         "error_map": f"absolute error, mean over the channels, black 0 to yellow {ERROR_RANGE}",
     }
     return Measurement(rows, frames, scoring.images, record)
 
 
-def _render(takes: Sequence[_Take], task: Task, log: Log) -> None:
-    """Warm up, then render the sequence in its order; each frame is scored and let go."""
+def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
+    """Warm up, then render the sequence in its order; each frame is scored and let go. Returns what
+    other processes did beside it, the warming up apart."""
     steps = task.trajectory.steps
     warmup = spread(len(steps), task.protocol.warmup)
     frames = len(takes) * (len(warmup) + len(steps))
@@ -147,11 +154,13 @@ def _render(takes: Sequence[_Take], task: Task, log: Log) -> None:
                     take.method.render(steps[index].camera, take.clock)
                 progress.advance(note="warming up")
             take.method.reset()
+        watch = Watch()
         for index, before in enumerate(task.trajectory.preceding):
             for take in takes:
                 _draw(take, task, index, before)
                 scores = [row["psnr"] for row in take.rows if "psnr" in row]
                 progress.advance(note=f"{np.mean(scores):.2f} dB" if scores else "")
+        return watch.seen()
 
 
 def _draw(take: _Take, task: Task, index: int, before: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from bench.neighbours import Neighbours
 from reports.runs import Run
 
 
@@ -24,10 +25,17 @@ def facts(run: Run) -> dict[str, str]:
         "computed on": _listed(computed),
         "peak memory": record["peak_bytes"],
         "machine": f"{machine['cpu']}, {machine['threads']} threads, {memory}",
+        "beside it": _beside(record),
         "GPU": ", ".join(machine["gpus"]) or "none",
         "system": f"{machine['system']}, Python {machine['python']}",
         "versions": _listed(record["made_of"].get("libraries", {})),
     }
+
+
+def _beside(record: Mapping[str, Any]) -> str:
+    """What other processes did while frames were timed; older runs and scores do not know."""
+    seen = record.get("neighbours")
+    return str(Neighbours(**seen)) if seen else "not recorded"
 
 
 def settings(run: Run) -> dict[str, str]:

@@ -20,6 +20,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import torch
 from torch import Tensor
 
+from bench import neighbours
 from bench.console import ConsoleLog
 from bench.lpips_weights import BACKBONES
 from bench.metrics import _lpips_package
@@ -87,8 +88,10 @@ def poisoned_empty() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def own_turns(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Tests wait for no measurement on this machine, and no measurement waits for them."""
+    """Tests wait for no measurement on this machine, no measurement waits for them, and nothing is
+    said about what runs beside them."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(neighbours, "NOTABLE_SHARE", math.inf)
         patch.setenv("STEERBENCH_LOCKS", str(tmp_path_factory.mktemp("locks")))
         yield
 

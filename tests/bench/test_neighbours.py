@@ -1,0 +1,58 @@
+"""What other processes do beside a measurement, with accounts of the kernel that are made up."""
+
+from __future__ import annotations
+
+import time
+from typing import NamedTuple
+
+import psutil
+import pytest
+
+from bench import neighbours
+from bench.neighbours import Neighbours, Watch
+
+
+class Times(NamedTuple):
+    user: float
+    system: float
+    idle: float
+    iowait: float
+    steal: float
+    guest: float
+
+
+@pytest.fixture
+def accounts(monkeypatch):
+    """The kernel's accounts, as a dictionary to change."""
+    now = {"passed": 0.0, "own": 0.0, "times": Times(0, 0, 0, 0, 0, 0)}
+    monkeypatch.setattr(psutil, "cpu_times", lambda: now["times"])
+    monkeypatch.setattr(psutil, "cpu_count", lambda: 4)
+    monkeypatch.setattr(time, "monotonic", lambda: now["passed"])
+    monkeypatch.setattr(time, "process_time", lambda: now["own"])
+    return now
+
+
+def test_work_of_others_is_all_work_less_our_own(accounts):
+    watch = Watch()
+    # In 10 s: 25 + 5 s of work, of which we did 18 s; 2 s were taken away by the host.
+    accounts |= {"passed": 10.0, "own": 18.0, "times": Times(25, 5, 6, 1, 2, 9)}
+    assert watch.seen() == Neighbours(pytest.approx(1.4), 4)
+    assert str(watch.seen()) == "other programs kept 1.4 of 4 cores busy"
+
+
+def test_alone_there_is_nothing_to_warn_of(accounts, monkeypatch):
+    monkeypatch.setattr(neighbours, "NOTABLE_SHARE", 0.1)
+    watch = Watch()
+    assert watch.seen().busy == 0.0
+    accounts |= {"passed": 10.0, "own": 20.0, "times": Times(20, 3, 17, 0, 0, 0)}
+    assert not watch.seen().notable
+    accounts["times"] = Times(23, 3, 14, 0, 0, 0)
+    assert watch.seen().notable
+
+
+def test_our_own_work_is_not_that_of_others():
+    watch, end = Watch(), time.process_time() + 0.3
+    while time.process_time() < end:
+        pass
+    seen = watch.seen()
+    assert 0 <= seen.busy < seen.cores
