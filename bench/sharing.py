@@ -11,9 +11,12 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bench.errors import explained
-from bench.types import Log
+
+if TYPE_CHECKING:  # it loads torch, for which no lock should wait
+    from bench.types import Log
 
 
 @contextmanager

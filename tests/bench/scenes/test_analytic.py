@@ -26,6 +26,12 @@ def name(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which the tests share what they draw."""
+    return tmp_path_factory.mktemp("scenes")
+
+
 def exact_frame(scene: Scene, camera: Camera, samples: int) -> Frame:
     """What is really there, with `camera` and depth in scene units."""
     in_model = move_camera(camera, scene.unit_length, scene.origin)
@@ -85,8 +91,8 @@ def test_two_writes_are_equal_byte_for_byte(tmp_path, log) -> None:
     assert len(digests) == 1
 
 
-def test_cameras_come_back_as_they_were_made(tmp_path, log) -> None:
-    scene = analytic.load("totem", **SMALL, root=tmp_path, log=log)
+def test_cameras_come_back_as_they_were_made(drawn, log) -> None:
+    scene = analytic.load("totem", **SMALL, root=drawn, log=log)
     for split, poses in (("train", train_poses(6, 0)), ("test", orbit_poses(3))):
         for camera, pose in zip(scene.splits[split].cameras, poses, strict=True):
             in_model = move_camera(camera, scene.unit_length, scene.origin)
@@ -95,8 +101,8 @@ def test_cameras_come_back_as_they_were_made(tmp_path, log) -> None:
             assert (camera.width, camera.height) == (32, 24)
 
 
-def test_pictures_are_the_exact_frames(tmp_path, log, name) -> None:
-    scene = analytic.load(name, **SMALL, root=tmp_path, bounds="full", log=log)
+def test_pictures_are_the_exact_frames(drawn, log, name) -> None:
+    scene = analytic.load(name, **SMALL, root=drawn, bounds="full", log=log)
     split = scene.splits["test"]
     frame = exact_frame(scene, split.cameras[1], samples=16)
     image = split.images[1].float() / 255
@@ -107,8 +113,8 @@ def test_pictures_are_the_exact_frames(tmp_path, log, name) -> None:
     assert differing <= 3
 
 
-def test_a_scene_knows_its_picture_at_any_camera_as_its_splits_have_it(tmp_path, log, name) -> None:
-    scene = analytic.load(name, **SMALL, root=tmp_path, log=log)
+def test_a_scene_knows_its_picture_at_any_camera_as_its_splits_have_it(drawn, log, name) -> None:
+    scene = analytic.load(name, **SMALL, root=drawn, log=log)
     assert scene.exact is not None
     for camera, image in zip(
         scene.splits["test"].cameras, scene.splits["test"].images, strict=True
@@ -121,9 +127,8 @@ def test_a_scene_knows_its_picture_at_any_camera_as_its_splits_have_it(tmp_path,
         assert differing <= 3
 
 
-def test_no_surface_point_is_outside_the_bounds(tmp_path, log, name) -> None:
-    options = {"width": 40, "train": 10, "test": 2}
-    scene = analytic.load(name, **options, root=tmp_path, log=log)
+def test_no_surface_point_is_outside_the_bounds(drawn, log, name) -> None:
+    scene = analytic.load(name, **SMALL, root=drawn, log=log)
     for camera in scene.splits["test"].cameras:
         frame = exact_frame(scene, camera, samples=1)
         seen = (frame.alpha > 0).nonzero()
