@@ -100,7 +100,7 @@ def implementation(kernel: str, backend: str, device: torch.device) -> ModuleTyp
 
 def description(backend: str, device: torch.device | str, kernels: Iterable[str]) -> str:
     """What computes `kernels` on `device`: the name of the backend and, where it has no version of
-    some of them, the names of these: "gpu, reference: adam, spherical"."""
+    some of them, the names of these: "gpu, reference: ssim, voxel_walk"."""
     name = resolve(backend, device)
     others = [kernel for kernel in kernels if not has(kernel, name)]
     return f"{name}, reference: {', '.join(sorted(others))}" if others else name

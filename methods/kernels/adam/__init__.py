@@ -6,8 +6,10 @@ go on moving it by momentum, and would read and write the whole table every step
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -47,6 +49,15 @@ class AdamState:
     def tensors(self, prefix: str) -> dict[str, Tensor]:
         """The state, for a checkpoint; names begin with `prefix`."""
         return {f"{prefix}{name}": getattr(self, name) for name in _NAMES}
+
+
+@cache
+def corrections() -> Tensor:
+    """The bias corrections 1 / (1 - beta^n) of both `BETAS`, for n = 0, which is not used, 1, ...
+    until float32 cannot tell them from 1: [2, N]."""
+    last = math.ceil(math.log(2.0**-25) / math.log(max(BETAS)))
+    powers = torch.tensor(BETAS, dtype=torch.float64)[:, None] ** torch.arange(last + 1)
+    return (1 / (1 - powers)).float()
 
 
 def sparse_adam_(

@@ -9,7 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from bench.case import U16, U32, Agreement, Case, Property, on_backends
+from bench.case import U16, U32, Agreement, Case, Property
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.dispatch import served
 from methods.kernels.encode import pack
@@ -33,7 +33,7 @@ def cases() -> list[Case]:
         "adam",
         "the step is that of the closed form",
         "moments, corrections, root, quotient and sum: 16 u of rates of 1",
-        on_backends(16),
+        {(backend, "fp32"): 16 * U32 for backend in served("adam")},
     )
     found = [
         first.case(f"first gradient {gradient:g}", partial(_first_step_error, gradient))
@@ -41,15 +41,21 @@ def cases() -> list[Case]:
     ]
     for count, share in kinds:
         name, items = f"{share:.0%} of {count:,}", count if count == LARGE else None
-        found.append(kernel.case(name, partial(_prepare, count, share), tolerance, items=items))
+        found.append(kernel.case(name, partial(_prepare, count, share, 2), tolerance, items=items))
+    for features in (1, 3, 48):
+        make = partial(_prepare, 70, 0.3, features)
+        found.append(kernel.case(f"30% of 70, {features} features", make, tolerance))
     return found
 
 
-def _prepare(count: int, share: float, device: str) -> Callable[[str], tuple[Tensor, ...]]:
+def _prepare(
+    count: int, share: float, features: int, device: str
+) -> Callable[[str], tuple[Tensor, ...]]:
+    """Two features are packed, too."""
     generator = torch.Generator().manual_seed(count)
-    table = torch.rand(count, 2, generator=generator) * 2 - 1
+    table = torch.rand(count, features, generator=generator) * 2 - 1
     grads = [
-        torch.randn(count, 2, generator=generator)
+        torch.randn(count, features, generator=generator)
         * (torch.rand(count, 1, generator=generator) < share)
         for _ in range(STEPS)
     ]
@@ -57,11 +63,11 @@ def _prepare(count: int, share: float, device: str) -> Callable[[str], tuple[Ten
 
     def call(backend: str) -> tuple[Tensor, ...]:
         trained, state = table.clone(), AdamState.like(table)
-        packed = pack(trained)
+        packed = pack(trained) if features == 2 else None
         for grad in grads:
             sparse_adam_(trained, grad.clone(), state, RATE, packed=packed, backend=backend)
-        unpacked = packed[:, None].view(torch.bfloat16).float()
-        return trained, state.first, state.second, state.steps, unpacked
+        changed = trained, state.first, state.second, state.steps
+        return changed if packed is None else (*changed, packed[:, None].view(torch.bfloat16))
 
     return call
 

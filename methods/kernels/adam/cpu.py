@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from functools import cache
 
 import numpy as np
 import torch
 from numba import njit, prange
 from torch import Tensor
 
-from methods.kernels.adam import BETAS, EPS, AdamState
+from methods.kernels.adam import BETAS, EPS, AdamState, corrections
 from methods.kernels.cpu import f32, pack_bf16
 
 CHUNK = 4096  # entries
@@ -31,21 +30,12 @@ def sparse_adam_(
         state.second.numpy(),
         state.steps.numpy(),
         words,
-        _corrections(BETAS[0]),
-        _corrections(BETAS[1]),
+        *corrections().numpy(),
         f32(rate),
         f32(BETAS[0]),
         f32(BETAS[1]),
         f32(EPS),
     )
-
-
-@cache
-def _corrections(beta: float) -> np.ndarray:
-    """1 / (1 - beta^n) for n = 0, 1, ... until float32 cannot tell it from 1; n = 0 is not used."""
-    last = math.ceil(math.log(2.0**-25) / math.log(beta))
-    powers = np.power(beta, np.arange(1, last + 1))
-    return np.concatenate(([np.inf], 1 / (1 - powers))).astype(np.float32)
 
 
 @njit(cache=True, parallel=True)

@@ -36,8 +36,8 @@ def test_what_has_no_kernel_for_the_gpu_is_computed_by_torch(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(dispatch, "resolve", lambda backend, device: backend)
-    chosen = dispatch.implementation("spherical", "gpu", torch.device("cpu"))
-    assert chosen.__name__ == "methods.kernels.spherical.reference"
+    chosen = dispatch.implementation("voxel_walk", "gpu", torch.device("cpu"))
+    assert chosen.__name__ == "methods.kernels.voxel_walk.reference"
 
 
 def test_cpu_backend_refuses_tensors_of_another_device() -> None:
@@ -51,7 +51,7 @@ def test_a_description_names_the_kernels_that_torch_computes_for_the_gpu(
     monkeypatch.setattr(dispatch, "resolve", lambda backend, device: backend)
     described = partial(dispatch.description, "gpu", "cuda")
     assert described(["encode", "march"]) == "gpu"
-    assert described(["spherical", "encode", "adam"]) == "gpu, reference: adam, spherical"
+    assert described(["voxel_walk", "encode", "ssim"]) == "gpu, reference: ssim, voxel_walk"
 
 
 def test_a_description_is_of_the_backend_that_computes() -> None:

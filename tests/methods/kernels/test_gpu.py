@@ -16,6 +16,7 @@ from torch import Tensor
 import methods.kernels
 from bench.case import U32, largest_error
 from methods.kernels import availability
+from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import Intervals, composite, visible_counts, weights
 from methods.kernels.encode import HashGrid, encode
 from methods.kernels.splat import gather, splat
@@ -165,3 +166,9 @@ def test_types_that_it_does_not_serve_are_refused() -> None:
     positions = torch.rand(2, 3, dtype=torch.float64, device=DEVICE)
     with pytest.raises(ValueError, match="expects positions of float32"):
         encode(positions, torch.rand(grid.entries, 2, device=DEVICE), grid, backend="gpu")
+
+
+def test_a_table_that_cannot_be_changed_in_place_is_refused() -> None:
+    table = torch.zeros(2, 5, device=DEVICE).T
+    with pytest.raises(ValueError, match="expects table to be contiguous"):
+        sparse_adam_(table, table, AdamState.like(table), 0.1, backend="gpu")

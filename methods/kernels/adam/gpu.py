@@ -1,0 +1,102 @@
+"""Sparse Adam with Triton: one pass, in which a program takes a block of entries.
+
+It reads the gradient of every entry, 4 F bytes. Of an entry that got one it also reads, and writes,
+the table, both moments and the number of steps, 12 F + 4 bytes each way, and writes a gradient of 0
+and the packed copy, 4 F + 4.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from methods.kernels import adam
+from methods.kernels.adam import AdamState, corrections
+from methods.kernels.gpu import check_types, launch
+
+BLOCK = 1024
+"""Features of a program, 8 a lane: so many loads at a time hide how long one takes."""
+
+BETA1, BETA2 = tl.constexpr(adam.BETAS[0]), tl.constexpr(adam.BETAS[1])
+EPS = tl.constexpr(adam.EPS)
+
+
+@torch.no_grad()
+def sparse_adam_(
+    table: Tensor, grad: Tensor, state: AdamState, rate: float, packed: Tensor | None
+) -> None:
+    """See `methods.kernels.adam.sparse_adam_`. Changes contiguous tensors only."""
+    given = {"table": table, "grad": grad, "first": state.first, "second": state.second}
+    check_types(torch.float32, **given)
+    for name, tensor in given.items():
+        if not tensor.is_contiguous():
+            raise ValueError(f"backend 'gpu' expects {name} to be contiguous")
+    entries, features = table.shape
+    width = triton.next_power_of_2(max(features, 1))
+    rows, known = max(BLOCK // width, 1), _corrections(table.device)
+    launch(
+        _update,
+        (triton.cdiv(entries, rows),),
+        *given.values(),
+        state.steps,
+        None if packed is None else packed.view(torch.bfloat16),
+        known,
+        known.shape[1] - 1,
+        rate,
+        entries,
+        features,
+        ROWS=rows,
+        WIDTH=width,
+    )
+
+
+@cache
+def _corrections(device: torch.device) -> Tensor:
+    """To copy them to the device again would wait for it."""
+    return corrections().to(device)
+
+
+@triton.jit
+def _update(
+    table,
+    grad,
+    first,
+    second,
+    steps,
+    packed,
+    corrections,
+    last,
+    rate,
+    entries,
+    features,
+    ROWS: tl.constexpr,
+    WIDTH: tl.constexpr,
+):
+    """`last` is the largest number of steps in `corrections`; `packed` is of bfloat16."""
+    entry = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    feature = tl.arange(0, WIDTH)
+    inside = (entry < entries)[:, None] & (feature < features)[None, :]
+    place = entry[:, None] * features + feature[None, :]
+    gradient = tl.load(grad + place, mask=inside, other=0.0)
+    touched = tl.max((gradient != 0).to(tl.int32), 1) > 0
+    step = tl.load(steps + entry, mask=touched, other=0) + 1
+    known = corrections + tl.minimum(step, last)
+    correction1, correction2 = tl.load(known)[:, None], tl.load(known + last + 1)[:, None]
+    changed = inside & touched[:, None]
+    m = BETA1 * tl.load(first + place, mask=changed, other=0.0) + (1 - BETA1) * gradient
+    squared = (1 - BETA2) * gradient * gradient
+    v = BETA2 * tl.load(second + place, mask=changed, other=0.0) + squared
+    scale = tl.sqrt(v * correction2) + EPS
+    old = tl.load(table + place, mask=changed, other=0.0)
+    new = old - rate * m * correction1 / scale
+    tl.store(steps + entry, step, mask=touched)
+    tl.store(first + place, m, mask=changed)
+    tl.store(second + place, v, mask=changed)
+    tl.store(table + place, new, mask=changed)
+    tl.store(grad + place, tl.zeros_like(gradient), mask=changed)
+    if packed is not None:
+        tl.store(packed + place, new.to(tl.bfloat16), mask=changed)
