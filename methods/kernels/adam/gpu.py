@@ -87,9 +87,9 @@ def _update(
     known = corrections + tl.minimum(step, last)
     correction1, correction2 = tl.load(known)[:, None], tl.load(known + last + 1)[:, None]
     changed = inside & touched[:, None]
-    m = BETA1 * tl.load(first + place, mask=changed, other=0.0) + (1 - BETA1) * gradient
-    squared = (1 - BETA2) * gradient * gradient
-    v = BETA2 * tl.load(second + place, mask=changed, other=0.0) + squared
+    m = tl.load(first + place, mask=changed, other=0.0) * BETA1 + gradient * (1 - BETA1)
+    squared = gradient * (1 - BETA2) * gradient
+    v = tl.load(second + place, mask=changed, other=0.0) * BETA2 + squared
     scale = tl.sqrt(v * correction2) + EPS
     old = tl.load(table + place, mask=changed, other=0.0)
     new = old - rate * m * correction1 / scale

@@ -33,7 +33,7 @@ def shade(coefficients: Tensor, directions: Tensor, *, backend: str = "auto") ->
         directions: [N, 3], unit vectors.
 
     Raises:
-        ValueError: a shape other than these; backend "cpu": not float32.
+        ValueError: a shape other than these; backends "cpu", "gpu": not float32.
     """
     check_shape("coefficients", coefficients, len(directions), None, 3)
     check_shape("directions", directions, None, 3)

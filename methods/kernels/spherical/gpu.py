@@ -1,0 +1,186 @@
+"""Spherical harmonics with Triton.
+
+Harmonics of a direction, 12 bytes, are 64 bytes; the gradients of the coefficients of a colour are
+12 C bytes, from 24. They are written as rows, in the order of memory: a lane computes all harmonics
+of its direction and keeps those of its columns, which costs less than to write in pieces. To shade,
+a lane takes a colour and reads its coefficients, 12 C bytes, one after the other: they come from
+the first-level cache, to which they were brought as a whole.
+"""
+
+from __future__ import annotations
+
+from math import pi, sqrt
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from methods.kernels.gpu import check_types, launch
+from methods.kernels.spherical import CHANNELS
+
+BLOCK = 1024
+"""Numbers that a program writes, 8 a lane."""
+
+LANES = 128
+"""Colours of a program, one a lane."""
+
+C00 = tl.constexpr(sqrt(1 / (4 * pi)))
+C1 = tl.constexpr(sqrt(3 / (4 * pi)))
+C2 = tl.constexpr(sqrt(15 / (4 * pi)))
+C20 = tl.constexpr(sqrt(5 / (16 * pi)))
+C22 = tl.constexpr(sqrt(15 / (16 * pi)))
+C33 = tl.constexpr(sqrt(35 / (32 * pi)))
+C3XYZ = tl.constexpr(sqrt(105 / (4 * pi)))
+C31 = tl.constexpr(sqrt(21 / (32 * pi)))
+C30 = tl.constexpr(sqrt(7 / (16 * pi)))
+C32 = tl.constexpr(sqrt(105 / (16 * pi)))
+
+
+def spherical_harmonics(directions: Tensor) -> Tensor:
+    """See `methods.kernels.spherical.spherical_harmonics`."""
+    _check(directions)
+    values = directions.new_empty(len(directions), CHANNELS)
+    rows = BLOCK // CHANNELS
+    grid = (triton.cdiv(len(values), rows),)
+    launch(_evaluate, grid, directions.contiguous(), values, len(values), ROWS=rows, SIZE=CHANNELS)
+    return values
+
+
+def shade(coefficients: Tensor, directions: Tensor) -> Tensor:
+    """See `methods.kernels.spherical.shade`."""
+    _check(directions)
+    check_types(torch.float32, coefficients=coefficients)
+    return _Shade.apply(coefficients, directions.contiguous())
+
+
+def _check(directions: Tensor) -> None:
+    check_types(torch.float32, directions=directions)
+    if directions.requires_grad:
+        raise ValueError("backend 'gpu' gives no gradient for directions: use backend='reference'")
+
+
+class _Shade(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, coefficients, directions):
+        count, size, _ = ctx.shape = coefficients.shape
+        ctx.save_for_backward(directions)
+        colours = torch.empty_like(directions)
+        given = directions, coefficients.detach().contiguous(), colours, count
+        launch(_shade, (triton.cdiv(count, LANES),), *given, SIZE=size, LANES=LANES)
+        return colours
+
+    @staticmethod
+    def backward(ctx, grad):
+        (directions,) = ctx.saved_tensors
+        count, size, _ = ctx.shape
+        grads, width = grad.new_empty(ctx.shape), triton.next_power_of_2(3 * size)
+        rows = BLOCK // width
+        given = directions, grad.contiguous(), grads, count
+        grid = (triton.cdiv(count, rows),)
+        launch(_unshade, grid, *given, ROWS=rows, WIDTH=width, SIZE=size)
+        return grads, None
+
+
+@triton.jit
+def _vector(vectors, i, inside):
+    return (
+        tl.load(vectors + 3 * i, mask=inside, other=0.0),
+        tl.load(vectors + 3 * i + 1, mask=inside, other=0.0),
+        tl.load(vectors + 3 * i + 2, mask=inside, other=0.0),
+    )
+
+
+@triton.jit
+def _harmonic(x, y, z, k: tl.constexpr):
+    """The k-th harmonic."""
+    xx, yy, zz = x * x, y * y, z * z
+    if k == 0:
+        return tl.full(x.shape, C00, tl.float32)
+    elif k == 1:
+        return y * C1
+    elif k == 2:
+        return z * C1
+    elif k == 3:
+        return x * C1
+    elif k == 4:
+        return x * C2 * y
+    elif k == 5:
+        return y * C2 * z
+    elif k == 6:
+        return (2 * zz - xx - yy) * C20
+    elif k == 7:
+        return x * C2 * z
+    elif k == 8:
+        return (xx - yy) * C22
+    elif k == 9:
+        return y * C33 * (3 * xx - yy)
+    elif k == 10:
+        return x * C3XYZ * y * z
+    elif k == 11:
+        return y * C31 * (4 * zz - xx - yy)
+    elif k == 12:
+        return z * C30 * (2 * zz - 3 * xx - 3 * yy)
+    elif k == 13:
+        return x * C31 * (4 * zz - xx - yy)
+    elif k == 14:
+        return z * C32 * (xx - yy)
+    else:
+        return x * C33 * (xx - 3 * yy)
+
+
+@triton.jit
+def _rows(x, y, z, column, SIZE: tl.constexpr):
+    """For each direction the harmonics that the columns want, of the first `SIZE`; else 0."""
+    rows = tl.zeros([x.shape[0], column.shape[0]], tl.float32)
+    for k in tl.static_range(SIZE):
+        rows = tl.where(column[None, :] == k, _harmonic(x, y, z, k)[:, None], rows)
+    return rows
+
+
+@triton.jit
+def _evaluate(directions, values, count, ROWS: tl.constexpr, SIZE: tl.constexpr):
+    i = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    inside = i < count
+    x, y, z = _vector(directions, i, inside)
+    column = tl.arange(0, SIZE)
+    place = values + i[:, None] * SIZE + column[None, :]
+    tl.store(place, _rows(x, y, z, column, SIZE), mask=inside[:, None])
+
+
+@triton.jit
+def _shade(directions, coefficients, colours, count, SIZE: tl.constexpr, LANES: tl.constexpr):
+    i = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
+    inside = i < count
+    x, y, z = _vector(directions, i, inside)
+    red, green, blue = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
+    for k in tl.static_range(SIZE):
+        basis = _harmonic(x, y, z, k)
+        of_red, of_green, of_blue = _vector(coefficients, i * SIZE + k, inside)
+        red += basis * of_red
+        green += basis * of_green
+        blue += basis * of_blue
+    tl.store(colours + 3 * i, red, mask=inside)
+    tl.store(colours + 3 * i + 1, green, mask=inside)
+    tl.store(colours + 3 * i + 2, blue, mask=inside)
+
+
+@triton.jit
+def _unshade(
+    directions,
+    grad,
+    grads,
+    count,
+    ROWS: tl.constexpr,
+    WIDTH: tl.constexpr,
+    SIZE: tl.constexpr,
+):
+    """Gradients of the coefficients: products of harmonics and gradients of the colours."""
+    i = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    inside = i < count
+    x, y, z = _vector(directions, i, inside)
+    column = tl.arange(0, WIDTH)
+    there = inside[:, None] & (column < 3 * SIZE)[None, :]
+    of_colour = tl.load(grad + 3 * i[:, None] + (column % 3)[None, :], mask=there, other=0.0)
+    place = grads + i[:, None] * (3 * SIZE) + column[None, :]
+    tl.store(place, _rows(x, y, z, column // 3, SIZE) * of_colour, mask=there)
