@@ -31,9 +31,9 @@ def enlarge(depth: Tensor, cells: Tensor, scale: int) -> Tensor:
         depth.contiguous(),
         cells.contiguous(),
         *depth.shape,
-        scale,
         out,
         out.numel(),
+        SCALE=scale,
         BLOCK=BLOCK,
     )
     return out
@@ -64,10 +64,10 @@ def warp(
         to_source.to(picture.device, non_blocking=True),
         *picture.shape,
         width,
-        scale,
         values,
         valid,
         depth.numel(),
+        SCALE=scale,
         PIXELS=pixels,
         CHANNELS=channels,
     )
@@ -80,14 +80,25 @@ def _clamp(value, size):
 
 
 @triton.jit
-def _between(cell, sub, scale):
+def _place(cells, width, i, inside, SCALE: tl.constexpr):
+    """Of the i-th pixels of the cells: row and column of the cell, and of the pixel in it.
+
+    Divisions are of 32 bits or by constants: others cost more than all the rest.
+    """
+    cell = tl.load(cells + i // (SCALE * SCALE), mask=inside, other=0).to(tl.int32)
+    sub = (i % (SCALE * SCALE)).to(tl.int32)
+    return cell // width, cell % width, sub // SCALE, sub % SCALE
+
+
+@triton.jit
+def _between(cell, sub, SCALE: tl.constexpr):
     """Along one axis, the cell whose centre is before that of a pixel, the `sub`-th of `cell`, and
-    how far, as a part of the way to the next.
+    how far that is, as a part of the way to the next.
 
     Counted in halves of a pixel, in whole numbers: a weight of 0 is one, however numbers round.
     """
-    halves = 2 * sub + 1 + scale  # from the centre of the cell before
-    return cell - 1 + halves // (2 * scale), (halves % (2 * scale)).to(tl.float32) / (2 * scale)
+    halves = 2 * sub + 1 + SCALE  # from the centre of the cell before
+    return cell - 1 + halves // (2 * SCALE), (halves % (2 * SCALE)).to(tl.float32) / (2 * SCALE)
 
 
 @triton.jit
@@ -99,13 +110,12 @@ def _known(depth, row, column, height, width, weight, inside):
 
 
 @triton.jit
-def _enlarge(depth, cells, height, width, scale, out, total, BLOCK: tl.constexpr):
+def _enlarge(depth, cells, height, width, out, total, SCALE: tl.constexpr, BLOCK: tl.constexpr):
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = i < total
-    area = scale * scale
-    cell, sub = tl.load(cells + i // area, mask=inside, other=0), (i % area).to(tl.int32)
-    row, down = _between(cell // width, sub // scale, scale)
-    column, right = _between(cell % width, sub % scale, scale)
+    row, column, sub_row, sub_column = _place(cells, width, i, inside, SCALE)
+    row, down = _between(row, sub_row, SCALE)
+    column, right = _between(column, sub_column, SCALE)
     w0, w1 = (1 - down) * (1 - right), (1 - down) * right
     w2, w3 = down * (1 - right), down * right
     z0 = _known(depth, row, column, height, width, w0, inside)
@@ -146,19 +156,18 @@ def _warp(
     width,
     channels,
     cells_a_row,
-    scale,
     values,
     valid,
     total,
+    SCALE: tl.constexpr,
     PIXELS: tl.constexpr,
     CHANNELS: tl.constexpr,
 ):
     i = tl.program_id(0).to(tl.int64) * PIXELS + tl.arange(0, PIXELS)
     inside = i < total
-    area = scale * scale
-    cell, sub = tl.load(cells + i // area, mask=inside, other=0), (i % area).to(tl.int32)
-    v = (cell // cells_a_row * scale + sub // scale).to(tl.float32) + 0.5
-    u = (cell % cells_a_row * scale + sub % scale).to(tl.float32) + 0.5
+    row, column, sub_row, sub_column = _place(cells, cells_a_row, i, inside, SCALE)
+    v = (row * SCALE + sub_row).to(tl.float32) + 0.5
+    u = (column * SCALE + sub_column).to(tl.float32) + 0.5
     z = tl.load(depth + i, mask=inside, other=0.0)
     seen = (z > 0) & (z < float("inf"))
     z = tl.where(seen, z, 1.0)

@@ -1,6 +1,6 @@
 """Compile every kernel of the GPU for a Hopper chip, which needs none: with the arguments that the
-cases of the kernels give, one line each. Run by test_gpu.py as a program of its own, in which
-nothing is interpreted.
+cases of the kernels give, one line each; with the last of them also for Ampere and Ada. Run by
+test_gpu.py as a program of its own, in which nothing is interpreted.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import methods.kernels.gpu
 from bench.case import Difference
 from methods.checks import found
 
-HOPPER = GPUTarget("cuda", 90, 32)
+AMPERE, ADA, HOPPER = (GPUTarget("cuda", capability, 32) for capability in (80, 89, 90))
 TYPES = {
     "float32": "fp32",
     "float16": "fp16",
@@ -64,12 +64,18 @@ def compile_for_hopper(
     if line not in seen:
         seen.add(line)
         rest = {name: value for name, value in options.items() if name not in constants}
-        source = ASTSource(kernel, types, constants, multiples)
-        triton.compile(source, target=HOPPER, options={"enable_fp_fusion": False, **rest})
+        last[kernel] = ASTSource(kernel, types, constants, multiples), rest
+        compile_for(HOPPER, *last[kernel])
         print(kernel.fn.__module__, kernel.fn.__name__)
 
 
+def compile_for(target: GPUTarget, source: ASTSource, options: dict[str, Any]) -> None:
+    """As `methods.kernels.gpu.launch` compiles."""
+    triton.compile(source, target=target, options={"enable_fp_fusion": False, **options})
+
+
 seen: set[str] = set()
+last: dict[triton.JITFunction, tuple[ASTSource, dict[str, Any]]] = {}
 methods.kernels.gpu.launch = compile_for_hopper
 for path in Path(methods.kernels.gpu.__file__).parent.glob("*/gpu.py"):
     importlib.import_module(f"methods.kernels.{path.parent.name}.gpu")
@@ -78,3 +84,6 @@ for case in found("cases"):
     by_gpu = any(backend == "gpu" for backend, _ in case.tolerances)
     if isinstance(case.error, Difference) and by_gpu and not case.timed:
         case.error.prepare("cpu")("gpu")
+for given in last.values():
+    for target in (AMPERE, ADA):
+        compile_for(target, *given)
