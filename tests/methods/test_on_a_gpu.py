@@ -13,11 +13,13 @@ import pytest
 import torch
 
 from bench.cameras import cast, place_camera, scale_camera
+from bench.case import Difference
 from bench.console import ConsoleLog
 from bench.protocol import EvaluationProtocol
 from bench.run import Task, measure
 from bench.trajectories import from_split
 from bench.types import Budget, Method, NullProbe, Scene, Split
+from methods.checks import found
 from methods.diver.method import Diver
 from methods.diver.training import Lessons as DiverLessons
 from methods.engines import cuda_graphs
@@ -245,4 +247,31 @@ def test_kernels_of_triton_compute_there_as_on_the_cpu() -> None:
     with pretended_gpu():
         there = by_triton("cuda")
         assert all(x.device.type == "cuda" for x in there)
+        assert all(torch.equal(x.cpu(), y) for x, y in zip(there, here, strict=True))
+
+
+@pytest.mark.skipif(bool(availability()["gpu"]), reason="Triton has no build for this platform")
+@pytest.mark.parametrize(
+    "which",
+    [
+        ("adam", "30% of 70, 3 features"),
+        ("depthwise backward", "scattered"),
+        ("shade backward", "131 colours of 16"),
+        ("spherical", "131 directions"),
+        ("warp", "holes"),
+    ],
+    ids=lambda which: which[0],
+)
+def test_a_kernel_of_triton_computes_there_as_on_the_cpu_while_the_host_goes_on(
+    which: tuple[str, str],
+) -> None:
+    case = next(case for case in found("cases") if (case.subject, case.name) == which)
+    assert isinstance(case.error, Difference)
+    here = case.error.prepare("cpu")("gpu")
+    with pretended_gpu():
+        compute = case.error.prepare("cuda")
+        compute("gpu")  # what never changes is copied once
+        torch.cuda.set_sync_debug_mode("error")
+        there = compute("gpu")
+        torch.cuda.set_sync_debug_mode("default")
         assert all(torch.equal(x.cpu(), y) for x, y in zip(there, here, strict=True))
