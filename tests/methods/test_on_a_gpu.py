@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from bench.cameras import cast, place_camera, scale_camera
-from bench.case import Difference
+from bench.case import Difference, Prepare
 from bench.console import ConsoleLog
 from bench.protocol import EvaluationProtocol
 from bench.run import Task, measure
@@ -250,28 +250,43 @@ def test_kernels_of_triton_compute_there_as_on_the_cpu() -> None:
         assert all(torch.equal(x.cpu(), y) for x, y in zip(there, here, strict=True))
 
 
-@pytest.mark.skipif(bool(availability()["gpu"]), reason="Triton has no build for this platform")
-@pytest.mark.parametrize(
-    "which",
-    [
-        ("adam", "30% of 70, 3 features"),
-        ("depthwise backward", "scattered"),
-        ("shade backward", "131 colours of 16"),
-        ("spherical", "131 directions"),
-        ("warp", "holes"),
-    ],
-    ids=lambda which: which[0],
-)
-def test_a_kernel_of_triton_computes_there_as_on_the_cpu_while_the_host_goes_on(
-    which: tuple[str, str],
-) -> None:
+GO_ON = [
+    ("adam", "30% of 70, 3 features"),
+    ("depthwise backward", "scattered"),
+    ("shade backward", "131 colours of 16"),
+    ("spherical", "131 directions"),
+    ("warp", "holes"),
+]
+"""Cases of kernels for which the host does not wait."""
+
+WAIT = [("space_to_depth backward", "scale 3"), ("depth_to_space backward", "scale 3")]
+
+
+def preparation(which: tuple[str, str]) -> Prepare:
+    """That of a case."""
     case = next(case for case in found("cases") if (case.subject, case.name) == which)
     assert isinstance(case.error, Difference)
-    here = case.error.prepare("cpu")("gpu")
+    return case.error.prepare
+
+
+@pytest.mark.skipif(bool(availability()["gpu"]), reason="Triton has no build for this platform")
+@pytest.mark.parametrize("which", [*GO_ON, *WAIT], ids=" ".join)
+def test_a_case_of_a_kernel_of_triton_is_computed_there_as_on_the_cpu(
+    which: tuple[str, str],
+) -> None:
+    prepare = preparation(which)
+    here = prepare("cpu")("gpu")
     with pretended_gpu():
-        compute = case.error.prepare("cuda")
+        there = prepare("cuda")("gpu")
+        assert all(torch.equal(x.cpu(), y) for x, y in zip(there, here, strict=True))
+
+
+@pytest.mark.skipif(bool(availability()["gpu"]), reason="Triton has no build for this platform")
+@pytest.mark.parametrize("which", GO_ON, ids=" ".join)
+def test_while_a_kernel_of_triton_computes_the_host_goes_on(which: tuple[str, str]) -> None:
+    prepare = preparation(which)
+    with pretended_gpu():
+        compute = prepare("cuda")
         compute("gpu")  # what never changes is copied once
         torch.cuda.set_sync_debug_mode("error")
-        there = compute("gpu")
-        torch.cuda.set_sync_debug_mode("default")
-        assert all(torch.equal(x.cpu(), y) for x, y in zip(there, here, strict=True))
+        compute("gpu")

@@ -19,6 +19,7 @@ from methods.kernels import availability
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import Intervals, composite, visible_counts, weights
 from methods.kernels.encode import HashGrid, encode
+from methods.kernels.space_to_depth import CellInputs, Layout, space_to_depth
 from methods.kernels.splat import gather, splat
 
 pytestmark = pytest.mark.skipif(
@@ -172,3 +173,18 @@ def test_a_table_that_cannot_be_changed_in_place_is_refused() -> None:
     table = torch.zeros(2, 5, device=DEVICE).T
     with pytest.raises(ValueError, match="expects table to be contiguous"):
         sparse_adam_(table, table, AdamState.like(table), 0.1, backend="gpu")
+
+
+@pytest.mark.parametrize("wrong", [-2, 5])
+@pytest.mark.parametrize("of", ["preceding", "surface"])
+def test_an_index_that_names_no_point_is_refused(of: str, wrong: int) -> None:
+    layout = Layout(channels=3, frames=1, scale=2, history=False, surface=True)
+    index = {"preceding": torch.zeros(4, 6), "surface": torch.zeros(6, 4)}
+    index[of][2, 3] = wrong
+    preceding, surface = (x.to(DEVICE, torch.int32) for x in index.values())
+    points = torch.zeros(5, 4, device=DEVICE)
+    frame = torch.zeros(2, 3, 3), torch.zeros(2, 3), torch.zeros(3), torch.arange(6)
+    pairs = [(points[:, :3], preceding)]
+    given = CellInputs(*(x.to(DEVICE) for x in frame), pairs, None, (points, surface))
+    with pytest.raises(ValueError, match="expected -1 or that of a point, got 1 that"):
+        space_to_depth(given, layout, backend="gpu")
