@@ -84,9 +84,9 @@ class _DepthToSpace(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad):
-        def again(*parts: Tensor) -> Pair:
-            matrix = parts[3] if len(parts) == 4 else None
-            return (reference.depth_to_space(*parts[:3], matrix, ctx.layout),)
+        def again(base: Tensor, rows: Tensor, output: Tensor, *matrix: Tensor) -> tuple[Tensor]:
+            shared = next(iter(matrix), None)
+            return (reference.depth_to_space(base, rows, output, shared, ctx.layout),)
 
         return None, *_gradients(again, ctx.saved_tensors, (grad,))
 
@@ -110,39 +110,36 @@ def _rows(inputs: CellInputs, layout: Layout, taps: Tensor, count: int) -> Pair:
     number, pixels, begins = len(cells), layout.scale**2, layout.begins
     each = pixels * (channels + 1)  # columns of a picture
     base, rows = values.new_empty(number, pixels, 3), values.new_empty(count, layout.width)
-    wrong = torch.zeros(layout.frames + 1, dtype=torch.int32, device=values.device)
+    wrong = torch.zeros(1, dtype=torch.int32, device=values.device)
+    into = rows, layout.width
     rows[number:] = 0
-    given = values, background, cells, height, width, taps.contiguous()
-    _launch(_base, base.numel(), layout, *given, base)
-    given = values, alpha, background, cells
-    _launch(_present, number * (channels + 1), layout, *given, rows, layout.width)
+    samples = values, background, cells, height, width, taps.contiguous()
+    _launch(_base, base.numel(), layout, *samples, base)
+    _launch(_present, number * (channels + 1), layout, values, alpha, background, cells, *into)
     for age in range(layout.frames):
         begin = begins[f"preceding {age}"]
         if age < len(inputs.preceding):
             points, index = (x.contiguous() for x in inputs.preceding[age])
-            given = points, len(points), index, background, cells, width
-            into = rows, layout.width, begin, wrong, age
-            _launch(_preceding, number * each, layout, *given, *into)
+            where = background, cells, width, *into, begin, wrong
+            _launch(_preceding, number * each, layout, points, len(points), index, *where)
         else:
             rows[:, begin : begin + each] = 0
     if layout.history:
         begin = begins["history"]
         if inputs.history is not None:
-            picture, valid = (x.contiguous() for x in inputs.history)
-            given = picture, valid, background, base
-            _launch(_history, number * pixels * 4, layout, *given, rows, layout.width, begin)
+            recent = (x.contiguous() for x in inputs.history)
+            _launch(_history, number * pixels * 4, layout, *recent, background, base, *into, begin)
         else:
             rows[:, begin : begin + 4 * pixels] = 0
     if layout.surface:
         begin = begins["surface"]
         if inputs.surface is not None:
             points, index = (x.contiguous() for x in inputs.surface)
-            given = points, len(points), index, background, base
-            into = rows, layout.width, begin, wrong, layout.frames
-            _launch(_surface, number * each, layout, *given, *into)
+            there = background, base, *into, begin, wrong
+            _launch(_surface, number * each, layout, points, len(points), index, *there)
         else:
             rows[:, begin:] = 0
-    if found := int(wrong.sum()):
+    if found := int(wrong):
         raise ValueError(f"index: expected -1 or that of a point, got {found} that are neither")
     return base, rows
 
@@ -220,12 +217,12 @@ def _less_background(features, background, source, seen, FEATURES: tl.constexpr)
 
 
 @triton.jit
-def _seen(point, points, f, wrong, picture):
+def _seen(point, points, f, wrong):
     """Where there is a point; counts the pixels that name none of the `points`."""
     unknown = (f == 0) & ((point < -1) | (point >= points))
     found = tl.sum(unknown.to(tl.int32), 0)
     if found > 0:
-        tl.atomic_add(wrong + picture, found, sem="relaxed")
+        tl.atomic_add(wrong, found, sem="relaxed")
     return (point >= 0) & (point < points)
 
 
@@ -263,7 +260,6 @@ def _preceding(
     columns,
     begin,
     wrong,
-    picture,
     total,
     SCALE: tl.constexpr,
     FEATURES: tl.constexpr,
@@ -276,7 +272,7 @@ def _preceding(
     row, column = cell // width * SCALE + sub // SCALE, cell % width * SCALE + sub % SCALE
     shown = index + row * (width * SCALE) + column
     point = tl.load(shown, mask=inside, other=-1).to(tl.int64)
-    seen, source = _seen(point, points, f, wrong, picture), _source(f, FEATURES)
+    seen, source = _seen(point, points, f, wrong), _source(f, FEATURES)
     features = values + point * (FEATURES - 1)
     less = _less_background(features, background, source, seen, FEATURES)
     opacity = (seen & (source == FEATURES - 1)).to(tl.float32)
@@ -320,7 +316,6 @@ def _surface(
     columns,
     begin,
     wrong,
-    picture,
     total,
     SCALE: tl.constexpr,
     FEATURES: tl.constexpr,
@@ -330,7 +325,7 @@ def _surface(
     n, place = i // (SCALE * SCALE * FEATURES), i % (SCALE * SCALE * FEATURES)
     pixel, f = i // FEATURES, i % FEATURES
     point = tl.load(index + pixel, mask=inside, other=-1).to(tl.int64)
-    seen, source = _seen(point, points, f, wrong, picture), _source(f, FEATURES)
+    seen, source = _seen(point, points, f, wrong), _source(f, FEATURES)
     features = values + point * FEATURES
     less = _less_background(features, background, source, seen, FEATURES)
     less -= tl.load(base + 3 * pixel + f, mask=seen & (f < 3), other=0.0)
