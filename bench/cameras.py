@@ -57,6 +57,12 @@ def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack((u, v), dim=-1), depth
 
 
+def within(pixels: Tensor, width: int, height: int) -> Tensor:
+    """Whether continuous `pixels` [..., 2] lie inside a picture of that size, [...] bool."""
+    u, v = pixels.unbind(dim=-1)
+    return (u >= 0) & (u < width) & (v >= 0) & (v < height)
+
+
 def scale_camera(camera: Camera, width: int, height: int) -> Camera:
     """The same view on a grid of `width` x `height` pixels.
 
@@ -91,8 +97,12 @@ def move_camera(camera: Camera, scale: float, offset: Tensor) -> Camera:
 
 
 def place_camera(camera: Camera, device: torch.device | str) -> Camera:
-    """The same camera with its pose on `device`; rays and projections then are there, too."""
-    return replace(camera, c2w=camera.c2w.to(device))
+    """The same camera with its pose on `device`; rays and projections then are there, too.
+
+    The host waits for a GPU only to bring a pose from there.
+    """
+    waits = camera.c2w.device.type != "cpu"
+    return replace(camera, c2w=camera.c2w.to(device, non_blocking=not waits))
 
 
 INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height")

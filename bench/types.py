@@ -83,7 +83,7 @@ class Rays:
             torch.cat([rays.directions for rays in parts]),
         )
 
-    def take(self, index: Tensor) -> Rays:
+    def take(self, index: Tensor | slice) -> Rays:
         """The rays at `index`."""
         return Rays(self.origins[index], self.directions[index])
 

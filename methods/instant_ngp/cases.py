@@ -102,8 +102,8 @@ def _prepare_step(device: str) -> Callable[[str], tuple[Tensor, ...]]:
                 field.to(device), scene, budget, TrainingOptions(), seed=0
             )
         training = trainings[backend]
-        # At a step that does not update the grid.
-        training.step, training.rays = 1, RAYS
+        # At a step that does not update the grid, but whose error is looked at.
+        training.step, training.rays = loop.LOOK_EVERY, RAYS
         training.generator.manual_seed(0)
         training.grid.occupancy = occupancy
         return (torch.tensor(training.advance()[""]),)
@@ -172,7 +172,7 @@ def _training(
 
 def _stays_finite(make: Callable[[], Scene], backend: str, device: str, precision: str) -> float:
     training = _training(make(), QUICK, backend, device, precision)
-    losses = [training.advance()[""] for _ in range(STEPS)]
+    losses = [loss for _ in range(STEPS) for loss in training.advance().values()]
     loop.check_finite(training)
     return 0.0 if all(map(math.isfinite, losses)) else math.inf
 

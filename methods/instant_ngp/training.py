@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -197,7 +196,7 @@ class PixelTraining(ABC):
         return self.options.rate * cosine(self.step / self.steps, self.options.final_rate)
 
     def advance(self) -> dict[str, float]:
-        """One step; its mean squared error.
+        """One step; its mean squared error, see `loop.look`.
 
         Raises:
             SteerbenchError: the loss is not finite.
@@ -209,13 +208,11 @@ class PixelTraining(ABC):
         loss = functional.mse_loss(pixels.values, target)
         entropy = opacity_entropy(pixels.alpha)
         (loss + self.options.opacity_entropy * entropy).backward()
-        value = loss.item()
-        if not math.isfinite(value):
-            loop.check_finite(self, {"loss": loss, "rendered pixels": pixels.values})
+        errors = loop.look(self, {"": loss}, {"loss": loss, "rendered pixels": pixels.values})
         self._update()
         self._fit_batch(samples)
         self.step += 1
-        return {"": value}
+        return errors
 
     def _target(self, colours: Tensor) -> tuple[Tensor, Tensor]:
         """Colours composited on the background, and that background ([3] or a ray's own [R, 3])."""

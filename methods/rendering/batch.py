@@ -8,11 +8,8 @@ from torch import Tensor
 from bench.types import Rays
 from methods.kernels.composite import Pixels, composite, visible_counts
 from methods.kernels.march import Occupancy, march
-from methods.rendering.field import Field, pad, query
+from methods.rendering.field import CHUNK_SAMPLES, Field, pad, query
 from methods.rendering.march import March
-
-CHUNK_SAMPLES = 1 << 18
-"""Samples whose density is evaluated together, without gradient: bounds the memory of a step."""
 
 
 def render_batch(

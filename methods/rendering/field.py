@@ -13,6 +13,9 @@ from bench.types import Probe
 BATCH_QUANTUM = 1 << 11
 """Samples are handed to a field in multiples of this."""
 
+CHUNK_SAMPLES = 1 << 18
+"""Samples that are evaluated together where no gradient needs them: bounds the memory."""
+
 LOG_DENSITY_CLAMP = 15.0
 """The gradient of exp is taken at a log density clamped to +- this (as torch-ngp and ngp_pl do)."""
 

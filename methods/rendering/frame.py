@@ -86,24 +86,32 @@ def everywhere(field: Field, occupancy: Occupancy, probe: Probe, how: March) -> 
 
 
 def rays_at_matter(camera: Camera, occupancy: Occupancy) -> tuple[Tensor, Rays]:
-    """The pixels that may see an occupied cell, as indices [P] row by row, and their rays.
+    """The pixels that may see an occupied cell, as indices [P] row by row, and their rays. The host
+    waits for a GPU once."""
+    row, column = sees_matter(camera, occupancy).nonzero().unbind(dim=1)
+    return row * camera.width + column, cast(camera, torch.stack((column, row), dim=1) + 0.5)
 
-    A pixel may see an occupied brick if it lies in the box around the projected corners of the
-    brick; every pixel may, if one of them is not in front of the camera.
+
+def sees_matter(camera: Camera, occupancy: Occupancy) -> Tensor:
+    """Whether a pixel may see an occupied cell: [h, w] bool.
+
+    It may see an occupied brick if it lies in the box around the projected corners of the brick;
+    every pixel may, if one of them is not in front of the camera.
     """
     device = camera.c2w.device
-    bricks = occupancy.words.nonzero().to(device)  # [B, 3]
+    bricks = occupancy.bricks.to(device)
     unit = torch.arange(2, device=device)
     corners = (bricks[:, None] + torch.cartesian_prod(unit, unit, unit)) * BRICK
     projected, depth = project(camera, corners.reshape(-1, 3) / occupancy.resolution)
-    projected = projected.view(-1, 8, 2)
+    projected, sides = projected.view(-1, 8, 2), (camera.width, camera.height)
     behind = (depth.view(-1, 8) <= 0).any(dim=1)[:, None]  # [B, 1]
 
-    size = torch.tensor((camera.width, camera.height), device=device)
-    low = torch.where(behind, 0, projected.amin(dim=1)).floor().clamp(min=0)
-    high = torch.where(behind, size, projected.amax(dim=1)).ceil().clamp(min=0)
-    left, top = torch.minimum(low, size).long().unbind(dim=1)
-    right, bottom = torch.minimum(high, size).long().unbind(dim=1)
+    low = torch.where(behind, 0, projected.amin(dim=1)).floor()
+    high = torch.where(behind, torch.inf, projected.amax(dim=1)).ceil()
+    (left, top), (right, bottom) = (
+        [x.clamp(0, size).long() for x, size in zip(ends.unbind(dim=1), sides, strict=True)]
+        for ends in (low, high)
+    )
 
     # How many boxes cover a pixel: the sum, over all pixels above and to the left, of +1 and -1 at
     # the boxes' corners.
@@ -114,7 +122,5 @@ def rays_at_matter(camera: Camera, occupancy: Occupancy) -> tuple[Tensor, Rays]:
         (bottom, left, -1),
         (bottom, right, 1),
     ):
-        edges.index_put_((row, column), torch.tensor(sign, dtype=torch.int32, device=device), True)
-    covers = edges.cumsum(dim=0).cumsum(dim=1)[:-1, :-1]
-    row, column = covers.nonzero().unbind(dim=1)
-    return row * camera.width + column, cast(camera, torch.stack((column, row), dim=1) + 0.5)
+        edges.index_put_((row, column), edges.new_full((), sign), True)
+    return edges.cumsum(dim=0).cumsum(dim=1)[:-1, :-1] != 0

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from bench.cameras import place_camera, project
+from bench.cameras import place_camera, project, within
 from bench.types import Camera
 from methods.kernels.march import BRICK, MAX_SAMPLES, Occupancy
 from methods.rendering.field import LOG_DENSITY_CLAMP, Field
@@ -68,8 +68,7 @@ def learnable_cells(bounds: Tensor, cameras: Sequence[Camera]) -> Tensor:
     for camera in cameras:
         camera = place_camera(camera, device)
         pixels, depth = project(camera, centres)
-        size = pixels.new_tensor((camera.width, camera.height))
-        views += (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
+        views += (depth > 0) & within(pixels, camera.width, camera.height)
         free &= (centres - camera.c2w[:, 3]).abs().amax(dim=1) > 1.5 / side
     bricks = ((views >= MIN_VIEWS) & free).view(side, side, side)
     for dim in range(3):
@@ -99,7 +98,8 @@ class DensityGrid:
         cells = self._draw(samples, generator)
         found = torch.full_like(self.density.view(-1), -1.0)
         for part in cells.split(CHUNK):
-            corner = torch.stack(torch.unravel_index(part, self.density.shape), dim=-1)
+            side = RESOLUTION  # not unravel_index: it asks for the largest, and a GPU is waited for
+            corner = torch.stack((part // side**2, part // side % side, part % side), dim=-1)
             jitter = torch.rand(len(part), 3, generator=generator, device=part.device)
             sigma, _ = field.density((corner + jitter) / RESOLUTION)
             found.scatter_reduce_(0, part, sigma.clamp(max=LARGEST), "amax")
@@ -120,5 +120,5 @@ class DensityGrid:
         )
 
     def _threshold(self) -> None:
-        mean = self.density.view(-1)[self._candidates].mean().item()
-        self.occupancy = Occupancy(self.density > min(mean, THRESHOLD))
+        mean = self.density.view(-1)[self._candidates].mean()
+        self.occupancy = Occupancy(self.density > mean.clamp(max=THRESHOLD))

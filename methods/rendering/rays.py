@@ -1,4 +1,5 @@
-"""Volume rendering to render: rays take a few samples at a time and end early."""
+"""Volume rendering to render: on a CPU rays take a few samples at a time and end early; on a GPU,
+which is not to be waited for, all at once."""
 
 from __future__ import annotations
 
@@ -7,12 +8,14 @@ from torch import Tensor
 
 from bench.types import Probe, Rays
 from methods.kernels.composite import Pixels, composite, weights
-from methods.kernels.march import Occupancy, Samples, march
-from methods.rendering.field import Field, pad
+from methods.kernels.march import Occupancy, Samples, extents, march
+from methods.rendering.compaction import compacts
+from methods.rendering.field import CHUNK_SAMPLES, Field, pad, query
 from methods.rendering.march import March
 
 CHUNK_RAYS = 1 << 16
-"""Rays rendered together: enough to keep all threads busy, few enough to stay in the cache."""
+"""Rays rendered together: enough to keep all threads busy, few enough to stay in the cache. It
+bounds the memory of a GPU, too: it holds the samples of so many rays."""
 
 ROUND_SAMPLES = 6
 """Samples of a ray in a round: with more, some are evaluated in vain behind its end; with fewer,
@@ -28,16 +31,27 @@ def render_rays(
     how: March,
     carry: Pixels | None = None,
 ) -> Pixels:
-    """Render `rays`, R of them, in rounds, so that few samples are evaluated behind the early stop.
-
-    A round takes the next few samples of the rays that are still open, evaluates and composites
-    them, and drops the rays that have ended. Values are not composited on a background.
+    """Render `rays`, R of them. Values are not composited on a background.
 
     Args:
         carry: what lies in front of the windows of `how`; changed in place and returned.
     """
     device = rays.origins.device
     canvas = carry or Pixels.blank(len(rays.origins), field.channels, device)
+    render = _in_rounds if compacts(device) else _at_once
+    render(field, rays, occupancy, probe, how, canvas)
+    return canvas
+
+
+def _in_rounds(
+    field: Field, rays: Rays, occupancy: Occupancy, probe: Probe, how: March, canvas: Pixels
+) -> None:
+    """Render into `canvas` so that few samples are evaluated behind the early stop.
+
+    A round takes the next few samples of the rays that are still open, evaluates and composites
+    them, and drops the rays that have ended.
+    """
+    device = rays.origins.device
     for first in range(0, len(rays.origins), CHUNK_RAYS):
         open_ = torch.arange(first, min(first + CHUNK_RAYS, len(rays.origins)), device=device)
         start = torch.zeros(len(open_), dtype=torch.int32, device=device)
@@ -65,9 +79,52 @@ def render_rays(
                 )
                 canvas.put(open_, pixels)
                 left = (samples.resume >= 0) & (1 - pixels.alpha > how.stop)
-                left = left.nonzero().squeeze(1)  # once: a GPU is waited for
+                left = left.nonzero().squeeze(1)
                 open_, start = open_[left], samples.resume[left]
-    return canvas
+
+
+def _at_once(
+    field: Field, rays: Rays, occupancy: Occupancy, probe: Probe, how: March, canvas: Pixels
+) -> None:
+    """Render into `canvas` so that the host waits once, for the numbers of samples of all chunks.
+
+    Every sample is evaluated, also where it is hidden or faint: only a GPU knows which are, and it
+    evaluates them sooner than it tells. So the work is that of one round of all samples.
+    """
+    window, backend = how.window, field.backend
+    with probe.stage("march"):
+        sizes = extents(rays, occupancy, how.step, CHUNK_RAYS, window=window, backend=backend)
+    for number, extent in enumerate(sizes):
+        chunk = slice(number * CHUNK_RAYS, (number + 1) * CHUNK_RAYS)
+        with probe.stage("march"):
+            some = rays.take(chunk)
+            samples = march(
+                some,
+                occupancy,
+                how.step,
+                window=None if window is None else window[chunk],
+                extent=extent,
+                backend=backend,
+            )
+        probe.count("samples", extent.total)
+        probe.count("shaded_samples", extent.total, extent.total)
+        field.count(probe, extent.total, extent.total)
+        front = canvas.take(chunk)
+        with probe.stage("field"):
+            encoded = field.encode_directions(some.directions)
+            pieces = zip(
+                samples.positions.split(CHUNK_SAMPLES),
+                samples.ray.split(CHUNK_SAMPLES),
+                strict=True,
+            )
+            found = [query(field, positions, ray, encoded) for positions, ray in pieces]
+            sigma, values = (torch.cat(column) for column in zip(*found, strict=True))
+            through = 1 - front.alpha
+            weight = weights(sigma, samples, stop=how.stop, front=through, backend=backend)
+            values = torch.where((weight > how.least_weight)[:, None], values, 0)
+        with probe.stage("composite"):
+            pixels = composite(sigma, values, samples, stop=how.stop, carry=front, backend=backend)
+            canvas.put(chunk, pixels)
 
 
 def _evaluated(

@@ -130,12 +130,10 @@ class FieldTraining(PixelTraining):
         positions, directions = self._places()
         loss = self._difference(positions, directions)
         loss.backward()
-        value = loss.item()
-        if not math.isfinite(value):
-            loop.check_finite(self, {"loss": loss})
+        errors = loop.look(self, {"": loss}, {"loss": loss})
         self._update()
         self.step += 1
-        return {"": value}
+        return errors
 
     def _places(self) -> tuple[Tensor, Tensor]:
         """Random points [S, 3] of occupied cells, and directions [S, 3] to see them in."""

@@ -8,11 +8,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 from bench.sharing import missing
 from bench.types import Log, SteerbenchError
 from methods.training import checkpoint
+
+LOOK_EVERY = 10
+"""Steps of which a GPU tells the errors of one: the host would wait for each of them."""
 
 CHECKPOINT_S = 20.0
 """Seconds between checkpoints: what a killed training loses at most."""
@@ -34,7 +38,7 @@ class Training(Protocol):
     advice: str
 
     def advance(self) -> Mapping[str, float]:
-        """One step; the mean squared errors to show, by label ("" for the main one)."""
+        """One step; the mean squared errors to show, by label ("" for the main one); see `look`."""
 
     def watched(self) -> Mapping[str, Tensor]:
         """What must be finite in a good state."""
@@ -101,7 +105,7 @@ def _drive(
         progress.advance(training.step, note="compiling kernels")  # on their first use ever
         while training.step < training.steps:
             errors = training.advance()
-            means = {k: 0.99 * means.get(k, mse) + 0.01 * mse for k, mse in errors.items()}
+            means |= {k: 0.99 * means.get(k, mse) + 0.01 * mse for k, mse in errors.items()}
             progress.advance(note=", ".join(f"{k} {_db(mse)}".strip() for k, mse in means.items()))
             training.seconds = time.monotonic() - began
             for path, step in marks.items():
@@ -132,6 +136,23 @@ def resume(training: Training, path: Path) -> None:
     with checkpoint.restoring(path):
         training.restore(tensors, figures)
         training.step, training.seconds = int(figures["step"]), figures["seconds"]
+
+
+def look(
+    training: Training, errors: Mapping[str, Tensor], tensors: Mapping[str, Tensor]
+) -> dict[str, float]:
+    """The `errors` of a step as numbers; nothing for most steps on a GPU, see `LOOK_EVERY`.
+
+    Raises:
+        SteerbenchError: an error is not finite; it names which of `tensors` are not.
+    """
+    together = torch.stack([error.detach() for error in errors.values()])
+    if together.device.type != "cpu" and training.step % LOOK_EVERY:
+        return {}
+    values = together.tolist()
+    if not all(map(math.isfinite, values)):
+        check_finite(training, tensors)
+    return dict(zip(errors, values, strict=True))
 
 
 def check_finite(training: Training, more: Mapping[str, Tensor] | None = None) -> None:

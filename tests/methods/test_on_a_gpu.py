@@ -33,7 +33,7 @@ from methods.instant_ngp.training import FieldTraining, TrainingOptions
 from methods.kernels import availability
 from methods.kernels.composite import composite
 from methods.kernels.encode import HashGrid, encode
-from methods.kernels.march import Occupancy, march
+from methods.kernels.march import Occupancy, longest_ray, march
 from methods.kernels.splat import splat
 from methods.kilonerf.method import KiloNerf
 from methods.kilonerf.training import Lessons as KiloLessons
@@ -161,10 +161,10 @@ def scene(ball_scene: Scene) -> Scene:
 
 
 @pytest.fixture(autouse=True)
-def few_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of long rays through a field that has hardly learned anything; and as few runs of a network
-    before it is recorded."""
-    monkeypatch.setattr(rays, "ROUND_SAMPLES", 64)
+def one_round(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of whole rays, as on a GPU, so that the sums have the same groups; and as few runs of a
+    network before it is recorded."""
+    monkeypatch.setattr(rays, "ROUND_SAMPLES", longest_ray(STAGE1.march.step))
     monkeypatch.setattr(cuda_graphs, "WARM_UP", 1)
     monkeypatch.setattr(TorchEngine, "samples", lambda engine, network: 1)
 

@@ -14,16 +14,16 @@ def sparse_adam_(
     table: Tensor, grad: Tensor, state: AdamState, rate: float, packed: Tensor | None
 ) -> None:
     """See `methods.kernels.adam.sparse_adam_`."""
-    touched = (grad != 0).any(dim=-1).nonzero().squeeze(-1)
-    gradient = grad[touched]
-    state.steps[touched] += 1
-    steps = state.steps[touched, None].to(table.dtype)
-    first = BETAS[0] * state.first[touched] + (1 - BETAS[0]) * gradient
-    second = BETAS[1] * state.second[touched] + (1 - BETAS[1]) * gradient * gradient
-    state.first[touched], state.second[touched] = first, second
+    touched = (grad != 0).any(dim=-1, keepdim=True)  # not a list: a GPU would be waited for
+    state.steps += touched.squeeze(-1)
+    steps = state.steps[:, None].to(table.dtype)
+    first = BETAS[0] * state.first + (1 - BETAS[0]) * grad
+    second = BETAS[1] * state.second + (1 - BETAS[1]) * grad * grad
     unbiased = first / (1 - BETAS[0] ** steps)
     scale = (second / (1 - BETAS[1] ** steps)).sqrt() + EPS
-    table[touched] -= rate * unbiased / scale
+    table.copy_(torch.where(touched, table - rate * unbiased / scale, table))
+    state.first.copy_(torch.where(touched, first, state.first))
+    state.second.copy_(torch.where(touched, second, state.second))
     grad.zero_()
     if packed is not None:
-        packed[touched] = pack(table[touched])
+        packed.copy_(torch.where(touched.squeeze(-1), pack(table), packed))

@@ -6,10 +6,11 @@ values = sum w_i f_i,  depth_sum = sum w_i t_i,  alpha = sum w_i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from bench.types import check_shape
 from methods.kernels.dispatch import implementation
@@ -25,6 +26,26 @@ def check_stop(stop: float) -> None:
 
 
 @dataclass(frozen=True)
+class Extent:
+    """How many samples some rays have, as the host knows it.
+
+    Attributes:
+        total: of all rays.
+        longest: of the ray that has the most.
+    """
+
+    total: int
+    longest: int
+
+    @classmethod
+    def of_each(cls, counts: Tensor) -> list[Extent]:
+        """Of rays with `counts` [G, R] samples, group by group. The host waits for a GPU, once."""
+        counts = functional.pad(counts, (0, 1))  # for a group without rays
+        sizes = torch.stack((counts.sum(dim=1), counts.amax(dim=1)), dim=1)
+        return [cls(*size) for size in sizes.tolist()]
+
+
+@dataclass(frozen=True)
 class Intervals:
     """Where samples lie on R rays, ray by ray, front to back.
 
@@ -32,17 +53,21 @@ class Intervals:
         t: [S] position along the ray (z-depth for rays of `bench.cameras.cast`).
         delta: [S] length of the interval a sample represents, scene units.
         offsets: [R + 1] int64, ray r owns samples offsets[r] to offsets[r + 1].
+        longest: samples of the ray that has the most; None: only `offsets` knows.
     """
 
     t: Tensor
     delta: Tensor
     offsets: Tensor
+    longest: int | None = field(default=None, kw_only=True)
 
-    def first_of_each(self, counts: Tensor) -> tuple[Tensor, Tensor]:
-        """The first `counts` [R] samples of each ray, as indices, and their own `offsets`."""
+    def first_of_each(self, counts: Tensor) -> tuple[Tensor, Tensor, int]:
+        """The first `counts` [R] samples of each ray, as indices, and their own `offsets` and
+        `longest`."""
+        (extent,) = Extent.of_each(counts[None])
         offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
-        shift = (self.offsets - offsets)[:-1].repeat_interleave(counts)
-        return torch.arange(len(shift), device=shift.device) + shift, offsets
+        shift = (self.offsets - offsets)[:-1].repeat_interleave(counts, output_size=extent.total)
+        return torch.arange(extent.total, device=shift.device) + shift, offsets, extent.longest
 
 
 @dataclass(frozen=True)
@@ -62,11 +87,11 @@ class Pixels:
             torch.zeros(rays, device=device),
         )
 
-    def take(self, index: Tensor) -> Pixels:
+    def take(self, index: Tensor | slice) -> Pixels:
         """The rays at `index`."""
         return Pixels(self.values[index], self.depth_sum[index], self.alpha[index])
 
-    def put(self, index: Tensor, pixels: Pixels) -> None:
+    def put(self, index: Tensor | slice, pixels: Pixels) -> None:
         """Replace, in place, the rays at `index`."""
         self.values[index] = pixels.values
         self.depth_sum[index] = pixels.depth_sum

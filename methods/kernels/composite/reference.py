@@ -12,7 +12,7 @@ def composite(
     sigma: Tensor, values: Tensor, intervals: Intervals, stop: float, carry: Pixels | None
 ) -> Pixels:
     """See `methods.kernels.composite.composite`."""
-    slots = _padded_rays(intervals.offsets)
+    slots = _padded_rays(intervals)
     front = sigma.new_ones(len(slots[0])) if carry is None else 1 - carry.alpha
     weight = _padded_weights(sigma, intervals.delta, slots, stop, front)
     rays = Pixels(
@@ -29,23 +29,30 @@ def composite(
 
 def weights(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> Tensor:
     """See `methods.kernels.composite.weights`."""
-    slots = _padded_rays(intervals.offsets)
-    return _padded_weights(sigma, intervals.delta, slots, stop, front)[slots[0]]
+    slots, starts = _padded_rays(intervals), intervals.offsets[:-1]
+    weight = _padded_weights(sigma, intervals.delta, slots, stop, front)
+    ray = torch.arange(len(starts), device=sigma.device).repeat_interleave(
+        intervals.offsets.diff(), output_size=len(sigma)
+    )
+    return weight[ray, torch.arange(len(sigma), device=sigma.device) - starts[ray]]
 
 
 def visible_counts(sigma: Tensor, intervals: Intervals, stop: float) -> Tensor:
     """See `methods.kernels.composite.visible_counts`."""
-    present, index = _padded_rays(intervals.offsets)
+    present, index = _padded_rays(intervals)
     if not len(sigma):
         return intervals.offsets.diff()
     tau = torch.where(present, _thickness(sigma, intervals.delta)[index], 0)
     return ((_transmittance(tau) > stop) & present).sum(dim=1)
 
 
-def _padded_rays(offsets: Tensor) -> tuple[Tensor, Tensor]:
+def _padded_rays(intervals: Intervals) -> tuple[Tensor, Tensor]:
     """Which of [R, N] slots hold a sample, N of the longest ray, and which sample (0 elsewhere)."""
+    offsets, longest = intervals.offsets, intervals.longest
     counts = offsets.diff()
-    slot = torch.arange(int(counts.max()) if len(counts) else 0, device=offsets.device)
+    if longest is None:
+        longest = int(counts.max()) if len(counts) else 0
+    slot = torch.arange(longest, device=offsets.device)
     present = slot < counts[:, None]
     return present, torch.where(present, offsets[:-1, None] + slot, 0)
 

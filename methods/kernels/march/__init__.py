@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench.types import Rays, check_shape
-from methods.kernels.composite import Intervals
+from methods.kernels.composite import Extent, Intervals
 from methods.kernels.dispatch import implementation
 
 MAX_SAMPLES = 1024
@@ -67,6 +67,11 @@ class Occupancy:
     def words(self) -> Tensor:
         """One bit a cell, one int64 word a brick: [G/4, G/4, G/4]."""
         return _pack_bricks(self.cells)
+
+    @cached_property
+    def bricks(self) -> Tensor:
+        """Where the bricks with anything in them are, in bricks: [B, 3]."""
+        return self.words.nonzero()
 
     @cached_property
     def clearance(self) -> Tensor:
@@ -121,7 +126,7 @@ class Samples(Intervals):
 
     def front(self, counts: Tensor) -> Samples:
         """Only the first `counts` [R] samples of each ray, which then has no more."""
-        kept, offsets = self.first_of_each(counts)
+        kept, offsets, longest = self.first_of_each(counts)
         return Samples(
             self.t[kept],
             self.delta[kept],
@@ -129,6 +134,7 @@ class Samples(Intervals):
             self.ray[kept],
             self.positions[kept],
             torch.full_like(self.resume, -1),
+            longest=longest,
         )
 
 
@@ -148,11 +154,6 @@ class Segments:
     jitter: Tensor
     start: Tensor
 
-    def take(self, index: slice) -> Segments:
-        """Those at `index`."""
-        rays = Rays(self.rays.origins[index], self.rays.directions[index])
-        return Segments(rays, self.window[index], self.jitter[index], self.start[index])
-
 
 def march(
     rays: Rays,
@@ -163,6 +164,7 @@ def march(
     jitter: Tensor | None = None,
     start: Tensor | None = None,
     limit: int | None = None,
+    extent: Extent | None = None,
     backend: str = "auto",
 ) -> Samples:
     """Sample R `rays` inside the unit cube. Not differentiable.
@@ -177,7 +179,43 @@ def march(
         start: [R] int32 step to begin with, `Samples.resume` of an earlier call with the same rays;
             a negative one ends the ray; None: 0.
         limit: at most so many samples a ray; None: all.
+        extent: how many samples there are, of `extents`: a GPU is not waited for then.
     """
+    segments = _segments(rays, step, window, jitter, start)
+    if limit is None:
+        limit = longest_ray(step)
+    if limit < 1:
+        raise ValueError(f"limit: expected 1 or more, got {limit}")
+    kernel = implementation("march", backend, rays.origins.device)
+    return kernel.march(segments, occupancy, step, limit, extent)
+
+
+def extents(
+    rays: Rays,
+    occupancy: Occupancy,
+    step: float,
+    size: int,
+    *,
+    window: Tensor | None = None,
+    backend: str = "auto",
+) -> list[Extent]:
+    """How many samples `march` finds for the first `size` of R `rays`, for the next, and so on. The
+    host waits for a GPU, once."""
+    segments = _segments(rays, step, window, None, None)
+    kernel = implementation("march", backend, rays.origins.device)
+    counts = kernel.count(segments, occupancy, step)
+    return Extent.of_each(functional.pad(counts, (0, -len(counts) % size)).view(-1, size))
+
+
+def longest_ray(step: float) -> int:
+    """No ray has more samples: those of the cube's diagonal, and what rounding adds."""
+    return math.ceil(math.sqrt(3) / step) + 1
+
+
+def _segments(
+    rays: Rays, step: float, window: Tensor | None, jitter: Tensor | None, start: Tensor | None
+) -> Segments:
+    """What `march` is given, checked, and its defaults."""
     origins, count = rays.origins, len(rays.origins)
     check_shape("origins", origins, None, 3)
     check_shape("directions", rays.directions, count, 3)
@@ -193,9 +231,4 @@ def march(
     check_shape("start", start, count)
     if not step > 0:
         raise ValueError(f"step: expected a positive length, got {step}")
-    if limit is None:
-        limit = math.ceil(math.sqrt(3) / step) + 1  # the cube's diagonal, and what rounding adds
-    if limit < 1:
-        raise ValueError(f"limit: expected 1 or more, got {limit}")
-    segments = Segments(rays, window, jitter, start)
-    return implementation("march", backend, origins.device).march(segments, occupancy, step, limit)
+    return Segments(rays, window, jitter, start)

@@ -12,9 +12,11 @@ import math
 import numpy as np
 import torch
 from numba import njit, prange
+from torch import Tensor
 
+from methods.kernels.composite import Extent
 from methods.kernels.cpu import f32, slope
-from methods.kernels.march import Occupancy, Samples, Segments
+from methods.kernels.march import Occupancy, Samples, Segments, longest_ray
 
 CHUNK = 64  # rays
 f64 = np.float64
@@ -22,7 +24,18 @@ INF = f32(np.inf)
 UNIT_CUBE = np.array([[0, 0, 0], [1, 1, 1]], np.float32)
 
 
-def march(segments: Segments, occupancy: Occupancy, step: float, limit: int) -> Samples:
+def count(segments: Segments, occupancy: Occupancy, step: float) -> Tensor:
+    """How many samples a ray has, [R] int64."""
+    return march(segments, occupancy, step, longest_ray(step)).offsets.diff()
+
+
+def march(
+    segments: Segments,
+    occupancy: Occupancy,
+    step: float,
+    limit: int,
+    extent: Extent | None = None,
+) -> Samples:
     """See `methods.kernels.march.march`."""
     origins, directions = (
         x.contiguous() for x in (segments.rays.origins, segments.rays.directions)
@@ -30,7 +43,7 @@ def march(segments: Segments, occupancy: Occupancy, step: float, limit: int) -> 
     if origins.dtype != torch.float32:
         raise ValueError(f"backend 'cpu' marches float32, got {origins.dtype}")
     rays = len(origins)
-    most = min(limit, math.ceil(math.sqrt(3) / step) + 1)
+    most = min(limit, longest_ray(step))
     scratch = torch.empty(-(-rays // CHUNK) * CHUNK * most)
     counts = torch.empty(rays, dtype=torch.int64)
     resume = torch.empty(rays, dtype=torch.int32)

@@ -6,13 +6,24 @@ write them.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import triton
 import triton.language as tl
+from torch import Tensor
 
+from methods.kernels.composite import Extent
 from methods.kernels.dispatch import interpreted
 from methods.kernels.gpu import check_types, launch
-from methods.kernels.march import BRICK, PARALLEL, Occupancy, Samples, Segments
+from methods.kernels.march import (
+    BRICK,
+    PARALLEL,
+    Occupancy,
+    Samples,
+    Segments,
+    longest_ray,
+)
 from methods.kernels.march.reference import clip
 
 BLOCK = 128 if interpreted() else 32
@@ -20,37 +31,67 @@ BLOCK = 128 if interpreted() else 32
 long for many as for few."""
 
 
-def march(segments: Segments, occupancy: Occupancy, step: float, limit: int) -> Samples:
+def count(segments: Segments, occupancy: Occupancy, step: float) -> Tensor:
+    """How many samples a ray has, [R] int64."""
+    counts, _ = _counted(_arguments(segments, occupancy, step, longest_ray(step)))
+    return counts
+
+
+def march(
+    segments: Segments,
+    occupancy: Occupancy,
+    step: float,
+    limit: int,
+    extent: Extent | None = None,
+) -> Samples:
     """See `methods.kernels.march.march`."""
+    arguments = _arguments(segments, occupancy, step, limit)
+    counts, resume = _counted(arguments)
+    if extent is None:
+        (extent,) = Extent.of_each(counts[None])
+    device, total = counts.device, extent.total
+    offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
+    ray = torch.empty(total, dtype=torch.int32, device=device)
+    t, positions = (torch.empty(*shape, device=device) for shape in ((total,), (total, 3)))
+    _launch(arguments, counts, resume, offsets, ray, t, positions)
+    delta = torch.full_like(t, step)
+    return Samples(t, delta, offsets, ray, positions, resume, longest=extent.longest)
+
+
+def _arguments(segments: Segments, occupancy: Occupancy, step: float, limit: int) -> list[Any]:
+    """What `_march` is given of rays and grid; the last is R."""
     origins, directions = segments.rays.origins, segments.rays.directions
     window, jitter, start = segments.window, segments.jitter, segments.start
     check_types(torch.float32, origins=origins, directions=directions, window=window, jitter=jitter)
-    rays, device = len(origins), origins.device
     near, far, step_t, alive = clip(segments.rays, step, window[:, 1])
     parallel = directions.abs() < PARALLEL
     slopes = torch.where(parallel, 0, 1 / torch.where(parallel, 1, directions))
-    counts = torch.zeros(rays, dtype=torch.int64, device=device)
-    resume = torch.full((rays,), -1, dtype=torch.int32, device=device)
     # Where a ray is not in the cube a window changes nothing, and may be far beyond any integer.
     lowest = torch.minimum(torch.maximum(window[:, 0], near), far)
     given = (origins, directions, slopes, near, far, step_t, lowest, jitter)
-    arguments = [
+    return [
         *(x.contiguous() for x in given),
         torch.where(alive, start, -1).int(),
         occupancy.words,
         occupancy.clearance,
         occupancy.resolution // BRICK,
         limit,
-        rays,
+        len(origins),
     ]
-    grid, options = (triton.cdiv(rays, BLOCK),), {"BLOCK": BLOCK, "num_warps": 1}
-    launch(_march, grid, *arguments, counts, resume, None, None, None, None, **options)
-    offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
-    total = int(offsets[-1])
-    ray = torch.empty(total, dtype=torch.int32, device=device)
-    t, positions = (torch.empty(*shape, device=device) for shape in ((total,), (total, 3)))
-    launch(_march, grid, *arguments, counts, resume, offsets, ray, t, positions, **options)
-    return Samples(t, torch.full_like(t, step), offsets, ray, positions, resume)
+
+
+def _counted(arguments: list[Any]) -> tuple[Tensor, Tensor]:
+    """How many samples a ray has, and where it resumes, [R] each."""
+    origins, rays = arguments[0], arguments[-1]
+    counts = torch.zeros(rays, dtype=torch.int64, device=origins.device)
+    resume = torch.full((rays,), -1, dtype=torch.int32, device=origins.device)
+    _launch(arguments, counts, resume, None, None, None, None)
+    return counts, resume
+
+
+def _launch(arguments: list[Any], *outputs: Tensor | None) -> None:
+    grid = (triton.cdiv(arguments[-1], BLOCK),)
+    launch(_march, grid, *arguments, *outputs, BLOCK=BLOCK, num_warps=1)
 
 
 @triton.jit

@@ -2,52 +2,99 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from bench.types import Rays
-from methods.kernels.march import PARALLEL, Occupancy, Samples, Segments
+from methods.kernels.composite import Extent
+from methods.kernels.march import PARALLEL, Occupancy, Samples, Segments, longest_ray
 
 BLOCK = 1 << 12
 """Rays whose steps are tested at once: [BLOCK, 1024, 3] positions are 50 MB."""
 
 
-def march(segments: Segments, occupancy: Occupancy, step: float, limit: int) -> Samples:
-    """See `methods.kernels.march.march`."""
-    rays = len(segments.start)
+def count(segments: Segments, occupancy: Occupancy, step: float) -> Tensor:
+    """How many samples a ray has, [R] int64."""
     parts = [
-        _march_block(segments.take(slice(first, first + BLOCK)), occupancy, step, limit)
-        for first in range(0, max(rays, 1), BLOCK)
+        counts for _, counts, _ in _Steps.of(segments, step).taken(occupancy, longest_ray(step))
     ]
-    t, positions, per_ray, resume = (torch.cat(column) for column in zip(*parts, strict=True))
-    ray = torch.arange(rays, device=t.device).repeat_interleave(per_ray, output_size=len(t))
-    offsets = torch.cat((per_ray.new_zeros(1), per_ray.cumsum(dim=0)))
-    return Samples(t, torch.full_like(t, step), offsets, ray.int(), positions, resume)
+    return torch.cat(parts)
 
 
-def _march_block(
-    segments: Segments, occupancy: Occupancy, step: float, limit: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """t [S] and positions [S, 3] of the samples, how many a ray has [R], where to resume [R]."""
-    origins, directions = segments.rays.origins, segments.rays.directions
-    window, start = segments.window, segments.start
-    near, far, step_t, alive = clip(segments.rays, step, window[:, 1])
-    alive &= start >= 0
-    count = torch.where(alive, (far - near) / step_t, 0).ceil().clamp(min=0)
-    k = torch.arange(int(count.max()) if len(count) else 0, device=origins.device)
-    t = near[:, None] + (k + segments.jitter[:, None]) * step_t[:, None]  # [R, K]
-    positions = origins[:, None] + t[..., None] * directions[:, None]  # [R, K, 3]
-    candidate = alive[:, None] & (t >= window[:, :1]) & (t < far[:, None]) & (k >= start[:, None])
-    candidate &= occupancy.holds(torch.where(candidate[..., None], positions, 0))
+def march(
+    segments: Segments,
+    occupancy: Occupancy,
+    step: float,
+    limit: int,
+    extent: Extent | None = None,
+) -> Samples:
+    """See `methods.kernels.march.march`."""
+    steps = _Steps.of(segments, step)
+    parts = zip(*steps.taken(occupancy, limit), strict=True)
+    kept, counts, resume = (torch.cat(column) for column in parts)
+    if extent is None:
+        (extent,) = Extent.of_each(counts[None])
+    place = torch.nonzero_static(kept.flatten(), size=extent.total).squeeze(1)
+    ray, k = place // max(steps.most, 1), place % max(steps.most, 1)
+    t, positions = steps.at(ray, k)
+    offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
+    delta = torch.full_like(t, step)
+    return Samples(t, delta, offsets, ray.int(), positions, resume, longest=extent.longest)
 
-    rank = candidate.cumsum(dim=1)
-    kept = candidate & (rank <= limit)
-    per_ray = kept.sum(dim=1)
-    full = (per_ray == limit) & (per_ray > 0)
-    last = (kept * (k + 1)).amax(dim=1) if len(k) else per_ray
-    place = kept.flatten().nonzero().squeeze(1)
-    resume = torch.where(full, last, -1).int()
-    return t.flatten()[place], positions.flatten(0, 1)[place], per_ray, resume
+
+@dataclass(frozen=True)
+class _Steps:
+    """The steps of R rays; see `clip`. No ray has more than `most`."""
+
+    segments: Segments
+    near: Tensor
+    far: Tensor
+    length: Tensor
+    alive: Tensor
+    most: int
+
+    @classmethod
+    def of(cls, segments: Segments, step: float) -> _Steps:
+        near, far, length, alive = clip(segments.rays, step, segments.window[:, 1])
+        alive &= segments.start >= 0
+        most = longest_ray(step)
+        if alive.device.type == "cpu":  # a GPU would have to be waited for
+            count = torch.where(alive, (far - near) / length, 0).ceil()
+            most = int(functional.pad(count, (0, 1)).max())
+        return cls(segments, near, far, length, alive, most)
+
+    def at(self, ray: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
+        """t [...] and positions [..., 3] of the steps `k` of the rays `ray`."""
+        rays = self.segments.rays
+        t = self.near[ray] + (k + self.segments.jitter[ray]) * self.length[ray]
+        return t, rays.origins[ray] + t[..., None] * rays.directions[ray]
+
+    def taken(self, occupancy: Occupancy, limit: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        """Of the next rays: which of their steps are samples [R, most] bool, how many a ray has
+        [R], where to resume [R]."""
+        rays = torch.arange(len(self.near), device=self.near.device)
+        k = torch.arange(self.most, device=self.near.device)
+        for ray in rays.split(BLOCK):
+            yield self._taken(ray[:, None], k, occupancy, limit)
+
+    def _taken(
+        self, ray: Tensor, k: Tensor, occupancy: Occupancy, limit: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        t, positions = self.at(ray, k)  # [R, K], [R, K, 3]
+        candidate = self.alive[ray] & (t >= self.segments.window[ray, 0]) & (t < self.far[ray])
+        candidate &= k >= self.segments.start[ray]
+        candidate &= occupancy.holds(torch.where(candidate[..., None], positions, 0))
+
+        rank = candidate.cumsum(dim=1)
+        kept = candidate & (rank <= limit)
+        per_ray = kept.sum(dim=1)
+        full = (per_ray == limit) & (per_ray > 0)
+        last = (kept * (k + 1)).amax(dim=1) if len(k) else per_ray
+        return kept, per_ray, torch.where(full, last, -1).int()
 
 
 def clip(rays: Rays, step: float, farthest: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -130,7 +130,7 @@ class Crossings(Intervals):
 
     def front(self, counts: Tensor) -> Crossings:
         """Only the first `counts` [R] of each ray, which then has no more."""
-        kept, offsets = self.first_of_each(counts)
+        kept, offsets, longest = self.first_of_each(counts)
         return Crossings(
             self.t[kept],
             self.delta[kept],
@@ -140,6 +140,7 @@ class Crossings(Intervals):
             self.ray[kept],
             self.voxel[kept],
             torch.full_like(self.resume, torch.inf),
+            longest=longest,
         )
 
 
