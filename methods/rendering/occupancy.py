@@ -98,8 +98,11 @@ class DensityGrid:
         cells = self._draw(samples, generator)
         found = torch.full_like(self.density.view(-1), -1.0)
         for part in cells.split(CHUNK):
-            side = RESOLUTION  # not unravel_index: it asks for the largest, and a GPU is waited for
-            corner = torch.stack((part // side**2, part // side % side, part % side), dim=-1)
+            # As `torch.unravel_index`, which asks for the largest: a GPU would be waited for.
+            rows, columns = self.density.shape[1:]
+            corner = torch.stack(
+                (part // (rows * columns), part // columns % rows, part % columns), dim=-1
+            )
             jitter = torch.rand(len(part), 3, generator=generator, device=part.device)
             sigma, _ = field.density((corner + jitter) / RESOLUTION)
             found.scatter_reduce_(0, part, sigma.clamp(max=LARGEST), "amax")

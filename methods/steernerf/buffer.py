@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,9 +10,18 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.cameras import pack_camera, pixel_grid, place_camera, project, unpack_camera, unproject
+from bench.cameras import (
+    pack_camera,
+    pixel_grid,
+    place_camera,
+    project,
+    unpack_camera,
+    unproject,
+    within,
+)
 from bench.types import Camera
 from methods.kernels.splat import splat
+from methods.rendering.compaction import worth
 from methods.rendering.frame import FeatureFrame
 from methods.steernerf.options import Reprojection
 from methods.training.checkpoint import part
@@ -32,6 +40,9 @@ CLOUD = ("source", "points", "values", "alpha")
 @dataclass(frozen=True)
 class Cloud:
     """The pixels of a low-resolution frame that show something, as points in the scene.
+
+    On a GPU they are all pixels (`rendering.compaction`), and a point that shows nothing lies
+    nowhere: its coordinates are NaN, and no view sees it.
 
     Attributes:
         camera: of the frame.
@@ -55,8 +66,9 @@ class Cloud:
             source = torch.arange(len(alpha), device=alpha.device)
             depth = torch.where(alpha > 0, depth.nan_to_num(posinf=0) * alpha, 0) + 1e-12
         else:
-            source = ((alpha > SPLAT_ALPHA) & depth.isfinite()).nonzero().squeeze(1)
-            depth = depth[source]
+            clear = (alpha > SPLAT_ALPHA) & depth.isfinite()
+            source = worth(clear)
+            depth = torch.where(clear, depth, torch.nan)[source]
         camera = frame.camera
         centres = pixel_grid(camera.width, camera.height, alpha.device)[source]
         if how.centres == "paper":
@@ -67,10 +79,11 @@ class Cloud:
 
     def expected(self) -> Cloud:
         """Of a cloud of sums w t: its points at the depths sum w t / sum w, without the faint."""
-        clear = (self.alpha > SPLAT_ALPHA).nonzero().squeeze(1)
-        alpha, centre = self.alpha[clear], self.camera.c2w[:, 3]
-        points = centre + (self.points[clear] - centre) / alpha[:, None]
-        return Cloud(self.camera, self.source[clear], points, self.values[clear], alpha)
+        clear = self.alpha > SPLAT_ALPHA
+        kept, centre = worth(clear), self.camera.c2w[:, 3]
+        alpha = torch.where(clear, self.alpha, torch.nan)[kept]
+        points = centre + (self.points[kept] - centre) / alpha[:, None]
+        return Cloud(self.camera, self.source[kept], points, self.values[kept], alpha)
 
     def splat(self, camera: Camera, how: Reprojection, backend: str) -> tuple[Tensor, Tensor]:
         """Which point each pixel of `camera` shows.
@@ -85,22 +98,25 @@ class Cloud:
         index = splat(pixels, depth, *size, rule=how.rule, backend=backend)  # Eq. 8, Eq. 10
         return index, depth
 
-    def overlap(self, camera: Camera) -> float:
-        """About which share of what this frame shows `camera` can see, 0 to 1.
+    def overlap(self, camera: Camera) -> Tensor:
+        """About which share of what this frame shows `camera` can see, 0 to 1: [], where it lies.
 
         An estimate that takes all surfaces for balls: a point inside the other picture counts
         (1 + cos t) / 2, the share of a ball's disc that a camera at an angle of t sees as well.
         Occlusion is ignored. 0 for a frame that shows nothing.
         """
-        points = self.points[self.alpha > SPLAT_ALPHA]
-        if not len(points):
-            return 0.0
-        points = points[:: math.ceil(len(points) / OVERLAP_POINTS)]
+        clear = self.alpha > SPLAT_ALPHA
+        number = clear.cumsum(dim=0)  # from 1
+        every = (number[-1:] + OVERLAP_POINTS - 1) // OVERLAP_POINTS
+        told = clear & ((number - 1) % every.clamp(min=1) == 0)
+        kept = worth(told)
+        points = self.points[kept]
         pixels, depth = project(camera, points)
-        size = torch.tensor((camera.width, camera.height), device=pixels.device)
-        inside = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
+        inside = told[kept] & (depth > 0) & within(pixels, camera.width, camera.height)
         here, there = (points - view.c2w[:3, 3] for view in (self.camera, camera))
-        return float((inside * (1 + functional.cosine_similarity(here, there, dim=1)) / 2).mean())
+        seen = (1 + functional.cosine_similarity(here, there, dim=1)) / 2
+        share = torch.where(inside, seen, 0).sum() / told.sum()
+        return share.nan_to_num(nan=0.0)
 
 
 @dataclass(frozen=True)

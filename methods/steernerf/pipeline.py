@@ -116,9 +116,10 @@ class Pipeline:
         self, frames: Sequence[Remembered], view: View, rendering: Rendering, probe: Probe
     ) -> Sequence[Remembered]:
         """Those of the preceding `frames` that share enough with `view`."""
-        if rendering.overlap:
+        if frames and (least := rendering.overlap):
             with probe.stage("feature_reprojection"):
-                frames = [f for f in frames if f.cloud.overlap(view.full) >= rendering.overlap]
+                shares = torch.stack([f.cloud.overlap(view.full) for f in frames]).tolist()
+                frames = [f for f, share in zip(frames, shares, strict=True) if share >= least]
         probe.count("preceding_frames", len(frames), self.model.frames)
         return frames
 

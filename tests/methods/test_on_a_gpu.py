@@ -19,6 +19,7 @@ from bench.protocol import EvaluationProtocol
 from bench.run import Task, measure
 from bench.trajectories import from_split
 from bench.types import Budget, Method, NullProbe, Scene, Split
+from bench.waits import device_waits
 from methods.checks import found
 from methods.diver.method import Diver
 from methods.diver.training import Lessons as DiverLessons
@@ -43,6 +44,7 @@ from methods.plenoctree.method import PlenOctree
 from methods.plenoctree.start import Extraction
 from methods.plenoctree.training import OctreeLessons
 from methods.rendering import rays
+from methods.rendering.occupancy import EVERY, STEP
 from methods.steernerf.beyond.lean_renderer import LeanRenderer
 from methods.steernerf.beyond.method import SteerNerfLean
 from methods.steernerf.method import SteerNerf
@@ -53,7 +55,7 @@ from methods.steernerf.training.sequences import MotionOptions
 from methods.steernerf.unet import UNet
 from methods.students.networks import NetworkLessons
 from methods.training import loop
-from tests.methods.conftest import look_at_the_middle
+from tests.methods.conftest import Work, look_at_the_middle
 from tests.methods.models import small_model, small_rendering
 from tests.methods.trainings import killed
 from tests.pretended_gpu import PretendedGpu, pretended_gpu
@@ -164,7 +166,7 @@ def scene(ball_scene: Scene) -> Scene:
 def one_round(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of whole rays, as on a GPU, so that the sums have the same groups; and as few runs of a
     network before it is recorded."""
-    monkeypatch.setattr(rays, "ROUND_SAMPLES", longest_ray(STAGE1.march.step))
+    monkeypatch.setattr(rays, "ROUND_SAMPLES", longest_ray(STEP))
     monkeypatch.setattr(cuda_graphs, "WARM_UP", 1)
     monkeypatch.setattr(TorchEngine, "samples", lambda engine, network: 1)
 
@@ -223,6 +225,38 @@ def test_what_was_trained_at_one_place_goes_on_at_the_other(
     assert second.field.device.type == places[1]
     for name, value in first.result().items():
         assert torch.equal(value.cpu(), second.result()[name].cpu()), name
+
+
+MOST_WAITS = {"ngp": 2, "steernerf": 2, "steernerf_lean": 6}
+
+
+@pytest.mark.parametrize("name", MOST_WAITS)
+def test_a_frame_waits_equally_often_whatever_its_rays(
+    gpu: PretendedGpu, name: str, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    method = fitted(name, "cuda", scene, tmp_path)
+    monkeypatch.setattr(rays, "CHUNK_RAYS", 20)
+    counts, marched = [], []
+    for size in (16, 40):
+        cameras = [scale_camera(c, size, size) for c in scene.splits["test"].cameras]
+        for camera in [cameras[0], *cameras]:  # the last ones have all preceding frames
+            work = Work()
+            with device_waits() as waits:
+                method.render(camera, work)
+        counts.append(waits.total())
+        marched.append(work.done["samples"])
+    assert marched[1] > 4 * marched[0] > 0
+    assert counts[0] == counts[1] <= MOST_WAITS[name]
+
+
+def test_a_step_of_stage_1_waits_less_than_three_times(gpu: PretendedGpu, scene: Scene) -> None:
+    field = HashField(GRID, backend="reference").to("cuda")
+    training = FieldTraining(field, scene, BUDGET, STAGE1, seed=0)
+    training.advance()
+    with device_waits() as waits:
+        for _ in range(2 * EVERY):
+            training.advance()
+    assert waits.total() < 3 * 2 * EVERY
 
 
 def by_triton(device: str) -> list[torch.Tensor]:

@@ -16,16 +16,17 @@ TAPS = 9
 """Neighbours of a cell, itself in the middle, row by row."""
 
 
-def neighbours_of(cells: Tensor) -> Tensor:
+def neighbours_of(cells: Tensor, count: int | None = None) -> Tensor:
     """Which cells lie around each: [N, 9] int32, -1 for none.
 
     Args:
-        cells: [B, h, w] bool, N of them True; cells count from 0, row by row, picture by picture.
+        cells: [B, h, w] bool; cells count from 0, row by row, picture by picture.
+        count: N, how many of them are True; None: a GPU is asked, and waited for.
     """
     check_shape("cells", cells, None, None, None)
     batch, height, width = cells.shape
     number = torch.full((batch, height + 2, width + 2), -1, dtype=torch.int32, device=cells.device)
-    where = cells.nonzero()
+    where = cells.nonzero() if count is None else torch.nonzero_static(cells, size=count)
     picture, row, column = where.unbind(dim=1)
     number[picture, row + 1, column + 1] = torch.arange(
         len(where), dtype=torch.int32, device=cells.device

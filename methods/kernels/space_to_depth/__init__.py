@@ -142,7 +142,8 @@ def space_to_depth(
     inputs.check(layout)
     values, count = inputs.values, len(inputs.cells)
     tent = _tent(layout.scale)
-    taps = (tent[:, None, :, None] * tent[None, :, None, :]).reshape(-1, TAPS).to(values)
+    taps = (tent[:, None, :, None] * tent[None, :, None, :]).reshape(-1, TAPS)
+    taps = taps.to(values.device, values.dtype, non_blocking=True)
     kernel = implementation("space_to_depth", backend, values.device)
     rows = multiple * -(-count // multiple)
     with torch.autocast(values.device.type, enabled=False):

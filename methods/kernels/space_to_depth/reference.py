@@ -82,9 +82,11 @@ def _in_cells(image: Tensor, cells: Tensor, scale: int) -> Tensor:
 
 def _shown(values: Tensor, index: Tensor) -> Tensor:
     """Rows of `values` at `index`, zeros where it is -1."""
-    if wrong := int(((index < -1) | (index >= len(values))).sum()):
+    # Of a GPU the host would have to wait for the number.
+    wrong = (index < -1) | (index >= len(values))
+    if index.device.type == "cpu" and wrong.any():
         raise ValueError(
-            f"index: expected -1 to {len(values) - 1}, got {wrong} entries that are not"
+            f"index: expected -1 to {len(values) - 1}, got {int(wrong.sum())} entries that are not"
         )
     return functional.pad(values, (0, 0, 0, 1))[index.long()]
 

@@ -14,18 +14,23 @@ def splat(pixels: Tensor, depth: Tensor, width: int, height: int, rule: Rule) ->
     # Compared as floats, where every comparison with nan is false: as integers, what is huge or
     # not finite has no defined value.
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    point = (inside & (depth > 0) & (depth < torch.inf)).nonzero()[:, 0]  # [M]
-    pixel = v[point].long() * width + u[point].long()  # not negative: cut off is floor
+    taken = inside & (depth > 0) & (depth < torch.inf)  # [N]
+    # No list of them, for which a GPU would be waited for: the others fall into a bin at the end.
+    bin_ = height * width
+    row, column = (torch.where(taken, x, 0).long() for x in (v, u))  # not negative: this is floor
+    pixel = torch.where(taken, row * width + column, bin_)
     if rule == "nearest":
         for key in (depth, u, v):
-            least = key.new_full((height * width,), torch.inf)
-            least.scatter_reduce_(0, pixel, key[point], "amin")
-            tied = key[point] == least[pixel]
-            point, pixel = point[tied], pixel[tied]
-    index = torch.full((height * width,), -1, dtype=torch.int32, device=pixels.device)
+            key = torch.where(taken, key, torch.inf)
+            least = key.new_full((bin_ + 1,), torch.inf)
+            least.scatter_reduce_(0, pixel, key, "amin")
+            taken &= key == least[pixel]
+            pixel = torch.where(taken, pixel, bin_)
+    index = torch.full((bin_ + 1,), -1, dtype=torch.int32, device=pixels.device)
+    point = torch.arange(len(depth), dtype=torch.int32, device=pixels.device)
     first_or_last = "amin" if rule == "nearest" else "amax"
-    index.scatter_reduce_(0, pixel, point.int(), first_or_last, include_self=False)
-    return index.view(height, width)
+    index.scatter_reduce_(0, pixel, point, first_or_last, include_self=False)
+    return index[:bin_].view(height, width)
 
 
 def gather(values: Tensor, index: Tensor) -> Tensor:

@@ -75,15 +75,18 @@ def warp(
 
 
 def source_from_camera(source: Camera, camera: Camera) -> tuple[Tensor, Tensor]:
-    """M [3, 3], m [3]: homogeneous source pixel = z M (u, v, 1) + m; in float64 on the CPU."""
-    to, of = source.c2w.double().cpu(), camera.c2w.double().cpu()
+    """M [3, 3], m [3]: homogeneous source pixel = z M (u, v, 1) + m; in float64, where the cameras
+    are."""
+    to, of = source.c2w.double(), camera.c2w.double()
     rotation = to[:, :3].T @ of[:, :3]
     offset = to[:, :3].T @ (of[:, 3] - to[:, 3])
-    inside = _intrinsics(source)
-    return inside @ rotation @ _intrinsics(camera).inverse(), inside @ offset
+    inside = _intrinsics(source).to(to.device, non_blocking=True)
+    outside = _intrinsics(camera).inverse().to(to.device, non_blocking=True)
+    return inside @ rotation @ outside, inside @ offset
 
 
 def _intrinsics(camera: Camera) -> Tensor:
+    """[3, 3] on the CPU, from which a GPU takes it without being waited for."""
     return torch.tensor(
         [(camera.fx, 0, camera.cx), (0, camera.fy, camera.cy), (0, 0, 1)], dtype=torch.float64
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from bench.cameras import within
 from methods.kernels.warp import TOLERANCE
 
 
@@ -45,8 +46,7 @@ def warp(
     at = torch.where(known, z, 1)[..., None] * (pixel @ matrix.T) + offset  # [N, s^2, 3]
     known &= at[..., 2] > 0
     position = at[..., :2] / torch.where(known, at[..., 2], 1)[..., None]
-    size = position.new_tensor((picture.shape[1], picture.shape[0]))
-    known &= ((position >= 0) & (position < size)).all(dim=-1)
+    known &= within(position, picture.shape[1], picture.shape[0])
     values = _look_up(picture, torch.where(known[..., None], position, 0)) * known[..., None]
     return values, known.to(values)
 

@@ -149,8 +149,9 @@ class LeanRenderer(Renderer2d):
         """Of all cells, and of as many more as make `rows`, which have none: [R, 9]."""
         size, device = observations[0].frame.alpha.shape, observations[0].cells.device
         active = torch.zeros(len(observations), *size, dtype=torch.bool, device=device)
-        active.view(-1)[number([o.cells for o in observations], size)] = True
-        neighbours = neighbours_of(active)
+        cells = number([o.cells for o in observations], size)
+        active.view(-1).index_fill_(0, cells, True)
+        neighbours = neighbours_of(active, len(cells))
         return functional.pad(neighbours, (0, 0, 0, rows - len(neighbours)), value=-1)
 
     def _paint(self, observations: Sequence[Observation], less: Tensor) -> Tensor:

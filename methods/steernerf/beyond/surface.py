@@ -7,6 +7,7 @@ from torch import Tensor
 
 from bench.cameras import cast, unproject
 from bench.types import Probe
+from methods.rendering.compaction import worth
 from methods.rendering.field import Field, query
 from methods.rendering.occupancy import STEP
 from methods.steernerf.beyond.cells import centres
@@ -25,11 +26,12 @@ def surface_points(
 ) -> Points:
     """Features and opacity, [P, K + 1], of a sample at every pixel of `cells` [N] whose `depth`
     [N, s^2] is finite; differentiable in the field, not in the depth."""
-    known = depth.isfinite().flatten().nonzero().squeeze(1)
+    there = depth.isfinite().flatten()
+    known = worth(there)
     probe.count("surface_samples", len(known), view.full.width * view.full.height)
     field.count(probe, len(known), len(known))
     pixels = centres(cells, view.low.width, scale).flatten(0, 1)[known]
-    points = unproject(view.full, pixels, depth.flatten()[known])
+    points = unproject(view.full, pixels, torch.where(there, depth.flatten(), 0)[known])
     # The pixels of a cell share the view direction of its middle.
     middles = cast(view.low, centres(cells, view.low.width, 1)[:, 0])
     encoded = field.encode_directions(middles.directions)
@@ -41,5 +43,5 @@ def surface_points(
         found.append(torch.cat((values, alpha[:, None]), dim=1))
     index = torch.full(depth.shape, -1, dtype=torch.int32, device=depth.device)
     number = torch.arange(len(points), dtype=torch.int32, device=depth.device)
-    index.view(-1)[known] = number
+    index.view(-1)[known] = torch.where(there[known], number, -1)
     return Points(torch.cat(found), index)

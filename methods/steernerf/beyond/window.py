@@ -14,6 +14,7 @@ from torch.nn import functional
 from bench.types import Camera, Probe, Rays
 from methods.kernels.composite import Pixels
 from methods.kernels.march import Occupancy
+from methods.rendering.compaction import worth
 from methods.rendering.field import Field
 from methods.rendering.frame import Render
 from methods.rendering.march import FAINT, March
@@ -64,8 +65,9 @@ def depths_around(depth: Tensor, epsilon: float) -> Tensor:
     in `depth` [h, w]; [0, inf) where none of them is finite."""
     near = -_highest(-depth)
     far = _highest(torch.where(depth.isfinite(), depth, -torch.inf))
-    window = torch.stack((near - epsilon, far + epsilon), dim=-1)
-    return torch.where(near.isfinite()[..., None], window, window.new_tensor((0.0, torch.inf)))
+    known = near.isfinite()
+    ends = torch.where(known, near - epsilon, 0), torch.where(known, far + epsilon, torch.inf)
+    return torch.stack(ends, dim=-1)
 
 
 def _highest(image: Tensor) -> Tensor:
@@ -82,14 +84,12 @@ def within(
     def render(seen: Tensor, rays: Rays) -> Pixels:
         window, expected = prior.window.view(-1, 2)[seen], prior.alpha.flatten()[seen]
         narrow = window[:, 1].isfinite()
-        inside = narrow.nonzero().squeeze(1)
-        expected = expected[inside]
+        inside = worth(narrow)
+        expected, near = expected[inside], torch.where(narrow[:, None], window, 0)[inside]
         # A stricter limit of what is faint: rays that go on would lack faint samples in front.
-        loose = March(
-            how.step, max(how.stop, 1 - KEPT_ALPHA), window[inside], faint=FAINT * how.stop
-        )
+        loose = March(how.step, max(how.stop, 1 - KEPT_ALPHA), near, faint=FAINT * how.stop)
         first = render_rays(field, rays.take(inside), occupancy, probe, loose)
-        enough = first.alpha >= KEPT_ALPHA * expected
+        enough = narrow[inside] & (first.alpha >= KEPT_ALPHA * expected)
         # Scaled to the expected opacity: the rest looks like what was found.
         more = torch.where(enough & (first.alpha < expected), expected / first.alpha, 1)
         canvas = Pixels.blank(len(seen), first.values.shape[1], field.device)
@@ -97,10 +97,10 @@ def within(
             inside, Pixels(first.values * more[:, None], first.depth_sum * more, first.alpha * more)
         )
         unfinished = torch.ones_like(narrow)
-        unfinished[inside[enough]] = False
-        rest = unfinished.nonzero().squeeze(1)
-        begin = torch.where(narrow, window[:, 1], 0)[rest]
-        behind = how.within(torch.stack((begin, torch.full_like(begin, torch.inf)), dim=1))
+        unfinished[inside] = ~enough
+        rest = worth(unfinished)
+        begin, end = torch.where(narrow, window[:, 1], 0), torch.where(unfinished, torch.inf, 0)
+        behind = how.within(torch.stack((begin, end), dim=1)[rest])
         carry = canvas.take(rest)
         canvas.put(rest, render_rays(field, rays.take(rest), occupancy, probe, behind, carry))
         return canvas

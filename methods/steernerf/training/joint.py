@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import torch
@@ -62,7 +61,8 @@ class RendererTraining:
         self.mean: Renderer2d = self._averaged.module  # type: ignore[assignment]
 
     def advance(self) -> dict[str, float]:
-        """One step; mean squared error of the picture and of the base that it corrects.
+        """One step; mean squared error of the picture and of the base that it corrects; see
+        `loop.look`.
 
         Raises:
             SteerbenchError: the loss is not finite.
@@ -73,16 +73,15 @@ class RendererTraining:
             drawing = self.renderer(batch.observations)
         loss = functional.mse_loss(drawing.pictures, batch.truth)
         (loss + self._error_loss(batch, drawing) + self._field_loss(batch, drawing)).backward()
-        value = loss.item()
-        if not math.isfinite(value):
-            loop.check_finite(self, {"loss": loss, "picture": drawing.pictures})
+        with torch.no_grad():
+            base = functional.mse_loss(self.renderer.base(batch.observations), batch.truth)
+        shown = {"loss": loss, "picture": drawing.pictures}
+        errors = loop.look(self, {"": loss, "base": base}, shown)
         if self.options.clip is not None:
             nn.utils.clip_grad_norm_(self.renderer.parameters(), self.options.clip)
         self._update()
         self.step += 1
-        with torch.no_grad():
-            base = functional.mse_loss(self.renderer.base(batch.observations), batch.truth).item()
-        return {"": value, "base": base}
+        return errors
 
     def _error_loss(self, batch: Batch, drawing: Drawing) -> Tensor | float:
         """How far the estimated errors of the renderer are from the errors it made."""
@@ -198,6 +197,7 @@ class JointTraining(RendererTraining):
         if not len(wanted):
             return 0.0
         some = torch.randperm(len(wanted), generator=self.generator)[: self.options.refined_rays]
+        some = some.to(wanted.device, non_blocking=True)
         pixels, _ = render_batch(
             self.field,
             every.take(some),

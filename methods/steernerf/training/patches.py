@@ -14,8 +14,8 @@ from bench.compositing import composite
 from bench.types import Camera, NullProbe, Rays
 from methods.kernels.composite import Pixels
 from methods.rendering.batch import render_batch
-from methods.rendering.frame import FeatureFrame, rays_at_matter
-from methods.steernerf.buffer import Cloud
+from methods.rendering.compaction import places
+from methods.rendering.frame import FeatureFrame, sees_matter
 from methods.steernerf.renderer import Observation, Points
 from methods.steernerf.training.options import JointOptions
 from methods.steernerf.training.sequences import Sequence, SequencePool
@@ -26,25 +26,32 @@ Through = Literal["all", "present", "none"]
 
 @dataclass(frozen=True)
 class Patch:
-    """A patch of a training view, and the rays of the field that it is drawn from.
+    """A patch of a training view, and which rays of the field it is drawn from.
 
     Attributes:
         sequence: what it was cut from.
         view: its cameras.
         truth: [H, W, 3].
-        seen: [P] pixels of `view.low` whose rays are rendered.
         indices: what each preceding frame shows at its pixels, [H, W].
-        shown: the points of each preceding frame that are seen.
-        rays: of `seen`, then of each of `shown`.
+        masks: which rays are rendered: of the pixels of `view.low` [h w], then, if the field learns
+            from them, of the points [N] of each preceding frame.
     """
 
     sequence: Sequence
     view: View
     truth: Tensor
-    seen: Tensor
     indices: list[Tensor]
-    shown: list[Tensor]
-    rays: list[Rays]
+    masks: list[Tensor]
+
+    def rays(self, chosen: list[Tensor]) -> list[Rays]:
+        """The rays of the `chosen` pixels and points, those where `masks` are true."""
+        clouds = [frame.cloud for frame in self.sequence.buffer.frames]
+        pixels, *points = chosen
+        shown = zip(clouds, points, strict=False)  # no points if the field learns from none
+        return [
+            _rays_of(self.view.low, pixels),
+            *(_rays_of(cloud.camera, cloud.source[some]) for cloud, some in shown),
+        ]
 
 
 @dataclass(frozen=True)
@@ -122,16 +129,14 @@ class PatchSource:
         else:
             top, left = self._random(size[0] - height + 1), self._random(size[1] - width + 1)
         cut = view.crop(left, top, width, height)
-        seen, rays = rays_at_matter(cut.low, self.pipeline.occupancy)
+        seen = sees_matter(cut.low, self.pipeline.occupancy).flatten()
         truth = self._truth(sequence, top, left, cut.full)
-        patch = Patch(sequence, cut, truth, seen, [], [], [rays])
+        patch = Patch(sequence, cut, truth, [], [seen])
         for frame in sequence.buffer.frames:
             index = self.pipeline.reproject(frame.cloud, cut).index
-            shown = index[index >= 0].unique().long()
             patch.indices.append(index)
-            patch.shown.append(shown)
             if self.through == "all":
-                patch.rays.append(_rays_of(frame.cloud, shown))
+                patch.masks.append(_shown(index, len(frame.cloud.points)))
         return patch
 
     def _around_content(
@@ -150,20 +155,23 @@ class PatchSource:
         background = self.pipeline.background[:3]
         rows = slice(top * scale, top * scale + full.height)
         columns = slice(left * scale, left * scale + full.width)
-        part = composite(sequence.truth.picture[rows, columns].to(background.device), background)
+        picture = sequence.truth.picture[rows, columns]
+        part = composite(picture.to(background.device, non_blocking=True), background)
         truth = background.expand(full.height, full.width, 3).clone()
         truth[: part.shape[0], : part.shape[1]] = part
         return truth
 
     def observe(self, patches: list[Patch]) -> tuple[list[Observation], Tensor]:
         """What the renderer is given of `patches`, with the gradient it is to have; opacities."""
-        rays = [rays for patch in patches for rays in patch.rays]
+        found = iter(places([mask for patch in patches for mask in patch.masks]))
+        chosen = [(patch, [next(found) for _ in patch.masks]) for patch in patches]
+        rays = [part for patch, some in chosen for part in patch.rays(some)]
         together = Rays.joined(rays)
         pipeline, count = self.pipeline, len(together.origins)
         device = together.origins.device
         jitter = None
         if self.options.jitter:
-            jitter = torch.rand(count, generator=self.generator).to(device)
+            jitter = torch.rand(count, generator=self.generator).to(device, non_blocking=True)
         with torch.set_grad_enabled(self.through != "none"):
             pixels, _ = render_batch(
                 pipeline.field,
@@ -173,28 +181,34 @@ class PatchSource:
                 jitter=jitter,
             )
             parts = iter(_split(pixels, [len(r.origins) for r in rays]))
-            observations = [self._observation(p, [next(parts) for _ in p.rays]) for p in patches]
+            observations = [
+                self._observation(patch, some, [next(parts) for _ in some])
+                for patch, some in chosen
+            ]
         return observations, pixels.alpha
 
-    def _observation(self, patch: Patch, rendered: list[Pixels]) -> Observation:
-        present, *preceding = rendered
-        frame = self._spread(patch, present)
+    def _observation(
+        self, patch: Patch, chosen: list[Tensor], rendered: list[Pixels]
+    ) -> Observation:
+        """Of the pixels and points that were `chosen` and `rendered`."""
+        (pixels, present), *preceding = zip(chosen, rendered, strict=True)
+        frame = self._spread(patch, pixels, present)
         frames = patch.sequence.buffer.frames
         values = [frame.cloud.values for frame in frames]
-        for age, pixels in enumerate(preceding):
-            rendered_values = pixels.over(self.pipeline.background).values
-            values[age] = values[age].index_copy(0, patch.shown[age], rendered_values)
+        for age, (shown, found) in enumerate(preceding):
+            rendered_values = found.over(self.pipeline.background).values
+            values[age] = values[age].index_copy(0, shown, rendered_values)
         points = [Points(v, i) for v, i in zip(values, patch.indices, strict=True)]
         newest = frames[0] if frames else None
         return self.pipeline.observe(frame, points, newest, patch.view, self.rendering, NullProbe())
 
-    def _spread(self, patch: Patch, pixels: Pixels) -> FeatureFrame:
-        """All pixels of the patch, from those that were rendered."""
+    def _spread(self, patch: Patch, seen: Tensor, pixels: Pixels) -> FeatureFrame:
+        """All pixels of the patch, from those `seen`, which were rendered."""
         low = patch.view.low
 
         def spread(part: Tensor) -> Tensor:
             blank = part.new_zeros(low.height * low.width, *part.shape[1:])
-            return blank.index_copy(0, patch.seen, part)
+            return blank.index_copy(0, seen, part)
 
         canvas = Pixels(spread(pixels.values), spread(pixels.depth_sum), spread(pixels.alpha))
         frame = FeatureFrame.of(low, canvas, self.pipeline.background)
@@ -204,10 +218,15 @@ class PatchSource:
         return int(torch.randint(below, (), generator=self.generator))
 
 
-def _rays_of(cloud: Cloud, points: Tensor) -> Rays:
-    camera = cloud.camera
-    centres = pixel_grid(camera.width, camera.height, points.device)
-    return cast(camera, centres[cloud.source[points]])
+def _shown(index: Tensor, count: int) -> Tensor:
+    """Which of `count` points stand in `index`, -1 for none: [count] bool."""
+    shown = torch.zeros(count + 1, dtype=torch.bool, device=index.device)
+    return shown.index_fill_(0, index.flatten().long() % (count + 1), True)[:count]
+
+
+def _rays_of(camera: Camera, pixels: Tensor) -> Rays:
+    """Rays through the centres of `pixels` [P], counted row by row."""
+    return cast(camera, pixel_grid(camera.width, camera.height, pixels.device)[pixels])
 
 
 def _split(pixels: Pixels, sizes: list[int]) -> list[Pixels]:

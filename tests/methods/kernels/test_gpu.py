@@ -15,10 +15,12 @@ from torch import Tensor
 
 import methods.kernels
 from bench.case import U32, largest_error
+from bench.types import Rays
 from methods.kernels import availability
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import Intervals, composite, visible_counts, weights
 from methods.kernels.encode import HashGrid, encode
+from methods.kernels.march import Occupancy, extents, march
 from methods.kernels.space_to_depth import CellInputs, Layout, space_to_depth
 from methods.kernels.splat import gather, splat
 
@@ -49,6 +51,20 @@ def test_a_table_of_half_precision_gives_features_of_its_type() -> None:
         assert exact.grad is not None
         most = exact.grad.abs().max().item()  # an entry's gradient is a sum of weights
         assert (table.grad - exact.grad).abs().max() <= most * unit + 57 * 6 * U32 * grid.n_max
+
+
+def test_what_is_marched_has_the_extent_that_was_told() -> None:
+    generator = torch.Generator().manual_seed(0)
+    cells = torch.rand(16, 16, 16, generator=generator) < 0.2
+    origins = torch.rand(40, 3, generator=generator) * 3 - 1
+    rays = Rays(origins.to(DEVICE), (0.5 - origins).to(DEVICE))
+    occupancy = Occupancy(cells.to(DEVICE))
+    found = extents(rays, occupancy, 0.02, 30, backend="gpu")
+    counts = march(rays, occupancy, 0.02, backend="reference").offsets.diff().split(30)
+    assert [(x.total, x.longest) for x in found] == [(int(c.sum()), int(c.max())) for c in counts]
+    first = Rays(rays.origins[:30], rays.directions[:30])
+    samples = march(first, occupancy, 0.02, extent=found[0], backend="gpu")
+    assert torch.equal(samples.offsets.diff(), counts[0])
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bench.types import Rays
-from methods.kernels.march import Occupancy, march
+from methods.kernels.march import Occupancy, extents, march
 
 STEP = math.sqrt(3) / 1024
 BACKENDS = ["reference", "cpu"]
@@ -91,6 +91,27 @@ def test_positions_lie_on_their_ray_in_an_occupied_cell(backend: str) -> None:
     cell = (samples.positions * 32).long().clamp(0, 31)
     assert grid.cells[cell[:, 0], cell[:, 1], cell[:, 2]].all()
     assert torch.equal(ray, torch.arange(100).repeat_interleave(samples.offsets.diff()))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_extents_are_those_of_what_is_marched(backend: str) -> None:
+    rays, grid = rays_through_the_cube(50), dust(4)
+    samples = march(rays, grid, STEP, backend=backend)
+    parts = samples.offsets.diff().split(20)
+    found = extents(rays, grid, STEP, 20, backend=backend)
+    assert [(x.total, x.longest) for x in found] == [(int(p.sum()), int(p.max())) for p in parts]
+    none = Rays(torch.zeros(0, 3), torch.zeros(0, 3))
+    assert extents(none, grid, STEP, 20, backend=backend) == []
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_samples_of_a_known_extent_are_the_same(backend: str) -> None:
+    rays, grid = rays_through_the_cube(50), dust(4)
+    (extent,) = extents(rays, grid, STEP, 50, backend=backend)
+    one = march(rays, grid, STEP, backend=backend)
+    other = march(rays, grid, STEP, extent=extent, backend=backend)
+    for name in ("t", "delta", "offsets", "ray", "positions", "resume"):
+        assert torch.equal(getattr(one, name), getattr(other, name)), name
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

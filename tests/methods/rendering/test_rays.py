@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 
-from bench.cameras import cast
+from bench.cameras import cast, place_camera
 from bench.types import NullProbe
 from methods.instant_ngp.field import HashField
 from methods.kernels.march import Occupancy, march
+from methods.rendering import rays as rendering
 from methods.rendering.batch import render_batch
 from methods.rendering.march import FAINT, March
 from methods.rendering.occupancy import STEP
-from methods.rendering.rays import ROUND_SAMPLES, render_rays
+from methods.rendering.rays import CHUNK_RAYS, ROUND_SAMPLES, render_rays
 from tests.methods.conftest import GRID, Work, look_at_the_middle
 
 
@@ -32,6 +34,26 @@ def test_rounds_render_what_one_go_renders(cloud: tuple[HashField, Occupancy], d
     torch.testing.assert_close(rounds.alpha, whole.alpha, rtol=0, atol=1e-4)
 
 
+def test_at_once_rays_look_as_in_rounds(
+    cloud: tuple[HashField, Occupancy], device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    field, occupancy = cloud
+    rays = cast(place_camera(look_at_the_middle(0.1, 0.4), device))
+    window = torch.tensor((0.0, 1.7), device=device).expand(len(rays.origins), 2)
+    found = []
+    for compacts, chunk in ((True, CHUNK_RAYS), (False, CHUNK_RAYS), (False, 100)):
+        monkeypatch.setattr(rendering, "compacts", lambda device, compacts=compacts: compacts)
+        monkeypatch.setattr(rendering, "CHUNK_RAYS", chunk)
+        found.append(render_rays(field, rays, occupancy, NullProbe(), March(window=window)))
+    rounds, once, chunks = found
+    assert 0.2 < rounds.alpha.max() < 1
+    for name in ("values", "depth_sum", "alpha"):
+        # As in `test_rounds_render_what_one_go_renders`.
+        a, b, c = (getattr(pixels, name) for pixels in (rounds, once, chunks))
+        torch.testing.assert_close(a, b, rtol=0, atol=3e-4)
+        torch.testing.assert_close(b, c, rtol=0, atol=1e-6)
+
+
 def test_samples_behind_the_early_stop_are_hardly_evaluated() -> None:
     field = HashField(GRID, precision="fp32", generator=torch.Generator().manual_seed(0))
     field.density = lambda positions: (  # type: ignore[method-assign]
@@ -46,13 +68,18 @@ def test_samples_behind_the_early_stop_are_hardly_evaluated() -> None:
     assert work.done["samples"] <= ROUND_SAMPLES * hit  # one round for each ray that hits
 
 
-def test_faint_samples_are_black_and_not_looked_at(cloud: tuple[HashField, Occupancy]) -> None:
+@pytest.mark.parametrize("compacts", [True, False])
+def test_faint_samples_are_black_and_not_looked_at_in_rounds(
+    cloud: tuple[HashField, Occupancy], compacts: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rendering, "compacts", lambda device: compacts)
     field, occupancy = cloud
     camera = look_at_the_middle(0.1, 0.4)
     rays = cast(replace(camera, c2w=camera.c2w.to(field.device)))
     stop, work = 0.01, Work()
     rendered = render_rays(field, rays, occupancy, work, March(stop=stop))
-    assert 0 < work.done["shaded_samples"] < work.done["samples"]
+    assert work.done["shaded_samples"] > 0
+    assert (work.done["shaded_samples"] < work.done["samples"]) == compacts
     # Of a field whose features are 1 everywhere, what is shown is the sum of the weights seen.
     field.features = lambda geometry, directions: torch.ones(  # type: ignore[method-assign]
         len(geometry), field.channels, device=geometry.device

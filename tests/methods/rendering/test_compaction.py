@@ -1,0 +1,36 @@
+"""Lists of what is left, and how often a GPU is waited for to make them."""
+
+from __future__ import annotations
+
+import torch
+
+from bench.waits import device_waits
+from methods.rendering.compaction import places, worth
+from tests.pretended_gpu import PretendedGpu
+
+MASK = torch.tensor([False, True, True, False, True])
+
+
+def test_on_a_cpu_what_is_worth_computing_is_listed() -> None:
+    assert worth(MASK).tolist() == [1, 2, 4]
+
+
+def test_on_a_gpu_all_is_computed_and_nothing_is_waited_for(gpu: PretendedGpu) -> None:
+    mask = MASK.to("cuda")
+    with device_waits() as waits:
+        found = worth(mask)
+    assert found.tolist() == [0, 1, 2, 3, 4]
+    assert not waits
+
+
+def test_the_places_of_many_masks_are_waited_for_once(gpu: PretendedGpu) -> None:
+    masks = [MASK, ~MASK, torch.zeros(3, dtype=torch.bool), torch.zeros(0, dtype=torch.bool)]
+    there = [mask.to("cuda") for mask in masks]
+    with device_waits() as waits:
+        found = places(there)
+    assert [place.tolist() for place in found] == [[1, 2, 4], [0, 3], [], []]
+    assert waits.total() == 1
+
+
+def test_no_masks_have_no_places() -> None:
+    assert places([]) == []
