@@ -53,12 +53,22 @@ class StageClock:
     The clock is read only when a stage begins or ends, after the device has finished its work;
     the time since the last reading goes to the innermost stage that was open. So the stages and
     `other` add up to the frame by construction.
+
+    Args:
+        stages: whether stages are timed. To read the clock waits for a GPU; without stages a frame
+            is waited for when it begins and ends, and all of it is `other`.
     """
 
-    def __init__(self, device: str, clock: Callable[[], int] = time.perf_counter_ns) -> None:
+    def __init__(
+        self,
+        device: str,
+        clock: Callable[[], int] = time.perf_counter_ns,
+        *,
+        stages: bool = True,
+    ) -> None:
         self.frames: list[FrameRecord] = []
         self._device = torch.device(device)
-        self._clock = clock
+        self._clock, self._stages = clock, stages
         self._open: list[str] | None = None  # names of the open stages; None outside a frame
         self._last = 0
         self._begin()
@@ -85,6 +95,9 @@ class StageClock:
             raise RuntimeError(f"stage {name!r} was entered outside a frame")
         if name == OTHER:
             raise ValueError(f"a stage may not be named {OTHER!r}: that is the remainder")
+        if not self._stages:
+            yield
+            return
         self._charge()
         self._open.append(name)
         try:

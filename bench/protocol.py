@@ -38,6 +38,7 @@ class EvaluationProtocol:
         flicker: where the true pictures of two consecutive frames come from: "split": only frames
             with ground truth have one; "exact": the others get theirs from the scene, if it can
             render its exact picture, in about half a second at 400 x 400.
+        stages: whether the stages of a frame are timed, which waits for a GPU at each.
     """
 
     name: str = "steerbench-1"
@@ -48,6 +49,7 @@ class EvaluationProtocol:
     warmup: int = 3
     memory: str = "steady"
     flicker: str = "split"
+    stages: bool = True
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lpips", tuple(self.lpips))  # a list, when read from YAML

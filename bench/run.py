@@ -99,7 +99,8 @@ class _Take:
     def of(cls, method: Method, task: Task, lpips: Mapping[str, Lpips]) -> _Take:
         device = method.settings()["device"]
         scoring = Scoring(task.scene, task.trajectory, task.protocol, lpips, task.pictures)
-        return cls(method, StageClock(device), MemoryMeter(device), scoring, [])
+        clock = StageClock(device, stages=task.protocol.stages)
+        return cls(method, clock, MemoryMeter(device), scoring, [])
 
 
 def _measurement(

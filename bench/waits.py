@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import linecache
 import traceback
 import warnings
 from collections import Counter
@@ -16,6 +17,7 @@ import torch
 from bench.errors import Unavailable
 
 TORCH = str(Path(torch.__file__).parent)
+ROOT = Path(__file__).parent.parent
 
 
 class Line(NamedTuple):
@@ -23,6 +25,17 @@ class Line(NamedTuple):
 
     path: str
     number: int
+
+    @property
+    def place(self) -> str:
+        """File and number; the file as seen from the folder of the packages, if it is in there."""
+        path = Path(self.path)
+        return f"{path.relative_to(ROOT) if path.is_relative_to(ROOT) else path}:{self.number}"
+
+    @property
+    def source(self) -> str:
+        """What stands there."""
+        return linecache.getline(*self).strip()
 
 
 @contextmanager

@@ -179,7 +179,11 @@ ARGUMENTS = {
     ],
     "parity": [*_rounds(40), *_words(SMOOTH)],
     "skips": [*_rounds(10), *_words(SMOOTH)],
-    "breakdown": [*_rounds(10), *_words(f"{SMOOTH} engine=openvino, on a GPU engine=torch")],
+    "breakdown": [
+        *_rounds(10),
+        *_flag("--device-waits", "print where the host waits for the GPU instead, line by line"),
+        *_words(f"{SMOOTH} engine=openvino, on a GPU engine=torch"),
+    ],
     "scaling": [
         *_count("--frames", 20, "steady frames of each"),
         *_several("--axis", "only this axis: pixels, threads, or one of the method's"),

@@ -1,14 +1,14 @@
-"""Prints how often the host waits for a GPU, line by line: in a frame, and in a step of training.
+"""Prints how often the host waits for a GPU, line by line: in a frame, in a step of training, and,
+apart from the step, in a frame that precedes what the step learns from.
 
     python -m tests.device_waits
 
 The GPU is pretended, the scene small, and the fields have hardly learned anything, so that a frame
-has more rounds of rays than usual: compare the counts with earlier ones, not with a real GPU's.
+takes more samples than usual: compare the counts with earlier ones, not with a real GPU's.
 """
 
 from __future__ import annotations
 
-import linecache
 import tempfile
 from collections import Counter
 from contextlib import ExitStack
@@ -22,12 +22,17 @@ from bench.console import ConsoleLog
 from bench.types import NullProbe, Scene, Split
 from bench.waits import Line, device_waits
 from methods.instant_ngp.training import FieldTraining
+from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.training.joint import JointTraining
 from tests.methods.conftest import ball, look_at_the_middle
 from tests.methods.test_on_a_gpu import BUDGET, METHODS
 from tests.pretended_gpu import pretended_gpu
 
-ROOT = Path(__file__).parent.parent
+PARTS = {
+    "a step of stage 1": (FieldTraining, "advance"),
+    "a step of stage 2": (JointTraining, "advance"),
+    "a frame that precedes what stage 2 learns from": (Pipeline, "remember"),
+}
 
 
 def small_scene() -> Scene:
@@ -53,8 +58,7 @@ def show(what: str, times: list[Counter[Line]]) -> None:
     total = sum(times, Counter())
     print(f"\n{what}: {total.total() / len(times):.1f} waits, mean of {len(times)}")
     for line, count in total.most_common():
-        place = f"{Path(line.path).relative_to(ROOT)}:{line.number}"
-        print(f"{count / len(times):8.1f}  {place:48} {linecache.getline(*line).strip()}")
+        print(f"{count / len(times):8.1f}  {line.place:48} {line.source}")
 
 
 def main() -> None:
@@ -64,9 +68,9 @@ def main() -> None:
         waits: dict[str, list[Counter[Line]]] = {}
         with ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
             stack.enter_context(pretended_gpu())
-            for kind in (FieldTraining, JointTraining):
-                step = counted(f"a step of {kind.__name__}", kind.advance, waits)
-                stack.enter_context(patch.object(kind, "advance", step))
+            for what, (kind, part) in PARTS.items():
+                call = counted(what, getattr(kind, part), waits)
+                stack.enter_context(patch.object(kind, part, call))
             method = METHODS[name](device="cuda", backend="reference")
             method.fit(scene, budget, ConsoleLog(Path(folder), quiet=True))
             render = counted(f"a frame of {name}", method.render, waits)
@@ -74,7 +78,7 @@ def main() -> None:
                 render(camera, NullProbe())
             waits[f"a frame of {name}"] = waits[f"a frame of {name}"][2:]  # with preceding ones
         for what, times in waits.items():
-            if name == "ngp" or "Field" not in what:
+            if name == "ngp" or "stage 1" not in what:
                 show(what, times)
 
 

@@ -24,6 +24,7 @@ from unittest.mock import MagicMock
 import pytest
 import torch
 from torch import Tensor
+from torch.nn.utils import clip_grad
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from methods.kernels.dispatch import availability, multiplies_bf16
@@ -294,6 +295,8 @@ def pretended_gpu() -> Iterator[PretendedGpu]:
         # So that a module moves to the GPU and back in place, as it does on a real one.
         patch.setattr(torch.__future__, "get_swap_module_params_on_conversion", lambda: True)
         patch.setattr(torch.autocast, "__init__", _autocast(torch.autocast.__init__))
+        groups = "_group_tensors_by_device_and_dtype"
+        patch.setattr(clip_grad, groups, _grouped(getattr(clip_grad, groups)))
         _patch_triton(patch)
         for cached in (availability, multiplies_bf16):
             cached.cache_clear()
@@ -380,6 +383,16 @@ def _autocast(begin: Callable[..., None]) -> Callable[..., None]:
         begin(self, "cpu", *args, **kwargs)
 
     return init
+
+
+def _grouped(group: Callable[..., dict]) -> Callable[..., dict]:
+    """C++, which sees the CPU, would say that the gradients to be clipped are there."""
+
+    def grouped(*args):
+        found = group(*args)
+        return {(x[0][0][0].device, dtype): x for (_, dtype), x in found.items()}
+
+    return grouped
 
 
 def _patch_triton(patch: pytest.MonkeyPatch) -> None:

@@ -117,6 +117,12 @@ def masked(x: Tensor, value: float | Tensor, mask: Tensor) -> None:
     x[mask] = value
 
 
+def clipped(x: Tensor) -> None:
+    weights = torch.nn.Parameter(x.clone())
+    weights.grad = x.clone()
+    torch.nn.utils.clip_grad_norm_([weights], 1.0)
+
+
 WAITS: dict[str, tuple[int, Callable[[Tensor], object]]] = {
     "arithmetic": (0, lambda x: (x + 1).sum() * 2),
     "item": (1, lambda x: x.sum().item()),
@@ -128,6 +134,7 @@ WAITS: dict[str, tuple[int, Callable[[Tensor], object]]] = {
     "a constant": (1, lambda x: torch.tensor(0.5, device="cuda")),
     "a constant that is filled in": (0, lambda x: x.new_full((1,), 0.5)),
     "nonzero": (1, lambda x: x.nonzero()),
+    "nonzero, how many is known": (0, lambda x: torch.nonzero_static(x, size=3)),
     "a mask": (1, lambda x: x[x > 0]),
     "two masks": (2, lambda x: x.expand(3, 3)[x > 0, x > 0]),
     "indices": (0, lambda x: x[x.long() % 3]),
@@ -136,6 +143,7 @@ WAITS: dict[str, tuple[int, Callable[[Tensor], object]]] = {
     "a number put at indices": (1, lambda x: masked(x, 0.0, x.long() % 3)),
     "where": (0, lambda x: torch.where(x > 0, x, 0.0)),
     "where, with a number of the CPU": (1, lambda x: torch.where(x > 0, x, HERE.sum())),
+    "gradients that are clipped": (0, clipped),
     "unique": (1, lambda x: x.unique()),
     "repeated by a tensor": (1, lambda x: x.repeat_interleave(x.long())),
     "repeated, how often is known": (

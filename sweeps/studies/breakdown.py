@@ -3,28 +3,40 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import compress
+from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from bench.accuracy import steady_frames
 from bench.probes import OTHER
 from bench.study import Study, Variant
+from bench.trajectories import Trajectory
+from bench.types import Method, NullProbe
+from bench.waits import Line, device_waits
 from reports.tables import Table, decimal, share
-from sweeps.device_lock import on_gpu
+from sweeps.device_lock import device_lock, on_gpu
+from sweeps.measurement import checked_settings
 from sweeps.overrides import composed
 from sweeps.studies.skips import nothing_skipped
 from sweeps.studies.variants import (
     METHOD,
+    OnceLog,
     Rendered,
     Row,
+    common_ground,
     computes_with_engine,
     declared,
     engines,
+    fit_each,
     print_rows,
     range_text,
     render_variants,
     settings_of,
+    usable,
 )
 from sweeps.terminal import show
 
@@ -35,8 +47,10 @@ DENSE = ", nothing skipped"
 
 
 def main(options: argparse.Namespace) -> int:
-    """Print two tables and, as the last line, the rows of the first as JSON."""
+    """Print two tables, or one of waits, and, as the last line, the rows of the first as JSON."""
     words = with_engine([*SETTINGS, *options.overrides])
+    if options.device_waits:
+        return _print_waits(words, options.frames)
     config = composed(words)
     study = declared(config)
     usual = _precisions(words) or [Variant("as it is")]
@@ -58,6 +72,46 @@ def main(options: argparse.Namespace) -> int:
         show(compared)
     print_rows(rows.values())
     return 0
+
+
+def _print_waits(words: Sequence[str], frames: int) -> int:
+    """Print how often the host waits for the GPU in a steady frame, by the line that makes it wait.
+
+    The path is rendered once before: what is made once is not counted.
+    """
+    with device_waits():
+        pass  # says that it needs a GPU before anything is trained
+    config = composed(words)
+    settings = checked_settings(config)
+    log = OnceLog(Path(settings.outputs))
+    methods = usable({"as it is": config}, log)
+    scene, path, _ = common_ground(config, frames)
+    with device_lock(settings.device, log):
+        fit_each(methods, {"as it is": config}, scene, path, log)
+        (method,) = methods.values()
+        times = [_waits(method, path) for _ in range(2)][1]
+    waits = sum(times, Counter[Line]())
+    rows: list[Row] = [
+        {"waits": count / len(times), "line": line.place, "source": line.source}
+        for line, count in waits.most_common()
+    ]
+    lines = tuple((decimal(row["waits"], 1), row["line"], row["source"]) for row in rows)
+    title = f"{decimal(waits.total() / len(times), 1)} waits a frame, mean of {len(times)}"
+    show(Table(title, ("waits", "line", "source"), lines, figures=False))
+    print_rows(rows)
+    return 0
+
+
+def _waits(method: Method, path: Trajectory) -> list[Counter[Line]]:
+    """Where the host waits in each steady frame of `path`."""
+    method.reset()
+    ready, _ = steady_frames([method], path)
+    found = []
+    for step in path.steps:
+        with device_waits() as waits:
+            method.render(step.camera, NullProbe())
+        found.append(waits)
+    return list(compress(found, ready))
 
 
 def with_engine(words: Sequence[str]) -> list[str]:

@@ -103,7 +103,8 @@ def test_a_stage_outside_a_frame_a_frame_in_a_frame_and_a_stage_named_other_are_
             pass
 
 
-def test_the_device_finishes_its_work_before_every_reading(monkeypatch):
+@pytest.mark.parametrize(("stages", "readings"), [(True, 4), (False, 2)])
+def test_the_device_finishes_its_work_before_every_reading(monkeypatch, stages, readings):
     events = []
     monkeypatch.setattr(torch.cuda, "synchronize", lambda device: events.append("synchronise"))
 
@@ -111,10 +112,11 @@ def test_the_device_finishes_its_work_before_every_reading(monkeypatch):
         events.append("read")
         return len(events)
 
-    clock = StageClock("cuda", clock=read)
+    clock = StageClock("cuda", clock=read, stages=stages)
     with clock.frame(), clock.stage("field"):
         pass
-    assert events == ["synchronise", "read"] * 4
+    assert events == ["synchronise", "read"] * readings
+    assert ("field" in clock.frames[0].stages_ns) == stages
 
 
 def test_the_real_clock_measures_on_the_device(device):

@@ -68,6 +68,13 @@ def test_the_rows_have_every_column_of_the_store_but_what_the_store_adds(
     assert not rows["metric"].duplicated().any()
 
 
+def test_a_protocol_without_stages_times_whole_frames(run, offset_method):
+    for stages in (True, False):
+        metrics = run(offset_method, protocol=replace(QUICK, stages=stages)).rows["metric"]
+        timed = {name for name in metrics if name.startswith("stage_ms.")}
+        assert (timed == {"stage_ms.other"}) == (not stages)
+
+
 def test_quality_is_the_mean_over_the_frames_of_the_protocols_scores(
     run, offset_method, tiny_scene
 ):

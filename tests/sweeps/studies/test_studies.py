@@ -6,6 +6,7 @@ import json
 from typing import Any
 
 import pytest
+import torch
 
 from bench.study import Study
 from sweeps.studies.variants import engines
@@ -97,6 +98,29 @@ def test_breakdown_of_a_method_without_engine_and_study_is_one_line(study):
     (row,) = rows(study("breakdown", "grey"))
     assert row["line"] == "as it is"
     assert set(row["parts"]) == {"paint", "other"}
+
+
+def test_breakdown_says_which_lines_of_a_frame_wait_for_the_gpu(study, gpu, monkeypatch):
+    def asking(self, camera, probe):
+        torch.ones(1, device="cuda").item()
+        return render(self, camera, probe)
+
+    import stand_ins
+
+    render = stand_ins.Grey.render
+    monkeypatch.setattr("stand_ins.Grey.render", asking)
+    (row,) = rows(study("breakdown", "grey", "--device-waits"))
+    assert row["waits"] == 1
+    assert row["line"].startswith("tests/sweeps/studies/test_studies.py:")
+    assert row["source"] == 'torch.ones(1, device="cuda").item()'
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="for a machine without a GPU")
+def test_breakdown_needs_a_gpu_to_say_where_a_frame_waits_for_it(study):
+    outcome = study("breakdown", "grey", "--device-waits")
+    assert outcome.status == 2
+    assert "a GPU is needed" in outcome.err
+    assert not outcome.out
 
 
 def test_a_line_of_another_budget_has_no_quality(study, monkeypatch):
