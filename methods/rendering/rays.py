@@ -95,6 +95,8 @@ def _at_once(
     with probe.stage("march"):
         sizes = extents(rays, occupancy, how.step, CHUNK_RAYS, window=window, backend=backend)
     for number, extent in enumerate(sizes):
+        if not extent.total:
+            continue
         chunk = slice(number * CHUNK_RAYS, (number + 1) * CHUNK_RAYS)
         with probe.stage("march"):
             some = rays.take(chunk)

@@ -93,7 +93,9 @@ def test_faint_samples_are_black_and_not_looked_at_in_rounds(
     assert missing.max() > 0
 
 
-def test_an_empty_grid_renders_nothing() -> None:
+@pytest.mark.parametrize("compacts", [True, False])
+def test_an_empty_grid_renders_nothing(compacts: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rendering, "compacts", lambda device: compacts)
     field = HashField(GRID, generator=torch.Generator().manual_seed(0))
     occupancy = Occupancy(torch.zeros(16, 16, 16, dtype=torch.bool))
     camera = look_at_the_middle(0.0, 0.0)

@@ -83,8 +83,8 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
             layer.weight.normal_(0, 0.1)
     training = new_training(ball_scene, options, model, field.float(), renderer)
     patches = [training.patches.cut(training.patches.pool.draw()) for _ in range(16)]
-    after_two = [patch for patch in patches if len(patch.masks) == 3]
-    patches = [patch for patch in after_two if all(mask.any() for mask in patch.masks)][:2]
+    after_two = [patch for patch in patches if len(patch.indices) == 2]
+    patches = [patch for patch in after_two if all((i >= 0).any() for i in patch.indices)][:2]
     assert len(patches) == 2
     field.double(), renderer.double()
     training.patches.pipeline.background = torch.ones(4, dtype=torch.float64)
