@@ -165,9 +165,9 @@ def test_the_time_to_see_what_frames_share_is_that_of_a_stage(monkeypatch) -> No
     """On a clock that stands still but for this."""
     now = [0]
 
-    def overlap(cloud: Cloud, camera: Camera) -> float:
+    def overlap(cloud: Cloud, camera: Camera) -> torch.Tensor:
         now[0] += 1
-        return 1.0
+        return torch.ones(())
 
     monkeypatch.setattr(Cloud, "overlap", overlap)
     clock, buffer = StageClock("cpu", lambda: now[0]), RenderingBuffer(2)
