@@ -118,8 +118,8 @@ def masked(x: Tensor, value: float | Tensor, mask: Tensor) -> None:
 
 
 def clipped(x: Tensor) -> None:
-    weights = torch.nn.Parameter(x.clone())
-    weights.grad = x.clone()
+    weights = torch.nn.Parameter(x.float())
+    weights.grad = x.float()
     torch.nn.utils.clip_grad_norm_([weights], 1.0)
 
 
