@@ -100,7 +100,8 @@ def quality_against(
 
     Bars show the intervals of both where there are several seeds.
     """
-    figure, axes = _psnr_axes(max(4.0, 0.2 * len(lines)), axis)  # room for the legend
+    legend_lines = -(-len(lines) // 2)
+    figure, axes = _psnr_axes(4.0 + 0.25 * legend_lines, axis)
     for number, line in enumerate(lines):
         across, up = line.mean(metric), line.mean("psnr")
         if across is None or up is None:
@@ -118,13 +119,17 @@ def quality_against(
         )
         drawn[0].set_gid(MARK.format(number))
     axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5, 7)))
+    axes.xaxis.set_major_locator(LogLocator(subs=_steps_of_a_decade(*axes.get_xlim())))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_locator(NullLocator())
-    figure.legend(
-        loc="outside right upper", frameon=False, fontsize="small" if len(lines) > 15 else None
-    )
+    figure.legend(loc="outside lower center", ncols=2, frameon=False)
     figure.savefig(path, dpi=150)
+
+
+def _steps_of_a_decade(low: float, high: float) -> tuple[int, ...]:
+    """Which multiples of the powers of ten have a tick from `low` to `high`: few over many."""
+    decades = math.log10(high / low)
+    return (1, 2, 3, 5, 7) if decades < 1.5 else (1, 2, 5) if decades < 3 else (1,)
 
 
 def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
