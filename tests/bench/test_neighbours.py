@@ -36,7 +36,7 @@ def test_work_of_others_is_all_work_less_our_own(accounts):
     watch = Watch()
     # In 10 s: 25 + 5 s of work, of which we did 18 s; 2 s were taken away by the host.
     accounts |= {"passed": 10.0, "own": 18.0, "times": Times(25, 5, 6, 1, 2, 9)}
-    assert watch.seen() == Neighbours(pytest.approx(1.4), 4)
+    assert watch.seen() == Neighbours(pytest.approx(1.4), 4, 10.0)
     assert str(watch.seen()) == "other programs kept 1.4 of 4 cores busy"
 
 
@@ -48,6 +48,14 @@ def test_alone_there_is_nothing_to_warn_of(accounts, monkeypatch):
     assert not watch.seen().notable
     accounts["times"] = Times(23, 3, 14, 0, 0, 0)
     assert watch.seen().notable
+
+
+def test_what_is_shorter_than_the_accounts_can_tell_is_not_warned_of(accounts, monkeypatch):
+    monkeypatch.setattr(neighbours, "NOTABLE_SHARE", 0.1)
+    watch = Watch()
+    accounts |= {"passed": 0.05, "own": 0.0, "times": Times(0.2, 0, 0, 0, 0, 0)}
+    assert watch.seen().busy == 4.0
+    assert not watch.seen().notable
 
 
 def test_our_own_work_is_not_that_of_others():

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -53,11 +54,12 @@ def run(steerbench: Callable[..., Outcome]) -> Callable[..., Outcome]:
 
 
 @pytest.fixture
-def spawn(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
-    """Start `steerbench run` with the stand-ins as a process of its own in `tmp_path`."""
+def spawn(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Start `steerbench run` with the stand-ins as a process of its own in `tmp_path`; what still
+    runs after the test is killed."""
 
     def start(*argv: str) -> subprocess.Popen[str]:
-        return subprocess.Popen(
+        process = subprocess.Popen(
             [Path(sys.executable).with_name("steerbench"), "run", *STAND_INS, *argv],
             cwd=tmp_path,
             env={**os.environ, "PYTHONPATH": str(HERE), "OMP_NUM_THREADS": "1"},
@@ -66,5 +68,9 @@ def spawn(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
             stderr=subprocess.PIPE,
             text=True,
         )
+        left.callback(process.__exit__, None, None, None)
+        left.callback(process.kill)
+        return process
 
-    return start
+    with contextlib.ExitStack() as left:
+        yield start
