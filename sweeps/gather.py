@@ -10,7 +10,7 @@ from bench.results import Store
 from reports.runs import Repeated, Run, readable
 from reports.scenes import over_scenes
 from sweeps import failures
-from sweeps.measurement import described, job_key, of_scene
+from sweeps.measurement import job_key, of_scene
 from sweeps.plan import Planned
 
 
@@ -57,7 +57,7 @@ def gather(
 
 
 def _outcome(job: Planned, runs: Mapping[str, Sequence[Run]], outputs: Path) -> Outcome:
-    failure = failures.found(outputs, described(job.config))
+    failure = failures.found(outputs, job.settings)
     shown = (run for run in runs.get(job.key, ()) if of_scene(run, job.config))
     if run := next(shown, None):
         why = failure and f"failed when it was tried again: {failure}"

@@ -87,7 +87,7 @@ def _run(jobs: Sequence[Planned]) -> int:
         there: dict[str, Obtained] = {}
         if room(together[0].config) > 1:  # or else each job is looked up when its turn comes
             there = {job.key: found for job in together if (found := _stored(job))}
-            train_ahead([job for job in together if job.key not in there])
+            train_ahead(together, there)
         seeds = list(dict.fromkeys(job.config.seed for job in together))
         for group in _groups(sorted(together, key=lambda job: seeds.index(job.config.seed))):
             for number, job in enumerate(group, ended + 1):

@@ -6,11 +6,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import product
+from typing import Any
 
 from omegaconf import DictConfig
 
 from bench.errors import SteerbenchError
-from reports.paper_tables import AFTER, METHOD, Line, PaperTable, paper_tables
+from reports.paper_tables import AFTER, METHOD, OF_CURVES, Line, PaperTable, paper_tables
 from sweeps.build import build, target_of
 from sweeps.data_sets import DataSet
 from sweeps.device_lock import on_gpu
@@ -46,9 +47,14 @@ class Planned:
         return ", ".join(filter(None, parts))
 
     @cached_property
+    def settings(self) -> dict[str, Any]:
+        """What decides its run."""
+        return described(self.config)
+
+    @cached_property
     def key(self) -> str:
         """Equal for equal jobs."""
-        return job_key(described(self.config), self.turns)
+        return job_key(self.settings, self.turns)
 
 
 def chosen(name: str | None, methods: Sequence[str]) -> list[PaperTable]:
@@ -74,8 +80,8 @@ def chosen(name: str | None, methods: Sequence[str]) -> list[PaperTable]:
 
 def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -> list[Planned]:
     """The jobs of the experiment of `table` under the settings in `words`: one for each line that
-    has a job, for each seed (those in `words`; or as many as the budget says, and for curves and a
-    method beyond the paper the first of these), and for each scene of `data`.
+    has a job, for each seed (those in `words`; or as many as the budget says, and for curves and
+    other methods than the paper's the first of these), and for each scene of `data`.
 
     What a line does not set is as the experiment has it. A job of the sweep that no line names is
     left out: Instant-NGP has no 2D renderer to compute in int8. So is a line at a precision that
@@ -103,12 +109,13 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     def with_choices(*groups: str) -> DictConfig:
         return composed([f"+experiment={table.name}", *fixed, *groups])
 
+    besides = {AFTER, *OF_CURVES}  # of curves, which no experiment has
     jobs = []
     for block, line, repeated in _lines(table, budget.beyond):
         if line.job is None or line.job.get("precision", engine.precision) not in precisions:
             continue
         added = line.job == {METHOD: line.label}
-        swept_here = {name: value for name, value in line.job.items() if name != AFTER}
+        swept_here = {name: value for name, value in line.job.items() if name not in besides}
         if not added and any(value not in grid.get(name, ()) for name, value in swept_here.items()):
             there = "; ".join(f"{name}={','.join(some)}" for name, some in grid.items())
             raise SteerbenchError(
@@ -135,10 +142,11 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
 
 def _lines(table: PaperTable, beyond: bool) -> Iterator[tuple[str, Line, bool]]:
     """The lines of all blocks of a table and those of its curves, each with the title of its block
-    and whether several seeds repeat it; a table that varies the training is one of the paper's
-    method alone, unless those `beyond` it are to be trained as often."""
+    and whether several seeds repeat it: the paper's conclusions are about its own method. A table
+    that varies the training is of that alone, unless those `beyond` it are to be trained as often.
+    """
     for block in table.blocks if beyond or not table.curve else [table]:
-        yield from ((block.title, line, block is table) for line in block.lines)
+        yield from ((block.title, line, METHOD not in (line.job or {})) for line in block.lines)
     yield from (("curves", line, False) for line in table.marks.values())
 
 

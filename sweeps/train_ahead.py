@@ -7,7 +7,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,7 +21,7 @@ from sweeps.build import build
 from sweeps.device_lock import device_lock, on_gpu
 from sweeps.failures import reason
 from sweeps.jobs import time_left
-from sweeps.measurement import described, trained
+from sweeps.measurement import trained
 from sweeps.plan import Planned
 
 CHOSEN_AFTERWARDS = {
@@ -31,15 +31,19 @@ CHOSEN_AFTERWARDS = {
 """Settings of a run and of its method that no training depends on."""
 
 
-def train_ahead(jobs: Sequence[Planned]) -> None:
-    """Do the trainings of `jobs`, which share their budget, as many at a time as there is room for.
+def train_ahead(jobs: Sequence[Planned], measured: Collection[str]) -> None:
+    """Do the trainings of `jobs`, which share their budget, as many at a time as there is room for;
+    not those behind a job whose key is among the `measured` ones.
 
     They are found again when the jobs are measured. What fails here fails there once more, and is
     reported then.
     """
     todo: dict[str, Planned] = {}
     for job in jobs:
-        todo.setdefault(_training(job.config), job)
+        todo.setdefault(_training(job), job)
+    for job in jobs:
+        if job.key in measured:
+            todo.pop(_training(job), None)
     if len(todo) < 2:
         return
     workers = room(jobs[0].config)
@@ -62,11 +66,10 @@ def room(config: DictConfig) -> int:
     return len(os.sched_getaffinity(0)) // threads
 
 
-def _training(config: DictConfig) -> str:
+def _training(job: Planned) -> str:
     """Equal for jobs that share a training: a key of all settings that it may depend on."""
-    settings = described(config)
-    settings["method"] = _kept(settings["method"])
-    return content_key(_kept(settings))
+    settings = _kept(job.settings)
+    return content_key(settings | {"method": _kept(settings["method"])})
 
 
 def _kept(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -56,7 +56,18 @@ def test_a_curve_has_the_lines_of_the_papers_method_at_several_shares_of_one_tra
         )
         one, other = described(job.config), described(whole.config)
         assert (one["method"].pop("after"), other["method"].pop("after")) == (float(share), 1)
+        scored = one.pop("protocol"), other.pop("protocol")
+        assert [protocol["lpips"] for protocol in scored] == [[], ["alex", "vgg"]]
         assert one == other
+
+
+def test_methods_that_no_conclusion_is_about_have_one_seed() -> None:
+    lines = [line for line in TABLES["table1"].lines if line.label in ("NeRF", "SteerNeRF, fp32")]
+    jobs = plan(replace(TABLES["table1"], lines=lines, beyond=None), ["budget=demo"])
+    assert [(job.line, job.config.seed) for job in jobs] == [
+        ("NeRF", 0),
+        *(("SteerNeRF, fp32", seed) for seed in range(3)),
+    ]
 
 
 def test_ours_is_repeated_only_with_seeds_that_are_asked_for() -> None:
