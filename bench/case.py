@@ -162,10 +162,13 @@ class Agreement:
         )
 
 
-def on_backends(units: float, *precisions: str) -> dict[Cell, float]:
-    """Tolerances of `units` u: of the reference and the CPU backend in fp32, and of the reference
-    alone in further `precisions`, which no other backend has."""
-    cells = [("reference", "fp32"), ("cpu", "fp32"), *(("reference", p) for p in precisions)]
+def on_backends(
+    units: float, *precisions: str, backends: Sequence[str] = ("reference", "cpu")
+) -> dict[Cell, float]:
+    """Tolerances of `units` u: of `backends` in fp32, and of the reference alone in further
+    `precisions`, which no other backend has."""
+    cells = [(backend, "fp32") for backend in backends]
+    cells += [("reference", precision) for precision in precisions]
     return {cell: units * torch.finfo(DTYPES[cell[1]]).eps / 2 for cell in cells}
 
 

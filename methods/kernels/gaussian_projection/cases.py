@@ -33,15 +33,16 @@ Gaussians = tuple[Tensor, Tensor, Tensor, Tensor]
 
 def cases() -> list[Case]:
     """No, one and many Gaussians, some behind the camera; circles; slopes by autograd."""
+    backends = served("gaussian_projection")
     forward = Agreement(
         "gaussian projection",
-        served("gaussian_projection"),
+        backends,
         "centres in widths of the picture and conics, of an area that loses a factor of "
         "xx yy / area < 64, after 30 roundings of numbers below 4: 8,000 u",
     )
     backward = Agreement(
         "gaussian projection backward",
-        served("gaussian_projection"),
+        backends,
         "relative to the largest gradient of its kind: conics, off by 8,000 u, twice",
     )
     found = []
@@ -55,7 +56,7 @@ def cases() -> list[Case]:
         "gaussian projection",
         "a round Gaussian on the axis is an ellipse of known axes, circles but for fx and fy",
         "relative: 30 roundings, and twice that of its depth, which a place near 1 has to 2 u",
-        on_backends(30),
+        on_backends(30, backends=backends),
     )
     for scale, depth in ((1e-3, 0.5), (0.1, 1.0), (0.02, 5.0)):
         name = f"scale {scale:g} at depth {depth:g}"
@@ -64,13 +65,13 @@ def cases() -> list[Case]:
         "gaussian projection",
         "the ellipse is that of the derivative of the projection, by autograd",
         "as in the agreement of the backends: 8,000 u",
-        on_backends(8000, "fp64"),
+        on_backends(8000, "fp64", backends=backends),
     )
     hidden = Property(
         "gaussian projection",
         "nothing is shown, and no gradient is not finite",
         "decided by comparisons: 0 wrong",
-        on_backends(0, "fp64"),
+        on_backends(0, "fp64", backends=backends),
     )
     found.append(slopes.case("in the picture", _slopes_error))
     for name, changed in HIDDEN.items():
