@@ -20,13 +20,15 @@ CLEAR = 1e-4
 """Relative distance of every opacity, at every pixel, from where a comparison turns."""
 
 SIZES = (
-    ("no Gaussian", 0, 20, 10),
-    ("one pixel", 30, 1, 1),
-    ("one tile", 60, 16, 16),
-    ("parts of tiles", 200, 67, 45),
-    ("crowded", 600, 21, 19),
-    ("160 x 160", 2000, 160, 160),
+    ("no Gaussian", 0, 20, 10, 1),
+    ("one pixel", 30, 1, 1, 1),
+    ("one tile", 60, 16, 16, 1),
+    ("parts of tiles", 200, 67, 45, 1),
+    ("of many tiles", 10, 67, 45, 10),
+    ("crowded", 600, 21, 19, 1),
+    ("160 x 160", 2000, 160, 160, 1),
 )
+"""Number of Gaussians, width and height of the picture, and how much larger than usual they are."""
 
 Given = tuple[Ellipses, Tensor, Tensor]
 """Ellipses, opacities, colours."""
@@ -48,9 +50,9 @@ def cases() -> list[Case]:
         "as large, are off as the weights are: 10 x 600 x 20 u",
     )
     found = []
-    for name, count, width, height in SIZES:
+    for name, count, width, height, size in SIZES:
         items = count if count == 2000 else None
-        inputs = count, width, height
+        inputs = count, width, height, size
         found += [
             forward.case(name, partial(_blended, *inputs), 12_000 * U32 + STOP, items=items),
             backward.case(name, partial(_gradients, *inputs), 120_000 * U32, items=items),
@@ -59,25 +61,25 @@ def cases() -> list[Case]:
         "gaussian blending",
         "the picture is that of a loop over pixels and Gaussians",
         "as in the agreement of the backends, of 60: 1,200 u",
-        on_backends(1200, "fp64"),
+        on_backends(1200, "fp64", backends=backends),
     )
     footprint = Property(
         "gaussian blending",
         "a Gaussian alone is its own formula",
         "20 roundings of numbers below 4",
-        on_backends(80, "fp64"),
+        on_backends(80, "fp64", backends=backends),
     )
     two = Property(
         "gaussian blending",
         "the nearer of two in one place is in front, whichever is given first",
         "10 roundings",
-        on_backends(10, "fp64"),
+        on_backends(10, "fp64", backends=backends),
     )
     hidden = Property(
         "gaussian blending",
         "what is behind the stop has no gradient",
         "nothing is computed: 0",
-        on_backends(0, "fp64"),
+        on_backends(0, "fp64", backends=backends),
     )
     found.append(known.case("13 x 9", _loop_error))
     for opacity in (1.0, 0.5, 2 * LEAST_ALPHA):
@@ -90,8 +92,8 @@ def cases() -> list[Case]:
 
 
 @cache
-def draw(count: int, width: int, height: int) -> Given:
-    """Gaussians in and around a picture, one to six pixels wide.
+def draw(count: int, width: int, height: int, size: int = 1) -> Given:
+    """Gaussians in and around a picture, one to six pixels wide, or `size` times as wide.
 
     Without those whose opacity comes, at a pixel, close to where it is cut off: there a rounding
     decides.
@@ -102,7 +104,7 @@ def draw(count: int, width: int, height: int) -> Given:
         return torch.rand(*shape, generator=generator)
 
     centres = (rand(count, 2) * 1.4 - 0.2) * torch.tensor((width, height))
-    variances = 0.3 + 4 * rand(count, 2)
+    variances = size**2 * (0.3 + 4 * rand(count, 2))
     tilt = (1.6 * rand(count) - 0.8) * variances.prod(dim=1).sqrt()
     area = variances.prod(dim=1) - tilt**2
     conics = torch.stack((variances[:, 1], -tilt, variances[:, 0]), dim=1) / area[:, None]
@@ -143,9 +145,9 @@ def _alphas(ellipses: Ellipses, opacities: Tensor, width: int, height: int) -> T
 
 
 def _blended(
-    count: int, width: int, height: int, device: str
+    count: int, width: int, height: int, size: int, device: str
 ) -> Callable[[str], tuple[Tensor, ...]]:
-    given = _to(draw(count, width, height), device, torch.float32)
+    given = _to(draw(count, width, height, size), device, torch.float32)
 
     def call(backend: str) -> tuple[Tensor, ...]:
         pixels = blend(*given, width, height, backend=backend)
@@ -155,9 +157,10 @@ def _blended(
 
 
 def _gradients(
-    count: int, width: int, height: int, device: str
+    count: int, width: int, height: int, size: int, device: str
 ) -> Callable[[str], tuple[Tensor, ...]]:
-    ellipses, opacities, colours = _to(draw(count, width, height), device, torch.float32)
+    drawn = draw(count, width, height, size)
+    ellipses, opacities, colours = _to(drawn, device, torch.float32)
     generator = torch.Generator().manual_seed(2)
     towards = (
         torch.randn(width * height, 3, generator=generator).to(device),
