@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from bench.allocator import give_back
 
@@ -84,7 +85,8 @@ class StageClock:
         try:
             yield
             self._charge()
-            self.frames.append(FrameRecord(dict(self._ns), dict(self._done), dict(self._dense)))
+            done = {name: int(units) for name, units in self._done.items()}
+            self.frames.append(FrameRecord(dict(self._ns), done, dict(self._dense)))
         finally:
             self._open = None
 
@@ -106,7 +108,7 @@ class StageClock:
             self._charge()
             self._open.pop()
 
-    def count(self, name: str, done: int, dense: int | None = None) -> None:
+    def count(self, name: str, done: int | Tensor, dense: int | None = None) -> None:
         """Add work to the current frame; see `bench.types.Probe`."""
         self._done[name] += done
         if dense is not None:
@@ -114,7 +116,7 @@ class StageClock:
 
     def _begin(self) -> None:
         self._ns: defaultdict[str, int] = defaultdict(int, {OTHER: 0})
-        self._done: defaultdict[str, int] = defaultdict(int)
+        self._done: defaultdict[str, int | Tensor] = defaultdict(int)
         self._dense: defaultdict[str, int] = defaultdict(int)
 
     def _now(self) -> int:

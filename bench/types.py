@@ -196,8 +196,11 @@ class Probe(Protocol):
     def stage(self, name: str) -> AbstractContextManager[None]:
         """Time a stage. Synchronises the device; a stage may be entered many times a frame."""
 
-    def count(self, name: str, done: int, dense: int | None = None) -> None:
-        """Add `done` units of work; `dense` is what a method that skips nothing would have done."""
+    def count(self, name: str, done: int | Tensor, dense: int | None = None) -> None:
+        """Add `done` units of work; `dense` is what a method that skips nothing would have done.
+
+        What a GPU has counted, a tensor of one number, is read when the frame has ended.
+        """
 
 
 class Method(Protocol):
@@ -237,5 +240,5 @@ class NullProbe:
         """Do not time."""
         return nullcontext()
 
-    def count(self, name: str, done: int, dense: int | None = None) -> None:
+    def count(self, name: str, done: int | Tensor, dense: int | None = None) -> None:
         """Do not count."""

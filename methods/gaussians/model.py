@@ -87,7 +87,7 @@ class Gaussians(nn.Module):
                 camera,
                 backend=backend,
             )
-        probe.count("gaussians", int((ellipses.extents[:, 0] > 0).sum()), len(self))
+        probe.count("gaussians", (ellipses.extents[:, 0] > 0).sum(), len(self))
         with probe.stage("shade"):
             towards = functional.normalize(self.means.detach() - camera.c2w[:, 3], dim=1)
             harmonics = torch.cat((self.base, self.view), dim=1)

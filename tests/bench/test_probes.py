@@ -79,6 +79,15 @@ def test_counters_add_up_within_a_frame_and_start_at_0_in_the_next():
     assert clock.frames[1].dense == {}
 
 
+def test_what_a_gpu_counts_is_a_number_when_the_frame_has_ended():
+    clock = clock_reading(itertools.count())
+    with clock.frame():
+        clock.count("samples", torch.tensor(3), dense=10)
+        clock.count("samples", 4)
+    assert clock.frames[0].done == {"samples": 7}
+    assert type(clock.frames[0].done["samples"]) is int
+
+
 def test_a_frame_that_raises_leaves_no_record_and_the_clock_usable():
     clock = clock_reading(itertools.count())
     with pytest.raises(KeyError), clock.frame(), clock.stage("field"):

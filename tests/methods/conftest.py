@@ -54,8 +54,8 @@ class Work(NullProbe):
     def __init__(self) -> None:
         self.done: Counter[str] = Counter()
 
-    def count(self, name: str, done: int, dense: int | None = None) -> None:
-        self.done[name] += done
+    def count(self, name: str, done: int | Tensor, dense: int | None = None) -> None:
+        self.done[name] += int(done)
 
 
 @pytest.fixture(scope="session")

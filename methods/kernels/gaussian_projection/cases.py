@@ -120,12 +120,12 @@ def _ellipses(count: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
 
 def _gradients(count: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
     means, scales, rotations, opacities = draw(count, device)
-    generator = torch.Generator().manual_seed(1)
+    camera, generator = _on(device), torch.Generator().manual_seed(1)
     towards = [torch.randn(count, n, generator=generator).to(device) for n in (2, 3)]
 
     def call(backend: str) -> tuple[Tensor, ...]:
         given = [x.clone().requires_grad_() for x in (means, scales, rotations)]
-        found = _projected([*given, opacities], _on(device), backend)
+        found = _projected([*given, opacities], camera, backend)
         seen = (found.centres.abs().amax(dim=1, keepdim=True) < 4 * CAMERA.width).detach()
         grads = torch.autograd.grad(
             (found.centres, found.conics), given, [seen * g for g in towards]

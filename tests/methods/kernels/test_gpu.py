@@ -14,12 +14,15 @@ import torch
 from torch import Tensor
 
 import methods.kernels
+from bench.cameras import place_camera
 from bench.case import U32, largest_error
-from bench.types import Rays
+from bench.types import Camera, Rays
 from methods.kernels import availability
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import Intervals, composite, visible_counts, weights
 from methods.kernels.encode import HashGrid, encode
+from methods.kernels.gaussian_blending import blend
+from methods.kernels.gaussian_projection import Ellipses, project_gaussians
 from methods.kernels.march import Occupancy, extents, march
 from methods.kernels.space_to_depth import CellInputs, Layout, space_to_depth
 from methods.kernels.splat import gather, splat
@@ -28,6 +31,9 @@ pytestmark = pytest.mark.skipif(
     bool(availability()["gpu"]), reason="Triton has no build for this platform"
 )
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+POSE = torch.tensor([[1.0, 0.0, 0.0, 0.5], [0.0, 1.0, 0.0, 0.5], [0.0, 0.0, 1.0, -1.0]])
+FRONT = Camera(POSE, 20.0, 20.0, 10.0, 9.0, 20, 18)
+"""It looks at the unit cube, which fills the picture."""
 
 
 def test_a_table_of_half_precision_gives_features_of_its_type() -> None:
@@ -145,6 +151,51 @@ def test_what_is_not_contiguous_is_read_and_added_to_all_the_same() -> None:
     assert largest_error(*((buffer,) for buffer in buffers)) <= 6 * 50**0.5 * (fractions + 50 * U32)
 
 
+def gaussian_gradients(given: list[Tensor]) -> tuple[Tensor, ...]:
+    """Those of the sum of a picture of 20 x 18 pixels, by all that Gaussians consist of."""
+    means, scales, rotations, opacities, colours = (x.detach().requires_grad_() for x in given)
+    ellipses = project_gaussians(
+        means, scales, rotations, opacities, place_camera(FRONT, DEVICE), backend="gpu"
+    )
+    pixels = blend(ellipses, opacities, colours, 20, 18, backend="gpu")
+    total = pixels.values.sum() + pixels.alpha.sum()  # its gradients are expanded, not contiguous
+    return torch.autograd.grad(total, (means, scales, rotations, opacities, colours))
+
+
+def some_gaussians() -> list[Tensor]:
+    """Means, scales, rotations, opacities and colours, each transposed in memory."""
+    generator = torch.Generator().manual_seed(0)
+    means, scales, rotations, colours = (
+        torch.rand(size, 12, generator=generator).to(DEVICE).T for size in (3, 3, 4, 3)
+    )
+    opacities = torch.rand(12, 2, generator=generator).to(DEVICE)[:, 0]
+    return [means, 0.2 * scales, rotations, opacities, colours]
+
+
+def test_gaussians_that_are_not_contiguous_are_the_same() -> None:
+    given = some_gaussians()
+    assert not any(x.is_contiguous() for x in given)
+    found = gaussian_gradients(given)
+    assert all(grad.count_nonzero() for grad in found)
+    assert largest_error(found, gaussian_gradients([x.contiguous() for x in given])) == 0
+
+
+def test_gradients_of_gaussians_repeat_to_the_last_bit() -> None:
+    """Nothing has to be told to be deterministic."""
+    given = some_gaussians()
+    assert largest_error(gaussian_gradients(given), gaussian_gradients(given)) == 0
+
+
+@pytest.mark.parametrize("far", [-1e30, -1e3, 1e3, 1e30])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_gaussian_far_outside_of_the_picture_is_not_in_it(axis: int, far: float) -> None:
+    centres = torch.full((1, 2), 8.0, device=DEVICE)
+    centres[0, axis] = far
+    ones = torch.ones(1, 3, device=DEVICE)
+    ellipses = Ellipses(centres, ones, ones[:, 0], torch.full_like(centres, 4.0))
+    assert not blend(ellipses, ones[:, 0], ones, 17, 33, backend="gpu").alpha.any()
+
+
 def test_a_thin_haze_keeps_its_light_to_the_last_digits() -> None:
     """1 - exp(-tau) of a tau far below 1, which a difference of float32 numbers does not have."""
     sigma = torch.logspace(-30, 0, 61, device=DEVICE)
@@ -183,6 +234,15 @@ def test_types_that_it_does_not_serve_are_refused() -> None:
     positions = torch.rand(2, 3, dtype=torch.float64, device=DEVICE)
     with pytest.raises(ValueError, match="expects positions of float32"):
         encode(positions, torch.rand(grid.entries, 2, device=DEVICE), grid, backend="gpu")
+
+
+def test_gaussians_of_another_type_are_refused() -> None:
+    means, scales, rotations, opacities, colours = (x.double() for x in some_gaussians())
+    with pytest.raises(ValueError, match="expects means of float32"):
+        project_gaussians(means, scales, rotations, opacities, FRONT, backend="gpu")
+    ellipses = Ellipses(means[:, :2], scales, opacities, means[:, :2])
+    with pytest.raises(ValueError, match="expects centres of float32"):
+        blend(ellipses, opacities, colours, 4, 4, backend="gpu")
 
 
 def test_a_table_that_cannot_be_changed_in_place_is_refused() -> None:
