@@ -16,7 +16,7 @@ from methods.gaussians.mcmc import disturb, relocate
 from methods.gaussians.model import Gaussians
 from methods.kernels.composite import STOP
 from methods.kernels.ssim import ssim
-from methods.training import checkpoint, loop
+from methods.training import checkpoint
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class GaussianTraining:
         self.optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def advance(self) -> dict[str, float]:
-        """One step; its mean squared error, see `loop.look`."""
+        """One step; its mean squared error."""
         options, gaussians = self.options, self.gaussians
         share = self.step / self.steps
         camera, target = self._picture(half=share < options.half)
@@ -117,8 +117,7 @@ class GaussianTraining:
             relocate(gaussians, self.optimiser, self.generator)
         if options.noise:
             disturb(gaussians, options.noise * rate, self.generator)
-        error = functional.mse_loss(picture.detach(), target)
-        return loop.look(self, {"": error}, {"rendered pixels": picture})
+        return {"": functional.mse_loss(picture.detach(), target).item()}
 
     def _picture(self, half: bool) -> tuple[Camera, Tensor]:
         """A training view and its picture [H, W, 3]; every view has its turn in a round."""
@@ -129,7 +128,7 @@ class GaussianTraining:
             self.views = order.tolist()
         view = self.views.pop()
         camera, device = self.split.cameras[view], self.background.device
-        picture = composite(self.split.images[view].to(device, non_blocking=True), self.background)
+        picture = composite(self.split.images[view].to(device), self.background)
         if half and min(camera.width, camera.height) > 1:
             camera = scale_camera(camera, camera.width // 2, camera.height // 2)
             shrunk = functional.interpolate(

@@ -40,7 +40,7 @@ def blend(
         stop: what lies behind a transmittance of at most `stop` has no weight.
 
     Raises:
-        ValueError: a shape other than these, no pixel; backend "cpu": not float32.
+        ValueError: a shape other than these, no pixel; backends "cpu" and "gpu": not float32.
     """
     count = len(opacities)
     check_shape("opacities", opacities, None)

@@ -20,8 +20,8 @@ CLEAR = 1e-4
 """Relative distance of every opacity, at every pixel, from where a comparison turns."""
 
 SIZES = (
-    ("no Gaussian", 0, 20, 10, 1),
     ("one pixel", 30, 1, 1, 1),
+    ("no Gaussian", 0, 20, 10, 1),
     ("one tile", 60, 16, 16, 1),
     ("parts of tiles", 200, 67, 45, 1),
     ("of many tiles", 10, 67, 45, 10),

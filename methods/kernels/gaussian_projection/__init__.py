@@ -69,7 +69,7 @@ def project_gaussians(
         camera: on the device of the Gaussians.
 
     Raises:
-        ValueError: a shape other than these; backend "cpu": not float32.
+        ValueError: a shape other than these; backends "cpu" and "gpu": not float32.
     """
     count = len(means)
     check_shape("means", means, None, 3)

@@ -36,8 +36,9 @@ def test_what_has_no_kernel_for_the_gpu_is_computed_by_torch(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(dispatch, "resolve", lambda backend, device: backend)
-    chosen = dispatch.implementation("voxel_walk", "gpu", torch.device("cpu"))
-    assert chosen.__name__ == "methods.kernels.voxel_walk.reference"
+    monkeypatch.setattr(dispatch, "has", lambda kernel, backend: False)
+    chosen = dispatch.implementation("splat", "gpu", torch.device("cpu"))
+    assert chosen.__name__ == "methods.kernels.splat.reference"
 
 
 def test_cpu_backend_refuses_tensors_of_another_device() -> None:
@@ -49,9 +50,10 @@ def test_a_description_names_the_kernels_that_torch_computes_for_the_gpu(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(dispatch, "resolve", lambda backend, device: backend)
+    monkeypatch.setattr(dispatch, "has", lambda kernel, backend: kernel in ("encode", "march"))
     described = partial(dispatch.description, "gpu", "cuda")
     assert described(["encode", "march"]) == "gpu"
-    assert described(["voxel_walk", "encode", "ssim"]) == "gpu, reference: ssim, voxel_walk"
+    assert described(["warp", "encode", "splat"]) == "gpu, reference: splat, warp"
 
 
 def test_a_description_is_of_the_backend_that_computes() -> None:
