@@ -4,13 +4,15 @@ Every number is written once, in the order of memory; what it is made of is read
 it, too, and comes from the cache. Of memory, rows are 4 bytes a column to write, and what is seen
 to read; pixels are 12 bytes to write, and rows, output, matrix and base to read.
 
-The backward passes compute again what the reference does and differentiate that. Whether an index
-names no point is asked once, after all is launched: here the host waits for that alone.
+What several cells share, samples and points, gets its gradient by atomics, in no order that
+repeats; where torch is told to use deterministic algorithms, it differentiates the reference. All
+other gradients are written once, too. Whether an index names no point is asked once, after all is
+launched: here the host waits for that alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -68,38 +70,32 @@ class _SpaceToDepth(torch.autograd.Function):
     @staticmethod
     def backward(ctx, *grads):
         inputs, *others = ctx.given
-
-        def again(*learned: Tensor) -> Pair:
-            return reference.space_to_depth(_with(inputs, *learned), *others)
-
-        return None, None, None, None, *_gradients(again, ctx.saved_tensors, grads)
+        learned, wanted = ctx.saved_tensors, ctx.needs_input_grad[4:]
+        if torch.are_deterministic_algorithms_enabled():
+            with torch.enable_grad():
+                fresh = [x.detach().requires_grad_() for x in learned]
+                found = reference.space_to_depth(_with(inputs, *fresh), *others)
+            added = torch.autograd.grad(found, fresh, grads)
+        else:
+            added = [
+                x.new_zeros(x.shape) if want else None
+                for x, want in zip(learned, wanted, strict=True)
+            ]
+            _add(inputs, *others[:2], *(grad.contiguous() for grad in grads), added)
+        return None, None, None, None, *added
 
 
 class _DepthToSpace(torch.autograd.Function):
     @staticmethod
     def forward(ctx, layout, *parts):
+        base, *rest = (x.detach().contiguous() for x in parts)
         ctx.layout = layout
-        ctx.save_for_backward(*parts)
-        return _drawn(layout, *(x.detach().contiguous() for x in parts))
+        ctx.save_for_backward(*rest)
+        return _drawn(layout, base, *rest)
 
     @staticmethod
     def backward(ctx, grad):
-        def again(base: Tensor, rows: Tensor, output: Tensor, *matrix: Tensor) -> tuple[Tensor]:
-            shared = next(iter(matrix), None)
-            return (reference.depth_to_space(base, rows, output, shared, ctx.layout),)
-
-        return None, *_gradients(again, ctx.saved_tensors, (grad,))
-
-
-def _gradients(
-    again: Callable[..., tuple[Tensor, ...]],
-    inputs: tuple[Tensor, ...],
-    grads: tuple[Tensor, ...],
-) -> tuple[Tensor, ...]:
-    """Of what `again` computes from `inputs`."""
-    with torch.enable_grad():
-        fresh = [x.detach().requires_grad_() for x in inputs]
-        return torch.autograd.grad(again(*fresh), fresh, grads, materialize_grads=True)
+        return None, grad, *_undrawn(ctx.layout, grad.contiguous(), *ctx.saved_tensors)
 
 
 def _rows(inputs: CellInputs, layout: Layout, taps: Tensor, count: int) -> Pair:
@@ -144,14 +140,70 @@ def _rows(inputs: CellInputs, layout: Layout, taps: Tensor, count: int) -> Pair:
     return base, rows
 
 
+def _add(
+    inputs: CellInputs,
+    layout: Layout,
+    taps: Tensor,
+    grad_base: Tensor,
+    grad_rows: Tensor,
+    grads: Sequence[Tensor | None],
+) -> None:
+    """Add to `grads` of `_learned(inputs)`, or leave out those that are None."""
+    height, width, channels = inputs.values.shape
+    cells, pixels, begins = inputs.cells.contiguous(), layout.scale**2, layout.begins
+    number, each = len(cells), pixels * (channels + 1)
+    values, alpha, *points = grads
+    rows = grad_rows, layout.width
+    known = inputs.history[1].contiguous() if inputs.history else None
+    at_surface = inputs.surface[1].contiguous() if inputs.surface else None
+    where = _places(layout).values()
+    whole = torch.empty_like(grad_base)
+    _launch(_base_back, whole.numel(), layout, grad_base, known, at_surface, *rows, *where, whole)
+    if values is not None:
+        samples = cells, height, width, taps.contiguous()
+        _launch(_taps_back, 3 * number * interface.TAPS, layout, whole, *samples, values)
+    if values is not None or alpha is not None:
+        _launch(_present_back, number * (channels + 1), layout, cells, *rows, values, alpha)
+    for age, (_, index) in enumerate(inputs.preceding):
+        if points[age] is not None:
+            given = index.contiguous(), cells, width, *rows, begins[f"preceding {age}"]
+            _launch(_preceding_back, number * each, layout, *given, points[age])
+    if inputs.surface and points[-1] is not None:
+        given = at_surface, *rows, begins["surface"]
+        _launch(_surface_back, number * each, layout, *given, points[-1])
+
+
 def _drawn(
     layout: Layout, base: Tensor, rows: Tensor, output: Tensor, matrix: Tensor | None = None
 ) -> Tensor:
-    pixels, begins = torch.empty_like(base), layout.begins
+    pixels = torch.empty_like(base)
     given = base, rows, layout.width, output, matrix, pixels
-    at = {name.upper(): begins.get(name, -1) for name in ("history", "surface")}
+    at = {name.upper(): begin for name, begin in _places(layout).items()}
     _launch(_pixels, pixels.numel(), layout, *given, **at)
     return pixels
+
+
+def _undrawn(
+    layout: Layout, grad: Tensor, rows: Tensor, output: Tensor, matrix: Tensor | None = None
+) -> list[Tensor]:
+    """Gradients of all that `_drawn` is given but the base, whose is `grad` itself."""
+    grads = [torch.zeros_like(x) for x in (rows, output, matrix) if x is not None]
+    at = {name.upper(): begin for name, begin in _places(layout).items()}
+    number, pixels = grad.shape[:2]
+    given = grad, rows, layout.width
+    outputs = number * output.shape[1]
+    _launch(_output_back, outputs, layout, *given, output, *grads[:2], **at)
+    if matrix is not None:
+        at.pop("HISTORY")
+        features = number * matrix.shape[1]
+        _launch(_read_back, features // 3 * pixels, layout, *given, matrix, grads[0], **at)
+        _launch(_matrix_back, features, layout, *given, grads[2], **at)
+    return grads
+
+
+def _places(layout: Layout) -> dict[str, int]:
+    """Where history and surface begin, -1 for nowhere."""
+    return {name: layout.begins.get(name, -1) for name in ("history", "surface")}
 
 
 def _launch(
@@ -174,6 +226,14 @@ def _block(total, BLOCK: tl.constexpr):
 
 
 @triton.jit
+def _near(cell, tap, height, width):
+    """Which of all samples is tap 0 to 8 of the 3 x 3 around a cell, the border repeated."""
+    y = tl.minimum(tl.maximum(cell // width + (tap // 3 - 1), 0), height - 1)
+    x = tl.minimum(tl.maximum(cell % width + (tap % 3 - 1), 0), width - 1)
+    return (y * width + x).to(tl.int64)
+
+
+@triton.jit
 def _base(
     values,
     background,
@@ -190,13 +250,10 @@ def _base(
     i, inside = _block(total, BLOCK)
     c, sub = i % 3, i // 3 % (SCALE * SCALE)
     cell = tl.load(cells + i // (3 * SCALE * SCALE), mask=inside, other=0).to(tl.int32)
-    row, column = cell // width, cell % width
     less = tl.load(background + c)
     blended = tl.zeros([BLOCK], tl.float32)
     for tap in tl.static_range(TAPS):
-        y = tl.minimum(tl.maximum(row + (tap // 3 - 1), 0), height - 1)
-        x = tl.minimum(tl.maximum(column + (tap % 3 - 1), 0), width - 1)
-        near = values + (y * width + x).to(tl.int64) * (FEATURES - 1)
+        near = values + _near(cell, tap, height, width) * (FEATURES - 1)
         colour = tl.load(near + c, mask=inside, other=0.0) - less
         blended += tl.load(taps + sub * TAPS + tap) * colour
     tl.store(base + i, blended, mask=inside)
@@ -249,6 +306,15 @@ def _present(
 
 
 @triton.jit
+def _in_cell(index, cells, width, n, sub, inside, SCALE: tl.constexpr):
+    """The points that the pixels `sub` of cells show."""
+    cell = tl.load(cells + n, mask=inside, other=0).to(tl.int32)
+    row, column = cell // width * SCALE + sub // SCALE, cell % width * SCALE + sub % SCALE
+    shown = index + row * (width * SCALE) + column
+    return tl.load(shown, mask=inside, other=-1).to(tl.int64)
+
+
+@triton.jit
 def _preceding(
     values,
     points,
@@ -268,10 +334,7 @@ def _preceding(
     i, inside = _block(total, BLOCK)
     n, place = i // (SCALE * SCALE * FEATURES), i % (SCALE * SCALE * FEATURES)
     sub, f = place // FEATURES, place % FEATURES
-    cell = tl.load(cells + n, mask=inside, other=0).to(tl.int32)
-    row, column = cell // width * SCALE + sub // SCALE, cell % width * SCALE + sub % SCALE
-    shown = index + row * (width * SCALE) + column
-    point = tl.load(shown, mask=inside, other=-1).to(tl.int64)
+    point = _in_cell(index, cells, width, n, sub, inside, SCALE)
     seen, source = _seen(point, points, f, wrong), _source(f, FEATURES)
     features = values + point * (FEATURES - 1)
     less = _less_background(features, background, source, seen, FEATURES)
@@ -371,3 +434,219 @@ def _pixels(
             read += weighted * tl.load(entry, mask=inside, other=0.0)
         shown += read
     tl.store(pixels + i, shown, mask=inside)
+
+
+@triton.jit
+def _base_back(
+    grad_base,
+    known,
+    at_surface,
+    rows,
+    columns,
+    history,
+    surface,
+    whole,
+    total,
+    SCALE: tl.constexpr,
+    FEATURES: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """`whole`: also what reaches the base through the columns that are relative to it."""
+    i, inside = _block(total, BLOCK)
+    pixel, c = i // 3, i % 3
+    n, sub = pixel // (SCALE * SCALE), pixel % (SCALE * SCALE)
+    row = rows + n * columns
+    grad = tl.load(grad_base + i, mask=inside, other=0.0)
+    if known is not None:
+        share = tl.load(known + pixel, mask=inside, other=0.0)
+        grad -= share * tl.load(row + history + 4 * sub + c, mask=inside, other=0.0)
+    if at_surface is not None:
+        seen = tl.load(at_surface + pixel, mask=inside, other=-1) >= 0
+        grad -= tl.load(row + surface + FEATURES * sub + c, mask=seen, other=0.0)
+    tl.store(whole + i, grad, mask=inside)
+
+
+@triton.jit
+def _taps_back(
+    whole,
+    cells,
+    height,
+    width,
+    taps,
+    grad_values,
+    total,
+    SCALE: tl.constexpr,
+    FEATURES: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Adjoint of `_base`."""
+    i, inside = _block(total, BLOCK)
+    n, tap, c = i // (3 * TAPS), (i // 3 % TAPS).to(tl.int32), i % 3
+    cell = tl.load(cells + n, mask=inside, other=0).to(tl.int32)
+    grad = tl.zeros([BLOCK], tl.float32)
+    for sub in range(SCALE * SCALE):
+        share = tl.load(whole + (n * (SCALE * SCALE) + sub) * 3 + c, mask=inside, other=0.0)
+        grad += tl.load(taps + sub * TAPS + tap) * share
+    near = grad_values + _near(cell, tap, height, width) * (FEATURES - 1)
+    tl.atomic_add(near + c, grad, mask=inside, sem="relaxed")
+
+
+@triton.jit
+def _present_back(
+    cells,
+    rows,
+    columns,
+    grad_values,
+    grad_alpha,
+    total,
+    SCALE: tl.constexpr,
+    FEATURES: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    i, inside = _block(total, BLOCK)
+    n, source = i // FEATURES, _source(i % FEATURES, FEATURES)
+    cell = tl.load(cells + n, mask=inside, other=0)
+    grad = tl.load(rows + n * columns + i % FEATURES, mask=inside, other=0.0)
+    last = source == FEATURES - 1
+    if grad_values is not None:
+        feature = grad_values + cell * (FEATURES - 1) + source
+        tl.atomic_add(feature, grad, mask=inside & (last == 0), sem="relaxed")
+    if grad_alpha is not None:
+        tl.atomic_add(grad_alpha + cell, grad, mask=inside & last, sem="relaxed")
+
+
+@triton.jit
+def _preceding_back(
+    index,
+    cells,
+    width,
+    rows,
+    columns,
+    begin,
+    grad_values,
+    total,
+    SCALE: tl.constexpr,
+    FEATURES: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    i, inside = _block(total, BLOCK)
+    n, place = i // (SCALE * SCALE * FEATURES), i % (SCALE * SCALE * FEATURES)
+    point = _in_cell(index, cells, width, n, place // FEATURES, inside, SCALE)
+    source = _source(place % FEATURES, FEATURES)
+    learned = (point >= 0) & (source < FEATURES - 1)
+    grad = tl.load(rows + n * columns + begin + place, mask=learned, other=0.0)
+    feature = grad_values + point * (FEATURES - 1) + source
+    tl.atomic_add(feature, grad, mask=learned, sem="relaxed")
+
+
+@triton.jit
+def _surface_back(
+    index,
+    rows,
+    columns,
+    begin,
+    grad_values,
+    total,
+    SCALE: tl.constexpr,
+    FEATURES: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    i, inside = _block(total, BLOCK)
+    n, place = i // (SCALE * SCALE * FEATURES), i % (SCALE * SCALE * FEATURES)
+    point = tl.load(index + i // FEATURES, mask=inside, other=-1).to(tl.int64)
+    seen, source = point >= 0, _source(place % FEATURES, FEATURES)
+    grad = tl.load(rows + n * columns + begin + place, mask=seen, other=0.0)
+    tl.atomic_add(grad_values + point * FEATURES + source, grad, mask=seen, sem="relaxed")
+
+
+@triton.jit
+def _output_back(
+    grad,
+    rows,
+    columns,
+    output,
+    grad_rows,
+    grad_output,
+    total,
+    HISTORY: tl.constexpr,
+    SURFACE: tl.constexpr,
+    SCALE: tl.constexpr,
+    FEATURES: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Of the output and, of as many columns, of the history."""
+    i, inside = _block(total, BLOCK)
+    OUTPUTS: tl.constexpr = 3 + (HISTORY >= 0)
+    pixel, o = i // OUTPUTS, i % OUTPUTS
+    colour = o < 3
+    gain = tl.load(grad + 3 * pixel + o, mask=inside & colour, other=0.0)
+    if HISTORY < 0:
+        tl.store(grad_output + i, gain, mask=inside)
+    else:
+        n, sub = pixel // (SCALE * SCALE), pixel % (SCALE * SCALE)
+        place = n * columns + HISTORY + 4 * sub
+        known = tl.load(rows + place + 3, mask=inside, other=0.0)
+        share = tl.sigmoid(tl.load(output + 4 * pixel + 3, mask=inside, other=0.0))
+        along = tl.zeros([BLOCK], tl.float32)
+        for c in tl.static_range(3):
+            of_colour = tl.load(grad + 3 * pixel + c, mask=inside, other=0.0)
+            along += of_colour * tl.load(rows + place + c, mask=inside, other=0.0)
+        of_logit = share * (1 - share) * known * along
+        tl.store(grad_output + i, tl.where(colour, gain, of_logit), mask=inside)
+        recent = tl.where(colour, share * known * gain, share * along)
+        tl.store(grad_rows + place + o, recent, mask=inside)
+
+
+@triton.jit
+def _read_back(
+    grad,
+    rows,
+    columns,
+    matrix,
+    grad_rows,
+    total,
+    SURFACE: tl.constexpr,
+    SCALE: tl.constexpr,
+    FEATURES: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Of the columns of the surface; that of an opacity goes through the colours, too."""
+    i, inside = _block(total, BLOCK)
+    pixel, f = i // FEATURES, i % FEATURES
+    n, sub = pixel // (SCALE * SCALE), pixel % (SCALE * SCALE)
+    surface = n * columns + SURFACE + FEATURES * sub
+    slope, of_colours = tl.zeros([BLOCK], tl.float32), tl.zeros([BLOCK], tl.float32)
+    weighs = inside & (f == 3)
+    for c in tl.static_range(3):
+        gain = tl.load(grad + 3 * pixel + c, mask=inside, other=0.0)
+        entry = matrix + (3 * n + c) * FEATURES
+        slope += gain * tl.load(entry + f, mask=inside, other=0.0)
+        for k in tl.static_range(3):
+            value = tl.load(rows + surface + k, mask=weighs, other=0.0)
+            of_colours += gain * tl.load(entry + k, mask=weighs, other=0.0) * value
+    opacity = tl.load(rows + surface + 3, mask=inside, other=0.0)
+    weight = tl.where(f < 3, opacity, 1.0)
+    tl.store(grad_rows + surface + f, weight * slope + of_colours, mask=inside)
+
+
+@triton.jit
+def _matrix_back(
+    grad,
+    rows,
+    columns,
+    grad_matrix,
+    total,
+    SURFACE: tl.constexpr,
+    SCALE: tl.constexpr,
+    FEATURES: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    i, inside = _block(total, BLOCK)
+    n, c, f = i // (3 * FEATURES), i // FEATURES % 3, i % FEATURES
+    slope = tl.zeros([BLOCK], tl.float32)
+    for sub in range(SCALE * SCALE):
+        surface = rows + n * columns + SURFACE + FEATURES * sub
+        value = tl.load(surface + f, mask=inside, other=0.0)
+        value *= tl.load(surface + 3, mask=inside & (f < 3), other=1.0)
+        slope += value * tl.load(grad + 3 * (n * SCALE * SCALE + sub) + c, mask=inside, other=0.0)
+    tl.store(grad_matrix + i, slope, mask=inside)
