@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 import triton
+import triton.language as tl
 from torch import Tensor
 
 
@@ -35,3 +36,20 @@ def check_types(*served: torch.dtype, **tensors: Tensor) -> None:
                 f"backend 'gpu' expects {name} of {expected}, got {tensor.dtype}: use "
                 "backend='reference'"
             )
+
+
+@triton.jit
+def vector(vectors, i, there):
+    """x, y and z of `vectors` [N, 3] at `i`; 0 where they are not `there`."""
+    return (
+        tl.load(vectors + 3 * i, mask=there, other=0.0),
+        tl.load(vectors + 3 * i + 1, mask=there, other=0.0),
+        tl.load(vectors + 3 * i + 2, mask=there, other=0.0),
+    )
+
+
+@triton.jit
+def opacity(tau):
+    """1 - exp(-tau), by its series where the difference would cancel."""
+    series = tau * (1 - tau / 2 * (1 - tau / 3 * (1 - tau / 4 * (1 - tau / 5))))
+    return tl.where(tau < 0.06, series, 1 - tl.exp(-tau))

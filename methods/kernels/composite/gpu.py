@@ -12,7 +12,7 @@ import triton.language as tl
 from torch import Tensor
 
 from methods.kernels.composite import Intervals, Pixels
-from methods.kernels.gpu import check_types, launch
+from methods.kernels.gpu import check_types, launch, opacity
 
 BLOCK = 64  # samples
 OPAQUE = tl.constexpr(128.0)
@@ -100,13 +100,6 @@ class _Composite(torch.autograd.Function):
 
 
 @triton.jit
-def _opacity(tau):
-    """1 - exp(-tau), by its series where the difference would cancel."""
-    series = tau * (1 - tau / 2 * (1 - tau / 3 * (1 - tau / 4 * (1 - tau / 5))))
-    return tl.where(tau < 0.06, series, 1 - tl.exp(-tau))
-
-
-@triton.jit
 def _thickness(sigma, delta, i, there):
     """Optical thickness of samples, at most `OPAQUE`; a NaN stays one.
 
@@ -126,7 +119,7 @@ def _block(sigma, delta, first, i, inside, light, stop):
     tau = _thickness(sigma, delta, i, inside)
     before = light * tl.exp(-tl.cumsum(in_front, 0))
     lit = inside & (before > stop)
-    weight = tl.where(lit, before * _opacity(tau), 0.0)
+    weight = tl.where(lit, before * opacity(tau), 0.0)
     return weight, lit, before * tl.exp(-tau), light * tl.exp(-tl.sum(tau, 0))
 
 

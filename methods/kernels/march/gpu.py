@@ -15,7 +15,7 @@ from torch import Tensor
 
 from methods.kernels.composite import Extent
 from methods.kernels.dispatch import interpreted
-from methods.kernels.gpu import check_types, launch
+from methods.kernels.gpu import check_types, launch, vector
 from methods.kernels.march import (
     BRICK,
     PARALLEL,
@@ -95,15 +95,6 @@ def _launch(arguments: list[Any], *outputs: Tensor | None) -> None:
 
 
 @triton.jit
-def _vector(vectors, ray, there):
-    return (
-        tl.load(vectors + 3 * ray, mask=there, other=0.0),
-        tl.load(vectors + 3 * ray + 1, mask=there, other=0.0),
-        tl.load(vectors + 3 * ray + 2, mask=there, other=0.0),
-    )
-
-
-@triton.jit
 def _leave_slab(origin, slope, cell, free, width):
     """t at which a ray leaves, along one axis, the cells that are empty with `cell`: itself, or, if
     `free` is not 0, those of as many bricks around."""
@@ -149,9 +140,9 @@ def _march(
     inside = ray < rays
     k = tl.load(starts + ray, mask=inside, other=-1)
     going = k >= 0
-    ox, oy, oz = _vector(origins, ray, going)
-    dx, dy, dz = _vector(directions, ray, going)
-    sx, sy, sz = _vector(slopes, ray, going)
+    ox, oy, oz = vector(origins, ray, going)
+    dx, dy, dz = vector(directions, ray, going)
+    sx, sy, sz = vector(slopes, ray, going)
     near = tl.load(nearest + ray, mask=going, other=0.0)
     far = tl.load(farthest + ray, mask=going, other=0.0)
     step = tl.load(steps + ray, mask=going, other=1.0)

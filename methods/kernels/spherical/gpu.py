@@ -16,7 +16,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from methods.kernels.gpu import check_types, launch
+from methods.kernels.gpu import check_types, launch, vector
 from methods.kernels.spherical import CHANNELS
 
 BLOCK = 1024
@@ -83,15 +83,6 @@ class _Shade(torch.autograd.Function):
 
 
 @triton.jit
-def _vector(vectors, i, inside):
-    return (
-        tl.load(vectors + 3 * i, mask=inside, other=0.0),
-        tl.load(vectors + 3 * i + 1, mask=inside, other=0.0),
-        tl.load(vectors + 3 * i + 2, mask=inside, other=0.0),
-    )
-
-
-@triton.jit
 def _harmonic(x, y, z, k: tl.constexpr):
     """The k-th harmonic."""
     xx, yy, zz = x * x, y * y, z * z
@@ -142,7 +133,7 @@ def _rows(x, y, z, column, SIZE: tl.constexpr):
 def _evaluate(directions, values, count, ROWS: tl.constexpr, SIZE: tl.constexpr):
     i = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     inside = i < count
-    x, y, z = _vector(directions, i, inside)
+    x, y, z = vector(directions, i, inside)
     column = tl.arange(0, SIZE)
     place = values + i[:, None] * SIZE + column[None, :]
     tl.store(place, _rows(x, y, z, column, SIZE), mask=inside[:, None])
@@ -152,11 +143,11 @@ def _evaluate(directions, values, count, ROWS: tl.constexpr, SIZE: tl.constexpr)
 def _shade(directions, coefficients, colours, count, SIZE: tl.constexpr, LANES: tl.constexpr):
     i = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
     inside = i < count
-    x, y, z = _vector(directions, i, inside)
+    x, y, z = vector(directions, i, inside)
     red, green, blue = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     for k in tl.static_range(SIZE):
         basis = _harmonic(x, y, z, k)
-        of_red, of_green, of_blue = _vector(coefficients, i * SIZE + k, inside)
+        of_red, of_green, of_blue = vector(coefficients, i * SIZE + k, inside)
         red += basis * of_red
         green += basis * of_green
         blue += basis * of_blue
@@ -178,7 +169,7 @@ def _unshade(
     """Gradients of the coefficients: products of harmonics and gradients of the colours."""
     i = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     inside = i < count
-    x, y, z = _vector(directions, i, inside)
+    x, y, z = vector(directions, i, inside)
     column = tl.arange(0, WIDTH)
     there = inside[:, None] & (column < 3 * SIZE)[None, :]
     of_colour = tl.load(grad + 3 * i[:, None] + (column % 3)[None, :], mask=there, other=0.0)

@@ -176,7 +176,7 @@ def walk(
         limit: at most so many crossings a ray; None: all.
 
     Raises:
-        ValueError: wrong shapes, a limit below 1; backend "cpu": not float32.
+        ValueError: wrong shapes, a limit below 1; backends "cpu", "gpu": not float32.
     """
     origins, count = rays.origins, len(rays.origins)
     check_shape("origins", origins, None, 3)
@@ -215,7 +215,7 @@ def render_voxels(
         faint: weight up to which a voxel has an opacity but no colour.
 
     Raises:
-        ValueError: wrong shapes, a stop outside [0, 1); backend "cpu": not float32.
+        ValueError: wrong shapes, a stop outside [0, 1); backends "cpu", "gpu": not float32.
     """
     check_stop(stop)
     check_shape("origins", rays.origins, None, 3)

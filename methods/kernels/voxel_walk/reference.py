@@ -29,7 +29,7 @@ def walk(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> Crossings:
     near, far, voxel, counts, resume = (torch.cat(column) for column in zip(*parts, strict=True))
     ray = torch.arange(count, device=start.device).repeat_interleave(counts)
     offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
-    delta = (far - near) * _length(rays.directions)[ray]
+    delta = (far - near) * length(rays.directions)[ray]
     middle = (near + far) * 0.5
     return Crossings(middle, delta, offsets, near, far, ray.int(), voxel, resume)
 
@@ -54,27 +54,47 @@ def render_voxels(
     return pixels, crossed.int(), shaded
 
 
+def length(directions: Tensor) -> Tensor:
+    """Of directions [R, 3], [R]: in float64, where every backend rounds to the same float32."""
+    return directions.double().norm(dim=-1).to(directions.dtype)
+
+
+def slopes(directions: Tensor) -> Tensor:
+    """t by length along each axis, [R, 3]; 0 for a ray that does not move along it."""
+    parallel = directions.abs() < PARALLEL
+    return torch.where(parallel, 0, 1 / torch.where(parallel, 1, directions))
+
+
+def clip(rays: Rays, resolution: int, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The t between which rays are inside the cube, from `start` on, and whether there is anything
+    to walk, each [R]; without that, the t are 0."""
+    origins, directions = rays.origins, rays.directions
+    parallel, slope = directions.abs() < PARALLEL, slopes(directions)
+    width = 1 / torch.tensor(resolution, dtype=origins.dtype, device=origins.device)
+    low, high = ((plane * width - origins) * slope for plane in (0, resolution))
+    inside = (origins >= 0) & (origins <= 1)
+    outside = torch.where(inside, -torch.inf, torch.inf)
+    first = torch.where(parallel, outside, torch.minimum(low, high))
+    last = torch.where(parallel, -outside, torch.maximum(low, high))
+    near, far = first.amax(dim=1).clamp(min=0), last.amin(dim=1)
+    reach = length(directions)
+    finite = origins.isfinite().all(dim=1) & (reach > 0) & reach.isfinite()
+    alive = finite & (near < far) & far.isfinite() & (start < far)
+    near, far = (torch.where(alive, t, 0) for t in (torch.maximum(near, start), far))
+    return near, far, alive
+
+
 def _walk_block(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> tuple[Tensor, ...]:
     """Near, far and voxel [S] of crossings, how many a ray has [R], where to resume [R]."""
     origins, directions = rays.origins, rays.directions
     size, rows = voxels.resolution, len(origins)
-    parallel = directions.abs() < PARALLEL
-    slope = torch.where(parallel, 0, 1 / torch.where(parallel, 1, directions))
+    parallel, slope = directions.abs() < PARALLEL, slopes(directions)
     width = 1 / torch.tensor(size, dtype=origins.dtype, device=origins.device)
     edges = torch.arange(size + 1, device=origins.device).to(origins) * width
     planes = (edges - origins[..., None]) * slope[..., None]  # [R, 3, G + 1]
     planes = planes.sort(dim=2).values  # in the order in which the ray meets them
-    inside = (origins >= 0) & (origins <= 1)
-    first = torch.where(parallel, torch.where(inside, -torch.inf, torch.inf), planes[..., 0])
-    last = torch.where(parallel, torch.where(inside, torch.inf, -torch.inf), planes[..., -1])
-    near, far = first.amax(dim=1).clamp(min=0), last.amin(dim=1)
-    length = _length(directions)
-    finite = origins.isfinite().all(dim=1) & (length > 0) & length.isfinite()
-    alive = finite & (near < far) & far.isfinite() & (start < far)
-
-    near = torch.maximum(near, start)
-    # A ray that is not alive has an interval without length.
-    near, far = (torch.where(alive, x, 0)[:, None] for x in (near, far))
+    near, far, alive = clip(rays, size, start)
+    near, far = near[:, None], far[:, None]
     crossed = torch.where(parallel[..., None] | ~alive[:, None, None], torch.inf, planes)
     t = torch.cat((near, crossed.flatten(1)), dim=1)
     t = torch.minimum(torch.maximum(t, near), far).sort(dim=1).values
@@ -106,8 +126,3 @@ def _look_up(cells: Tensor, voxels: Voxels) -> Tensor:
     return torch.where(
         brick >= 0, voxels.leaves[brick.clamp(min=0), (x * BRICK + y) * BRICK + z], -1
     )
-
-
-def _length(directions: Tensor) -> Tensor:
-    # In float64, where every backend rounds to the same float32.
-    return directions.double().norm(dim=-1).to(directions.dtype)
