@@ -39,8 +39,8 @@ def gather(
             autograd sees none: a training step then neither allocates nor clears a second table.
 
     Raises:
-        ValueError: a shape other than these, a voxel that is no row of `corners`; backend "cpu":
-            other types.
+        ValueError: a shape other than these, a voxel that is no row of `corners`; backends "cpu",
+            "gpu": other types.
     """
     check_shape("table", table, None, None)
     check_shape("corners", corners, None, CORNERS)
@@ -65,7 +65,7 @@ def trilinear(local: Tensor, *, backend: str = "auto") -> Tensor:
     Differentiable with backend="reference" only.
 
     Raises:
-        ValueError: a shape other than this; backend "cpu": not float32.
+        ValueError: a shape other than this; backends "cpu", "gpu": not float32.
     """
     check_shape("local", local, None, 3)
     return implementation("corner_gather", backend, local.device).trilinear(local)
@@ -83,7 +83,7 @@ def integral(entry: Tensor, leave: Tensor, *, backend: str = "auto") -> Tensor:
         leave: [S, 3] of the other.
 
     Raises:
-        ValueError: a shape other than these; backend "cpu": not float32.
+        ValueError: a shape other than these; backends "cpu", "gpu": not float32.
     """
     check_shape("entry", entry, None, 3)
     check_shape("leave", leave, len(entry), 3)
@@ -98,7 +98,8 @@ def integral_along(
     Not differentiable.
 
     Raises:
-        ValueError: rays or voxels that are not those of the crossings; backend "cpu": not float32.
+        ValueError: rays or voxels that are not those of the crossings; backends "cpu", "gpu": not
+            float32.
     """
     count = len(rays.origins)
     check_shape("origins", rays.origins, count, 3)
