@@ -6,6 +6,8 @@ TRITON_INTERPRET=1: the tests do so.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -36,6 +38,19 @@ def check_types(*served: torch.dtype, **tensors: Tensor) -> None:
                 f"backend 'gpu' expects {name} of {expected}, got {tensor.dtype}: use "
                 "backend='reference'"
             )
+
+
+@contextmanager
+def gradient(buffer: Tensor | None, shape: torch.Size, device: torch.device) -> Iterator[Tensor]:
+    """What a kernel adds a gradient to, contiguous float32: `buffer` itself, if it is that; else
+    zeros of `shape`, which are added to a buffer in the end."""
+    if buffer is not None and buffer.dtype == torch.float32 and buffer.is_contiguous():
+        yield buffer
+        return
+    target = torch.zeros(shape, device=device)
+    yield target
+    if buffer is not None:
+        buffer += target
 
 
 @triton.jit

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from bench.types import Rays
 from methods.kernels import corner_gather as interface
-from methods.kernels.gpu import check_types, launch, vector
+from methods.kernels.gpu import check_types, gradient, launch, vector
 from methods.kernels.voxel_walk import Crossings, Voxels
 
 BLOCK = 1024
@@ -63,17 +63,13 @@ class _Gather(torch.autograd.Function):
     def backward(ctx, grad):
         corners, voxel, weights = ctx.saved_tensors
         buffer = ctx.grad_buffer
-        target = buffer
-        if buffer is None or buffer.dtype != torch.float32 or not buffer.is_contiguous():
-            target = grad.new_zeros(ctx.shape)
-        if torch.are_deterministic_algorithms_enabled():
-            for corner in range(interface.CORNERS):
-                rows = corners[voxel.long(), corner].long()
-                target.index_put_((rows,), weights[:, corner, None] * grad, accumulate=True)
-        else:
-            _move(_scatter, target, corners, voxel, weights, grad.contiguous())
-        if buffer is not None and target is not buffer:
-            buffer += target
+        with gradient(buffer, ctx.shape, grad.device) as target:
+            if torch.are_deterministic_algorithms_enabled():
+                for corner in range(interface.CORNERS):
+                    rows = corners[voxel.long(), corner].long()
+                    target.index_put_((rows,), weights[:, corner, None] * grad, accumulate=True)
+            else:
+                _move(_scatter, target, corners, voxel, weights, grad.contiguous())
         return target if buffer is None else None, None, None, None, None
 
 
@@ -93,7 +89,7 @@ def integral_along(rays: Rays, crossings: Crossings, voxels: Voxels) -> Tensor:
     check_types(torch.float32, origins=origins, directions=directions, near=near)
     of_rays = (x.detach() for x in (origins, directions))
     given = *of_rays, crossings.ray, near, crossings.far, voxels.coordinates, crossings.voxel
-    return _filled(_integral_along, len(crossings), *given, voxels.resolution)
+    return _filled(_integral_along, len(crossings), *given, SIZE=voxels.resolution)
 
 
 def _weights(kernel: triton.JITFunction, *places: Tensor) -> Tensor:
@@ -106,11 +102,13 @@ def _weights(kernel: triton.JITFunction, *places: Tensor) -> Tensor:
     return _filled(kernel, len(places[0]), *places)
 
 
-def _filled(kernel: triton.JITFunction, count: int, *given: Tensor | int) -> Tensor:
+def _filled(
+    kernel: triton.JITFunction, count: int, first: Tensor, *given: Tensor, **sizes: int
+) -> Tensor:
     """The weights of `count` samples, which `kernel` writes."""
-    arguments = [x.contiguous() if isinstance(x, Tensor) else x for x in given]
-    out = torch.empty(count, interface.CORNERS, device=arguments[0].device)
-    launch(kernel, (triton.cdiv(count, LANES),), *arguments, out, count, LANES=LANES)
+    out = first.new_empty(count, interface.CORNERS)
+    places = (x.contiguous() for x in (first, *given))
+    launch(kernel, (triton.cdiv(count, LANES),), *places, out, count, **sizes, LANES=LANES)
     return out
 
 
@@ -229,14 +227,14 @@ def _integral(entry, leave, out, count, LANES: tl.constexpr):
 
 
 @triton.jit
-def _local(origin, direction, t, size, corner):
+def _local(origin, direction, t, size: tl.constexpr, corner):
     """Local coordinate, along an axis, in the voxel that begins at `corner`; rounding leads out."""
-    place = (origin + t * direction) * size.to(tl.float32) - corner.to(tl.float32)
+    place = (origin + t * direction) * size - corner.to(tl.float32)
     return tl.minimum(tl.maximum(place, 0.0), 1.0)
 
 
 @triton.jit
-def _place(o, d, t, size, corner):
+def _place(o, d, t, size: tl.constexpr, corner):
     return (
         _local(o[0], d[0], t, size, corner[0]),
         _local(o[1], d[1], t, size, corner[1]),
@@ -253,9 +251,9 @@ def _integral_along(
     far,
     coordinates,
     voxel,
-    size,
     out,
     count,
+    SIZE: tl.constexpr,
     LANES: tl.constexpr,
 ):
     i = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
@@ -268,6 +266,6 @@ def _integral_along(
         tl.load(coordinates + 3 * v + 1, mask=inside, other=0),
         tl.load(coordinates + 3 * v + 2, mask=inside, other=0),
     )
-    entry = _place(o, d, tl.load(near + i, mask=inside, other=0.0), size, corner)
-    leave = _place(o, d, tl.load(far + i, mask=inside, other=0.0), size, corner)
+    entry = _place(o, d, tl.load(near + i, mask=inside, other=0.0), SIZE, corner)
+    leave = _place(o, d, tl.load(far + i, mask=inside, other=0.0), SIZE, corner)
     _put_means(out, i, inside, entry, leave)

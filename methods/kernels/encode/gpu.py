@@ -17,7 +17,7 @@ from torch import Tensor
 
 from methods.kernels.encode import PRIMES, HashGrid
 from methods.kernels.encode.reference import corners
-from methods.kernels.gpu import check_types, launch
+from methods.kernels.gpu import check_types, gradient, launch
 
 BLOCK = 256  # samples
 PRIME_Y, PRIME_Z = tl.constexpr(PRIMES[1]), tl.constexpr(PRIMES[2])
@@ -54,18 +54,13 @@ class _Encode(torch.autograd.Function):
     def backward(ctx, grad):
         (positions,) = ctx.saved_tensors
         grid, buffer = ctx.grid, ctx.grad_buffer
-        target = buffer
-        if buffer is None or buffer.dtype != torch.float32 or not buffer.is_contiguous():
-            target = grad.new_zeros(grid.entries, grid.features, dtype=torch.float32)
-        if torch.are_deterministic_algorithms_enabled():
-            _scatter_sorted(positions, grad.float(), grid, target)
-        else:
-            _launch(_scatter, positions, target, grid, grad.contiguous())
-        if buffer is None:
-            return None, target.to(ctx.dtype), None, None, None
-        if target is not buffer:
-            buffer += target
-        return None, None, None, None, None
+        shape = torch.Size((grid.entries, grid.features))
+        with gradient(buffer, shape, grad.device) as target:
+            if torch.are_deterministic_algorithms_enabled():
+                _scatter_sorted(positions, grad.float(), grid, target)
+            else:
+                _launch(_scatter, positions, target, grid, grad.contiguous())
+        return None, target.to(ctx.dtype) if buffer is None else None, None, None, None
 
 
 def _launch(

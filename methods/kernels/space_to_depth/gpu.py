@@ -69,19 +69,18 @@ class _SpaceToDepth(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *grads):
-        inputs, *others = ctx.given
+        inputs, layout, taps, count = ctx.given
         learned, wanted = ctx.saved_tensors, ctx.needs_input_grad[4:]
         if torch.are_deterministic_algorithms_enabled():
             with torch.enable_grad():
                 fresh = [x.detach().requires_grad_() for x in learned]
-                found = reference.space_to_depth(_with(inputs, *fresh), *others)
-            added = torch.autograd.grad(found, fresh, grads)
+                found = reference.space_to_depth(_with(inputs, *fresh), layout, taps, count)
+            added: Sequence[Tensor | None] = torch.autograd.grad(found, fresh, grads)
         else:
-            added = [
-                x.new_zeros(x.shape) if want else None
-                for x, want in zip(learned, wanted, strict=True)
-            ]
-            _add(inputs, *others[:2], *(grad.contiguous() for grad in grads), added)
+            pairs = zip(learned, wanted, strict=True)
+            added = [x.new_zeros(x.shape) if want else None for x, want in pairs]
+            grad_base, grad_rows = (grad.contiguous() for grad in grads)
+            _add(inputs, layout, taps, grad_base, grad_rows, added)
         return None, None, None, None, *added
 
 
@@ -169,8 +168,8 @@ def _add(
             given = index.contiguous(), cells, width, *rows, begins[f"preceding {age}"]
             _launch(_preceding_back, number * each, layout, *given, points[age])
     if inputs.surface and points[-1] is not None:
-        given = at_surface, *rows, begins["surface"]
-        _launch(_surface_back, number * each, layout, *given, points[-1])
+        begin = begins["surface"]
+        _launch(_surface_back, number * each, layout, at_surface, *rows, begin, points[-1])
 
 
 def _drawn(
