@@ -86,7 +86,7 @@ def locate(
         side: [] length of a cube.
 
     Raises:
-        ValueError: a shape other than these; backend "cpu": not float32.
+        ValueError: a shape other than these; backends "cpu", "gpu": not float32.
     """
     check_shape("positions", positions, None, 3)
     check_shape("cubes", cubes, None, None, None)
@@ -121,11 +121,11 @@ def encode_frequencies(inputs: Tensor, frequencies: int, *, backend: str = "auto
     """Positional encoding [S, 3 + 6 F] of `inputs` [S, 3]: x, sin x, cos x, sin 2x, cos 2x, ...
 
     Angles are 2^k x for k = 0 to F - 1, without the factor pi of Mildenhall et al. 2020, Eq. 4: so
-    had their release and that of KiloNeRF. With backend="cpu" there is no gradient, and an input
-    beyond +-16 loses digits.
+    had their release and that of KiloNeRF. Differentiable with backend="reference" only; with
+    backend="cpu" an input beyond +-16 loses digits.
 
     Raises:
-        ValueError: a shape other than this, F < 1; backend "cpu": not float32.
+        ValueError: a shape other than this, F < 1; backends "cpu", "gpu": not float32.
     """
     check_shape("inputs", inputs, None, 3)
     if frequencies < 1:
@@ -154,8 +154,8 @@ def grouped_linear(
         relu: whether outputs below 0 become 0.
 
     Raises:
-        ValueError: a shape other than these, offsets that do not end at S; backend "cpu": not
-            float32.
+        ValueError: a shape other than these, offsets that do not end at S; backends "cpu", "gpu":
+            not float32.
     """
     check_shape("weights", weights, None, None, None)
     networks, channels, outputs = weights.shape
@@ -185,7 +185,7 @@ def densities(
         numbers: [S] the network of each, as `order` takes them.
 
     Raises:
-        ValueError: a shape other than these; backend "cpu": not float32.
+        ValueError: a shape other than these; backends "cpu", "gpu": not float32.
     """
     check_shape("positions", positions, None, 3)
     check_shape("numbers", numbers, len(positions))
@@ -208,7 +208,7 @@ def colours(
         encoded: [S, D] encoded directions.
 
     Raises:
-        ValueError: a shape other than these; backend "cpu": not float32.
+        ValueError: a shape other than these; backends "cpu", "gpu": not float32.
     """
     check_shape("geometry", geometry, None, HIDDEN + 1)
     check_shape("encoded", encoded, len(geometry), networks.weights["direction"].shape[1] - HIDDEN)

@@ -26,6 +26,7 @@ TYPES = {
     "bfloat16": "bf16",
     "int64": "i64",
     "int32": "i32",
+    "int16": "i16",
     "uint8": "u8",
 }
 
