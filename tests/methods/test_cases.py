@@ -16,7 +16,17 @@ from methods.kernels import BACKENDS, availability
 
 CASES = found("cases")
 QUICK = [case for case in CASES if not (case.slow or case.timed)]
-LOOPS = ("march", "composite backward", "gaussian blending backward", "voxel_walk", "render_voxels")
+LOOPS = (
+    "march",
+    "composite backward",
+    "gaussian blending backward",
+    "voxel_walk",
+    "render_voxels",
+    "grouped linear",
+    "grouped linear backward",
+    "ssim",
+    "ssim backward",
+)
 """Subjects whose kernels of the GPU have loops, which cost seconds where they are interpreted."""
 
 

@@ -325,18 +325,28 @@ def test_kernels_of_triton_compute_there_as_on_the_cpu() -> None:
 
 GO_ON = [
     ("adam", "30% of 70, 3 features"),
+    ("colours of networks", "fewer samples than go together"),
+    ("densities of networks", "fewer samples than go together"),
+    ("depth_to_space backward", "scale 3"),
     ("depthwise backward", "scattered"),
     ("gaussian projection backward", "1 Gaussians"),
+    ("integral", "257 segments"),
+    ("locate", "1 positions"),
+    ("render_voxels", "no voxel"),
     ("shade backward", "131 colours of 16"),
+    ("shade_voxels backward", "300 of 4 harmonics"),
     ("spherical", "131 directions"),
+    ("ssim backward", "noise, 20 x 3"),
     ("warp", "holes"),
 ]
 """Cases of kernels for which the host does not wait."""
 
 WAIT = [
-    ("space_to_depth backward", "scale 3"),
-    ("depth_to_space backward", "scale 3"),
+    ("corner_gather backward", "257 samples of 27, no buffer"),
     ("gaussian blending backward", "one pixel"),
+    ("grouped linear backward", "fewer samples than go together, 63 to 32"),
+    ("space_to_depth backward", "scale 3"),
+    ("voxel_walk", "limit 1"),
 ]
 
 

@@ -30,11 +30,11 @@ BOUND = 1 / 8
 """Largest weight and bias of the cases: no sum grows from layer to layer beyond 8."""
 
 KINDS = {
+    "some samples without a network": (1000, 7),
     "no sample": (0, 3),
     "one sample": (1, 1),
     "fewer samples than go together": (5, 1),
     "most networks empty": (40, 300),
-    "some samples without a network": (1000, 7),
 }
 """Samples and networks."""
 

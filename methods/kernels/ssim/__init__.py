@@ -22,7 +22,8 @@ def ssim(picture: Tensor, target: Tensor, *, backend: str = "auto") -> Tensor:
     Differentiable in `picture`.
 
     Raises:
-        ValueError: a shape other than these; backend "cpu": not float32, or `target` with gradient.
+        ValueError: a shape other than these; backends "cpu", "gpu": not float32, or `target` with
+            gradient.
     """
     check_shape("picture", picture, None, None, 3)
     check_shape("target", target, *picture.shape)

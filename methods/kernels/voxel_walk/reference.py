@@ -70,7 +70,7 @@ def clip(rays: Rays, resolution: int, start: Tensor) -> tuple[Tensor, Tensor, Te
     to walk, each [R]; without that, the t are 0."""
     origins, directions = rays.origins, rays.directions
     parallel, slope = directions.abs() < PARALLEL, slopes(directions)
-    width = 1 / torch.tensor(resolution, dtype=origins.dtype, device=origins.device)
+    width = 1 / origins.new_full((), resolution)
     low, high = ((plane * width - origins) * slope for plane in (0, resolution))
     inside = (origins >= 0) & (origins <= 1)
     outside = torch.where(inside, -torch.inf, torch.inf)
@@ -89,7 +89,7 @@ def _walk_block(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> tuple[
     origins, directions = rays.origins, rays.directions
     size, rows = voxels.resolution, len(origins)
     parallel, slope = directions.abs() < PARALLEL, slopes(directions)
-    width = 1 / torch.tensor(size, dtype=origins.dtype, device=origins.device)
+    width = 1 / origins.new_full((), size)
     edges = torch.arange(size + 1, device=origins.device).to(origins) * width
     planes = (edges - origins[..., None]) * slope[..., None]  # [R, 3, G + 1]
     planes = planes.sort(dim=2).values  # in the order in which the ray meets them

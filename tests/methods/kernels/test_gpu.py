@@ -7,6 +7,7 @@ import platform
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,15 +18,20 @@ import methods.kernels
 from bench.cameras import place_camera
 from bench.case import U32, largest_error
 from bench.types import Camera, Rays
-from methods.kernels import availability
+from methods.kernels import availability, corner_gather
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import Intervals, composite, visible_counts, weights
 from methods.kernels.encode import HashGrid, encode
 from methods.kernels.gaussian_blending import blend
 from methods.kernels.gaussian_projection import Ellipses, project_gaussians
+from methods.kernels.grouped_mlp import grouped_linear
 from methods.kernels.march import Occupancy, extents, march
 from methods.kernels.space_to_depth import CellInputs, Layout, space_to_depth
+from methods.kernels.space_to_depth.cases import cases
 from methods.kernels.splat import gather, splat
+from methods.kernels.ssim import ssim
+from methods.kernels.voxel_shading import shade_voxels
+from methods.kernels.voxel_walk import Voxels, walk
 
 pytestmark = pytest.mark.skipif(
     bool(availability()["gpu"]), reason="Triton has no build for this platform"
@@ -84,11 +90,20 @@ def test_told_to_be_deterministic_it_adds_up_in_an_order_that_repeats() -> None:
     values = torch.rand(3, 5, device=DEVICE, requires_grad=True)
     index = torch.randint(-1, 3, (4000,), dtype=torch.int32, device=DEVICE)
     rows = torch.rand(4000, 5, device=DEVICE)
+    corners = torch.arange(16, dtype=torch.int32, device=DEVICE).view(2, 8)
+    features = torch.rand(16, 5, device=DEVICE, requires_grad=True)
+    of_corners = torch.rand(4000, 8, device=DEVICE)
+    harmonics = torch.rand(2, 4, 3, device=DEVICE, requires_grad=True)
+    up = torch.tensor([[0.0, 0.0, 1.0]], device=DEVICE)
+    voxel, ray = index.clamp(0, 1), torch.zeros_like(index)
 
     def gradients() -> tuple[Tensor, ...]:
         loss = (encode(positions, table, grid, backend="gpu") * weights_of_rows).sum()
         loss = loss + (gather(values, index, backend="gpu") * rows).sum()
-        return torch.autograd.grad(loss, (table, values))
+        at_corners = corner_gather.gather(features, corners, voxel, of_corners, backend="gpu")
+        colours = shade_voxels(harmonics, voxel, ray, up, backend="gpu")
+        loss = loss + (at_corners * rows).sum() + (colours * rows[:, :3]).sum()
+        return torch.autograd.grad(loss, (table, values, features, harmonics))
 
     free = gradients()
     torch.use_deterministic_algorithms(True)
@@ -99,6 +114,20 @@ def test_told_to_be_deterministic_it_adds_up_in_an_order_that_repeats() -> None:
     assert largest_error(first, second) == 0
     # At most 4,000 terms below 1: 2 n roundings of a sum of n, as independent errors.
     assert 0 < largest_error(first, free) <= 6 * 4000**0.5 * 4000 * U32
+
+
+def test_told_to_be_deterministic_it_adds_up_what_cells_share_in_an_order_that_repeats() -> None:
+    """Numbers are short: that order and every other give the same sums."""
+    case = next(
+        case
+        for case in cases()
+        if case.subject == "space_to_depth backward" and case.name == "all cells"
+    )
+    torch.use_deterministic_algorithms(True)
+    try:
+        assert case.error("gpu", DEVICE, "fp32") == 0
+    finally:
+        torch.use_deterministic_algorithms(False)
 
 
 def test_what_is_not_a_number_shows_and_what_is_behind_it_does_not() -> None:
@@ -194,6 +223,73 @@ def test_a_gaussian_far_outside_of_the_picture_is_not_in_it(axis: int, far: floa
     ones = torch.ones(1, 3, device=DEVICE)
     ellipses = Ellipses(centres, ones, ones[:, 0], torch.full_like(centres, 4.0))
     assert not blend(ellipses, ones[:, 0], ones, 17, 33, backend="gpu").alpha.any()
+
+
+def scattered(x: Tensor) -> Tensor:
+    """The same numbers, with the last axis outermost in memory."""
+    axes = tuple(reversed(range(x.dim())))
+    return x.permute(axes).contiguous().permute(axes)
+
+
+def ssim_of(picture: Tensor, target: Tensor, grad: Tensor) -> tuple[Tensor, ...]:
+    found = ssim(picture.requires_grad_(), target, backend="gpu")
+    return found, *torch.autograd.grad(found, picture, grad)
+
+
+def linear_of(x: Tensor, weights: Tensor, biases: Tensor, grad: Tensor) -> tuple[Tensor, ...]:
+    offsets = torch.tensor([0, 3, 7], device=DEVICE)
+    given = x.requires_grad_(), weights.requires_grad_(), biases.requires_grad_()
+    out = grouped_linear(*given, offsets, relu=True, backend="gpu")
+    return out, *torch.autograd.grad(out, given, grad)
+
+
+def corner_features_of(
+    table: Tensor, corners: Tensor, weights: Tensor, grad: Tensor, buffer: Tensor
+) -> tuple[Tensor, ...]:
+    """Of voxels that share no corner: a sum has one term, in every order."""
+    given = table.requires_grad_(), corners.int(), torch.tensor([1, 0], device=DEVICE).int()
+    out = corner_gather.gather(*given, weights, grad_buffer=buffer, backend="gpu")
+    out.backward(grad)
+    return out, buffer
+
+
+def colours_of(
+    harmonics: Tensor, directions: Tensor, grad: Tensor, buffer: Tensor
+) -> tuple[Tensor, ...]:
+    """Of voxels that are seen once."""
+    voxel, ray = (torch.tensor(x, device=DEVICE).int() for x in ([2, 0, 1], [1, 0, 1]))
+    out = shade_voxels(harmonics, voxel, ray, directions, grad_buffer=buffer, backend="gpu")
+    out.backward(grad)
+    return out, buffer
+
+
+def crossed_by(origins: Tensor, directions: Tensor, cells: Tensor) -> tuple[Tensor, ...]:
+    voxels = Voxels((8 * cells).long().unique(dim=0), 8)
+    found = walk(Rays(origins - 1, directions + 0.5), voxels, limit=2, backend="gpu")
+    assert len(found)
+    return found.t, found.delta, found.voxel
+
+
+@pytest.mark.parametrize(
+    ("compute", "shapes"),
+    [
+        (ssim_of, [(4, 5, 3), (4, 5, 3), ()]),
+        (linear_of, [(7, 5), (2, 5, 3), (2, 3), (7, 3)]),
+        (corner_features_of, [(16, 5), (2, 8), (2, 8), (2, 5), (16, 5)]),
+        (colours_of, [(3, 4, 3), (2, 3), (3, 3), (3, 4, 3)]),
+        (crossed_by, [(6, 3), (6, 3), (300, 3)]),
+    ],
+)
+def test_where_numbers_lie_in_memory_changes_nothing(
+    compute: Callable[..., tuple[Tensor, ...]], shapes: list[tuple[int, ...]]
+) -> None:
+    generator = torch.Generator().manual_seed(0)
+    given = [torch.rand(shape, generator=generator).to(DEVICE) for shape in shapes]
+    if compute is corner_features_of:
+        given[1] = torch.arange(16.0, device=DEVICE).view(2, 8)
+    there = [scattered(x) for x in given]
+    right = compute(*(x.clone() for x in given))
+    assert all(torch.equal(x, y) for x, y in zip(compute(*there), right, strict=True))
 
 
 def test_a_thin_haze_keeps_its_light_to_the_last_digits() -> None:
