@@ -115,6 +115,17 @@ class Graph(list[tuple[Callable[..., Any], tuple, dict, Any]]):
                     old.copy_(new)
 
 
+class Event:
+    """A moment: the host waits for it, unless it has waited for anything since."""
+
+    def __init__(self, gpu: PretendedGpu) -> None:
+        self._gpu, self._before = gpu, gpu.waited
+
+    def synchronize(self) -> None:
+        if self._gpu.waited == self._before:
+            self._gpu.wait()
+
+
 class PretendedGpu(TorchDispatchMode):
     """Computes every operation of torch, those of the CPU as if it were not there."""
 
@@ -125,7 +136,7 @@ class PretendedGpu(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
         self.generators: dict[int, torch.Generator] = {}  # kept: the address of one is its key
-        self.sync_debug_mode = 0
+        self.sync_debug_mode = self.waited = 0
         self._graph: Graph | None = None
         self.inside = False  # a function that works on the GPU: what C++ makes belongs there
         self._differentiating = False  # the same of C++ alone, but not of Python that it calls
@@ -150,6 +161,7 @@ class PretendedGpu(TorchDispatchMode):
 
     def wait(self) -> None:
         """The host waits for the GPU: refused while a graph is captured."""
+        self.waited += 1
         if self._graph is not None:
             raise RuntimeError("CUDA error: operation not permitted when stream is capturing")
         if self.sync_debug_mode == 2:
@@ -326,7 +338,7 @@ def _of_torch_cuda(gpu: PretendedGpu) -> dict[str, Any]:
         "get_sync_debug_mode": lambda: gpu.sync_debug_mode,
         "device_of": lambda tensor: nullcontext(),
         "Stream": MagicMock,
-        "current_stream": MagicMock,
+        "current_stream": lambda *device: MagicMock(record_event=lambda: Event(gpu)),
         "stream": lambda stream: nullcontext(),
         "graph_pool_handle": lambda: None,
         "CUDAGraph": Graph,

@@ -162,6 +162,20 @@ def test_the_host_waits_as_often_as_for_cuda(gpu: PretendedGpu, what: str) -> No
     assert waits.total() == expected
 
 
+def test_the_host_waits_for_a_moment_unless_it_has_waited_since(gpu: PretendedGpu) -> None:
+    x = there(1, 2, 3)
+    moment = torch.cuda.current_stream().record_event()
+    with device_waits() as waits:
+        moment.synchronize()
+        moment.synchronize()
+    assert waits.total() == 1
+    moment = torch.cuda.current_stream().record_event()
+    x.tolist()
+    with device_waits() as waits:
+        moment.synchronize()
+    assert not waits
+
+
 def test_told_to_raise_it_raises_where_it_would_wait(gpu: PretendedGpu) -> None:
     torch.cuda.set_sync_debug_mode("error")
     with pytest.raises(RuntimeError, match="synchronizing"):

@@ -16,7 +16,7 @@ from methods.gaussians.mcmc import disturb, relocate
 from methods.gaussians.model import Gaussians
 from methods.kernels.composite import STOP
 from methods.kernels.ssim import ssim
-from methods.training import checkpoint
+from methods.training import checkpoint, loop
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,7 @@ class GaussianTraining:
     """The training as a `methods.training.loop.Training`: a picture a step."""
 
     advice = "Try a smaller rate (method.fitting.means)."
+    asked: loop.Asked | None = None
 
     def __init__(
         self,
@@ -94,7 +95,11 @@ class GaussianTraining:
         self.optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def advance(self) -> dict[str, float]:
-        """One step; its mean squared error."""
+        """One step; its mean squared error, see `loop.look`.
+
+        Raises:
+            SteerbenchError: the error is not finite.
+        """
         options, gaussians = self.options, self.gaussians
         share = self.step / self.steps
         camera, target = self._picture(half=share < options.half)
@@ -108,6 +113,7 @@ class GaussianTraining:
             + options.scale_cost * gaussians.log_scales.exp().mean()
         )
         (loss + costs).backward()
+        errors = loop.look(self, {"": functional.mse_loss(picture, target)}, {"picture": picture})
         rate = options.means * options.final_means**share
         self.optimiser.param_groups[0]["lr"] = rate
         self.optimiser.step()
@@ -117,7 +123,7 @@ class GaussianTraining:
             relocate(gaussians, self.optimiser, self.generator)
         if options.noise:
             disturb(gaussians, options.noise * rate, self.generator)
-        return {"": functional.mse_loss(picture.detach(), target).item()}
+        return errors
 
     def _picture(self, half: bool) -> tuple[Camera, Tensor]:
         """A training view and its picture [H, W, 3]; every view has its turn in a round."""
@@ -128,7 +134,7 @@ class GaussianTraining:
             self.views = order.tolist()
         view = self.views.pop()
         camera, device = self.split.cameras[view], self.background.device
-        picture = composite(self.split.images[view].to(device), self.background)
+        picture = composite(self.split.images[view].to(device, non_blocking=True), self.background)
         if half and min(camera.width, camera.height) > 1:
             camera = scale_camera(camera, camera.width // 2, camera.height // 2)
             shrunk = functional.interpolate(

@@ -106,7 +106,9 @@ def _prepare_step(device: str) -> Callable[[str], tuple[Tensor, ...]]:
         training.step, training.rays = loop.LOOK_EVERY, RAYS
         training.generator.manual_seed(0)
         training.grid.occupancy = occupancy
-        return (torch.tensor(training.advance()[""]),)
+        training.advance()
+        assert training.asked is not None
+        return (torch.tensor(training.asked.tell()[""]),)
 
     return call
 

@@ -152,6 +152,7 @@ class PixelTraining(ABC):
     """
 
     advice = "Try a smaller learning rate (method.training.rate)."
+    asked: loop.Asked | None = None
 
     def __init__(
         self,

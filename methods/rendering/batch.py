@@ -2,14 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from bench.types import Rays
-from methods.kernels.composite import Pixels, composite, visible_counts
-from methods.kernels.march import Occupancy, march
+from methods.kernels.composite import Extent, Pixels, composite, visible_counts
+from methods.kernels.march import Occupancy, Samples, march
 from methods.rendering.field import CHUNK_SAMPLES, Field, pad, query
 from methods.rendering.march import March
+
+
+@dataclass(frozen=True)
+class FirstPass:
+    """All samples of R rays, and which of them the early stop leaves.
+
+    Attributes:
+        samples: hidden or not.
+        sigma: [S] their density, without gradient.
+        counts: [R] visible samples of each ray, its first ones.
+    """
+
+    samples: Samples
+    sigma: Tensor
+    counts: Tensor
+
+    def opaque(self) -> Tensor:
+        """Which rays have an opacity of more than 0, [R] bool."""
+        thick = self.sigma * self.samples.delta > 0
+        found = torch.zeros_like(self.counts, dtype=torch.int32)
+        return found.scatter_reduce_(0, self.samples.ray.long(), thick.int(), "amax") > 0
 
 
 def render_batch(
@@ -21,12 +44,12 @@ def render_batch(
     jitter: Tensor | None = None,
     background: Tensor | None = None,
     guide: Field | None = None,
+    hidden: bool = False,
 ) -> tuple[Pixels, int]:
     """Render `rays`, R of them, differentiably; also the number of samples that took part.
 
     Samples behind the early stop, more than half of all once surfaces have formed, have neither
-    weight nor gradient. A first pass finds them: it evaluates the density of all samples, without
-    gradient.
+    weight nor gradient. A first pass finds them, and they are left out.
 
     Args:
         how: `window` and `faint` are ignored.
@@ -34,18 +57,47 @@ def render_batch(
         background: [K] or [R, K]; None: not composited on any.
         guide: a cheaper field whose densities tell in the first pass which samples are hidden, and
             so have neither weight nor gradient; None: `field` itself.
+        hidden: evaluate hidden samples, too: a GPU is not waited for to count the others.
     """
-    samples = march(rays, occupancy, how.step, jitter=jitter, backend=field.backend)
-    with torch.no_grad():
-        teller = field if guide is None else guide
-        parts = pad(samples.positions).split(CHUNK_SAMPLES)
-        sigma = torch.cat([teller.density(part)[0] for part in parts])[: len(samples)]
-        counts = visible_counts(sigma, samples, stop=how.stop, backend=field.backend)
-    samples = samples.front(counts)
+    if hidden:
+        samples = march(rays, occupancy, how.step, jitter=jitter, backend=field.backend)
+    else:
+        first = first_pass(field, rays, occupancy, how, jitter=jitter, guide=guide)
+        samples = first.samples.front(first.counts)
+    pixels = second_pass(field, rays, samples, how)
+    return pixels if background is None else pixels.over(background), len(samples)
+
+
+@torch.no_grad()
+def first_pass(
+    field: Field,
+    rays: Rays,
+    occupancy: Occupancy,
+    how: March,
+    *,
+    jitter: Tensor | None = None,
+    extent: Extent | None = None,
+    guide: Field | None = None,
+) -> FirstPass:
+    """Evaluate the density of all samples of `rays`; see `render_batch`.
+
+    Args:
+        extent: how many there are; None: a GPU is waited for.
+    """
+    backend = field.backend
+    samples = march(rays, occupancy, how.step, jitter=jitter, extent=extent, backend=backend)
+    teller = field if guide is None else guide
+    parts = pad(samples.positions).split(CHUNK_SAMPLES)
+    sigma = torch.cat([teller.density(part)[0] for part in parts])[: len(samples)]
+    counts = visible_counts(sigma, samples, stop=how.stop, backend=backend)
+    return FirstPass(samples, sigma, counts)
+
+
+def second_pass(field: Field, rays: Rays, samples: Samples, how: March) -> Pixels:
+    """Composite the `samples` of `rays`, with a gradient."""
     encoded = field.encode_directions(rays.directions)
     sigma, values = query(field, samples.positions, samples.ray, encoded)
-    pixels = composite(sigma, values, samples, stop=how.stop, backend=field.backend)
-    return pixels if background is None else pixels.over(background), len(samples)
+    return composite(sigma, values, samples, stop=how.stop, backend=field.backend)
 
 
 def opacity_entropy(opacity: Tensor) -> Tensor:

@@ -24,11 +24,21 @@ def worth(mask: Tensor) -> Tensor:
     return torch.arange(len(mask), device=mask.device)
 
 
-def places(masks: Sequence[Tensor]) -> list[Tensor]:
-    """Where each of `masks` is true, in order. The host waits for a GPU once, not for each."""
+def told(numbers: Sequence[Tensor]) -> list[int]:
+    """All integers in `numbers`, of any shapes. The host waits for a GPU once, not for each."""
+    return torch.cat([number.flatten() for number in numbers]).tolist()
+
+
+def places(masks: Sequence[Tensor], sizes: Sequence[int] | None = None) -> list[Tensor]:
+    """Where each of `masks` is true, in order.
+
+    Args:
+        sizes: how often each is true; None: a GPU is waited for, once for all.
+    """
     if not masks:
         return []
-    sizes = torch.stack([mask.sum() for mask in masks]).tolist()
+    if sizes is None:
+        sizes = told([mask.sum() for mask in masks])
     return [
         torch.nonzero_static(mask, size=size).squeeze(1)
         for mask, size in zip(masks, sizes, strict=True)

@@ -165,14 +165,19 @@ class Pipeline:
         view: View,
         rendering: Rendering,
         probe: Probe,
+        cells: Tensor | None = None,
     ) -> Observation:
         """All that the 2D renderer is given: the present `frame`, the `preceding` features and,
-        beyond the paper, the `newest` preceding picture and the field at the surface."""
+        beyond the paper, the `newest` preceding picture and the field at the surface.
+
+        Args:
+            cells: those near matter; None: a GPU is waited for to find them.
+        """
         model = self.model
-        if rendering.skip.background and self.renderer.draws_cells:
-            cells = cells_at_matter(frame.alpha, preceding)
-        else:
+        if not self.leaves_out(rendering):
             cells = torch.arange(frame.alpha.numel(), device=frame.alpha.device)
+        elif cells is None:
+            cells = cells_at_matter(frame.alpha, preceding)
         history = surface = None
         if model.history or model.surface:
             depth = enlarge(frame.depth.detach(), cells, model.scale, backend=self.backend)
@@ -182,6 +187,10 @@ class Pipeline:
             if newest is not None and newest.picture is not None:
                 history = self._history(newest, newest.picture, depth, cells, view)
         return Observation(frame, self.background, preceding, cells, history, surface, self.backend)
+
+    def leaves_out(self, rendering: Rendering) -> bool:
+        """Whether the 2D renderer draws only the cells near matter."""
+        return rendering.skip.background and self.renderer.draws_cells
 
     def _history(
         self, newest: Remembered, picture: Tensor, depth: Tensor, cells: Tensor, view: View

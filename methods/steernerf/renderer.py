@@ -60,11 +60,17 @@ class Observation:
 
 def cells_at_matter(alpha: Tensor, preceding: Sequence[Points]) -> Tensor:
     """The cells [N] near anything seen: in the present frame, of opacity `alpha` [h, w], or in a
-    preceding one."""
-    seen = alpha > 0
-    for points in preceding:
-        scale = points.index.shape[0] // len(alpha)
-        seen = seen | (largest_in_cell(points.index, scale) >= 0)
+    preceding one. The host waits for a GPU."""
+    near = near_matter(alpha > 0, [points.index for points in preceding])
+    return near.flatten().nonzero().squeeze(1)
+
+
+def near_matter(seen: Tensor, indices: Sequence[Tensor]) -> Tensor:
+    """Which cells are near anything, [h, w] bool: where the present frame has `seen` it, [h, w], or
+    preceding ones show it, of whose points the `indices` [H, W] tell."""
+    for index in indices:
+        scale = index.shape[0] // len(seen)
+        seen = seen | (largest_in_cell(index, scale) >= 0)
     return cells_near(seen)
 
 

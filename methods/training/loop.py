@@ -16,10 +16,27 @@ from bench.types import Log, SteerbenchError
 from methods.training import checkpoint
 
 LOOK_EVERY = 10
-"""Steps of which a GPU tells the errors of one: the host would wait for each of them."""
+"""Steps of which a GPU tells the errors of one: to ask it takes time, too."""
 
 CHECKPOINT_S = 20.0
 """Seconds between checkpoints: what a killed training loses at most."""
+
+
+class Asked:
+    """Errors of a step, by label, on their way to the host, which goes on meanwhile."""
+
+    def __init__(self, errors: Mapping[str, Tensor]) -> None:
+        together = torch.stack([error.detach() for error in errors.values()])
+        self._labels, self._values = list(errors), together.to("cpu", non_blocking=True)
+        self._arrived = None
+        if together.device.type == "cuda":
+            self._arrived = torch.cuda.current_stream(together.device).record_event()
+
+    def tell(self) -> dict[str, float]:
+        """Them as numbers; if they have not arrived yet, the host waits."""
+        if self._arrived is not None:
+            self._arrived.synchronize()
+        return dict(zip(self._labels, self._values.tolist(), strict=True))
 
 
 class Training(Protocol):
@@ -30,12 +47,14 @@ class Training(Protocol):
         step: how many there were.
         seconds: that they took, over all the processes the training was continued in.
         advice: what to try where the training breaks down.
+        asked: the errors that `look` asked for last; None at first.
     """
 
     steps: int
     step: int
     seconds: float
     advice: str
+    asked: Asked | None
 
     def advance(self) -> Mapping[str, float]:
         """One step; the mean squared errors to show, by label ("" for the main one); see `look`."""
@@ -141,18 +160,21 @@ def resume(training: Training, path: Path) -> None:
 def look(
     training: Training, errors: Mapping[str, Tensor], tensors: Mapping[str, Tensor]
 ) -> dict[str, float]:
-    """The `errors` of a step as numbers; nothing for most steps on a GPU, see `LOOK_EVERY`.
+    """The `errors` of a step as numbers; on a GPU every `LOOK_EVERY` steps, and those that were
+    asked for then: they have arrived meanwhile.
 
     Raises:
         SteerbenchError: an error is not finite; it names which of `tensors` are not.
     """
-    together = torch.stack([error.detach() for error in errors.values()])
-    if together.device.type != "cpu" and training.step % LOOK_EVERY:
+    on_cpu = all(error.device.type == "cpu" for error in errors.values())
+    if not on_cpu and training.step % LOOK_EVERY:
         return {}
-    values = together.tolist()
-    if not all(map(math.isfinite, values)):
+    before, training.asked = training.asked, Asked(errors)
+    asked = training.asked if on_cpu else before
+    told = {} if asked is None else asked.tell()
+    if not all(map(math.isfinite, told.values())):
         check_finite(training, tensors)
-    return dict(zip(errors, values, strict=True))
+    return told
 
 
 def check_finite(training: Training, more: Mapping[str, Tensor] | None = None) -> None:

@@ -49,6 +49,8 @@ from methods.steernerf.beyond.lean_renderer import LeanRenderer
 from methods.steernerf.beyond.method import SteerNerfLean
 from methods.steernerf.method import SteerNerf
 from methods.steernerf.options import RangeReduction, Reprojection
+from methods.steernerf.pipeline import Pipeline
+from methods.steernerf.training import joint as stage2
 from methods.steernerf.training.joint import JointTraining
 from methods.steernerf.training.options import JointOptions
 from methods.steernerf.training.sequences import MotionOptions
@@ -82,7 +84,7 @@ def steernerf(field: str, **where: Any) -> Method:
         model=small_model(reprojection=release, history=False, surface=False),
         rendering=small_rendering(range=RangeReduction("paper")),
         renderer=partial(UNet, width=4),
-        joint=joint(field=field),
+        joint=joint(field=field, through="all", jitter=True),
         engine=TorchEngine(),
         **where,
     )
@@ -95,7 +97,7 @@ def steernerf_lean(**where: Any) -> Method:
         model=small_model(),
         rendering=small_rendering(range=RangeReduction("window"), refined=0.1, overlap=0.1),
         renderer=partial(LeanRenderer, width=8, blocks=1, init="scratch"),
-        joint=joint(refined=0.1),
+        joint=joint(refined=0.1, grid_samples=0),
         engine=TorchEngine(),
         **where,
     )
@@ -164,8 +166,9 @@ def scene(ball_scene: Scene) -> Scene:
 
 @pytest.fixture(autouse=True)
 def one_round(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of whole rays, as on a GPU, so that the sums have the same groups; and as few runs of a
-    network before it is recorded."""
+    """Of whole rays, as on a GPU, also where they are hidden in training, so that the sums have the
+    same groups; and as few runs of a network before it is recorded."""
+    monkeypatch.setattr(stage2, "compacts", lambda device: False)
     monkeypatch.setattr(rays, "ROUND_SAMPLES", longest_ray(STEP))
     monkeypatch.setattr(cuda_graphs, "WARM_UP", 1)
     monkeypatch.setattr(TorchEngine, "samples", lambda engine, network: 1)
@@ -296,6 +299,32 @@ def test_a_step_of_stage_1_waits_less_than_three_times(gpu: PretendedGpu, scene:
         for _ in range(2 * EVERY):
             training.advance()
     assert waits.total() < 3 * 2 * EVERY
+
+
+@pytest.mark.parametrize("name", ["steernerf", "steernerf_lean"])
+def test_a_step_of_stage_2_waits_at_most_three_times(
+    gpu: PretendedGpu, name: str, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    advance, remember, counts = JointTraining.advance, Pipeline.remember, []
+
+    def counted(training: JointTraining) -> dict[str, float]:
+        with device_waits() as waits:
+            errors = advance(training)
+        counts.append(waits.total())
+        assert bool(errors) == (training.step > 1)  # those of the step before
+        return errors
+
+    def apart(*args: Any) -> None:
+        with device_waits():
+            remember(*args)
+
+    monkeypatch.setattr(loop, "LOOK_EVERY", 1)
+    monkeypatch.setattr(JointTraining, "advance", counted)
+    monkeypatch.setattr(Pipeline, "remember", apart)
+    method = METHODS[name](device="cuda", backend="reference")
+    method.fit(scene, replace(BUDGET, renderer_steps=4), ConsoleLog(tmp_path, quiet=True))
+    assert len(counts) == 4
+    assert sum(counts) <= 3 * len(counts)
 
 
 def by_triton(device: str) -> list[torch.Tensor]:

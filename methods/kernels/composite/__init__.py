@@ -40,9 +40,13 @@ class Extent:
     @classmethod
     def of_each(cls, counts: Tensor) -> list[Extent]:
         """Of rays with `counts` [G, R] samples, group by group. The host waits for a GPU, once."""
+        return [cls(*size) for size in cls.figures(counts).tolist()]
+
+    @staticmethod
+    def figures(counts: Tensor) -> Tensor:
+        """`total` and `longest` of each group of `counts` [G, R], where they are: [G, 2]."""
         counts = functional.pad(counts, (0, 1))  # for a group without rays
-        sizes = torch.stack((counts.sum(dim=1), counts.amax(dim=1)), dim=1)
-        return [cls(*size) for size in sizes.tolist()]
+        return torch.stack((counts.sum(dim=1), counts.amax(dim=1)), dim=1)
 
 
 @dataclass(frozen=True)
@@ -61,10 +65,13 @@ class Intervals:
     offsets: Tensor
     longest: int | None = field(default=None, kw_only=True)
 
-    def first_of_each(self, counts: Tensor) -> tuple[Tensor, Tensor, int]:
+    def first_of_each(
+        self, counts: Tensor, extent: Extent | None = None
+    ) -> tuple[Tensor, Tensor, int]:
         """The first `counts` [R] samples of each ray, as indices, and their own `offsets` and
-        `longest`."""
-        (extent,) = Extent.of_each(counts[None])
+        `longest`; `extent` is that of `counts`, None: a GPU is waited for."""
+        if extent is None:
+            (extent,) = Extent.of_each(counts[None])
         offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
         shift = (self.offsets - offsets)[:-1].repeat_interleave(counts, output_size=extent.total)
         return torch.arange(extent.total, device=shift.device) + shift, offsets, extent.longest

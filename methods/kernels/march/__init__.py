@@ -124,9 +124,10 @@ class Samples(Intervals):
     def __len__(self) -> int:
         return len(self.t)
 
-    def front(self, counts: Tensor) -> Samples:
-        """Only the first `counts` [R] samples of each ray, which then has no more."""
-        kept, offsets, longest = self.first_of_each(counts)
+    def front(self, counts: Tensor, extent: Extent | None = None) -> Samples:
+        """Only the first `counts` [R] samples of each ray, which then has no more; see
+        `first_of_each`."""
+        kept, offsets, longest = self.first_of_each(counts, extent)
         return Samples(
             self.t[kept],
             self.delta[kept],
@@ -179,7 +180,8 @@ def march(
         start: [R] int32 step to begin with, `Samples.resume` of an earlier call with the same rays;
             a negative one ends the ray; None: 0.
         limit: at most so many samples a ray; None: all.
-        extent: how many samples there are, of `extents`: a GPU is not waited for then.
+        extent: how many samples there are, of `extents` or `sample_counts`: a GPU is not waited
+            for then.
     """
     segments = _segments(rays, step, window, jitter, start)
     if limit is None:
@@ -201,10 +203,25 @@ def extents(
 ) -> list[Extent]:
     """How many samples `march` finds for the first `size` of R `rays`, for the next, and so on. The
     host waits for a GPU, once."""
-    segments = _segments(rays, step, window, None, None)
-    kernel = implementation("march", backend, rays.origins.device)
-    counts = kernel.count(segments, occupancy, step)
+    counts = sample_counts(rays, occupancy, step, window=window, backend=backend)
     return Extent.of_each(functional.pad(counts, (0, -len(counts) % size)).view(-1, size))
+
+
+def sample_counts(
+    rays: Rays,
+    occupancy: Occupancy,
+    step: float,
+    *,
+    window: Tensor | None = None,
+    jitter: Tensor | None = None,
+    start: Tensor | None = None,
+    backend: str = "auto",
+) -> Tensor:
+    """How many samples `march` finds for each of R `rays`: [R] int64."""
+    segments = _segments(rays, step, window, jitter, start)
+    kernel = implementation("march", backend, rays.origins.device)
+    counts: Tensor = kernel.count(segments, occupancy, step)
+    return counts
 
 
 def longest_ray(step: float) -> int:

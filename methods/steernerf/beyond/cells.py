@@ -16,7 +16,7 @@ REACH = 1
 
 
 def cells_near(seen: Tensor) -> Tensor:
-    """The cells [N] within `REACH` of those that are `seen`, [h, w] bool."""
+    """Which cells lie within `REACH` of those that are `seen`, [h, w] bool."""
     near = seen.clone()
     for axis in (0, 1):
         line = near.clone()
@@ -24,7 +24,7 @@ def cells_near(seen: Tensor) -> Tensor:
             rest = line.shape[axis] - far
             near.narrow(axis, far, rest).logical_or_(line.narrow(axis, 0, rest))
             near.narrow(axis, 0, rest).logical_or_(line.narrow(axis, far, rest))
-    return near.flatten().nonzero().squeeze(1)
+    return near
 
 
 def largest_in_cell(image: Tensor, scale: int) -> Tensor:

@@ -15,6 +15,7 @@ from methods.instant_ngp.stage1 import TrainedField
 from methods.instant_ngp.training import restore_field
 from methods.kernels import multiplies_bf16
 from methods.rendering.batch import opacity_entropy, render_batch
+from methods.rendering.compaction import compacts
 from methods.rendering.occupancy import EVERY
 from methods.steernerf.beyond.cells import pixels_of
 from methods.steernerf.beyond.refinement import rays_of_cells, worst_cells
@@ -44,6 +45,7 @@ class RendererTraining:
     """
 
     advice = "Try smaller learning rates (method.joint.rate, method.joint.field_rate)."
+    asked: loop.Asked | None = None
 
     def __init__(
         self,
@@ -204,6 +206,7 @@ class JointTraining(RendererTraining):
             pipeline.occupancy,
             rendering.refined_march,
             background=pipeline.background,
+            hidden=not compacts(wanted.device),
         )
         error = (pixels.values[:, :3] - wanted[some]).square().sum() / len(some)
         return error * len(wanted) / batch.truth.numel()

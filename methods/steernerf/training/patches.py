@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Literal, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -12,15 +12,17 @@ from torch import Tensor
 from bench.cameras import cast, pixel_grid
 from bench.compositing import composite
 from bench.types import Camera, NullProbe, Rays
-from methods.kernels.composite import Pixels
-from methods.rendering.batch import render_batch
-from methods.rendering.compaction import places
+from methods.kernels.composite import Extent, Pixels
+from methods.kernels.march import Samples, sample_counts
+from methods.rendering.batch import FirstPass, first_pass, second_pass
+from methods.rendering.compaction import compacts, places, told
 from methods.rendering.frame import FeatureFrame, sees_matter
-from methods.steernerf.renderer import Observation, Points
+from methods.steernerf.renderer import Observation, Points, near_matter
 from methods.steernerf.training.options import JointOptions
 from methods.steernerf.training.sequences import Sequence, SequencePool
 from methods.steernerf.view import View
 
+T = TypeVar("T")
 Through = Literal["all", "present", "none"]
 
 
@@ -163,36 +165,83 @@ class PatchSource:
 
     def observe(self, patches: list[Patch]) -> tuple[list[Observation], Tensor]:
         """What the renderer is given of `patches`, with the gradient it is to have; opacities."""
-        found = iter(places([mask for patch in patches for mask in patch.masks]))
-        chosen = [(patch, [next(found) for _ in patch.masks]) for patch in patches]
-        rays = [part for patch, some in chosen for part in patch.rays(some)]
-        together = Rays.joined(rays)
-        pipeline, count = self.pipeline, len(together.origins)
-        device = together.origins.device
-        jitter = None
-        if self.options.jitter:
-            jitter = torch.rand(count, generator=self.generator).to(device, non_blocking=True)
+        found, rays, extent = self._rays(patches)
+        chosen = _of_each(patches, found)
+        field, occupancy = self.pipeline.field, self.pipeline.occupancy
+        how, jitter = self.rendering.march, self._jitter(len(rays.origins), self.generator)
+        first = first_pass(field, rays, occupancy, how, jitter=jitter, extent=extent)
+        samples, cells = self._visible(first, patches, chosen)
         with torch.set_grad_enabled(self.through != "none"):
-            pixels, _ = render_batch(
-                pipeline.field,
-                together,
-                pipeline.occupancy,
-                self.rendering.march,
-                jitter=jitter,
-            )
-            parts = iter(_split(pixels, [len(r.origins) for r in rays]))
-            observations = [
-                self._observation(patch, some, [next(parts) for _ in some])
-                for patch, some in chosen
-            ]
+            pixels = second_pass(field, rays, samples, how)
+            rendered = _of_each(patches, _split(pixels, [len(some) for some in found]))
+            observations = list(map(self._observation, patches, chosen, rendered, cells))
         return observations, pixels.alpha
 
+    def _rays(self, patches: list[Patch]) -> tuple[list[Tensor], Rays, Extent | None]:
+        """The chosen pixels and points of all patches, where their masks are true, and their rays.
+
+        A GPU is asked at once how many there are and how many samples they have.
+        """
+        masks = [mask for patch in patches for mask in patch.masks]
+        if compacts(masks[0].device):
+            chosen = places(masks)
+            parts = zip(patches, _of_each(patches, chosen), strict=True)
+            return chosen, Rays.joined([x for patch, some in parts for x in patch.rays(some)]), None
+        which = torch.cat(masks)
+        every = [torch.arange(len(mask), device=mask.device) for mask in masks]
+        parts = zip(patches, _of_each(patches, every), strict=True)
+        rays = Rays.joined([x for patch, some in parts for x in patch.rays(some)])
+        # The chosen rays draw theirs again, the same.
+        jitter = self._jitter(len(which), self.generator.clone_state())
+        if jitter is not None:
+            jitter = jitter[(which.cumsum(0) - 1).clamp(min=0)]
+        counts = sample_counts(
+            rays,
+            self.pipeline.occupancy,
+            self.rendering.march.step,
+            jitter=jitter,
+            start=which.int() - 1,
+            backend=self.pipeline.backend,
+        )
+        *sizes, total, longest = told(
+            [*(mask.sum() for mask in masks), Extent.figures(counts[None])]
+        )
+        (together,) = places([which], [sum(sizes)])
+        return places(masks, sizes), rays.take(together), Extent(total, longest)
+
+    def _jitter(self, rays: int, generator: torch.Generator) -> Tensor | None:
+        """Phases of the samples of each ray, if they are random."""
+        if not self.options.jitter:
+            return None
+        device = self.pipeline.field.device
+        return torch.rand(rays, generator=generator).to(device, non_blocking=True)
+
+    def _visible(
+        self, first: FirstPass, patches: list[Patch], chosen: list[list[Tensor]]
+    ) -> tuple[Samples, list[Tensor] | list[None]]:
+        """The samples that are not hidden, and the cells near matter of each patch: a GPU is asked
+        at once for the numbers of both."""
+        counts = first.counts
+        if compacts(counts.device) or not self.pipeline.leaves_out(self.rendering):
+            return first.samples.front(counts), [None] * len(patches)
+        opaque = first.opaque().split([len(some) for x in chosen for some in x])
+        near = [
+            near_matter(_spread(patch, pixels, seen), patch.indices).flatten()
+            for patch, (pixels, *_), (seen, *_) in zip(
+                patches, chosen, _of_each(patches, opaque), strict=True
+            )
+        ]
+        *sizes, total, longest = told(
+            [*(mask.sum() for mask in near), Extent.figures(counts[None])]
+        )
+        return first.samples.front(counts, Extent(total, longest)), places(near, sizes)
+
     def _observation(
-        self, patch: Patch, chosen: list[Tensor], rendered: list[Pixels]
+        self, patch: Patch, chosen: list[Tensor], rendered: list[Pixels], cells: Tensor | None
     ) -> Observation:
         """Of the pixels and points that were `chosen` and `rendered`."""
         (pixels, present), *preceding = zip(chosen, rendered, strict=True)
-        frame = self._spread(patch, pixels, present)
+        frame = self._frame(patch, pixels, present)
         frames = patch.sequence.buffer.frames
         values = [frame.cloud.values for frame in frames]
         for age, (shown, found) in enumerate(preceding):
@@ -200,22 +249,31 @@ class PatchSource:
             values[age] = values[age].index_copy(0, shown, rendered_values)
         points = [Points(v, i) for v, i in zip(values, patch.indices, strict=True)]
         newest = frames[0] if frames else None
-        return self.pipeline.observe(frame, points, newest, patch.view, self.rendering, NullProbe())
+        rendering, probe = self.rendering, NullProbe()
+        return self.pipeline.observe(frame, points, newest, patch.view, rendering, probe, cells)
 
-    def _spread(self, patch: Patch, seen: Tensor, pixels: Pixels) -> FeatureFrame:
+    def _frame(self, patch: Patch, seen: Tensor, pixels: Pixels) -> FeatureFrame:
         """All pixels of the patch, from those `seen`, which were rendered."""
-        low = patch.view.low
-
-        def spread(part: Tensor) -> Tensor:
-            blank = part.new_zeros(low.height * low.width, *part.shape[1:])
-            return blank.index_copy(0, seen, part)
-
-        canvas = Pixels(spread(pixels.values), spread(pixels.depth_sum), spread(pixels.alpha))
-        frame = FeatureFrame.of(low, canvas, self.pipeline.background)
+        parts = (pixels.values, pixels.depth_sum, pixels.alpha)
+        canvas = Pixels(*(_spread(patch, seen, part).flatten(0, 1) for part in parts))
+        frame = FeatureFrame.of(patch.view.low, canvas, self.pipeline.background)
         return replace(frame, depth=frame.depth.detach())
 
     def _random(self, below: int) -> int:
         return int(torch.randint(below, (), generator=self.generator))
+
+
+def _spread(patch: Patch, seen: Tensor, part: Tensor) -> Tensor:
+    """`part` [P, ...] at the pixels of the patch that are `seen` [P], 0 elsewhere: [h, w, ...]."""
+    low = patch.view.low
+    blank = part.new_zeros(low.height * low.width, *part.shape[1:])
+    return blank.index_copy(0, seen, part).unflatten(0, (low.height, low.width))
+
+
+def _of_each(patches: list[Patch], parts: Iterable[T]) -> list[list[T]]:
+    """`parts` of the masks of all patches, patch by patch."""
+    following = iter(parts)
+    return [[next(following) for _ in patch.masks] for patch in patches]
 
 
 def _shown(index: Tensor, count: int) -> Tensor:

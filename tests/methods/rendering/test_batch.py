@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from bench.cameras import cast
 from methods.instant_ngp.field import HashField
 from methods.kernels.composite import composite
 from methods.kernels.march import Occupancy, march
-from methods.rendering.batch import render_batch
+from methods.rendering.batch import first_pass, render_batch, second_pass
 from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
 from tests.methods.conftest import look_at_the_middle
@@ -44,6 +45,46 @@ def test_leaving_out_hidden_samples_changes_no_gradient(
         assert want is not None
         # Sums over up to 10^5 samples, in another grouping.
         torch.testing.assert_close(got, want, rtol=1e-3, atol=1e-4 * want.abs().max().item())
+
+
+def test_hidden_samples_may_be_evaluated_too(
+    cloud: tuple[HashField, Occupancy], device: str
+) -> None:
+    field, occupancy = cloud
+    thin = field.density
+    field.density = lambda x: (100 * thin(x)[0], thin(x)[1])  # type: ignore[method-assign]
+    camera = look_at_the_middle(0.1, 0.4)
+    rays = cast(replace(camera, c2w=camera.c2w.to(device)))
+    grads, used = [], []
+    for hidden in (False, True):
+        pixels, samples = render_batch(field, rays, occupancy, March(), hidden=hidden)
+        pixels.values.square().sum().backward()
+        grads.append([p.grad.clone() for p in field.parameters() if p.grad is not None])
+        used.append(samples)
+        field.zero_grad()
+    assert used[0] < 0.9 * used[1]
+    for got, want in zip(*grads, strict=True):
+        # Sums over up to 10^5 samples, in another grouping.
+        torch.testing.assert_close(got, want, rtol=1e-3, atol=1e-4 * want.abs().max().item())
+
+
+def test_rays_are_opaque_where_any_of_their_samples_is(
+    cloud: tuple[HashField, Occupancy], device: str
+) -> None:
+    field, occupancy = cloud
+    holey = field.density
+
+    def density(positions: Tensor) -> tuple[Tensor, Tensor]:
+        sigma, geometry = holey(positions)
+        return torch.where(positions[:, 0] < 0.5, sigma, 0), geometry
+
+    field.density = density  # type: ignore[method-assign]
+    camera = look_at_the_middle(0.1, 0.4)
+    rays = cast(replace(camera, c2w=camera.c2w.to(device)))
+    first = first_pass(field, rays, occupancy, March())
+    alpha = second_pass(field, rays, first.samples, March()).alpha
+    assert 0 < (alpha > 0).sum() < (first.samples.offsets.diff() > 0).sum()
+    assert torch.equal(first.opaque(), alpha > 0)
 
 
 def test_a_guide_tells_which_samples_are_hidden(

@@ -112,7 +112,7 @@ def test_where_every_cell_is_refined_the_picture_is_that_of_the_field(mode: Mode
     render = everywhere(pipeline.field, pipeline.occupancy, probe, March(step=4.0 * STEP))
     field = render_frame(CAMERA, pipeline.occupancy, pipeline.background, probe, render)
     low = pipeline.features(pipeline.view(CAMERA), (), rendering, probe)
-    drawn = cells_near(low.alpha > 0)
+    drawn = cells_near(low.alpha > 0).flatten().nonzero().squeeze(1)
     assert 10 < len(drawn) < 64
     want = pixels_of(field.values[..., :3], drawn, 4)
     assert want.std() > 0.01
