@@ -16,6 +16,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from types import FrameType, SimpleNamespace
 from typing import Any
@@ -137,7 +138,7 @@ class PretendedGpu(TorchDispatchMode):
         super().__init__()
         self.generators: dict[int, torch.Generator] = {}  # kept: the address of one is its key
         self.sync_debug_mode = self.waited = 0
-        self._graph: Graph | None = None
+        self.graph: Graph | None = None
         self.inside = False  # a function that works on the GPU: what C++ makes belongs there
         self._differentiating = False  # the same of C++ alone, but not of Python that it calls
 
@@ -153,16 +154,16 @@ class PretendedGpu(TorchDispatchMode):
     @contextmanager
     def capturing(self, graph: Graph, **options: object) -> Iterator[None]:
         """As `torch.cuda.graph`."""
-        self._graph = graph
+        self.graph = graph
         try:
             yield
         finally:
-            self._graph = None
+            self.graph = None
 
     def wait(self) -> None:
         """The host waits for the GPU: refused while a graph is captured."""
         self.waited += 1
-        if self._graph is not None:
+        if self.graph is not None:
             raise RuntimeError("CUDA error: operation not permitted when stream is capturing")
         if self.sync_debug_mode == 2:
             raise RuntimeError("called a synchronizing CUDA operation")
@@ -199,8 +200,8 @@ class PretendedGpu(TorchDispatchMode):
         args = _each(_held, args)
         kwargs = {name: _each(_held, x) for name, x in kwargs.items()}
         results = func(*args, **kwargs)
-        if self._graph is not None and on_gpu:
-            self._graph.append((func, args, kwargs, results))
+        if self.graph is not None and on_gpu:
+            self.graph.append((func, args, kwargs, results))
 
         def returned(x: Tensor) -> Tensor:
             """What was changed in place is the same object as before."""
@@ -418,6 +419,9 @@ def _patch_triton(patch: pytest.MonkeyPatch) -> None:
     def launch(self, *args, **kwargs):
         if any(isinstance(x, Tensor) and not isinstance(x, GpuTensor) for x in args):
             raise ValueError("Pointer argument cannot be accessed from Triton (cpu tensor?)")
-        return run(self, *_each(_held, args), **kwargs)
+        held = _each(_held, args)
+        if _gpu.graph is not None:
+            _gpu.graph.append((partial(run, self), held, kwargs, None))
+        return run(self, *held, **kwargs)
 
     patch.setattr(GridExecutor, "__call__", launch)

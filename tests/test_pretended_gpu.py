@@ -197,6 +197,30 @@ def test_a_graph_computes_again_from_what_is_in_its_memory(gpu: PretendedGpu) ->
     assert result.tolist() == [61, 61]
 
 
+def test_a_graph_launches_kernels_of_triton_again(gpu: PretendedGpu) -> None:
+    pytest.importorskip("triton")
+    grid = HashGrid(levels=1, log2_table=6, n_min=4, n_max=4)
+    table = torch.ones(grid.entries, 2, device="cuda")
+    positions = torch.full((2, 3), 0.5, device="cuda")
+    encode(positions, table, grid, backend="gpu")  # what never changes is copied once
+    graph, features = captured(lambda: encode(positions, table, grid, backend="gpu"))
+    table.fill_(3)
+    assert features.tolist() == [[1, 1], [1, 1]]
+    graph.replay()
+    assert features.tolist() == [[3, 3], [3, 3]]
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_autocast_lowers_products(gpu: PretendedGpu, enabled: bool) -> None:
+    x = torch.eye(2, device="cuda", requires_grad=True)
+    with torch.autocast("cuda", torch.bfloat16, enabled=enabled):
+        product = x @ x
+    product.float().sum().backward()
+    assert product.dtype == (torch.bfloat16 if enabled else torch.float32)
+    assert x.grad is not None
+    assert x.grad.dtype == torch.float32
+
+
 def test_while_a_graph_is_captured_nothing_may_wait(gpu: PretendedGpu) -> None:
     x = there(1, 2, 3)
     with pytest.raises(RuntimeError, match="stream is capturing"):

@@ -91,6 +91,7 @@ class Baked:
                     )
                     canvas.put(open_, pixels)
                     left = crossings.resume.isfinite() & (1 - pixels.alpha > stop)
+                    left = left.nonzero().squeeze(1)
                     open_, start = open_[left], crossings.resume[left]
         return canvas
 

@@ -31,7 +31,7 @@ from methods.instant_ngp.field import HashField
 from methods.instant_ngp.method import InstantNgp
 from methods.instant_ngp.stage1 import Setup
 from methods.instant_ngp.training import FieldTraining, TrainingOptions
-from methods.kernels import availability
+from methods.kernels import availability, multiplies_bf16
 from methods.kernels.composite import composite
 from methods.kernels.encode import HashGrid, encode
 from methods.kernels.march import Occupancy, longest_ray, march
@@ -43,7 +43,7 @@ from methods.nsvf.method import Nsvf
 from methods.plenoctree.method import PlenOctree
 from methods.plenoctree.start import Extraction
 from methods.plenoctree.training import OctreeLessons
-from methods.rendering import rays
+from methods.rendering import field, rays
 from methods.rendering.occupancy import EVERY, STEP
 from methods.steernerf.beyond.lean_renderer import LeanRenderer
 from methods.steernerf.beyond.method import SteerNerfLean
@@ -149,10 +149,11 @@ def equal(some: list[torch.Tensor], others: list[torch.Tensor]) -> bool:
     return all(torch.equal(x, y) for x, y in zip(some, others, strict=True))
 
 
-def fewer(split: Split, count: int) -> Split:
-    """The first `count` pictures, with every other of their pixels."""
-    cameras = [scale_camera(camera, 16, 16) for camera in split.cameras[:count]]
-    pictures = [picture[::2, ::2] for picture in split.images[:count]]
+def fewer(split: Split, count: int, side: int = 16) -> Split:
+    """The first `count` pictures, with `side` x `side` of their pixels."""
+    every = split.cameras[0].width // side
+    cameras = [scale_camera(camera, side, side) for camera in split.cameras[:count]]
+    pictures = [picture[::every, ::every] for picture in split.images[:count]]
     return Split(cameras, pictures, split.names[:count])
 
 
@@ -190,6 +191,22 @@ def rows(method: Method, scene: Scene, folder: Path) -> pd.DataFrame:
     timed = found["metric"].str.startswith(("frame_ms", "fps", "stage_ms", "train_s", "peak"))
     assert timed.any()
     return found[~timed]
+
+
+def test_with_products_of_bfloat16_it_trains_and_renders_as_on_the_cpu(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capabilities = {**torch.cpu.get_capabilities(), "avx512_bf16": True}
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
+    multiplies_bf16.cache_clear()
+    try:
+        here = frames(fitted("steernerf_lean", "cpu", scene, tmp_path / "cpu"), scene)
+        with pretended_gpu():
+            assert multiplies_bf16("cuda")
+            there = frames(fitted("steernerf_lean", "cuda", scene, tmp_path / "cuda"), scene)
+    finally:
+        multiplies_bf16.cache_clear()
+    assert equal(here, there)
 
 
 def test_its_rows_are_those_of_the_cpu(scene: Scene, tmp_path: Path) -> None:
@@ -269,7 +286,7 @@ def test_what_was_trained_at_one_place_goes_on_at_the_other(
         assert torch.equal(value.cpu(), second.result()[name].cpu()), name
 
 
-MOST_WAITS = {"ngp": 2, "steernerf": 2, "steernerf_lean": 6}
+MOST_WAITS = {"ngp": 2, "nsvf": 2, "steernerf": 2, "steernerf_lean": 6}
 
 
 @pytest.mark.parametrize("name", MOST_WAITS)
@@ -325,6 +342,50 @@ def test_a_step_of_stage_2_waits_at_most_three_times(
     method.fit(scene, replace(BUDGET, renderer_steps=4), ConsoleLog(tmp_path, quiet=True))
     assert len(counts) == 4
     assert sum(counts) <= 3 * len(counts)
+
+
+def smallest(**where: Any) -> Method:
+    """The lean one, as small as it gets: an interpreter takes long for a step of a ray."""
+    long = {"step": 64.0, "refined_step": 64.0, "refined": 0.1}
+    motion = MotionOptions(pool=1, length=1, least=1, uses=3, longer=0.0)
+    return SteerNerfLean(
+        grid=replace(GRID, levels=2),
+        training=TrainingOptions(march_step=64.0, grid_samples=16, max_rays=64),
+        model=small_model(step=64.0, frames=1),
+        rendering=small_rendering(range=RangeReduction("window"), overlap=0.1, **long),
+        renderer=partial(LeanRenderer, width=8, blocks=1, init="scratch"),
+        joint=joint(
+            refined=0.1, refined_step=64.0, grid_samples=0, distilled_views=0, motion=motion
+        ),
+        engine=TorchEngine(),
+        **where,
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(availability()["gpu"]), reason="Triton has no build for this platform")
+def test_by_triton_it_trains_and_renders_as_on_the_cpu(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from triton.runtime.interpreter import interpreter_builder as builder
+
+    # What takes half of the time, and is looked for by the tests of the kernels.
+    monkeypatch.setattr(builder, "options", replace(builder.options, sanitize_overflow=False))
+    monkeypatch.setattr(field, "BATCH_QUANTUM", 64)
+    splits = {name: fewer(split, 3, side=8) for name, split in scene.splits.items()}
+    tiny = replace(scene, splits=splits)
+    budget = replace(BUDGET, steps=1, samples=64, renderer_steps=1)
+
+    def shown(device: str) -> list[torch.Tensor]:
+        method = smallest(device=device, backend="gpu")
+        method.fit(tiny, budget, ConsoleLog(tmp_path / device, quiet=True))
+        return frames(method, tiny)
+
+    here = shown("cpu")
+    with pretended_gpu():
+        there = shown("cuda")
+    assert here[0].std() > 0
+    assert equal(here, there)
 
 
 def by_triton(device: str) -> list[torch.Tensor]:

@@ -39,8 +39,8 @@ def gather(
             autograd sees none: a training step then neither allocates nor clears a second table.
 
     Raises:
-        ValueError: a shape other than these, a voxel that is no row of `corners`; backends "cpu",
-            "gpu": other types.
+        ValueError: a shape other than these; on a CPU, a voxel that is no row of `corners`;
+            backends "cpu", "gpu": other types.
     """
     check_shape("table", table, None, None)
     check_shape("corners", corners, None, CORNERS)
@@ -48,7 +48,7 @@ def gather(
     check_shape("weights", weights, len(voxel), CORNERS)
     if grad_buffer is not None:
         check_shape("grad_buffer", grad_buffer, *table.shape)
-    if len(voxel):
+    if len(voxel) and voxel.device.type == "cpu":  # a GPU would have to be waited for
         low, high = (int(end) for end in torch.aminmax(voxel))
         if not 0 <= low <= high < len(corners):
             raise ValueError(

@@ -30,8 +30,9 @@ def blend(
         y, half = ellipses.centres[:, 1].detach(), ellipses.extents[:, 1]
         reaching = (half > 0) & (y + half >= top) & (y - half <= top + rows)
         some = order[reaching[order]]
-        x = pixel_grid(width, rows, opacities.device).to(opacities) + opacities.new_tensor((0, top))
-        offset = x[:, None] - ellipses.centres[some]  # [P, M, 2]
+        column, row = pixel_grid(width, rows, opacities.device).to(opacities).unbind(dim=1)
+        pixels = torch.stack((column, row + top), dim=1)
+        offset = pixels[:, None] - ellipses.centres[some]  # [P, M, 2]
         a, b, c = ellipses.conics[some].unbind(dim=1)
         u, v = offset.unbind(dim=2)
         alpha = opacities[some] * (-(a * u * u + 2 * b * u * v + c * v * v) / 2).exp()

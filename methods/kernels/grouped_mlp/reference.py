@@ -12,8 +12,8 @@ def locate(positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor) -> tu
     """See `methods.kernels.grouped_mlp.locate`."""
     scaled = (positions.detach() - corner) / side
     cell = scaled.floor()
-    size = torch.tensor(cubes.shape, device=cell.device)
-    inside = ((cell >= 0) & (cell < size)).all(dim=1)
+    sizes = [cell.new_full((), size) for size in cubes.shape]  # filled in: no GPU is waited for
+    inside = ((cell >= 0) & (cell < torch.stack(sizes))).all(dim=1)
     x, y, z = torch.where(inside[:, None], cell, 0).long().unbind(dim=1)
     return torch.where(inside, cubes[x, y, z], -1), 2 * (scaled - cell) - 1
 

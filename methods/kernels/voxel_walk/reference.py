@@ -27,11 +27,13 @@ def walk(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> Crossings:
         for block in (slice(at, at + BLOCK) for at in range(0, max(count, 1), BLOCK))
     ]
     near, far, voxel, counts, resume = (torch.cat(column) for column in zip(*parts, strict=True))
-    ray = torch.arange(count, device=start.device).repeat_interleave(counts)
+    ray = torch.arange(count, device=start.device)
+    ray = ray.repeat_interleave(counts, output_size=len(near))
     offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
     delta = (far - near) * length(rays.directions)[ray]
     middle = (near + far) * 0.5
-    return Crossings(middle, delta, offsets, near, far, ray.int(), voxel, resume)
+    longest = int(counts.max()) if count else 0  # asked once, not by all that composite them
+    return Crossings(middle, delta, offsets, near, far, ray.int(), voxel, resume, longest=longest)
 
 
 @torch.no_grad()
@@ -43,14 +45,15 @@ def render_voxels(
     sigma = light.density[crossings.voxel.long()]
     crossed = visible_counts(sigma, crossings, stop=stop, backend="reference")
     weight = weights(sigma, crossings, stop=stop, backend="reference")
-    seen = weight > faint
+    shown = weight > faint
+    seen = shown.nonzero().squeeze(1)
     values = sigma.new_zeros(len(sigma), 3)
     towards = normalize(rays.directions, dim=1)[crossings.ray[seen].long()]
     coefficients = light.harmonics[crossings.voxel[seen].long()]
     values[seen] = shade(coefficients, towards, backend="reference").sigmoid()
     pixels = composite(sigma, values, crossings, stop=stop, backend="reference")
     shaded = torch.zeros(len(rays.origins), dtype=torch.int32, device=sigma.device)
-    shaded.index_add_(0, crossings.ray.long(), seen.int())
+    shaded.index_add_(0, crossings.ray.long(), shown.int())
     return pixels, crossed.int(), shaded
 
 
@@ -114,7 +117,9 @@ def _walk_block(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> tuple[
     ended = torch.where(kept, leave, -torch.inf).amax(dim=1) if rows else near[:, 0]
     more = (counts == limit) & (ended < far[:, 0])
     resume = torch.where(more, ended, torch.inf)
-    return enter[kept], leave[kept], voxel[kept], counts, resume
+    place = kept.flatten().nonzero().squeeze(1)  # a GPU is waited for once, not for each
+    enter, leave, voxel = (x.flatten()[place] for x in (enter, leave, voxel))
+    return enter, leave, voxel, counts, resume
 
 
 def _look_up(cells: Tensor, voxels: Voxels) -> Tensor:
