@@ -138,6 +138,8 @@ class SequencePool:
         self.pipeline, self.rendering = pipeline, rendering
         self._views, self._options, self._generator = views, options, generator
         self._pool: list[Sequence] = []
+        background = pipeline.background[:3].cpu()  # asked for once: a GPU is waited for
+        self._background = (background * 255).round().to(torch.uint8)
 
     def draw(self) -> Sequence:
         """A sequence of the pool; counts as one use."""
@@ -170,7 +172,7 @@ class SequencePool:
         number, uses, lasting = tensors["figures"].tolist()
         buffer = RenderingBuffer(self.pipeline.model.frames)
         buffer.restore(tensors, self.pipeline.background.device)
-        cells = _cells_with_content(self._views.all[number].picture, self.pipeline)
+        cells = self._cells(self._views.all[number].picture)
         return self._sequence(number, buffer, cells, uses, bool(lasting))
 
     def _make(self) -> Sequence:
@@ -180,7 +182,7 @@ class SequencePool:
         number = first + self._random(len(pictures))
         buffer = RenderingBuffer(self.pipeline.model.frames)
         view = views.all[number]
-        cells = _cells_with_content(view.picture, self.pipeline)
+        cells = self._cells(view.picture)
         return self._ended(number, self._motion(view), buffer, cells)
 
     def _go_on(self, old: Sequence) -> Sequence:
@@ -219,16 +221,15 @@ class SequencePool:
     def _random(self, below: int) -> int:
         return int(torch.randint(below, (), generator=self._generator))
 
-
-def _cells_with_content(picture: Tensor, pipeline: Pipeline) -> Tensor:
-    scale = pipeline.model.scale
-    if picture.shape[-1] == 4:
-        content = picture[..., 3] > 0
-    else:
-        background = (pipeline.background[:3].cpu() * 255).round().to(torch.uint8)
-        content = (picture != background).any(dim=-1)
-    height, width = (-(-side // scale) for side in content.shape)
-    cells = torch.zeros(height, width, dtype=torch.bool)
-    rows, columns = content.nonzero().unbind(dim=1)
-    cells[rows // scale, columns // scale] = True
-    return cells.nonzero() if cells.any() else (~cells).nonzero()
+    def _cells(self, picture: Tensor) -> Tensor:
+        """See `Sequence.cells`."""
+        scale = self.pipeline.model.scale
+        if picture.shape[-1] == 4:
+            content = picture[..., 3] > 0
+        else:
+            content = (picture != self._background).any(dim=-1)
+        height, width = (-(-side // scale) for side in content.shape)
+        cells = torch.zeros(height, width, dtype=torch.bool)
+        rows, columns = content.nonzero().unbind(dim=1)
+        cells[rows // scale, columns // scale] = True
+        return cells.nonzero() if cells.any() else (~cells).nonzero()
