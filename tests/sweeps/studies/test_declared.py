@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import pytest
@@ -11,20 +12,19 @@ from bench.study import Study, Variant
 from sweeps.overrides import choices, composed
 from sweeps.studies.variants import declared
 
-OF_CLASS = {
-    composed([f"method={name}"]).method._target_: name for name in reversed(choices("method"))
-}
-METHODS = sorted(OF_CLASS.values())
-"""One method of every class: those of one class declare the same."""
+METHODS = [name for name, path in choices("method").items() if "_target_" in OmegaConf.load(path)]
+"""Those with a class of their own: the others declare what the method does that they vary."""
 
 AFTERWARDS = ("rendering", "engine", "stop", "stored", "faint", "skip")
 """Settings of a method that a training does not depend on."""
 
 
+@cache
 def study(name: str) -> Study:
     return declared(composed([f"method={name}"]))
 
 
+@cache
 def trained(name: str, *settings: str) -> dict[str, Any]:
     """What the training of a method depends on."""
     config = composed([f"method={name}", *settings])
