@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections import Counter
 
 import pytest
@@ -10,10 +11,13 @@ import torch
 from torch import Tensor
 
 from bench.cameras import cast
-from bench.types import Camera, NullProbe, Scene, Split
+from bench.console import ConsoleLog
+from bench.types import Camera, Log, NullProbe, Scene, Split
 from methods.instant_ngp.field import HashField
+from methods.instant_ngp.stage1 import TrainedField, train_field
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy
+from tests.methods.trainings import TAUGHT, TEACHER
 
 SIZE = 32
 
@@ -70,6 +74,21 @@ def ball_scene() -> Scene:
         splits[name] = Split(cameras, [ball(camera) for camera in cameras], names)
     bounds = torch.tensor([[0.1, 0.1, 0.1], [0.9, 0.9, 0.9]])
     return Scene("ball", splits, torch.ones(3), bounds, unit_length=1.0, digest="ball")
+
+
+@pytest.fixture(scope="session")
+def shared_log(tmp_path_factory: pytest.TempPathFactory) -> Log:
+    """One folder for all tests, of all processes: what one of them trained, the others find."""
+    root = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        root = root.parent
+    return ConsoleLog(root / "trained", quiet=True)
+
+
+@pytest.fixture(scope="module")
+def teacher(ball_scene: Scene, shared_log: Log) -> TrainedField:
+    """A field that has learned the ball."""
+    return train_field(TEACHER, ball_scene, TAUGHT, shared_log)
 
 
 @pytest.fixture

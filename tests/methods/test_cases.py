@@ -16,25 +16,20 @@ from methods.kernels import BACKENDS, availability
 
 CASES = found("cases")
 QUICK = [case for case in CASES if not (case.slow or case.timed)]
-LOOPS = (
-    "march",
-    "composite backward",
-    "gaussian blending backward",
-    "voxel_walk",
-    "render_voxels",
-    "grouped linear",
-    "grouped linear backward",
-    "ssim",
-    "ssim backward",
+DEAR = (
+    *("march", "voxel_walk", "render_voxels", "warp"),
+    *("composite backward", "encode backward", "gaussian blending backward"),
+    *("grouped linear", "grouped linear backward", "ssim", "ssim backward"),
+    *("space_to_depth", "space_to_depth backward"),
 )
-"""Subjects whose kernels of the GPU have loops, which cost seconds where they are interpreted."""
+"""Subjects whose kernels of the GPU have loops or many operations: interpreted, they take long."""
 
 
 def marks(case: Case, cell: Cell) -> list[pytest.MarkDecorator]:
-    """Of an interpreted loop `make test` takes the first case."""
+    """Of a dear kernel that is interpreted `make test` takes the first case."""
     interpreted = cell[0] == "gpu" and not torch.cuda.is_available()
     first = next(other for other in QUICK if other.subject == case.subject)
-    slow = interpreted and case.subject in LOOPS and case is not first
+    slow = interpreted and case.subject in DEAR and case is not first
     return [pytest.mark.slow] if slow else []
 
 

@@ -1,4 +1,5 @@
-"""What is asked of every method that trains: what it learned, and that a kill changes nothing."""
+"""The field that most tests begin with, and what is asked of every method that trains: what it
+learned, and that a kill changes nothing."""
 
 from __future__ import annotations
 
@@ -12,8 +13,24 @@ import torch
 
 from bench.compositing import composite
 from bench.metrics import psnr
-from bench.types import Method, NullProbe, Scene
+from bench.types import Budget, Method, NullProbe, Scene
+from methods.instant_ngp.stage1 import Setup
+from methods.instant_ngp.training import TrainingOptions
+from methods.kernels.encode import HashGrid
 from methods.training import loop
+
+GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
+
+QUICK = TrainingOptions(march_step=8.0, grid_samples=1 << 15)
+"""Few samples of a ray and few visits of the density grid: enough for a ball."""
+
+TEACHER = Setup.resolved(GRID, QUICK, "bf16", "auto", "cpu", seed=0)
+TAUGHT = Budget("test", steps=200, samples=2048, renderer_steps=40)
+"""Of the fixture `teacher`."""
+
+EXACT_GRID = HashGrid(levels=16, log2_table=10, n_min=4, n_max=64)
+EXACT_TEACHER = Setup.resolved(EXACT_GRID, QUICK, "fp32", "auto", "cpu", seed=0)
+"""Of networks whose products are in the precision of their teacher's."""
 
 
 def quality(method: Method, scene: Scene, split: str = "test", view: int = 1) -> float:

@@ -8,45 +8,28 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench.console import ConsoleLog
 from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene
 from methods.diver.method import Diver
 from methods.diver.training import DiverTraining, Lessons
-from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
-from methods.instant_ngp.training import TrainingOptions
-from methods.kernels.encode import HashGrid
-from tests.methods.trainings import goes_on_after_a_kill, quality
+from methods.instant_ngp.stage1 import TrainedField
+from tests.methods.trainings import GRID, TAUGHT, TEACHER, goes_on_after_a_kill, quality
 
-GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
-SETUP = Setup.resolved(GRID, TrainingOptions(), "bf16", "auto", "cpu", seed=0)
 LESSONS = Lessons(prune_rays=1 << 13)
-BUDGET = Budget("test", steps=100, samples=4096, renderer_steps=40)
 
 
 def method_of(**options) -> Diver:
-    return Diver(**{"teacher": SETUP, "resolution": 32, "training": LESSONS} | options)
+    return Diver(**{"teacher": TEACHER, "resolution": 32, "training": LESSONS} | options)
 
 
-def fitted(scene: Scene, log: Log, budget: Budget = BUDGET, **options) -> Diver:
+def fitted(scene: Scene, log: Log, budget: Budget = TAUGHT, **options) -> Diver:
     method = method_of(**options)
     method.fit(scene, budget, log)
     return method
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
-    """One folder for all tests: what one of them trained, the next one finds."""
-    return ConsoleLog(tmp_path_factory.mktemp("outputs"), quiet=True)
-
-
-@pytest.fixture(scope="module")
-def teacher(ball_scene: Scene, log: Log) -> TrainedField:
-    return train_field(SETUP, ball_scene, BUDGET, log)
-
-
 @pytest.mark.slow
-def test_it_learns_a_ball(ball_scene: Scene, log: Log) -> None:
-    method = fitted(ball_scene, log, replace(BUDGET, renderer_steps=200))
+def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log) -> None:
+    method = fitted(ball_scene, shared_log, replace(TAUGHT, renderer_steps=200))
     assert quality(method, ball_scene) > 24
     frame = method.render(ball_scene.splits["test"].cameras[1], NullProbe())
     # The depth is that of the front of the ball, 1.6 - 0.3 from the camera, to two voxels.
@@ -58,7 +41,7 @@ def test_it_learns_a_ball(ball_scene: Scene, log: Log) -> None:
 def test_it_begins_with_the_encoding_of_the_teacher(
     ball_scene: Scene, teacher: TrainedField
 ) -> None:
-    model = method_of().begin(teacher, ball_scene, BUDGET).model
+    model = method_of().begin(teacher, ball_scene, TAUGHT).model
     cells = model.voxels.coordinates.long() * 4  # the teacher's grid is four times as fine
     near = teacher.occupancy.cells.unfold(0, 4, 4).unfold(1, 4, 4).unfold(2, 4, 4)
     assert near.flatten(3).any(dim=3).sum() == len(cells) > 0
@@ -66,11 +49,11 @@ def test_it_begins_with_the_encoding_of_the_teacher(
     assert (model.table[:, GRID.channels :] == 0).all()
 
 
-def test_pruning_leaves_what_shows(ball_scene: Scene, teacher: TrainedField, log: Log) -> None:
+def test_pruning_leaves_what_shows(ball_scene: Scene, teacher: TrainedField) -> None:
     late = replace(LESSONS, prune_at=1.0)
     method = method_of(stored="fp32", stop=1e-4, faint=0.0, training=late)
     method.background = ball_scene.background
-    training = method.begin(teacher, ball_scene, replace(BUDGET, renderer_steps=200))
+    training = method.begin(teacher, ball_scene, replace(TAUGHT, renderer_steps=200))
     while training.step < 100:
         training.advance()
     method.restore(training.result())
@@ -88,22 +71,22 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(
     ball_scene: Scene, teacher: TrainedField, tmp_path: Path, stop_at: int
 ) -> None:
     def training() -> DiverTraining:
-        return method_of().begin(teacher, ball_scene, BUDGET)
+        return method_of().begin(teacher, ball_scene, TAUGHT)
 
     goes_on_after_a_kill(training, stop_at, tmp_path)  # before and after the pruning
 
 
-def test_a_training_is_found_again(ball_scene: Scene, log: Log) -> None:
-    first = fitted(ball_scene, log)
-    again = fitted(ball_scene, log)
+def test_a_training_is_found_again(ball_scene: Scene, shared_log: Log) -> None:
+    first = fitted(ball_scene, shared_log)
+    again = fitted(ball_scene, shared_log)
     assert again.train_s == first.train_s > 0
     camera = ball_scene.splits["test"].cameras[0]
     pictures = [method.render(camera, NullProbe()).rgb for method in (first, again)]
     assert torch.equal(*pictures)
 
 
-def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, log: Log) -> None:
-    half, single = (fitted(ball_scene, log, stored=kind) for kind in ("bf16", "fp32"))
+def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, shared_log: Log) -> None:
+    half, single = (fitted(ball_scene, shared_log, stored=kind) for kind in ("bf16", "fp32"))
     corners = len(half.baked.model.vertices)
     merged = 32 * 32 + 32 + 32 + 1 + 32 * 32 + 32 * 27 + 32 + 3 * 32 + 3
     assert half.sizes() == {"corners": corners * 64, "voxels": 32**3 // 8, "decoder": 4 * merged}
@@ -134,7 +117,9 @@ def test_wrong_lessons_are_refused(wrong: dict[str, float]) -> None:
         Lessons(**wrong)
 
 
-def test_a_teacher_with_more_features_than_a_corner_is_refused(ball_scene: Scene, log: Log) -> None:
-    setup = replace(SETUP, grid=replace(GRID, levels=17))
+def test_a_teacher_with_more_features_than_a_corner_is_refused(
+    ball_scene: Scene, shared_log: Log
+) -> None:
+    setup = replace(TEACHER, grid=replace(GRID, levels=17))
     with pytest.raises(ValueError, match="expected a hash grid of at most"):
-        fitted(ball_scene, log, replace(BUDGET, steps=1), teacher=setup)
+        fitted(ball_scene, shared_log, replace(TAUGHT, steps=1), teacher=setup)

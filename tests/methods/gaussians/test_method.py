@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,26 +12,20 @@ from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene, SteerbenchEr
 from methods.gaussians.method import GaussianSplatting
 from methods.gaussians.start import anywhere, on_surfaces, spacing
 from methods.gaussians.training import Fitting, GaussianTraining
-from methods.instant_ngp.stage1 import Setup, train_field
-from methods.instant_ngp.training import TrainingOptions
-from methods.kernels.encode import HashGrid
-from tests.methods.trainings import goes_on_after_a_kill, quality
-
-GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
-BUDGET = Budget("test", steps=100, samples=8192, renderer_steps=60)
+from methods.instant_ngp.stage1 import TrainedField
+from tests.methods.trainings import GRID, QUICK, TAUGHT, goes_on_after_a_kill, quality
 
 
-def fitted(scene: Scene, log: Log, budget: Budget = BUDGET, **options) -> GaussianSplatting:
+def fitted(scene: Scene, log: Log, budget: Budget = TAUGHT, **options) -> GaussianSplatting:
     settings = {"count": 400, "fitting": Fitting()} | options
-    method = GaussianSplatting(grid=GRID, training=TrainingOptions(), device="cpu", **settings)
+    method = GaussianSplatting(grid=GRID, training=QUICK, device="cpu", **settings)
     method.fit(scene, budget, log)
     return method
 
 
 @pytest.mark.slow
-def test_they_learn_a_ball(ball_scene: Scene, quiet_log: Log) -> None:
-    budget = Budget("test", steps=100, samples=8192, renderer_steps=300)
-    method = fitted(ball_scene, quiet_log, budget)
+def test_they_learn_a_ball(ball_scene: Scene, shared_log: Log) -> None:
+    method = fitted(ball_scene, shared_log, replace(TAUGHT, renderer_steps=300))
     assert quality(method, ball_scene) > 24
     frame = method.render(ball_scene.splits["test"].cameras[1], NullProbe())
     # Depth is that of the front of the ball, 1.6 - 0.3 from the camera, to four pixels' widths:
@@ -60,18 +55,16 @@ def test_they_learn_from_scratch(ball_scene: Scene, quiet_log: Log) -> None:
     assert quality(after, ball_scene) > quality(before, ball_scene) + 3
 
 
-@pytest.mark.slow
-def test_they_begin_on_surfaces_with_their_colours(ball_scene: Scene, quiet_log: Log) -> None:
-    setup = Setup.resolved(GRID, TrainingOptions(), "bf16", "auto", "cpu", seed=0)
-    budget = Budget("test", steps=400, samples=8192)
-    field = train_field(setup, ball_scene, budget, quiet_log)
+def test_they_begin_on_surfaces_with_their_colours(
+    ball_scene: Scene, teacher: TrainedField
+) -> None:
     generator = torch.Generator().manual_seed(0)
-    points, colours = on_surfaces(field, setup.training.march, ball_scene, 500, generator)
+    points, colours = on_surfaces(teacher, QUICK.march, ball_scene, 500, generator)
     radius = (points - 0.5).norm(dim=1)
     assert len(points) == 500
     assert abs(radius.median().item() - 0.3) < 2 * 1.6 / 40
     error = colours - (0.5 + (points - 0.5) / 0.6).clamp(0, 1)  # the ball is coloured by its normal
-    assert error.abs().median() < 0.05
+    assert error.abs().median() < 0.1  # two colours drawn at random are 0.3 apart
 
 
 def test_spacing_is_the_distance_of_neighbours(ball_scene: Scene) -> None:
@@ -89,7 +82,7 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(
     def training() -> GaussianTraining:
         method = GaussianSplatting(
             grid=GRID,
-            training=TrainingOptions(),
+            training=QUICK,
             fitting=Fitting(every=10),
             count=200,
             start="scratch",
@@ -103,11 +96,12 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(
 def test_a_training_is_found_again_and_left_for_others(
     ball_scene: Scene, quiet_log: Log, tmp_path: Path
 ) -> None:
-    first = fitted(ball_scene, quiet_log)
-    again = fitted(ball_scene, quiet_log)
+    budget = Budget("test", steps=40, samples=1024, renderer_steps=20)
+    first = fitted(ball_scene, quiet_log, budget)
+    again = fitted(ball_scene, quiet_log, budget)
     assert again.train_s == first.train_s > 0
     (exported,) = (tmp_path / "outputs").rglob("gaussians.ply")
-    shown = fitted(ball_scene, quiet_log, checkpoint=str(exported))
+    shown = fitted(ball_scene, quiet_log, budget, checkpoint=str(exported))
     camera = ball_scene.splits["test"].cameras[0]
     pictures = [m.render(camera, NullProbe()).rgb for m in (first, again, shown)]
     assert torch.equal(pictures[0], pictures[1])
@@ -115,9 +109,9 @@ def test_a_training_is_found_again_and_left_for_others(
     assert shown.train_s == 0
 
 
-def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, quiet_log: Log) -> None:
-    plain = fitted(ball_scene, quiet_log)
-    small = fitted(ball_scene, quiet_log, stored="int8")
+def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, shared_log: Log) -> None:
+    plain = fitted(ball_scene, shared_log)
+    small = fitted(ball_scene, shared_log, stored="int8")
     assert plain.sizes() == {"gaussians": 400 * 59 * 4}
     assert small.sizes()["gaussians"] < plain.sizes()["gaussians"] / 3.5
     assert small.settings()["precision"] == "int8"
@@ -132,6 +126,4 @@ def test_a_missing_checkpoint_is_one_line(ball_scene: Scene, quiet_log: Log) -> 
 @pytest.mark.parametrize("wrong", [{"count": 0}, {"degree": 4}, {"stop": 1.0}])
 def test_wrong_settings_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="expected"):
-        GaussianSplatting(
-            grid=GRID, training=TrainingOptions(), fitting=Fitting(), **{"count": 10} | wrong
-        )
+        GaussianSplatting(grid=GRID, training=QUICK, fitting=Fitting(), **{"count": 10} | wrong)

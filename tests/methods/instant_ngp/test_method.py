@@ -9,21 +9,21 @@ from bench.compositing import composite
 from bench.metrics import psnr
 from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene
 from methods.instant_ngp.method import InstantNgp
-from methods.instant_ngp.training import TrainingOptions
 from methods.kernels import multiplies_bf16
 from methods.kernels.encode import HashGrid
+from tests.methods.trainings import GRID, QUICK, TAUGHT
 
-GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
+BUDGET = Budget("test", steps=8, samples=2048)
 
 
-def fitted(scene: Scene, log: Log, device: str, steps: int = 8, **options) -> InstantNgp:
-    method = InstantNgp(grid=GRID, training=TrainingOptions(), device=device, **options)
-    method.fit(scene, Budget("test", steps=steps, samples=8192), log)
+def fitted(scene: Scene, log: Log, device: str, budget: Budget = BUDGET, **options) -> InstantNgp:
+    method = InstantNgp(grid=GRID, training=QUICK, device=device, **options)
+    method.fit(scene, budget, log)
     return method
 
 
-def test_it_learns_a_ball(ball_scene: Scene, quiet_log: Log, device: str) -> None:
-    method = fitted(ball_scene, quiet_log, device, steps=400)
+def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log, device: str) -> None:
+    method = fitted(ball_scene, shared_log, device, TAUGHT)
     test = ball_scene.splits["test"]
     frame = method.render(test.cameras[1], NullProbe())
     truth = composite(test.images[1], ball_scene.background)
@@ -78,21 +78,21 @@ def test_settings_say_in_which_precision_a_field_is_multiplied(
     monkeypatch: pytest.MonkeyPatch, has_products: bool, precision: str, said: str
 ) -> None:
     monkeypatch.setattr("methods.instant_ngp.stage1.multiplies_bf16", lambda kind: has_products)
-    method = InstantNgp(grid=GRID, training=TrainingOptions(), device="cpu", precision=precision)
+    method = InstantNgp(grid=GRID, training=QUICK, device="cpu", precision=precision)
     assert method.settings()["precision"] == said
 
 
 def test_a_packed_table_needs_two_features() -> None:
     with pytest.raises(ValueError, match=r"grid\.features is 4: use precision=fp32"):
-        InstantNgp(grid=HashGrid(features=4), training=TrainingOptions(), device="cpu")
+        InstantNgp(grid=HashGrid(features=4), training=QUICK, device="cpu")
 
 
 def test_a_stop_that_ends_every_ray_at_once_is_refused() -> None:
     with pytest.raises(ValueError, match=r"stop: expected a transmittance of 0 or more and less"):
-        InstantNgp(grid=HashGrid(), training=TrainingOptions(), stop=1.0, device="cpu")
+        InstantNgp(grid=HashGrid(), training=QUICK, stop=1.0, device="cpu")
 
 
 @pytest.mark.parametrize("device", ["", "gpu", "cpu:0", "meta"])
 def test_what_is_no_name_of_a_device_is_refused(device: str) -> None:
     with pytest.raises(ValueError, match=rf"^device: expected auto, .* got '{device}'"):
-        InstantNgp(grid=GRID, training=TrainingOptions(), device=device)
+        InstantNgp(grid=GRID, training=QUICK, device=device)

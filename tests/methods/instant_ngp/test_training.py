@@ -13,7 +13,7 @@ from bench.console import ConsoleLog
 from bench.sharing import locked
 from bench.types import Budget, Log, Scene, Split, SteerbenchError
 from methods.instant_ngp.field import HashField
-from methods.instant_ngp.stage1 import Setup, train_field
+from methods.instant_ngp.stage1 import train_field
 from methods.instant_ngp.training import (
     MIN_RAYS,
     FieldTraining,
@@ -21,13 +21,10 @@ from methods.instant_ngp.training import (
     PixelTraining,
     TrainingOptions,
 )
-from methods.kernels.encode import HashGrid
 from methods.training import checkpoint, loop
-from tests.methods.trainings import killed
+from tests.methods.trainings import GRID, QUICK, TEACHER, killed
 
-GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
-BUDGET = Budget("test", steps=40, samples=4096)
-SETUP = Setup.resolved(GRID, TrainingOptions(), "bf16", "auto", "cpu", seed=0)
+BUDGET = Budget("test", steps=40, samples=1024)
 
 
 def new_field() -> HashField:
@@ -36,12 +33,12 @@ def new_field() -> HashField:
 
 def trained(scene: Scene, root: Path) -> HashField:
     """The field that is trained with `root` as the folder of all results."""
-    return train_field(SETUP, scene, BUDGET, ConsoleLog(root, quiet=True)).field
+    return train_field(TEACHER, scene, BUDGET, ConsoleLog(root, quiet=True)).field
 
 
 def stage(scene: Scene, root: Path) -> Path:
     """Where that field is kept."""
-    return ConsoleLog(root, quiet=True).stage_dir("field", SETUP.key(scene, BUDGET))
+    return ConsoleLog(root, quiet=True).stage_dir("field", TEACHER.key(scene, BUDGET))
 
 
 def test_rays_go_through_the_pixels_whose_colours_they_carry(ball_scene: Scene) -> None:
@@ -56,13 +53,14 @@ def test_rays_go_through_the_pixels_whose_colours_they_carry(ball_scene: Scene) 
 
 
 def test_the_loss_falls(ball_scene: Scene) -> None:
-    training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
+    budget = replace(BUDGET, samples=4096)
+    training = FieldTraining(new_field(), ball_scene, budget, QUICK, seed=0)
     losses = [training.advance()[""] for _ in range(BUDGET.steps)]
     assert sum(losses[-10:]) < 0.5 * sum(losses[:10])
 
 
 def test_the_batch_grows_to_the_samples_of_the_budget(ball_scene: Scene) -> None:
-    training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
+    training = FieldTraining(new_field(), ball_scene, BUDGET, QUICK, seed=0)
     training.rays = 100
     for wanted in (50, 50, 50):  # each ray brought half a sample: the batch may grow by a quarter
         training._fit_batch(wanted)
@@ -72,7 +70,7 @@ def test_the_batch_grows_to_the_samples_of_the_budget(ball_scene: Scene) -> None
 
 
 def test_the_learning_rate_falls_from_the_first_to_the_last_step(ball_scene: Scene) -> None:
-    training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
+    training = FieldTraining(new_field(), ball_scene, BUDGET, QUICK, seed=0)
     rates = []
     for training.step in range(BUDGET.steps + 1):
         rates.append(training.learning_rate())
@@ -135,7 +133,7 @@ def test_who_finds_the_same_training_under_way_waits_and_loads_its_result(
     other = ExitStack()
     other.enter_context(locked(folder / "lock", "", quiet_log))
     log = Waiting(tmp_path / "shared", quiet=True)
-    second = train_field(SETUP, ball_scene, BUDGET, log).field
+    second = train_field(TEACHER, ball_scene, BUDGET, log).field
     assert f"waits for another process that makes the same: {folder}" in said[0]
     assert torch.equal(first.table, second.table)
     assert torch.equal(first.packed, second.packed)
@@ -156,7 +154,7 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_last_good_checkpoint(
     monkeypatch.setattr(FieldTraining, "advance", spoiled_at_10)
     with pytest.raises(SteerbenchError, match=r"step 10.*feature_mid.*last good checkpoint"):
         trained(ball_scene, tmp_path)
-    training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
+    training = FieldTraining(new_field(), ball_scene, BUDGET, QUICK, seed=0)
     loop.resume(training, stage(ball_scene, tmp_path) / "checkpoint.safetensors")
     assert training.step == 10
     assert all(layer.isfinite().all() for layer in training.field.layers.values())
@@ -197,7 +195,7 @@ def test_a_file_of_another_training_is_named_with_what_to_do(
 
 
 def test_no_step_has_more_rays_than_it_may(ball_scene: Scene) -> None:
-    options = TrainingOptions(max_rays=MIN_RAYS)
+    options = replace(QUICK, max_rays=MIN_RAYS)
     training = FieldTraining(new_field(), ball_scene, BUDGET, options, seed=0)
     rays = []
     for _ in range(2):
@@ -221,9 +219,7 @@ def test_pictures_that_do_not_overlap_are_refused(ball_scene: Scene) -> None:
     train = ball_scene.splits["train"]
     alone = Split(train.cameras[:1], train.images[:1], train.names[:1])
     with pytest.raises(SteerbenchError, match="no part of the unit cube is seen by 2 training"):
-        FieldTraining(
-            new_field(), replace(ball_scene, splits={"train": alone}), BUDGET, TrainingOptions(), 0
-        )
+        FieldTraining(new_field(), replace(ball_scene, splits={"train": alone}), BUDGET, QUICK, 0)
 
 
 @pytest.mark.parametrize("setting", [{"rate": 0.0}, {"final_rate": 2.0}, {"max_rays": 1}])
@@ -235,7 +231,7 @@ def test_options_that_make_no_sense_are_refused(setting: dict) -> None:
 def test_a_checkpoint_that_cannot_be_written_says_so(
     ball_scene: Scene, tmp_path: Path, quiet_log: Log
 ) -> None:
-    training = FieldTraining(new_field(), ball_scene, BUDGET, TrainingOptions(), seed=0)
+    training = FieldTraining(new_field(), ball_scene, BUDGET, QUICK, seed=0)
     with pytest.raises(SteerbenchError, match=r"cannot write to .*gone"):
         loop.train(training, tmp_path / "gone" / "field.safetensors", "training", quiet_log)
     assert training.step == 0  # before it is trained
@@ -247,6 +243,6 @@ def test_pictures_without_alpha_are_trained_on_as_they_are(ball_scene: Scene) ->
     split = ball_scene.splits["train"]
     opaque = replace(split, images=[image[..., :3] for image in split.images])
     scene = replace(ball_scene, splits={"train": opaque, "test": opaque})
-    training = FieldTraining(new_field(), scene, BUDGET, TrainingOptions(), seed=0)
+    training = FieldTraining(new_field(), scene, BUDGET, QUICK, seed=0)
     losses = [training.advance()[""] for _ in range(5)]
     assert all(loss < 1 for loss in losses)

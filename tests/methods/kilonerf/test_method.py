@@ -8,19 +8,14 @@ import pytest
 import torch
 
 from bench.types import Budget, Log, NullProbe, Scene
-from methods.instant_ngp.stage1 import Setup, train_field
-from methods.instant_ngp.training import TrainingOptions
-from methods.kernels.encode import HashGrid
+from methods.instant_ngp.stage1 import TrainedField
 from methods.kilonerf.field import SHAPES
 from methods.kilonerf.method import KiloNerf
 from methods.kilonerf.training import Lessons
 from methods.training import loop
-from tests.methods.trainings import goes_on_after_a_kill, quality
+from tests.methods.trainings import TAUGHT, TEACHER, goes_on_after_a_kill, quality
 
-GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
-BUDGET = Budget("test", steps=100, samples=8192, renderer_steps=60)
 LESSONS = Lessons(points_each=64, rate=1e-2)
-TEACHER = Setup.resolved(GRID, TrainingOptions(), "bf16", "auto", "cpu", seed=0)
 
 
 def method(**options) -> KiloNerf:
@@ -29,13 +24,13 @@ def method(**options) -> KiloNerf:
 
 def fitted(scene: Scene, log: Log, **options) -> KiloNerf:
     student = method(**options)
-    student.fit(scene, BUDGET, log)
+    student.fit(scene, TAUGHT, log)
     return student
 
 
 @pytest.mark.slow
-def test_it_learns_a_ball(ball_scene: Scene, quiet_log: Log) -> None:
-    student = fitted(ball_scene, quiet_log)
+def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log) -> None:
+    student = fitted(ball_scene, shared_log)
     test = ball_scene.splits["test"]
     frame = student.render(test.cameras[1], NullProbe())
     assert quality(student, ball_scene) > 20
@@ -43,9 +38,8 @@ def test_it_learns_a_ball(ball_scene: Scene, quiet_log: Log) -> None:
 
 
 def test_a_killed_training_goes_on_as_if_it_had_not_been(
-    ball_scene: Scene, quiet_log: Log, tmp_path: Path
+    ball_scene: Scene, teacher: TrainedField, tmp_path: Path
 ) -> None:
-    teacher = train_field(TEACHER, ball_scene, BUDGET, quiet_log)
     budget = Budget("test", steps=100, samples=2048, renderer_steps=12)
 
     def training() -> loop.Training:
@@ -54,16 +48,16 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(
     goes_on_after_a_kill(training, 8, tmp_path)  # of which six from points
 
 
-def test_a_finished_training_is_found_again(ball_scene: Scene, quiet_log: Log) -> None:
-    first, again = (fitted(ball_scene, quiet_log) for _ in range(2))
+def test_a_finished_training_is_found_again(ball_scene: Scene, shared_log: Log) -> None:
+    first, again = (fitted(ball_scene, shared_log) for _ in range(2))
     assert again.train_s == first.train_s > 0
     camera = ball_scene.splits["test"].cameras[0]
     pictures = [student.render(camera, NullProbe()).rgb for student in (first, again)]
     assert torch.equal(*pictures)
 
 
-def test_sizes_are_those_of_the_networks(ball_scene: Scene, quiet_log: Log) -> None:
-    student = fitted(ball_scene, quiet_log)
+def test_sizes_are_those_of_the_networks(ball_scene: Scene, shared_log: Log) -> None:
+    student = fitted(ball_scene, shared_log)
     parameters = sum(i * o + o for i, o in SHAPES.values())
     assert parameters == 6212  # of the publication
     cubes = student.grid.networks

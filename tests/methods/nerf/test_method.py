@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,41 +10,30 @@ import pytest
 import torch
 from torch import nn
 
-from bench.console import ConsoleLog
-from bench.types import Budget, Log, NullProbe, Scene
-from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
-from methods.instant_ngp.training import TrainingOptions
+from bench.types import Log, NullProbe, Scene
+from methods.instant_ngp.stage1 import TrainedField, train_field
 from methods.kernels.composite import STOP
-from methods.kernels.encode import HashGrid
 from methods.nerf.field import NerfField
 from methods.nerf.method import Nerf
 from methods.rendering.march import March
 from methods.students.networks import NetworkLessons
 from methods.training import loop
 from tests.methods.conftest import Work
-from tests.methods.trainings import goes_on_after_a_kill, quality
+from tests.methods.trainings import EXACT_TEACHER, TAUGHT, goes_on_after_a_kill, quality
 
-GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
-BUDGET = Budget("test", steps=80, samples=4096, renderer_steps=4)
+BUDGET = replace(TAUGHT, renderer_steps=4)
 LONG = 8.0
 """March step, in the usual ones: few samples for a large network."""
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
-    """Of the whole module: its field is trained once."""
-    return ConsoleLog(tmp_path_factory.mktemp("outputs"), quiet=True)
-
-
 def new_method(**options: Any) -> Nerf:
-    setup = Setup.resolved(GRID, TrainingOptions(), "fp32", "auto", "cpu", seed=0)
     training = NetworkLessons(rate=1e-3, march_step=LONG)
-    return Nerf(**{"teacher": setup, "training": training} | options)
+    return Nerf(**{"teacher": EXACT_TEACHER, "training": training} | options)
 
 
 def fitted(scene: Scene, log: Log, steps: int, **options: Any) -> Nerf:
     method = new_method(**options)
-    method.fit(scene, Budget("test", 80, 4096, renderer_steps=steps), log)
+    method.fit(scene, replace(TAUGHT, renderer_steps=steps), log)
     return method
 
 
@@ -52,13 +42,13 @@ def trained_teacher(scene: Scene, log: Log) -> TrainedField:
 
 
 @pytest.mark.slow
-def test_it_learns_a_ball(ball_scene: Scene, log: Log) -> None:
-    method = fitted(ball_scene, log, steps=60)
+def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log) -> None:
+    method = fitted(ball_scene, shared_log, steps=60)
     assert quality(method, ball_scene) > 16
 
 
-def test_skipping_changes_no_picture_and_saves_products(ball_scene: Scene, log: Log) -> None:
-    method = fitted(ball_scene, log, steps=20, stop=STOP)
+def test_skipping_changes_no_picture_and_saves_products(ball_scene: Scene, shared_log: Log) -> None:
+    method = fitted(ball_scene, shared_log, steps=20, stop=STOP)
     camera = ball_scene.splits["test"].cameras[0]
     skipping, dense = Work(), Work()
     fast = method.render(camera, skipping)
@@ -80,9 +70,9 @@ def products_of_a_sample() -> int:
 
 
 def test_a_killed_training_goes_on_as_if_it_had_not_been(
-    ball_scene: Scene, log: Log, tmp_path: Path
+    ball_scene: Scene, shared_log: Log, tmp_path: Path
 ) -> None:
-    teacher = trained_teacher(ball_scene, log)
+    teacher = trained_teacher(ball_scene, shared_log)
 
     def training() -> loop.Training:
         return new_method().begin(teacher, ball_scene, BUDGET)
@@ -90,17 +80,17 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(
     goes_on_after_a_kill(training, 3, tmp_path)  # points, then rays
 
 
-def test_a_training_is_found_again(ball_scene: Scene, log: Log) -> None:
-    first = fitted(ball_scene, log, steps=2)
-    again = fitted(ball_scene, log, steps=2, skip=True)
+def test_a_training_is_found_again(ball_scene: Scene, shared_log: Log) -> None:
+    first = fitted(ball_scene, shared_log, steps=2)
+    again = fitted(ball_scene, shared_log, steps=2, skip=True)
     assert again.train_s == first.train_s > 0
     camera = ball_scene.splits["test"].cameras[0]
     pictures = [method.render(camera, NullProbe()).rgb for method in (first, again)]
     assert torch.equal(*pictures)
 
 
-def test_size_is_that_of_the_published_network(ball_scene: Scene, log: Log) -> None:
-    method = fitted(ball_scene, log, steps=2)
+def test_size_is_that_of_the_published_network(ball_scene: Scene, shared_log: Log) -> None:
+    method = fitted(ball_scene, shared_log, steps=2)
     assert method.sizes() == {"network": 4 * 595_844, "occupancy": 128**3 // 8}
 
 

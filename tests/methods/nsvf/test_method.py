@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,41 +11,39 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from bench.console import ConsoleLog
-from bench.types import Budget, Log, NullProbe, Scene
-from methods.instant_ngp.stage1 import Setup, train_field
-from methods.instant_ngp.training import TrainingOptions
-from methods.kernels.encode import HashGrid, encode
+from bench.types import Log, NullProbe, Scene
+from methods.instant_ngp.stage1 import train_field
+from methods.kernels.encode import encode
 from methods.kernels.march import Occupancy
 from methods.nsvf.field import NsvfField
 from methods.nsvf.method import Nsvf
 from methods.rendering.occupancy import STEP
 from methods.students.networks import NetworkLessons
 from methods.training import loop
-from tests.methods.trainings import goes_on_after_a_kill, quality
+from tests.methods.trainings import (
+    EXACT_GRID,
+    EXACT_TEACHER,
+    TAUGHT,
+    TEACHER,
+    goes_on_after_a_kill,
+    quality,
+)
 
-GRID = HashGrid(levels=16, log2_table=10, n_min=4, n_max=64)
-BUDGET = Budget("test", steps=80, samples=4096, renderer_steps=4)
+BUDGET = replace(TAUGHT, renderer_steps=4)
 U = 2.0**-24
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
-    """Of the whole module: its field is trained once."""
-    return ConsoleLog(tmp_path_factory.mktemp("outputs"), quiet=True)
-
-
 def new_method(**options: Any) -> Nsvf:
-    setup = Setup.resolved(GRID, TrainingOptions(), "fp32", "auto", "cpu", seed=0)
     training = NetworkLessons(rate=2e-3)
     return Nsvf(
-        **{"teacher": setup, "training": training, "resolution": 32, "start": "random"} | options
+        **{"teacher": EXACT_TEACHER, "training": training, "resolution": 32, "start": "random"}
+        | options
     )
 
 
 def fitted(scene: Scene, log: Log, steps: int, **options: Any) -> Nsvf:
     method = new_method(**options)
-    method.fit(scene, Budget("test", 80, 4096, renderer_steps=steps), log)
+    method.fit(scene, replace(TAUGHT, renderer_steps=steps), log)
     return method
 
 
@@ -123,15 +122,15 @@ def test_the_network_is_that_of_the_publication() -> None:
 
 
 @pytest.mark.slow
-def test_it_learns_a_ball(ball_scene: Scene, log: Log) -> None:
-    method = fitted(ball_scene, log, steps=60, start="teacher")
+def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log) -> None:
+    method = fitted(ball_scene, shared_log, steps=60, start="teacher")
     assert quality(method, ball_scene) > 16
 
 
 def test_a_killed_training_goes_on_as_if_it_had_not_been(
-    ball_scene: Scene, log: Log, tmp_path: Path
+    ball_scene: Scene, shared_log: Log, tmp_path: Path
 ) -> None:
-    teacher = train_field(new_method().teacher, ball_scene, BUDGET, log)
+    teacher = train_field(new_method().teacher, ball_scene, BUDGET, shared_log)
 
     def training() -> loop.Training:
         return new_method().begin(teacher, ball_scene, BUDGET)
@@ -139,8 +138,10 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(
     goes_on_after_a_kill(training, 3, tmp_path)  # points, then rays
 
 
-def test_a_training_is_found_again_and_depends_on_its_step(ball_scene: Scene, log: Log) -> None:
-    first, again = (fitted(ball_scene, log, steps=2) for _ in range(2))
+def test_a_training_is_found_again_and_depends_on_its_step(
+    ball_scene: Scene, shared_log: Log
+) -> None:
+    first, again = (fitted(ball_scene, shared_log, steps=2) for _ in range(2))
     assert again.train_s == first.train_s > 0
     camera = ball_scene.splits["test"].cameras[0]
     pictures = [method.render(camera, NullProbe()).rgb for method in (first, again)]
@@ -149,15 +150,15 @@ def test_a_training_is_found_again_and_depends_on_its_step(ball_scene: Scene, lo
     assert new_method(step=0.25).training.march_step * STEP == pytest.approx(0.25 / 32)
 
 
-def test_embeddings_begin_as_the_teachers_features(ball_scene: Scene, log: Log) -> None:
+def test_embeddings_begin_as_the_teachers_features(ball_scene: Scene, shared_log: Log) -> None:
     method = new_method(start="teacher")
-    teacher = train_field(method.teacher, ball_scene, BUDGET, log)
+    teacher = train_field(method.teacher, ball_scene, BUDGET, shared_log)
     field = method.begin(teacher, ball_scene, BUDGET).field
     assert isinstance(field, NsvfField)
     embeddings = field.embeddings.detach()
     assert embeddings.std().item() == pytest.approx(32**-0.5, rel=1e-5)
     places = field.vertices / 32
-    learned = encode(places, teacher.field.table.detach(), GRID, backend="reference")
+    learned = encode(places, teacher.field.table.detach(), EXACT_GRID, backend="reference")
     # The same table, read by another backend, and a factor: some roundings.
     scale = 32**-0.5 / learned.std()
     torch.testing.assert_close(embeddings, scale * learned, rtol=1e-4, atol=1e-5)
@@ -178,7 +179,5 @@ def test_wrong_settings_are_refused(wrong: dict[str, Any], message: str) -> None
 
 
 def test_a_teacher_of_other_channels_is_no_start() -> None:
-    small = HashGrid(levels=8, log2_table=10, n_min=4, n_max=64)
-    setup = Setup.resolved(small, TrainingOptions(), "fp32", "auto", "cpu", seed=0)
     with pytest.raises(ValueError, match=r"32 channels .* got 16"):
-        new_method(teacher=setup, start="teacher")
+        new_method(teacher=TEACHER, start="teacher")

@@ -9,52 +9,31 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench.console import ConsoleLog
-from bench.threads import torch_threads
 from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene, SteerbenchError
-from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
-from methods.instant_ngp.training import PixelBatches, TrainingOptions
-from methods.kernels.encode import HashGrid
+from methods.instant_ngp.stage1 import TrainedField
+from methods.instant_ngp.training import PixelBatches
 from methods.plenoctree.method import PlenOctree
 from methods.plenoctree.octree import Octree
 from methods.plenoctree.start import Extraction, extract, fibonacci_sphere
 from methods.plenoctree.training import OctreeLessons, OctreeTraining
 from tests.methods.conftest import Work
-from tests.methods.trainings import goes_on_after_a_kill, quality
+from tests.methods.trainings import TAUGHT, TEACHER, goes_on_after_a_kill, quality
 
-GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
 SMALL = {"resolution": 128, "degree": 1, "rays": 20_000, "points": 2, "directions": 8}
-BUDGET = Budget("test", steps=250, samples=8192)
 Y00 = (4 * math.pi) ** -0.5
-
-
-def setup() -> Setup:
-    return Setup.resolved(GRID, TrainingOptions(), "bf16", "auto", "cpu", seed=0)
 
 
 def fitted(scene: Scene, log: Log, steps: int = 20, **others) -> PlenOctree:
     extraction = Extraction(**SMALL | {k: others.pop(k) for k in SMALL if k in others})
     method = PlenOctree(
-        teacher=setup(), extraction=extraction, training=OctreeLessons(samples=8192), **others
+        teacher=TEACHER, extraction=extraction, training=OctreeLessons(samples=8192), **others
     )
-    method.fit(scene, replace(BUDGET, renderer_steps=steps), log)
+    method.fit(scene, replace(TAUGHT, renderer_steps=steps), log)
     return method
 
 
 def mean_quality(method: PlenOctree, scene: Scene, split: str) -> float:
     return sum(quality(method, scene, split, view) for view in range(3)) / 3
-
-
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
-    """One for all: what one test trained, the next finds."""
-    return ConsoleLog(tmp_path_factory.mktemp("outputs"), quiet=True)
-
-
-@pytest.fixture(scope="module")
-def teacher(ball_scene: Scene, log: Log) -> TrainedField:
-    with torch_threads(None):
-        return train_field(setup(), ball_scene, BUDGET, log)
 
 
 def extracted(teacher: TrainedField, scene: Scene, **others) -> Octree:
@@ -75,15 +54,15 @@ def test_leaves_stand_where_the_ball_is(ball_scene: Scene, teacher: TrainedField
 
 
 def test_densities_are_means_of_the_teacher(ball_scene: Scene, teacher: TrainedField) -> None:
-    octree = extracted(teacher, ball_scene, points=64)
+    octree = extracted(teacher, ball_scene, points=16)
     centres = (octree.voxels.coordinates + 0.5) / 128
     axis = (torch.arange(4) + 0.5) / 4 - 0.5
     inner = torch.cartesian_prod(axis, axis, axis) / 128
     some = torch.arange(0, len(centres), len(centres) // 50)
     with torch.no_grad():
         dense = torch.stack([teacher.field.density(x + inner)[0] for x in centres[some]])
-    # Two means of 64 points each are, but for chance, within 6 of their standard deviations.
-    spread = dense.std(dim=1) / 8 * 2**0.5
+    # Means of 16 and of 64 points are, but for chance, within 6 of their standard deviations.
+    spread = dense.std(dim=1) * (1 / 16 + 1 / 64) ** 0.5
     difference = (octree.light.density[some] - dense.mean(dim=1)).abs()
     assert (difference < 6 * spread + 1e-3).all()
 
@@ -117,8 +96,8 @@ def test_directions_are_spread_evenly() -> None:
 
 
 @pytest.mark.slow
-def test_it_learns_a_ball(ball_scene: Scene, log: Log) -> None:
-    before, after = fitted(ball_scene, log, 1), fitted(ball_scene, log, 60)
+def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log) -> None:
+    before, after = fitted(ball_scene, shared_log, 1), fitted(ball_scene, shared_log, 60)
     assert mean_quality(after, ball_scene, "train") > mean_quality(before, ball_scene, "train") + 1
     assert mean_quality(after, ball_scene, "test") > 21
     frame = after.render(ball_scene.splits["test"].cameras[1], NullProbe())
@@ -133,7 +112,7 @@ def test_only_what_rays_meet_is_changed(ball_scene: Scene, teacher: TrainedField
     octree = extracted(teacher, ball_scene)
     before = octree.tensors()["density"].clone(), octree.tensors()["harmonics"].clone()
     options = OctreeLessons(max_rays=64)
-    training = OctreeTraining(octree, ball_scene, BUDGET, options, seed=0)
+    training = OctreeTraining(octree, ball_scene, TAUGHT, options, seed=0)
     training.advance()
     met = torch.zeros(len(octree.voxels), dtype=torch.bool)
     met[training.visited.long()] = True
@@ -156,15 +135,15 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(
     goes_on_after_a_kill(training, 9, tmp_path)
 
 
-def test_a_training_is_found_again(ball_scene: Scene, log: Log) -> None:
-    first, again = fitted(ball_scene, log), fitted(ball_scene, log)
+def test_a_training_is_found_again(ball_scene: Scene, shared_log: Log) -> None:
+    first, again = fitted(ball_scene, shared_log), fitted(ball_scene, shared_log)
     assert again.train_s == first.train_s > 0
     camera = ball_scene.splits["test"].cameras[0]
     assert torch.equal(first.render(camera, NullProbe()).rgb, again.render(camera, NullProbe()).rgb)
 
 
-def test_what_is_stored_is_chosen_afterwards(ball_scene: Scene, log: Log) -> None:
-    half, full = fitted(ball_scene, log), fitted(ball_scene, log, stored="fp32")
+def test_what_is_stored_is_chosen_afterwards(ball_scene: Scene, shared_log: Log) -> None:
+    half, full = fitted(ball_scene, shared_log), fitted(ball_scene, shared_log, stored="fp32")
     assert full.train_s == half.train_s  # the same training
     assert full.sizes()["leaves"] == 2 * half.sizes()["leaves"]
     assert half.settings()["precision"] == "fp16"
@@ -173,8 +152,8 @@ def test_what_is_stored_is_chosen_afterwards(ball_scene: Scene, log: Log) -> Non
     )
 
 
-def test_a_frame_says_its_work(ball_scene: Scene, log: Log) -> None:
-    probe, method = Work(), fitted(ball_scene, log)
+def test_a_frame_says_its_work(ball_scene: Scene, shared_log: Log) -> None:
+    probe, method = Work(), fitted(ball_scene, shared_log)
     method.render(ball_scene.splits["test"].cameras[0], probe)
     assert 0 < probe.done["rays"] <= 32 * 32
     assert 0 < probe.done["shaded_samples"] <= probe.done["samples"]
@@ -211,7 +190,7 @@ def test_wrong_settings_are_refused(wrong: dict[str, float]) -> None:
 
 
 def test_a_wrong_precision_or_rate_is_refused() -> None:
-    given = {"teacher": setup(), "extraction": Extraction(), "training": OctreeLessons()}
+    given = {"teacher": TEACHER, "extraction": Extraction(), "training": OctreeLessons()}
     with pytest.raises(ValueError, match="stored: expected fp16 or fp32, got 'fp8'"):
         PlenOctree(**given, stored="fp8")
     with pytest.raises(ValueError, match="stop: expected"):

@@ -12,7 +12,7 @@ import torch
 
 from bench.console import ConsoleLog
 from bench.errors import Unavailable
-from bench.types import Budget, NullProbe, Scene
+from bench.types import Budget, Log, NullProbe, Scene
 from methods.engines import Engine
 from methods.engines.openvino_engine import OpenVino
 from methods.engines.torch_engine import TorchEngine
@@ -25,8 +25,9 @@ from methods.steernerf.training.options import JointOptions
 from methods.steernerf.training.sequences import MotionOptions
 from methods.steernerf.unet import UNet
 from tests.methods.models import small_model, small_rendering
+from tests.methods.trainings import GRID, QUICK
 
-BUDGET = Budget("test", steps=40, samples=4096, renderer_steps=4)
+BUDGET = Budget("test", steps=40, samples=1024, renderer_steps=4)
 
 
 RENDERER = partial(LeanRenderer, width=8, blocks=1, init="scratch")
@@ -41,8 +42,8 @@ def new_method(
     **rendering: Any,
 ) -> SteerNerf:
     return SteerNerf(
-        grid=HashGrid(levels=8, log2_table=12, n_min=8, n_max=64),
-        training=TrainingOptions(),
+        grid=GRID,
+        training=QUICK,
         model=small_model(channels=5, frames=frames, step=4.0),
         rendering=small_rendering(**{"step": 4.0} | rendering),
         renderer=RENDERER,
@@ -95,9 +96,9 @@ def test_every_number_of_frames_shares_one_field(
     assert stages(tmp_path) == ["distilled", "field", "steernerf", "steernerf"]
 
 
-def test_reset_forgets(ball_scene: Scene, log: ConsoleLog) -> None:
+def test_reset_forgets(ball_scene: Scene, shared_log: Log) -> None:
     method = new_method(rate=1e-2)
-    method.fit(ball_scene, BUDGET, log)
+    method.fit(ball_scene, BUDGET, shared_log)
     camera = ball_scene.splits["test"].cameras[0]
     cold = method.render(camera, NullProbe()).rgb
     steady = method.render(camera, NullProbe()).rgb
@@ -107,9 +108,9 @@ def test_reset_forgets(ball_scene: Scene, log: ConsoleLog) -> None:
     assert method.memory == 2
 
 
-def test_sizes_are_those_of_all_that_a_frame_needs(ball_scene: Scene, log: ConsoleLog) -> None:
+def test_sizes_are_those_of_all_that_a_frame_needs(ball_scene: Scene, shared_log: Log) -> None:
     method = new_method()
-    method.fit(ball_scene, BUDGET, log)
+    method.fit(ball_scene, BUDGET, shared_log)
     renderer = RENDERER(5, 2, 4)
     numbers = sum(p.numel() for p in renderer.parameters())
     assert method.sizes()["renderer2d"] == 4 * numbers
@@ -262,9 +263,9 @@ def test_without_preceding_frames_there_is_no_range_reduction(mode: str) -> None
         refused(model=small_model(frames=0, history=False, surface=False), rendering=ranged)
 
 
-def test_a_rendering_may_be_exchanged_between_frames(ball_scene: Scene, log: ConsoleLog) -> None:
+def test_a_rendering_may_be_exchanged_between_frames(ball_scene: Scene, shared_log: Log) -> None:
     method = new_method(refined=1.0)
-    method.fit(ball_scene, BUDGET, log)
+    method.fit(ball_scene, BUDGET, shared_log)
     camera = ball_scene.splits["test"].cameras[0]
     refined = method.render(camera, NullProbe()).rgb
     method.reset()

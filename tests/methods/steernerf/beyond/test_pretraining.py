@@ -13,9 +13,6 @@ from torch import Tensor
 
 from bench.console import ConsoleLog
 from bench.types import Budget, Log, Scene, SteerbenchError
-from methods.instant_ngp.stage1 import Setup
-from methods.instant_ngp.training import TrainingOptions
-from methods.kernels.encode import HashGrid
 from methods.steernerf.beyond import lean_renderer
 from methods.steernerf.beyond.lean_renderer import LeanRenderer
 from methods.steernerf.beyond.pretraining import AnyOf, pretrain_renderer
@@ -25,19 +22,18 @@ from methods.steernerf.training.sequences import MotionOptions
 from methods.steernerf.training.stage2 import Stage2
 from methods.training import checkpoint
 from tests.methods.models import small_model
+from tests.methods.trainings import TEACHER
 
-GRID = HashGrid(levels=8, log2_table=12, n_min=8, n_max=64)
-SETUP = Setup.resolved(GRID, TrainingOptions(), "bf16", "auto", "cpu", seed=0)
 MODEL = small_model(channels=3, step=4.0)
 JOINT = JointOptions(patch=4, motion=MotionOptions(pool=2, length=2))
-BUDGET = Budget("test", steps=40, samples=4096, renderer_steps=8)
+BUDGET = Budget("test", steps=40, samples=1024, renderer_steps=8)
 RENDERER = partial(LeanRenderer, width=8, blocks=1)
 
 
 def train(scenes: list[Scene], output: Path, log: Log, channels: int = 3) -> dict[str, Tensor]:
     model = replace(MODEL, channels=channels)
     stage2 = Stage2(model, partial(RENDERER, init="scratch"), JOINT)
-    pretrain_renderer(SETUP, stage2, scenes, BUDGET, output, log)
+    pretrain_renderer(TEACHER, stage2, scenes, BUDGET, output, log)
     return load_file(output)
 
 

@@ -11,13 +11,13 @@ from bench.cameras import pack_camera
 from bench.console import ConsoleLog
 from bench.types import Budget, NullProbe, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField
-from methods.instant_ngp.training import TrainingOptions
 from methods.rendering.frame import everywhere, render_frame
 from methods.steernerf.training import distillation
 from methods.steernerf.training.distillation import distilled_views
 from methods.steernerf.training.sequences import TrueView
 from tests.methods.conftest import SIZE
 from tests.methods.models import SMALL_GRID, misty_field, trained_field
+from tests.methods.trainings import QUICK
 
 COUNT = 3
 BUDGET = Budget("test", steps=1, samples=1)
@@ -33,7 +33,7 @@ def views_of(
     trained: TrainedField, scene: Scene, root: Path, seed: int = 0, count: int = COUNT
 ) -> list[TrueView]:
     """With `root` as the folder of all results."""
-    setup = Setup.resolved(SMALL_GRID, TrainingOptions(), "bf16", "auto", "cpu", seed)
+    setup = Setup.resolved(SMALL_GRID, QUICK, "bf16", "auto", "cpu", seed)
     log = ConsoleLog(root, quiet=True)
     return distilled_views(setup, trained, scene, BUDGET, count, log)[0]
 
@@ -57,7 +57,7 @@ def test_a_view_is_what_the_field_shows_at_full_resolution(
         assert view.picture.shape == (SIZE, SIZE, 3)
         assert view.picture.dtype == torch.uint8
         field, occupancy, probe = trained.field, trained.occupancy, NullProbe()
-        render = everywhere(field, occupancy, probe, TrainingOptions().march)
+        render = everywhere(field, occupancy, probe, QUICK.march)
         white = ball_scene.background
         frame = render_frame(view.camera, occupancy, white, probe, render)
         assert (frame.alpha > 0.1).float().mean() > 0.1
