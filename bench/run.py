@@ -76,6 +76,8 @@ def measure_in_turns(methods: Sequence[Method], task: Task, log: Log) -> list[Me
     """
     lpips, missing = task.protocol.load_lpips(task.weights_dir, log)
     task.protocol.check(task.scene, task.trajectory)
+    for split in task.scene.splits.values():
+        list(split.images)  # decoded and refused now: not in a training, nor between frames
     for method in methods:
         method.fit(task.scene, task.budget, log)
     takes = [_Take.of(method, task, lpips) for method in methods]

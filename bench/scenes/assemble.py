@@ -11,7 +11,7 @@ import torch
 from bench.cameras import move_camera
 from bench.scenes.bounds import Box
 from bench.scenes.files import unexpected, whole_number
-from bench.scenes.images import Picture, View, decode_all
+from bench.scenes.images import Pictures, View, describe_all
 from bench.types import BACKGROUNDS, Log, Scene, Split, SteerbenchError
 
 SMALLEST, LARGEST = torch.finfo(torch.float32).tiny, torch.finfo(torch.float32).max
@@ -45,21 +45,18 @@ def leave_out(missing: Sequence[str], views: Sequence[View], where: str, log: Lo
         log.info(f"{where}: {count} pictures are not there, left out: {', '.join(missing)}")
 
 
-def decode_splits(
+def describe_splits(
     views: Mapping[str, Sequence[View]], downscale: int, log: Log
-) -> dict[str, list[Picture]]:
-    """The pictures of every split, each read and decoded once."""
+) -> dict[str, Pictures]:
+    """The pictures of every split, each read once; pixels are decoded when they are asked for."""
     whole_number(downscale, "downscale", 1)
-    pictures = iter(
-        decode_all([view for split in views.values() for view in split], downscale, log)
-    )
-    return {name: [next(pictures) for _ in split] for name, split in views.items()}
+    found = iter(describe_all([view for split in views.values() for view in split], downscale, log))
+    return {name: Pictures([next(found) for _ in split], log) for name, split in views.items()}
 
 
 def assemble(
     name: str,
-    views: Mapping[str, Sequence[View]],
-    pictures: Mapping[str, Sequence[Picture]],
+    pictures: Mapping[str, Pictures],
     box: Box,
     *,
     background: str,
@@ -79,12 +76,12 @@ def assemble(
         split: Split(
             cameras=[
                 move_camera(picture.camera, 1 / box.side, -box.origin / box.side)
-                for picture in pictures[split]
+                for picture in of_split.described
             ],
-            images=[picture.image for picture in pictures[split]],
-            names=[view.name for view in views[split]],
+            images=of_split,
+            names=[picture.view.name for picture in of_split.described],
         )
-        for split in views
+        for split, of_split in pictures.items()
     }
     for part in splits.values():
         for view, camera in zip(part.names, part.cameras, strict=True):
@@ -94,8 +91,8 @@ def assemble(
     digest = hashlib.sha256(repr((background, corners)).encode())
     for path in camera_files:
         digest.update(hashlib.sha256(path.read_bytes()).digest())
-    for split in pictures:
-        for picture in pictures[split]:
+    for split, of_split in pictures.items():
+        for picture in of_split.described:
             size = f"{split} {picture.camera.width} {picture.camera.height} "
             digest.update(size.encode() + picture.sha256.encode())
     return Scene(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bench.scenes.assemble import assemble, decode_splits
+from bench.scenes.assemble import assemble, describe_splits
 from bench.scenes.bounds import Box, cube, hull_box, parse_box
 from bench.scenes.files import (
     data_folder,
@@ -15,7 +15,7 @@ from bench.scenes.files import (
     read_json,
     unexpected,
 )
-from bench.scenes.images import Picture, View, image_size
+from bench.scenes.images import Pictures, View, image_size
 from bench.types import Camera, Log, Scene
 
 HALF_EXTENT = 1.5
@@ -48,11 +48,11 @@ def load(
     root = data_folder(path)
     found = {split: read_split(root, split, log) for split in ("train", "val", "test")}
     views = {split: of_split for split, of_split in found.items() if of_split}
-    pictures = decode_splits(views, downscale, log)
+    pictures = describe_splits(views, downscale, log)
     box = scene_box(bounds, pictures["train"], log)
     files = [root / camera_file(split) for split in views]
     name = name or root.name
-    return assemble(name, views, pictures, box, background=background, camera_files=files)
+    return assemble(name, pictures, box, background=background, camera_files=files)
 
 
 def camera_file(split: str) -> str:
@@ -94,14 +94,14 @@ def picture_path(root: Path, file_path: str, where: str) -> Path:
     return path if path.is_file() else inside(root, f"{file_path}.png", where)
 
 
-def scene_box(bounds: str | list, train: list[Picture], log: Log) -> Box:
+def scene_box(bounds: str | list, train: Pictures, log: Log) -> Box:
     """The box in the data set's units that `bounds`, as of `load`, means."""
     space = cube(HALF_EXTENT)
     if bounds == "full":
         return space
     if bounds != "auto":
         return parse_box(bounds)
-    hull = hull_box([p.camera for p in train], [p.image for p in train], space)
+    hull = hull_box([picture.camera for picture in train.described], train, space)
     if hull is None:
         taken = f"[-{HALF_EXTENT}, {HALF_EXTENT}]^3"
         log.info(f"bounds: the training pictures hold no masks, taking {taken}")

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bench.cameras import scale_camera
 from bench.errors import Unavailable
-from bench.scenes.assemble import assemble, decode_splits, every_nth, leave_out
+from bench.scenes.assemble import assemble, describe_splits, every_nth, leave_out
 from bench.scenes.bounds import MARGIN, Box, parse_box
 from bench.scenes.distortion import Lens
 from bench.scenes.files import data_folder, inside, rigid_pose, unexpected
@@ -71,9 +71,9 @@ def load(
     found = read_model(folder)
     splits = every_nth(read_views(root, images, folder, found, log), split_every, folder)
     box = points_box(found, folder) if bounds == "auto" else parse_box(bounds)
-    pictures = decode_splits(splits, downscale, log)
+    pictures = describe_splits(splits, downscale, log)
     files = sorted(folder.glob(f"*{_kind(folder)}"))
-    return assemble(root.name, splits, pictures, box, background=background, camera_files=files)
+    return assemble(root.name, pictures, box, background=background, camera_files=files)
 
 
 def model_folder(root: Path, model: str | None) -> Path:

@@ -46,8 +46,8 @@ class Fisheye:
         return distort_points_kannala_brandt(points, points.new_tensor(plain + self.coefficients))
 
 
-def undistort(image: Tensor, camera: Camera, lens: Lens, where: Path) -> tuple[Tensor, Camera]:
-    """The pinhole picture and its camera.
+def undistort(image: Tensor, camera: Camera, lens: Lens, where: Path) -> Tensor:
+    """The pinhole picture of `undistorted_camera`.
 
     Args:
         image: uint8 [H, W, C].
@@ -55,15 +55,9 @@ def undistort(image: Tensor, camera: Camera, lens: Lens, where: Path) -> tuple[T
         lens: that the picture was taken with.
         where: the picture, for messages.
 
-    The result is cropped to a rectangle in which every pixel was seen: no invented border.
     Raises SteerbenchError when the lens folds the picture over itself.
     """
-    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
-    try:
-        source, left, top = pinhole_window(camera.width, camera.height, intrinsics, lens)
-    except ValueError as error:
-        expected = "a lens distortion that can be undone"
-        raise unexpected(where, expected, f"{lens}: {error}") from error
+    source, _, _ = _window(camera, lens, where)
     planes = image.permute(2, 0, 1)[None].float()
     alpha = planes[:, 3:] / 255
     planes[:, :3] *= alpha if alpha.numel() else 1  # between pixels, colours weigh by their alpha
@@ -72,8 +66,24 @@ def undistort(image: Tensor, camera: Camera, lens: Lens, where: Path) -> tuple[T
     planes = remap(planes, u[None], v[None], align_corners=True)
     alpha = planes[:, 3:] / 255
     planes[:, :3] /= alpha.clamp(min=1e-6) if alpha.numel() else 1
-    straight = planes[0].permute(1, 2, 0).round().clamp(0, 255).to(torch.uint8).contiguous()
-    return straight, crop_camera(camera, left, top, source.shape[1], source.shape[0])
+    return planes[0].permute(1, 2, 0).round().clamp(0, 255).to(torch.uint8).contiguous()
+
+
+def undistorted_camera(camera: Camera, lens: Lens, where: Path) -> Camera:
+    """The camera of the pinhole picture, cropped to a rectangle in which every pixel was seen: no
+    invented border. Arguments and errors are those of `undistort`."""
+    source, left, top = _window(camera, lens, where)
+    return crop_camera(camera, left, top, source.shape[1], source.shape[0])
+
+
+def _window(camera: Camera, lens: Lens, where: Path) -> tuple[Tensor, int, int]:
+    """See `pinhole_window`."""
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    try:
+        return pinhole_window(camera.width, camera.height, intrinsics, lens)
+    except ValueError as error:
+        expected = "a lens distortion that can be undone"
+        raise unexpected(where, expected, f"{lens}: {error}") from error
 
 
 @lru_cache(maxsize=2)  # most captures have one lens

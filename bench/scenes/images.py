@@ -1,4 +1,4 @@
-"""Pictures of a data set: read once, decoded in parallel, kept as 8-bit tensors."""
+"""Pictures of a data set: decoded when they are asked for, kept as 8-bit tensors."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from bench.cameras import crop_camera, scale_camera
-from bench.scenes.distortion import Lens, undistort
+from bench.scenes.distortion import Lens, undistort, undistorted_camera
 from bench.scenes.files import unexpected
 from bench.scenes.parallel import in_parallel
 from bench.types import Camera, Log
@@ -41,11 +42,44 @@ class View:
 
 @dataclass(frozen=True)
 class Picture:
-    """A decoded view: `image` uint8 [H, W, 3 or 4], its pinhole `camera`, hash of its file."""
+    """A view at 1 / `downscale` of its resolution, of which no pixel was decoded yet: its pinhole
+    `camera`, and the hash of its file."""
 
-    image: Tensor
+    view: View
+    downscale: int
     camera: Camera
     sha256: str
+
+
+class Pictures(Sequence[Tensor]):
+    """The pixels of what is `described`, uint8 [H, W, 3 or 4] each: decoded when they are first
+    asked for, and kept. Who iterates gets all of them, decoded in parallel.
+
+    Raises:
+        SteerbenchError: a file is damaged, or another one than it was.
+    """
+
+    def __init__(self, described: Sequence[Picture], log: Log) -> None:
+        self.described, self._log = described, log
+        self._decoded: dict[int, Tensor] = {}
+
+    def __len__(self) -> int:
+        return len(self.described)
+
+    def __getitem__(self, place: Any) -> Any:
+        index = range(len(self))[place]
+        return self._at(index) if isinstance(index, int) else [self._at(one) for one in index]
+
+    def __iter__(self) -> Iterator[Tensor]:
+        missing = [index for index in range(len(self)) if index not in self._decoded]
+        if missing:
+            in_parallel(self._at, missing, "decode pictures", self._log)
+        return iter(self[:])
+
+    def _at(self, index: int) -> Tensor:
+        if index not in self._decoded:  # two threads may both decode it, to the same
+            self._decoded[index] = decode(self.described[index])
+        return self._decoded[index]
 
 
 @contextmanager
@@ -71,23 +105,38 @@ def image_size(path: Path) -> tuple[int, int]:
         return image.size
 
 
-def decode_all(views: Sequence[View], downscale: int, log: Log) -> list[Picture]:
-    """Read, undistort and downscale every view, in parallel; the order stays."""
-    return in_parallel(lambda view: decode(view, downscale), views, "decode pictures", log)
+def describe_all(views: Sequence[View], downscale: int, log: Log) -> list[Picture]:
+    """What is known of every view before its pixels are; read in parallel, the order stays."""
+    return in_parallel(lambda view: describe(view, downscale), views, "read pictures", log)
 
 
-def decode(view: View, downscale: int) -> Picture:
-    """One view as a pinhole picture at 1 / downscale of its resolution."""
-    content = contents(view.path)
-    image = decode_bytes(content, view.path)
-    camera = view.camera
-    if image.shape[:2] != (camera.height, camera.width):
-        expected = f"{camera.width} x {camera.height} pixels"
-        raise unexpected(view.path, expected, f"{image.shape[1]} x {image.shape[0]}")
+def describe(view: View, downscale: int) -> Picture:
+    """One view as a pinhole picture at 1 / downscale of its resolution.
+
+    Raises:
+        SteerbenchError: it is no picture, of another size, or too small.
+    """
+    content, camera = contents(view.path), view.camera
+    with opened(io.BytesIO(content), view.path) as image:
+        check_mode(image, view.path)
+        if image.size != (camera.width, camera.height):
+            expected = f"{camera.width} x {camera.height} pixels"
+            raise unexpected(view.path, expected, f"{image.width} x {image.height}")
     if view.lens:
-        image, camera = undistort(image, camera, view.lens, view.path)
-    image, camera = shrink(image, camera, downscale, view.path)
-    return Picture(image, camera, hashlib.sha256(content).hexdigest())
+        camera = undistorted_camera(camera, view.lens, view.path)
+    camera = shrunk_camera(camera, downscale, view.path)
+    return Picture(view, downscale, camera, hashlib.sha256(content).hexdigest())
+
+
+def decode(picture: Picture) -> Tensor:
+    """The pixels of a picture, as `Pictures` gives them."""
+    view, content = picture.view, contents(picture.view.path)
+    if hashlib.sha256(content).hexdigest() != picture.sha256:
+        raise unexpected(view.path, "the picture that was there at the start", "another one")
+    image = decode_bytes(content, view.path)
+    if view.lens:
+        image = undistort(image, view.camera, view.lens, view.path)
+    return shrink(image, picture.downscale)
 
 
 def contents(path: Path) -> bytes:
@@ -101,26 +150,28 @@ def contents(path: Path) -> bytes:
 def decode_bytes(content: bytes, path: Path) -> Tensor:
     """The 8-bit picture in `content` as uint8 [H, W, 3], or [H, W, 4] when it has an alpha."""
     with opened(io.BytesIO(content), path) as image:
-        if image.mode.startswith(("I", "F")):
-            raise unexpected(path, "8 bits a channel", f"mode {image.mode}")
+        check_mode(image, path)
         if image.mode == "P" and image.palette is None:
             raise unexpected(path, "a palette beside numbers of colours", "none")
         mode = "RGBA" if image.has_transparency_data else "RGB"
         return torch.from_numpy(np.array(image.convert(mode)))
 
 
-def shrink(image: Tensor, camera: Camera, factor: int, where: Path) -> tuple[Tensor, Camera]:
+def check_mode(image: Image.Image, path: Path) -> None:
+    """Raise unless the picture has 8 bits a channel."""
+    if image.mode.startswith(("I", "F")):
+        raise unexpected(path, "8 bits a channel", f"mode {image.mode}")
+
+
+def shrink(image: Tensor, factor: int) -> Tensor:
     """Average blocks of `factor` x `factor` pixels; colours weigh by their alpha.
 
-    Columns and rows that do not fill a block, at the right and the bottom, are left out, so that
-    the camera of what remains is exact. Means are rounded to the nearest 8-bit value.
+    Columns and rows that do not fill a block, at the right and the bottom, are left out. Means are
+    rounded to the nearest 8-bit value.
     """
     if factor == 1:
-        return image, camera
-    height, width = camera.height // factor, camera.width // factor
-    if not height or not width:
-        got = f"{camera.width} x {camera.height}"
-        raise unexpected(where, f"at least {factor} x {factor} pixels for this downscale", got)
+        return image
+    height, width = image.shape[0] // factor, image.shape[1] // factor
     blocks = image[: height * factor, : width * factor].long()
     blocks = blocks.reshape(height, factor, width, factor, -1)
     if image.shape[2] == 3:
@@ -130,8 +181,22 @@ def shrink(image: Tensor, camera: Camera, factor: int, where: Path) -> tuple[Ten
         mass = alpha.sum((1, 3))
         colour = rounded_ratio((blocks[..., :3] * alpha).sum((1, 3)), mass.clamp(min=1))
         small = torch.cat((colour, rounded_ratio(mass, torch.tensor(factor**2))), dim=-1)
-    camera = crop_camera(camera, 0, 0, width * factor, height * factor)
-    return small.to(torch.uint8), scale_camera(camera, width, height)
+    return small.to(torch.uint8)
+
+
+def shrunk_camera(camera: Camera, factor: int, where: Path) -> Camera:
+    """The exact camera of what `shrink` leaves.
+
+    Raises:
+        SteerbenchError: there is no whole block.
+    """
+    if factor == 1:
+        return camera
+    width, height = camera.width // factor, camera.height // factor
+    if not height or not width:
+        got = f"{camera.width} x {camera.height}"
+        raise unexpected(where, f"at least {factor} x {factor} pixels for this downscale", got)
+    return scale_camera(crop_camera(camera, 0, 0, width * factor, height * factor), width, height)
 
 
 def rounded_ratio(numerator: Tensor, denominator: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from bench.scenes.assemble import assemble, decode_splits
+from bench.scenes.assemble import assemble, describe_splits
 from bench.scenes.bounds import MARGIN, Box
 from bench.scenes.files import (
     data_folder,
@@ -58,10 +58,8 @@ def load(path: str | Path, *, downscale: int = 1, background: str = "white", log
     for split, names in (("train", "0_*"), ("test", "2_* or 1_*")):
         if split not in views:
             raise unexpected(root / "rgb", f"pictures {names}", "none")
-    pictures = decode_splits(views, downscale, log)
-    return assemble(
-        root.name, views, pictures, box, background=background, camera_files=camera_files
-    )
+    pictures = describe_splits(views, downscale, log)
+    return assemble(root.name, pictures, box, background=background, camera_files=camera_files)
 
 
 def read_box(root: Path) -> Box:

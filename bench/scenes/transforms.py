@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from bench.scenes.assemble import assemble, decode_splits, every_nth, leave_out
+from bench.scenes.assemble import assemble, describe_splits, every_nth, leave_out
 from bench.scenes.bounds import Box
 from bench.scenes.distortion import Fisheye, Lens, RadialTangential
 from bench.scenes.files import (
@@ -72,8 +72,8 @@ def load(
     record, path = read_json(root, CAMERA_FILE), root / CAMERA_FILE
     splits = every_nth(read_views(root, record, log), split_every, path)
     box = capture_box(path, record, aabb_scale)
-    pictures = decode_splits(splits, downscale, log)
-    return assemble(root.name, splits, pictures, box, background=background, camera_files=[path])
+    pictures = describe_splits(splits, downscale, log)
+    return assemble(root.name, pictures, box, background=background, camera_files=[path])
 
 
 def read_views(root: Path, record: dict, log: Log) -> list[View]:

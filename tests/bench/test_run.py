@@ -68,6 +68,17 @@ def test_the_rows_have_every_column_of_the_store_but_what_the_store_adds(
     assert not rows["metric"].duplicated().any()
 
 
+def test_every_picture_is_decoded_before_the_training(run, offset_method, tiny_scene):
+    class Decoded(list):
+        def __iter__(self):
+            offset_method.calls.append("decode")
+            return super().__iter__()
+
+    lazy = {name: replace(of, images=Decoded(of.images)) for name, of in tiny_scene.splits.items()}
+    run(offset_method, scene=replace(tiny_scene, splits=lazy))
+    assert offset_method.calls[:3] == ["decode", "decode", "fit"]
+
+
 def test_a_protocol_without_stages_times_whole_frames(run, offset_method):
     for stages in (True, False):
         metrics = run(offset_method, protocol=replace(QUICK, stages=stages)).rows["metric"]

@@ -1,8 +1,9 @@
-"""Area averaging: exact integers, colours weighed by their alpha, an exact camera."""
+"""Area averaging, exact and weighed by alpha; pictures decoded when they are asked for."""
 
 from __future__ import annotations
 
 import io
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
 
@@ -10,7 +11,18 @@ import pytest
 import torch
 from PIL import Image
 
-from bench.scenes.images import MOST_PIXELS, decode_bytes, image_size, shrink
+from bench.scenes import images
+from bench.scenes.images import (
+    MOST_PIXELS,
+    Picture,
+    Pictures,
+    View,
+    decode_bytes,
+    describe_all,
+    image_size,
+    shrink,
+    shrunk_camera,
+)
 from bench.types import Camera, SteerbenchError
 
 HERE = Path("picture.png")
@@ -31,7 +43,7 @@ def test_shrink_is_the_exact_mean_weighted_by_alpha(factor) -> None:
         256, (11, 17, 4), dtype=torch.uint8, generator=torch.Generator().manual_seed(factor)
     )
     image[:factor, :factor, 3] = 0  # a block that nothing is seen in
-    small, _ = shrink(image, pinhole(17, 11), factor, HERE)
+    small = shrink(image, factor)
     assert small.shape == (11 // factor, 17 // factor, 4)
     for row in range(small.shape[0]):
         for column in range(small.shape[1]):
@@ -49,12 +61,12 @@ def test_shrink_is_the_exact_mean_weighted_by_alpha(factor) -> None:
 
 def test_shrink_of_an_opaque_picture_is_the_mean() -> None:
     image = torch.tensor([[0, 1], [1, 1]], dtype=torch.uint8)[..., None].expand(2, 2, 3)
-    assert shrink(image, pinhole(2, 2), 2, HERE)[0].tolist() == [[[1, 1, 1]]]
+    assert shrink(image, 2).tolist() == [[[1, 1, 1]]]
 
 
 def test_what_fills_no_block_is_left_out_and_the_camera_stays_exact() -> None:
-    image = torch.zeros(11, 17, 3, dtype=torch.uint8)
-    _, camera = shrink(image, pinhole(17, 11), 4, HERE)
+    assert shrink(torch.zeros(11, 17, 3, dtype=torch.uint8), 4).shape == (2, 4, 3)
+    camera = shrunk_camera(pinhole(17, 11), 4, HERE)
     assert (camera.width, camera.height) == (4, 2)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (2.5, 3.0, 17 / 8, 11 / 8)
 
@@ -91,3 +103,72 @@ def test_a_header_that_announces_more_than_memory_holds_is_refused(tmp_path: Pat
     for read in (lambda: image_size(path), lambda: decode_bytes(path.read_bytes(), path)):
         with pytest.raises(SteerbenchError, match="at most 67,108,864 pixels, got 16384 x 4097"):
             read()
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> list[Path]:
+    """Four pictures of 5 x 4 in files."""
+    generator = torch.Generator().manual_seed(0)
+    paths = [tmp_path / f"{number}.png" for number in range(4)]
+    for path in paths:
+        pixels = torch.randint(256, (4, 5, 4), dtype=torch.uint8, generator=generator)
+        Image.fromarray(pixels.numpy()).save(path)
+    return paths
+
+
+def pictures(files: list[Path], log) -> Pictures:
+    """What is known of `files`, their pixels apart."""
+    views = [View(path.name, path, pinhole(5, 4)) for path in files]
+    return Pictures(describe_all(views, 1, log), log)
+
+
+def test_only_pictures_that_are_asked_for_are_decoded_and_once(files, log, monkeypatch) -> None:
+    opened = []
+
+    def decode(picture: Picture) -> torch.Tensor:
+        opened.append(picture.view.name)
+        return images.decode_bytes(picture.view.path.read_bytes(), picture.view.path)
+
+    monkeypatch.setattr(images, "decode", decode)
+    lazy = pictures(files, log)
+    assert len(lazy) == 4
+    assert opened == []
+    last = lazy[-1]
+    assert opened == ["3.png"]
+    assert list(lazy)[3] is last
+    assert [one is other for one, other in zip(lazy[1:3], list(lazy)[1:3], strict=True)] == [
+        True
+    ] * 2
+    assert sorted(opened) == ["0.png", "1.png", "2.png", "3.png"]
+
+
+def test_threads_that_ask_for_pictures_at_once_get_them_in_order(files, log) -> None:
+    expected = [decode_bytes(path.read_bytes(), path) for path in files]
+    lazy = pictures(files, log)
+    with ThreadPoolExecutor(4) as pool:
+        for found in pool.map(list, [lazy] * 8):
+            assert all(map(torch.equal, found, expected))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda content: content[:-40], "the picture that was there at the start, got another"),
+        (lambda content: content + b" ", "the picture that was there at the start, got another"),
+        (lambda content: None, "a readable picture"),
+    ],
+)
+def test_a_file_that_changed_before_it_was_decoded_is_refused(files, log, change, message) -> None:
+    lazy = pictures(files, log)
+    content = change(files[2].read_bytes())
+    files[2].unlink() if content is None else files[2].write_bytes(content)
+    with pytest.raises(SteerbenchError, match=f"2.png: expected {message}"):
+        list(lazy)
+
+
+def test_a_truncated_file_is_refused_when_it_is_decoded(files, log) -> None:
+    files[1].write_bytes(files[1].read_bytes()[:-40])
+    lazy = pictures(files, log)
+    assert lazy[0].shape == (4, 5, 4)
+    with pytest.raises(SteerbenchError, match=r"1\.png: expected a whole picture"):
+        lazy[1]

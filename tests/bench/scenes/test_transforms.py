@@ -14,7 +14,7 @@ from PIL import Image
 
 from bench.cameras import pixel_grid
 from bench.scenes import transforms
-from bench.scenes.distortion import Fisheye, RadialTangential, undistort
+from bench.scenes.distortion import Fisheye, RadialTangential, undistort, undistorted_camera
 from bench.types import Camera, SteerbenchError
 
 HERE = Path("picture.png")
@@ -220,7 +220,8 @@ def test_undistortion_recovers_the_pinhole_picture(name) -> None:
     seen = undistort_points(grid, matrix, torch.tensor(lens, dtype=torch.float64), num_iters=60)
     x, y = (seen[:, 0] - camera.cx) / camera.fx, (seen[:, 1] - camera.cy) / camera.fy
     distorted = wave(x, y).reshape(camera.height, camera.width, 3).round().to(torch.uint8)
-    straight, cropped = undistort(distorted, camera, RadialTangential(lens), HERE)
+    straight = undistort(distorted, camera, RadialTangential(lens), HERE)
+    cropped = undistorted_camera(camera, RadialTangential(lens), HERE)
     assert straight.shape == (cropped.height, cropped.width, 3)
     # The crop loses a border only: most of the picture stays.
     assert cropped.width * cropped.height > 0.85 * camera.width * camera.height
@@ -235,9 +236,9 @@ def test_undistortion_recovers_the_pinhole_picture(name) -> None:
 
 def test_a_lens_that_does_nothing_returns_the_inner_picture(picture) -> None:
     image = torch.from_numpy(picture(1, 100, 76, 3))
-    straight, cropped = undistort(
-        image, pinhole(), RadialTangential((1e-12, 0.0, 0.0, 0.0, 0.0)), HERE
-    )
+    nothing = RadialTangential((1e-12, 0.0, 0.0, 0.0, 0.0))
+    straight = undistort(image, pinhole(), nothing, HERE)
+    cropped = undistorted_camera(pinhole(), nothing, HERE)
     left, top = round(52.3 - cropped.cx), round(37.1 - cropped.cy)
     assert cropped.width >= 98
     inner = image[top : top + cropped.height, left : left + cropped.width]
@@ -249,15 +250,14 @@ def test_colours_between_pixels_weigh_by_their_alpha() -> None:
     image[..., 0] = 200
     image[:, 50:, 3] = 255
     image[:, :50, :3] = 90  # not seen: alpha is 0
-    straight, _ = undistort(image, pinhole(), RadialTangential(LENSES["pincushion"]), HERE)
+    straight = undistort(image, pinhole(), RadialTangential(LENSES["pincushion"]), HERE)
     colours = straight[straight[..., 3] > 0][:, :3]
     assert (colours.float() - torch.tensor([200.0, 0, 0])).abs().max() <= 1
 
 
 def test_a_lens_that_folds_the_picture_is_refused() -> None:
-    image = torch.zeros(76, 100, 3, dtype=torch.uint8)
     with pytest.raises(SteerbenchError, match=r"picture.png: .* it folds the picture"):
-        undistort(image, pinhole(), RadialTangential((-2.0, 0.0, 0.0, 0.0, 0.0)), HERE)
+        undistorted_camera(pinhole(), RadialTangential((-2.0, 0.0, 0.0, 0.0, 0.0)), HERE)
 
 
 def test_a_capture_with_a_lens_is_cropped_alike_everywhere(folder, edit_json, picture, log) -> None:
