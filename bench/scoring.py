@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import matplotlib
 import numpy as np
 import torch
 from torch import Tensor
@@ -105,6 +104,8 @@ class Scoring:
 
 def kept_pictures(index: int, rgb: Tensor, truth: Tensor) -> dict[str, np.ndarray]:
     """Ground truth, rendering and error map of a frame, as 8-bit pictures by file name."""
+    import matplotlib  # takes a third of a second, which who keeps no picture need not wait
+
     rendering, truth = quantise(rgb).cpu(), truth.cpu()
     error = (rendering - truth).abs().mean(dim=-1) / ERROR_RANGE
     return {

@@ -75,13 +75,15 @@ def _times(files: dict[str, Path]) -> list[int]:
 
 def _found(*things: Any) -> dict[str, Path]:
     found: dict[str, Path] = {}
+    seen: set[str] = set()
     pending = {
         name: path for thing in things for name, path in _files(thing.__module__, home=True).items()
     }
     while pending:
         name, path = pending.popitem()
         found[name] = path
-        for imported in _imports(path):
+        for imported in set(_imports(path)) - seen:
+            seen.add(imported)
             files = _files(imported)
             pending |= {name: files[name] for name in files.keys() - found.keys()}
     return found

@@ -25,7 +25,6 @@ from bench.scenes.held_out import hold_out
 from bench.sources import digest, libraries
 from bench.trajectories import Trajectory
 from bench.types import DEVICE, Log, Method, Scene
-from reports.page import write_page
 from reports.runs import Run, load
 from reports.tables import run_tables
 from reports.trackers import Tracker, tracker
@@ -80,6 +79,8 @@ def execute(config: DictConfig, command: Sequence[str]) -> None:
     (run,) = load(obtained.store, label)
     _show(run, explain=not obtained.measured)
     if config.report:
+        from reports.page import write_page  # and matplotlib, which only a page needs
+
         page = write_page(obtained.store, label, Path(config.report))
         ConsoleLog(Path(config.outputs)).info(f"report: {page}")
 

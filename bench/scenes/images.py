@@ -154,7 +154,7 @@ def decode_bytes(content: bytes, path: Path) -> Tensor:
         if image.mode == "P" and image.palette is None:
             raise unexpected(path, "a palette beside numbers of colours", "none")
         mode = "RGBA" if image.has_transparency_data else "RGB"
-        return torch.from_numpy(np.array(image.convert(mode)))
+        return torch.from_numpy(np.array(image if image.mode == mode else image.convert(mode)))
 
 
 def check_mode(image: Image.Image, path: Path) -> None:
