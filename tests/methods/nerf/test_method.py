@@ -21,7 +21,7 @@ from methods.training import loop
 from tests.methods.conftest import Work
 from tests.methods.trainings import EXACT_TEACHER, TAUGHT, goes_on_after_a_kill, quality
 
-BUDGET = replace(TAUGHT, renderer_steps=4)
+BUDGET = replace(TAUGHT, steps=80, renderer_steps=4)
 LONG = 8.0
 """March step, in the usual ones: few samples for a large network."""
 
@@ -33,7 +33,7 @@ def new_method(**options: Any) -> Nerf:
 
 def fitted(scene: Scene, log: Log, steps: int, **options: Any) -> Nerf:
     method = new_method(**options)
-    method.fit(scene, replace(TAUGHT, renderer_steps=steps), log)
+    method.fit(scene, replace(BUDGET, renderer_steps=steps), log)
     return method
 
 

@@ -29,7 +29,7 @@ from tests.methods.trainings import (
     quality,
 )
 
-BUDGET = replace(TAUGHT, renderer_steps=4)
+BUDGET = replace(TAUGHT, steps=80, renderer_steps=4)
 U = 2.0**-24
 
 
@@ -43,7 +43,7 @@ def new_method(**options: Any) -> Nsvf:
 
 def fitted(scene: Scene, log: Log, steps: int, **options: Any) -> Nsvf:
     method = new_method(**options)
-    method.fit(scene, replace(TAUGHT, renderer_steps=steps), log)
+    method.fit(scene, replace(BUDGET, renderer_steps=steps), log)
     return method
 
 
