@@ -229,6 +229,8 @@ class PretendedGpu(TorchDispatchMode):
             self.wait()
         elif name == "copy_" and others:
             return self.wait()
+        elif name == "_has_compatible_shallow_copy_type":
+            return None  # a module that moves asks this of a parameter here and there
         elif name == "where":
             for _ in others:
                 self.wait()  # for a number of the CPU, which is copied

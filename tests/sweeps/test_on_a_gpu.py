@@ -1,0 +1,55 @@
+"""The commands that take a device, with the paper's method on a pretended GPU, from the command
+line to the page. `view` serves in threads, for which the pretence does not hold."""
+
+from __future__ import annotations
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+SMALLEST = [
+    *("method=steernerf", "device=cuda", "method.backend=reference", "engine=torch"),
+    *("scene=totem", "scene.width=16", "scene.train=2", "scene.test=4", "trajectory=test"),
+    *("budget=tiny", "budget.frames=0", "budget.steps=2", "budget.samples=64"),
+    *("budget.renderer_steps=2", "method.joint.distilled_views=1"),
+    *("method.grid.levels=2", "method.grid.log2_table=10"),
+    *("protocol.name=quick", "protocol.lpips=[]", "protocol.warmup=0"),
+]
+FRAMES = ["--frames", "3", "--repeats", "1"]
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["run", "report=page"],
+        ["run", "protocol.stages=false"],
+        ["render", "trajectory=orbit"],
+        ["breakdown", *FRAMES],
+        ["breakdown", *FRAMES, "--device-waits"],
+        ["parity", *FRAMES],
+        ["skips", *FRAMES],
+        ["accuracy", *FRAMES, "--filter", "stop"],
+        ["scaling", "--frames", "3", "--axis", "L"],
+        ["paper", "--table", "table2", "budget.beyond=false"],
+    ],
+    ids=" ".join,
+)
+def test_it_ends_well(command: list[str], steerbench, gpu) -> None:
+    name, *options = command
+    settings = [word for word in SMALLEST if name != "paper" or not word.startswith("method=")]
+    outcome = steerbench(name, *options, *settings)
+    assert outcome.status == 0, outcome.err
+    assert gpu.waited
+
+
+def test_pictures_are_scored_there(steerbench, gpu, lpips_weights) -> None:
+    words = ("scene.width=32", "protocol.lpips=[alex]", f"weights_dir={lpips_weights}")
+    outcome = steerbench("run", *SMALLEST, *words)
+    assert outcome.status == 0, outcome.err
+    assert "LPIPS alex" in outcome.out
+
+
+def test_kernels_are_compared_there(steerbench, gpu) -> None:
+    outcome = steerbench("kernels", "--filter", "adam")
+    assert outcome.status == 0, outcome.err + outcome.out
+    assert gpu.waited
