@@ -29,9 +29,19 @@ function compare(a, b, sign) {
   return sign * (typeof a === "number" ? a - b : alphabet.compare(a, b));
 }
 
+const LONG = 200; // rows, of a table in which only those in sight are laid out
+
+/** Fix the widths of the columns: then a row can be laid out without all others. */
+function fixColumns(table) {
+  const widths = [...table.tHead.rows[0].cells].map((head) => head.getBoundingClientRect().width);
+  table.style.setProperty("--columns", widths.map((width) => `${width}px`).join(" "));
+  table.classList.add("long");
+}
+
 function makeSortable(table) {
   const body = table.tBodies[0];
   const original = [...body.rows];
+  if (original.length > LONG) fixColumns(table);
   const heads = [...table.tHead.rows[0].cells];
   heads.forEach((head, column) => {
     if (!head.textContent.trim()) return;
