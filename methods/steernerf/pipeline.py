@@ -216,7 +216,7 @@ class Pipeline:
         probe.count("refined_rays", len(rays.origins), view.full.width * view.full.height)
         found = render_rays(self.field, rays, self._occupied(rendering), probe, how)
         colours = found.over(self.background).values[:, :3]
-        return colours.clamp_(0, 1).view(len(cells), -1, 3)
+        return colours.clamp_(0, 1).view(len(cells), view.scale**2, 3)
 
     def _occupied(self, rendering: Rendering) -> Occupancy:
         """Where rays take samples."""

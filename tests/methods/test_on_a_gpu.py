@@ -366,15 +366,15 @@ def smallest(**where: Any) -> Method:
 @pytest.mark.slow
 @pytest.mark.skipif(bool(availability()["gpu"]), reason="Triton has no build for this platform")
 def test_by_triton_it_trains_and_renders_as_on_the_cpu(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ball_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from triton.runtime.interpreter import interpreter_builder as builder
 
     # What takes half of the time, and is looked for by the tests of the kernels.
     monkeypatch.setattr(builder, "options", replace(builder.options, sanitize_overflow=False))
     monkeypatch.setattr(field, "BATCH_QUANTUM", 64)
-    splits = {name: fewer(split, 3, side=8) for name, split in scene.splits.items()}
-    tiny = replace(scene, splits=splits)
+    splits = {name: fewer(split, 3, side=8) for name, split in ball_scene.splits.items()}
+    tiny = replace(ball_scene, splits=splits)
     budget = replace(BUDGET, steps=1, samples=64, renderer_steps=1)
 
     def shown(device: str) -> list[torch.Tensor]:

@@ -12,6 +12,7 @@ import torch
 from bench.cameras import cast, project
 from bench.probes import StageClock
 from bench.types import Camera, NullProbe
+from methods.kernels.march import Occupancy
 from methods.kernels.warp import enlarge
 from methods.rendering.frame import everywhere, render_frame
 from methods.rendering.march import March
@@ -141,6 +142,13 @@ def test_the_cells_with_the_largest_estimated_error_are_refined() -> None:
     assert set(worst_cells(error, share).tolist()) == set(order[:count].tolist())
     assert set(changed.nonzero().flatten().tolist()) <= set(order[:count].tolist())
     assert changed.sum() > 0.5 * count
+
+
+def test_where_nothing_is_in_sight_nothing_is_refined() -> None:
+    pipeline = new_pipeline()
+    pipeline.occupancy = Occupancy(torch.zeros_like(pipeline.occupancy.cells))
+    frame = pipeline.render(CAMERA, RenderingBuffer(2), replace(USUAL, refined=0.1), NullProbe())
+    assert torch.equal(frame.rgb, pipeline.background[:3].expand_as(frame.rgb))
 
 
 def test_a_frame_that_shows_too_little_of_the_present_view_is_as_if_forgotten() -> None:
