@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,6 +23,7 @@ msgspec = pytest.importorskip("msgspec")
 viser = pytest.importorskip("viser")
 zstandard = pytest.importorskip("zstandard")
 client = pytest.importorskip("websockets.sync.client")
+ConnectionClosed = pytest.importorskip("websockets.exceptions").ConnectionClosed
 
 TICK_S, ROUNDS = 0.02, 2000
 """How long is waited for a message at a time, and how often: for what takes no time, unless
@@ -48,13 +50,16 @@ class Page:
         uuid = self._controls[label]["uuid"]
         self._send("GuiUpdateMessage", uuid=uuid, updates={"value": value})
 
+    def close(self) -> None:
+        self._socket.close()
+
     def until(self, holds: Callable[[], bool]) -> None:
         """Let the viewer draw and receive what it sends until something holds."""
         for _ in range(ROUNDS):
             if holds():
                 return
             self._viewer.draw(TICK_S)
-            with suppress(TimeoutError):
+            with suppress(TimeoutError, ConnectionClosed):
                 self._receive(self._socket.recv(timeout=TICK_S))
         pytest.fail("it did not come to hold")
 
@@ -156,6 +161,29 @@ def test_a_browser_that_leaves_takes_nothing_with_it(opened: Callable[..., Viewe
         page.look()
         page.until(lambda: len(viewer.browsers) == 1)
         page.look(0.1)
+    with browser(viewer) as other:
+        other.look()
+        other.until(lambda: other.picture.size > 0 and len(viewer.browsers) == 1)
+
+
+def test_a_browser_that_leaves_in_the_middle_of_a_frame_takes_nothing_with_it(
+    opened: Callable[..., Viewer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    viewer, left = opened(), threading.Event()
+    viewer.server.on_client_disconnect(lambda _: left.set())
+    (method,) = viewer.painter.methods
+    with browser(viewer) as page:
+        whole = type(method).render
+
+        def interrupted(self: Any, *args: Any) -> Any:
+            page.close()
+            assert left.wait(TICK_S * ROUNDS)
+            return whole(self, *args)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(type(method), "render", interrupted)
+            page.look()
+            page.until(left.is_set)
     with browser(viewer) as other:
         other.look()
         other.until(lambda: other.picture.size > 0 and len(viewer.browsers) == 1)
