@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -20,12 +21,15 @@ class FieldOptimiser:
     """
 
     def __init__(self, field: HashField, *, fused: bool = False) -> None:
-        self._field = field
+        self._field, self._fused = field, fused
         self._table = AdamState.like(field.table.detach())
-        self._networks = torch.optim.Adam(
-            list(field.layers.values()), betas=(0.9, 0.99), eps=1e-15, fused=fused
-        )
         field.grad_buffer = torch.zeros_like(field.table)
+
+    @cached_property
+    def _networks(self) -> torch.optim.Adam:
+        # Made when it is needed: the first one of a process imports torch's compiler, in seconds.
+        parameters = list(self._field.layers.values())
+        return torch.optim.Adam(parameters, betas=(0.9, 0.99), eps=1e-15, fused=self._fused)
 
     def step(self, rate: float) -> None:
         """Change table and networks at learning rate `rate`."""

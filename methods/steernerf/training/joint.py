@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 
 import torch
 from torch import Tensor, nn
@@ -58,9 +59,14 @@ class RendererTraining:
         self.renderer, self.patches, self.options = renderer, patches, options
         self.generator = generator
         self.step, self.steps, self.seconds = 0, steps, 0.0
-        self.optimiser = torch.optim.Adam(renderer.parameters(), lr=options.rate, fused=True)
         self._averaged = AveragedModel(renderer, multi_avg_fn=self._average)
         self.mean: Renderer2d = self._averaged.module  # type: ignore[assignment]
+
+    @cached_property
+    def optimiser(self) -> torch.optim.Adam:
+        """Of the renderer; made when it is needed, as that of the field."""
+        parameters = self.renderer.parameters()
+        return torch.optim.Adam(parameters, lr=self.options.rate, fused=True)
 
     def advance(self) -> dict[str, float]:
         """One step; mean squared error of the picture and of the base that it corrects; see

@@ -73,11 +73,13 @@ def test_what_was_trained_is_found_again_and_renders_the_same(
     log: ConsoleLog,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
     device: str,
 ) -> None:
     first, second = (new_method(device=device) for _ in range(2))
     first.fit(ball_scene, BUDGET, log)
     capsys.readouterr()
+    monkeypatch.delattr(torch.optim, "Adam")  # which takes seconds to make, and is not needed
     second.fit(ball_scene, BUDGET, log)
     assert "training the 2D renderer: found in" in capsys.readouterr().err
     inputs = ["inputs"] * (device == "cuda")  # for which the engine records the network
