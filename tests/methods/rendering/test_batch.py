@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 from torch import Tensor
 
 from bench.cameras import cast
+from bench.types import Rays
 from methods.instant_ngp.field import HashField
 from methods.kernels.composite import composite
 from methods.kernels.march import Occupancy, march
@@ -16,15 +18,21 @@ from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
 from tests.methods.conftest import look_at_the_middle
 
+Thick = tuple[HashField, Occupancy, Rays]
 
-def test_leaving_out_hidden_samples_changes_no_gradient(
-    cloud: tuple[HashField, Occupancy], device: str
-) -> None:
+
+@pytest.fixture
+def thick(cloud: tuple[HashField, Occupancy], device: str) -> Thick:
+    """The cloud a hundred times as dense, so that it hides its own samples, and rays through it."""
     field, occupancy = cloud
     thin = field.density
     field.density = lambda x: (100 * thin(x)[0], thin(x)[1])  # type: ignore[method-assign]
     camera = look_at_the_middle(0.1, 0.4)
-    rays = cast(replace(camera, c2w=camera.c2w.to(device)))
+    return field, occupancy, cast(replace(camera, c2w=camera.c2w.to(device)))
+
+
+def test_leaving_out_hidden_samples_changes_no_gradient(thick: Thick, device: str) -> None:
+    field, occupancy, rays = thick
     jitter = torch.rand(len(rays.origins), generator=torch.Generator().manual_seed(0)).to(device)
     white = torch.ones(3, device=device)
 
@@ -47,14 +55,8 @@ def test_leaving_out_hidden_samples_changes_no_gradient(
         torch.testing.assert_close(got, want, rtol=1e-3, atol=1e-4 * want.abs().max().item())
 
 
-def test_hidden_samples_may_be_evaluated_too(
-    cloud: tuple[HashField, Occupancy], device: str
-) -> None:
-    field, occupancy = cloud
-    thin = field.density
-    field.density = lambda x: (100 * thin(x)[0], thin(x)[1])  # type: ignore[method-assign]
-    camera = look_at_the_middle(0.1, 0.4)
-    rays = cast(replace(camera, c2w=camera.c2w.to(device)))
+def test_hidden_samples_may_be_evaluated_too(thick: Thick) -> None:
+    field, occupancy, rays = thick
     grads, used = [], []
     for hidden in (False, True):
         pixels, samples = render_batch(field, rays, occupancy, March(), hidden=hidden)
