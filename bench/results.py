@@ -16,7 +16,7 @@ import shutil
 import time
 import uuid
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -150,14 +150,21 @@ class Store:
             finally:
                 shutil.rmtree(partial, ignore_errors=True)
 
-    def rows(self, report: Callable[[str], object] = warnings.warn) -> pd.DataFrame:
-        """Every row of every run, `COLUMNS`, methods under their present names.
+    def rows(
+        self,
+        report: Callable[[str], object] = warnings.warn,
+        keys: Collection[str] | None = None,
+    ) -> pd.DataFrame:
+        """Every row of every run, or of those with `keys` alone: `COLUMNS`, methods under their
+        present names.
 
         `report` is called with a message for each run that cannot be read.
         """
         header = ",".join(COLUMNS)
         bodies, old = [], []
         for folder in sorted(self.folder.glob("[!.]*")):
+            if keys is not None and folder.name not in keys:
+                continue
             schema = _schema_version(folder)
             first, _, body = _text(folder / "rows.csv").partition("\n")
             if schema in READABLE and first == header:

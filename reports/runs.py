@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
@@ -159,7 +159,7 @@ def load(store: Store, labels: Mapping[str, str]) -> list[Run]:
         SteerbenchError: one of them is not in the store, or of a schema that cannot be read.
     """
     records = {key: store.record(key) for key in labels}
-    by_run = _rows_by_run(store)
+    by_run = _rows_by_run(store, labels)
     for key in labels:
         if key not in by_run:
             schema = records[key].get("schema_version")
@@ -181,7 +181,8 @@ def _run(store: Store, key: str, label: str, rows: pd.DataFrame, record: Mapping
     return Run(key, label, rows, frames, record, store.folder / key / "pictures")
 
 
-def _rows_by_run(store: Store) -> dict[str, pd.DataFrame]:
-    """The rows of every run that can be read; others are left out without a warning."""
-    rows = store.rows(report=lambda unreadable: None)
+def _rows_by_run(store: Store, keys: Collection[str] | None = None) -> dict[str, pd.DataFrame]:
+    """The rows of every run that can be read, or of those with `keys`; others are left out without
+    a warning."""
+    rows = store.rows(report=lambda unreadable: None, keys=keys)
     return {str(run): of_run for run, of_run in rows.groupby("run")}
