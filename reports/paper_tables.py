@@ -18,10 +18,10 @@ from reports.trends import Trend, steps, trend_table
 FOLDER = Path(__file__).parent / "paper"
 METHOD = "method"
 AFTER, SHARES = "method.after", (0.125, 0.25, 0.5)
-OF_CURVES = {"protocol.name": "psnr", "protocol.lpips": "[]"}
-"""Curves show PSNR, and LPIPS takes most of the time of a frame at 200x200."""
 """The setting of the share of a training after which a method is rendered, and shares before its
 end."""
+OF_CURVES = {"protocol.name": "psnr", "protocol.lpips": "[]"}
+"""Curves show PSNR, and LPIPS takes most of the time of a frame at 200x200."""
 ABSENT = "–"
 """In place of a figure that the paper does not give or that nothing here can measure."""
 

@@ -23,7 +23,7 @@ from methods.kernels import gaussian_projection
 from methods.kernels.composite import Pixels
 from methods.kernels.dispatch import interpreted
 from methods.kernels.gaussian_projection import Ellipses
-from methods.kernels.gpu import check_types, launch
+from methods.kernels.gpu import check_types, launch, vector
 
 TILE = 16  # pixels, along both axes
 BLOCK = 128  # Gaussians or entries of a program that makes the lists
@@ -210,21 +210,12 @@ def _pixels(width, height, TILE: tl.constexpr):
 
 
 @triton.jit
-def _vector(vectors, i, there):
-    return (
-        tl.load(vectors + 3 * i, mask=there, other=0.0),
-        tl.load(vectors + 3 * i + 1, mask=there, other=0.0),
-        tl.load(vectors + 3 * i + 2, mask=there, other=0.0),
-    )
-
-
-@triton.jit
 def _shares(centres, conics, opacities, i, there, x, y):
     """Of Gaussians `i` [G, 1] at pixels [1, P]: the way from centre to pixel, and the opacity
     there, before and after it is cut off, [G, P]."""
     u = x - tl.load(centres + 2 * i, mask=there, other=0.0)
     v = y - tl.load(centres + 2 * i + 1, mask=there, other=0.0)
-    a, b, c = _vector(conics, i, there)
+    a, b, c = vector(conics, i, there)
     distance = a * u * u + 2 * b * u * v + c * v * v
     raw = tl.load(opacities + i, mask=there, other=0.0) * tl.exp(-distance / 2)
     return u, v, raw, tl.where(raw >= LEAST, tl.minimum(raw, LARGEST), 0.0)
@@ -268,7 +259,7 @@ def _forward(
         i = tl.load(owners + entry, mask=there, other=0)
         _, _, _, share = _shares(centres, conics, opacities, i, there, x[None, :], y[None, :])
         _, weight, light = _weights(share, light, stop)
-        r, g, b = _vector(colours, i, there)
+        r, g, b = vector(colours, i, there)
         red += tl.sum(weight * r, 0)
         green += tl.sum(weight * g, 0)
         blue += tl.sum(weight * b, 0)
@@ -309,9 +300,9 @@ def _backward(
     """
     pixel, inside, x, y = _pixels(width, height, TILE)
     light = tl.where(inside, 1.0, 0.0)
-    to_red, to_green, to_blue = _vector(grad_values, pixel, inside)
+    to_red, to_green, to_blue = vector(grad_values, pixel, inside)
     to_alpha = tl.load(grad_alpha + pixel, mask=inside, other=0.0)
-    red, green, blue = _vector(values, pixel, inside)
+    red, green, blue = vector(values, pixel, inside)
     rest = to_red * red + to_green * green + to_blue * blue
     rest += to_alpha * tl.load(alpha + pixel, mask=inside, other=0.0)
     tile = tl.program_id(1) * tl.num_programs(0) + tl.program_id(0)
@@ -322,7 +313,7 @@ def _backward(
         i = tl.load(owners + entry, mask=there, other=0)
         u, v, raw, share = _shares(centres, conics, opacities, i, there, x[None, :], y[None, :])
         before, weight, light = _weights(share, light, stop)
-        r, g, b = _vector(colours, i, there)
+        r, g, b = vector(colours, i, there)
         gain = r * to_red[None, :] + g * to_green[None, :] + b * to_blue[None, :]
         gain += to_alpha[None, :]
         part = weight * gain
@@ -381,7 +372,7 @@ def _collect(
     first = tl.load(ends + i - 1, mask=inside & (i > 0), other=0)
     end = tl.load(ends + i, mask=inside, other=0)
     end = tl.where(inside, end, first)
-    a, b, c = _vector(conics, i, inside)
+    a, b, c = vector(conics, i, inside)
     opacity = tl.load(opacities + i, mask=inside, other=0.0)
     px = _total(sums, first, end, 1, ROWS, SLOTS)
     py = _total(sums, first, end, 2, ROWS, SLOTS)

@@ -14,7 +14,7 @@ from torch import Tensor
 from bench.types import Camera
 from methods.kernels import gaussian_projection as interface
 from methods.kernels.gaussian_projection import FRUSTUM, Ellipses
-from methods.kernels.gpu import check_types, launch
+from methods.kernels.gpu import check_types, launch, vector
 
 BLOCK = 128  # Gaussians
 
@@ -87,15 +87,6 @@ def _view(camera: Camera) -> tuple[float, ...]:
 
 
 @triton.jit
-def _vector(vectors, i, inside):
-    return (
-        tl.load(vectors + 3 * i, mask=inside, other=0.0),
-        tl.load(vectors + 3 * i + 1, mask=inside, other=0.0),
-        tl.load(vectors + 3 * i + 2, mask=inside, other=0.0),
-    )
-
-
-@triton.jit
 def _put(vectors, i, x, y, z, inside):
     tl.store(vectors + 3 * i, x, mask=inside)
     tl.store(vectors + 3 * i + 1, y, mask=inside)
@@ -116,7 +107,7 @@ def _finite(x, y, z):
 @triton.jit
 def _local(means, pose, i, inside):
     """Centres as the camera has them; of those that are not finite, z is not a number."""
-    x, y, z = _vector(means, i, inside)
+    x, y, z = vector(means, i, inside)
     finite = _finite(x, y, z)
     x = tl.where(finite, x, 0.0) - tl.load(pose + 3)
     y = tl.where(finite, y, 0.0) - tl.load(pose + 7)
@@ -187,7 +178,7 @@ def _forward(
     x, y, z = _local(means, pose, i, inside)
     tl.store(depth + i, z, mask=inside)
     opacity = tl.load(opacities + i, mask=inside, other=0.0)
-    s0, s1, s2 = _vector(scales, i, inside)
+    s0, s1, s2 = vector(scales, i, inside)
     shown = inside & (z > NEAR) & (opacity >= LEAST) & _finite(s0, s1, s2)
     s0, s1, s2 = tl.where(shown, s0, 0.0), tl.where(shown, s1, 0.0), tl.where(shown, s2, 0.0)
     inverse = 1 / tl.where(shown, z, 1.0)
@@ -253,11 +244,11 @@ def _backward(
     ty = tl.minimum(tl.maximum(v, -limit_y), limit_y)
     ax, ay = fx * inverse, fy * inverse
     qw, qx, qy, qz, shrink = _rotation(rotations, i, shown)
-    s0, s1, s2 = _vector(scales, i, shown)
+    s0, s1, s2 = vector(scales, i, shown)
 
     # dL/dV', symmetric: its entry off the diagonal stands for half of dL/dB.
-    a, b, c = _vector(conics, i, shown)
-    ga, gb, gc = _vector(grad_conics, i, shown)
+    a, b, c = vector(conics, i, shown)
+    ga, gb, gc = vector(grad_conics, i, shown)
     gb = gb / 2
     p00, p01 = a * ga + b * gb, a * gb + b * gc
     p10, p11 = b * ga + c * gb, b * gb + c * gc

@@ -185,12 +185,10 @@ class PatchSource:
         masks = [mask for patch in patches for mask in patch.masks]
         if compacts(masks[0].device):
             chosen = places(masks)
-            parts = zip(patches, _of_each(patches, chosen), strict=True)
-            return chosen, Rays.joined([x for patch, some in parts for x in patch.rays(some)]), None
+            return chosen, _joined(patches, chosen), None
         which = torch.cat(masks)
         every = [torch.arange(len(mask), device=mask.device) for mask in masks]
-        parts = zip(patches, _of_each(patches, every), strict=True)
-        rays = Rays.joined([x for patch, some in parts for x in patch.rays(some)])
+        rays = _joined(patches, every)
         # The chosen rays draw theirs again, the same.
         jitter = self._jitter(len(which), self.generator.clone_state())
         if jitter is not None:
@@ -203,11 +201,9 @@ class PatchSource:
             start=which.int() - 1,
             backend=self.pipeline.backend,
         )
-        *sizes, total, longest = told(
-            [*(mask.sum() for mask in masks), Extent.figures(counts[None])]
-        )
+        sizes, extent = _asked(masks, counts)
         (together,) = places([which], [sum(sizes)])
-        return places(masks, sizes), rays.take(together), Extent(total, longest)
+        return places(masks, sizes), rays.take(together), extent
 
     def _jitter(self, rays: int, generator: torch.Generator) -> Tensor | None:
         """Phases of the samples of each ray, if they are random."""
@@ -231,10 +227,8 @@ class PatchSource:
                 patches, chosen, _of_each(patches, opaque), strict=True
             )
         ]
-        *sizes, total, longest = told(
-            [*(mask.sum() for mask in near), Extent.figures(counts[None])]
-        )
-        return first.samples.front(counts, Extent(total, longest)), places(near, sizes)
+        sizes, extent = _asked(near, counts)
+        return first.samples.front(counts, extent), places(near, sizes)
 
     def _observation(
         self, patch: Patch, chosen: list[Tensor], rendered: list[Pixels], cells: Tensor | None
@@ -274,6 +268,19 @@ def _of_each(patches: list[Patch], parts: Iterable[T]) -> list[list[T]]:
     """`parts` of the masks of all patches, patch by patch."""
     following = iter(parts)
     return [[next(following) for _ in patch.masks] for patch in patches]
+
+
+def _joined(patches: list[Patch], chosen: list[Tensor]) -> Rays:
+    """The rays of what is `chosen` by each mask of all patches, in one."""
+    parts = zip(patches, _of_each(patches, chosen), strict=True)
+    return Rays.joined([rays for patch, some in parts for rays in patch.rays(some)])
+
+
+def _asked(masks: list[Tensor], counts: Tensor) -> tuple[list[int], Extent]:
+    """In how many places each mask is true, and the extent of samples with `counts` [R]: a GPU is
+    asked once."""
+    *sizes, total, longest = told([*(mask.sum() for mask in masks), Extent.figures(counts[None])])
+    return sizes, Extent(total, longest)
 
 
 def _shown(index: Tensor, count: int) -> Tensor:
