@@ -96,6 +96,7 @@ def _update(
     scale = tl.sqrt(v * correction2) + EPS
     old = tl.load(table + place, mask=changed, other=0.0)
     new = old - rate * m * correction1 / scale
+    tl.debug_barrier()  # each warp may have read the steps of its rows: all have, before one writes
     tl.store(steps + entry, step, mask=touched)
     tl.store(first + place, m, mask=changed)
     tl.store(second + place, v, mask=changed)

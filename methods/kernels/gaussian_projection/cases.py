@@ -139,7 +139,8 @@ def _gradients(count: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
 def _circle_error(scale: float, depth: float, backend: str, device: str, precision: str) -> float:
     camera, dtype = _on(device), DTYPES[precision]
     place = camera.c2w[:, 3] + depth * camera.c2w[:, 2]
-    given = place[None], torch.full((1, 3), scale), torch.randn(1, 4), torch.tensor([1.0])
+    turn = torch.randn(1, 4, generator=torch.Generator().manual_seed(0))
+    given = place[None], torch.full((1, 3), scale), turn, torch.tensor([1.0])
     found = _projected([x.to(device, dtype) for x in given], camera, backend)
     # As the inputs have it: the place is rounded to float32.
     z = float((place - camera.c2w[:, 3]).double() @ camera.c2w[:, 2].double())

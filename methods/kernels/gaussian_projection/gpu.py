@@ -129,7 +129,8 @@ def _rotation(rotations, i, inside):
     x = tl.load(rotations + 4 * i + 1, mask=inside, other=0.0)
     y = tl.load(rotations + 4 * i + 2, mask=inside, other=0.0)
     z = tl.load(rotations + 4 * i + 3, mask=inside, other=0.0)
-    shrink = 1 / tl.sqrt(w * w + x * x + y * y + z * z)
+    # An error of the length enters a conic four times: not the approximations of a GPU.
+    shrink = tl.div_rn(1.0, tl.sqrt_rn(w * w + x * x + y * y + z * z))
     return w * shrink, x * shrink, y * shrink, z * shrink, shrink
 
 
@@ -204,7 +205,8 @@ def _forward(
     tl.store(centres + 2 * i + 1, tl.where(shown, fy * v + cy, 0.0), mask=inside)
     a, b, c = tl.where(shown, a, 0.0), tl.where(shown, b, 0.0), tl.where(shown, c, 0.0)
     _put(conics, i, a, b, c, inside)
-    reach = 2 * tl.log(tl.where(shown, opacity / LEAST, 1.0))
+    # A quotient of a GPU may be a little below 1 where both are equal.
+    reach = 2 * tl.log(tl.where(shown, tl.maximum(opacity / LEAST, 1.0), 1.0))
     wide, tall = tl.sqrt(reach * xx), tl.sqrt(reach * yy)
     tl.store(extents + 2 * i, tl.where(shown, wide, 0.0), mask=inside)
     tl.store(extents + 2 * i + 1, tl.where(shown, tall, 0.0), mask=inside)
