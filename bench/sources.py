@@ -24,8 +24,15 @@ CHECKS = ("cases.py", "experiments.py")
 
 def digest(*things: Any) -> str:
     """SHA-256 of the names and bytes of the `sources` of `things`."""
+    files = sources(*things)
+    return _hashed(tuple(sorted(files.items())), tuple(_times(files)))
+
+
+@cache
+def _hashed(files: tuple[tuple[str, Path], ...], changed: tuple[int, ...]) -> str:
+    """Of `files` as they are since they were `changed`."""
     total = hashlib.sha256()
-    for name, path in sorted(sources(*things).items()):
+    for name, path in files:
         content = path.read_bytes()
         total.update(f"{name} {len(content)}\n".encode())
         total.update(content)
@@ -154,6 +161,7 @@ def _distributions() -> dict[str, list[str]]:
     return dict(metadata.packages_distributions())
 
 
+@cache
 def _version(distribution: str) -> str | None:
     try:
         return metadata.version(distribution)

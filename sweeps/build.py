@@ -68,7 +68,7 @@ def build(config: DictConfig, group: str, *args: Any, **extra: Any) -> Any:
     given = [*list(inspect.signature(target).parameters)[: len(args)], *extra]
     check_settings(target, node, f"{group}.", given)
     try:
-        prepared = instantiate(config[group], _partial_=True, _convert_="all")
+        prepared = instantiate(node, _partial_=True, _convert_="all")
         return prepared(*args, **extra)
     except InstantiationException as error:
         cause = error.__cause__ or error

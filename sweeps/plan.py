@@ -8,7 +8,7 @@ from functools import cache, cached_property
 from itertools import product
 from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import SteerbenchError
 from reports.paper_tables import AFTER, METHOD, OF_CURVES, Line, PaperTable, paper_tables
@@ -132,6 +132,7 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
             job = changed(config, [*values, word])
             if data:
                 job.scene.path = folder
+            OmegaConf.resolve(job)  # once: what is built of it would read each `${...}` anew
             place = [setting("scene.path", folder)] if data else []
             given = [f"+experiment={table.name}", *fixed, *settings, *place, word]
             command = ["steerbench", "run", *given, "hydra.mode=RUN"]

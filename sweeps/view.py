@@ -38,7 +38,8 @@ def opened(options: argparse.Namespace) -> Viewer:
     config = composed(words)
     log, scene = ConsoleLog(Path(config.outputs)), scene_of(config)
     first = build(config, "trajectory", scene).steps[0].camera
-    painter = Painter([trained(composed(one.words()), log) for one in wanted])
+    others = [composed(one.words()) for one in wanted[1:]]
+    painter = Painter([trained(each, log) for each in (config, *others)])
     for method, one in zip(painter.methods, wanted, strict=True):
         one.knobs = dict(study_of(method).knobs)
     names = [{name: [v.name for v in one.knobs[name]] for name in one.knobs} for one in wanted]

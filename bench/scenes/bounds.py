@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,6 +18,10 @@ MARGIN = 0.05
 
 CELLS = 64
 """Cells along each side of the cube in which a visual hull is looked for."""
+
+BLOCK, GLANCES = 4, 16
+"""Before single cells, blocks of as many along each side are looked for, in the first so many
+pictures: where a block is dropped, so would be each of its cells."""
 
 
 @dataclass(frozen=True)
@@ -78,16 +83,30 @@ def hull_box(cameras: Sequence[Camera], images: Sequence[Tensor], space: Box) ->
     if all((image[..., 3] == 255).all() for image in images):
         return None
     size = (space.upper - space.lower) / CELLS
-    cells = torch.cartesian_prod(*(torch.arange(CELLS, dtype=torch.float32),) * 3)
-    steps = torch.cartesian_prod(*(torch.tensor((0.0, 1.0)),) * 3)
-    for camera, image in zip(cameras, images, strict=True):
-        corners = space.lower + size * (cells[:, None] + steps)  # [M, 8, 3]
-        cells = cells[maybe_seen(camera, image[..., 3] > 0, corners.float())]
+    views = list(zip(cameras, images, strict=True))
+    blocks = _left(_grid(CELLS // BLOCK), views[:GLANCES], space.lower, size * BLOCK)
+    cells = (blocks[:, None] * BLOCK + _grid(BLOCK)).flatten(0, 1)
+    cells = _left(cells, views, space.lower, size)
     if not len(cells):
         return None
     lower = space.lower + size * cells.amin(0)
     upper = space.lower + size * (cells.amax(0) + 1)
     return Box(lower, upper).grown(MARGIN)
+
+
+def _grid(side: int) -> Tensor:
+    """The places [side^3, 3] of a cube of cells."""
+    return torch.cartesian_prod(*(torch.arange(side, dtype=torch.float32),) * 3)
+
+
+def _left(
+    cells: Tensor, views: Sequence[tuple[Camera, Tensor]], lower: Tensor, size: Tensor
+) -> Tensor:
+    """Those of `cells` [M, 3] of `size` [3], counted from `lower` [3], that no picture drops."""
+    for camera, image in views:
+        corners = lower + size * (cells[:, None] + _grid(2))  # [M, 8, 3]
+        cells = cells[maybe_seen(camera, image[..., 3] > 0, corners.float())]
+    return cells
 
 
 def maybe_seen(camera: Camera, mask: Tensor, corners: Tensor) -> Tensor:
@@ -99,8 +118,10 @@ def maybe_seen(camera: Camera, mask: Tensor, corners: Tensor) -> Tensor:
     limit = first.new_tensor((camera.width, camera.height))
     inside = ((first >= 0) & (last <= limit)).all(1) & (depth > 0).all(1)
     (u0, v0), (u1, v1) = (edge[inside].long().unbind(1) for edge in (first, last))
-    # A summed-area table counts the mask's pixels in any rectangle with four look-ups.
-    table = torch.nn.functional.pad(mask.int(), (1, 0, 1, 0)).cumsum(0).cumsum(1)
+    # A summed-area table counts the mask's pixels in any rectangle with four look-ups. NumPy's
+    # running sums of 32 bits take a quarter of the time of torch's, which are of 64.
+    sums = mask.numpy().cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32)
+    table = torch.from_numpy(np.pad(sums, ((1, 0), (1, 0))))
     count = table[v1, u1] - table[v0, u1] - table[v1, u0] + table[v0, u0]
     seen = torch.ones(len(corners), dtype=torch.bool)
     seen[inside] = count > 0

@@ -7,6 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bench.scenes import bounds
 from bench.scenes.analytic import picture, pose_on_sphere, train_poses
 from bench.scenes.bounds import Box, cube, hull_box
 from bench.scenes.opaque import Part, Solids
@@ -50,6 +51,18 @@ def test_the_hull_of_many_views_is_tight() -> None:
     slack = 2 * 4 / 45 + 2 * 3 / 64
     assert box is not None
     assert (box.upper - box.lower).max() <= (0.6 + 2 * slack) * 1.05
+
+
+def test_blocks_drop_no_cell_that_would_be_kept(monkeypatch) -> None:
+    model = Solids([Part(Ellipsoid((0.2, 0.5, 0.1)), plain((1.0, 0.0, 0.0)), (0.3, -0.2, 0.1))])
+    views = pictures_of(model, train_poses(20, 3))
+    box = hull_box(*views, cube(1.5))
+    monkeypatch.setattr(bounds, "GLANCES", 0)
+    cell_by_cell = hull_box(*views, cube(1.5))
+    assert box is not None
+    assert cell_by_cell is not None
+    assert torch.equal(box.lower, cell_by_cell.lower)
+    assert torch.equal(box.upper, cell_by_cell.upper)
 
 
 def test_cells_that_leave_the_picture_are_kept() -> None:
