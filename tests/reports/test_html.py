@@ -75,11 +75,18 @@ def tables_of(text: str) -> list[list[list[str]]]:
     return found
 
 
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the page of each device is kept: no test changes one."""
+    return tmp_path_factory.mktemp("pages")
+
+
 @pytest.fixture
-def page(several: tuple[Store, dict[str, str]], tmp_path: Path) -> Path:
+def page(several: tuple[Store, dict[str, str]], pages: Path, device: str) -> Path:
     """The folder of the page of six runs, and of one that failed."""
-    write_page(*several, tmp_path / "page", {"gone | lost": "no memory"})
-    return tmp_path / "page"
+    if not (pages / device).exists():
+        write_page(*several, pages / device, {"gone | lost": "no memory"})
+    return pages / device
 
 
 @pytest.fixture
