@@ -18,6 +18,11 @@ class Unavailable(SteerbenchError):
     """Something asked for by name cannot be used here; the message says why and how to get it."""
 
 
+def install(extra: str) -> str:
+    """The command that installs an `extra` of this project, in the folder that it lies in."""
+    return f'pip install -c constraints.txt -e ".[{extra}]"'
+
+
 @contextmanager
 def explained(folder: Path) -> Iterator[None]:
     """Turn the system's error for a `folder` that cannot be written into a SteerbenchError."""

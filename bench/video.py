@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.errors import SteerbenchError, Unavailable
+from bench.errors import SteerbenchError, Unavailable, install
 
 QUALITY = "18"
 """H.264's constant rate factor: hardly to be told from the original."""
@@ -29,8 +29,8 @@ def recorded(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
         import av
     except ImportError as error:
         raise Unavailable(
-            f"{path}: videos need PyAV: pip install 'steerbench[video]'; without --video the "
-            "pictures alone are written"
+            f"{path}: videos need PyAV: {install('video')}; without --video the pictures alone "
+            "are written"
         ) from error
     try:
         with av.open(path, "w") as container:

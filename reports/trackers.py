@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from PIL import Image
 
-from bench.errors import SteerbenchError, Unavailable
+from bench.errors import SteerbenchError, Unavailable, install
 from reports.runs import Run
 
 PROJECT = "steerbench"
@@ -127,9 +127,7 @@ def tracker(name: str) -> Tracker:
         raise SteerbenchError(f"tracker: expected one of {', '.join(TRACKERS)}, got {name!r}")
     found = TRACKERS[name]
     if find_spec(found.package) is None:
-        raise Unavailable(
-            f"tracker={name} needs the package {found.package}: pip install 'steerbench[{name}]'"
-        )
+        raise Unavailable(f"tracker={name} needs the package {found.package}: {install(name)}")
     return found
 
 

@@ -1,7 +1,7 @@
 """What is varied: Hydra configurations and the `steerbench` command line.
 
-Here stands what its processes ask of their libraries, those of a launcher, too: torch, which is
-loaded later, reads the environment once.
+It sets what torch and the memory allocator read when they are loaded, also in the processes of a
+launcher.
 """
 
 import os

@@ -1,8 +1,8 @@
 """The command `steerbench`: its subcommands, and how errors and signals end it.
 
-Exit statuses: 0 done, 1 a check failed (a kernel is wrong, a file differs) or a bug (with its
-traceback), 2 an error the user can act on, 130 interrupted, 141 the reader of a pipe went away,
-143 terminated.
+Exit statuses: 0 done, 1 a check failed (a kernel is wrong, a file differs), a job of the tables
+failed, or a bug (with its traceback), 2 an error the user can act on, 130 interrupted, 141 the
+reader of a pipe went away, 143 terminated.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def _parser() -> Parser:
     parser = Parser(
         prog="steerbench",
         usage="steerbench COMMAND [...]",
-        description=f"Radiance-field renderers measured under one ruler.\n\n{overview()}",
+        description=f"Benchmarks of radiance-field renderers.\n\n{overview()}",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
