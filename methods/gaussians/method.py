@@ -165,4 +165,4 @@ class GaussianSplatting:
 
     def settings(self) -> dict[str, str]:
         """See `bench.types.Method.settings`."""
-        return self.setup.settings(type(self)) | {"precision": self.stored, "engine": "none"}
+        return self.setup.settings() | {"precision": self.stored, "engine": "none"}

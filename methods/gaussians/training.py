@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -81,6 +82,11 @@ class GaussianTraining:
         self.split, self.background = scene.splits["train"], scene.background.to(device)
         self.generator = torch.Generator(device).manual_seed(seed)
         self.views: list[int] = []  # of this round through the pictures, still to come
+
+    @cached_property
+    def optimiser(self) -> torch.optim.Adam:
+        """Made when it is needed, as that of a field."""
+        options = self.options
         rates = {
             "means": options.means,
             "log_scales": options.scales,
@@ -90,9 +96,9 @@ class GaussianTraining:
             "view": options.colours / 20,
         }
         groups = [
-            {"params": [getattr(gaussians, name)], "lr": rate} for name, rate in rates.items()
+            {"params": [getattr(self.gaussians, name)], "lr": rate} for name, rate in rates.items()
         ]
-        self.optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def advance(self) -> dict[str, float]:
         """One step; its mean squared error, see `loop.look`.

@@ -78,4 +78,4 @@ class InstantNgp:
 
     def settings(self) -> dict[str, str]:
         """See `bench.types.Method.settings`."""
-        return self.setup.settings(type(self))
+        return self.setup.settings()

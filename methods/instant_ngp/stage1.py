@@ -12,7 +12,6 @@ from bench.types import DEVICE, Budget, Log, Scene
 from methods.instant_ngp.field import HashField, Precision
 from methods.instant_ngp.training import FieldTraining, TrainingOptions, new_grid, restore_field
 from methods.kernels import multiplies_bf16, resolve
-from methods.kernels.dispatch import description, used_by
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy
 from methods.rendering.occupancy import DensityGrid
@@ -66,12 +65,12 @@ class Setup:
         place = torch.device(device)
         return cls(grid, training, precision, resolve(backend, place), place, seed)
 
-    def settings(self, method: type) -> dict[str, str]:
-        """See `bench.types.Method.settings`; the kernels are those that `method` stands on."""
+    def settings(self) -> dict[str, str]:
+        """See `bench.types.Method.settings`."""
         multiplied = self.precision == "fp32" or multiplies_bf16(self.device.type)
         return {
             "device": str(self.device),
-            "backend": description(self.backend, self.device, used_by(method)),
+            "backend": self.backend,
             "engine": "torch",
             "precision": self.precision if multiplied else "bf16 in fp32",
         }

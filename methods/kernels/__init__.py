@@ -2,17 +2,15 @@
 
 A kernel is a folder: `__init__` holds its signature and meaning, `reference` the plain torch
 version (any dtype, any device, differentiable; all others are compared with it), `cpu` the numba
-version, `gpu`, where there is one, the Triton version.
-All backends of a kernel have the same signature.
+version, `gpu` the Triton version. All backends of a kernel have the same signature.
 """
 
 from methods.kernels.dispatch import (
     BACKENDS,
     availability,
     compiled,
-    description,
     multiplies_bf16,
     resolve,
 )
 
-__all__ = ["BACKENDS", "availability", "compiled", "description", "multiplies_bf16", "resolve"]
+__all__ = ["BACKENDS", "availability", "compiled", "multiplies_bf16", "resolve"]

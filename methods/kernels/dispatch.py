@@ -1,8 +1,4 @@
-"""Which backend computes a kernel: by name, or by the device of the tensors.
-
-Not every kernel has a Triton version: with backend "gpu" torch computes the others on the device.
-`description` names them.
-"""
+"""Which backend computes a kernel: by name, or by the device of the tensors."""
 
 from __future__ import annotations
 
@@ -10,7 +6,6 @@ import difflib
 import importlib
 import importlib.util
 import os
-from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -18,7 +13,6 @@ from types import ModuleType
 import torch
 
 from bench.errors import Unavailable
-from bench.sources import sources
 
 BACKENDS = ("reference", "cpu", "gpu")
 
@@ -91,35 +85,15 @@ def multiplies_bf16(kind: str) -> bool:
 def implementation(kernel: str, backend: str, device: torch.device) -> ModuleType:
     """The module that implements `kernel` (a folder beside this file) for tensors on `device`."""
     name = resolve(backend, device)
-    if name == "gpu" and not has(kernel, name):
-        name = "reference"
     if name == "cpu":
         _load("methods.kernels.cpu").follow_torch_threads()
     return _load(f"methods.kernels.{kernel}.{name}")
 
 
-def description(backend: str, device: torch.device | str, kernels: Iterable[str]) -> str:
-    """What computes `kernels` on `device`: the name of the backend and, where it has no version of
-    some of them, the names of these: "gpu, reference: ssim, voxel_walk"."""
-    name = resolve(backend, device)
-    others = [kernel for kernel in kernels if not has(kernel, name)]
-    return f"{name}, reference: {', '.join(sorted(others))}" if others else name
-
-
-def used_by(thing: type) -> list[str]:
-    """The names of the kernels that a class stands on, by its imports."""
-    folders = {path.parent for path in sources(thing).values()}
-    return sorted(folder.name for folder in folders if folder.parent == Path(__file__).parent)
-
-
-def has(kernel: str, backend: str) -> bool:
-    """Whether `backend` has its own version of `kernel`."""
-    return (Path(__file__).parent / kernel / f"{backend}.py").exists()
-
-
 def served(kernel: str) -> list[str]:
-    """The backends that have their own version of `kernel`."""
-    return [name for name in BACKENDS if has(kernel, name)]
+    """The backends that have `kernel`."""
+    folder = Path(__file__).parent / kernel
+    return [name for name in BACKENDS if (folder / f"{name}.py").exists()]
 
 
 def compiled(device: str) -> list[str]:

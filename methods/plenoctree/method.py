@@ -19,7 +19,7 @@ from methods.kernels.voxel_walk import render_voxels
 from methods.plenoctree.octree import Octree
 from methods.plenoctree.start import Extraction, extract
 from methods.plenoctree.training import OctreeLessons, OctreeTraining
-from methods.rendering.compaction import told
+from methods.rendering.compaction import to_host
 from methods.rendering.frame import Render
 from methods.rendering.march import March
 from methods.students.method import Student
@@ -105,7 +105,7 @@ class PlenOctree(Student):
                     faint=March(stop=self.stop).least_weight,
                     backend=self.teacher.backend,
                 )
-                samples, shown = told([crossed.sum(), shaded.sum()])
+                samples, shown = to_host([crossed.sum(), shaded.sum()])
             probe.count("samples", samples)
             probe.count("shaded_samples", shown, samples)
             return pixels

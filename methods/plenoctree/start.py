@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bench.types import SteerbenchError
+from bench.types import Rays, SteerbenchError
 from methods.instant_ngp.stage1 import TrainedField
 from methods.instant_ngp.training import PixelBatches
 from methods.kernels.composite import STOP, weights
 from methods.kernels.march import Occupancy
 from methods.kernels.spherical import spherical_harmonics
-from methods.kernels.voxel_walk import BRICK, Light, Voxels
+from methods.kernels.voxel_walk import BRICK, Crossings, Light, Voxels
 from methods.plenoctree.octree import Octree
 from methods.rendering.field import Field, pad
 from methods.students.voxels import largest_weights
@@ -82,14 +82,12 @@ def extract(
     """
     candidates = _candidates(teacher.occupancy, options)
     density = _densities(teacher.field, candidates, options.resolution, options.points, generator)
-    voxels = Voxels(candidates, options.resolution)
-    seen = largest_weights(
-        voxels,
-        lambda _, crossings: weights(density[crossings.voxel], crossings, stop=STOP),
-        batches,
-        options.rays,
-        generator,
-    )
+    voxels, backend = Voxels(candidates, options.resolution), teacher.field.backend
+
+    def weigh(_: Rays, crossings: Crossings) -> Tensor:
+        return weights(density[crossings.voxel], crossings, stop=STOP, backend=backend)
+
+    seen = largest_weights(voxels, weigh, batches, options.rays, generator, backend)
     kept = (seen >= options.least_weight) & (density > 0)
     if not kept.any():
         raise SteerbenchError(
@@ -141,7 +139,7 @@ def _harmonics(field: Field, voxels: Voxels, degree: int, directions: int) -> Te
     the logits of the colours at the centres of the voxels."""
     device, terms = voxels.coordinates.device, (degree + 1) ** 2
     towards = fibonacci_sphere(directions).to(device)
-    basis = spherical_harmonics(towards)[:, :terms].double()
+    basis = spherical_harmonics(towards, backend=field.backend)[:, :terms].double()
     solve = torch.linalg.pinv(basis).float()  # [C, D], the same for all voxels
     encoded = field.encode_directions(towards)
     found = torch.zeros(len(voxels), terms, 3, device=device)

@@ -17,19 +17,19 @@ def compacts(device: torch.device) -> bool:
     return device.type == "cpu"
 
 
-def worth(mask: Tensor) -> Tensor:
+def kept_indices(mask: Tensor) -> Tensor:
     """Where `mask` [N] is true, in order; all N places where no lists are made."""
     if compacts(mask.device):
         return mask.nonzero().squeeze(1)
     return torch.arange(len(mask), device=mask.device)
 
 
-def told(numbers: Sequence[Tensor]) -> list[int]:
+def to_host(numbers: Sequence[Tensor]) -> list[int]:
     """All integers in `numbers`, of any shapes. The host waits for a GPU once, not for each."""
     return torch.cat([number.flatten() for number in numbers]).tolist()
 
 
-def places(masks: Sequence[Tensor], sizes: Sequence[int] | None = None) -> list[Tensor]:
+def indices_where(masks: Sequence[Tensor], sizes: Sequence[int] | None = None) -> list[Tensor]:
     """Where each of `masks` is true, in order.
 
     Args:
@@ -38,7 +38,7 @@ def places(masks: Sequence[Tensor], sizes: Sequence[int] | None = None) -> list[
     if not masks:
         return []
     if sizes is None:
-        sizes = told([mask.sum() for mask in masks])
+        sizes = to_host([mask.sum() for mask in masks])
     return [
         torch.nonzero_static(mask, size=size).squeeze(1)
         for mask, size in zip(masks, sizes, strict=True)

@@ -21,7 +21,7 @@ from bench.cameras import (
 )
 from bench.types import Camera
 from methods.kernels.splat import splat
-from methods.rendering.compaction import worth
+from methods.rendering.compaction import kept_indices
 from methods.rendering.frame import FeatureFrame
 from methods.steernerf.options import Reprojection
 from methods.training.checkpoint import part
@@ -67,7 +67,7 @@ class Cloud:
             depth = torch.where(alpha > 0, depth.nan_to_num(posinf=0) * alpha, 0) + 1e-12
         else:
             clear = (alpha > SPLAT_ALPHA) & depth.isfinite()
-            source = worth(clear)
+            source = kept_indices(clear)
             depth = torch.where(clear, depth, torch.nan)[source]
         camera = frame.camera
         centres = pixel_grid(camera.width, camera.height, alpha.device)[source]
@@ -80,7 +80,7 @@ class Cloud:
     def expected(self) -> Cloud:
         """Of a cloud of sums w t: its points at the depths sum w t / sum w, without the faint."""
         clear = self.alpha > SPLAT_ALPHA
-        kept, centre = worth(clear), self.camera.c2w[:, 3]
+        kept, centre = kept_indices(clear), self.camera.c2w[:, 3]
         alpha = torch.where(clear, self.alpha, torch.nan)[kept]
         points = centre + (self.points[kept] - centre) / alpha[:, None]
         return Cloud(self.camera, self.source[kept], points, self.values[kept], alpha)
@@ -108,14 +108,14 @@ class Cloud:
         clear = self.alpha > SPLAT_ALPHA
         number = clear.cumsum(dim=0)  # from 1
         every = (number[-1:] + OVERLAP_POINTS - 1) // OVERLAP_POINTS
-        told = clear & ((number - 1) % every.clamp(min=1) == 0)
-        kept = worth(told)
+        sampled = clear & ((number - 1) % every.clamp(min=1) == 0)
+        kept = kept_indices(sampled)
         points = self.points[kept]
         pixels, depth = project(camera, points)
-        inside = told[kept] & (depth > 0) & within(pixels, camera.width, camera.height)
+        inside = sampled[kept] & (depth > 0) & within(pixels, camera.width, camera.height)
         here, there = (points - view.c2w[:3, 3] for view in (self.camera, camera))
         seen = (1 + functional.cosine_similarity(here, there, dim=1)) / 2
-        share = torch.where(inside, seen, 0).sum() / told.sum()
+        share = torch.where(inside, seen, 0).sum() / sampled.sum()
         return share.nan_to_num(nan=0.0)
 
 

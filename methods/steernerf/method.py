@@ -94,7 +94,7 @@ class SteerNerf:
 
     def settings(self) -> dict[str, str]:
         """See `bench.types.Method.settings`; engine and precision are those of the 2D renderer."""
-        return self.setup.settings(type(self)) | {
+        return self.setup.settings() | {
             "engine": self.engine.name,
             "precision": self.engine.computed(self.setup.device),
         }
@@ -130,6 +130,12 @@ def _check(stage2: Stage2, rendering: Rendering) -> None:
         raise ValueError(
             "rendering.range.mode: expected off without preceding frames (L = 0), got "
             f"{rendering.range.mode}"
+        )
+    kinds = model.reprojection.depth, rendering.range.depth
+    if rendering.range.mode != "off" and kinds == ("expected", "sum"):
+        raise ValueError(
+            "rendering.range.depth: expected the depth that is kept, model.reprojection.depth="
+            "expected; got sum"
         )
     with torch.random.fork_rng(devices=()):  # asked for what it can do; another one is trained
         renderer = stage2.make_renderer(model.channels, model.frames, model.scale)

@@ -38,8 +38,8 @@ class Model:
         channels: K, features of the field; the first three are RGB.
         frames: L, preceding frames.
         scale: s, the field is rendered at 1/s of the resolution.
-        step: of the rays at low resolution, as a multiple of the step of stage 1. Stage 2 trains
-            the field for a longer one.
+        step: of the rays at low resolution, in diagonals of the cube / 1024; stage 2 trains the
+            field for it.
         stop: transmittance at which a ray ends.
         reprojection: how preceding frames are brought into the present view.
         feature_background: what the features beyond RGB are composited on. 1/2 is what an
@@ -76,13 +76,13 @@ class RangeReduction:
             3 x 3 neighbourhood. A ray ends at the opacity they had; if it does not reach it, it
             continues behind the window. At a depth edge the whole ray is marched.
         epsilon: scene units along z.
-        depth: of "paper", which D it is that is reprojected: "sum", sum w t as the release renders
-            it, or "expected", divided by the opacity. The two differ at silhouettes.
+        depth: which D it is that is reprojected: "sum", sum w t as the release renders it, or
+            "expected", divided by the opacity. The two differ at silhouettes.
     """
 
     mode: Literal["off", "paper", "window"] = "off"
     epsilon: float = 0.03
-    depth: Literal["sum", "expected"] = "sum"
+    depth: Literal["sum", "expected"] = "expected"
 
     def __post_init__(self) -> None:
         if not self.epsilon > 0:

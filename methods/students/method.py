@@ -120,4 +120,4 @@ class Student(ABC):
 
     def settings(self) -> dict[str, str]:
         """See `bench.types.Method.settings`."""
-        return self.teacher.settings(type(self)) | {"engine": "none"}
+        return self.teacher.settings() | {"engine": "none"}

@@ -38,13 +38,6 @@ def corners_of(coordinates: Tensor) -> tuple[Tensor, Tensor]:
     return corners.int(), vertices.int()
 
 
-def subdivided(coordinates: Tensor) -> Tensor:
-    """The eighths [8 V, 3] of voxels [V, 3], in a grid of twice the resolution."""
-    check_shape("coordinates", coordinates, None, 3)
-    offsets = torch.tensor(OFFSETS, dtype=coordinates.dtype, device=coordinates.device)
-    return (2 * coordinates[:, None] + offsets).reshape(-1, 3)
-
-
 def occupied_voxels(occupancy: Occupancy, resolution: int) -> Tensor:
     """The voxels [V, 3] int32 of a grid of another resolution that reach into occupied cells.
 
@@ -72,7 +65,7 @@ def largest_weights(
     batches: PixelBatches,
     rays: int,
     generator: torch.Generator,
-    backend: str = "auto",
+    backend: str,
 ) -> Tensor:
     """The largest weight [V] that each voxel has in a pixel, over random training rays.
 

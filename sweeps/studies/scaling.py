@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,7 +27,14 @@ from sweeps.device_lock import device_lock
 from sweeps.measurement import checked_settings, scene_of
 from sweeps.names import unknown
 from sweeps.overrides import composed
-from sweeps.studies.variants import METHOD, Row, amount, computes_with_engine, declared
+from sweeps.studies.variants import (
+    METHOD,
+    Row,
+    amount,
+    computes_with_engine,
+    declared,
+    print_rows,
+)
 from sweeps.terminal import show
 
 SETTINGS = (METHOD, "trajectory=smooth", "++budget.renderer_steps=8")
@@ -87,7 +93,7 @@ def main(options: argparse.Namespace) -> int:
         axes.setdefault(row["axis"], []).append(row)
     title = f"{config.method.get('name', scene.name)} on {scene.name}, {rows[0]['frames']} frames"
     show(_table(title, axes))
-    print(json.dumps(rows))
+    print_rows(rows)
     if options.plot is not None:
         _plot(axes, options.plot)
         log.info(f"plot: {options.plot}")

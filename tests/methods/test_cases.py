@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ import torch
 import methods.kernels
 from bench.case import Case, Cell, Difference, largest_error
 from methods.checks import found
-from methods.kernels import BACKENDS, availability
+from methods.kernels import BACKENDS, availability, dispatch
 
 CASES = found("cases")
 QUICK = [case for case in CASES if not (case.slow or case.timed)]
@@ -45,19 +46,55 @@ KERNELS = sorted(
 )
 
 
-@pytest.fixture(autouse=True)
-def wide_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An interpreted kernel of the GPU costs the same for a block of any size."""
-    if not (torch.cuda.is_available() or availability()["gpu"]):
-        monkeypatch.setattr("methods.kernels.march.gpu.BLOCK", 256)
-
-
 @pytest.mark.parametrize(("case", "cell"), CELLS)
 def test_it_holds(case: Case, cell: Cell, device: str) -> None:
     row = case.check(cell, device)
     if row["status"].startswith("unavailable"):
         pytest.skip(row["status"])
     assert row["status"] == "ok", row
+
+
+MANY_BLOCKS = {
+    "gaussian_blending": {"parts of tiles"},
+    "march": {"inside and outside"},
+    "ssim": {"noise, 33 x 40"},
+    "voxel_walk": {"inside and outside", "stop and faint"},
+}
+"""Kernels whose blocks are larger where they are interpreted, and cases of several small blocks."""
+
+
+@pytest.fixture
+def blocks_of_a_gpu(kernel: str) -> Iterator[None]:
+    module = importlib.import_module(f"methods.kernels.{kernel}.gpu")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dispatch, "interpreted", lambda: False)
+        importlib.reload(module)
+    yield
+    importlib.reload(module)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(torch.cuda.is_available(), reason="here all cases have them")
+@pytest.mark.usefixtures("blocks_of_a_gpu")
+@pytest.mark.parametrize("kernel", MANY_BLOCKS)
+def test_it_holds_in_the_blocks_of_a_gpu(kernel: str) -> None:
+    if reason := availability()["gpu"]:
+        pytest.skip(reason)
+    cases = importlib.import_module(f"methods.kernels.{kernel}.cases").cases()
+    chosen = [case for case in cases if case.name in MANY_BLOCKS[kernel]]
+    for case in chosen:
+        for cell in case.tolerances:
+            if cell[0] == "gpu":
+                row = case.check(cell, "cpu")
+                assert row["status"] == "ok", row
+
+
+def test_no_kernel_with_blocks_of_its_own_for_the_interpreter_is_left_out() -> None:
+    folder = Path(methods.kernels.__file__).parent
+    sized = {
+        path.parent.name for path in folder.glob("*/gpu.py") if "interpreted()" in path.read_text()
+    }
+    assert sized == set(MANY_BLOCKS)
 
 
 @pytest.mark.parametrize(

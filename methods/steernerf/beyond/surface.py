@@ -7,7 +7,7 @@ from torch import Tensor
 
 from bench.cameras import cast, unproject
 from bench.types import Probe
-from methods.rendering.compaction import worth
+from methods.rendering.compaction import kept_indices
 from methods.rendering.field import Field, query
 from methods.rendering.occupancy import STEP
 from methods.steernerf.beyond.cells import centres
@@ -27,7 +27,7 @@ def surface_points(
     """Features and opacity, [P, K + 1], of a sample at every pixel of `cells` [N] whose `depth`
     [N, s^2] is finite; differentiable in the field, not in the depth."""
     there = depth.isfinite().flatten()
-    known = worth(there)
+    known = kept_indices(there)
     probe.count("surface_samples", len(known), view.full.width * view.full.height)
     field.count(probe, len(known), len(known))
     pixels = centres(cells, view.low.width, scale).flatten(0, 1)[known]

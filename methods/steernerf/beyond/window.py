@@ -14,7 +14,7 @@ from torch.nn import functional
 from bench.types import Camera, Probe, Rays
 from methods.kernels.composite import Pixels
 from methods.kernels.march import Occupancy
-from methods.rendering.compaction import worth
+from methods.rendering.compaction import kept_indices
 from methods.rendering.field import Field
 from methods.rendering.frame import Render
 from methods.rendering.march import FAINT, March
@@ -84,7 +84,7 @@ def within(
     def render(seen: Tensor, rays: Rays) -> Pixels:
         window, expected = prior.window.view(-1, 2)[seen], prior.alpha.flatten()[seen]
         narrow = window[:, 1].isfinite()
-        inside = worth(narrow)
+        inside = kept_indices(narrow)
         expected, near = expected[inside], torch.where(narrow[:, None], window, 0)[inside]
         # A stricter limit of what is faint: rays that go on would lack faint samples in front.
         loose = March(how.step, max(how.stop, 1 - KEPT_ALPHA), near, faint=FAINT * how.stop)
@@ -98,7 +98,7 @@ def within(
         )
         unfinished = torch.ones_like(narrow)
         unfinished[inside] = ~enough
-        rest = worth(unfinished)
+        rest = kept_indices(unfinished)
         begin, end = torch.where(narrow, window[:, 1], 0), torch.where(unfinished, torch.inf, 0)
         behind = how.within(torch.stack((begin, end), dim=1)[rest])
         carry = canvas.take(rest)

@@ -15,7 +15,7 @@ from bench.types import Camera, NullProbe, Rays
 from methods.kernels.composite import Extent, Pixels
 from methods.kernels.march import Samples, sample_counts
 from methods.rendering.batch import FirstPass, first_pass, second_pass
-from methods.rendering.compaction import compacts, places, told
+from methods.rendering.compaction import compacts, indices_where, to_host
 from methods.rendering.frame import FeatureFrame, sees_matter
 from methods.steernerf.renderer import Observation, Points, near_matter
 from methods.steernerf.training.options import JointOptions
@@ -184,7 +184,7 @@ class PatchSource:
         """
         masks = [mask for patch in patches for mask in patch.masks]
         if compacts(masks[0].device):
-            chosen = places(masks)
+            chosen = indices_where(masks)
             return chosen, _joined(patches, chosen), None
         which = torch.cat(masks)
         every = [torch.arange(len(mask), device=mask.device) for mask in masks]
@@ -202,8 +202,8 @@ class PatchSource:
             backend=self.pipeline.backend,
         )
         sizes, extent = _asked(masks, counts)
-        (together,) = places([which], [sum(sizes)])
-        return places(masks, sizes), rays.take(together), extent
+        (together,) = indices_where([which], [sum(sizes)])
+        return indices_where(masks, sizes), rays.take(together), extent
 
     def _jitter(self, rays: int, generator: torch.Generator) -> Tensor | None:
         """Phases of the samples of each ray, if they are random."""
@@ -228,7 +228,7 @@ class PatchSource:
             )
         ]
         sizes, extent = _asked(near, counts)
-        return first.samples.front(counts, extent), places(near, sizes)
+        return first.samples.front(counts, extent), indices_where(near, sizes)
 
     def _observation(
         self, patch: Patch, chosen: list[Tensor], rendered: list[Pixels], cells: Tensor | None
@@ -279,7 +279,9 @@ def _joined(patches: list[Patch], chosen: list[Tensor]) -> Rays:
 def _asked(masks: list[Tensor], counts: Tensor) -> tuple[list[int], Extent]:
     """In how many places each mask is true, and the extent of samples with `counts` [R]: a GPU is
     asked once."""
-    *sizes, total, longest = told([*(mask.sum() for mask in masks), Extent.figures(counts[None])])
+    *sizes, total, longest = to_host(
+        [*(mask.sum() for mask in masks), Extent.figures(counts[None])]
+    )
     return sizes, Extent(total, longest)
 
 

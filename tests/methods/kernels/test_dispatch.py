@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from functools import partial
 
 import pytest
 import torch
@@ -32,33 +31,9 @@ def test_backend_that_cannot_be_used_says_why(monkeypatch: pytest.MonkeyPatch) -
     availability.cache_clear()
 
 
-def test_what_has_no_kernel_for_the_gpu_is_computed_by_torch(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(dispatch, "resolve", lambda backend, device: backend)
-    monkeypatch.setattr(dispatch, "has", lambda kernel, backend: False)
-    chosen = dispatch.implementation("splat", "gpu", torch.device("cpu"))
-    assert chosen.__name__ == "methods.kernels.splat.reference"
-
-
 def test_cpu_backend_refuses_tensors_of_another_device() -> None:
     with pytest.raises(Unavailable, match="serves CPU tensors, these are on 'cuda'"):
         resolve("cpu", "cuda")
-
-
-def test_a_description_names_the_kernels_that_torch_computes_for_the_gpu(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(dispatch, "resolve", lambda backend, device: backend)
-    monkeypatch.setattr(dispatch, "has", lambda kernel, backend: kernel in ("encode", "march"))
-    described = partial(dispatch.description, "gpu", "cuda")
-    assert described(["encode", "march"]) == "gpu"
-    assert described(["warp", "encode", "splat"]) == "gpu, reference: splat, warp"
-
-
-def test_a_description_is_of_the_backend_that_computes() -> None:
-    assert dispatch.description("auto", "cpu", ["adam", "spherical"]) == "cpu"
-    assert dispatch.description("reference", "cpu", ["adam"]) == "reference"
 
 
 def test_an_interpreted_backend_is_not_compiled(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,20 +5,20 @@ from __future__ import annotations
 import torch
 
 from bench.waits import device_waits
-from methods.rendering.compaction import places, told, worth
+from methods.rendering.compaction import indices_where, kept_indices, to_host
 from tests.pretended_gpu import PretendedGpu
 
 MASK = torch.tensor([False, True, True, False, True])
 
 
 def test_on_a_cpu_what_is_worth_computing_is_listed() -> None:
-    assert worth(MASK).tolist() == [1, 2, 4]
+    assert kept_indices(MASK).tolist() == [1, 2, 4]
 
 
 def test_on_a_gpu_all_is_computed_and_nothing_is_waited_for(gpu: PretendedGpu) -> None:
     mask = MASK.to("cuda")
     with device_waits() as waits:
-        found = worth(mask)
+        found = kept_indices(mask)
     assert found.tolist() == [0, 1, 2, 3, 4]
     assert not waits
 
@@ -27,7 +27,7 @@ def test_the_places_of_many_masks_are_waited_for_once(gpu: PretendedGpu) -> None
     masks = [MASK, ~MASK, torch.zeros(3, dtype=torch.bool), torch.zeros(0, dtype=torch.bool)]
     there = [mask.to("cuda") for mask in masks]
     with device_waits() as waits:
-        found = places(there)
+        found = indices_where(there)
     assert [place.tolist() for place in found] == [[1, 2, 4], [0, 3], [], []]
     assert waits.total() == 1
 
@@ -35,12 +35,12 @@ def test_the_places_of_many_masks_are_waited_for_once(gpu: PretendedGpu) -> None
 def test_how_often_masks_are_true_may_be_told_with_other_numbers(gpu: PretendedGpu) -> None:
     masks, more = [MASK.to("cuda"), ~MASK.to("cuda")], torch.tensor([[7, 8]]).to("cuda")
     with device_waits() as waits:
-        *sizes, seven, eight = told([*(mask.sum() for mask in masks), more])
-        found = places(masks, sizes)
+        *sizes, seven, eight = to_host([*(mask.sum() for mask in masks), more])
+        found = indices_where(masks, sizes)
     assert [place.tolist() for place in found] == [[1, 2, 4], [0, 3]]
     assert (seven, eight) == (7, 8)
     assert waits.total() == 1
 
 
 def test_no_masks_have_no_places() -> None:
-    assert places([]) == []
+    assert indices_where([]) == []

@@ -257,6 +257,17 @@ def test_a_renderer_that_does_not_estimate_its_error_cannot_be_refined() -> None
         refused(joint=JointOptions(refined=0.1))
 
 
+def test_where_the_depth_is_kept_no_sum_can_be_reprojected() -> None:
+    kept = {
+        depth: small_model(history=False, surface=False, reprojection=Reprojection(depth=depth))
+        for depth in ("expected", "sum")
+    }
+    wanted = small_rendering(range=RangeReduction("paper", depth="sum"))
+    refused(model=kept["sum"], rendering=wanted)  # there it can
+    with pytest.raises(ValueError, match=r"range\.depth: expected the depth that is kept"):
+        refused(model=kept["expected"], rendering=wanted)
+
+
 @pytest.mark.parametrize("mode", ["paper", "window"])
 def test_without_preceding_frames_there_is_no_range_reduction(mode: str) -> None:
     ranged = small_rendering(range=RangeReduction(mode))

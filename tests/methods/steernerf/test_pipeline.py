@@ -19,8 +19,8 @@ from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
 from methods.steernerf.beyond.cells import cells_near, pixels_of
 from methods.steernerf.beyond.refinement import worst_cells
-from methods.steernerf.buffer import Cloud, RenderingBuffer
-from methods.steernerf.options import SIZES, RangeReduction, Skips
+from methods.steernerf.buffer import Cloud, Remembered, RenderingBuffer
+from methods.steernerf.options import SIZES, RangeReduction, Reprojection, Skips
 from methods.steernerf.unet import UNet
 from methods.steernerf.view import View
 from tests.methods.conftest import Work, look_at_the_middle
@@ -101,6 +101,27 @@ def test_the_preceding_picture_of_a_still_camera_is_where_it_was() -> None:
     assert known.float().mean() > 0.2
     # Positions are off by some ulps of 32 pixels, and neighbours differ by at most 1.
     assert (history.values - blocks)[known].abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("mode", ["paper", "window"])
+def test_of_a_sum_of_depths_range_reduction_reprojects_what_it_is_told_to(
+    mode: Literal["paper", "window"],
+) -> None:
+    """Expected depths are those of a cloud that has them instead."""
+    pipeline = new_pipeline(small_model(reprojection=Reprojection(depth="sum")))
+    buffer, probe = RenderingBuffer(2), NullProbe()
+    pipeline.render(CAMERA, buffer, USUAL, probe)
+    newest, view = buffer.frames[0], pipeline.view(look_at_the_middle(0.15, 0.3))
+    mended = replace(newest, cloud=newest.cloud.expected())
+
+    def values(remembered: Remembered, depth: Literal["sum", "expected"]) -> torch.Tensor:
+        reduction = RangeReduction(mode, epsilon=0.02, depth=depth)
+        rendering = replace(USUAL, range=reduction)
+        return pipeline.features(view, (remembered,), rendering, probe).values
+
+    expected = values(newest, "expected")
+    assert torch.equal(expected, values(mended, "sum"))
+    assert not torch.equal(expected, values(newest, "sum"))
 
 
 @pytest.mark.parametrize("mode", ["off", "window"])
