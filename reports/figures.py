@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -24,6 +25,8 @@ from reports.tables import NOT_AVAILABLE
 
 STAGE = "stage_ms."
 LEGEND_COLUMNS = 4
+LEGEND_WIDTH = 44
+"""Characters of a line in a legend of two columns."""
 MARKERS = "osD^vP*X<>"
 COLOURS = [matplotlib.colormaps["tab20"](index) for index in (*range(0, 20, 2), *range(1, 20, 2))]
 COLOURS = [colour for colour in COLOURS if len(set(colour[:3])) > 1]  # grey is for "other"
@@ -100,7 +103,9 @@ def quality_against(
 
     Bars show the intervals of both where there are several seeds.
     """
-    legend_lines = -(-len(lines) // 2)
+    labels = [textwrap.fill(line.label, LEGEND_WIDTH) for line in lines]
+    half = -(-len(labels) // 2)  # the legend has two columns
+    legend_lines = max("\n".join(part).count("\n") + 1 for part in (labels[:half], labels[half:]))
     figure, axes = _psnr_axes(4.0 + 0.25 * legend_lines, axis)
     for number, line in enumerate(lines):
         across, up = line.mean(metric), line.mean("psnr")
@@ -115,7 +120,7 @@ def quality_against(
             fmt=MARKERS[number % len(MARKERS)],
             color=COLOURS[number % len(COLOURS)],
             markersize=8,
-            label=line.label,
+            label=labels[number],
         )
         drawn[0].set_gid(MARK.format(number))
     axes.set_xscale("log")

@@ -67,11 +67,12 @@ def _plot(plot: Mapping[str, Any], tables: Sequence[PaperTable], lines: Lines) -
     """A plot with its heading and caption, if anything that it shows was measured."""
     stem, title = plot["file"], plot["title"]
     if "metric" in plot:
+        listed = {line.label for table in tables for block in table.blocks for line in block.lines}
         shown = [
             replace(line, label=label.format(line.label))
             for table, label in plot["tables"].items()
             for line in lines.get(table, ())
-            if line.runs
+            if line.runs and line.label in listed  # and not a point of a curve
         ]
         axis = plot["metric"], plot["unit"], plot["axis"]
         drawn = figures.quality_plot(shown, *axis, stem, title)
