@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,6 +14,7 @@ from reports import figures
 from reports.outliers import Outlier
 from reports.paper_page import PAGE, _curves, write_paper_page
 from reports.paper_tables import paper_tables
+from reports.parts import Plot
 from reports.runs import Repeated, Run, load
 
 
@@ -55,6 +58,23 @@ def test_the_page_has_every_table_and_every_figure(run: Run, tmp_path: Path) -> 
     html = (tmp_path / "report.html").read_text()
     assert html.count("<svg") == 4
     assert html.count('<div class="frame"') == 2
+
+
+def test_points_of_a_curve_are_not_plotted_against_cost(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (table,) = (table for table in paper_tables() if table.name == "table6")
+    lines = [of(run, line.label) for line in (*table.lines, *table.marks.values())]
+    drawn: list[str] = []
+    real = figures.quality_plot
+
+    def watched(shown: Sequence[Repeated], *others: Any) -> Plot:
+        drawn.extend(line.label for line in shown)
+        return real(shown, *others)
+
+    monkeypatch.setattr(figures, "quality_plot", watched)
+    write_paper_page([table], {"table6": lines}, [], tmp_path)
+    assert drawn == [f"SteerNeRF, {line.label}" for line in table.lines]
 
 
 def test_a_page_of_nothing_still_says_what_is_missing(tmp_path: Path) -> None:
