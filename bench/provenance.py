@@ -8,8 +8,9 @@ import platform
 import subprocess
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
-from bench.sources import ROOT
+from bench.sources import ROOT, digest, libraries
 
 CPU_MARKS = ("cpu family", "model", "CPU implementer", "CPU part")
 """Fields of /proc/cpuinfo: processors of one name may compute differently."""
@@ -48,6 +49,19 @@ def decisive() -> dict[str, object]:
     """The part of the machine that can change a figure; see `bench.sources` for its libraries."""
     found = machine()
     return {name: found[name] for name in ("cpu", "instructions", "gpus")}
+
+
+def computed_by(*things: Any) -> dict[str, object]:
+    """What decides what `things`, classes or functions, compute here, beside what they are given: a
+    part of every key."""
+    import torch
+
+    return {
+        "code": digest(*things),
+        "libraries": libraries(*things),
+        "machine": decisive(),
+        "threads": torch.get_num_threads(),
+    }
 
 
 def _git(*arguments: str) -> str:

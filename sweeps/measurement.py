@@ -18,11 +18,10 @@ from rich.columns import Columns
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
-from bench.provenance import decisive
+from bench.provenance import computed_by
 from bench.results import Measurement, Store, content_key
 from bench.run import Task, measure_in_turns
 from bench.scenes.held_out import hold_out
-from bench.sources import digest, libraries
 from bench.trajectories import Trajectory
 from bench.types import DEVICE, Log, Method, Scene
 from reports.runs import Run, load
@@ -327,14 +326,11 @@ def _identity(
     files = (*getattr(method, "reads", ()), *trajectory.reads)
     read = [file for file in files if file.is_file()]
     return {
-        "code": digest(*things),
-        "libraries": libraries(*things),
         "config": settings,
         "scene": scene.digest,
         "resolved": method.settings(),
         "files": [hashlib.sha256(file.read_bytes()).hexdigest() for file in read],
-        "threads": torch.get_num_threads(),
-        "machine": decisive(),
+        **computed_by(*things),
     }
 
 

@@ -9,8 +9,7 @@ from typing import Literal
 import torch
 
 from bench.cameras import place_camera
-from bench.provenance import decisive
-from bench.sources import digest, libraries
+from bench.provenance import computed_by
 from bench.study import Axis, Study, Variant, turned
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
@@ -139,11 +138,8 @@ class GaussianSplatting:
             "start": self.start,
             "backend": self.setup.backend,
             "device": self.setup.device.type,
-            "machine": decisive(),
-            "libraries": libraries(GaussianTraining, on_surfaces),
-            "threads": torch.get_num_threads(),
             "seed": self.setup.seed,
-            "code": digest(GaussianTraining, on_surfaces),
+            **computed_by(GaussianTraining, on_surfaces),
         }
 
     def reset(self) -> None:

@@ -6,8 +6,7 @@ from dataclasses import asdict, dataclass
 
 import torch
 
-from bench.provenance import decisive
-from bench.sources import digest, libraries
+from bench.provenance import computed_by
 from bench.types import DEVICE, Budget, Log, Scene
 from methods.instant_ngp.field import HashField, Precision
 from methods.instant_ngp.training import FieldTraining, TrainingOptions, new_grid, restore_field
@@ -86,11 +85,8 @@ class Setup:
             "precision": self.precision,
             "backend": self.backend,
             "device": self.device.type,
-            "machine": decisive(),
-            "libraries": libraries(train_field),
-            "threads": torch.get_num_threads(),
             "seed": self.seed,
-            "code": digest(train_field),
+            **computed_by(train_field),
         }
 
 

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from bench.cameras import place_camera
-from bench.provenance import decisive
-from bench.sources import digest, libraries
+from bench.provenance import computed_by
 from bench.study import Study, turned
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, Probe, Scene
@@ -109,10 +108,7 @@ class Student(ABC):
             "steps": budget.renderer_steps,
             "model": self.model_settings(),
             "training": asdict(self.training),
-            "libraries": libraries(type(self)),
-            "machine": decisive(),
-            "threads": torch.get_num_threads(),
-            "code": digest(type(self)),
+            **computed_by(type(self)),
         }
 
     def reset(self) -> None:  # noqa: B027 (no student has anything to forget)
