@@ -18,7 +18,7 @@ class Unavailable(SteerbenchError):
     """Something asked for by name cannot be used here; the message says why and how to get it."""
 
 
-def install(extra: str) -> str:
+def install_command(extra: str) -> str:
     """The command that installs an `extra` of this project, in the folder that it lies in."""
     return f'pip install -c constraints.txt -e ".[{extra}]"'
 

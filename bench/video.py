@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.errors import SteerbenchError, Unavailable, install
+from bench.errors import SteerbenchError, Unavailable, install_command
 
 QUALITY = "18"
 """H.264's constant rate factor: hardly to be told from the original."""
@@ -29,7 +29,7 @@ def recorded(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
         import av
     except ImportError as error:
         raise Unavailable(
-            f"{path}: videos need PyAV: {install('video')}; without --video the pictures alone "
+            f"{path}: videos need PyAV: {install_command('video')}; without --video the pictures alone "
             "are written"
         ) from error
     try:

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from PIL import Image
 
-from bench.errors import SteerbenchError, Unavailable, install
+from bench.errors import SteerbenchError, Unavailable, install_command
 from reports.runs import Run
 
 PROJECT = "steerbench"
@@ -127,7 +127,9 @@ def tracker(name: str) -> Tracker:
         raise SteerbenchError(f"tracker: expected one of {', '.join(TRACKERS)}, got {name!r}")
     found = TRACKERS[name]
     if find_spec(found.package) is None:
-        raise Unavailable(f"tracker={name} needs the package {found.package}: {install(name)}")
+        raise Unavailable(
+            f"tracker={name} needs the package {found.package}: {install_command(name)}"
+        )
     return found
 
 

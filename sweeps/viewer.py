@@ -17,7 +17,7 @@ from torch.nn import functional
 from bench import paths
 from bench.cameras import pack_camera
 from bench.compositing import composite
-from bench.errors import SteerbenchError, Unavailable, install
+from bench.errors import SteerbenchError, Unavailable, install_command
 from bench.metrics import as_bytes, psnr
 from bench.types import Camera, Log, Scene
 from bench.viewing import (
@@ -257,7 +257,7 @@ def _serve(host: str, port: int) -> ViserServer:
     try:
         import viser
     except ImportError as error:
-        raise Unavailable(f"view needs viser: {install('viewer')}") from error
+        raise Unavailable(f"view needs viser: {install_command('viewer')}") from error
     try:
         with redirect_stdout(StringIO()):  # it would print its address in a frame
             server = viser.ViserServer(host=host, port=port, label="steerbench", verbose=False)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from bench.cameras import scale_camera
-from bench.errors import Unavailable, install
+from bench.errors import Unavailable, install_command
 from bench.scenes.assemble import assemble, describe_splits, every_nth, leave_out
 from bench.scenes.bounds import MARGIN, Box, parse_box
 from bench.scenes.distortion import Lens
@@ -97,7 +97,7 @@ def read_model(folder: Path) -> Any:
         import pycolmap
     except ImportError as error:
         raise Unavailable(
-            f"{folder}: models of COLMAP need pycolmap: {install('colmap')}"
+            f"{folder}: models of COLMAP need pycolmap: {install_command('colmap')}"
         ) from error
     for name in LISTS:
         check_length(folder / f"{name}.bin")

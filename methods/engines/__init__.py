@@ -19,7 +19,7 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from bench.errors import Unavailable, explained, install
+from bench.errors import Unavailable, explained, install_command
 from bench.sharing import missing
 from bench.sources import digest, libraries
 from bench.types import Log
@@ -199,5 +199,5 @@ def required(engine: str, library: str, extra: str) -> ModuleType:
         return importlib.import_module(library)
     except ImportError as error:
         raise Unavailable(
-            f"engine={engine} cannot be used here ({error}): {install(extra)}"
+            f"engine={engine} cannot be used here ({error}): {install_command(extra)}"
         ) from error
