@@ -29,8 +29,8 @@ def recorded(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
         import av
     except ImportError as error:
         raise Unavailable(
-            f"{path}: videos need PyAV: {install_command('video')}; without --video the pictures alone "
-            "are written"
+            f"{path}: videos need PyAV: {install_command('video')}; without --video the pictures "
+            "alone are written"
         ) from error
     try:
         with av.open(path, "w") as container:
