@@ -17,7 +17,7 @@ from bench.scenes.models import MODELS
 from bench.scenes.raytrace import render
 from bench.types import Camera, Frame, Scene, SteerbenchError, Unavailable
 
-SMALL = {"width": 32, "height": 24, "train": 6, "test": 3}
+SMALL = {"width": 24, "height": 18, "train": 4, "test": 2}
 
 
 @pytest.fixture(params=[*MODELS, "medley-0"])
@@ -46,8 +46,8 @@ def test_the_layout_is_that_of_nerf_synthetic(tmp_path, log) -> None:
     files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*"))
     assert files == sorted(
         ["transforms_train.json", "transforms_test.json"]
-        + [f"train/r_{k}.png" for k in range(6)]
-        + [f"test/r_{k}.png" for k in range(3)]
+        + [f"train/r_{k}.png" for k in range(4)]
+        + [f"test/r_{k}.png" for k in range(2)]
     )
     record = json.loads((folder / "transforms_train.json").read_text())
     assert record["scene"] == {"name": "void", "seed": 0, **SMALL}
@@ -57,9 +57,9 @@ def test_a_scene_is_written_once(tmp_path, log) -> None:
     options = {**SMALL, "bounds": "full", "root": tmp_path}
     first = analytic.load("void", **options, log=log)
     written = log.done
-    assert written == 2 * 9  # nine rendered, nine read
+    assert written == 2 * 6  # six rendered, six read
     second = analytic.load("void", **options, log=log)
-    assert log.done == written + 9
+    assert log.done == written + 6
     assert second.digest == first.digest
 
 
@@ -77,7 +77,7 @@ def test_who_finishes_second_accepts_the_scene_of_the_first(tmp_path, log, monke
 
 
 @pytest.mark.parametrize(
-    "change", [{"width": 33}, {"height": 25}, {"train": 7}, {"test": 4}, {"seed": 1}]
+    "change", [{"width": 25}, {"height": 19}, {"train": 5}, {"test": 3}, {"seed": 1}]
 )
 def test_every_parameter_has_its_own_folder(tmp_path, log, change) -> None:
     analytic.load("void", **SMALL, root=tmp_path, log=log)
@@ -94,12 +94,12 @@ def test_two_writes_are_equal_byte_for_byte(tmp_path, log) -> None:
 
 def test_cameras_come_back_as_they_were_made(drawn, log) -> None:
     scene = analytic.load("totem", **SMALL, root=drawn, log=log)
-    for split, poses in (("train", train_poses(6, 0)), ("test", orbit_poses(3))):
+    for split, poses in (("train", train_poses(4, 0)), ("test", orbit_poses(2))):
         for camera, pose in zip(scene.splits[split].cameras, poses, strict=True):
             in_model = move_camera(camera, scene.unit_length, scene.origin)
             torch.testing.assert_close(in_model.c2w, pose.float(), rtol=0, atol=2e-6)
-            assert camera.fx == camera.fy == 16 / math.tan(0.345)
-            assert (camera.width, camera.height) == (32, 24)
+            assert camera.fx == camera.fy == 12 / math.tan(0.345)
+            assert (camera.width, camera.height) == (24, 18)
 
 
 def test_pictures_are_the_exact_frames(drawn, log, name) -> None:
