@@ -145,7 +145,10 @@ ARGUMENTS = {
         ),
         *_words("method=steernerf_lean scene=medley budget=pretrain"),
     ],
-    "list": FOLDER,
+    "list": [
+        *_flag("--here", "also the backends and engines, and why some cannot be used here"),
+        *FOLDER,
+    ],
     "results": [
         *OUTPUTS,
         *_one(

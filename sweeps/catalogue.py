@@ -1,4 +1,4 @@
-"""`steerbench list`: what can be chosen, and what of it cannot be used on this machine, and why."""
+"""`steerbench list`: what can be chosen, and what of it cannot be used here, and why."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from reports.tables import Table
 from sweeps.build import engine_kinds
 from sweeps.overrides import choices
 from sweeps.plug_ins import PlugIn, installed
-from sweeps.terminal import show
+from sweeps.terminal import console, show
 
 GROUPS = ("method", "engine", "scene", "trajectory", "protocol", "budget", "experiment")
 
 
 def main(options: argparse.Namespace) -> int:
-    """Print the choices of `steerbench run`, then the backends of the kernels and the engines.
+    """Print the choices of `steerbench run`; with `--here` the usable backends and engines, too.
 
-    The choices come first: what follows imports torch and every engine, which takes seconds.
+    Those are asked for: only torch and the engines themselves know, and importing them takes
+    seconds.
     """
     words = options.config_dir
     files = [
@@ -31,6 +32,9 @@ def main(options: argparse.Namespace) -> int:
     ]
     _show("Choices", ("choice", "what it is"), files)
     _show("Installed plug-ins", ("plug-in", "what it brings"), _plug_ins(words))
+    if not options.here:
+        console().print("Backends and engines that this machine can use: steerbench list --here")
+        return 0
 
     from methods.kernels import availability
 

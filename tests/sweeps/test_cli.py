@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from bench.results import COLUMNS
+from methods.kernels import BACKENDS
 from sweeps.cli import COMMANDS
 
 
@@ -42,19 +43,32 @@ def test_list_shows_every_choice_with_what_it_is(steerbench):
     assert "scene=blender" in out
     assert "NeRF-Synthetic" in out
     assert "+experiment=demo" in out
-    for name in ("reference", "cpu", "gpu", "torch", "openvino", "onnxruntime", "engine=tensorrt"):
-        assert name in out
+    for name in ("torch", "openvino", "onnxruntime", "tensorrt"):
+        assert f"engine={name}" in out
+
+
+def test_list_answers_without_torch():
+    program = (
+        "import sys, sweeps.cli as cli; sys.exit(cli.dispatch(['list']) or 'torch' in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)
+
+
+def test_list_shows_the_backends_that_can_be_used_here(steerbench):
+    lines = steerbench("list", "--here").out.splitlines()
+    for name in BACKENDS:
+        assert any(f" {name} " in line for line in lines)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="for a machine without a GPU")
 def test_list_says_why_an_engine_cannot_be_used(steerbench):
-    out = " ".join(steerbench("list").out.split())
+    out = " ".join(steerbench("list", "--here").out.split())
     assert "engine=tensorrt computes on a CUDA GPU, and torch sees none here" in out
 
 
 def test_list_says_how_to_get_an_engine_that_is_not_installed(steerbench, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    assert 'pip install -c constraints.txt -e ".[onnx]"' in steerbench("list").out
+    assert 'pip install -c constraints.txt -e ".[onnx]"' in steerbench("list", "--here").out
 
 
 @pytest.mark.parametrize(
