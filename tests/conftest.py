@@ -204,11 +204,19 @@ def offset_method(device: str) -> OffsetMethod:
 
 
 @pytest.fixture(scope="session")
-def lpips_weights(shared_data: Path | None, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the backbones of LPIPS: the real ones where they are, else random ones."""
+def real_lpips_weights(shared_data: Path | None) -> Path | None:
+    """A folder with the backbones of LPIPS, if there is one on this machine."""
     real = os.environ.get("STEERBENCH_WEIGHTS") or (shared_data and shared_data / "lpips")
-    if real and Path(real).is_dir():
-        return Path(real)
+    return Path(real) if real and Path(real).is_dir() else None
+
+
+@pytest.fixture(scope="session")
+def lpips_weights(
+    real_lpips_weights: Path | None, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """A folder with the backbones of LPIPS: the real ones where they are, else random ones."""
+    if real_lpips_weights:
+        return real_lpips_weights
     folder = tmp_path_factory.mktemp("weights")
     with warnings.catch_warnings():  # torchvision deprecates how lpips calls it
         warnings.simplefilter("ignore", UserWarning)

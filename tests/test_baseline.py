@@ -1,0 +1,53 @@
+"""The methods against recorded figures, on a scene that each of them learns in seconds."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BASELINE = Path(__file__).with_name("baseline.json")
+STEERBENCH = Path(sys.executable).with_name("steerbench")
+RUN = [
+    *("+experiment=demo", "scene=cloud", "scene.width=64", "scene.train=24", "scene.test=6"),
+    *("budget=tiny", "budget.steps=200", "budget.samples=16384", "budget.renderer_steps=100"),
+    *("budget.frames=0", "sizing.field_step=4", "sizing.step=4"),
+]
+METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "work.samples", "work.products")
+
+
+def test_the_baseline_is_of_methods_that_have_learnt() -> None:
+    baseline = json.loads(BASELINE.read_text())
+    assert baseline["limits"].keys() >= set(METRICS)
+    for run in baseline["runs"].values():
+        assert run["values"]["psnr"] >= 25
+        assert run["values"].keys() >= set(METRICS)
+
+
+@pytest.mark.slow
+def test_the_methods_are_as_good_as_the_recorded_baseline(
+    tmp_path: Path, lpips_weights: Path, real_lpips_weights: Path | None
+) -> None:
+    """The limits are what other rounding does to a training, rounded up: docs/log.md.
+
+    Recorded anew by `steerbench check --record` when a method was changed on purpose, be it in the
+    order of its random numbers.
+    """
+    done = _steerbench("run", *RUN, f"weights_dir={lpips_weights}", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    held = json.loads(BASELINE.read_text())
+    if not real_lpips_weights:
+        limits = held["limits"].items()
+        held["limits"] = {name: one for name, one in limits if not name.startswith("lpips")}
+    baseline = tmp_path / "baseline.json"
+    baseline.write_text(json.dumps(held))
+    checked = _steerbench("check", baseline, folder=tmp_path)
+    assert checked.returncode == 0, checked.stdout
+
+
+def _steerbench(command: str, *words: str | Path, folder: Path) -> subprocess.CompletedProcess[str]:
+    line = [STEERBENCH, command, *words]
+    return subprocess.run(line, cwd=folder, capture_output=True, text=True, check=False)
