@@ -12,7 +12,7 @@ from bench.types import Budget, Probe, Rays, Scene
 from methods.diver.decoder import Decoder
 from methods.diver.model import CornerModel
 from methods.diver.rendering import Baked, Stored
-from methods.diver.training import DiverTraining, Lessons
+from methods.diver.training import DiverLessons, DiverTraining
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.kernels.composite import Pixels
 from methods.kernels.march import Occupancy
@@ -40,7 +40,7 @@ class Diver(Student):
     """
 
     kind = "diver"
-    training: Lessons
+    training: DiverLessons
     study = Study(
         knobs={
             "stop": turned("stop", "method.stop", ("1e-1", "1e-3", "1e-4")),
@@ -56,7 +56,7 @@ class Diver(Student):
         self,
         *,
         teacher: Setup,
-        training: Lessons,
+        training: DiverLessons,
         resolution: int = 256,
         stored: Stored = "bf16",
         faint: float = 1e-2,

@@ -22,7 +22,7 @@ from methods.training.optimiser import step_at
 
 
 @dataclass(frozen=True)
-class Lessons(PixelOptions):
+class DiverLessons(PixelOptions):
     """How the model learns; `rate` is that of the decoder.
 
     Attributes:
@@ -52,10 +52,10 @@ class Lessons(PixelOptions):
 class DiverTraining(PixelTraining):
     """The training as a `methods.training.loop.Training`: some thousand rays a step."""
 
-    options: Lessons
+    options: DiverLessons
 
     def __init__(
-        self, model: CornerModel, scene: Scene, budget: Budget, options: Lessons, seed: int
+        self, model: CornerModel, scene: Scene, budget: Budget, options: DiverLessons, seed: int
     ) -> None:
         device = model.table.device
         super().__init__(scene, device, budget.renderer_steps, budget.samples, options, seed)

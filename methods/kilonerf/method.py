@@ -11,7 +11,7 @@ from bench.types import Budget, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.kilonerf.field import KiloField
 from methods.kilonerf.grid import Grid, place_networks
-from methods.kilonerf.training import KiloTraining, Lessons
+from methods.kilonerf.training import KiloLessons, KiloTraining
 from methods.students.fields import FieldStudent
 from methods.training import checkpoint
 
@@ -32,13 +32,13 @@ class KiloNerf(FieldStudent):
     """
 
     kind = "kilonerf"
-    training: Lessons
+    training: KiloLessons
 
     def __init__(
         self,
         *,
         teacher: Setup,
-        training: Lessons,
+        training: KiloLessons,
         networks: int = 16,
         stop: float = 1e-2,
         name: str = "kilonerf",

@@ -12,14 +12,14 @@ from bench.types import Budget, Scene
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kilonerf.field import KiloField
 from methods.kilonerf.grid import Pieces
-from methods.students.fields import FieldLessons, FieldTraining
+from methods.students.fields import FieldLessons, StudentTraining
 
 LEAK = 0.01
 """Slope of the density below 0 in distillation: where nothing is, its gradient does not vanish."""
 
 
 @dataclass(frozen=True)
-class Lessons(FieldLessons):
+class KiloLessons(FieldLessons):
     """How the networks learn; `rate` is below that of a hash grid.
 
     Attributes:
@@ -37,8 +37,8 @@ class Lessons(FieldLessons):
             raise ValueError(f"expected points_each >= 1, view_cost >= 0: {self}")
 
 
-class KiloTraining(FieldTraining):
-    """As `FieldTraining`, with as many points for each network."""
+class KiloTraining(StudentTraining):
+    """As `StudentTraining`, with as many points for each network."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class KiloTraining(FieldTraining):
         teacher: TrainedField,
         scene: Scene,
         budget: Budget,
-        options: Lessons,
+        options: KiloLessons,
         seed: int,
     ) -> None:
         super().__init__(field, teacher, scene, budget, options, seed)

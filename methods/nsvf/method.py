@@ -15,7 +15,7 @@ from methods.kernels.march import BRICK, Occupancy
 from methods.nsvf.field import EMBEDDING, NsvfField
 from methods.rendering.march import check_step
 from methods.rendering.occupancy import STEP
-from methods.students.fields import FieldStudent, FieldTraining
+from methods.students.fields import FieldStudent, StudentTraining
 from methods.students.networks import NetworkLessons
 from methods.students.voxels import occupied_voxels
 
@@ -76,7 +76,7 @@ class Nsvf(FieldStudent):
         field = NsvfField(self.occupancy, teacher.precision, teacher.backend, generator)
         return field.to(teacher.device)
 
-    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> FieldTraining:
+    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> StudentTraining:
         """See `Student`."""
         training = super().begin(teacher, scene, budget)
         if self.start == "teacher" and isinstance(training.field, NsvfField):

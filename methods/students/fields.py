@@ -91,7 +91,7 @@ class StudentField(nn.Module, ABC):
         """Bytes by component."""
 
 
-class FieldTraining(PixelTraining):
+class StudentTraining(PixelTraining):
     """Points of the teacher, then rays of the photos, among what the teacher's grid has.
 
     Rays learn at the samples that the teacher does not hide: its density costs less than that of a
@@ -218,10 +218,10 @@ class FieldStudent(Student):
         """The cells in which the field may be other than empty: those of the teacher."""
         return teacher.occupancy
 
-    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> FieldTraining:
+    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> StudentTraining:
         """See `Student`."""
         self.occupancy = self.occupied(teacher)
-        return FieldTraining(
+        return StudentTraining(
             self.new_field(),
             teacher,
             scene,

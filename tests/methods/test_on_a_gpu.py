@@ -22,7 +22,7 @@ from bench.types import Budget, Method, NullProbe, Scene, Split
 from bench.waits import device_waits
 from methods.checks import found
 from methods.diver.method import Diver
-from methods.diver.training import Lessons as DiverLessons
+from methods.diver.training import DiverLessons
 from methods.engines import cuda_graphs
 from methods.engines.torch_engine import TorchEngine
 from methods.gaussians.method import GaussianSplatting
@@ -37,7 +37,7 @@ from methods.kernels.encode import HashGrid, encode
 from methods.kernels.march import Occupancy, longest_ray, march
 from methods.kernels.splat import splat
 from methods.kilonerf.method import KiloNerf
-from methods.kilonerf.training import Lessons as KiloLessons
+from methods.kilonerf.training import KiloLessons
 from methods.nerf.method import Nerf
 from methods.nsvf.method import Nsvf
 from methods.plenoctree.method import PlenOctree

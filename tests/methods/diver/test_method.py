@@ -10,11 +10,11 @@ import torch
 
 from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene
 from methods.diver.method import Diver
-from methods.diver.training import DiverTraining, Lessons
+from methods.diver.training import DiverLessons, DiverTraining
 from methods.instant_ngp.stage1 import TrainedField
 from tests.methods.trainings import GRID, TAUGHT, TEACHER, goes_on_after_a_kill, quality
 
-LESSONS = Lessons(prune_rays=1 << 13)
+LESSONS = DiverLessons(prune_rays=1 << 13)
 
 
 def method_of(**options) -> Diver:
@@ -114,7 +114,7 @@ def test_wrong_settings_are_refused(wrong: dict[str, object]) -> None:
 @pytest.mark.parametrize("wrong", [{"corner_rate": 0.0}, {"prune_at": 2.0}, {"prune_below": 1.0}])
 def test_wrong_lessons_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="expected"):
-        Lessons(**wrong)
+        DiverLessons(**wrong)
 
 
 def test_a_teacher_with_more_features_than_a_corner_is_refused(

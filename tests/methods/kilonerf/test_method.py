@@ -11,11 +11,11 @@ from bench.types import Budget, Log, NullProbe, Scene
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kilonerf.field import SHAPES
 from methods.kilonerf.method import KiloNerf
-from methods.kilonerf.training import Lessons
+from methods.kilonerf.training import KiloLessons
 from methods.training import loop
 from tests.methods.trainings import TAUGHT, TEACHER, goes_on_after_a_kill, quality
 
-LESSONS = Lessons(points_each=64, rate=1e-2)
+LESSONS = KiloLessons(points_each=64, rate=1e-2)
 
 
 def method(**options) -> KiloNerf:
@@ -79,4 +79,4 @@ def test_wrong_settings_are_refused(wrong: dict[str, float]) -> None:
 @pytest.mark.parametrize("wrong", [{"points_each": 0}, {"view_cost": -1.0}, {"points": 2.0}])
 def test_wrong_lessons_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="expected"):
-        Lessons(**wrong)
+        KiloLessons(**wrong)
