@@ -84,13 +84,12 @@ class OctreeTraining(PixelTraining):
         crossings = crossings.front(counts)
         self._sigma = light.density[crossings.voxel].requires_grad_()
         self.visited = crossings.voxel
-        harmonics = light.harmonics.detach().requires_grad_()
         colours = shade_voxels(
-            harmonics,
+            light.harmonics,
             crossings.voxel,
             crossings.ray,
             functional.normalize(rays.directions, dim=1),
-            grad_buffer=self.gradients["harmonics"].view_as(harmonics),
+            grad_buffer=self.gradients["harmonics"].view_as(light.harmonics),
             backend=backend,
         )
         pixels = composite(self._sigma.relu(), colours, crossings, stop=STOP, backend=backend)

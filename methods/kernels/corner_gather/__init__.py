@@ -48,6 +48,8 @@ def gather(
     check_shape("weights", weights, len(voxel), CORNERS)
     if grad_buffer is not None:
         check_shape("grad_buffer", grad_buffer, *table.shape)
+        if not table.requires_grad:
+            table = table.detach().requires_grad_()  # else there is no backward pass
     if len(voxel) and voxel.device.type == "cpu":  # a GPU would have to be waited for
         low, high = (int(end) for end in torch.aminmax(voxel))
         if not 0 <= low <= high < len(corners):

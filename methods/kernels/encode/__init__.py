@@ -118,6 +118,8 @@ def encode(
         check_shape("packed", packed, grid.entries)
     if grad_buffer is not None:
         check_shape("grad_buffer", grad_buffer, grid.entries, grid.features)
+        if not table.requires_grad:
+            table = table.detach().requires_grad_()  # else there is no backward pass
     features = implementation("encode", backend, positions.device).encode(
         positions, table, grid, packed=packed, grad_buffer=grad_buffer
     )

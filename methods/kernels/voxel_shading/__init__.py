@@ -47,6 +47,8 @@ def shade_voxels(
     check_shape("directions", directions, None, 3)
     if grad_buffer is not None:
         check_shape("grad_buffer", grad_buffer, *harmonics.shape)
+        if not harmonics.requires_grad:
+            harmonics = harmonics.detach().requires_grad_()  # else there is no backward pass
     kernel = implementation("voxel_shading", backend, harmonics.device)
     colours: Tensor = kernel.shade_voxels(harmonics, voxel, ray, directions, grad_buffer)
     return colours

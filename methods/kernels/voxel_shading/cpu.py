@@ -25,8 +25,6 @@ def shade_voxels(
             f"backend 'cpu' shades float32, got harmonics {harmonics.dtype} and directions "
             f"{directions.dtype}: use backend='reference'"
         )
-    if grad_buffer is not None and not harmonics.requires_grad:
-        harmonics = harmonics.detach().requires_grad_()
     basis = spherical_harmonics(directions, backend="cpu")
     return _Shade.apply(harmonics, voxel, ray, basis, grad_buffer)
 

@@ -29,8 +29,6 @@ def shade_voxels(
 ) -> Tensor:
     """See `methods.kernels.voxel_shading.shade_voxels`."""
     check_types(torch.float32, harmonics=harmonics, directions=directions)
-    if grad_buffer is not None and not harmonics.requires_grad:
-        harmonics = harmonics.detach().requires_grad_()
     basis = spherical_harmonics(directions, backend="gpu")
     return _Shade.apply(harmonics, voxel.contiguous(), ray.contiguous(), basis, grad_buffer)
 
