@@ -18,9 +18,9 @@ DIRECTION_CHANNELS = 3 + 2 * 3 * FREQUENCIES
 
 
 def encode_directions(directions: Tensor) -> Tensor:
-    """Unit vectors of ray `directions` [R, 3], with sines and cosines of 1, 2, 4 and 8 times them:
-    [R, 27]."""
-    return positional(functional.normalize(directions, dim=-1), FREQUENCIES, scale=1.0)
+    """Unit vectors of ray `directions` [R, 3], with sines and cosines of pi, 2 pi, 4 pi and 8 pi
+    times them: [R, 27]."""
+    return positional(functional.normalize(directions, dim=-1), FREQUENCIES)
 
 
 class Decoder(nn.Module):
@@ -36,10 +36,11 @@ class Decoder(nn.Module):
         self.colour = _linear(3, CHANNELS, generator)
 
     def density(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Density [S], integrated over the segment, and what `colours` needs [S, 32]."""
+        """Density [S], integrated over the segment, before its ReLU; what `colours` needs
+        [S, 32]."""
         hidden = self.second(self.first(features).relu()).relu()
         sigma, geometry = self.third(hidden).split((1, CHANNELS), dim=1)
-        return sigma.squeeze(1).relu(), geometry
+        return sigma.squeeze(1), geometry
 
     def colours(self, geometry: Tensor, encoded: Tensor, ray: Tensor) -> Tensor:
         """RGB [S, 3] in [0, 1] on rays `ray` [S] of encoded directions [R, 27]."""

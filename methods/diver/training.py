@@ -27,7 +27,8 @@ class DiverLessons(PixelOptions):
 
     Attributes:
         corner_rate: learning rate at the beginning, of the features of the corners.
-        sparsity: weight of the mean of log(1 + 2 sigma^2) over all segments.
+        sparsity: weight of the mean of log(1 + 2 sigma^2) over the segments that are not hidden,
+            sigma before its ReLU: what is negative is drawn back to 0.
         prune_at: share of the steps after which voxels go that hardly show.
         prune_below: largest weight, in all rays that were looked along, of a voxel that goes.
         prune_rays: random training rays that are looked along, at most as many as there are.
@@ -81,23 +82,22 @@ class DiverTraining(PixelTraining):
         count = len(crossings)
         weight = model.weights(rays, crossings)
         features = model.features(pad(crossings.voxel), pad(weight), self.grad)
-        sigma, geometry = model.decoder.density(features)
-        self._push_to_sparsity(sigma, count)
+        raw, geometry = model.decoder.density(features)
+        self._push_to_sparsity(raw, count)
         encoded = encode_directions(rays.directions)
         colours = model.decoder.colours(geometry, encoded, pad(crossings.ray))
-        pixels = composite(
-            sigma[:count], colours[:count], as_intervals(crossings), stop=STOP, backend=backend
-        )
+        sigma, intervals = raw[:count].relu(), as_intervals(crossings)
+        pixels = composite(sigma, colours[:count], intervals, stop=STOP, backend=backend)
         return pixels.over(background), count
 
-    def _push_to_sparsity(self, sigma: Tensor, count: int) -> None:
-        """Add, to the gradient of the first `count` of `sigma`, that of the mean of
+    def _push_to_sparsity(self, raw: Tensor, count: int) -> None:
+        """Add, to the gradient of the first `count` of the densities `raw`, that of the mean of
         log(1 + 2 sigma^2)."""
-        if self.options.sparsity and sigma.requires_grad:
-            slope = 4 * sigma.detach() / (1 + 2 * sigma.detach().square())
+        if self.options.sparsity and raw.requires_grad:
+            slope = 4 * raw.detach() / (1 + 2 * raw.detach().square())
             slope[count:] = 0
             push = self.options.sparsity / max(count, 1) * slope
-            sigma.register_hook(lambda grad: grad + push)
+            raw.register_hook(lambda grad: grad + push)
 
     @torch.no_grad()
     def _densities(self, rays: Rays, crossings: Crossings) -> Tensor:
@@ -105,7 +105,7 @@ class DiverTraining(PixelTraining):
         model = self.model
         weight = model.weights(rays, crossings)
         features = model.features(pad(crossings.voxel), pad(weight))
-        return model.decoder.density(features)[0][: len(crossings)]
+        return model.decoder.density(features)[0][: len(crossings)].relu()
 
     @torch.no_grad()
     def _prune(self) -> None:

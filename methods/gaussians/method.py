@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Literal
@@ -99,10 +100,12 @@ class GaussianSplatting:
             field = train_field(setup, scene, budget, log)
             key["field"] = setup.key(scene, budget)
         finished = log.stage_dir("gaussians", key) / "gaussians.safetensors"
+        begun = time.monotonic()
         gaussians = self._untrained(field, scene, finished.exists())
         work = GaussianTraining(
             gaussians, scene, budget.renderer_steps, self.fitting, setup.backend, setup.seed
         )
+        work.seconds = time.monotonic() - begun
         loop.train(work, finished, "gaussians", log)
         self.train_s = work.seconds + (0.0 if field is None else field.train_s)
         exported = finished.with_suffix(".ply")

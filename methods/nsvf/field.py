@@ -116,7 +116,7 @@ class NsvfField(StudentField):
 
     def _density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         embedding, inside = self.embedding(positions)
-        hidden = self.trunk(positional(embedding, EMBEDDING_FREQUENCIES, scale=1.0))
+        hidden = self.trunk(positional(embedding, EMBEDDING_FREQUENCIES))
         raw = self.opacity(hidden)[:, 0].to(embedding.dtype)
         return FREE_ENERGY * ACROSS * torch.where(inside, density_of(raw), 0), hidden
 

@@ -108,7 +108,7 @@ class PlenOctree(Student):
                 samples, shown = to_host([crossed.sum(), shaded.sum()])
             probe.count("samples", samples)
             probe.count("shaded_samples", shown, samples)
-            return pixels
+            return opaque_at_end(pixels, self.stop)
 
         return octree.occupancy, render
 
@@ -119,3 +119,15 @@ class PlenOctree(Student):
     def settings(self) -> dict[str, str]:
         """See `bench.types.Method.settings`."""
         return super().settings() | {"precision": self.stored}
+
+
+def opaque_at_end(pixels: Pixels, stop: float) -> Pixels:
+    """With the rays opaque that ended at the transmittance `stop`, as in the release's viewer: what
+    they show is scaled to an opacity of 1."""
+    ended = 1 - pixels.alpha <= stop
+    scale = torch.where(ended, 1 / pixels.alpha, 1)
+    return Pixels(
+        pixels.values * scale[:, None],
+        pixels.depth_sum * scale,
+        torch.where(ended, 1, pixels.alpha),
+    )

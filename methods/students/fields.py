@@ -145,14 +145,14 @@ class StudentTraining(PixelTraining):
         return positions, functional.normalize(directions, dim=1)
 
     def _difference(self, positions: Tensor, directions: Tensor) -> Tensor:
-        """Mean square of the differences in opacity over `REACH`, and in colour where there is
-        any."""
+        """Mean square of the differences in opacity over `REACH` and, where there is any, in red,
+        green and blue, which count as much each."""
         with torch.no_grad():
             wanted, shown = _seen(self.teacher, positions, directions)
         opacity, colour = self._learned(positions, directions)
         return (
             functional.mse_loss(opacity, wanted)
-            + (wanted[:, None] * (colour - shown).square()).mean()
+            + (wanted * (colour - shown).square().sum(dim=1)).mean()
         )
 
     def _learned(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:

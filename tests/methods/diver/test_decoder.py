@@ -44,8 +44,9 @@ def test_directions_are_encoded_by_sines_and_cosines() -> None:
     want = [0.0, 0.6, 0.8]
     for k in range(4):
         for function in (math.sin, math.cos):
-            want += [function(2**k * x) for x in (0.0, 0.6, 0.8)]
-    torch.testing.assert_close(encoded, torch.tensor([want]), rtol=0, atol=1e-6)
+            want += [function(math.pi * 2**k * x) for x in (0.0, 0.6, 0.8)]
+    # Angles of up to 8 pi are rounded to 2^-20, and doubled three times.
+    torch.testing.assert_close(encoded, torch.tensor([want]), rtol=0, atol=8 * 2.0**-20)
     assert encoded.shape == (1, 27)
 
 
@@ -54,10 +55,10 @@ def test_rendered_rays_are_those_of_the_trained_model() -> None:
     model, rays = random_model(), some_rays(200)
     crossings = walk(rays, model.voxels)
     features = model.features(crossings.voxel, model.weights(rays, crossings))
-    sigma, geometry = model.decoder.density(features)
+    raw, geometry = model.decoder.density(features)
     encoded = encode_directions(rays.directions)
     colours = model.decoder.colours(geometry, encoded, crossings.ray)
-    want = composite(sigma, colours, as_intervals(crossings), stop=0.0)
+    want = composite(raw.relu(), colours, as_intervals(crossings), stop=0.0)
     got = Baked(model, "fp32").render_rays(rays, NullProbe(), stop=0.0, faint=0.0)
     # Five layers of 32 numbers below 8 with sums of 32 roundings: 5 x 32 x 8 u = 8e-5.
     torch.testing.assert_close(got.values, want.values.detach(), rtol=0, atol=1e-4)

@@ -49,6 +49,19 @@ def test_it_begins_with_the_encoding_of_the_teacher(
     assert (model.table[:, GRID.channels :] == 0).all()
 
 
+def test_sparsity_draws_a_negative_density_back_to_zero(
+    ball_scene: Scene, teacher: TrainedField
+) -> None:
+    """Its slope is 4 s / (1 + 2 s^2) of the mean, of the first `count` densities alone."""
+    training = method_of().begin(teacher, ball_scene, TAUGHT)
+    raw = torch.tensor([-2.0, 0.0, 0.5, 3.0], requires_grad=True)
+    shown = raw * 1.0
+    training._push_to_sparsity(shown, 3)
+    shown.relu().mul(0).sum().backward()
+    wanted = LESSONS.sparsity / 3 * torch.tensor([-8 / 9, 0, 4 / 3, 0])
+    torch.testing.assert_close(raw.grad, wanted)
+
+
 def test_pruning_leaves_what_shows(ball_scene: Scene, teacher: TrainedField) -> None:
     late = replace(LESSONS, prune_at=1.0)
     method = method_of(stored="fp32", stop=1e-4, faint=0.0, training=late)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ from tests.methods.trainings import (
 
 BUDGET = replace(TAUGHT, steps=80, renderer_steps=4)
 U = 2.0**-24
+SINES = (torch.sin, torch.cos)
 
 
 def new_method(**options: Any) -> Nsvf:
@@ -91,6 +93,7 @@ def test_density_is_zero_outside_voxels() -> None:
 
 
 def test_the_network_is_that_of_the_publication() -> None:
+    """And its encodings those of the release, in which only that of angles goes without pi."""
     field = two_thirds().float()
     network = sum(p.numel() for name, p in field.named_parameters() if name != "embeddings")
     assert network == 545_284
@@ -110,8 +113,8 @@ def test_the_network_is_that_of_the_publication() -> None:
     places = torch.rand(300, 3, generator=torch.Generator().manual_seed(4))
     d = functional.normalize(torch.randn(300, 3, generator=torch.Generator().manual_seed(5)), dim=1)
     e, inside = field.embedding(places)
-    encoded = torch.cat((e, *(f(2**k * e) for k in range(6) for f in (torch.sin, torch.cos))), 1)
-    seen = torch.cat([f(2**k * d) for k in range(4) for f in (torch.sin, torch.cos)], dim=1)
+    encoded = torch.cat((e, *(f(math.pi * 2**k * e) for k in range(6) for f in SINES)), 1)
+    seen = torch.cat([f(2**k * d) for k in range(4) for f in SINES], dim=1)
     feature = trunk(encoded)
     sigma, geometry = field.density(places)
     shown = field.features(geometry, field.encode_directions(d))

@@ -12,7 +12,8 @@ import torch
 from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene, SteerbenchError
 from methods.instant_ngp.stage1 import TrainedField
 from methods.instant_ngp.training import PixelBatches
-from methods.plenoctree.method import PlenOctree
+from methods.kernels.composite import Pixels
+from methods.plenoctree.method import PlenOctree, opaque_at_end
 from methods.plenoctree.octree import Octree
 from methods.plenoctree.start import Extraction, extract, fibonacci_sphere
 from methods.plenoctree.training import OctreeLessons, OctreeTraining
@@ -40,6 +41,15 @@ def extracted(teacher: TrainedField, scene: Scene, **others) -> Octree:
     batches = PixelBatches(scene.splits["train"], torch.device("cpu"))
     generator = torch.Generator().manual_seed(0)
     return extract(teacher, batches, Extraction(**SMALL | others), generator)
+
+
+def test_a_ray_that_ends_is_opaque_and_keeps_its_colour_and_depth() -> None:
+    alpha = torch.tensor([0.0, 0.5, 0.98, 0.995, 1.0])
+    depth, colour = 3.0, torch.tensor([0.2, 0.4, 0.8])
+    shown = opaque_at_end(Pixels(alpha[:, None] * colour, alpha * depth, alpha), stop=0.01)
+    assert shown.alpha.tolist() == [*alpha[:3].tolist(), 1.0, 1.0]
+    torch.testing.assert_close(shown.values, shown.alpha[:, None] * colour)
+    torch.testing.assert_close(shown.depth_sum, shown.alpha * depth)
 
 
 def test_leaves_stand_where_the_ball_is(ball_scene: Scene, teacher: TrainedField) -> None:
