@@ -113,7 +113,7 @@ def _measurement(
     method, meter, scoring = take.method, take.meter, take.scoring
     frames = _frame_table(take.rows, protocol)
     summary = [
-        *_frame_rows(frames, protocol),
+        *_frame_rows(frames),
         *(_single(f"size_bytes.{part}", size) for part, size in method.sizes().items()),
         _single("size_bytes.total", sum(method.sizes().values())),
         _single("peak_bytes", meter.peak_bytes),
@@ -202,29 +202,36 @@ def _frame_table(table: list[dict[str, Any]], protocol: EvaluationProtocol) -> p
     return frames.reindex(columns=columns).fillna(dict.fromkeys(touched, 0))
 
 
-def _frame_rows(frames: pd.DataFrame, protocol: EvaluationProtocol) -> list[dict[str, Any]]:
+def _frame_rows(frames: pd.DataFrame) -> list[dict[str, Any]]:
+    """The rows of the steady frames, then those of the cold ones, where there are any."""
+    return [
+        row | {"phase": phase}
+        for phase in (STEADY, COLD)
+        if len(of_phase := frames[frames["phase"] == phase])
+        for row in phase_rows(of_phase)
+    ]
+
+
+def phase_rows(frames: pd.DataFrame) -> list[dict[str, Any]]:
     """Mean and interval of every column, quantiles of the frame time, frames a second.
 
-    First those of the steady frames, then those of the cold ones, where there are any.
+    Args:
+        frames: one or more, in the order of the path: `frame`, `name` and `phase`, scores up to
+            `flicker`, times, work, memory.
     """
-    rows: list[dict[str, Any]] = []
-    for phase in (STEADY, COLD):
-        of_phase = frames[frames["phase"] == phase]
-        if of_phase.empty:
-            continue
-        blink = ["flicker"] if of_phase["flicker"].notna().any() else []
-        parts = [name for name in map(str, frames) if name.startswith(("stage_ms.", "work."))]
-        times = of_phase["frame_ms"]
-        ms = mean_row("frame_ms", times)
-        found = [
-            *(mean_row(name, of_phase[name]) for name in (*protocol.metric_names, *blink)),
-            ms,
-            *(_single(f"frame_ms.p{part}", np.percentile(times, part)) for part in QUANTILES),
-            {"metric": "fps", "n": ms["n"]} | _rate(ms),
-            *(mean_row(name, of_phase[name]) for name in parts),
-        ]
-        rows += [row | {"phase": phase} for row in found]
-    return rows
+    columns = list(map(str, frames))
+    scores = columns[columns.index("phase") + 1 : columns.index("flicker")]
+    blink = ["flicker"] if frames["flicker"].notna().any() else []
+    parts = [name for name in columns if name.startswith(("stage_ms.", "work."))]
+    times = frames["frame_ms"]
+    ms = mean_row("frame_ms", times)
+    return [
+        *(mean_row(name, frames[name]) for name in (*scores, *blink)),
+        ms,
+        *(_single(f"frame_ms.p{part}", np.percentile(times, part)) for part in QUANTILES),
+        {"metric": "fps", "n": ms["n"]} | _rate(ms),
+        *(mean_row(name, frames[name]) for name in parts),
+    ]
 
 
 def mean_row(metric: str, values: pd.Series) -> dict[str, Any]:

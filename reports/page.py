@@ -14,7 +14,7 @@ from reports.images import MOST_RENDERINGS, frame_section, kept_frames
 from reports.parts import Part, Plot
 from reports.provenance import facts
 from reports.publish import publish
-from reports.runs import Repeated, Run, load
+from reports.runs import Repeated, Run, load, over_common_frames
 from reports.tables import Table, run_tables
 
 
@@ -37,7 +37,7 @@ def write_page(
     Raises:
         SteerbenchError: a run is not in the store, or `folder` cannot be written to.
     """
-    runs = load(store, labels)
+    runs = over_common_frames(load(store, labels))
     parts = [
         *_heading(runs, failures or {}),
         *_tradeoffs(runs),

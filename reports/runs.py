@@ -14,7 +14,8 @@ import pandas as pd
 
 from bench.errors import SteerbenchError
 from bench.intervals import half_interval
-from bench.results import WHOLE, Store, unreadable
+from bench.results import STEADY, WHOLE, Store, unreadable
+from bench.run import phase_rows
 from reports.tables import headline, phases, run_tables, suffix
 
 
@@ -150,6 +151,38 @@ class Repeated:
             for run in self.runs
         )
         return [math.fsum(figures) for figures in of_runs if figures]
+
+
+def over_common_frames(runs: Sequence[Run]) -> list[Run]:
+    """The same runs with the steady figures of common frames: of the frames alone that are steady
+    in all of the runs that render the same views. A method that looks back has fewer than one that
+    does not, and the first of a path are no average ones.
+
+    Runs without steady frames stay as they are, as do all that have no such frame in common.
+    """
+    steady = [set(run.frames.loc[run.frames["phase"] == STEADY, "frame"]) for run in runs]
+    common: dict[tuple[object, ...], set[int]] = {}
+    for run, frames in zip(runs, steady, strict=True):
+        if frames:
+            common[run.views] = common.get(run.views, frames) & frames
+    return [
+        _over(run, common[run.views]) if common.get(run.views, frames) < frames else run
+        for run, frames in zip(runs, steady, strict=True)
+    ]
+
+
+def _over(run: Run, kept: Collection[int]) -> Run:
+    """With the steady figures of the frames `kept`; as they were if there is none."""
+    if not kept:
+        return run
+    frames = run.frames
+    chosen = frames[(frames["phase"] == STEADY) & frames["frame"].isin(kept)]
+    found = pd.DataFrame(phase_rows(chosen)).set_index("metric")
+    rows = run.rows.copy()
+    changed = (rows["phase"] == STEADY) & rows["metric"].isin(found.index)
+    for column in ("value", "n", "lo", "hi"):
+        rows.loc[changed, column] = rows.loc[changed, "metric"].map(found[column])
+    return replace(run, rows=rows)
 
 
 def load(store: Store, labels: Mapping[str, str]) -> list[Run]:

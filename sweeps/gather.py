@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bench.results import Store
-from reports.runs import Repeated, Run, readable
+from reports.runs import Repeated, Run, over_common_frames, readable
 from reports.scenes import over_scenes
 from sweeps import failures
 from sweeps.measurement import job_key, of_scene
@@ -66,10 +66,22 @@ def _outcome(job: Planned, runs: Mapping[str, Sequence[Run]], outputs: Path) -> 
 
 
 def _lines(of_block: Mapping[str, Sequence[Outcome]]) -> list[Repeated]:
-    """The lines of a block, each from the outcomes of its jobs."""
+    """The lines of a block, each from the outcomes of its jobs, over their common frames."""
+    of_block = _over_common_frames(of_block)
     measured = [{each.job.scene for each in line if each.run} for line in of_block.values()]
     common = set.intersection(*filter(None, measured)) if any(measured) else set()
     return [_line(label, outcomes, common) for label, outcomes in of_block.items()]
+
+
+def _over_common_frames(
+    of_block: Mapping[str, Sequence[Outcome]],
+) -> dict[str, list[Outcome]]:
+    every = [each for line in of_block.values() for each in line]
+    runs = iter(over_common_frames([each.run for each in every if each.run]))
+    return {
+        label: [replace(each, run=next(runs)) if each.run else each for each in line]
+        for label, line in of_block.items()
+    }
 
 
 def _line(label: str, outcomes: Sequence[Outcome], common: set[str]) -> Repeated:

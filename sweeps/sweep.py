@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 from bench.results import Store
 from reports.comparison import comparison
 from reports.page import write_page
-from reports.runs import load
+from reports.runs import load, over_common_frames
 from sweeps import failures
 from sweeps.jobs import Job, attempt, read, say, time_left, varying
 from sweeps.sweep_callback import SweepCallback
@@ -87,7 +87,7 @@ def _labels(jobs: Sequence[Job], names: Sequence[str]) -> tuple[dict[str, str], 
 
 def _show(store: Store, labels: dict[str, str], failed: dict[str, str]) -> None:
     """Print the table of all jobs, and why a figure is missing."""
-    runs = load(store, labels)
+    runs = over_common_frames(load(store, labels))
     show(comparison(runs, failed))
     for note in dict.fromkeys(
         f"{metric}: n/a. {why}" for run in runs for metric, why in run.record["missing"].items()
