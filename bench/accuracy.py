@@ -149,7 +149,10 @@ def render_in_turns(
     """
     images = scene.splits[trajectory.split].images
     ready, scored = steady_frames(methods.values(), trajectory)
-    clocks = {name: StageClock(method.settings()["device"]) for name, method in methods.items()}
+    clocks = {
+        name: StageClock(method.settings()["device"], stages=protocol.stages)
+        for name, method in methods.items()
+    }
     first: dict[int, Tensor] = {}
     found: dict[str, list[tuple[float, float, float]]] = {name: [] for name in methods}
     with torch.no_grad(), log.progress("rendering", (repeats + 1) * len(methods)) as progress:

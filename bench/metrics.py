@@ -134,7 +134,9 @@ class Lpips:
         _check_pair(image, reference)
         check_size(f"lpips_{self.net}", image.shape[1], image.shape[0])
         pair = torch.stack((image, reference)).float().permute(0, 3, 1, 2)  # channels last
-        distance = self._model.to(image.device)(pair[:1], pair[1:], normalize=True)
+        # On a GPU, too, in float32: unless told not to, cuDNN rounds the inputs of convolutions.
+        with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+            distance = self._model.to(image.device)(pair[:1], pair[1:], normalize=True)
         return float(distance.item())
 
 

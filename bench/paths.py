@@ -142,9 +142,15 @@ def _of_frames(record: dict, file: Path, scene: Scene) -> list[Camera]:
         settings = ChainMap(frame, record)
         width = whole_number(settings.get("w", usual.width), f"{where}.w", 1)
         height = whole_number(settings.get("h", usual.height), f"{where}.h", 1)
-        fx = focal(settings, "x", width, where) or usual.fx * width / usual.width
-        fy = focal(settings, "y", height, where) or fx
-        found.append(_camera(opengl_pose(frame, where), fx, fy, width, height))
+        given = focal(settings, "x", width, where)
+        fx = given or usual.fx * width / usual.width
+        fy = focal(settings, "y", height, where) or given or usual.fy * height / usual.height
+        centre = usual.cx * width / usual.width, usual.cy * height / usual.height
+        cx, cy = (
+            number(settings.get(name, value), f"{where}.{name}", 0, most)
+            for name, value, most in zip(("cx", "cy"), centre, (width, height), strict=True)
+        )
+        found.append(Camera(opengl_pose(frame, where), fx, fy, cx, cy, width, height))
     return found
 
 

@@ -72,13 +72,17 @@ def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
     order, where numbers in names count as numbers.
 
     Raises:
-        SteerbenchError: a picture is missing, or there is one that belongs to none of `names`.
+        SteerbenchError: a picture is missing, there is one that belongs to none of `names`, or two
+            of these are the same.
     """
     files = listed(folder)
     if match == "order":
         if len(files) != len(names):
             raise unexpected(folder, f"{len(names)} pictures, as many as true ones", len(files))
         return files
+    if twice := sorted({name for name in names if names.count(name) > 1}, key=_natural):
+        wanted = "true pictures of different names; --match order takes both in their order"
+        raise unexpected(folder, wanted, f"several of {_some(twice)}")
     known = {path.stem: path for path in files}
     missing = [name for name in names if name not in known]
     further = sorted(known.keys() - set(names), key=_natural)
@@ -140,14 +144,14 @@ def score(
     frames: list[dict[str, Any]] = []
     images: dict[str, np.ndarray] = {}
     sizes, alphas = set(), 0
-    seen, blinking = hashlib.sha256(), Flicker()
+    seen, truths, blinking = hashlib.sha256(), hashlib.sha256(), Flicker()
     with log.progress("scoring", len(pairs)) as progress:
         for index, pair in enumerate(pairs):
             picture = read(pair.picture)
             truth = read(pair.truth) if isinstance(pair.truth, Path) else pair.truth
             _check(pair, picture, truth, protocol)
-            for tensor in (picture, truth):
-                seen.update(tensor.numpy().tobytes())
+            seen.update(picture.numpy().tobytes())
+            truths.update(truth.numpy().tobytes())
             alphas += picture.shape[2] == 4
             rgb = composite(picture, background)
             figures = protocol.score(rgb, truth, background, lpips)
@@ -170,7 +174,12 @@ def score(
         protocol=protocol.name,
         **facts,
     )
-    record = {"protocol": asdict(protocol), "content": seen.hexdigest(), "with_alpha": alphas}
+    record = {
+        "protocol": asdict(protocol),
+        "pictures": seen.hexdigest(),
+        "truths": truths.hexdigest(),
+        "with_alpha": alphas,
+    }
     return Measurement(rows, table, images, record)
 
 

@@ -85,9 +85,14 @@ class EvaluationProtocol:
         """Raise, before any training, if the frames could not be scored after it.
 
         Raises:
-            SteerbenchError: the scene is composited on another background, or a frame is smaller
-                than a metric's window.
+            SteerbenchError: the scene is composited on another background, has no exact pictures
+                for the flicker, or a frame is smaller than a metric's window.
         """
+        if self.flicker == "exact" and scene.exact is None:
+            raise SteerbenchError(
+                f"protocol.flicker=exact: scene {scene.name} has no exact pictures, expected an "
+                "embedded one; use protocol.flicker=split"
+            )
         wanted = torch.full((3,), BACKGROUNDS[self.background])
         if not torch.equal(scene.background.cpu().float(), wanted):
             got = ", ".join(f"{value:g}" for value in scene.background.tolist())

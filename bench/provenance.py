@@ -48,7 +48,7 @@ def machine() -> dict[str, object]:
 def decisive() -> dict[str, object]:
     """The part of the machine that can change a figure; see `bench.sources` for its libraries."""
     found = machine()
-    return {name: found[name] for name in ("cpu", "instructions", "gpus")}
+    return {name: found[name] for name in ("cpu", "instructions", "gpus", "python")}
 
 
 def computed_by(*things: Any) -> dict[str, object]:
@@ -61,6 +61,7 @@ def computed_by(*things: Any) -> dict[str, object]:
         "libraries": libraries(*things),
         "machine": decisive(),
         "threads": torch.get_num_threads(),
+        "kernel_threads": os.environ.get("NUMBA_NUM_THREADS", ""),  # at most so many
     }
 
 

@@ -15,6 +15,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from bench.errors import SteerbenchError
+
 ROOT = Path(__file__).resolve().parent.parent
 OURS = ("bench", "methods")
 WEIGHTS = "*.safetensors"
@@ -23,20 +25,29 @@ CHECKS = ("cases.py", "experiments.py")
 
 
 def digest(*things: Any) -> str:
-    """SHA-256 of the names and bytes of the `sources` of `things`."""
-    files = sources(*things)
-    return _hashed(tuple(sorted(files.items())), tuple(_times(files)))
+    """SHA-256 of the names and bytes of the `sources` of `things`.
+
+    Raises:
+        SteerbenchError: one of them was changed since its digest was first taken here. This process
+            may go on with the old code, whose results would stand under the key of the new one.
+    """
+    total = hashlib.sha256()
+    for name, path in sorted(sources(*things).items()):
+        content = _hashed(path, path.stat().st_mtime_ns)
+        if _first.setdefault(path, content) != content:
+            raise SteerbenchError(f"{name} was changed while this process runs: start it again")
+        total.update(f"{name} {content}\n".encode())
+    return total.hexdigest()
+
+
+_first: dict[Path, str] = {}
+"""The hash of each file when it was first asked for."""
 
 
 @cache
-def _hashed(files: tuple[tuple[str, Path], ...], changed: tuple[int, ...]) -> str:
-    """Of `files` as they are since they were `changed`."""
-    total = hashlib.sha256()
-    for name, path in files:
-        content = path.read_bytes()
-        total.update(f"{name} {len(content)}\n".encode())
-        total.update(content)
-    return total.hexdigest()
+def _hashed(path: Path, changed: int) -> str:
+    """Of a file as it is since it was `changed`."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def libraries(*things: Any) -> dict[str, str]:

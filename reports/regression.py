@@ -75,7 +75,7 @@ class Figures:
         values = {
             metric: run.values[metric]
             for metric in limits
-            if math.isfinite(run.values.get(metric, math.nan))
+            if not math.isnan(run.values.get(metric, math.nan))
         }
         steady = run.frames[run.frames["phase"] == STEADY]
         steady = steady if len(steady) else run.frames
@@ -84,6 +84,8 @@ class Figures:
         for metric in values:
             if metric in run.frames and metric not in LARGEST:
                 averaged = scored if metric in QUALITY else steady
+                if metric == "flicker":  # the first frame of a path has none
+                    averaged = averaged.dropna(subset=[metric])
                 names = averaged["frame"].astype(str) + ": " + averaged["name"].fillna("")
                 if averaged[metric].notna().all():
                     frames[metric] = dict(zip(names, averaged[metric].astype(float), strict=True))
@@ -130,12 +132,12 @@ def changes(old: Figures, new: Figures, limits: Mapping[str, Limit] = LIMITS) ->
         if metric not in old.values or (limit.here and old.machine != new.machine):
             continue
         before, after = old.values[metric], new.values.get(metric, math.nan)
-        by, interval, certain = after - before, None, True
-        allowed = limit.absolute + limit.relative * abs(before)
+        by, interval, certain = _apart(before, after), None, True
+        allowed = limit.absolute + (limit.relative and limit.relative * abs(before))
         one, other = old.frames.get(metric, {}), new.frames.get(metric, {})
         both = [name for name in one if name in other]
         if len(both) > 1:
-            apart = np.array([other[name] - one[name] for name in both])
+            apart = np.array([_apart(one[name], other[name]) for name in both])
             by, half = float(apart.mean()), path_interval(apart)
             interval = (by - half, by + half)
             broken = not limit.here and (-limit.better * apart).max() / len(apart) > allowed
@@ -144,6 +146,11 @@ def changes(old: Figures, new: Figures, limits: Mapping[str, Limit] = LIMITS) ->
         gone = math.isnan(after) or len(both) < len(one)
         verdict = "missing" if gone else "worse" if worse else ""
         yield Change(metric, before, after, by, interval, verdict)
+
+
+def _apart(old: float, new: float) -> float:
+    """New less old; 0 of equal pictures, whose PSNR is infinite."""
+    return 0.0 if old == new else new - old
 
 
 def change_table(title: str, found: Sequence[Change]) -> Table:

@@ -89,7 +89,8 @@ def scored(
     parts = {
         "score": digest(pictures.score),
         "libraries": libraries(pictures.score),
-        "content": record["content"],
+        "pictures": record["pictures"],
+        "truths": record["truths"],
         "protocol": asdict(protocol),
         "lpips": protocol.find_lpips(weights, log),
         "facts": facts,
@@ -98,7 +99,7 @@ def scored(
     more: dict[str, Any] = {
         "command": shlex.join(_command(folder, truth, words, name, match, sequence)),
         "missing": missing,
-        "scene": {"name": facts["scene"], "digest": record["content"]},
+        "scene": {"name": facts["scene"], "digest": record["truths"]},
         "budget": {"name": NOTHING},
     }
     key = store.key(parts)

@@ -80,8 +80,9 @@ def decibels(text: str) -> float:
 
 
 def _last_words(words: Sequence[str]) -> list[str]:
-    """`words` without those that a later word for the same setting replaces."""
-    return list({word.partition("=")[0]: word for word in words}.values())
+    """`words` without those that a later word for the same setting replaces; all options stay."""
+    key = {word: word if word.startswith("--") else word.partition("=")[0] for word in words}
+    return list({key[word]: word for word in words}.values())
 
 
 def _knobs(config: DictConfig, words: Sequence[str], trained: bool) -> Knobs:
@@ -137,7 +138,7 @@ def _setting_rows(
             **row,
             "lost": rendered[0]["psnr"] - row["psnr"],
             "instead": rendered[instead]["setting"],
-            "overrides": " ".join(lines[row["setting"]]),
+            "overrides": shlex.join(lines[row["setting"]]),
         }
         for row, instead in zip(rendered, best, strict=True)
     ]

@@ -79,6 +79,25 @@ def test_a_transforms_file_needs_no_pictures(scene: Scene, tmp_path: Path) -> No
     assert camera.fx == pytest.approx(10)
 
 
+def test_a_transforms_file_gives_intrinsics_or_leaves_them_to_the_test_camera(
+    scene: Scene, tmp_path: Path
+) -> None:
+    pose = [[1.0, 0, 0, 3], [0, 1, 0, 0], [0, 0, 1, 8], [0, 0, 0, 1]]
+    given = {"fl_x": 30.0, "fl_y": 31.0, "cx": 9.0, "cy": 14.0}
+    usual = replace(scene.splits["test"].cameras[0], fy=44.0, cx=15.0)
+    split = replace(scene.splits["test"], cameras=[usual])
+    scene = replace(scene, splits={**scene.splits, "test": split})
+    for record, wanted in (
+        (given, (30, 31, 9, 14)),
+        ({}, (40, 44, 15, 12)),
+        ({"w": 64, "h": 48}, (80, 88, 30, 24)),  # of twice the size
+        ({"fl_x": 30.0}, (30, 30, 15, 12)),  # pixels are square where one length is given
+    ):
+        path = stored(tmp_path, record | {"frames": [{"transform_matrix": pose}]})
+        camera = follow(scene, path).steps[0].camera
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == wanted
+
+
 @pytest.mark.parametrize(
     ("record", "message"),
     [

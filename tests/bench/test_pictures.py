@@ -109,6 +109,15 @@ def test_pictures_that_do_not_match_are_named(tmp_path: Path, names: list[str], 
         pictures.pairs_with_folder(ours, true)
 
 
+def test_two_truths_of_one_name_have_no_picture_of_their_own(tmp_path: Path) -> None:
+    ours = write(tmp_path / "ours", {"0001.png": noise(), "0002.png": noise()})
+    with pytest.raises(
+        SteerbenchError, match="--match order takes both in their order, got several of 0001"
+    ):
+        pictures.matched(ours, ["0001", "0001"], "name")
+    assert len(pictures.matched(ours, ["0001", "0001"], "order")) == 2
+
+
 def test_another_number_has_no_order(tmp_path: Path) -> None:
     ours = write(tmp_path / "ours", {"a.png": noise()})
     true = write(tmp_path / "true", {"a.png": noise(), "b.png": noise()})

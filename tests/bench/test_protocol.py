@@ -117,3 +117,11 @@ def test_frames_too_small_for_a_metric_are_refused(tiny_scene):
     QUICK.check(tiny_scene, shrunk)
     with pytest.raises(SteerbenchError, match=r"lpips_alex needs .* 31 x 31 pixels, got 20 x 16"):
         EvaluationProtocol().check(tiny_scene, shrunk)
+
+
+def test_flicker_against_exact_pictures_is_refused_where_there_are_none(tiny_scene):
+    protocol = replace(QUICK, name="exact", flicker="exact")
+    path = from_split(tiny_scene)
+    with pytest.raises(SteerbenchError, match=r"protocol\.flicker=exact: scene .* has no exact"):
+        protocol.check(tiny_scene, path)
+    protocol.check(replace(tiny_scene, exact=lambda camera: torch.zeros(0)), path)

@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 
 from bench import sources
+from bench.errors import SteerbenchError
 from bench.run import measure
-from bench.sources import digest, libraries
+from bench.sources import libraries
 from methods.instant_ngp.stage1 import train_field
 
 FILES = {
@@ -39,6 +40,12 @@ def write(root: Path, files: dict[str, str]) -> None:
 
 def defined_in(module: str, **attributes: Any) -> type:
     return type("Thing", (), {"__module__": module, **attributes})
+
+
+def digest(*things: Any) -> str:
+    """As a process finds it that has just begun."""
+    sources._first.clear()
+    return sources.digest(*things)
 
 
 METHOD = defined_in("methods.alone.method")
@@ -68,6 +75,18 @@ def test_what_a_thing_stands_on_changes_its_digest(tree, name):
     assert digest(METHOD) == before
     (tree / name).write_text(FILES[name] + "\n")
     assert digest(METHOD) != before
+
+
+def test_a_file_that_is_changed_while_a_process_runs_ends_it(tree):
+    """Its old code, still loaded, would store its results under the key of the new one."""
+    before = digest(METHOD)
+    (tree / "bench/ruler.py").write_text("A = 2\n")
+    with pytest.raises(
+        SteerbenchError, match=r"bench/ruler\.py was changed while this process runs"
+    ):
+        sources.digest(METHOD)
+    write(tree, FILES)
+    assert sources.digest(METHOD) == before
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,7 @@ def make(rows: pd.DataFrame) -> Make:
         width: int = 100,
         precision: str = "fp32",
         cpu: str = "EPYC",
+        stages: bool = True,
         **figures: float,
     ) -> Run:
         facts = {"scene": scene, "seed": seed, "resolution": f"{width}x{width}"}
@@ -49,7 +50,11 @@ def make(rows: pd.DataFrame) -> Make:
             "precision": precision,
             "engine": engine,
         }
-        record = {"machine": {"cpu": cpu, "gpus": []}, "made_of": {"config": config}}
+        record = {
+            "machine": {"cpu": cpu, "gpus": []},
+            "made_of": {"config": config},
+            "protocol": {"stages": stages},
+        }
         return Run(key, key, own, pd.DataFrame, record, Path())
 
     return make_run
@@ -99,6 +104,8 @@ def test_stages_that_leave_a_frame_unexplained_are_outliers(make: Make) -> None:
     assert keys(stages_do_not_add_up([make("d", **{"stage_ms.field": 192.0})])) == ["d"]
     assert keys(stages_do_not_add_up([make("b")])) == ["b"]
     assert keys(stages_do_not_add_up([make("c", **{"stage_ms.field": 250.0})])) == ["c"]
+    untimed = {"stage_ms.field": 0.0, "stage_ms.other": 200.0}
+    assert keys(stages_do_not_add_up([make("e", stages=False, **untimed)])) == []
 
 
 def test_int8_without_calibration_may_lose_anything(make: Make) -> None:

@@ -97,6 +97,18 @@ def test_one_broken_frame_among_many_is_worse() -> None:
     assert found.verdict == "worse"
 
 
+def test_frames_without_an_error_hide_no_others() -> None:
+    """Equal pictures have an infinite PSNR, before and after."""
+    before = {str(i): 30.0 for i in range(9)} | {"9": math.inf}
+    after = {str(i): 20.0 for i in range(9)} | {"9": math.inf}
+    values = {**OLD.values, "psnr": math.inf}
+    old, new = (Figures(values, {"psnr": psnr}, "one", "views") for psnr in (before, after))
+    found = next(each for each in changes(old, new) if each.metric == "psnr")
+    assert found.by == pytest.approx(-9)
+    assert found.verdict == "worse"
+    assert next(changes(old, old)).verdict == ""
+
+
 def test_one_slow_frame_among_many_is_chance() -> None:
     times = {str(i): 100.0 for i in range(24)}
     old = replace(OLD, frames={"frame_ms": times})

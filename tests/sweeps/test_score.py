@@ -57,6 +57,20 @@ def test_the_same_pictures_are_the_same_run_and_others_are_another(
     assert len(set(keys)) == 3
 
 
+def test_pictures_of_two_programs_are_compared_where_their_truth_is_the_same(
+    steerbench, folders: tuple[str, str]
+) -> None:
+    theirs, true = folders
+    keys = []
+    for folder in (theirs, true):
+        outcome = steerbench("score", folder, "--truth", true, *QUICK)
+        keys.append(re.search(r"run (\w+)", outcome.out)[1])
+    compared = steerbench("compare", *keys)
+    assert compared.status == 0, compared.err
+    assert "psnr" in compared.out
+    assert steerbench("compare", *reversed(keys)).status == 1
+
+
 def test_the_pictures_of_a_scene_are_its_own_truth(steerbench) -> None:
     assert steerbench("score", "nowhere", *SCENE, *QUICK).status == 2  # writes the scene
     (folder,) = Path("outputs/scenes").glob("totem-*/test")

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from bench.errors import SteerbenchError
 from bench.study import Study, Variant
-from sweeps.studies.accuracy import decibels
+from sweeps.studies.accuracy import _last_words, decibels
 
 VARIANTS = "sweeps.studies.variants"
 EXACT = "method.rendering.skip.empty=false"
@@ -83,6 +83,11 @@ def test_the_fastest_setting_within_the_budget_is_printed_as_a_command(
         "steerbench run method=steernerf_lean scene=totem budget=demo trajectory=orbit seed=3 "
         f"method.rendering.refined={refined}"
     )
+
+
+def test_a_later_word_replaces_one_of_the_same_setting_and_no_folder():
+    words = ["--config-dir=a", "seed=1", "--config-dir=b", "seed=2"]
+    assert _last_words(words) == ["--config-dir=a", "seed=2", "--config-dir=b"]
 
 
 def test_where_nothing_faster_keeps_within_it_everything_off_is_recommended(steerbench, measured):
