@@ -137,6 +137,7 @@ class Lpips:
         # On a GPU, too, in float32: unless told not to, cuDNN rounds the inputs of convolutions.
         with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
             distance = self._model.to(image.device)(pair[:1], pair[1:], normalize=True)
+        self._model.cpu()  # left on a GPU, it would count as memory of the method that is measured
         return float(distance.item())
 
 

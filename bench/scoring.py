@@ -50,6 +50,8 @@ class Flicker:
     ) -> dict[str, float]:
         """The flicker of a frame and its truth, both [H, W, 3], since the frame before, where both
         have a true picture of the same size; none after a `cut`."""
+        if frame is not None:  # kept on a GPU, it would count as memory of the method
+            frame = frame[0].cpu(), frame[1].cpu()
         last, self._last = self._last, frame
         if cut or last is None or frame is None or last[0].shape != frame[0].shape:
             return {}

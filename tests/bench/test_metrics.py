@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from bench.metrics import SMALLEST_SIDE, Lpips, flicker, psnr, quantise, ssim
+from bench.scoring import Flicker
 from bench.types import SteerbenchError, Unavailable
 
 UNIT = st.floats(0.0, 1.0)
@@ -267,3 +268,13 @@ def test_scores_do_not_depend_on_the_strides_of_the_picture(lpips_weights, quiet
     lpips = Lpips("alex", lpips_weights, quiet_log)
     for metric in (psnr, ssim, lpips):
         assert np.isclose(metric(strided, b), metric(a, b), rtol=1e-9, atol=0)
+
+
+def test_scoring_leaves_nothing_on_a_gpu(gpu, lpips_weights, quiet_log):
+    """What lay there would count as memory of the method that is measured."""
+    lpips, blinking = Lpips("alex", lpips_weights, quiet_log), Flicker()
+    pictures = [torch.rand(40, 40, 3).to("cuda") for _ in range(2)]
+    assert math.isfinite(lpips(*pictures))
+    blinking.since_last((pictures[0], pictures[1]))
+    kept = [*lpips._model.parameters(), *lpips._model.buffers(), *blinking._last]
+    assert {tensor.device.type for tensor in kept} == {"cpu"}
