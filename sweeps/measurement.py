@@ -59,6 +59,10 @@ class Settings:
     report: str | None
 
 
+Asked = tuple[DictConfig, Sequence[str]]
+"""The configuration of a measurement, and the command that asks for it."""
+
+
 @dataclass(frozen=True)
 class Obtained:
     """A run that is in the store; `measured` says whether it had to be measured for that."""
@@ -97,9 +101,7 @@ def obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
     return obtain_in_turns([(config, command)])[0]
 
 
-def obtain_in_turns(
-    jobs: Sequence[tuple[DictConfig, Sequence[str]]], turns: str = ""
-) -> list[Obtained]:
+def obtain_in_turns(jobs: Sequence[Asked], turns: str = "") -> list[Obtained]:
     """`obtain` several jobs, which share scene, trajectory, protocol and seed, under the name
     `turns`: unless the store has all of them, they draw each frame one after the other, see
     `bench.run.measure_in_turns`. A job alone has no such name.
@@ -107,7 +109,7 @@ def obtain_in_turns(
     Raises as `obtain` does.
     """
     log = ConsoleLog(Path(jobs[0][0].outputs))
-    ready = [_Ready.of(config, command, turns, log) for config, command in jobs]
+    ready = _ready(jobs, turns, log)
     for one in ready:
         if one.stored:
             one.say_stored(log)
@@ -139,18 +141,19 @@ def _send(one: _Ready, to: Tracker, log: Log) -> None:
         log.info(f"not sent to {one.config.tracker}: {one.run}: {failures.reason(error)}")
 
 
-def stored(config: DictConfig, command: Sequence[str], turns: str = "") -> Obtained | None:
-    """What `obtain_in_turns` would find of this job in the store, if anything.
+def stored(jobs: Sequence[Asked], turns: str = "") -> list[Obtained]:
+    """What `obtain_in_turns` would find of these jobs in the store: all of them, or nothing.
 
     Raises as `obtain` does.
     """
-    log = ConsoleLog(Path(config.outputs))
-    ready = _Ready.of(config, command, turns, log)
-    if not ready.stored:
-        return None
-    ready.say_stored(log)
-    failures.forget(Path(config.outputs), described(config))
-    return Obtained(ready.store, ready.run, measured=False)
+    log = ConsoleLog(Path(jobs[0][0].outputs))
+    ready = _ready(jobs, turns, log)
+    if not all(one.stored for one in ready):
+        return []
+    for one in ready:
+        one.say_stored(log)
+        failures.forget(Path(one.config.outputs), described(one.config))
+    return [Obtained(one.store, one.run, measured=False) for one in ready]
 
 
 def trained(config: DictConfig, log: Log) -> Method:
@@ -209,6 +212,16 @@ class _Ready:
         more = {"command": shlex.join(self.command), "scene_path": _folder(self.config)}
         record = {**measurement.record, **more}
         self.store.save(self.parts, replace(measurement, record=record))
+
+
+def _ready(jobs: Sequence[Asked], turns: str, log: Log) -> list[_Ready]:
+    """The measurements of `jobs`. The key of one in turns names those beside it: if one of them is
+    new, all of them are, and no two lines of a table come from different hours."""
+    ready = [_Ready.of(config, command, turns, log) for config, command in jobs]
+    if not turns:
+        return ready
+    beside = sorted(content_key(one.parts) for one in ready)
+    return [replace(one, parts={**one.parts, "beside": beside}) for one in ready]
 
 
 def scene_of(config: DictConfig) -> Scene:

@@ -86,7 +86,11 @@ def _run(jobs: Sequence[Planned]) -> int:
     for together in of_scenes.values():
         there: dict[str, Obtained] = {}
         if room(together[0].config) > 1:  # or else each job is looked up when its turn comes
-            there = {job.key: found for job in together if (found := _stored(job))}
+            there = {
+                job.key: found
+                for group in _groups(together)
+                for job, found in zip(group, _stored(group), strict=False)
+            }
             train_ahead(together, there)
         seeds = list(dict.fromkeys(job.config.seed for job in together))
         for group in _groups(sorted(together, key=lambda job: seeds.index(job.config.seed))):
@@ -115,12 +119,13 @@ def _obtained(group: Sequence[Planned], there: Mapping[str, Obtained]) -> list[O
     return attempt_in_turns(wanted, group[0].turns)
 
 
-def _stored(job: Planned) -> Obtained | None:
-    """What the store has of `job`; nothing of one that cannot even begin: measuring it says why."""
+def _stored(group: Sequence[Planned]) -> list[Obtained]:
+    """What the store has of all jobs of a group, or nothing; nothing, too, where one cannot even
+    begin: measuring it says why."""
     try:
-        return stored(job.config, job.command, job.turns)
+        return stored([(job.config, job.command) for job in group], group[0].turns)
     except SteerbenchError:
-        return None
+        return []
 
 
 def _groups(jobs: Sequence[Planned]) -> list[list[Planned]]:
