@@ -14,6 +14,7 @@ HELPER = "LEVEL = 0.5\n"
 RENDERER = """
 import torch
 
+from bench import sources
 from bench.types import Frame
 from mine.helper import LEVEL
 
@@ -81,13 +82,18 @@ def keys(tmp_path: Path) -> set[str]:
     return {path.parent.name for path in tmp_path.glob("outputs/runs/*/record.json")}
 
 
-def test_a_change_in_either_module_is_a_new_run(call, folder, tmp_path):
+def test_a_change_in_either_module_is_a_new_run_of_a_new_process(
+    call, folder, tmp_path, monkeypatch
+):
     first = call("run", "method=mine", *SMALL)
     assert first.status == 0, first.err
     assert call("run", "method=mine", *SMALL).err.startswith("already measured")
     for number, name in enumerate(("helper.py", "renderer.py"), 2):
         with (folder / "mine" / name).open("a") as file:
             file.write("# changed\n")
+        refused = call("run", "method=mine", *SMALL)
+        assert f"mine/{name} was changed while this process runs" in refused.err
+        monkeypatch.setattr(sources, "_first", {})  # as a new process
         assert call("run", "method=mine", *SMALL).status == 0
         assert len(keys(tmp_path)) == number
 
