@@ -10,11 +10,12 @@ from typing import Any
 
 import pytest
 
+from bench import sources
+
 HELPER = "LEVEL = 0.5\n"
 RENDERER = """
 import torch
 
-from bench import sources
 from bench.types import Frame
 from mine.helper import LEVEL
 
