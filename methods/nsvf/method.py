@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal
@@ -86,9 +87,12 @@ class Nsvf(FieldStudent):
 
 @torch.no_grad()
 def seen_at_corners(field: NsvfField, teacher: TrainedField) -> None:
-    """Give every corner the teacher's encoding of its place, in the usual size of embeddings."""
+    """Give every corner the teacher's encoding of its place, in 1 / pi of the usual size of
+    embeddings: the network then begins with angles of that size, up to 32 times it, which are still
+    smooth from corner to corner."""
     table = teacher.field
     places = field.vertices / len(field.index)
     found = encode(places, table.table, table.grid, packed=table.packed, backend=table.backend)
     spread = found.std() if found.numel() > 1 else found.new_ones(())
-    field.embeddings.copy_(found * EMBEDDING**-0.5 / spread.clamp(min=1e-12))
+    size = EMBEDDING**-0.5 / math.pi
+    field.embeddings.copy_(found * size / spread.clamp(min=1e-12))

@@ -159,11 +159,11 @@ def test_embeddings_begin_as_the_teachers_features(ball_scene: Scene, shared_log
     field = method.begin(teacher, ball_scene, BUDGET).field
     assert isinstance(field, NsvfField)
     embeddings = field.embeddings.detach()
-    assert embeddings.std().item() == pytest.approx(32**-0.5, rel=1e-5)
+    assert embeddings.std().item() == pytest.approx(32**-0.5 / math.pi, rel=1e-5)
     places = field.vertices / 32
     learned = encode(places, teacher.field.table.detach(), EXACT_GRID, backend="reference")
     # The same table, read by another backend, and a factor: some roundings.
-    scale = 32**-0.5 / learned.std()
+    scale = 32**-0.5 / math.pi / learned.std()
     torch.testing.assert_close(embeddings, scale * learned, rtol=1e-4, atol=1e-5)
 
 
