@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -80,7 +81,7 @@ def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
         if len(files) != len(names):
             raise unexpected(folder, f"{len(names)} pictures, as many as true ones", len(files))
         return files
-    if twice := sorted({name for name in names if names.count(name) > 1}, key=_natural):
+    if twice := _repeated(names):
         wanted = "true pictures of different names; --match order takes both in their order"
         raise unexpected(folder, wanted, f"several of {_some(twice)}")
     known = {path.stem: path for path in files}
@@ -106,8 +107,7 @@ def listed(folder: Path) -> list[Path]:
     files.sort(key=lambda path: _natural(path.name))
     if not files:
         raise unexpected(folder, f"pictures ({', '.join(SUFFIXES)})", "none")
-    stems = [path.stem for path in files]
-    if twice := sorted({stem for stem in stems if stems.count(stem) > 1}):
+    if twice := _repeated([path.stem for path in files]):
         raise unexpected(folder, "one picture of a name", f"several of {_some(twice)}")
     return files
 
@@ -193,6 +193,11 @@ def _check(pair: Pair, picture: Tensor, truth: Tensor, protocol: EvaluationProto
                 check_size(metric, picture.shape[1], picture.shape[0])
             except SteerbenchError as error:
                 raise SteerbenchError(f"{pair.picture}: {error}") from error
+
+
+def _repeated(names: Sequence[str]) -> list[str]:
+    """Those that are there more than once."""
+    return sorted((name for name, count in Counter(names).items() if count > 1), key=_natural)
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
