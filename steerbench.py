@@ -46,7 +46,7 @@ from bench.types import (
     SteerbenchError,
 )
 from reports.runs import Run, load
-from sweeps import measurement
+from sweeps import configured, measurement
 from sweeps.catalogue import described
 from sweeps.overrides import composed
 from sweeps.score import scored
@@ -96,7 +96,7 @@ def fit(*settings: str) -> Method:
         SteerbenchError: a setting is wrong, or something in the training went wrong.
     """
     config = composed(settings)
-    return measurement.trained(config, ConsoleLog(Path(config.outputs)))
+    return configured.trained(config, ConsoleLog(Path(config.outputs)))
 
 
 def load_scene(*settings: str) -> Scene:
@@ -105,7 +105,7 @@ def load_scene(*settings: str) -> Scene:
     Raises:
         SteerbenchError: it cannot be loaded.
     """
-    return measurement.scene_of(composed(settings))
+    return configured.scene_of(composed(settings))
 
 
 def score(

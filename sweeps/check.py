@@ -15,7 +15,7 @@ from bench.results import Store
 from bench.sharing import whole
 from reports.regression import LIMITS, Figures, Limit, change_table, changes
 from reports.runs import Run, load, readable
-from sweeps.measurement import PLACES
+from sweeps.identity import PLACES
 from sweeps.terminal import console, show
 
 SCHEMA = 1

@@ -10,7 +10,7 @@ from bench.results import Store
 from reports.runs import Repeated, Run, over_common_frames, readable
 from reports.scenes import over_scenes
 from sweeps import failures
-from sweeps.measurement import job_key, of_scene
+from sweeps.identity import job_key, of_scene
 from sweeps.plan import Planned
 
 

@@ -16,7 +16,8 @@ from bench.sharing import whole
 from reports.runs import load
 from reports.tables import decimal
 from sweeps import failures
-from sweeps.measurement import Obtained, described, obtain_in_turns
+from sweeps.identity import described
+from sweeps.measurement import Obtained, obtain_in_turns
 
 SUFFIX = ".job.json"
 

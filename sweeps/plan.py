@@ -15,7 +15,7 @@ from reports.paper_tables import AFTER, METHOD, OF_CURVES, Line, PaperTable, pap
 from sweeps.build import build, target_of
 from sweeps.data_sets import DataSet
 from sweeps.device_lock import on_gpu
-from sweeps.measurement import described, job_key
+from sweeps.identity import described, job_key
 from sweeps.names import unknown
 from sweeps.overrides import changed, choices, composed, setting, swept
 

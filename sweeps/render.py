@@ -22,7 +22,7 @@ from bench.trajectories import MIXED
 from bench.types import Camera, Method, NullProbe
 from bench.video import recorded
 from sweeps.build import build
-from sweeps.measurement import scene_of, trained
+from sweeps.configured import scene_of, trained
 from sweeps.overrides import composed, setting
 
 

@@ -22,7 +22,7 @@ from bench.types import SteerbenchError
 from reports.runs import Run, load
 from reports.tables import run_tables
 from sweeps.build import build
-from sweeps.measurement import checked_settings, scene_of
+from sweeps.configured import checked_settings, scene_of
 from sweeps.names import unknown
 from sweeps.overrides import composed
 from sweeps.terminal import console, rich_table

@@ -18,10 +18,10 @@ from omegaconf import DictConfig
 from bench.console import ConsoleLog
 from bench.results import content_key
 from sweeps.build import build
+from sweeps.configured import trained
 from sweeps.device_lock import device_lock, on_gpu
 from sweeps.failures import reason
 from sweeps.jobs import time_left
-from sweeps.measurement import trained
 from sweeps.plan import Planned
 
 CHOSEN_AFTERWARDS = {

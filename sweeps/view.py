@@ -10,7 +10,7 @@ from bench.console import ConsoleLog
 from bench.study import Variant, study_of
 from bench.viewing import Painter
 from sweeps.build import build
-from sweeps.measurement import scene_of, trained
+from sweeps.configured import scene_of, trained
 from sweeps.overrides import composed
 from sweeps.render import words_of_run
 from sweeps.viewer import AS_GIVEN, Viewer

@@ -18,8 +18,8 @@ from bench.errors import SteerbenchError
 from bench.frontier import best_instead, cheapest_within
 from bench.study import Variant
 from reports.tradeoff import experiment_table, setting_table, write_tradeoff
+from sweeps.configured import checked_settings
 from sweeps.device_lock import device_lock
-from sweeps.measurement import checked_settings
 from sweeps.overrides import composed
 from sweeps.studies.variants import (
     METHOD,

@@ -18,8 +18,8 @@ from bench.trajectories import Trajectory
 from bench.types import Method, NullProbe
 from bench.waits import Line, device_waits
 from reports.tables import Table, decimal, share
+from sweeps.configured import checked_settings
 from sweeps.device_lock import device_lock, on_gpu
-from sweeps.measurement import checked_settings
 from sweeps.overrides import composed
 from sweeps.studies.skips import nothing_skipped
 from sweeps.studies.variants import (

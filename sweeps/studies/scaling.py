@@ -23,8 +23,8 @@ from bench.types import Camera, Log, Method, Scene
 from reports.figures import growth_panels
 from reports.tables import Table, decimal, megabytes
 from sweeps.build import build
+from sweeps.configured import checked_settings, scene_of
 from sweeps.device_lock import device_lock
-from sweeps.measurement import checked_settings, scene_of
 from sweeps.names import unknown
 from sweeps.overrides import composed
 from sweeps.studies.variants import (

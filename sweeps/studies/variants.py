@@ -21,8 +21,8 @@ from bench.trajectories import Trajectory
 from bench.types import Log, Method, Scene
 from reports.tables import decimal
 from sweeps.build import build, engine_kinds, target_of
+from sweeps.configured import checked_settings, scene_of
 from sweeps.device_lock import device_lock
-from sweeps.measurement import checked_settings, scene_of
 from sweeps.overrides import composed
 
 Row = dict[str, Any]

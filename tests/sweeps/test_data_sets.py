@@ -19,7 +19,7 @@ from reports import paper_tables
 from reports.runs import Run, load
 from sweeps import gather
 from sweeps.data_sets import DataSet, find
-from sweeps.measurement import described
+from sweeps.identity import described
 from sweeps.overrides import composed, setting
 from sweeps.paper import data_set
 from sweeps.plan import Planned, plan

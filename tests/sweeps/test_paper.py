@@ -18,7 +18,8 @@ from bench.results import Store
 from bench.types import SteerbenchError, Unavailable
 from reports.paper_tables import paper_tables
 from sweeps import failures, jobs
-from sweeps.measurement import Obtained, described
+from sweeps.identity import described
+from sweeps.measurement import Obtained
 from sweeps.overrides import composed
 from sweeps.plan import Planned, plan
 

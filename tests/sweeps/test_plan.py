@@ -16,9 +16,9 @@ from bench.errors import SteerbenchError
 from bench.results import Store
 from bench.types import Scene
 from reports.paper_tables import paper_tables
-from sweeps import failures, measurement
+from sweeps import configured, failures
 from sweeps.gather import gather, newest
-from sweeps.measurement import described
+from sweeps.identity import described
 from sweeps.overrides import composed
 from sweeps.plan import Planned, plan
 from sweeps.studies.breakdown import with_engine
@@ -65,9 +65,9 @@ def content(monkeypatch: pytest.MonkeyPatch, tiny_scene: Scene) -> Callable[[str
     def none(node: str, root: Path) -> Scene:
         raise AssertionError(f"loads {node}")
 
-    monkeypatch.setattr(measurement, "_scene", none)
+    monkeypatch.setattr(configured, "_scene", none)
     return lambda digest: monkeypatch.setattr(
-        measurement, "_scene", lambda node, root: replace(tiny_scene, digest=digest)
+        configured, "_scene", lambda node, root: replace(tiny_scene, digest=digest)
     )
 
 

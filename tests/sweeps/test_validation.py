@@ -7,7 +7,7 @@ import pytest
 from bench.results import Store
 from bench.types import Scene
 from reports.paper_tables import paper_tables
-from sweeps.measurement import described
+from sweeps.identity import described
 from sweeps.overrides import composed
 from sweeps.plan import plan
 from tests.sweeps.conftest import STAND_INS
