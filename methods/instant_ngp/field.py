@@ -14,7 +14,7 @@ from methods.kernels import multiplies_bf16
 from methods.kernels.encode import HashGrid, encode, pack
 from methods.kernels.spherical import CHANNELS as DIRECTION_CHANNELS
 from methods.kernels.spherical import spherical_harmonics
-from methods.rendering.field import LOG_DENSITY_CLAMP
+from methods.rendering.field import LOG_DENSITY_CLAMP, ROUND_SAMPLES
 
 Precision = Literal["bf16", "fp32"]
 
@@ -35,6 +35,8 @@ class HashField(nn.Module):
     bfloat16 weights with float32 accumulation; parameters, gradients of the table and outputs stay
     float32. So do the activations where the device has no products of bfloat16.
     """
+
+    round_samples = ROUND_SAMPLES
 
     def __init__(
         self,

@@ -51,6 +51,8 @@ class NerfField(StudentField):
         generator: of the first weights.
     """
 
+    round_samples = 2  # a sample costs half a million products
+
     def __init__(
         self, precision: Precision, backend: str, generator: torch.Generator | None = None
     ) -> None:
@@ -91,14 +93,22 @@ class NerfField(StudentField):
         return torch.cat([self._colours(*pair) for pair in pairs])
 
     def _colours(self, geometry: Tensor, encoded: Tensor) -> Tensor:
-        bottleneck = self.bottleneck(geometry)
-        hidden = self.view(torch.cat((bottleneck, encoded.to(bottleneck.dtype)), dim=1)).relu_()
+        hidden = self._view(geometry, encoded).relu_()
         return self.colour(hidden).to(encoded.dtype).sigmoid()
+
+    def _view(self, geometry: Tensor, encoded: Tensor) -> Tensor:
+        """The layer that sees the direction, behind the bottleneck. No activation separates the
+        two, so that one product with both weights spares two thirds of the work of a colour."""
+        of_feature, of_direction = self.view.weight.split((WIDTH, encoded.shape[1]), dim=1)
+        weight = torch.cat((of_feature @ self.bottleneck.weight, of_direction), dim=1)
+        bias = self.view.bias + of_feature @ self.bottleneck.bias
+        inputs = torch.cat((geometry, encoded.to(geometry.dtype)), dim=1)
+        return self.view.forward_with(inputs, weight, bias)
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
         """See `Field`."""
         density = products(self.trunk, self.opacity)
-        colour = products(self.bottleneck, self.view, self.colour)
+        colour = products(self.view, self.colour)
         probe.count("products", density * samples + colour * shaded)
 
     def sizes(self) -> dict[str, int]:

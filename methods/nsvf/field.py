@@ -72,6 +72,8 @@ class NsvfField(StudentField):
         generator: of the first weights and embeddings.
     """
 
+    round_samples = 2  # a sample costs half a million products
+
     index: Tensor
     corners: Tensor
     vertices: Tensor

@@ -16,6 +16,10 @@ BATCH_QUANTUM = 1 << 11
 CHUNK_SAMPLES = 1 << 18
 """Samples that are evaluated together where no gradient needs them: bounds the memory."""
 
+ROUND_SAMPLES = 6
+"""Samples of a ray that a field evaluates together where rays end early, if one costs little. With
+more, some are evaluated in vain behind the end of a ray; with fewer, there are more rounds."""
+
 LOG_DENSITY_CLAMP = 15.0
 """The gradient of exp is taken at a log density clamped to +- this (as torch-ngp and ngp_pl do)."""
 
@@ -26,10 +30,12 @@ class Field(Protocol):
     Attributes:
         channels: K; the first three features are RGB.
         backend: of the kernels that render it.
+        round_samples: samples of a ray that are best evaluated together where rays end early.
     """
 
     channels: int
     backend: str
+    round_samples: int
 
     @property
     def device(self) -> torch.device:

@@ -17,10 +17,6 @@ CHUNK_RAYS = 1 << 16
 """Rays rendered together: enough to keep all threads busy, few enough to stay in the cache. It
 bounds the memory of a GPU, too: it holds the samples of so many rays."""
 
-ROUND_SAMPLES = 6
-"""Samples of a ray in a round: with more, some are evaluated in vain behind its end; with fewer,
-there are more rounds. When fewer than half of the rays are left, each takes as many more."""
-
 
 @torch.no_grad()
 def render_rays(
@@ -49,7 +45,8 @@ def _in_rounds(
     """Render into `canvas` so that few samples are evaluated behind the early stop.
 
     A round takes the next few samples of the rays that are still open, evaluates and composites
-    them, and drops the rays that have ended.
+    them, and drops the rays that have ended. When fewer than half of the rays are left, each takes
+    as many more.
     """
     device = rays.origins.device
     for first in range(0, len(rays.origins), CHUNK_RAYS):
@@ -65,7 +62,7 @@ def _in_rounds(
                     how.step,
                     window=None if how.window is None else how.window[open_],
                     start=start,
-                    limit=ROUND_SAMPLES * max(count // (2 * len(open_)), 1),
+                    limit=field.round_samples * max(count // (2 * len(open_)), 1),
                     backend=field.backend,
                 )
             probe.count("samples", len(samples))

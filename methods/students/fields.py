@@ -17,7 +17,7 @@ from methods.instant_ngp.training import MarchOptions, PixelTraining
 from methods.kernels.composite import Pixels
 from methods.kernels.march import Occupancy
 from methods.rendering.batch import render_batch
-from methods.rendering.field import Field
+from methods.rendering.field import ROUND_SAMPLES, Field
 from methods.rendering.frame import Render, everywhere
 from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
@@ -60,6 +60,7 @@ class StudentField(nn.Module, ABC):
     """
 
     channels = 3
+    round_samples = ROUND_SAMPLES
 
     def __init__(self, backend: str) -> None:
         super().__init__()

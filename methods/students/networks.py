@@ -71,10 +71,13 @@ class Dense(nn.Linear):
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Of [S, I]: [S, O]."""
+        return self.forward_with(inputs, self.weight, self.bias)
+
+    def forward_with(self, inputs: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """The same with `weight` [O, I] and `bias` [O] in place of its own."""
         half = self.precision == "bf16" and multiplies_bf16(self.weight.device.type)
         dtype = torch.bfloat16 if half else self.weight.dtype
-        weight, bias = self.weight.to(dtype), self.bias.to(dtype)
-        return functional.linear(inputs.to(dtype), weight, bias)
+        return functional.linear(inputs.to(dtype), weight.to(dtype), bias.to(dtype))
 
 
 def density_of(raw: Tensor) -> Tensor:

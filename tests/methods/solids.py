@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from bench.types import Probe
+from methods.rendering.field import ROUND_SAMPLES
 
 DENSITY = 1000.0
 """Of what is solid: 7 thousandths of the cube let exp(-7) through."""
@@ -19,6 +20,7 @@ class Solid:
     """A field dense where any of `shapes` is > 0, of up to 4 features in [0, 1] of the place."""
 
     backend = "cpu"
+    round_samples = ROUND_SAMPLES
 
     def __init__(self, *shapes: Shape, density: float = DENSITY, channels: int = 4) -> None:
         self.shapes, self.solid, self.channels = shapes, density, channels

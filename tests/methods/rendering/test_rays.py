@@ -15,7 +15,7 @@ from methods.rendering import rays as rendering
 from methods.rendering.batch import render_batch
 from methods.rendering.march import FAINT, March
 from methods.rendering.occupancy import STEP
-from methods.rendering.rays import CHUNK_RAYS, ROUND_SAMPLES, render_rays
+from methods.rendering.rays import CHUNK_RAYS, render_rays
 from tests.methods.conftest import GRID, Work, look_at_the_middle
 
 
@@ -65,7 +65,7 @@ def test_samples_behind_the_early_stop_are_hardly_evaluated() -> None:
     pixels = render_rays(field, rays, occupancy, work, March())
     hit = int((pixels.alpha > 0).sum())
     assert hit > 0
-    assert work.done["samples"] <= ROUND_SAMPLES * hit  # one round for each ray that hits
+    assert work.done["samples"] <= field.round_samples * hit  # one round for each ray that hits
 
 
 @pytest.mark.parametrize("compacts", [True, False])

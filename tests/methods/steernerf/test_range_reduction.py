@@ -12,10 +12,10 @@ from torch import Tensor
 
 from bench.types import Camera
 from methods.kernels.march import Occupancy
+from methods.rendering.field import ROUND_SAMPLES
 from methods.rendering.frame import FeatureFrame, everywhere, render_frame
 from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
-from methods.rendering.rays import ROUND_SAMPLES
 from methods.steernerf.beyond.window import EDGE, KEPT_ALPHA, DepthPrior, depth_prior, within
 from methods.steernerf.buffer import Cloud
 from methods.steernerf.options import RangeReduction, Reprojection
