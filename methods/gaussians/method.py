@@ -125,7 +125,7 @@ class GaussianSplatting:
             points, colours = (
                 anywhere(scene, self.count, generator)
                 if field is None
-                else on_surfaces(field, setup.training.march, scene, self.count, generator)
+                else on_surfaces(field, scene, self.count, generator)
             )
             scales = self.fitting.size * spacing(points)
         return Gaussians.at(points, colours, scales, self.fitting.opacity, self.degree)

@@ -10,7 +10,6 @@ from torch import Tensor
 from bench.types import NullProbe, Scene
 from methods.instant_ngp.stage1 import TrainedField
 from methods.instant_ngp.training import PixelBatches
-from methods.rendering.march import March
 from methods.rendering.rays import render_rays
 
 SOLID = 0.5
@@ -20,7 +19,7 @@ NEIGHBOURS = 3
 
 
 def on_surfaces(
-    trained: TrainedField, march: March, scene: Scene, count: int, generator: torch.Generator
+    trained: TrainedField, scene: Scene, count: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """`count` points where rays of random training pixels end, and their colours: [count, 3] twice.
 
@@ -32,7 +31,7 @@ def on_surfaces(
     colours: list[Tensor] = []
     for _ in range(64):  # pictures with less than a 64th of matter give fewer points
         rays, _ = batches.draw(count, generator)
-        pixels = render_rays(field, rays, trained.occupancy, NullProbe(), march)
+        pixels = render_rays(field, rays, trained.occupancy, NullProbe(), trained.march)
         hit = pixels.alpha > SOLID
         depth = pixels.depth_sum[hit] / pixels.alpha[hit]
         points.append(rays.origins[hit] + depth[:, None] * rays.directions[hit])

@@ -32,6 +32,9 @@ class InstantNgp:
     memory = 0
     study = Study(
         knobs={"stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3"))},
+        trained={
+            "step, trained": turned("trained step", "method.training.march_step", (1, 2, 4)),
+        },
         exact=("method.stop=1e-4",),
         parts=dict.fromkeys(("rays", "march", "composite"), "field"),
     )
@@ -68,8 +71,8 @@ class InstantNgp:
         """One frame at the camera's full resolution."""
         camera = place_camera(camera, self.setup.device)
         field, occupancy = self.trained.field, self.trained.occupancy
-        march = self.setup.training.march
-        render = everywhere(field, occupancy, probe, replace(march, stop=self.stop))
+        march = replace(self.trained.march, stop=self.stop)
+        render = everywhere(field, occupancy, probe, march)
         return render_frame(camera, occupancy, self.background, probe, render).picture()
 
     def sizes(self) -> dict[str, int]:

@@ -13,6 +13,7 @@ from methods.instant_ngp.training import FieldTraining, TrainingOptions, new_gri
 from methods.kernels import multiplies_bf16, resolve
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy
+from methods.rendering.march import March
 from methods.rendering.occupancy import DensityGrid
 from methods.training import checkpoint, loop
 
@@ -92,10 +93,12 @@ class Setup:
 
 @dataclass(frozen=True)
 class TrainedField:
-    """A trained `field`, the `grid` of its densities, and the seconds its training took."""
+    """A trained `field`, the `grid` of its densities, how its rays were marched (`march`), and the
+    seconds its training took."""
 
     field: HashField
     grid: DensityGrid
+    march: March
     train_s: float
 
     @property
@@ -125,8 +128,8 @@ def train_field(setup: Setup, scene: Scene, budget: Budget, log: Log) -> Trained
             restore_field(field, grid, tensors)
             seconds = figures["seconds"]
         log.info(f"trained field found: {finished}")
-        return TrainedField(field, grid, seconds)
+        return TrainedField(field, grid, setup.training.march(scene), seconds)
     training = FieldTraining(field, scene, budget, setup.training, setup.seed)
     loop.train(training, finished, "training", log)
     field.grad_buffer = None
-    return TrainedField(field, training.grid, training.seconds)
+    return TrainedField(field, training.grid, training.march, training.seconds)

@@ -15,7 +15,7 @@ from methods.instant_ngp.field import HashField
 from methods.instant_ngp.optimiser import FieldOptimiser
 from methods.kernels.composite import Pixels
 from methods.rendering.batch import opacity_entropy, render_batch
-from methods.rendering.march import March, check_step
+from methods.rendering.march import March, check_step, suitable_step
 from methods.rendering.occupancy import EVERY, MIN_VIEWS, STEP, DensityGrid, learnable_cells
 from methods.training import checkpoint, loop
 from methods.training.optimiser import cosine
@@ -61,18 +61,20 @@ class MarchOptions(PixelOptions):
 
     Attributes:
         march_step: length of a ray-marching step, in diagonals of the cube / 1024; the release
-            has 1.
+            has 1. None: as the scene needs, see `suitable_step`.
     """
 
-    march_step: float = 2.0
+    march_step: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_step("march_step", self.march_step)
+        if self.march_step is not None:
+            check_step("march_step", self.march_step)
 
-    @property
-    def march(self) -> March:
-        """Of the rays of the training, and of what is shown as it was trained."""
+    def march(self, scene: Scene) -> March:
+        """Of the rays of a training on `scene`, and of what is shown as it was trained."""
+        if self.march_step is None:
+            return March(step=suitable_step(scene))
         return March(step=self.march_step * STEP)
 
 
@@ -251,7 +253,7 @@ class FieldTraining(PixelTraining):
     ) -> None:
         super().__init__(scene, field.device, budget.steps, budget.samples, options, seed)
         self.field, self.grid = field, new_grid(scene, field.device)
-        self.grid_samples, self.march = options.grid_samples, options.march
+        self.grid_samples, self.march = options.grid_samples, options.march(scene)
         self.optimiser = FieldOptimiser(field)
 
     def advance(self) -> dict[str, float]:

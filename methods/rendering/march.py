@@ -2,16 +2,37 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
+from bench.types import Scene
 from methods.kernels.composite import STOP
-from methods.rendering.occupancy import STEP
+from methods.rendering.occupancy import RESOLUTION, STEP
 
 FAINT = 0.1
 """A sample of less weight than `FAINT * stop` has an opacity but no features: the error is less
 than a tenth of what the early stop may cause."""
+
+
+def suitable_step(scene: Scene) -> float:
+    """World length of a step that suits the training pictures of `scene`: the geometric mean of the
+    width of a pixel where the scene is and that of a cell of the density grid.
+
+    Shorter steps tell apart what no picture shows; longer ones miss what the grid has found. With
+    as many samples, longer steps are more rays, too, so that a training sees more pixels.
+    docs/log.md has the measurements that this follows, "The step that a scene needs".
+    """
+    cameras = scene.splits["train"].cameras
+    corners = torch.cartesian_prod(*scene.bounds.cpu().unbind(dim=1))  # of what may be seen, [8, 3]
+    places = torch.stack([camera.c2w[:, 3].cpu() for camera in cameras])
+    distance = torch.cdist(places, corners).mean(dim=1)
+    focal = torch.tensor([math.sqrt(camera.fx * camera.fy) for camera in cameras])
+    footprint = (distance / focal).median().item()
+    cell = 1 / RESOLUTION
+    return math.sqrt(min(footprint, cell) * cell)
 
 
 def check_step(name: str, length: float) -> None:

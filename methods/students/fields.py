@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.types import Budget, Probe, Rays, Scene
+from bench.types import Budget, Log, Probe, Rays, Scene
 from methods.instant_ngp.stage1 import TrainedField
 from methods.instant_ngp.training import MarchOptions, PixelTraining
 from methods.kernels.composite import Pixels
@@ -19,7 +19,6 @@ from methods.kernels.march import Occupancy
 from methods.rendering.batch import render_batch
 from methods.rendering.field import ROUND_SAMPLES, Field
 from methods.rendering.frame import Render, everywhere
-from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
 from methods.students.method import Student
 from methods.training import checkpoint, loop
@@ -118,7 +117,7 @@ class StudentTraining(PixelTraining):
         super().__init__(scene, device, budget.renderer_steps, samples, options, seed)
         self.field, self.teacher = field, teacher.field
         self.occupancy = occupancy or teacher.occupancy
-        self.march, self.cells = options.march, self.occupancy.cells.nonzero()
+        self.march, self.cells = options.march(scene), self.occupancy.cells.nonzero()
         self.points_until = options.points * self.steps if len(self.cells) else 0
         self.optimiser = torch.optim.Adam(
             field.parameters(), betas=(0.9, 0.99), eps=1e-15, fused=True
@@ -238,10 +237,10 @@ class FieldStudent(Student):
         self.field = self.new_field()
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
 
-    @property
-    def march(self) -> March:
-        """How rays are marched when rendering."""
-        return replace(self.training.march, stop=self.stop)
+    def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
+        """See `Student`."""
+        super().fit(scene, budget, log)
+        self.march = replace(self.training.march(scene), stop=self.stop)
 
     def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
         """See `Student`."""

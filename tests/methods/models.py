@@ -12,6 +12,7 @@ from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.composite import STOP
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy
+from methods.rendering.march import March
 from methods.rendering.occupancy import DensityGrid
 from methods.steernerf.beyond.lean_renderer import LeanRenderer
 from methods.steernerf.options import Model, Rendering, Reprojection
@@ -50,7 +51,7 @@ def shell() -> Occupancy:
 
 def trained_field(field: HashField) -> TrainedField:
     """In place of a trained field: `field`, around the surface of the ball."""
-    return TrainedField(field, DensityGrid(shell().cells), train_s=0.0)
+    return TrainedField(field, DensityGrid(shell().cells), March(), train_s=0.0)
 
 
 def misty_field(precision: str = "bf16", backend: str = "auto", channels: int = 4) -> HashField:

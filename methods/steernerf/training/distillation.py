@@ -14,7 +14,6 @@ from bench.sources import digest
 from bench.types import Budget, Camera, Log, NullProbe, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.rendering.frame import everywhere, render_frame
-from methods.rendering.march import March
 from methods.steernerf.training.sequences import TrueView
 from methods.training import checkpoint
 
@@ -35,12 +34,12 @@ def distilled_views(
         if to_render:
             generator = torch.Generator().manual_seed(setup.seed)
             taken, target = scene.splits["train"].cameras, viewing_target(scene)
-            background, march = scene.background, setup.training.march
+            background = scene.background
             cameras = [novel_view(taken, target, generator) for _ in range(count)]
             began, tensors = time.monotonic(), {}
             with log.progress("distilling", count) as progress:
                 for number, camera in enumerate(cameras):
-                    tensors[f"{number}.picture"] = _picture(trained, camera, background, march)
+                    tensors[f"{number}.picture"] = _picture(trained, camera, background)
                     tensors[f"{number}.camera"] = pack_camera(camera)
                     progress.advance()
             figures = {"views": count, "seconds": time.monotonic() - began}
@@ -54,10 +53,10 @@ def distilled_views(
         return views, figures["seconds"]
 
 
-def _picture(trained: TrainedField, camera: Camera, background: Tensor, march: March) -> Tensor:
+def _picture(trained: TrainedField, camera: Camera, background: Tensor) -> Tensor:
     """uint8 [H, W, 3]."""
     field, probe = trained.field, NullProbe()
     camera, background = place_camera(camera, field.device), background.to(field.device)
-    render = everywhere(field, trained.occupancy, probe, march)
+    render = everywhere(field, trained.occupancy, probe, trained.march)
     frame = render_frame(camera, trained.occupancy, background, probe, render)
     return (frame.values.clamp(0, 1) * 255).round().to(torch.uint8).cpu()

@@ -59,7 +59,7 @@ def test_they_begin_on_surfaces_with_their_colours(
     ball_scene: Scene, teacher: TrainedField
 ) -> None:
     generator = torch.Generator().manual_seed(0)
-    points, colours = on_surfaces(teacher, QUICK.march, ball_scene, 500, generator)
+    points, colours = on_surfaces(teacher, ball_scene, 500, generator)
     radius = (points - 0.5).norm(dim=1)
     assert len(points) == 500
     assert abs(radius.median().item() - 0.3) < 2 * 1.6 / 40
