@@ -128,7 +128,7 @@ def train_field(setup: Setup, scene: Scene, budget: Budget, log: Log) -> Trained
             restore_field(field, grid, tensors)
             seconds = figures["seconds"]
         log.info(f"trained field found: {finished}")
-        return TrainedField(field, grid, setup.training.march(scene), seconds)
+        return TrainedField(field, grid, setup.training.march(budget), seconds)
     training = FieldTraining(field, scene, budget, setup.training, setup.seed)
     loop.train(training, finished, "training", log)
     field.grad_buffer = None

@@ -61,7 +61,7 @@ class MarchOptions(PixelOptions):
 
     Attributes:
         march_step: length of a ray-marching step, in diagonals of the cube / 1024; the release
-            has 1. None: as the scene needs, see `suitable_step`.
+            has 1. None: by the steps of the training of the field, see `suitable_step`.
     """
 
     march_step: float | None = None
@@ -71,10 +71,10 @@ class MarchOptions(PixelOptions):
         if self.march_step is not None:
             check_step("march_step", self.march_step)
 
-    def march(self, scene: Scene) -> March:
-        """Of the rays of a training on `scene`, and of what is shown as it was trained."""
+    def march(self, budget: Budget) -> March:
+        """Of the rays of a training within `budget`, and of what is shown as it was trained."""
         if self.march_step is None:
-            return March(step=suitable_step(scene))
+            return March(step=suitable_step(budget.steps))
         return March(step=self.march_step * STEP)
 
 
@@ -253,7 +253,7 @@ class FieldTraining(PixelTraining):
     ) -> None:
         super().__init__(scene, field.device, budget.steps, budget.samples, options, seed)
         self.field, self.grid = field, new_grid(scene, field.device)
-        self.grid_samples, self.march = options.grid_samples, options.march(scene)
+        self.grid_samples, self.march = options.grid_samples, options.march(budget)
         self.optimiser = FieldOptimiser(field)
 
     def advance(self) -> dict[str, float]:

@@ -117,7 +117,7 @@ class StudentTraining(PixelTraining):
         super().__init__(scene, device, budget.renderer_steps, samples, options, seed)
         self.field, self.teacher = field, teacher.field
         self.occupancy = occupancy or teacher.occupancy
-        self.march, self.cells = options.march(scene), self.occupancy.cells.nonzero()
+        self.march, self.cells = options.march(budget), self.occupancy.cells.nonzero()
         self.points_until = options.points * self.steps if len(self.cells) else 0
         self.optimiser = torch.optim.Adam(
             field.parameters(), betas=(0.9, 0.99), eps=1e-15, fused=True
@@ -240,7 +240,7 @@ class FieldStudent(Student):
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """See `Student`."""
         super().fit(scene, budget, log)
-        self.march = replace(self.training.march(scene), stop=self.stop)
+        self.march = replace(self.training.march(budget), stop=self.stop)
 
     def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
         """See `Student`."""
