@@ -45,6 +45,8 @@ class KiloField(StudentField):
         generator: of the weights, which are the same in all networks at the beginning.
     """
 
+    round_samples = 8  # samples are sorted by network: more of them have longer runs
+
     networks: Tensor
     corner: Tensor
     side: Tensor

@@ -36,6 +36,7 @@ from methods.kernels.composite import composite
 from methods.kernels.encode import HashGrid, encode
 from methods.kernels.march import Occupancy, longest_ray, march
 from methods.kernels.splat import splat
+from methods.kilonerf.field import KiloField
 from methods.kilonerf.method import KiloNerf
 from methods.kilonerf.training import KiloLessons
 from methods.nerf.field import NerfField
@@ -182,7 +183,7 @@ def one_round(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of whole rays, as on a GPU, also where they are hidden in training, so that the sums have the
     same groups; and as few runs of a network before it is recorded."""
     monkeypatch.setattr(stage2, "compacts", lambda device: False)
-    for kind in (HashField, StudentField, NerfField, NsvfField):
+    for kind in (HashField, StudentField, KiloField, NerfField, NsvfField):
         monkeypatch.setattr(kind, "round_samples", longest_ray(STEP))
     monkeypatch.setattr(cuda_graphs, "WARM_UP", 1)
     monkeypatch.setattr(TorchEngine, "samples", lambda engine, network: 1)
