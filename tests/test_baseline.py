@@ -18,7 +18,7 @@ STEERBENCH = Path(sys.executable).with_name("steerbench")
 RUN = [
     *("+experiment=demo", "scene=cloud", "scene.width=64", "scene.train=24", "scene.test=6"),
     *("budget=tiny", "budget.steps=200", "budget.samples=16384", "budget.renderer_steps=100"),
-    *("budget.frames=0", "sizing.field_step=4", "sizing.step=4"),
+    *("budget.frames=0", "sizing.field_step=4", "sizing.refined_step=4", "sizing.step=4"),
 ]
 METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "work.samples", "work.products")
 
