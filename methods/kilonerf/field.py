@@ -45,7 +45,7 @@ class KiloField(StudentField):
         generator: of the weights, which are the same in all networks at the beginning.
     """
 
-    round_samples = 8  # samples are sorted by network: more of them have longer runs
+    round_samples = 8  # measured: docs/log.md
 
     networks: Tensor
     corner: Tensor

@@ -154,9 +154,8 @@ def equal(some: list[torch.Tensor], others: list[torch.Tensor]) -> bool:
 
 
 def alike(some: list[torch.Tensor], others: list[torch.Tensor]) -> bool:
-    """Whether all numbers differ by no more than a few roundings of values up to 1: where torch's
-    vectors are 512 bits long, numbers in the rest of an array are rounded in another way than those
-    in a vector, and the arrays of a device have their own lengths."""
+    """Whether all numbers differ by no more than a few roundings of values up to 1. On a CPU with
+    AVX-512 colours differed in the last bit; which operation rounds in another way is not known."""
     pairs = zip(some, others, strict=True)
     return all(torch.allclose(x, y, rtol=0, atol=1e-6, equal_nan=True) for x, y in pairs)
 
