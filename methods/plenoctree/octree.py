@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import cached_property
 
 import torch
@@ -36,13 +35,15 @@ class Octree:
         return Occupancy.at(self.voxels.coordinates // CELL, self.voxels.resolution // CELL)
 
     def visible(self) -> Octree:
-        """The same with densities of 0 where they are negative."""
-        return Octree(self.voxels, replace(self.light, density=self.light.density.relu()))
+        """The same without the leaves that show nothing: those whose density is not positive."""
+        light, shown = self.light, self.light.density > 0
+        voxels = Voxels(self.voxels.coordinates[shown], self.voxels.resolution)
+        return Octree(voxels, Light(light.density[shown], light.harmonics[shown]))
 
     def rounded(self) -> Octree:
-        """The same as it comes back from a file of 16-bit numbers."""
-        light = self.visible().light
-        return Octree(self.voxels, Light(_half(light.density), _half(light.harmonics)))
+        """The visible leaves as they come back from a file of 16-bit numbers."""
+        light = self.light
+        return Octree(self.voxels, Light(_half(light.density), _half(light.harmonics))).visible()
 
     def sizes(self, width: int) -> dict[str, int]:
         """Bytes of values of `width` bytes, and of what finds them: a word for each brick of the

@@ -12,6 +12,7 @@ from bench.types import Rays
 from methods.kernels.spherical import spherical_harmonics
 from methods.kernels.voxel_walk import Light, Voxels, render_voxels
 from methods.plenoctree.octree import Octree
+from methods.rendering.frame import rays_at_matter
 from tests.methods.conftest import look_at_the_middle
 
 
@@ -33,12 +34,14 @@ def slab(octree: Octree, leaf: int, origin: torch.Tensor, direction: torch.Tenso
     return [ends.amin(0).amax().item(), ends.amax(0).amin().item()]
 
 
-def test_a_picture_is_that_of_a_plain_loop_over_all_leaves() -> None:
-    octree = some_octree().visible()
+def test_the_picture_of_the_visible_leaves_is_that_of_a_plain_loop_over_all() -> None:
+    octree = some_octree()
+    visible = octree.visible()
+    assert len(visible.voxels) == (octree.light.density > 0).sum() < 60
     camera = look_at_the_middle(0.13, 0.4)
     every = cast(camera)
     rays = Rays(every.origins[::9], every.directions[::9])
-    pixels, _, _ = render_voxels(rays, octree.voxels, octree.light, stop=0.0)
+    pixels, _, _ = render_voxels(rays, visible.voxels, visible.light, stop=0.0)
     for ray in range(len(rays.origins)):
         origin, direction = rays.origins[ray].double(), rays.directions[ray].double()
         pieces = [(*slab(octree, leaf, origin, direction), leaf) for leaf in range(60)]
@@ -46,7 +49,7 @@ def test_a_picture_is_that_of_a_plain_loop_over_all_leaves() -> None:
         basis = spherical_harmonics(towards, backend="reference")[0, :4].double()
         light, colour = 1.0, torch.zeros(3, dtype=torch.float64)
         for near, far, leaf in sorted(piece for piece in pieces if piece[1] > piece[0]):
-            sigma = octree.light.density[leaf].item()
+            sigma = max(octree.light.density[leaf].item(), 0)
             weight = light * -math.expm1(-sigma * (far - near) * direction.norm().item())
             colour += weight * (basis @ octree.light.harmonics[leaf].double()).sigmoid()
             light -= weight
@@ -107,17 +110,27 @@ def test_what_a_file_holds_comes_back() -> None:
     assert torch.equal(again.light.harmonics, octree.light.harmonics)
 
 
-def test_rounded_leaves_are_16_bit_numbers_and_not_negative() -> None:
+def test_rounded_leaves_are_16_bit_numbers_and_positive() -> None:
     octree = some_octree()
-    octree.light.density[0] = 1e6
+    octree.light.density[:2] = torch.tensor([1e6, 1e-9])  # opaque, and 0 with 16 bits
     rounded = octree.rounded().light
     for values in (rounded.density, rounded.harmonics):
         assert torch.equal(values, values.half().float())
         assert values.isfinite().all()
-    assert (rounded.density >= 0).all()
-    torch.testing.assert_close(
-        rounded.density[1:], octree.light.density[1:].relu(), rtol=2**-11, atol=2**-24
-    )
+    assert (rounded.density > 0).all()
+    wanted = octree.visible().light.density[2:]
+    torch.testing.assert_close(rounded.density[1:], wanted, rtol=2**-11, atol=0)
+
+
+def test_where_no_leaf_is_visible_there_is_nothing_to_see() -> None:
+    octree = some_octree(size=64)
+    octree.light.density[:] = -1
+    camera = look_at_the_middle(0.13, 0.4)
+    visible = octree.visible()
+    seen, _ = rays_at_matter(camera, visible.occupancy)
+    assert len(visible.voxels) == len(seen) == 0
+    pixels, _, _ = render_voxels(cast(camera), visible.voxels, visible.light)
+    assert (pixels.alpha == 0).all()
 
 
 @pytest.mark.parametrize("width", [2, 4])
