@@ -1,4 +1,4 @@
-"""Comparison of a run with an earlier one: metric by metric, frame by frame."""
+"""Comparison of runs with earlier ones: metric by metric, in pairs of seeds and of frames."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.errors import SteerbenchError
-from bench.intervals import path_interval
+from bench.intervals import half_interval, path_interval
 from bench.results import STEADY
 from reports.runs import Run
 from reports.tables import QUALITY, Table
@@ -100,8 +100,10 @@ class Change:
 
     Attributes:
         old, new: `new` is nan if the new run lacks the metric.
-        by: new less old; the mean over the frames that both runs have, where frames are known.
-        interval: 95 % interval of that mean over frames; None where only two figures are known.
+        by: new less old; the mean over the frames that both runs have, where frames are known, and
+            over the seeds.
+        interval: 95 % interval of that mean, over the seeds; with one seed over its frames; None
+            where only two figures are known.
         verdict: "worse" by more than its limit and not by chance, "missing" if it or a frame is
             gone, else "".
     """
@@ -114,38 +116,64 @@ class Change:
     verdict: str
 
 
-def changes(old: Figures, new: Figures, limits: Mapping[str, Limit] = LIMITS) -> Iterator[Change]:
-    """The change of every metric of `old` that has a limit.
+def changes(
+    old: Sequence[Figures], new: Sequence[Figures], limits: Mapping[str, Limit] = LIMITS
+) -> Iterator[Change]:
+    """The change of every metric of `old` that has a limit, over runs with the same seeds.
 
     A change beyond its limit is chance where its interval contains 0, unless one frame alone moves
-    the mean beyond the limit. Then that frame is broken; but a time may be long by chance.
+    the mean beyond the limit. Then that frame is broken; but a time may be long by chance. With
+    several seeds the interval is that over the seeds. It holds what rounding does to a training
+    where another processor adds in another order; that over the frames of one training does not.
 
     Raises:
         SteerbenchError: the runs rendered other frames.
     """
-    if old.views != new.views:
-        raise SteerbenchError(
-            "these are figures of other frames, expected those of one scene, size and protocol: "
-            f"{old.views}; {new.views}"
-        )
+    pairs = list(zip(old, new, strict=True))
+    for before, after in pairs:
+        if before.views != after.views:
+            raise SteerbenchError(
+                "these are figures of other frames, expected those of one scene, size and "
+                f"protocol: {before.views}; {after.views}"
+            )
+    here = all(before.machine == after.machine for before, after in pairs)
     for metric, limit in limits.items():
-        if metric not in old.values or (limit.here and old.machine != new.machine):
-            continue
-        before, after = old.values[metric], new.values.get(metric, math.nan)
-        by, interval, certain = _apart(before, after), None, True
-        allowed = limit.absolute + (limit.relative and limit.relative * abs(before))
-        one, other = old.frames.get(metric, {}), new.frames.get(metric, {})
-        both = [name for name in one if name in other]
-        if len(both) > 1:
-            apart = np.array([_apart(one[name], other[name]) for name in both])
-            by, half = float(apart.mean()), path_interval(apart)
-            interval = (by - half, by + half)
-            broken = not limit.here and (-limit.better * apart).max() / len(apart) > allowed
-            certain = broken or -limit.better * by - half > 0
-        worse = certain and -limit.better * by > allowed
-        gone = math.isnan(after) or len(both) < len(one)
-        verdict = "missing" if gone else "worse" if worse else ""
-        yield Change(metric, before, after, by, interval, verdict)
+        if metric in old[0].values and (here or not limit.here):
+            yield _change(metric, limit, pairs)
+
+
+def _change(metric: str, limit: Limit, pairs: Sequence[tuple[Figures, Figures]]) -> Change:
+    """Of one metric, over `pairs` of runs with the same seed."""
+    values = np.array([[run.values.get(metric, math.nan) for run in pair] for pair in pairs])
+    frames = [_frames_apart(metric, *pair) for pair in pairs]
+    by_seed = np.array(
+        [
+            each.mean() if len(each) > 1 else _apart(*pair)
+            for each, pair in zip(frames, values, strict=True)
+        ]
+    )
+    before, after = map(float, values.mean(axis=0))
+    allowed = limit.absolute + (limit.relative and limit.relative * abs(before))
+    by, interval, certain = float(by_seed.mean()), None, True
+    if len(pairs) > 1 or len(frames[0]) > 1:
+        half = half_interval(by_seed) if len(pairs) > 1 else path_interval(frames[0])
+        interval = (by - half, by + half)
+        moved = [(-limit.better * each).max() / len(each) for each in frames if len(each) > 1]
+        broken = not limit.here and max(moved, default=0) / len(pairs) > allowed
+        certain = broken or -limit.better * by - half > 0
+    worse = certain and -limit.better * by > allowed
+    gone = math.isnan(after) or any(
+        one.frames.get(metric, {}).keys() - other.frames.get(metric, {}) for one, other in pairs
+    )
+    return Change(
+        metric, before, after, by, interval, "missing" if gone else "worse" if worse else ""
+    )
+
+
+def _frames_apart(metric: str, old: Figures, new: Figures) -> np.ndarray:
+    """New less old of the frames that both have, in the order of the path."""
+    one, other = old.frames.get(metric, {}), new.frames.get(metric, {})
+    return np.array([_apart(one[name], other[name]) for name in one if name in other])
 
 
 def _apart(old: float, new: float) -> float:

@@ -18,7 +18,7 @@ from reports.runs import Run, load, readable
 from sweeps.identity import PLACES
 from sweeps.terminal import console, show
 
-SCHEMA = 1
+SCHEMA = 2
 """Of baseline files."""
 
 
@@ -32,13 +32,16 @@ def main(options: argparse.Namespace) -> int:
         return 0
     runs, limits = _read(options.baseline)
     failed = 0
-    for command, figures in runs.items():
-        if command not in found:
-            console().print(f"{command}: no such run below {options.outputs}", markup=False)
+    for command, old in runs.items():
+        if missing := old.keys() - found.get(command, {}):
+            seeds = f" with seed={','.join(sorted(missing))}" if command in found else ""
+            text = f"{command}: no such run{seeds} below {options.outputs}"
+            console().print(text, markup=False)
             failed += 1
             continue
         try:
-            rows = list(changes(figures, Figures.of(found[command], limits), limits))
+            new = [Figures.of(found[command][seed], limits) for seed in old]
+            rows = list(changes(list(old.values()), new, limits))
         except SteerbenchError as error:
             text = f"{command}: {error}; `steerbench check --record` takes the new ones"
             console().print(text, markup=False)
@@ -55,24 +58,28 @@ def _compare(options: argparse.Namespace) -> int:
     store = Store(options.outputs)
     keys = [store.whole_key(key) for key in (options.old, options.new)]
     old, new = (Figures.of(load(store, {key: key})[0]) for key in keys)
-    rows = list(changes(old, new))
+    rows = list(changes([old], [new]))
     show(change_table(" to ".join(keys), rows))
     return int(any(row.verdict for row in rows))
 
 
-def _by_command(store: Store) -> dict[str, Run]:
-    """Every run, by what was typed for it; of several, the last that was stored."""
-    return {_command(str(run.record["command"])): run for run in readable(store)}
+def _by_command(store: Store) -> dict[str, dict[str, Run]]:
+    """Every run, by what was typed for it and by its seed; of several, the last that was stored."""
+    found: dict[str, dict[str, Run]] = {}
+    for run in readable(store):
+        seeds = found.setdefault(_command(str(run.record["command"])), {})
+        seeds[str(run.facts["seed"])] = run
+    return found
 
 
 def _command(typed: str) -> str:
-    """What was typed, in one order, without what does not change a row."""
+    """What was typed, in one order, without the seed and what does not change a row."""
     words = shlex.split(typed)[2:]
-    places = (*PLACES, "hydra.mode")
-    return shlex.join(sorted(word for word in words if word.partition("=")[0] not in places))
+    others = (*PLACES, "hydra.mode", "seed")
+    return shlex.join(sorted(word for word in words if word.partition("=")[0] not in others))
 
 
-def _record(path: Path, found: Mapping[str, Run]) -> None:
+def _record(path: Path, found: Mapping[str, Mapping[str, Run]]) -> None:
     """Write the figures of `found` to `path`; limits and choice of runs of a baseline that is there
     stay."""
     limits: Mapping[str, Limit] = LIMITS
@@ -83,7 +90,10 @@ def _record(path: Path, found: Mapping[str, Run]) -> None:
         found = {command: found[command] for command in known}
     if not found:
         raise SteerbenchError("there are no runs to record: `steerbench run` makes one")
-    runs = {command: asdict(Figures.of(run, limits)) for command, run in found.items()}
+    runs = {
+        command: {seed: asdict(Figures.of(run, limits)) for seed, run in seeds.items()}
+        for command, seeds in found.items()
+    }
     plain = {metric: asdict(limit) for metric, limit in limits.items()}
     text = json.dumps({"schema": SCHEMA, "limits": plain, "runs": runs}, indent=1)
     with explained(path.parent), whole(path) as new:
@@ -91,12 +101,16 @@ def _record(path: Path, found: Mapping[str, Run]) -> None:
     console().print(f"{path}: {len(runs)} runs", markup=False)
 
 
-def _read(path: Path) -> tuple[dict[str, Figures], dict[str, Limit]]:
+def _read(path: Path) -> tuple[dict[str, dict[str, Figures]], dict[str, Limit]]:
+    """The figures of a baseline, by what was typed and by seed, and its limits."""
     try:
         held: Any = json.loads(path.read_text(encoding="utf-8"))
         if held["schema"] != SCHEMA:
             raise ValueError(f"schema {held['schema']}, expected {SCHEMA}")
-        runs = {command: Figures(**figures) for command, figures in held["runs"].items()}
+        runs = {
+            command: {seed: Figures(**figures) for seed, figures in seeds.items()}
+            for command, seeds in held["runs"].items()
+        }
         return runs, {metric: Limit(**limit) for metric, limit in held["limits"].items()}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SteerbenchError(

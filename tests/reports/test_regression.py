@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bench.errors import SteerbenchError
-from bench.intervals import path_interval
+from bench.intervals import half_interval, path_interval
 from bench.results import Store
 from reports.regression import LIMITS, Change, Figures, Limit, changes
 from reports.runs import load
@@ -21,7 +21,7 @@ OLD = Figures(
 
 def change(metric: str, value: float, old: Figures = OLD) -> Change | None:
     new = replace(old, values={**old.values, metric: value})
-    return next((found for found in changes(old, new) if found.metric == metric), None)
+    return next((found for found in changes([old], [new]) if found.metric == metric), None)
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_worse_is_what_passes_the_limit_in_the_wrong_direction(
 
 def test_what_depends_on_the_machine_is_compared_on_the_same_one_only() -> None:
     other = replace(OLD, machine="another machine", values={**OLD.values, "frame_ms": 500.0})
-    assert {found.metric for found in changes(OLD, other)} == {"psnr", "size_bytes.total"}
+    assert {found.metric for found in changes([OLD], [other])} == {"psnr", "size_bytes.total"}
 
 
 def paired(*by: float) -> Change:
@@ -55,7 +55,7 @@ def paired(*by: float) -> Change:
     after = {name: value + by[int(name)] for name, value in before.items()}
     old = replace(OLD, frames={"psnr": before})
     new = replace(OLD, frames={"psnr": after | {"more": 99.0}})
-    return next(found for found in changes(old, new) if found.metric == "psnr")
+    return next(found for found in changes([old], [new]) if found.metric == "psnr")
 
 
 def test_frames_that_both_have_are_compared_in_pairs() -> None:
@@ -85,7 +85,7 @@ def test_a_sure_change_within_the_limit_is_as_good() -> None:
 def test_more_work_is_worse_on_any_machine(metric: str) -> None:
     old = replace(OLD, values={metric: 1e6})
     found = [
-        next(changes(old, replace(old, values={metric: work}, machine="another"))).verdict
+        next(changes([old], [replace(old, values={metric: work}, machine="another")])).verdict
         for work in (1.04e6, 1.06e6)
     ]
     assert found == ["", "worse"]
@@ -103,37 +103,74 @@ def test_frames_without_an_error_hide_no_others() -> None:
     after = {str(i): 20.0 for i in range(9)} | {"9": math.inf}
     values = {**OLD.values, "psnr": math.inf}
     old, new = (Figures(values, {"psnr": psnr}, "one", "views") for psnr in (before, after))
-    found = next(each for each in changes(old, new) if each.metric == "psnr")
+    found = next(each for each in changes([old], [new]) if each.metric == "psnr")
     assert found.by == pytest.approx(-9)
     assert found.verdict == "worse"
-    assert next(changes(old, old)).verdict == ""
+    assert next(changes([old], [old])).verdict == ""
 
 
 def test_one_slow_frame_among_many_is_chance() -> None:
     times = {str(i): 100.0 for i in range(24)}
     old = replace(OLD, frames={"frame_ms": times})
     new = replace(OLD, frames={"frame_ms": {**times, "11": 2000.0}})
-    found = next(each for each in changes(old, new) if each.metric == "frame_ms")
+    found = next(each for each in changes([old], [new]) if each.metric == "frame_ms")
     assert found.by > 25
     assert found.verdict == ""
 
 
+def seeds(*by: float, metric: str = "psnr") -> Change:
+    """PSNR of a run with so many seeds, each of which changed by so much in all of its frames."""
+    before = [{str(i): 25.0 + seed + i for i in range(6)} for seed in range(len(by))]
+    after = [
+        {name: value + each for name, value in frames.items()}
+        for frames, each in zip(before, by, strict=True)
+    ]
+    old, new = ([replace(OLD, frames={metric: x}) for x in runs] for runs in (before, after))
+    return next(found for found in changes(old, new) if found.metric == metric)
+
+
+def test_seeds_of_which_some_became_better_have_changed_by_chance() -> None:
+    """All frames of a training change alike, so that those of one seed would call it worse."""
+    found = seeds(-0.6, 0.2, -0.4)
+    assert found.by == pytest.approx(-0.8 / 3)
+    half = half_interval(np.array([-0.6, 0.2, -0.4]))
+    assert found.interval == pytest.approx((found.by - half, found.by + half))
+    assert found.verdict == ""
+    assert seeds(-0.6).verdict == "worse"
+
+
+def test_a_change_that_all_seeds_have_is_worse() -> None:
+    assert seeds(-0.6, -0.5, -0.7).verdict == "worse"
+
+
+def test_one_broken_frame_of_one_seed_is_worse() -> None:
+    whole = replace(OLD, frames={"psnr": {str(i): 30.0 for i in range(6)}})
+    broken = replace(OLD, frames={"psnr": {**whole.frames["psnr"], "3": 10.0}})
+    found = next(changes([whole] * 3, [whole, broken, whole]))
+    assert found.verdict == "worse"
+
+
+def test_a_metric_that_one_seed_lacks_is_missing() -> None:
+    lacking = replace(OLD, values={"frame_ms": 100.0})
+    assert next(changes([OLD, OLD], [OLD, lacking])).verdict == "missing"
+
+
 def test_a_metric_or_a_frame_that_is_gone_is_missing() -> None:
     gone = replace(OLD, values={"frame_ms": 100.0, "size_bytes.total": 1000.0})
-    assert {found.metric: found.verdict for found in changes(OLD, gone)}["psnr"] == "missing"
+    assert {found.metric: found.verdict for found in changes([OLD], [gone])}["psnr"] == "missing"
     old = replace(OLD, frames={"psnr": {"0": 30.0, "1": 30.0, "2": 30.0}})
     new = replace(OLD, frames={"psnr": {"0": 30.0, "1": 30.0}})
-    assert next(changes(old, new)).verdict == "missing"
+    assert next(changes([old], [new])).verdict == "missing"
 
 
 def test_figures_of_other_frames_are_not_compared() -> None:
     with pytest.raises(SteerbenchError, match=r"of other frames, .*: views; another scene"):
-        list(changes(OLD, replace(OLD, views="another scene")))
+        list(changes([OLD], [replace(OLD, views="another scene")]))
 
 
 def test_a_baseline_can_have_limits_of_its_own() -> None:
     new = replace(OLD, values={**OLD.values, "psnr": 29.0})
-    (wide,) = changes(OLD, new, {"psnr": Limit(1, absolute=2.0)})
+    (wide,) = changes([OLD], [new], {"psnr": Limit(1, absolute=2.0)})
     assert wide.verdict == ""
     assert LIMITS["psnr"].absolute < 1
 

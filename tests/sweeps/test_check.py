@@ -6,6 +6,7 @@ import json
 import shutil
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from bench.errors import SteerbenchError
@@ -46,7 +47,7 @@ def test_a_figure_that_became_worse_is_shown_and_fails(
     baseline: Path, outputs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     held = json.loads(baseline.read_text())
-    (figures,) = held["runs"].values()
+    ((figures,),) = (seeds.values() for seeds in held["runs"].values())
     figures["values"]["psnr"] += 1
     figures["frames"]["psnr"] = {name: x + 1 for name, x in figures["frames"]["psnr"].items()}
     baseline.write_text(json.dumps(held))
@@ -73,16 +74,15 @@ def test_a_baseline_that_is_recorded_anew_keeps_its_limits_and_its_runs(
     again = json.loads(baseline.read_text())
     assert again["limits"]["psnr"]["absolute"] == 0.5
     assert again["runs"].keys() == held["runs"].keys()
-    (figures,) = again["runs"].values()
-    assert list(figures["values"]) == ["psnr"]
+    assert list(again["runs"]["method=offset scene=tiny"]["5"]["values"]) == ["psnr"]
 
 
 def test_a_run_that_is_missing_fails(
     baseline: Path, outputs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     held = json.loads(baseline.read_text())
-    (figures,) = held["runs"].values()
-    held["runs"] = {"method=other": figures}
+    (seeds,) = held["runs"].values()
+    held["runs"] = {"method=other": seeds}
     baseline.write_text(json.dumps(held))
     assert check(baseline, outputs) == 1
     assert "method=other: no such run" in capsys.readouterr().out
@@ -92,8 +92,9 @@ def test_a_run_of_other_frames_fails_and_the_others_are_still_compared(
     baseline: Path, outputs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     held = json.loads(baseline.read_text())
-    ((command, figures),) = held["runs"].items()
-    held["runs"] = {command: {**figures, "views": "others"}, "method=other": figures}
+    ((command, seeds),) = held["runs"].items()
+    others = {"5": {**seeds["5"], "views": "others"}}
+    held["runs"] = {command: others, "method=other": seeds}
     baseline.write_text(json.dumps(held))
     assert check(baseline, outputs) == 1
     out = capsys.readouterr().out
@@ -129,6 +130,36 @@ def unread(outputs: Path, stored_run: str) -> str:
     held = json.loads(record.read_text())
     record.write_text(json.dumps(held | {"schema_version": 1}))
     return key
+
+
+@pytest.fixture
+def second_seed(outputs: Path, stored_run: str) -> str:
+    """The key of the same run with seed 6, whose PSNR is 1 dB higher."""
+    key = f"0{stored_run[1:]}"
+    folder = shutil.copytree(outputs / "runs" / stored_run, outputs / "runs" / key)
+    rows = pd.read_csv(folder / "rows.csv").assign(seed=6, run=key)
+    rows.loc[rows["metric"] == "psnr", "value"] += 1
+    rows.to_csv(folder / "rows.csv", index=False)
+    return key
+
+
+def test_all_seeds_of_a_run_are_one_entry(outputs: Path, second_seed: str, tmp_path: Path) -> None:
+    path = tmp_path / "baseline.json"
+    assert check(path, outputs, "--record") == 0
+    (seeds,) = json.loads(path.read_text())["runs"].values()
+    assert seeds.keys() == {"5", "6"}
+    assert seeds["6"]["values"]["psnr"] == pytest.approx(seeds["5"]["values"]["psnr"] + 1)
+    assert check(path, outputs) == 0
+
+
+def test_a_seed_that_is_missing_fails(
+    outputs: Path, second_seed: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "baseline.json"
+    check(path, outputs, "--record")
+    shutil.rmtree(outputs / "runs" / second_seed)
+    assert check(path, outputs) == 1
+    assert "scene=tiny: no such run with seed=6 below" in capsys.readouterr().out
 
 
 def test_a_run_of_another_schema_is_left_out(
