@@ -1,25 +1,25 @@
-"""steerbench from Python: measure, train, score, and read what was measured.
+"""The Python interface of steerbench: measure, train, score, and read results.
 
     import steerbench
 
     run = steerbench.run("method=ngp", "scene=totem", "budget=tiny")
     run.rows  # a DataFrame; in a notebook the run shows its tables
 
-Settings are the words of `steerbench run`, and mean the same. What raises, raises
-`SteerbenchError` with a message for the user.
+Settings are strings with the same meaning as in `steerbench run`. Errors are `SteerbenchError`s
+with a message for the user.
 
 | name | what it is for |
 |---|---|
-| `run` | measure a method on a scene, or read that from the store |
-| `fit` | the trained method itself, to render any camera |
+| `run` | measure a method on a scene, or read the result from the store |
+| `fit` | train a method, or load it, to render any camera |
 | `load_scene` | cameras, pictures and bounds of a scene |
-| `score` | pictures of any program against true ones |
+| `score` | score pictures of any program against true ones |
 | `results` | the rows of all runs in the store |
-| `methods`, `scenes` | what can be chosen, with a line on each |
+| `methods`, `scenes` | what can be chosen, with a description of each |
 | `Run` | what `run` and `score` return |
-| `Method`, `Probe`, `NullProbe` | what a method must have; what it reports to |
-| `Scene`, `Split`, `Camera`, `Frame`, `Budget` | what methods are given and return |
-| `SteerbenchError` | base of all errors a user can mend |
+| `Method`, `Probe`, `NullProbe` | the interface of a method; the probe it reports to |
+| `Scene`, `Split`, `Camera`, `Frame`, `Budget` | what methods take and return |
+| `SteerbenchError` | base class of all errors that a user can fix |
 """
 
 from __future__ import annotations
@@ -76,11 +76,11 @@ def run(*settings: str) -> Run:
     """Measure what `settings` describe, unless the store has it already.
 
     Args:
-        settings: the words of `steerbench run`: "method=ngp", "scene=totem", "budget=tiny".
+        settings: as for `steerbench run`: "method=ngp", "scene=totem", "budget=tiny".
             `--config-dir=DIR` names a folder with further choices.
 
     Raises:
-        SteerbenchError: a setting is wrong, or something in the measurement went wrong.
+        SteerbenchError: a setting is wrong, or the measurement failed.
     """
     obtained = measurement.obtain(composed(settings), ["steerbench", "run", *settings])
     (found,) = load(obtained.store, {obtained.run: obtained.run})
@@ -88,22 +88,22 @@ def run(*settings: str) -> Run:
 
 
 def fit(*settings: str) -> Method:
-    """The method that `settings` describe, trained on its scene, or loaded from its stored stages.
+    """Train the method that `settings` describe on its scene, or load its stored stages.
 
     `method.render(camera, NullProbe())` renders a camera in scene units; see `load_scene`.
 
     Raises:
-        SteerbenchError: a setting is wrong, or something in the training went wrong.
+        SteerbenchError: a setting is wrong, or the training failed.
     """
     config = composed(settings)
     return configured.trained(config, ConsoleLog(Path(config.outputs)))
 
 
 def load_scene(*settings: str) -> Scene:
-    """The scene of `settings`: "scene=blender", "scene.path=DIR".
+    """Load the scene of `settings`: "scene=blender", "scene.path=DIR".
 
     Raises:
-        SteerbenchError: it cannot be loaded.
+        SteerbenchError: the scene cannot be loaded.
     """
     return configured.scene_of(composed(settings))
 
@@ -119,10 +119,10 @@ def score(
     """Score a folder of pictures against true ones, as `steerbench score` does.
 
     Args:
-        truth: the folder of the true ones; None: the split of the scene in `settings`.
-        name: of the method in the rows; None: that of the folder.
-        match: how a picture finds its truth.
-        sequence: whether the pictures follow one another: the flicker is scored, too.
+        truth: the folder of true pictures; None: the split of the scene in `settings`.
+        name: name of the method in the rows; None: the name of the folder.
+        match: how pictures are matched to true ones: by "name" or by "order".
+        sequence: whether the pictures are consecutive frames, so that flicker is scored, too.
 
     Raises:
         SteerbenchError: pictures are missing, damaged or of another size.
@@ -138,15 +138,15 @@ def score(
 
 
 def results(outputs: str | Path = "outputs") -> pd.DataFrame:
-    """One metric per row, of all runs below `outputs`; docs/protocol.md explains the columns."""
+    """All rows of all runs below `outputs`, one metric each; docs/protocol.md explains columns."""
     return Store(Path(outputs)).rows()
 
 
 def methods(*settings: str) -> Mapping[str, str]:
-    """What can follow `method=`, and what each is; `--config-dir=DIR` adds those of a folder."""
+    """The choices for `method=`, each with a description; `--config-dir=DIR` adds a folder's."""
     return described("method", settings)
 
 
 def scenes(*settings: str) -> Mapping[str, str]:
-    """The same of `scene=`."""
+    """The choices for `scene=`, in the same form as `methods`."""
     return described("scene", settings)

@@ -1,7 +1,7 @@
-"""Run time against error, for computations whose exact answer is known and for whole methods.
+"""Run time against error, for computations with a known exact answer and for whole methods.
 
-The settings that are compared take turns, so that a drifting clock affects all of them alike. The
-times come from further rounds of the computation that gave the errors.
+The compared settings take turns, so that a drifting clock affects all of them alike. The times come
+from further rounds of the same computation that gave the errors.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Trial:
     """One setting of a knob.
 
     Attributes:
-        setting: the value of the knob, in words where it is no number.
-        call: computes, from inputs that are in place, what `exact` holds.
+        setting: the value of the knob; a word where it is not a number.
+        call: computes an approximation of `exact`; its inputs are ready.
         exact: the answer, float64.
     """
 
@@ -47,10 +47,10 @@ class Experiment:
 
     Attributes:
         subject: what is computed.
-        knob: what is turned, with its unit.
+        knob: the parameter that is varied, with its unit.
         trials: the settings of the knob.
-        smooth: the lowest and the highest setting between which the error should be a power of
-            the knob; None: it is none, or rounding hides it.
+        smooth: the range of settings (lowest, highest) in which the error should follow a power
+            of the knob; None: it follows none, or rounding hides it.
     """
 
     subject: str
@@ -63,9 +63,12 @@ class Experiment:
 def experiment_rows(
     experiments: Sequence[Experiment], repeats: int, log: Log
 ) -> list[dict[str, Any]]:
-    """One row for each trial: subject, knob, setting, error (the largest, absolute), ms (median of
-    `repeats`), ms_lo and ms_hi (the extremes), and the observed order of its experiment with
-    order_from and order_to, between which it was fitted; None where there is none."""
+    """Run the experiments; one row for each trial.
+
+    A row holds subject, knob, setting, error (largest absolute), ms (median of `repeats`), ms_lo
+    and ms_hi (the extremes), the observed order of the experiment, and order_from and order_to,
+    the range of settings it was fitted on. The last three are None where no order is expected.
+    """
     rows = []
     with log.progress("experiments", len(experiments)) as progress:
         for experiment in experiments:
@@ -107,7 +110,7 @@ def _order(experiment: Experiment, errors: Sequence[float]) -> float | None:
 
 
 def _times_ms(calls: Sequence[Callable[[], Tensor]], repeats: int) -> list[list[float]]:
-    """Of each call `repeats` times, in turn with the others."""
+    """Milliseconds of `repeats` runs of each call; the calls take turns."""
     times: list[list[float]] = [[] for _ in calls]
     for _ in range(repeats):
         for call, of_call in zip(calls, times, strict=True):
@@ -129,23 +132,23 @@ def render_in_turns(
     repeats: int,
     log: Log,
 ) -> list[dict[str, Any]]:
-    """Render the same trajectory with every one of the fitted `methods` in turn, again and again.
+    """Render the same trajectory with each of the fitted `methods` in turn, in several rounds.
 
-    A first round warms up and is scored; `repeats` more are timed. A turn is the whole trajectory,
-    not a frame, which would find the caches full of another model.
+    The first round warms up and is scored; `repeats` more are timed. A turn is a whole trajectory:
+    if methods alternated frame by frame, each would find the caches full of another model.
 
     Returns:
-        One row for each method: setting (its name), ms (the mean time of a frame in the median
-        round, the lower of two), ms_lo and ms_hi (the extremes over the rounds), and of that median
-        round p99_to_p50 and, as in the rows of `bench.run.measure`, stage_ms.* and work.*. Only
-        frames count that have as many frames before them since the last cut as any of the methods
-        looks back on. Of those with a ground truth: psnr (mean over the frames), psnr_to_first
-        (against the pictures of the first method, all frames together, inf where there is no
-        difference) and worst (the largest difference of a channel from these, of 1), all of
-        pictures as `protocol` rounds them.
+        One row for each method. Only steady frames count, see `steady_frames`. Times: setting (the
+        method's name), ms (mean frame time of the median round, the lower median), ms_lo and ms_hi
+        (extremes over the rounds), and for the median round p99_to_p50, stage_ms.* and work.* as
+        in the rows of `bench.run.measure`. Quality, over the frames with a ground truth: psnr
+        (mean over frames), psnr_to_first (against the pictures of the first method, from the MSE
+        over all frames; inf if equal) and worst (largest difference of any channel from the first
+        method, on a scale of 1). Pictures are rounded as `protocol` says.
 
     Raises:
-        SteerbenchError: there is no such frame, or a method rendered values that are not finite.
+        SteerbenchError: no frame is both steady and has a ground truth, or a method rendered
+            values that are not finite.
     """
     images = scene.splits[trajectory.split].images
     ready, scored = steady_frames(methods.values(), trajectory)
@@ -184,11 +187,13 @@ def render_in_turns(
 def steady_frames(
     methods: Iterable[Method], trajectory: Trajectory
 ) -> tuple[list[bool], list[int]]:
-    """Whether each frame has all preceding frames that any of the `methods` uses, and the numbers
-    of those that have a ground truth, too.
+    """Which frames are steady, and the indices of the steady frames with a ground truth.
+
+    A frame is steady if, since the last cut, it has as many preceding frames as the method with
+    the longest memory uses.
 
     Raises:
-        SteerbenchError: there is none with a ground truth.
+        SteerbenchError: no steady frame has a ground truth.
     """
     start = max(method.memory for method in methods)
     ready = [count >= start for count in trajectory.preceding]
@@ -202,7 +207,7 @@ def steady_frames(
 
 
 def _costs(records: Sequence[FrameRecord], ready: Sequence[bool]) -> dict[str, float]:
-    """The costs of the `ready` frames in all rounds but the first; see `render_in_turns`."""
+    """Costs of the `ready` frames over all rounds but the first; see `render_in_turns`."""
     count = len(ready)
     rounds = [
         list(compress(records[first : first + count], ready))
@@ -213,7 +218,7 @@ def _costs(records: Sequence[FrameRecord], ready: Sequence[bool]) -> dict[str, f
     usual = rounds[means.index(ms)]
     return {
         **_spread(means),
-        "ms": ms,  # of a round that there was, whose parts follow
+        "ms": ms,  # median_low: of an actual round, which the next lines describe
         "p99_to_p50": p99_to_p50(usual),
         **_means("stage_ms", [record.stages_ns for record in usual], 1e-6),
         **_means("work", [record.done for record in usual]),
@@ -223,7 +228,7 @@ def _costs(records: Sequence[FrameRecord], ready: Sequence[bool]) -> dict[str, f
 def _means(
     kind: str, of_frames: Sequence[Mapping[str, int]], factor: float = 1
 ) -> dict[str, float]:
-    """The mean over frames of every figure that one of them has; a missing one counts as 0."""
+    """Mean over frames of every figure that any frame has; a missing figure counts as 0."""
     names = dict.fromkeys(name for figures in of_frames for name in figures)
     return {
         f"{kind}.{name}": factor * statistics.fmean(figures.get(name, 0) for figures in of_frames)
@@ -232,6 +237,6 @@ def _means(
 
 
 def _compared(picture: Tensor, first: Tensor, truth: Tensor) -> tuple[float, float, float]:
-    """The PSNR against `truth`, and the mean squared and the largest difference from `first`."""
+    """PSNR against `truth`, then mean squared and largest difference from `first`."""
     apart = picture.double() - first.double()
     return psnr(picture, truth), apart.square().mean().item(), apart.abs().max().item()

@@ -1,7 +1,7 @@
-"""Tells glibc to keep freed memory for the next step, or to give it back to the system.
+"""Tells glibc to keep freed memory for the next step, or to return it to the system.
 
-A training step allocates and frees 50 MB of activations. Given back each time, they are some 12,000
-pages that must be mapped and cleared again. With another C library nothing happens here.
+A training step allocates and frees 50 MB of activations. If this memory is returned each time, some
+12,000 pages must be mapped and cleared again. With other C libraries these functions do nothing.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
 """Names of parameters in malloc.h."""
 
 LARGEST_KEPT = 32 << 20
-"""Bytes of the largest piece that is kept, the most that glibc allows."""
+"""Largest block in bytes that is kept when freed; glibc allows no higher limit."""
 
 
 def keep_freed() -> None:
-    """Keep what is freed from now on, for the next allocation of any thread."""
+    """Keep memory that is freed from now on, for later allocations by any thread."""
     if mallopt := _of_libc("mallopt"):
         mallopt(M_MMAP_THRESHOLD, LARGEST_KEPT)
         mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
-        mallopt(M_ARENA_MAX, 1)  # other arenas give freed memory back all the same
+        mallopt(M_ARENA_MAX, 1)  # other arenas would still return freed memory
 
 
 def give_back() -> None:
-    """Give back what was freed until now."""
+    """Return all memory freed so far to the system."""
     if malloc_trim := _of_libc("malloc_trim"):
         malloc_trim(0)
 

@@ -1,4 +1,4 @@
-"""Rays, projection and scaling of pinhole cameras: one pixel-centre convention for all of them.
+"""Rays, projection and scaling of pinhole cameras, with one pixel-centre convention.
 
 Pixel (i, j) (column i, row j) covers [i, i+1) x [j, j+1) and is sampled at its centre, +0.5.
 """
@@ -23,7 +23,7 @@ def pixel_grid(width: int, height: int, device: torch.device | str = "cpu") -> T
 def cast(camera: Camera, pixels: Tensor | None = None) -> Rays:
     """Rays through continuous `pixels` [R, 2] as (u, v), or through all pixel centres, row by row.
 
-    Directions are rotated (x, y, 1): not normalised, so that the ray parameter is z-depth.
+    Directions are (x, y, 1) rotated to world axes, not normalised: the ray parameter is z-depth.
     """
     if pixels is None:
         pixels = pixel_grid(camera.width, camera.height, camera.c2w.device)
@@ -66,7 +66,7 @@ def within(pixels: Tensor, width: int, height: int) -> Tensor:
 def scale_camera(camera: Camera, width: int, height: int) -> Camera:
     """The same view on a grid of `width` x `height` pixels.
 
-    With centres at +0.5 every intrinsic scales by the same factor, so 1/4 and back is exact.
+    With pixel centres at +0.5 every intrinsic is simply multiplied, so 1/4 and back is exact.
     """
     sx, sy = width / camera.width, height / camera.height
     fx, fy, cx, cy = camera.fx * sx, camera.fy * sy, camera.cx * sx, camera.cy * sy
@@ -74,22 +74,21 @@ def scale_camera(camera: Camera, width: int, height: int) -> Camera:
 
 
 def frame_camera(camera: Camera, width: int, height: int) -> Camera:
-    """The view on a grid of `width` x `height` pixels: the same from top to bottom, but wider or
-    narrower."""
+    """The view on `width` x `height` pixels: same vertical field of view, wider or narrower."""
     zoom = height / camera.height
     cx, cy = width / 2 + (camera.cx - camera.width / 2) * zoom, camera.cy * zoom
     return Camera(camera.c2w, camera.fx * zoom, camera.fy * zoom, cx, cy, width, height)
 
 
 def crop_camera(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
-    """The camera of the `width` x `height` pixels whose first is column `left`, row `top`."""
+    """The camera of a crop: `width` x `height` pixels, beginning at column `left`, row `top`."""
     return replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=width, height=height)
 
 
 def move_camera(camera: Camera, scale: float, offset: Tensor) -> Camera:
-    """The same view after every world point x became scale * x + offset (`offset` [3]).
+    """The same view after the world is moved: point x becomes scale * x + offset (`offset` [3]).
 
-    Computed in float64: what lies far from its origin keeps the digits that `camera.c2w` has.
+    Computed in float64, so that a camera far from the origin keeps the digits of its `c2w`.
     """
     pose = camera.c2w.double()
     centre = scale * pose[:, 3:] + offset.to(pose)[:, None]
@@ -97,9 +96,9 @@ def move_camera(camera: Camera, scale: float, offset: Tensor) -> Camera:
 
 
 def place_camera(camera: Camera, device: torch.device | str) -> Camera:
-    """The same camera with its pose on `device`; rays and projections then are there, too.
+    """The same camera with its pose on `device`, where its rays and projections are then computed.
 
-    The host waits for a GPU only to bring a pose from there.
+    The host waits for a GPU only when it copies a pose from it.
     """
     waits = camera.c2w.device.type != "cpu"
     return replace(camera, c2w=camera.c2w.to(device, non_blocking=not waits))
@@ -109,13 +108,13 @@ INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height")
 
 
 def pack_camera(camera: Camera) -> Tensor:
-    """All of `camera` as [18] float64 on the CPU: `c2w` row by row, then the intrinsics."""
+    """`camera` as one [18] float64 tensor on the CPU: `c2w` row by row, then the intrinsics."""
     inside = torch.tensor([getattr(camera, name) for name in INTRINSICS], dtype=torch.float64)
     return torch.cat((camera.c2w.double().cpu().flatten(), inside))
 
 
 def unpack_camera(packed: Tensor) -> Camera:
-    """The camera that `pack_camera` packed, to the last bit, on the CPU."""
+    """The camera that `pack_camera` packed, bit for bit, on the CPU."""
     fx, fy, cx, cy, width, height = packed[12:].tolist()
     return Camera(packed[:12].view(3, 4).float(), fx, fy, cx, cy, int(width), int(height))
 

@@ -1,7 +1,7 @@
 """A case: one check, what must hold and within which tolerance.
 
-The cases of a folder are in its `cases.py`. A tolerance is derived from the arithmetic, never from
-an error that was seen: in terms of the unit roundoff u of the type that a result is computed in.
+Each folder keeps its cases in `cases.py`. A tolerance is derived from the arithmetic, in units of
+the unit roundoff u of the type that the result is computed in, never from an observed error.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Cell = tuple[str, str]
 """A backend or an engine, and a precision."""
 
 Prepare = Callable[[str], Callable[[str], tuple[Tensor, ...]]]
-"""Makes inputs on a device and returns a function that computes with a backend."""
+"""Makes inputs on a device and returns a function of the backend that computes the outputs."""
 
 DTYPES = {
     "fp64": torch.float64,
@@ -39,7 +39,7 @@ to neighbours."""
 
 @dataclass(frozen=True)
 class Timed:
-    """What is timed: a call that handles `items` samples, rays or entries."""
+    """A computation to time; one call processes `items` samples, rays or entries."""
 
     items: int
     prepare: Prepare
@@ -47,18 +47,18 @@ class Timed:
 
 @dataclass(frozen=True)
 class Case:
-    """Something that must hold for every backend or engine.
+    """A property that must hold for every backend or engine.
 
     Attributes:
-        subject: what is checked ("composite backward").
+        subject: the computation that is checked ("composite backward").
         name: what is special about the inputs.
         holds: what must hold.
         derivation: where the tolerances come from.
         tolerances: the largest allowed error of each cell.
-        error: backend, device and precision to the largest error. It raises `Unavailable` where the
-            cell does not exist on that device.
-        timed: None where the inputs are too few for a meaningful throughput.
-        slow: takes more than a moment: skipped by the tests.
+        error: computes the largest error, given backend, device and precision. Raises `Unavailable`
+            if the cell does not exist on that device.
+        timed: None if there are too few inputs for a meaningful throughput.
+        slow: takes more than a moment, so the tests skip it.
     """
 
     subject: str
@@ -71,11 +71,11 @@ class Case:
     slow: bool = False
 
     def check(self, cell: Cell, device: str) -> dict[str, Any]:
-        """The row of one cell.
+        """Check one cell and return its row.
 
-        It holds subject, case, holds, derivation, device, backend, precision, tolerance, error
-        (None where it is not finite or there is none) and status: "ok", "failed", "failed: " with
-        the exception, or "unavailable: " with the reason.
+        The row holds subject, case, holds, derivation, device, backend, precision, tolerance, error
+        (None if missing or not finite) and status: "ok", "failed", "failed: " with the exception,
+        or "unavailable: " with the reason.
         """
         backend, precision = cell
         error, tolerance = math.inf, self.tolerances[cell]
@@ -104,7 +104,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Property:
-    """What must hold in several cases, within the same tolerances; see `Case`."""
+    """A property that several cases check, with the same tolerances; see `Case`."""
 
     subject: str
     holds: str
@@ -112,14 +112,14 @@ class Property:
     tolerances: Mapping[Cell, float]
 
     def case(self, name: str, error: Callable[[str, str, str], float], slow: bool = False) -> Case:
-        """One of the cases."""
+        """Make one case of the property."""
         given = self.subject, name, self.holds, self.derivation, self.tolerances, error
         return Case(*given, slow=slow)
 
 
 @dataclass(frozen=True)
 class Difference:
-    """The largest difference from the reference backend on the CPU."""
+    """Computes the largest difference from the reference backend on the CPU."""
 
     prepare: Prepare
 
@@ -132,9 +132,9 @@ class Difference:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Cases in which all `backends` compute what the reference does.
+    """Makes cases which check that all `backends` agree with the reference.
 
-    The inputs decide the tolerance; `derivation` says how.
+    The tolerance depends on the inputs; `derivation` says how.
     """
 
     subject: str
@@ -150,7 +150,7 @@ class Agreement:
         precision: str = "fp32",
         items: int | None = None,
     ) -> Case:
-        """One of the cases, timed if it says how many `items` a call handles."""
+        """Make one case; it is timed if `items`, the number that a call processes, is given."""
         return Case(
             self.subject,
             name,
@@ -165,15 +165,17 @@ class Agreement:
 def on_backends(
     units: float, *precisions: str, backends: Sequence[str] = ("reference", "cpu")
 ) -> dict[Cell, float]:
-    """Tolerances of `units` u: of `backends` in fp32, and of the reference alone in further
-    `precisions`, which no other backend has."""
+    """Tolerances of `units` u, for `backends` in fp32 and for the reference in `precisions`.
+
+    Only the reference has other precisions than fp32.
+    """
     cells = [(backend, "fp32") for backend in backends]
     cells += [("reference", precision) for precision in precisions]
     return {cell: units * torch.finfo(DTYPES[cell[1]]).eps / 2 for cell in cells}
 
 
 def largest_error(results: Sequence[Tensor], reference: Sequence[Tensor]) -> float:
-    """Largest |result - reference| of all outputs; inf where shapes or non-finite values differ."""
+    """Largest |result - reference| over all outputs; inf if shapes or non-finite values differ."""
     worst = 0.0
     for got, want in zip(results, reference, strict=True):
         if got.shape != want.shape:

@@ -1,4 +1,4 @@
-"""Projection and its inverse: near and far, tiny scenes, odd pictures, any rigid motion."""
+"""Cases of projection and unprojection: near, far, tiny scenes, odd sizes, rigid motions."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ MOTION_UNITS = 64 * (32 + 42)
 
 
 def cases() -> list[Case]:
-    """Points projected and unprojected, at all scales; rigid motions."""
+    """Cases that project and unproject points at all scales, or move everything rigidly."""
     front = _property("projection", "its depth is not positive, its pixel finite", "comparisons: 0")
     pixels = _property(
         "normalisation",
@@ -84,7 +84,7 @@ def _round_trips() -> list[Case]:
         reach = max(abs(camera.cx), abs(camera.cy), camera.width, camera.height)
         distance, units = _distance(camera), 8 * reach
         if distance and depth < 1:
-            continue  # nearer than the roundings of where the camera is
+            continue  # nearer than the rounding error of the camera position
         if distance:
             units += 8 * reach + 8 * max(camera.fx, camera.fy) * (1 + distance / depth)
         same = _property(
@@ -103,7 +103,7 @@ def _distance(camera: Camera) -> float:
 
 
 def _apart(got: Tensor, want: Tensor) -> float:
-    """Largest difference; inf where one is not finite."""
+    """Largest difference; inf if any value is not finite."""
     return (got.double() - want.double()).abs().nan_to_num(nan=math.inf).max().item()
 
 
@@ -127,7 +127,7 @@ def _not_in_front(depths: tuple[float, ...], backend: str, device: str, precisio
 
 
 def _normalisation_error(side: float, backend: str, device: str, precision: str) -> float:
-    """A cube of `side`, as many sides away from the origin as a town is wide in metres."""
+    """Pixel error after normalising a cube of `side` that lies some 10^4 sides from the origin."""
     camera = CAMERAS["looking at the cube"]
     origin = side * torch.tensor([1e4, -2e4, 3e4], dtype=torch.float64)
     given = camera.c2w.double()
@@ -156,7 +156,7 @@ def random_motion(seed: int) -> tuple[Tensor, Tensor]:
 
 
 def moved_by(camera: Camera, rotation: Tensor, translation: Tensor) -> Camera:
-    """The camera after a rigid motion of everything."""
+    """The camera after the whole scene, camera included, has moved rigidly."""
     pose = camera.c2w.double().cpu()
     centre = rotation @ pose[:, 3] + translation
     c2w = torch.cat((rotation @ pose[:, :3], centre[:, None]), dim=1)
@@ -164,7 +164,7 @@ def moved_by(camera: Camera, rotation: Tensor, translation: Tensor) -> Camera:
 
 
 def motion_error(seed: int, device: str) -> float:
-    """Pixels by which points of the unit cube move in the picture, moved with the camera."""
+    """Pixels by which points of the unit cube shift when they and the camera move rigidly."""
     rotation, translation = random_motion(seed)
     camera = CAMERAS["looking at the cube"]
     camera = place_camera(camera, device)

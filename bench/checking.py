@@ -1,4 +1,4 @@
-"""Runs cases: all cells of each, and throughput where nothing is wrong."""
+"""Runs cases: checks every cell, and times the backends that pass."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bench.types import Log
 
 
 def run_cases(cases: Sequence[Case], devices: Sequence[str], log: Log) -> Iterator[dict[str, Any]]:
-    """The rows of all cells of `cases` on all `devices`, case by case; see `Case.check`."""
+    """Check all cells of `cases` on all `devices`, and yield their rows; see `Case.check`."""
     cells = sum(len(case.tolerances) for case in cases)
     with log.progress("stress", cells * len(devices)) as progress:
         for case, device in product(cases, devices):
@@ -26,20 +26,19 @@ def run_cases(cases: Sequence[Case], devices: Sequence[str], log: Log) -> Iterat
 
 
 def failed(row: Mapping[str, Any]) -> bool:
-    """Whether what must hold does not."""
+    """Whether the check of this row failed."""
     return row["status"].startswith("failed")
 
 
 def timed_rows(
     cases: Sequence[Case], device: str, backends: Collection[str], repeats: int, log: Log
 ) -> list[dict[str, Any]]:
-    """One row for each timed case and each of the `backends` that it is for.
+    """Check the cases and time the correct ones; one row per timed case and supported backend.
 
-    A row holds kernel, case, backend, dtype, error and tolerance (absolute, error None where it is
-    not finite), status ("ok", or which cases of the kernel the backend fails, timed or not), ms
+    A row holds kernel, case, backend, dtype, error and tolerance (absolute; error is None if not
+    finite), status ("ok", or the cases of the kernel that the backend fails, timed or not), ms
     (median of `repeats`), mitems_s (million items a second) and ratio (time of the reference over
-    that of this backend, the two timed in turn). A backend that fails any case of a kernel gets no
-    time.
+    time of this backend). A backend that fails any case of a kernel is not timed.
     """
     subjects = {case.subject for case in cases if case.timed}
     checked = [case for case in cases if case.subject in subjects and not case.slow]
@@ -85,7 +84,7 @@ def _row(
 
 
 def _times_ms(timed: Timed, backends: Sequence[str], repeats: int, device: str) -> dict[str, float]:
-    """Median milliseconds of each backend; they take turns, so that a drifting clock hits all."""
+    """Median milliseconds of each backend; they take turns, so clock drift affects all alike."""
     compute = timed.prepare(device)
     times: dict[str, list[float]] = {name: [] for name in backends}
     for _ in range(repeats):

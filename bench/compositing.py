@@ -1,4 +1,4 @@
-"""Pictures with an opacity channel over a background."""
+"""Composites pictures with an opacity channel onto a background."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from torch import Tensor
 
 
 def composite(picture: Tensor, background: Tensor) -> Tensor:
-    """An 8-bit `picture` [H, W, 3 or 4] as float [H, W, 3] over `background` [3]."""
+    """Composite an 8-bit `picture` [H, W, 3 or 4] onto `background` [3]; float [H, W, 3]."""
     values = picture.float() / 255.0
     if values.shape[-1] == 3:
         return values

@@ -1,4 +1,4 @@
-"""The log of a person at a terminal: messages, progress with the time left, stage folders."""
+"""The log for a user at a terminal: messages, progress with the time left, stage folders."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from bench.errors import explained
 from bench.results import content_key
 
 PLAIN_INTERVAL_S = 10.0
-"""Time between two lines of progress where there is no terminal to draw a bar on."""
+"""Time between two progress lines when there is no terminal to draw a bar on."""
 
 DRAW_INTERVAL_S = 0.2
-"""Time between two drawings of a bar."""
+"""Time between two redraws of a bar."""
 
 WORTH_A_LINE_S = 2.0
-"""Work that took longer leaves a line behind when it is done."""
+"""Work that takes longer leaves a line on the screen when it is done."""
 
 
 class ConsoleLog:
-    """`bench.types.Log` on standard error, so that standard output holds the results alone.
+    """A `bench.types.Log` on standard error, so that standard output holds only results.
 
     Args:
         root: `outputs`; trained stages go to `stages/` in it.
         quiet: say nothing and draw nothing.
-        clock: seconds, from any beginning.
+        clock: returns seconds from any origin.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class ConsoleLog:
             progress.TextColumn("{task.fields[note]}", markup=False),
             console=self._console,
             transient=True,
-            auto_refresh=False,  # by a thread, which would run beside what is being measured
+            auto_refresh=False,  # it would use a thread, which disturbs what is being measured
             get_time=clock,
             disable=quiet or not self._console.is_terminal,
         )
@@ -59,7 +59,7 @@ class ConsoleLog:
 
     @contextmanager
     def progress(self, label: str, total: int) -> Iterator[_Bar]:
-        """Show a bar, or without a terminal a line now and then; bars may nest."""
+        """Show a bar, or a line now and then without a terminal; bars may nest."""
         bar = _Bar(self.info, self._bars, label, total)
         self._bars.start()
         try:
@@ -71,7 +71,7 @@ class ConsoleLog:
                 self._bars.stop()
 
     def stage_dir(self, kind: str, key: Mapping[str, object]) -> Path:
-        """`stages/<kind>-<hash of key>`, made if missing; SteerbenchError where it cannot be."""
+        """`stages/<kind>-<hash of key>`, created if missing; SteerbenchError if it cannot be."""
         folder = self._root / "stages" / f"{kind}-{content_key(key)[:12]}"
         with explained(folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -104,7 +104,7 @@ class _Bar:
             self._bars.refresh()
 
     def report_done(self) -> None:
-        """Leave a line behind, if the work was worth one."""
+        """Leave a line on the screen if the work took long enough; see `WORTH_A_LINE_S`."""
         elapsed = self._clock() - self._begun
         if elapsed > WORTH_A_LINE_S:
             self._line(f"done in {_duration(elapsed)}")

@@ -1,4 +1,4 @@
-"""Downloads a file: checked, and continued where an earlier attempt broke off."""
+"""Downloads a file, checks it, and resumes an earlier attempt that broke off."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from bench.types import Log
 TIMEOUT_S = 10.0
 CHUNK_BYTES = 1 << 16
 PARTIAL = 206
-"""The HTTP status of an answer that begins where it was asked to."""
+"""HTTP status 206: the answer begins at the requested byte."""
 
 
 def fetch(address: str, target: Path, sha256: str | None, log: Log) -> Path:
-    """`target`, downloaded from `address` unless it is there and right.
+    """Download `address` to `target` unless it is there already and correct; returns `target`.
 
-    What an interrupted download got waits beside it for the next attempt: no other process may
-    fetch the same meanwhile.
+    An interrupted download leaves its part beside `target`, and the next attempt resumes it. Two
+    processes must not fetch the same file at once.
 
     Args:
-        sha256: of the content; None: whatever comes is right.
+        sha256: expected hash of the content; None: not checked.
 
     Raises:
-        Unavailable: there is no answer, it breaks off, or the content is another.
+        Unavailable: no answer, the connection breaks off, or the content has another hash.
         OSError: `target` cannot be written.
     """
-    import pooch  # here, because it takes a tenth of a second that few commands need to spend
+    import pooch  # imported here: it takes 0.1 s, and few commands need it
     from requests import RequestException
 
     pooch.get_logger().setLevel(logging.WARNING)
@@ -36,13 +36,13 @@ def fetch(address: str, target: Path, sha256: str | None, log: Log) -> Path:
         pooch.retrieve(address, sha256, target.name, target.parent, downloader=continued)
     except RequestException as error:
         raise Unavailable(f"the download of {address} failed ({error})") from error
-    except ValueError as error:  # of pooch, which has deleted the file
+    except ValueError as error:  # from pooch, which has deleted the file
         raise Unavailable(f"the download of {address} is damaged: {error}") from error
     return target
 
 
 class _Continued:
-    """A downloader for pooch."""
+    """A downloader for pooch that resumes a partial file."""
 
     def __init__(self, target: Path, log: Log) -> None:
         self._name, self._log = target.name, log
@@ -55,7 +55,7 @@ class _Continued:
         asked = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={there}-"} if there else {})
         with requests.get(address, headers=asked, stream=True, timeout=TIMEOUT_S) as answer:
             if answer.status_code == requests.codes.requested_range_not_satisfiable:
-                self._part.unlink()  # it is longer than what lies there now
+                self._part.unlink()  # the part is longer than the file on the server
                 return self(address, output_file, pooch)
             answer.raise_for_status()
             if answer.status_code != PARTIAL:

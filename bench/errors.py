@@ -1,4 +1,4 @@
-"""Errors for users. Apart from `bench.types`, so that the command line need not load torch."""
+"""Errors for users. Not in `bench.types`, so that the command line need not load torch."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 class SteerbenchError(Exception):
-    """An error a user can act on: the message names what was expected, what came, what to do.
+    """An error a user can act on: its message says what was expected, what came and what to do.
 
     The command line prints the message alone, without a traceback, and exits with status 2.
     """
@@ -19,13 +19,13 @@ class Unavailable(SteerbenchError):
 
 
 def install_command(extra: str) -> str:
-    """The command that installs an `extra` of this project, in the folder that it lies in."""
+    """The command that installs an `extra` of this project from its folder."""
     return f'pip install -c constraints.txt -e ".[{extra}]"'
 
 
 @contextmanager
 def explained(folder: Path) -> Iterator[None]:
-    """Turn the system's error for a `folder` that cannot be written into a SteerbenchError."""
+    """Turn an OSError about a `folder` that cannot be written into a SteerbenchError."""
     try:
         yield
     except OSError as error:

@@ -8,11 +8,11 @@ import numpy as np
 
 
 def best_instead(cost: Sequence[float], error: Sequence[float]) -> list[int]:
-    """For each setting, the index of the one to use in its place: the least `error` among those
-    that cost no more, of equals the cheapest, of equals the first.
+    """For each setting, the index of the best setting that costs no more.
 
-    A setting on the Pareto frontier (of several alike there, the first) gets its own index; any
-    other is dominated by the one at its index.
+    Best is the least `error`, then the least `cost`, then the lowest index. A setting on the Pareto
+    frontier gets its own index (among duplicates, only the first does); any other setting gets the
+    index of one that dominates it.
     """
     costs, errors = np.asarray(cost, float), np.asarray(error, float)
     best: list[int] = [0] * len(costs)
@@ -25,13 +25,15 @@ def best_instead(cost: Sequence[float], error: Sequence[float]) -> list[int]:
 
 
 def cheapest_within(cost: Sequence[float], error: Sequence[float], limit: float) -> int | None:
-    """The index of the cheapest setting whose error is at most `limit`; None without one."""
+    """The index of the cheapest setting whose error is at most `limit`; None if there is none."""
     allowed = [index for index, size in enumerate(error) if size <= limit]
     return min(allowed, key=lambda index: (cost[index], error[index]), default=None)
 
 
 def observed_order(knob: Sequence[float], error: Sequence[float]) -> float:
-    """p of the power law error = c knob^p that fits best: the slope of the logarithms, by least
-    squares. `knob` and `error` are positive, and two or more."""
+    """Fit the power law error = c knob^p and return p, by least squares on the logarithms.
+
+    `knob` and `error` hold at least two values, all positive.
+    """
     slope, _ = np.polyfit(np.log(knob), np.log(error), 1)
     return float(slope)

@@ -11,26 +11,29 @@ CONFIDENCE = 0.95
 
 
 def half_interval(values: np.ndarray) -> float:
-    """Half of the t-interval of the mean of independent `values` [n]; nan for fewer than two, or
-    where one is not finite."""
+    """Half the width of the t-interval of the mean of independent `values` [n].
+
+    nan for fewer than two values, or if one is not finite.
+    """
     if len(values) < 2 or not np.isfinite(values).all():
         return math.nan
     return _quantile(len(values) - 1) * values.std(ddof=1) / math.sqrt(len(values))
 
 
 def path_interval(values: np.ndarray) -> float:
-    """Half of the interval of the mean of `values` [n], one a frame, in the order of their path;
-    nan for fewer than two, or where one is not finite.
+    """Half the width of the interval of the mean of `values` [n], one per frame, in path order.
 
-    Neighbouring frames are alike, so n of them say less than n independent ones. The slow part of
-    their variation says how uncertain the mean is: the first B coefficients of the orthonormal
-    cosine transform, B = 0.4 n^(2/3) rounded up, each with a variance near n times that of the
-    mean, and nearly independent. So their mean square gives a t-interval with B degrees of freedom
-    (Lazarus et al. 2018, "HAR Inference: Recommendations for Practice"). With all n - 1
-    coefficients it would be `half_interval`.
+    nan for fewer than two values, or if one is not finite.
 
-    A block bootstrap needs more frames than a path has: of autocorrelated series as short as ours
-    it covered the mean less often (docs/log.md).
+    Neighbouring frames are alike, so n frames say less than n independent values. How uncertain the
+    mean is follows from the slow part of the variation: the first B coefficients of the orthonormal
+    cosine transform, B = 0.4 n^(2/3) rounded up. They are nearly independent, each with a variance
+    near n times that of the mean, so their mean square gives a t-interval with B degrees of freedom
+    (Lazarus et al. 2018, "HAR Inference: Recommendations for Practice"). All n - 1 coefficients
+    would give `half_interval`.
+
+    A block bootstrap needs more frames than a path has: for autocorrelated series as short as ours
+    its intervals covered the mean less often (docs/log.md).
     """
     if len(values) < 2 or not np.isfinite(values).all():
         return math.nan
@@ -40,5 +43,5 @@ def path_interval(values: np.ndarray) -> float:
 
 
 def _quantile(freedom: int) -> float:
-    """Of Student's t: the half-width, in standard errors, of an interval with `CONFIDENCE`."""
+    """Quantile of Student's t: half-width, in standard errors, of an interval at `CONFIDENCE`."""
     return float(special.stdtrit(freedom, 0.5 + CONFIDENCE / 2))

@@ -1,8 +1,8 @@
-"""Where the backbone weights of LPIPS come from, and what to do when there are none.
+"""Finds or downloads the backbone weights of LPIPS.
 
-The folders `weights_dir`, `$STEERBENCH_WEIGHTS` and torch's hub cache are searched in this order
-for torchvision's file or for one that holds its `features.*` alone; then torchvision's file is
-downloaded into the cache. A file that carries its SHA-256 in its name is checked against it.
+The folders `weights_dir`, `$STEERBENCH_WEIGHTS` and torch's hub cache are searched in this order,
+for torchvision's file or for one with only its `features.*`. If there is none, torchvision's file
+is downloaded into the cache. A file with a SHA-256 in its name is checked against it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ ADDRESS = "https://download.pytorch.org/models/"
 
 
 class Backbone(NamedTuple):
-    """Names of a backbone's file: torchvision's own, and one with its `features.*` alone."""
+    """File names of a backbone: torchvision's own, and one with only its `features.*`."""
 
     published: str
     features: str
@@ -37,7 +37,7 @@ BACKBONES = {
     "squeeze": Backbone("squeezenet1_1-b8a52dc0.pth", "squeezenet1_1_features.pth"),
 }
 
-_unreachable: list[str] = []  # why the download failed: one attempt a process is enough
+_unreachable: list[str] = []  # why the download failed: each process tries only once
 
 
 def locate(net: str, weights_dir: Path | None, log: Log) -> Path:
@@ -45,7 +45,7 @@ def locate(net: str, weights_dir: Path | None, log: Log) -> Path:
 
     Raises:
         SteerbenchError: `net` is unknown, or `weights_dir` is not a folder.
-        Unavailable: no such file anywhere and the download failed, or the file is damaged.
+        Unavailable: there is no file and the download failed, or the file is damaged.
     """
     if net not in BACKBONES:
         raise SteerbenchError(f"LPIPS net: expected one of {', '.join(BACKBONES)}, got {net!r}")
@@ -68,7 +68,7 @@ def locate(net: str, weights_dir: Path | None, log: Log) -> Path:
 
 
 def load_features(net: str, weights_dir: Path | None, log: Log) -> tuple[Path, dict[str, Tensor]]:
-    """The weight file of backbone `net` and what it holds; raises as `locate` does."""
+    """The weight file of backbone `net` and the tensors in it; raises as `locate` does."""
     path = locate(net, weights_dir, log)
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
@@ -89,7 +89,7 @@ def _folders(weights_dir: Path | None) -> list[Path]:
 
 
 def _verified(path: Path) -> Path:
-    """`path`, unless its name promises a SHA-256 that its bytes do not have."""
+    """Return `path`; raise if its name holds a SHA-256 that its content does not match."""
     promised = re.search(r"-([0-9a-f]{8})\.pth$", path.name)
     if promised is None:
         return path
@@ -104,7 +104,10 @@ def _verified(path: Path) -> Path:
 
 
 def _download(name: str, log: Log) -> Path:
-    """Fetch a file into torch's hub cache; raises Unavailable, at once after a failure."""
+    """Download a file into torch's hub cache.
+
+    Raises Unavailable if that fails; after one failure, without trying again.
+    """
     if _unreachable:
         raise Unavailable(_unreachable[0])
     folder = Path(torch.hub.get_dir()) / "checkpoints"

@@ -1,6 +1,6 @@
-"""Picture quality: PSNR, SSIM and LPIPS of one picture against its reference, flicker of two.
+"""Picture quality: PSNR, SSIM and LPIPS of a picture, flicker between two consecutive ones.
 
-Every function takes float pictures [H, W, 3] in [0, 1] and returns a Python float. None of them
+Every metric takes float pictures [H, W, 3] in [0, 1] and returns a Python float. None of them
 clips or rounds: that is the protocol's choice, made with `quantise`.
 """
 
@@ -21,11 +21,11 @@ from bench.lpips_weights import load_features
 from bench.types import Log, SteerbenchError, Unavailable, check_shape
 
 SMALLEST_SIDE = {"ssim": 11, "lpips_alex": 31, "lpips_vgg": 16, "lpips_squeeze": 17}
-"""Smallest side in pixels: SSIM needs room for its window, LPIPS for one deepest feature."""
+"""Smallest side in pixels: SSIM needs room for its window, LPIPS for one feature at its deepest."""
 
 
 def check_size(metric: str, width: int, height: int) -> None:
-    """Raise `SteerbenchError` if `metric` does not exist for pictures of this size."""
+    """Raise `SteerbenchError` if pictures of this size are too small for `metric`."""
     side = SMALLEST_SIDE[metric]
     if min(width, height) < side:
         raise SteerbenchError(
@@ -58,10 +58,10 @@ def psnr_of_mse(mse: float) -> float:
 def flicker(
     image: Tensor, reference: Tensor, previous_image: Tensor, previous_reference: Tensor
 ) -> float:
-    """Change of the error from one frame to the next, root mean square over pixels and channels.
+    """Change of the error from one frame to the next, as the RMS over pixels and channels.
 
-    0 for an error that stays the same, as also for none: a wrong colour is the business of the
-    other metrics, this one sees what blinks, swims or shimmers.
+    A constant error scores 0, like no error at all. Wrong colours are the business of the other
+    metrics; this one detects what blinks, swims or shimmers.
     """
     _check_pair(image, reference)
     _check_pair(previous_image, previous_reference)
@@ -105,11 +105,11 @@ class Lpips:
 
     Args:
         net: "alex", "vgg" or "squeeze".
-        weights_dir: folder to look into first, or None.
+        weights_dir: folder to search first, or None.
         log: shows a download.
 
     Raises:
-        Unavailable: the backbone weights cannot be had, or are not those of this network.
+        Unavailable: the backbone weights cannot be found or downloaded, or do not fit the network.
     """
 
     def __init__(self, net: str, weights_dir: Path | None, log: Log) -> None:
@@ -134,10 +134,10 @@ class Lpips:
         _check_pair(image, reference)
         check_size(f"lpips_{self.net}", image.shape[1], image.shape[0])
         pair = torch.stack((image, reference)).float().permute(0, 3, 1, 2)  # channels last
-        # On a GPU, too, in float32: unless told not to, cuDNN rounds the inputs of convolutions.
+        # float32 on a GPU, too: by default cuDNN rounds the inputs of convolutions to TF32.
         with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
             distance = self._model.to(image.device)(pair[:1], pair[1:], normalize=True)
-        self._model.cpu()  # left on a GPU, it would count as memory of the method that is measured
+        self._model.cpu()  # on the GPU it would count as memory of the measured method
         return float(distance.item())
 
 
@@ -145,10 +145,10 @@ _torchvision_operators: torch.library.Library | None = None
 
 
 def _lpips_package() -> ModuleType:
-    """Import `lpips`, which imports torchvision for its network definitions alone.
+    """Import `lpips`, which needs torchvision only for its network definitions.
 
     Torchvision's binary does not load beside a torch built for another device; its import then
-    stops at two operators it finds undeclared. Declaring them lets the definitions through.
+    fails because two operators are undeclared. Declaring them makes the definitions importable.
     """
     global _torchvision_operators
     try:

@@ -1,7 +1,7 @@
-"""Cameras in motion: between two poses, along a random smooth path, at a random new view.
+"""Moves cameras: between two poses, along a random smooth path, to a random new view.
 
-Poses are computed in float64 and given back in the type they came in. Directions and turns are
-those about a `target` [3], the point in scene units that the cameras look around.
+Poses are computed in float64 and returned in the type of the input. Directions and rotations are
+about a `target` [3], the point in scene units that the cameras look at or move around.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from torch import Tensor
 from bench.types import Camera, Scene, SteerbenchError, check_shape
 
 BEND_DEG = 2.0
-"""A random motion's direction turns by at most this much from frame to frame."""
+"""The rotation axis of a random motion turns by at most this much from frame to frame."""
 
 ZOOM = 0.005
-"""A random motion's distance changes by at most this share a frame, and in proportion less when
-it turns by less than a degree a frame: a camera that stands still stands still."""
+"""A random motion changes its distance by at most this share per frame, and by proportionally less
+if it turns by less than a degree per frame, so that a still camera stays still."""
 
 NEIGHBOURS = 3
 JITTER_DEG = 2.0
@@ -32,21 +32,21 @@ JITTER_ZOOM = 0.02
 
 
 def viewing_target(scene: Scene) -> Tensor:
-    """The point [3] that cameras look around: the centre of what is to be rendered."""
+    """The point [3] that cameras move around: the centre of `scene.bounds`."""
     return scene.bounds.double().mean(dim=0)
 
 
 def rotation_between(first: Camera, second: Camera) -> Tensor:
-    """The rotation [3] from one camera to the other, axis times angle, in the first one's axes."""
+    """The rotation [3] from `first` to `second`, axis times angle, in the axes of `first`."""
     relative = first.c2w[:, :3].double().T @ second.c2w[:, :3].double()
     return rotation_matrix_to_axis_angle(relative[None])[0]
 
 
 def between(first: Camera, second: Camera, turn: Tensor, share: float) -> Camera:
-    """The camera at `share` of the way: rotated evenly, everything else interpolated linearly.
+    """The camera at `share` of the way: rotation at constant speed, everything else linear.
 
-    `turn` [3] is their `rotation_between`. On an orbit the centre takes the chord: at 4 degrees it
-    is off by 0.06 % of the distance.
+    `turn` [3] is their `rotation_between`. On an orbit the centre follows the chord: at 4 degrees
+    it is off by 0.06 % of the distance.
 
     Raises:
         SteerbenchError: the pictures differ in size.
@@ -58,7 +58,7 @@ def between(first: Camera, second: Camera, turn: Tensor, share: float) -> Camera
 
 
 def lens_between(first: Camera, second: Camera, share: float) -> Camera:
-    """The `first` camera with intrinsics at `share` of the way to those of the second.
+    """The `first` camera with its intrinsics interpolated at `share` of the way to `second`.
 
     Raises:
         SteerbenchError: the pictures differ in size.
@@ -82,15 +82,15 @@ def preceding(
     degrees: tuple[float, float],
     generator: torch.Generator,
 ) -> list[Camera]:
-    """The `count` cameras of a random smooth motion that ends in `camera`, oldest first.
+    """The `count` cameras that precede `camera` on a random smooth motion, oldest first.
 
-    Each frame turns the camera rigidly about `target` [3], by an angle that is drawn once from the
-    range `degrees`, around an axis that is perpendicular to the viewing direction and bends
-    slightly from frame to frame; the distance changes slightly too. `target` stays where it is in
-    the direction of view, and the intrinsics stay.
+    Each frame turns the camera rigidly about `target` [3]. The angle per frame is drawn once from
+    the range `degrees`; the axis is perpendicular to the viewing direction and bends slightly from
+    frame to frame; the distance changes slightly, too. `target` keeps its place in the picture, and
+    the intrinsics are constant.
 
     Raises:
-        ValueError: `target` is no point, `count` is negative, or `degrees` is no range from 0 up.
+        ValueError: `target` is not [3], `count` is negative, or `degrees` is not a range from 0 up.
     """
     check_shape("target", target, 3)
     if count < 0 or not 0 <= degrees[0] <= degrees[1]:
@@ -105,15 +105,15 @@ def preceding(
     for _ in range(count):
         step = math.radians(speed) * (path[-1].c2w[:, :3] @ axis)
         path.append(_turned(path[-1], target, step, zoom))
-        axis = _rotation(axis.new_tensor([0.0, 0.0, bend])) @ axis  # about the viewing direction
+        axis = _rotation(axis.new_tensor([0.0, 0.0, bend])) @ axis  # about viewing direction
     return [replace(frame, c2w=frame.c2w.to(camera.c2w)) for frame in path[:0:-1]]
 
 
 def novel_view(cameras: Sequence[Camera], target: Tensor, generator: torch.Generator) -> Camera:
-    """A random camera in the zone from which `cameras` view `target` [3].
+    """A random camera from the region in which `cameras` view `target` [3].
 
     It lies between a camera and one of its nearest neighbours by direction, at a distance between
-    theirs, a little turned about the target and a little nearer or farther.
+    theirs, then is turned a little about the target and moved a little nearer or farther.
 
     Raises:
         SteerbenchError: the pictures of the two differ in size.
@@ -127,14 +127,14 @@ def novel_view(cameras: Sequence[Camera], target: Tensor, generator: torch.Gener
     first, second = cameras[pick], cameras[other]
     view = between(first, second, rotation_between(first, second), share)
     start, end, chord = (_offset(camera, target).norm().item() for camera in (first, second, view))
-    # The way between them takes the chord, which is nearer than both: put it back.
+    # `between` moves along the chord, which comes too near to the target: restore the distance.
     zoom = ((1 - share) * start + share * end) / chord * (1 + JITTER_ZOOM * (2 * zoom - 1))
     step = math.radians(JITTER_DEG * angle) * torch.nn.functional.normalize(axis, dim=0)
     return _turned(view, target, step, zoom)
 
 
 def _nearest(cameras: Sequence[Camera], target: Tensor, index: int) -> list[int]:
-    """The cameras that see `target` from nearly the same direction as camera `index`."""
+    """The cameras whose direction to `target` is nearest to that of camera `index`."""
     offsets = torch.stack([_offset(camera, target) for camera in cameras])  # [N, 3]
     directions = torch.nn.functional.normalize(offsets, dim=-1)
     order = (directions @ directions[index]).argsort(descending=True, stable=True).tolist()

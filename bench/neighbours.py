@@ -1,4 +1,4 @@
-"""How busy other processes keep the machine, from the kernel's own accounts: psutil."""
+"""Measures how busy other processes keep the machine, from the kernel's accounting (psutil)."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ from typing import NamedTuple
 import psutil
 
 NOTABLE_SHARE = 0.1
-"""Of the cores: times that were measured beside more than that are worth a warning."""
+"""Share of the cores: if other processes use more, measured times deserve a warning."""
 SHORTEST = 0.5
-"""Seconds: the kernel counts work in hundredths of a second, a core a count, so that in a shorter
-time a fifth of `NOTABLE_SHARE` and more is rounding."""
+"""Seconds. The kernel counts in hundredths of a second per core, so that over a shorter time the
+rounding alone is a fifth of `NOTABLE_SHARE` or more."""
 
 
 class Neighbours(NamedTuple):
-    """Cores that other processes kept busy on average, of how many, in how many seconds; a virtual
-    machine counts what its host took away."""
+    """What other processes used: `busy` cores on average, of `cores`, over `seconds`.
+
+    In a virtual machine, time taken away by the host (steal time) counts as busy.
+    """
 
     busy: float
     cores: int
@@ -25,7 +27,7 @@ class Neighbours(NamedTuple):
 
     @property
     def notable(self) -> bool:
-        """Whether they are worth a warning."""
+        """Whether they deserve a warning."""
         return self.seconds >= SHORTEST and self.busy > NOTABLE_SHARE * self.cores
 
     def __str__(self) -> str:
@@ -33,13 +35,13 @@ class Neighbours(NamedTuple):
 
 
 class Watch:
-    """Counts from its making on."""
+    """Watches other processes from its construction on."""
 
     def __init__(self) -> None:
         self._begin = _seconds()
 
     def seen(self) -> Neighbours:
-        """What other processes did since then."""
+        """What other processes used since the construction."""
         spans = [now - then for now, then in zip(_seconds(), self._begin, strict=True)]
         passed, busy, own = spans
         others = max(busy - own, 0.0) / passed if passed > 0 else 0.0
@@ -47,9 +49,9 @@ class Watch:
 
 
 def _seconds() -> tuple[float, float, float]:
-    """Time passed, work of all cores, and work of this process."""
+    """Seconds: of a monotonic clock, of work on all cores, and of work of this process."""
     spent = psutil.cpu_times()._asdict()
-    # A guest's time is in `user` and `nice`, too.
+    # `user` and `nice` already include the time of guests.
     none = ("idle", "iowait", "guest", "guest_nice")
     busy = sum(seconds for name, seconds in spent.items() if name not in none)
     return time.monotonic(), busy, time.process_time()

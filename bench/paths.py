@@ -1,4 +1,4 @@
-"""Camera paths in files: those of nerfstudio's viewer, and the cameras of a `transforms.json`.
+"""Reads camera paths from nerfstudio's viewer and from a `transforms.json`; writes the former.
 
 Poses are camera-to-world in the coordinates of the data set, OpenGL axes (y up, z backward).
 """
@@ -34,19 +34,19 @@ from bench.trajectories import Step, Trajectory, from_split
 from bench.types import Camera, Scene, SteerbenchError
 
 KEYFRAMES = "camera_path"
-"""What a file of nerfstudio's viewer has its cameras under."""
+"""The name under which a file of nerfstudio's viewer lists its cameras."""
 
 
 def follow(scene: Scene, path: str, limit: int = 0) -> Trajectory:
-    """The cameras of a file, in their order and without ground truth.
+    """The cameras of a file, in order and without ground truth.
 
-    nerfstudio's file has `camera_path`, with a `camera_to_world` of 16 numbers row by row and a
-    vertical `fov` in degrees for each, and `render_width`, `render_height` for all. A
-    `transforms.json` has `frames`; what intrinsics it lacks are those of the first test camera.
+    nerfstudio's file has a list `camera_path`, each entry with a `camera_to_world` of 16 numbers
+    row by row and a vertical `fov` in degrees; `render_width` and `render_height` hold for all. A
+    `transforms.json` has `frames`; missing intrinsics are taken from the first test camera.
 
     Args:
         path: the file.
-        limit: > 0 keeps the first that many.
+        limit: if > 0, keep only the first `limit` cameras.
 
     Raises:
         SteerbenchError: the file is damaged or has no cameras; a pose is not rigid.
@@ -64,17 +64,18 @@ def follow(scene: Scene, path: str, limit: int = 0) -> Trajectory:
 def spline(
     scene: Scene, path: str | None, split: str = "test", keys: int = 6, degrees: float = 1.0
 ) -> Trajectory:
-    """A path without corners through a few cameras; see `splines.leading`.
+    """A smooth path through a few key cameras; see `splines.leading`.
 
     Args:
-        path: a file of cameras, as `follow` reads it; all of them are keys. None: the scene's own.
-        split: whose cameras are keys then; they alone have ground truth.
+        path: a file of cameras, as `follow` reads it; all of them are keys. None: the keys are
+            cameras of the scene.
+        split: the split these keys come from. Only they have ground truth.
         keys: how many, evenly spread over the split.
-        degrees: the longest way from frame to frame.
+        degrees: largest step from frame to frame.
 
     Raises:
         SteerbenchError: as `follow`; as `from_split`; `degrees` is not positive; fewer than two
-            keys, two in a row at one pose, or their pictures differ in size.
+            keys, two consecutive keys with the same pose, or their pictures differ in size.
     """
     if not degrees > 0:
         raise SteerbenchError(f"trajectory.degrees: expected more than 0, got {degrees}")
@@ -91,7 +92,7 @@ def spline(
 
 
 def write(path: Path, cameras: Sequence[Camera], scene: Scene, fps: float = 30.0) -> None:
-    """Write `cameras`, of one size and in scene units, as a path that nerfstudio's viewer reads."""
+    """Write `cameras` (scene units, all of one size) as a path that nerfstudio's viewer reads."""
     first = cameras[0]
     record = {
         "camera_type": "perspective",
@@ -106,7 +107,7 @@ def write(path: Path, cameras: Sequence[Camera], scene: Scene, fps: float = 30.0
 
 def _keyframe(camera: Camera, scene: Scene) -> dict[str, Any]:
     moved = move_camera(camera, scene.unit_length, scene.origin)
-    pose = opengl_to_opencv(moved.c2w.double())  # the same change of signs, there and back
+    pose = opengl_to_opencv(moved.c2w.double())  # its own inverse: it flips two axes
     rows = torch.cat((pose, pose.new_tensor([[0, 0, 0, 1]])))
     return {
         "camera_to_world": rows.flatten().tolist(),
@@ -116,7 +117,7 @@ def _keyframe(camera: Camera, scene: Scene) -> dict[str, Any]:
 
 
 def _of_viewer(record: dict, file: Path) -> list[Camera]:
-    """The cameras of nerfstudio's file: square pixels, the principal point in the middle."""
+    """The cameras of nerfstudio's file: square pixels, principal point at the centre."""
     width, height = (whole_number(record.get(k), f"{file}: {k}", 1) for k in _SIZE)
     found = []
     for where, entry in _entries(record, KEYFRAMES, file):
@@ -155,7 +156,7 @@ def _of_frames(record: dict, file: Path, scene: Scene) -> list[Camera]:
 
 
 def _entries(record: dict, name: str, file: Path) -> list[tuple[str, dict]]:
-    """The objects of a list in the file, each after its place."""
+    """The objects of the list `name` in the file, each with its position for error messages."""
     entries = record.get(name)
     if not isinstance(entries, list) or not entries:
         raise unexpected(f"{file}: {name}", "a list with at least one camera", describe(entries))

@@ -1,4 +1,4 @@
-"""Pictures that exist already, from whatever program, scored as rendered frames are."""
+"""Scores existing pictures, from any program, in the same way as rendered frames."""
 
 from __future__ import annotations
 
@@ -27,18 +27,23 @@ from bench.trajectories import MIXED, spread
 from bench.types import BACKGROUNDS, Log, Split, SteerbenchError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
-"""Of the files that count as pictures; others in a folder are ignored."""
+"""Endings of files that count as pictures; other files in a folder are ignored."""
 
 NAMED = 5
-"""As many files are named in an error; of the rest their number."""
+"""An error names at most this many files and gives the number of the rest."""
 
 Match = Literal["name", "order"]
 
 
 @dataclass(frozen=True)
 class Pair:
-    """The file of a picture to be scored, and the name of its truth, which is a file, too, or uint8
-    [H, W, 3 or 4]."""
+    """A picture to score and its true picture.
+
+    Attributes:
+        picture: the file to score.
+        name: the name of the true picture.
+        truth: its file, or its pixels as uint8 [H, W, 3 or 4].
+    """
 
     picture: Path
     name: str
@@ -46,7 +51,7 @@ class Pair:
 
 
 def pairs_with_folder(pictures: Path, truth: Path, match: Match = "name") -> list[Pair]:
-    """Each picture of the folder `truth` with its counterpart in the folder `pictures`.
+    """Pair each picture of the folder `truth` with its counterpart in the folder `pictures`.
 
     Raises:
         SteerbenchError: they do not match, see `matched`.
@@ -58,7 +63,7 @@ def pairs_with_folder(pictures: Path, truth: Path, match: Match = "name") -> lis
 
 
 def pairs_with_split(pictures: Path, split: Split, match: Match = "name") -> list[Pair]:
-    """Each picture of a `split` of a scene with its counterpart in the folder `pictures`.
+    """Pair each picture of a scene's `split` with its counterpart in the folder `pictures`.
 
     Raises:
         SteerbenchError: they do not match, see `matched`.
@@ -69,12 +74,13 @@ def pairs_with_split(pictures: Path, split: Split, match: Match = "name") -> lis
 
 
 def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
-    """The file of `folder` for each of `names`: of the same name without the ending, or in the same
-    order, where numbers in names count as numbers.
+    """The file of `folder` for each of `names`, matched by name without the ending, or by order.
+
+    Files are ordered by name, numbers in names counting as numbers.
 
     Raises:
-        SteerbenchError: a picture is missing, there is one that belongs to none of `names`, or two
-            of these are the same.
+        SteerbenchError: a picture is missing, one belongs to none of `names`, or `names` has
+            duplicates.
     """
     files = listed(folder)
     if match == "order":
@@ -96,10 +102,10 @@ def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
 
 
 def listed(folder: Path) -> list[Path]:
-    """The pictures in a folder by their names, 10 after 9.
+    """The pictures in a folder, sorted by name with 10 after 9.
 
     Raises:
-        SteerbenchError: there are none, or two that differ in the ending of their names alone.
+        SteerbenchError: there are none, or the names of two differ only in the ending.
     """
     if not folder.is_dir():
         raise unexpected(folder, "a folder", "a file" if folder.exists() else "nothing there")
@@ -113,10 +119,10 @@ def listed(folder: Path) -> list[Path]:
 
 
 def read(path: Path) -> Tensor:
-    """The picture in a file, uint8 [H, W, 3 or 4].
+    """Read a picture file as uint8 [H, W, 3 or 4].
 
     Raises:
-        SteerbenchError: it is none, or damaged, or has more than 8 bits a channel.
+        SteerbenchError: not a picture, damaged, or more than 8 bits per channel.
     """
     return decode_bytes(contents(path), path)
 
@@ -130,14 +136,14 @@ def score(
     *,
     sequence: bool = False,
 ) -> Measurement:
-    """Score pictures under a protocol. Alpha is composited on the background of the protocol.
+    """Score pictures under a protocol, on whose background any alpha is composited.
 
     Args:
         facts: method, scene and so on, for the rows.
-        sequence: they were taken one after the other: their flicker is scored, too.
+        sequence: whether the pictures are consecutive frames, so that flicker is scored, too.
 
     Raises:
-        SteerbenchError: a picture cannot be read, or is not of the size of its truth.
+        SteerbenchError: a picture cannot be read, or differs in size from its true picture.
     """
     background = torch.full((3,), BACKGROUNDS[protocol.background])
     shown = spread(len(pairs), PICTURES)
@@ -196,12 +202,12 @@ def _check(pair: Pair, picture: Tensor, truth: Tensor, protocol: EvaluationProto
 
 
 def _repeated(names: Sequence[str]) -> list[str]:
-    """Those that are there more than once."""
+    """The names that occur more than once."""
     return sorted((name for name, count in Counter(names).items() if count > 1), key=_natural)
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """A key that sorts numbers in names as numbers."""
+    """A sort key that orders numbers in names as numbers."""
     return [
         (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)
     ]

@@ -18,7 +18,7 @@ from torch import Tensor
 from bench.allocator import give_back
 
 OTHER = "other"
-"""The stage that is charged while a frame is in no stage."""
+"""The stage that gets the time of a frame outside any stage."""
 
 
 @dataclass(frozen=True)
@@ -26,10 +26,10 @@ class FrameRecord:
     """The times and the work of one frame.
 
     Attributes:
-        stages_ns: own time of each stage, and of `other`; a stage inside another is named
-            "outer/inner", and its time is not in that of "outer".
+        stages_ns: time of each stage and of `other`, without nested stages: a stage inside another
+            is named "outer/inner", and its time is not part of "outer".
         done: units of work by counter.
-        dense: what a method that skips nothing would have done, for the counters that say so.
+        dense: the work of a method that skips nothing, for the counters that report it.
     """
 
     stages_ns: dict[str, int]
@@ -38,12 +38,12 @@ class FrameRecord:
 
     @property
     def total_ns(self) -> int:
-        """Time from the beginning to the end of the frame: every nanosecond has its stage."""
+        """Time from the beginning to the end of the frame: the sum of all stages."""
         return sum(self.stages_ns.values())
 
 
 def p99_to_p50(frames: Sequence[FrameRecord]) -> float:
-    """How much longer than usual the longest frames take: the 99th percentile over the median."""
+    """How much longer the slowest frames take: 99th percentile of frame time over the median."""
     middle, last = np.percentile([frame.total_ns for frame in frames], (50, 99))
     return float(last / middle)
 
@@ -51,13 +51,13 @@ def p99_to_p50(frames: Sequence[FrameRecord]) -> float:
 class StageClock:
     """The probe of a measurement: charges every nanosecond of a frame to exactly one stage.
 
-    The clock is read only when a stage begins or ends, after the device has finished its work;
-    the time since the last reading goes to the innermost stage that was open. So the stages and
+    The clock is read only when a stage begins or ends, after the device has finished its work.
+    The time since the last reading goes to the innermost open stage, so that the stages and
     `other` add up to the frame by construction.
 
     Args:
-        stages: whether stages are timed. To read the clock waits for a GPU; without stages a frame
-            is waited for when it begins and ends, and all of it is `other`.
+        stages: whether to time stages. Each reading of the clock waits for the GPU. Without stages
+            this happens only at the beginning and end of a frame, and all its time is `other`.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class StageClock:
 
     @contextmanager
     def frame(self) -> Iterator[None]:
-        """Delimit one frame; its record is kept unless the body raises."""
+        """Measure one frame; its record is kept unless the body raises."""
         if self._open is not None:
             raise RuntimeError("a frame may not begin inside a frame")
         self._begin()
@@ -131,16 +131,15 @@ class StageClock:
 
 
 class MemoryMeter:
-    """Peak memory over all regions measured with it: `with meter: ...`, as often as needed.
+    """Measures peak memory over regions of code: `with meter: ...`, as often as needed.
 
-    What the process has freed before, say in a training, is given back first.
+    Memory freed earlier, say in a training, is first returned to the system.
 
     Attributes:
         peak_bytes: the highest peak so far.
         last_bytes: the peak of the last region.
-        source: in words, what was read; it belongs beside the figure, because the memory of a
-            device, of a process while it renders, and of a process since it began are three
-            different things.
+        source: what was read, in words. It must be reported with the figure: memory of a device, of
+            a process while it renders, and of a process since its start are different things.
     """
 
     def __init__(self, device: str) -> None:
@@ -169,7 +168,7 @@ class MemoryMeter:
 
 
 def _reset_high_water_mark() -> bool:
-    """Reset the peak resident memory of this process; False where the system cannot."""
+    """Reset the peak resident memory of this process; False if the system cannot do that."""
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:
@@ -178,7 +177,7 @@ def _reset_high_water_mark() -> bool:
 
 
 def _process_peak_bytes() -> int:
-    """Peak resident memory since the last reset, or since the process began."""
+    """Peak resident memory since the last reset, or since the process started."""
     status = Path("/proc/self/status")
     if status.exists():
         line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))

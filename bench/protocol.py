@@ -1,4 +1,4 @@
-"""The protocol: what one fair measurement is. Every row has its name."""
+"""The protocol: the rules of a fair measurement. Its name is in every row."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ class EvaluationProtocol:
     mixed with those of another.
 
     Attributes:
-        name: as it stands in result rows.
-        rounding: of the prediction before scoring: "8bit" (clip, then round) or "none".
+        name: as shown in result rows.
+        rounding: how the prediction is rounded before scoring: "8bit" (clip, then round) or "none".
         ssim: window of the SSIM, see `bench.metrics.ssim`.
         lpips: backbones of LPIPS, each with a metric `lpips_<net>` of its own.
-        background: "white" or "black": what pictures with an opacity channel are composited on.
+        background: "white" or "black": onto which pictures with an opacity channel are composited.
         warmup: frames rendered before the timed sequence, spread over the trajectory.
         memory: "steady": a method keeps its preceding frames along the trajectory; "cold": it is
             reset before every frame.
-        flicker: where the true pictures of two consecutive frames come from: "split": only frames
-            with ground truth have one; "exact": the others get theirs from the scene, if it can
-            render its exact picture, in about half a second at 400 x 400.
-        stages: whether the stages of a frame are timed, which waits for a GPU at each.
+        flicker: where the true pictures of consecutive frames come from. "split": only frames with
+            ground truth have one. "exact": the scene renders it for the other frames, if it can;
+            this takes about half a second at 400 x 400.
+        stages: whether to time the stages of a frame; this waits for the GPU at each stage.
     """
 
     name: str = "steerbench-1"
@@ -78,11 +78,11 @@ class EvaluationProtocol:
 
     @property
     def metric_names(self) -> tuple[str, ...]:
-        """Names of what `score` returns, in the order of the table."""
+        """Names of the metrics that `score` returns, in the order of the table."""
         return ("psnr", "ssim", *(f"lpips_{net}" for net in self.lpips))
 
     def check(self, scene: Scene, trajectory: Trajectory) -> None:
-        """Raise, before any training, if the frames could not be scored after it.
+        """Raise before any training if the frames could not be scored afterwards.
 
         Raises:
             SteerbenchError: the scene is composited on another background, has no exact pictures
@@ -106,13 +106,13 @@ class EvaluationProtocol:
                 metrics.check_size(f"lpips_{net}", camera.width, camera.height)
 
     def find_lpips(self, weights_dir: Path | None, log: Log) -> dict[str, str | None]:
-        """SHA-256 of each backbone's weight file, None where there is none: rows depend on it."""
+        """SHA-256 of each backbone's weight file, None if missing: part of the run's key."""
         return {net: _weights_digest(net, weights_dir, log) for net in self.lpips}
 
     def load_lpips(
         self, weights_dir: Path | None, log: Log
     ) -> tuple[dict[str, metrics.Lpips], dict[str, str]]:
-        """LPIPS by backbone, and by metric why one is missing, which is logged, too."""
+        """LPIPS by backbone; and by metric, the reason why one is missing, which is also logged."""
         loaded, missing = {}, {}
         for net in self.lpips:
             try:
@@ -123,7 +123,7 @@ class EvaluationProtocol:
         return loaded, missing
 
     def rounded(self, rgb: Tensor) -> Tensor:
-        """A prediction [H, W, 3] as it is scored."""
+        """A prediction [H, W, 3], rounded as for scoring."""
         return metrics.quantise(rgb.float()) if self.rounding == "8bit" else rgb.float()
 
     def score(
@@ -135,8 +135,8 @@ class EvaluationProtocol:
     ) -> dict[str, float]:
         """Every metric of a prediction `rgb` [H, W, 3] against its ground truth.
 
-        `reference` is uint8 [H, W, 3 or 4]; straight alpha is composited on `background` [3].
-        NaN stands for a backbone missing from `lpips`.
+        `reference` is uint8 [H, W, 3 or 4]; straight alpha is composited onto `background` [3].
+        A backbone that is missing from `lpips` scores NaN.
         """
         image = self.rounded(rgb)
         truth = composite(reference.to(rgb.device), background)
@@ -159,6 +159,6 @@ def _weights_digest(net: str, weights_dir: Path | None, log: Log) -> str | None:
 
 @cache
 def _digest(path: Path, changed: int) -> str:
-    """SHA-256 of a file as it is since it was `changed`."""
+    """SHA-256 of a file; its time of change, `changed`, only serves as a key of the cache."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

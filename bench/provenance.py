@@ -13,12 +13,12 @@ from typing import Any
 from bench.sources import ROOT, digest, libraries
 
 CPU_MARKS = ("cpu family", "model", "CPU implementer", "CPU part")
-"""Fields of /proc/cpuinfo: processors of one name may compute differently."""
+"""Fields of /proc/cpuinfo that tell apart processors which share a name but compute differently."""
 
 
 @functools.cache
 def commit() -> str:
-    """The commit of a git checkout, with `-dirty` after changes; else the installed version."""
+    """The commit of a git checkout, with `-dirty` if changed; otherwise the installed version."""
     try:
         # An installed copy may lie inside a repository that has nothing to do with it.
         _git("ls-files", "--error-unmatch", __file__)
@@ -29,7 +29,7 @@ def commit() -> str:
 
 def machine() -> dict[str, object]:
     """The machine and its system, for the record of a run."""
-    import torch  # here, because reading the store needs no torch
+    import torch  # imported here, because reading the store needs no torch
 
     capabilities = torch.cpu.get_capabilities()
     return {
@@ -46,14 +46,16 @@ def machine() -> dict[str, object]:
 
 
 def decisive() -> dict[str, object]:
-    """The part of the machine that can change a figure; see `bench.sources` for its libraries."""
+    """The part of `machine` that can change a result; for libraries see `bench.sources`."""
     found = machine()
     return {name: found[name] for name in ("cpu", "instructions", "gpus", "python")}
 
 
 def computed_by(*things: Any) -> dict[str, object]:
-    """What decides what `things`, classes or functions, compute here, beside what they are given: a
-    part of every key."""
+    """Everything that decides what `things` (classes or functions) compute, beside their inputs.
+
+    A part of every key.
+    """
     import torch
 
     return {
@@ -61,7 +63,7 @@ def computed_by(*things: Any) -> dict[str, object]:
         "libraries": libraries(*things),
         "machine": decisive(),
         "threads": torch.get_num_threads(),
-        "kernel_threads": os.environ.get("NUMBA_NUM_THREADS", ""),  # at most so many
+        "kernel_threads": os.environ.get("NUMBA_NUM_THREADS", ""),  # upper limit
     }
 
 
@@ -77,7 +79,7 @@ def _cpu_model() -> str:
         text = Path("/proc/cpuinfo").read_text()
     except OSError:
         return platform.processor()
-    # Of the first processor; the others are taken to be like it.
+    # The first processor stands for all of them.
     known = {k.strip(): v.strip() for k, _, v in (x.partition(":") for x in text.splitlines()[:40])}
     marks = [f"{mark.removeprefix('cpu ')} {known[mark]}" for mark in CPU_MARKS if mark in known]
     name = known.get("model name", platform.machine())

@@ -1,8 +1,8 @@
-"""The store of runs, `outputs/runs/<key>/`, and the one tidy table made of all of them.
+"""The store of runs, `outputs/runs/<key>/`, and the tidy table made from all of them.
 
 A run folder holds `rows.csv` (one metric per row, `COLUMNS`), `frames.csv` (one frame per row),
 `record.json` (what the key was made of, commit, machine, what the figures mean) and `pictures/`.
-It appears under its key only when it is whole.
+It gets its final name only when it is complete.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from bench.errors import SteerbenchError, explained
 from bench.provenance import commit, machine
 
 SCHEMA_VERSION = 3
-"""The version of record.json and rows.csv that is written."""
+"""The version in which record.json and rows.csv are written."""
 
 READABLE = (2, SCHEMA_VERSION)
-"""The versions that can be read; a folder of another one is reported and left alone.
+"""The versions that can be read; folders of other versions are reported and skipped.
 
-Version 2 has the libraries of a run beside its machine, and other names for two methods."""
+Version 2 stores the libraries of a run with its machine, and has other names for two methods."""
 
 COLUMNS = [
     *("run", "method", "scene", "split", "trajectory", "resolution", "protocol", "budget"),
@@ -42,9 +42,8 @@ COLUMNS = [
     *("device", "backend", "engine", "precision", "seed", "commit"),
 ]
 """`value` is a mean over `n` frames with its 95 % interval [lo, hi], or a single figure (n = 1,
-no interval); NaN with n = 0 is a figure that is not available. `phase` says which frames: "steady",
-"cold" (there were fewer frames before it than the method looks back on), or "all" for a figure of
-the whole run."""
+no interval). NaN with n = 0 means not available. `phase` says which frames: "steady", "cold" (with
+fewer preceding frames than the method looks back on), or "all" for a figure of the whole run."""
 
 STEADY, COLD, WHOLE = "steady", "cold", "all"
 """The values of the column `phase`."""
@@ -56,7 +55,7 @@ STALE_S = 24 * 3600.0
 
 
 def content_key(parts: Mapping[str, object]) -> str:
-    """SHA-256 of `parts`, whatever their order; they hold what JSON can hold, and no NaN."""
+    """SHA-256 of `parts`, regardless of their order; they must be JSON values without NaN."""
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -68,8 +67,8 @@ class Measurement:
     Attributes:
         rows: one metric per row, `COLUMNS` without `run` and `commit`.
         frames: one frame per row; NaN where a figure does not exist for that frame.
-        pictures: uint8 [H, W, 3] by the name of the file, without `.png`.
-        record: what the figures mean: JSON values only.
+        pictures: uint8 [H, W, 3] by file name without `.png`.
+        record: what the figures mean; JSON values only.
     """
 
     rows: pd.DataFrame
@@ -85,16 +84,16 @@ class Store:
         self.folder = root / "runs"
 
     def key(self, parts: Mapping[str, object]) -> str:
-        """The name of the run that is made of `parts`: everything that can change its rows."""
+        """The key of a run, made of `parts`: everything that can change its rows."""
         return content_key(parts)[:16]
 
     def find(self, key: str) -> Path | None:
-        """The folder of a whole run, or None."""
+        """The folder of a complete run, or None."""
         folder = self.folder / key
         return folder if (folder / RECORD).is_file() else None
 
     def whole_key(self, beginning: str) -> str:
-        """The key of the one run whose key begins so.
+        """The key of the only run whose key starts with `beginning`.
 
         Raises:
             SteerbenchError: there is none, or several.
@@ -108,7 +107,7 @@ class Store:
         return keys[0]
 
     def save(self, parts: Mapping[str, object], measurement: Measurement) -> str:
-        """Write the run that is made of `parts`, and return its key; raises as `write` does."""
+        """Write the run made of `parts` and return its key; raises as `write` does."""
         key = self.key(parts)
         record = {
             "schema_version": SCHEMA_VERSION,
@@ -130,9 +129,9 @@ class Store:
 
     @contextmanager
     def write(self, key: str) -> Iterator[Path]:
-        """A temporary folder that becomes the run `key` when the body ends without an exception.
+        """A temporary folder that becomes the run `key` if the body ends without an exception.
 
-        When another process has finished the same run meanwhile, that one stays.
+        If another process has finished the same run in the meantime, its result is kept.
 
         Raises:
             SteerbenchError: no space, no permission, or `outputs` is no folder.
@@ -155,10 +154,10 @@ class Store:
         report: Callable[[str], object] = warnings.warn,
         keys: Collection[str] | None = None,
     ) -> pd.DataFrame:
-        """Every row of every run, or of those with `keys` alone: `COLUMNS`, methods under their
-        present names.
+        """Every row of all runs, or only of those in `keys`, with `COLUMNS`.
 
-        `report` is called with a message for each run that cannot be read.
+        Methods have their present names. `report` is called with a message for each run that
+        cannot be read.
         """
         header = ",".join(COLUMNS)
         bodies, old = [], []
@@ -189,9 +188,9 @@ class Store:
         return pd.read_csv(path, dtype={"name": "str"}, keep_default_na=False, na_values=[""])
 
     def record(self, run: str) -> dict[str, object]:
-        """What a run was made of, and on which machine.
+        """The record of a run: what it was made of, and on which machine.
 
-        The versions of its libraries are in `record["made_of"]["libraries"]`, whatever its schema.
+        Versions of libraries are in `record["made_of"]["libraries"]` for every schema.
         """
         record = json.loads((self._existing(run) / RECORD).read_text(encoding="utf-8"))
         if record.get("schema_version") == 2:
@@ -209,7 +208,7 @@ class Store:
         _sync(self.folder)
 
     def _sweep(self) -> None:
-        """Delete what killed processes left behind; a day is longer than any writing takes.
+        """Delete what killed processes left behind: partial folders older than a day.
 
         What other processes publish or delete meanwhile is ignored.
         """
@@ -226,7 +225,7 @@ class Store:
 
 
 def present_name(method: str) -> str:
-    """The present name of what schema 2 calls `method`.
+    """The present name of the method that schema 2 calls `method`.
 
     "steernerf" was the lean method and "steernerf_paper" the paper's; variants have a suffix.
     """
@@ -249,12 +248,12 @@ def _schema_version(folder: Path) -> object:
 
 
 def _text(path: Path) -> str:
-    """The text of a file; empty where there is no such file."""
+    """The text of a file; empty if there is no such file."""
     return path.read_text(encoding="utf-8") if path.is_file() else ""
 
 
 def _sync(path: Path) -> None:
-    """Write a file or folder to the disk now."""
+    """Flush a file or folder to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -36,7 +36,7 @@ UNITS = {
     "peak_bytes": "B",
     "train_s": "s",
 }
-"""Units by the name of a metric up to its first dot; a metric that is not listed has none."""
+"""Units of metrics, by name up to the first dot; other metrics have no unit."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ class Task:
     """What a method is measured on.
 
     Attributes:
-        seed: for the rows; the method was made with it.
-        weights_dir: where to look first for the backbones of LPIPS.
-        pictures: scored frames whose pictures are kept.
+        seed: the seed that the method was made with; only written into the rows.
+        weights_dir: folder to search first for the LPIPS backbones.
+        pictures: number of scored frames whose pictures are kept.
     """
 
     scene: Scene
@@ -62,22 +62,22 @@ def measure(method: Method, task: Task, log: Log) -> Measurement:
     """Fit `method` to the scene of `task`, render its trajectory under the clock and score it.
 
     Raises:
-        SteerbenchError: the scene does not suit the protocol, or the method rendered values that
+        SteerbenchError: the scene does not fit the protocol, or the method rendered values that
             are not finite.
     """
     return measure_in_turns([method], task, log)[0]
 
 
 def measure_in_turns(methods: Sequence[Method], task: Task, log: Log) -> list[Measurement]:
-    """`measure` several methods that draw each frame one after the other, so that their times are
-    those of the same minutes. The peak memory of one process is that of all of them.
+    """`measure` several methods side by side: each frame is rendered by all before the next one.
 
-    Raises as `measure` does.
+    So their times come from the same minutes. Peak memory of the process is that of all methods
+    together. Raises as `measure` does.
     """
     lpips, missing = task.protocol.load_lpips(task.weights_dir, log)
     task.protocol.check(task.scene, task.trajectory)
     for split in task.scene.splits.values():
-        list(split.images)  # decoded and refused now: not in a training, nor between frames
+        list(split.images)  # decode now, so damaged files raise here, not during training or timing
     for method in methods:
         method.fit(task.scene, task.budget, log)
     takes = [_Take.of(method, task, lpips) for method in methods]
@@ -89,7 +89,7 @@ def measure_in_turns(methods: Sequence[Method], task: Task, log: Log) -> list[Me
 
 @dataclass(frozen=True)
 class _Take:
-    """A method in front of its clock, and a row for each frame that it has drawn."""
+    """A method being measured: its clock, memory meter, scoring, and a row per rendered frame."""
 
     method: Method
     clock: StageClock
@@ -108,7 +108,7 @@ class _Take:
 def _measurement(
     take: _Take, task: Task, missing: Mapping[str, str], neighbours: Neighbours
 ) -> Measurement:
-    """What is kept of a method that has drawn all frames."""
+    """The measurement of a method that has rendered all frames."""
     scene, trajectory, protocol, budget = task.scene, task.trajectory, task.protocol, task.budget
     method, meter, scoring = take.method, take.meter, take.scoring
     frames = _frame_table(take.rows, protocol)
@@ -144,8 +144,10 @@ def _measurement(
 
 
 def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
-    """Warm up, then render the sequence in its order; each frame is scored and let go. Returns what
-    other processes did beside it, the warming up apart."""
+    """Warm up, then render the sequence in order; each frame is scored and discarded.
+
+    Returns what other processes used meanwhile, not counting the warm-up.
+    """
     steps = task.trajectory.steps
     warmup = spread(len(steps), task.protocol.warmup)
     frames = len(takes) * (len(warmup) + len(steps))
@@ -167,8 +169,10 @@ def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
 
 
 def _draw(take: _Take, task: Task, index: int, before: int) -> None:
-    """The next frame of a method, with `before` frames since the last cut, under the clock. No cut
-    is announced to it: nobody who steers a camera announces a jump."""
+    """Render and score the next frame of a method; `before` frames precede it since the last cut.
+
+    The method is not told of cuts, because a user who steers a camera does not announce a jump.
+    """
     method, step = take.method, task.trajectory.steps[index]
     if task.protocol.memory == "cold":
         method.reset()
@@ -183,7 +187,7 @@ def _draw(take: _Take, task: Task, index: int, before: int) -> None:
 
 
 def _times_and_work(record: FrameRecord) -> dict[str, Any]:
-    """One frame's columns: its time, that of its stages, its work."""
+    """One frame's columns: its time, the times of its stages, its work."""
     return {
         "frame_ms": record.total_ns / 1e6,
         **{f"stage_ms.{name}": ns / 1e6 for name, ns in record.stages_ns.items()},
@@ -193,7 +197,7 @@ def _times_and_work(record: FrameRecord) -> dict[str, Any]:
 
 
 def _frame_table(table: list[dict[str, Any]], protocol: EvaluationProtocol) -> pd.DataFrame:
-    """One row per frame: a stage or counter that a frame did not have is 0, a score NaN."""
+    """One row per frame; missing stages and counters are 0, missing scores NaN."""
     frames = pd.DataFrame(table)
     touched = [name for name in map(str, frames) if name.startswith(("stage_ms.", "work."))]
     touched.sort(key=lambda name: (name.startswith("work."), name == "stage_ms.other"))
@@ -203,7 +207,7 @@ def _frame_table(table: list[dict[str, Any]], protocol: EvaluationProtocol) -> p
 
 
 def _frame_rows(frames: pd.DataFrame) -> list[dict[str, Any]]:
-    """The rows of the steady frames, then those of the cold ones, where there are any."""
+    """The rows of the steady frames, then those of the cold frames, if there are any."""
     return [
         row | {"phase": phase}
         for phase in (STEADY, COLD)
@@ -213,10 +217,10 @@ def _frame_rows(frames: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def phase_rows(frames: pd.DataFrame) -> list[dict[str, Any]]:
-    """Mean and interval of every column, quantiles of the frame time, frames a second.
+    """Mean and interval of every column, quantiles of the frame time, frames per second.
 
     Args:
-        frames: one or more, in the order of the path: `frame`, `name` and `phase`, scores up to
+        frames: at least one, in path order. Columns: `frame`, `name` and `phase`, scores up to
             `flicker`, times, work, memory.
     """
     columns = list(map(str, frames))
@@ -235,8 +239,10 @@ def phase_rows(frames: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def mean_row(metric: str, values: pd.Series) -> dict[str, Any]:
-    """A row of a metric: its mean over the frames that have a value, in the order of the path, and
-    the interval of that."""
+    """The row of a metric: its mean over the frames that have a value, with the interval.
+
+    `values` are in path order.
+    """
     known = values.dropna().to_numpy(dtype=float)
     value = known.mean() if len(known) else math.nan
     half = path_interval(known)
@@ -245,12 +251,12 @@ def mean_row(metric: str, values: pd.Series) -> dict[str, Any]:
 
 
 def _rate(ms: dict) -> dict[str, float]:
-    """Frames a second of a mean time; the interval exists where that of the time is positive."""
+    """Frames per second from a mean time; no upper end if the interval of the time reaches 0."""
     slowest, fastest = ms["hi"], ms["lo"] if ms["lo"] > 0 else math.nan
     return {"value": 1000 / ms["value"], "lo": 1000 / slowest, "hi": 1000 / fastest}
 
 
 def _single(metric: str, value: float) -> dict[str, Any]:
-    """A row of a single figure, of the whole run unless its phase is replaced."""
+    """The row of a single figure; it belongs to the whole run unless its phase is replaced."""
     row = {"metric": metric, "value": float(value), "n": 1, "lo": math.nan, "hi": math.nan}
     return row | {"phase": WHOLE}

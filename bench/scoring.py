@@ -1,4 +1,4 @@
-"""Scores a sequence of frames one after another, so that none has to be kept."""
+"""Scores a sequence frame by frame, so that frames need not be kept."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from bench.trajectories import Step, Trajectory, spread
 from bench.types import Camera, Frame, Scene, SteerbenchError, check_shape
 
 PICTURES = 3
-"""Scored frames whose pictures are kept, unless something else is asked for."""
+"""Default number of scored frames whose pictures are kept."""
 
 ERROR_RANGE = 0.1
-"""Absolute error, mean over the channels, that the brightest colour of an error map stands for."""
+"""Absolute error (mean over channels) that the brightest colour of an error map stands for."""
 
 
 def check_frame(frame: Frame, camera: Camera, method: str, index: int) -> None:
-    """Raise if a picture has a NaN in it: it has no score, and a table may not invent one.
+    """Raise if a frame cannot be scored: wrong size, or values that are not finite.
 
     Raises:
-        ValueError: the picture is not of the size of `camera`.
-        SteerbenchError: a pixel of it is not finite.
+        ValueError: the size differs from that of `camera`.
+        SteerbenchError: a pixel is not finite.
     """
     check_shape("rgb", frame.rgb, camera.height, camera.width, 3)
     broken = int((~torch.isfinite(frame.rgb)).any(dim=-1).sum())
@@ -40,7 +40,7 @@ def check_frame(frame: Frame, camera: Camera, method: str, index: int) -> None:
 
 
 class Flicker:
-    """Scores frames against the one before, which it keeps."""
+    """Scores the flicker of each frame against the previous one, which it keeps."""
 
     def __init__(self) -> None:
         self._last: tuple[Tensor, Tensor] | None = None
@@ -48,9 +48,12 @@ class Flicker:
     def since_last(
         self, frame: tuple[Tensor, Tensor] | None, cut: bool = False
     ) -> dict[str, float]:
-        """The flicker of a frame and its truth, both [H, W, 3], since the frame before, where both
-        have a true picture of the same size; none after a `cut`."""
-        if frame is not None:  # kept on a GPU, it would count as memory of the method
+        """The flicker from the previous frame to this one.
+
+        `frame` is a rendering and its true picture, both [H, W, 3]; None: it has no truth. Empty
+        after a `cut`, and if either frame has no truth or their sizes differ.
+        """
+        if frame is not None:  # on the GPU it would count as memory of the method
             frame = frame[0].cpu(), frame[1].cpu()
         last, self._last = self._last, frame
         if cut or last is None or frame is None or last[0].shape != frame[0].shape:
@@ -59,11 +62,11 @@ class Flicker:
 
 
 class Scoring:
-    """Scores the frames of a trajectory in their order; keeps the last one for the flicker.
+    """Scores the frames of a trajectory in order; keeps the last one for the flicker.
 
     Attributes:
-        images: of some scored frames, evenly spread: ground truth, rendering and error map
-            as 8-bit pictures by file name; filled as the frames come.
+        images: 8-bit pictures by file name: ground truth, rendering and error map of some evenly
+            spread scored frames. Filled while frames are scored.
     """
 
     def __init__(
@@ -82,7 +85,7 @@ class Scoring:
         self._flicker = Flicker()
 
     def score(self, index: int, step: Step, rgb: Tensor) -> dict[str, Any]:
-        """Name and metrics of frame `index`, rendered as `rgb` [H, W, 3]; none without a truth."""
+        """Name and metrics of frame `index`, rendered as `rgb` [H, W, 3]; none without truth."""
         figures: dict[str, Any] = {}
         if step.truth is not None:
             truth, background = self._split.images[step.truth], self._scene.background
@@ -93,7 +96,7 @@ class Scoring:
         return figures | self._flicker.since_last(self._with_truth(step, rgb), step.cut)
 
     def _with_truth(self, step: Step, rgb: Tensor) -> tuple[Tensor, Tensor] | None:
-        """The frame as it is scored and its true picture, both [H, W, 3]."""
+        """The frame, rounded as for scoring, and its true picture, both [H, W, 3]."""
         if step.truth is not None:
             truth = self._split.images[step.truth]
         elif self._protocol.flicker == "exact" and self._scene.exact is not None:
@@ -106,7 +109,7 @@ class Scoring:
 
 def kept_pictures(index: int, rgb: Tensor, truth: Tensor) -> dict[str, np.ndarray]:
     """Ground truth, rendering and error map of a frame, as 8-bit pictures by file name."""
-    import matplotlib  # takes a third of a second, which who keeps no picture need not wait
+    import matplotlib  # imported here: it takes 0.3 s, needed only for pictures
 
     rendering, truth = quantise(rgb).cpu(), truth.cpu()
     error = (rendering - truth).abs().mean(dim=-1) / ERROR_RANGE

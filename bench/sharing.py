@@ -1,6 +1,6 @@
-"""Files that several processes share, also of other users and machines: whole, and made once.
+"""Files shared by processes, users and machines: written atomically, and made only once.
 
-A lock ends with the process that holds it, however that ends.
+A lock is released when its process ends, no matter how it ends.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING
 
 from bench.errors import explained
 
-if TYPE_CHECKING:  # it loads torch, for which no lock should wait
+if TYPE_CHECKING:  # loads torch; a lock should not wait for that
     from bench.types import Log
 
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """A file beside `path` to write, which becomes `path` when the body ends without an exception.
+    """A temporary file beside `path`; it becomes `path` if the body ends without an exception.
 
-    Its name is unique, and ends as `path` does.
+    Its name is unique and has the ending of `path`.
     """
     new = path.with_name(f".{path.stem}-{uuid.uuid4().hex}{path.suffix}")
     try:
@@ -35,10 +35,10 @@ def whole(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def locked(path: Path, waiting: str, log: Log) -> Iterator[None]:
-    """Hold the lock file `path`, made if missing and never removed, alone among all processes.
+    """Hold an exclusive lock on the file `path`, which is created if missing and never removed.
 
-    `waiting` is logged while another process holds it. Where the file system has no locks, that is
-    logged, and the work is done all the same, at worst twice.
+    `waiting` is logged while another process holds it. If the file system has no locks, that is
+    logged and the body runs anyway; at worst, work is then done twice.
 
     Raises:
         SteerbenchError: `path` cannot be opened for writing.
@@ -57,7 +57,7 @@ def locked(path: Path, waiting: str, log: Log) -> Iterator[None]:
 
 @contextmanager
 def missing(path: Path, log: Log) -> Iterator[bool]:
-    """Whether `path` is still to be made: the body makes it, and no other process meanwhile.
+    """Whether `path` must still be made: if so, the body makes it while other processes wait.
 
     Raises:
         SteerbenchError: the folder of `path` cannot be written to.
@@ -74,10 +74,10 @@ def _opened(path: Path) -> int:
     try:
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL)
     except FileExistsError:
-        # Without O_CREAT: in a folder for everybody, that is refused for the file of another user.
+        # No O_CREAT: in a world-writable folder it is refused for a file of another user.
         return os.open(path, os.O_RDWR)
     with suppress(OSError):  # some file systems have no modes
-        os.fchmod(handle, 0o666)  # whatever the umask: other users take turns, too
+        os.fchmod(handle, 0o666)  # regardless of umask, so that other users can lock it, too
     return handle
 
 

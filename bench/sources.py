@@ -1,7 +1,7 @@
-"""Which files and libraries decide what a class or a function computes, found from the imports.
+"""Finds the files and libraries that decide what a class or function computes, from the imports.
 
-A cache key holds the digest of these files, so that a change in any of them, and in no other file,
-makes new results necessary. No list of files is kept by hand.
+A cache key holds the digest of these files, so that results become invalid exactly when one of them
+changes. No list of files is kept by hand.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ ROOT = Path(__file__).resolve().parent.parent
 OURS = ("bench", "methods")
 WEIGHTS = "*.safetensors"
 CHECKS = ("cases.py", "experiments.py")
-"""Files of a folder that hold its checks. They compute nothing that a result is made of."""
+"""Files that hold the checks of their folder. They do not affect results."""
 
 
 def digest(*things: Any) -> str:
     """SHA-256 of the names and bytes of the `sources` of `things`.
 
     Raises:
-        SteerbenchError: one of them was changed since its digest was first taken here. This process
-            may go on with the old code, whose results would stand under the key of the new one.
+        SteerbenchError: a file changed after this process first hashed it. The process may still
+            run the old code, and would store its results under the key of the new code.
     """
     total = hashlib.sha256()
     for name, path in sorted(sources(*things).items()):
@@ -41,19 +41,19 @@ def digest(*things: Any) -> str:
 
 
 _first: dict[Path, str] = {}
-"""The hash of each file when it was first asked for."""
+"""The first hash that this process took of each file."""
 
 
 @cache
 def _hashed(path: Path, changed: int) -> str:
-    """Of a file as it is since it was `changed`."""
+    """SHA-256 of a file; its time of change, `changed`, only serves as a key of the cache."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def libraries(*things: Any) -> dict[str, str]:
-    """The version of every installed distribution that the `sources` of `things` import.
+    """Versions of all installed distributions that the `sources` of `things` import.
 
-    A class whose libraries are loaded by name lists them in its attribute `libraries`.
+    A class that loads libraries by name lists them in its attribute `libraries`.
     """
     imported = {name for path in sources(*things).values() for name in _imports(path)}
     packages = {name.partition(".")[0] for name in imported} - set(OURS)
@@ -64,15 +64,16 @@ def libraries(*things: Any) -> dict[str, str]:
 
 
 def sources(*things: Any) -> dict[str, Path]:
-    """The files that decide what `things`, classes or functions, compute.
+    """The files that decide what `things` (classes or functions) compute.
 
-    Of this project: the module that each thing is defined in and all that it imports. An imported
-    package counts with every file beside its `__init__`, because backends are loaded by name, and
-    with the weights that lie there. Of other projects: the whole top-level package of the thing,
-    and what that imports of ours and of packages that no installed distribution has.
+    In this project: the module that defines each thing, and everything it imports, directly or not.
+    An imported package counts with all files beside its `__init__`, because backends are loaded by
+    name, and with the weights in its folder. For a thing from another project: its whole top-level
+    package, and what that imports from this project or from packages outside any installed
+    distribution.
 
     Returns:
-        Their paths by name, which begins with the top-level package, wherever that lies.
+        Paths by name. A name starts at the top-level package, wherever that is on the disk.
     """
     known = _known.get((ROOT, things))
     if known is None or _times(known[0]) != known[1]:
@@ -82,8 +83,8 @@ def sources(*things: Any) -> dict[str, Path]:
 
 
 _known: dict[tuple[Path, tuple[Any, ...]], tuple[dict[str, Path], list[int]]] = {}
-"""What `sources` found, and when these files and their folders were changed last: a sweep asks for
-the same things again and again."""
+"""Cache of `sources`, with modification times of the files and their folders: a sweep asks for the
+same things again and again."""
 
 
 def _times(files: dict[str, Path]) -> list[int]:
@@ -108,10 +109,10 @@ def _found(*things: Any) -> dict[str, Path]:
 
 
 def _files(name: str, home: bool = False) -> dict[str, Path]:
-    """The files of the module or package `name`, or of the one that defines it.
+    """The files of the module or package `name`, or of the module that defines that name.
 
-    Where an installed distribution or Python itself has it, its version is enough: none, unless it
-    is the `home` of a thing.
+    Empty for installed distributions and Python itself, whose versions are enough, unless it is the
+    `home` of a thing.
     """
     top = name.partition(".")[0]
     if top in OURS:
@@ -132,7 +133,7 @@ def _files(name: str, home: bool = False) -> dict[str, Path]:
 
 
 def _ours(name: str) -> list[Path]:
-    """The files of this project that `name` stands for."""
+    """The files of this project that `name` refers to."""
     parts = name.split(".")
     while parts:
         path = ROOT.joinpath(*parts)
@@ -146,12 +147,12 @@ def _ours(name: str) -> list[Path]:
 
 
 def _weights(folder: Path) -> list[Path]:
-    """Weights below a folder of a top-level package."""
+    """Weight files below `folder`; none for a top-level package itself."""
     return list(folder.rglob(WEIGHTS)) if folder.parent != ROOT else []
 
 
 def _imports(path: Path) -> tuple[str, ...]:
-    """The modules, and the names in them, that a file imports anywhere."""
+    """The modules, and names from modules, that a file imports anywhere in its code."""
     return _parsed(path, path.stat().st_mtime_ns) if path.suffix == ".py" else ()
 
 
@@ -168,7 +169,7 @@ def _parsed(path: Path, changed: int) -> tuple[str, ...]:
 
 @cache
 def _distributions() -> dict[str, list[str]]:
-    """The distributions that have a top-level package, by its name."""
+    """The installed distributions that provide each top-level package."""
     return dict(metadata.packages_distributions())
 
 

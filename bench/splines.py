@@ -1,4 +1,4 @@
-"""Camera paths without corners through a few given cameras."""
+"""Smooth camera paths through a few given cameras."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from bench.motion import lens_between
 from bench.types import Camera, SteerbenchError
 
 SAMPLES = 65
-"""Poses along a piece of a spline that its length is measured with: 64 chords of an arc of half a
-turn miss 0.01 % of it."""
+"""Poses per segment for measuring its length: 64 chords of half a circle are 0.01 % too short."""
 
 
 def leading(keys: Sequence[Camera], target: Tensor, degrees: float) -> list[list[Camera]]:
-    """A path without corners through `keys`: for each but the first the cameras that lead to it
-    from the one before, the key itself as the last.
+    """A smooth path through `keys`, one segment for each key but the first.
 
-    Centres follow a cubic spline, rotations one of continuous angular acceleration. Both run over
-    the length of the way, an angle: by how much the camera turns or, if that is more, its centre
-    moves, seen from `target` [3]. The cameras of a piece are evenly spaced, by at most `degrees`.
+    A segment holds the cameras after the previous key, up to and including its own key. Centres
+    follow a cubic spline, rotations a spline with continuous angular acceleration. Both are
+    parametrised by length, measured as an angle: the camera's rotation, or the motion of its centre
+    as seen from `target` [3], whichever is larger. The cameras of a segment are evenly spaced, by
+    at most `degrees`.
 
     Raises:
-        SteerbenchError: fewer than two keys, two in a row with the same pose, or keys whose
-            pictures differ in size.
+        SteerbenchError: fewer than two keys, two consecutive keys with the same pose, or keys
+            whose pictures differ in size.
     """
     poses = torch.stack([camera.c2w.double() for camera in keys]).numpy()
     turns, centres = Rotation.from_matrix(poses[:, :, :3]), poses[:, :, 3]
@@ -56,7 +56,7 @@ def leading(keys: Sequence[Camera], target: Tensor, degrees: float) -> list[list
 
 
 def _lengths(turns: Rotation, centres: np.ndarray, target: Tensor) -> np.ndarray:
-    """The length [N - 1] of the way from each of N poses to the next, radians; see `leading`."""
+    """The length [N - 1] in radians from each of N poses to the next; see `leading`."""
     moved = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     far = np.linalg.norm(centres - target.double().numpy(), axis=1)
     return np.maximum((turns[:-1].inv() * turns[1:]).magnitude(), np.arctan2(moved, far[:-1]))

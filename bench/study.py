@@ -9,26 +9,26 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Variant:
-    """A variant of a run: its `name`, and the `settings` that make it, as of `steerbench run`."""
+    """A variant of a run: its `name`, and the `settings` of `steerbench run` that make it."""
 
     name: str
     settings: tuple[str, ...] = ()
 
 
 def turned(label: str, setting: str, values: Iterable[object], *more: str) -> list[Variant]:
-    """A variant for each of the `values` of a setting; all have `more` settings."""
+    """One variant for each of the `values` of a setting; all share the settings in `more`."""
     return [Variant(f"{label} {value}", (f"{setting}={value}", *more)) for value in values]
 
 
 @dataclass(frozen=True)
 class Axis:
-    """A setting whose value the cost of a frame grows with.
+    """A setting that the cost of a frame grows with.
 
     Attributes:
         label: how a value is shown, "K = {}".
         setting: its name, "method.model.channels".
-        values: the values that are measured.
-        size: what each value amounts to, for the fit of a power; None: the value itself.
+        values: the values to measure.
+        size: converts a value to the size used in the power-law fit; None: the value itself.
     """
 
     label: str
@@ -39,19 +39,19 @@ class Axis:
 
 @dataclass(frozen=True)
 class Study:
-    """What can be varied of a method, and what its stages are; each attribute may be left out.
+    """What can be varied in a method, and which stages it has; every attribute is optional.
 
     Attributes:
-        knobs: by name, the settings a knob can have after the training. Engines and precisions
-            need not be declared.
-        trained: the same for settings that need a training of their own.
-        exact: the settings with which the trained model trades no error for speed.
-        skips: by what is skipped, the setting that switches this off with `false`.
-        skips_with: settings that all lines of the study of skips share.
+        knobs: by knob, the variants that need no new training. Engines and precisions need not be
+            declared.
+        trained: the same for variants that need a training of their own.
+        exact: settings with which the trained model gives up no accuracy for speed.
+        skips: by what is skipped, the setting that switches this skipping off with `false`.
+        skips_with: settings shared by all lines of the study of skips.
         savings: further savings, each compared on top of all skips.
         axes: by name, what the cost of a frame grows with, beside pixels and threads.
-        parts: the part of a frame that a stage, with all stages inside it, is counted in; other
-            stages are parts of their own.
+        parts: by stage, the part of a frame that it counts towards, with all stages nested in it.
+            Other stages are parts of their own.
         network_stage: the stage that the engine computes.
         network_size: the name of the network in `Method.sizes`.
         beside: by name, the settings of other methods to compare with.
@@ -70,7 +70,7 @@ class Study:
     beside: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def part_of(self, stage: str) -> str:
-        """The part of a frame that `stage`, "field/march", is counted in."""
+        """The part of a frame that `stage` (for example "field/march") counts towards."""
         outer = stage
         while outer and outer not in self.parts:
             outer = outer.rpartition("/")[0]
@@ -78,5 +78,5 @@ class Study:
 
 
 def study_of(method: Any) -> Study:
-    """What the class, function or object of a method declares as `study`; an empty one if none."""
+    """The `study` attribute of a method's class, function or object; an empty one if missing."""
     return getattr(method, "study", Study())

@@ -1,4 +1,4 @@
-"""Sets how many threads torch uses for an operation."""
+"""Sets how many threads torch uses per operation."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ import torch
 
 @contextmanager
 def torch_threads(count: int | None) -> Iterator[None]:
-    """Compute each of torch's operations on `count` threads, and afterwards on as many as before;
-    with None, on as many as before all along.
+    """Run each torch operation on `count` threads inside the context; None: leave it unchanged.
 
-    One, for many small operations: pools inside a pool fight for the cores, and on a busy machine
-    even a single pool spends most of its time waiting for its slowest thread.
+    Use 1 for many small operations: nested thread pools compete for the cores, and on a busy
+    machine even a single pool mostly waits for its slowest thread.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(count or before)

@@ -1,6 +1,6 @@
 """Trajectories: the ordered cameras of a measurement, and which of them have ground truth.
 
-How a camera comes from one pose to the next is in `bench.motion`.
+`bench.motion` computes the motion from one pose to the next.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from bench.motion import between, preceding, rotation_between, viewing_target
 from bench.types import Camera, Scene, SteerbenchError
 
 MIXED = "mixed"
-"""The resolution of a trajectory whose frames differ in size."""
+"""Stands for the resolution of a trajectory whose frames differ in size."""
 
 
 @dataclass(frozen=True)
@@ -26,10 +26,10 @@ class Step:
     """One frame of a trajectory.
 
     Attributes:
-        camera: from where it is rendered.
+        camera: the camera to render.
         truth: the index of its ground truth in the split; None: unscored.
-        cut: the camera did not come here from the step before. The first step of a trajectory
-            has no step before it and counts as a cut whether it is marked or not.
+        cut: whether the camera jumped here instead of moving from the previous step. The first
+            step of a trajectory always counts as a cut, marked or not.
     """
 
     camera: Camera
@@ -42,10 +42,10 @@ class Trajectory:
     """The frames of one sequence, in the order in which they are rendered.
 
     Attributes:
-        name: as it stands in result rows.
-        split: the split of the scene that `Step.truth` counts in.
+        name: as shown in result rows.
+        split: the split of the scene that `Step.truth` indexes.
         steps: at least one.
-        reads: the files that it was read from.
+        reads: the files that the trajectory was read from.
     """
 
     name: str
@@ -69,14 +69,14 @@ class Trajectory:
 
 
 def spread(total: int, count: int) -> list[int]:
-    """At most `count` different indices of `total`, evenly spread, first and last among them."""
+    """At most `count` distinct indices below `total`, evenly spread, from the first to the last."""
     return np.linspace(0, total - 1, min(total, count)).round().astype(int).tolist()
 
 
 def from_split(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:
-    """The cameras of a split in their order; `limit` > 0 keeps that many, evenly spread.
+    """The cameras of a split in order; `limit` > 0 keeps only that many, evenly spread.
 
-    A frame that is kept without the one before it comes after a cut.
+    A kept frame whose predecessor was dropped comes after a cut.
 
     Raises:
         SteerbenchError: the scene has no such split, it is empty, or `limit` is negative.
@@ -90,9 +90,9 @@ def from_split(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:
 
 
 def orbit(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:
-    """The cameras of a split in their order, without gaps; `limit` > 0 keeps the first that many.
+    """The cameras of a split in order, without gaps; `limit` > 0 keeps only the first `limit`.
 
-    Where the split was taken along a path, the frames before a frame are those of that path.
+    If the split was recorded along a path, preceding frames are true neighbours on that path.
 
     Raises:
         SteerbenchError: as `from_split`.
@@ -106,7 +106,7 @@ def smooth(scene: Scene, split: str = "test", degrees: float = 1.0, limit: int =
     """A path through the cameras of a split that turns by at most `degrees` from frame to frame.
 
     Frames between two cameras have no ground truth: they are rendered and timed, not scored.
-    `limit` > 0 keeps the first that many cameras, so that the path has no gaps.
+    `limit` > 0 keeps only the first `limit` cameras, so that the path has no gaps.
 
     Raises:
         SteerbenchError: as `from_split`; `degrees` is not positive, or picture sizes differ.
@@ -118,9 +118,9 @@ def smooth(scene: Scene, split: str = "test", degrees: float = 1.0, limit: int =
 def jump(
     scene: Scene, split: str = "test", degrees: float = 1.0, every: int = 10, limit: int = 0
 ) -> Trajectory:
-    """The smooth path in pieces of `every` frames, shuffled: a teleport after each of them.
+    """The smooth path cut into pieces of `every` frames and shuffled, so the camera jumps between.
 
-    The order is the same every time, and no piece follows the one it followed on the path.
+    The order is the same every time, and no piece follows its predecessor on the path.
 
     Raises:
         SteerbenchError: as `smooth`; `every` is less than 1, or the path has no second piece.
@@ -143,10 +143,10 @@ def jump(
 def loop(
     scene: Scene, split: str = "test", degrees: float = 1.0, frames: int = 1000, limit: int = 0
 ) -> Trajectory:
-    """The smooth path there and back, again and again, until `frames` frames are rendered.
+    """The smooth path back and forth, repeated until `frames` frames are rendered.
 
-    Every round comes back to exactly the same cameras, so what drifts or grows over a long
-    sequence shows in the scores of the same pictures.
+    Every round revisits exactly the same cameras, so that drift over a long sequence shows in the
+    scores of the same pictures.
 
     Raises:
         SteerbenchError: as `smooth`; `frames` is less than 1.
@@ -159,7 +159,7 @@ def loop(
 
 
 def static(scene: Scene, split: str = "test", view: int = 0, frames: int = 60) -> Trajectory:
-    """The camera stands still: `frames` times camera `view` of a split.
+    """A still camera: camera `view` of a split, repeated for `frames` frames.
 
     Raises:
         SteerbenchError: as `from_split`; there is no such view, or `frames` is less than 1.
@@ -177,11 +177,11 @@ def static(scene: Scene, split: str = "test", view: int = 0, frames: int = 60) -
 def approached(
     scene: Scene, split: str, lead: int, degrees: float, seed: int, limit: int
 ) -> Trajectory:
-    """Scattered cameras of a split, each at the end of a random smooth motion of its own.
+    """Scattered cameras of a split, each reached by its own random smooth motion.
 
     The `lead` frames before a camera have no ground truth; the first of them comes after a cut.
     From frame to frame the camera turns by `degrees` about what it looks at (`motion.preceding`).
-    `seed` decides about the motions, and `limit` > 0 keeps that many cameras, evenly spread.
+    `seed` seeds the motions; `limit` > 0 keeps only that many cameras, evenly spread.
 
     Raises:
         SteerbenchError: as `from_split`; `lead` is negative, or `degrees` not from 0 to 180.
@@ -214,21 +214,21 @@ def _cameras(scene: Scene, split: str, limit: int) -> Sequence[Camera]:
 
 
 def _first(scene: Scene, split: str, limit: int) -> tuple[Sequence[Camera], str]:
-    """The first `limit` cameras of a split (0: all), and how the name says that some are left."""
+    """The first `limit` cameras of a split (0: all), and the part of the name that says so."""
     cameras = _cameras(scene, split, limit)
     kept = cameras[: limit or len(cameras)]
     return kept, "" if len(kept) == len(cameras) else f"-{len(kept)}of{len(cameras)}"
 
 
 def _smooth_steps(scene: Scene, split: str, degrees: float, limit: int) -> tuple[list[Step], str]:
-    """The steps of the smooth path through the first `limit` cameras, and the end of its name."""
+    """The steps of the smooth path through the first `limit` cameras, and its name's ending."""
     if not degrees > 0:
         raise SteerbenchError(f"trajectory.degrees: expected more than 0, got {degrees}")
     kept, part = _first(scene, split, limit)
     steps = [Step(kept[0], 0)]
     for index, (first, second) in enumerate(pairwise(kept), 1):
         turn = rotation_between(first, second)
-        # Cameras that are `degrees` apart are neighbours, whatever the rounding of their poses.
+        # 1e-3: cameras that are `degrees` apart need no frame between them, despite rounding.
         count = max(math.ceil(math.degrees(turn.norm().item()) / degrees - 1e-3), 1)
         steps += [Step(between(first, second, turn, k / count), None) for k in range(1, count)]
         steps.append(Step(second, index))
@@ -236,9 +236,9 @@ def _smooth_steps(scene: Scene, split: str, degrees: float, limit: int) -> tuple
 
 
 def _shuffled(count: int) -> list[int]:
-    """0 to count - 1 in a repeatable random order in which k + 1 never follows k; count >= 2."""
+    """0 to count - 1 in a fixed random order in which k + 1 never follows k; count >= 2."""
     random = np.random.default_rng(0)
-    while True:  # about one order in three is free of neighbours
+    while True:  # about one order in three qualifies
         order = random.permutation(count).tolist()
         if all(after != before + 1 for before, after in pairwise(order)):
             return order

@@ -1,4 +1,4 @@
-"""The contracts between the ruler and what it measures, and the glossary of symbols.
+"""The interfaces between the benchmark and the methods it measures, and the glossary of symbols.
 
 | symbol   | meaning                                             | unit, shape, axes                     |
 |----------|-----------------------------------------------------|---------------------------------------|
@@ -16,8 +16,8 @@
 | K        | channels of a feature map, the first three are RGB  |                                       |
 | L        | preceding frames a method with memory looks back on |                                       |
 
-Scene units: every scene is normalised so that what is to be rendered lies in the unit cube
-[0, 1]^3; `Scene.unit_length` converts a length back to the data set's own unit.
+Scene units: every scene is normalised so that its content lies in the unit cube [0, 1]^3;
+`Scene.unit_length` converts a length back to the data set's own unit.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from bench.errors import SteerbenchError as SteerbenchError
 from bench.errors import Unavailable as Unavailable
 
 EMPTY_ALPHA = 1e-3
-"""Opacity below which a pixel is empty: its depth is +inf and it is never unprojected."""
+"""Pixels with a lower opacity are empty: their depth is +inf and they are never unprojected."""
 
 BACKGROUNDS = {"white": 1.0, "black": 0.0}
 """Backgrounds by name: the value of every channel of `Scene.background`."""
 
 
 DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?")
-"""Names of devices; auto is the GPU where there is one."""
+"""Valid device names; `auto` is the GPU if there is one."""
 
 
 def check_shape(name: str, value: Tensor, *shape: int | None) -> None:
@@ -114,16 +114,16 @@ class Scene:
     """Everything a method may learn from and everything it is scored on.
 
     Attributes:
-        name: short name, as it stands in result rows.
+        name: short name, as shown in result rows.
         splits: "train" and "test" at least.
         background: rgb [3] in [0, 1] onto which RGBA pictures and predictions are composited.
-        bounds: [2, 3] lower and upper corner of what is to be rendered, inside the unit cube.
+        bounds: [2, 3] lower and upper corner of the content, inside the unit cube.
         unit_length: length of one scene unit in the data set's own unit.
         digest: content hash of cameras, pictures and normalisation.
         origin: [3] the corner (0, 0, 0) of the unit cube in the data set's own coordinates:
-            data set point = origin + unit_length * scene point; the axes stay.
-        exact: the exact picture at any camera, uint8 [H, W, 3 or 4] as in a split, for scenes
-            that know it.
+            data set point = origin + unit_length * scene point, with the same axes.
+        exact: renders the exact picture of any camera, uint8 [H, W, 3 or 4] as in a split; None
+            if the scene cannot.
     """
 
     name: str
@@ -138,18 +138,18 @@ class Scene:
 
 @dataclass(frozen=True)
 class Budget:
-    """How much work a training may do: counted in steps, not seconds, so that it is repeatable.
+    """How much work a training may do, in steps rather than seconds so that it is repeatable.
 
     Attributes:
-        name: as it stands in result rows.
+        name: as shown in result rows.
         steps: optimiser steps of the (pre-)training of a field.
-        samples: field samples with a gradient that a step aims at; the rays follow from it.
+        samples: target number of field samples with a gradient per step; it sets the ray count.
         frames: at most this many test frames are rendered and scored (0: all).
         renderer_steps: optimiser steps of the second stage, for methods with a 2D renderer.
-        seeds: with how many seeds, 0 to seeds - 1, `steerbench paper` repeats a measurement.
-        beyond: whether it also varies what a method beyond the paper is trained for.
+        seeds: `steerbench paper` repeats a measurement with this many seeds, 0 to seeds - 1.
+        beyond: whether `steerbench paper` also varies the training of methods beyond the paper.
         threads: CPU threads of a training; None: as many as torch uses. On a CPU `steerbench paper`
-            trains side by side what the cores have room for.
+            runs as many trainings in parallel as the cores have room for.
     """
 
     name: str
@@ -171,7 +171,7 @@ class Budget:
 
 
 class Log(Protocol):
-    """The log of a training: messages, progress with the time left, and folders of its stages."""
+    """The log of a training: messages, progress with the time left, folders of its stages."""
 
     def info(self, message: str) -> None:
         """Show one line to the user."""
@@ -191,15 +191,15 @@ class Progress(Protocol):
 
 
 class Probe(Protocol):
-    """Owns every clock and counter of a measurement; a method gets it with every frame."""
+    """Owns every clock and counter of a measurement; passed to a method with every frame."""
 
     def stage(self, name: str) -> AbstractContextManager[None]:
         """Time a stage. Synchronises the device; a stage may be entered many times a frame."""
 
     def count(self, name: str, done: int | Tensor, dense: int | None = None) -> None:
-        """Add `done` units of work; `dense` is what a method that skips nothing would have done.
+        """Add `done` units of work; `dense` is the work of a method that skips nothing.
 
-        What a GPU has counted, a tensor of one number, is read when the frame has ended.
+        A count on a GPU, given as a tensor of one number, is read at the end of the frame.
         """
 
 
@@ -207,9 +207,9 @@ class Method(Protocol):
     """A radiance-field renderer.
 
     Attributes:
-        name: as it stands in result rows.
-        train_s: seconds the training took, over all the processes it was continued in; `fit`
-            sets it even when it only loads.
+        name: as shown in result rows.
+        train_s: seconds of training, summed over all processes that continued it; `fit` sets it
+            even if it only loads.
         memory: preceding frames that it uses; 0: every frame is rendered independently.
     """
 
@@ -218,7 +218,7 @@ class Method(Protocol):
     memory: int
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
-        """Train, or load the stages that a training with the same content hash left behind."""
+        """Train, or load the stages that an earlier training with the same key stored."""
 
     def reset(self) -> None:
         """Forget preceding frames: a new sequence starts."""
@@ -227,14 +227,14 @@ class Method(Protocol):
         """Render one frame of the current sequence."""
 
     def sizes(self) -> dict[str, int]:
-        """Bytes by component: what a file of the model would need."""
+        """Bytes by component, as stored in a file of the model."""
 
     def settings(self) -> dict[str, str]:
         """The resolved `device`, `backend`, `engine` and `precision`, for the result rows."""
 
 
 class NullProbe:
-    """A probe that measures nothing: for pictures alone."""
+    """A probe that measures nothing, for when only pictures are wanted."""
 
     def stage(self, name: str) -> AbstractContextManager[None]:
         """Do not time."""

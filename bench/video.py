@@ -1,4 +1,4 @@
-"""Videos of 8-bit pictures, by PyAV."""
+"""Writes videos of 8-bit pictures with PyAV."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ import numpy as np
 from bench.errors import SteerbenchError, Unavailable, install_command
 
 QUALITY = "18"
-"""H.264's constant rate factor: hardly to be told from the original."""
+"""H.264's constant rate factor; at 18 the video hardly differs from the original."""
 
 
 @contextmanager
 def recorded(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
-    """What takes the pictures of a video, uint8 [H, W, 3], of one size, one after the other.
+    """A function that appends a picture, uint8 [H, W, 3], to a video; all have the same size.
 
-    H.264 needs even sizes: an odd last row or column is repeated.
+    H.264 needs even sizes: if the height or width is odd, the last row or column is repeated.
 
     Raises:
         Unavailable: PyAV is not installed.
-        SteerbenchError: the file cannot be written, or its name ends in nothing that is a video.
+        SteerbenchError: the file cannot be written, or its ending is not that of a video.
     """
     try:
         import av

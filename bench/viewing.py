@@ -1,4 +1,4 @@
-"""What a viewer draws: for each browser the newest camera that it wants, one frame at a time."""
+"""The rendering side of a viewer: one frame at a time, each browser's newest camera only."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from bench.scoring import check_frame
 from bench.types import Camera, Method
 
 COARSE = 2
-"""While a camera moves, a slow method draws so many times fewer pixels along both axes."""
+"""While a camera moves, a slow method renders this many times fewer pixels along both axes."""
 
 FLUENT_MS = 100.0
-"""A method that needs longer for a frame is slow: a moving hand notices."""
+"""A method is slow if a frame takes longer than this: the user notices the lag."""
 
 
 @dataclass(frozen=True)
 class Ask:
-    """A picture that a browser wants; a `still` one is of a camera that has stopped."""
+    """A request for a picture by a browser; `still` if its camera has stopped."""
 
     camera: Camera
     still: bool = False
 
 
 class Turns:
-    """Who waits for a picture, in the order in which they began to wait.
+    """The queue of browsers that wait for a picture, in the order in which they began to wait.
 
-    Only the newest that someone asked for counts: pictures are dropped, they never queue.
+    Only the newest request of a browser counts; older ones are dropped.
     """
 
     def __init__(self) -> None:
@@ -42,23 +42,23 @@ class Turns:
         self._changed = threading.Condition()
 
     def want(self, who: Hashable, ask: Ask) -> None:
-        """Ask for a picture instead of the one that `who` is waiting for."""
+        """Request a picture for `who`, replacing any pending request."""
         with self._changed:
             self._waiting[who] = ask
             self._changed.notify_all()
 
     def offer(self, who: Hashable, ask: Ask) -> None:
-        """Ask for a picture unless `who` is waiting for another one."""
+        """Request a picture for `who` unless a request is already pending."""
         with self._changed:
             self._waiting.setdefault(who, ask)
 
     def forget(self, who: Hashable) -> None:
-        """`who` has gone."""
+        """Drop any pending request of `who`, which has disconnected."""
         with self._changed:
             self._waiting.pop(who, None)
 
     def next(self, timeout: float | None = None) -> tuple[Hashable, Ask] | None:
-        """Who has waited longest, and for what; None where nobody came for `timeout` seconds."""
+        """Take the longest-waiting browser and its request; None after `timeout` idle seconds."""
         with self._changed:
             if not self._changed.wait_for(lambda: self._waiting, timeout):
                 return None
@@ -68,12 +68,12 @@ class Turns:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A picture of a method.
+    """A picture rendered by a method.
 
     Attributes:
-        rgb: [H, W, 3] in [0, 1], on the CPU, with the 256 values of a file.
-        ms: that the frame took.
-        stages_ms: own time of each stage, the longest first.
+        rgb: [H, W, 3] in [0, 1], on the CPU, rounded to 8 bits.
+        ms: the frame time.
+        stages_ms: time of each stage without nested stages, longest first.
     """
 
     rgb: Tensor
@@ -82,25 +82,25 @@ class Drawn:
 
 
 class Painter:
-    """Draws with several methods what several browsers want.
+    """Renders the pictures that several browsers want, each with all methods.
 
-    A method with memory forgets when it draws for another browser, or at another size: its
-    preceding frames are then of another sequence.
+    Methods are reset when the browser or the picture size changes, because their preceding frames
+    then belong to another sequence.
     """
 
     def __init__(self, methods: Sequence[Method]) -> None:
         self.methods = list(methods)
         self._sequence: tuple[Hashable, int, int] | None = None
-        self._full_ms: dict[int, float] = {}  # of the last frame, by its pixels
+        self._full_ms: dict[int, float] = {}  # of the latest frame, by its number of pixels
 
     def put(self, place: int, method: Method) -> None:
-        """Replace a method."""
+        """Replace the method at `place`."""
         self.methods[place] = method
         self._sequence = None
         self._full_ms.clear()
 
     def sized(self, ask: Ask) -> Camera:
-        """The camera to draw with: coarser where the methods are too slow for one that moves."""
+        """The camera to render: coarser if the methods are too slow for a moving camera."""
         camera = ask.camera
         took = self._full_ms.get(camera.width * camera.height, 0.0)
         if ask.still or took <= FLUENT_MS:
@@ -109,10 +109,10 @@ class Painter:
 
     @torch.no_grad()
     def draw(self, who: Hashable, camera: Camera) -> list[Drawn]:
-        """The picture of each method.
+        """Render `camera` with each method.
 
         Raises:
-            SteerbenchError: a method gave something that is no frame.
+            SteerbenchError: a method rendered values that are not finite.
         """
         sequence = (who, camera.width, camera.height)
         if sequence != self._sequence:
@@ -136,8 +136,10 @@ def _drawn(method: Method, camera: Camera) -> Drawn:
 
 
 def divided(left: Tensor, right: Tensor, at: float) -> Tensor:
-    """The first picture on the left of share `at` of the width, the other one on the right, with a
-    line between them; [H, W, 3] each."""
+    """`left` and `right` in one picture, split by a line at share `at` of the width.
+
+    All are [H, W, 3].
+    """
     column = round(at * left.shape[1])
     both = torch.cat((left[:, :column], right[:, column:]), dim=1)
     both[:, max(column - 1, 0) : column + 1] = 0.5
@@ -145,15 +147,17 @@ def divided(left: Tensor, right: Tensor, at: float) -> Tensor:
 
 
 def difference(one: Tensor, other: Tensor, gain: float = 4.0) -> Tensor:
-    """|one - other|, `gain` times as large so that it shows; [H, W, 3] in [0, 1]."""
+    """|one - other|, amplified by `gain` to make it visible; [H, W, 3] in [0, 1]."""
     return (gain * (one - other).abs()).clamp(0, 1)
 
 
 def seen_from(
     rotation: np.ndarray, position: np.ndarray, fov: float, width: int, height: int
 ) -> Camera:
-    """The camera at `position` [3], with `rotation` [3, 3] to the world (OpenCV axes) and a field
-    of view of `fov` radians from top to bottom."""
+    """The camera at `position` [3] with a vertical field of view of `fov` radians.
+
+    `rotation` [3, 3] is camera-to-world, in OpenCV axes.
+    """
     c2w = torch.from_numpy(np.concatenate((rotation, position[:, None]), axis=1)).float()
     focal = height / 2 / float(np.tan(fov / 2))
     return Camera(c2w, focal, focal, width / 2, height / 2, width, height)

@@ -1,4 +1,4 @@
-"""Where the host waits for a GPU, counted by the lines of Python that make it wait."""
+"""Counts how often the host waits for a GPU, by the line of Python that makes it wait."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ class Line(NamedTuple):
 
     @property
     def place(self) -> str:
-        """File and number; the file as seen from the folder of the packages, if it is in there."""
+        """File and line number; the path is relative to the repository if the file is inside it."""
         path = Path(self.path)
         return f"{path.relative_to(ROOT) if path.is_relative_to(ROOT) else path}:{self.number}"
 
     @property
     def source(self) -> str:
-        """What stands there."""
+        """The text of the line."""
         return linecache.getline(*self).strip()
 
 
 @contextmanager
 def device_waits() -> Iterator[Counter[Line]]:
-    """Count how often the host waits for the GPU in here, by the line that made it wait.
+    """Count how often the host waits for the GPU inside the context, by the line that caused it.
 
-    Torch tells of them (`torch.cuda.set_sync_debug_mode`). That a clock waits for the device to
-    finish is not counted.
+    Torch reports the waits (`torch.cuda.set_sync_debug_mode`), except explicit synchronisation as
+    by a clock.
 
     Raises:
         Unavailable: there is no GPU.
@@ -70,7 +70,7 @@ def device_waits() -> Iterator[Counter[Line]]:
 
 
 def _cause(warned: Line) -> Line:
-    """The innermost line outside of torch on the way to the one that was warned of."""
+    """The innermost line outside torch in the call stack of the line that the warning names."""
     lines = (Line(f.f_code.co_filename, number) for f, number in traceback.walk_stack(None))
     outwards = dropwhile(lambda line: line != warned, lines)
     return next((line for line in outwards if not line.path.startswith(TORCH)), warned)

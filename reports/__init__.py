@@ -1,1 +1,1 @@
-"""What is claimed: tables, figures and pages, made from the store alone."""
+"""Tables, figures and pages, made from the store alone."""

@@ -1,4 +1,4 @@
-"""One table of several runs, a line each, with the best figures in bold."""
+"""One table of several runs, one line each, with the best figures in bold."""
 
 from __future__ import annotations
 
@@ -19,20 +19,19 @@ COST: dict[str, tuple[str, Write]] = {
     "size_bytes.total": ("model, MB ↓", megabytes),
     "train_s": ("training, s ↓", partial(decimal, decimals=0)),
 }
-"""Label and format of the columns that are no quality."""
+"""Label and format of the columns other than quality metrics."""
 
 COMMON = ("scene", "resolution", "trajectory", "budget", "protocol", "device")
 """Facts that a heading lists."""
 
 
 def comparison(runs: Sequence[Run], failures: Mapping[str, str]) -> Table:
-    """One line per run, or per phase of it, then one per failure; the best figures are bold.
+    """One line per run or per phase of a run, then one per failure; the best figures are bold.
 
-    A figure is the best only among runs made under the same conditions, and only where there are
-    at least two of them.
+    Figures are ranked only among runs under the same conditions, if there are at least two.
 
     Args:
-        runs: with any of the qualities; a quality that no run has gets no column.
+        runs: the runs; a quality metric that none of them has gets no column.
         failures: why a run is missing, by its label.
     """
     quality = [metric for metric in QUALITY if any(metric in run.values for run in runs)]
@@ -57,7 +56,7 @@ def comparison(runs: Sequence[Run], failures: Mapping[str, str]) -> Table:
 
 
 def metric_format(metric: str) -> tuple[str, Write]:
-    """The label of a metric, with its unit and an arrow to better, and the format of its figures.
+    """The label of a metric, with unit and an arrow to better values, and its number format.
 
     Raises:
         SteerbenchError: there is no such metric.
@@ -79,7 +78,7 @@ def metric_format(metric: str) -> tuple[str, Write]:
 
 
 def written(found: Repeated, metric: str) -> str | None:
-    """The mean of a metric with half of its 95 % interval, if known, as text; None without it."""
+    """The mean of a metric as text, with half its 95 % interval if known; None without a mean."""
     mean, half = found.mean(metric), found.half(metric)
     _, write = metric_format(metric)
     if mean is None:
@@ -90,10 +89,10 @@ def written(found: Repeated, metric: str) -> str | None:
 def ranks(
     runs: Sequence[Run | Repeated], metric: str, write: Write | None = None
 ) -> dict[int, int]:
-    """The place, from 1, of each of `runs`, by its index, among those of the same conditions.
+    """The rank, from 1, of each of `runs` among those under the same conditions, by its index.
 
-    Figures that are written alike, by `write` or as everywhere else, share a place. A run that is
-    alone under its conditions has none.
+    Figures that look the same when written (by `write`, or in the usual format) share a rank. A run
+    that is alone under its conditions has no rank.
     """
     label, usual = metric_format(metric)
     write = write or usual
@@ -111,7 +110,6 @@ def ranks(
 
 
 def conditions_of(runs: Sequence[Run]) -> str:
-    """Scene, resolution, trajectory and so on of `runs`, as text; several values of a fact are all
-    listed."""
+    """Scene, resolution, trajectory and so on of `runs`, as text; lists all values of a fact."""
     values = {name: dict.fromkeys(str(run.facts[name]) for run in runs) for name in COMMON}
     return ", ".join(f"{name} {' / '.join(several)}" for name, several in values.items())

@@ -1,4 +1,4 @@
-"""The tables of the paper for other programs: LaTeX for an article, CSV for a spreadsheet."""
+"""Exports the paper's tables: LaTeX for an article, CSV for a spreadsheet."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from reports.runs import Repeated
 from reports.tables import decimal
 
 DECIMALS = {"psnr": 2, "ssim": 3, "lpips": 3, "fps": 2, "frame": 2, "stage": 2, "size": 1}
-"""With how many the paper prints a metric, by the first part of its name."""
+"""Decimals with which the paper prints a metric, by the first part of its name."""
 
 ESCAPES = str.maketrans(
     {
@@ -32,20 +32,20 @@ ESCAPES = str.maketrans(
 )
 
 SETTING = re.compile(r"(?P<name>[A-Z]) = (?P<base>\d+)(\^(?P<power>\d+))?")
-"""A label such as "T = 2^19", set as mathematics."""
+"""A label such as "T = 2^19", which is set in math mode."""
 
 MARKS = {1: r"\textbf{%s}", 2: r"\underline{%s}"}
-"""How the best figure of a column and the second look."""
+"""LaTeX for the best and the second-best figure of a column."""
 
 PUBLISHED = r"$^\dagger$"
 
 
 def latex(tables: Sequence[PaperTable], measured: Lines) -> str:
-    """All tables as LaTeX, for the package booktabs, with as many decimals as the paper prints.
+    """All tables as LaTeX, for the package booktabs, with as many decimals as in the paper.
 
-    The best figures of a column are bold, the second of at least three underlined, among those
-    measured under the same conditions; what is written alike shares a place. Figures of methods
-    that nothing here measures are the paper's and have a dagger.
+    Among figures under the same conditions, the best of a column is bold and, of at least three,
+    the second best is underlined; figures that look the same share a rank. Methods that cannot be
+    measured here show the paper's figures, with a dagger.
     """
     return "\n".join(_latex(table, measured.get(table.name, ())) for table in tables)
 
@@ -72,7 +72,7 @@ def _latex(table: PaperTable, lines: Sequence[Repeated]) -> str:
 
 
 def _rows(block: PaperTable, known: Mapping[str, Repeated]) -> list[list[str]]:
-    """The label of each line and its figures."""
+    """The label and the figures of each line."""
     lines = [known.get(line.label, Repeated(line.label, ())) for line in block.lines]
     columns = []
     for metric in block.metrics:
@@ -97,8 +97,10 @@ def _rows(block: PaperTable, known: Mapping[str, Repeated]) -> list[list[str]]:
 
 
 def csv(tables: Sequence[PaperTable], measured: Lines) -> str:
-    """All tables as CSV, one figure a row, in the units of `steerbench results`: what was measured,
-    as the mean of so many runs with half of its 95 % interval, and what the paper has."""
+    """All tables as CSV, one figure per row, in the units of `steerbench results`.
+
+    A row has the measured mean, the number of runs, half the 95 % interval, and the paper's figure.
+    """
     rows = []
     for table in tables:
         known = {line.label: line for line in measured.get(table.name, ())}
@@ -121,7 +123,7 @@ def csv(tables: Sequence[PaperTable], measured: Lines) -> str:
 
 
 def _written(metric: str, value: float | None) -> str:
-    """A figure with the paper's decimals, bytes in MB."""
+    """A figure with the paper's number of decimals; bytes in MB."""
     family = re.split(r"[._]", metric)[0]
     if family == "size" and value is not None:
         value /= 1e6

@@ -1,4 +1,4 @@
-"""Plots of measured rows, as PNG. Drawn without a display and without global state."""
+"""Plots of measured rows, as PNG. They need no display and no global state."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from reports.tables import NOT_AVAILABLE
 STAGE = "stage_ms."
 LEGEND_COLUMNS = 4
 LEGEND_WIDTH = 44
-"""Characters of a line in a legend of two columns."""
+"""Characters per line in a legend of two columns."""
 MARKERS = "osD^vP*X<>"
 COLOURS = [matplotlib.colormaps["tab20"](index) for index in (*range(0, 20, 2), *range(1, 20, 2))]
 COLOURS = [colour for colour in COLOURS if len(set(colour[:3])) > 1]  # grey is for "other"
 
 MARK = "mark-{}"
-"""The `gid` of the mark of a line of `quality_against`, by its number."""
+"""The `gid` of the mark for the line with this number in `quality_against`."""
 
 NAME_SIZE = (160, 13)
-"""Pixels that the name of a setting takes on a plot."""
+"""Width and height in pixels of the name of a setting on a plot."""
 
 Row = Mapping[str, Any]
 
 
 def stage_bars(runs: Sequence[Run], path: Path) -> None:
-    """Write a PNG: one bar per run, its mean frame time in ms divided into stages.
+    """Write a PNG: one bar per run, its mean frame time in ms split into stages.
 
-    A stage, which includes the stages inside it, has one colour in all bars. Time outside all
-    stages is grey and comes last.
+    A stage includes its nested stages and has the same colour in all bars. Time outside all stages
+    is grey and comes last.
     """
     bars = [_stages(run) for run in runs]
     stages = list(dict.fromkeys(name for bar in bars for name in bar))
@@ -70,7 +70,7 @@ def stage_bars(runs: Sequence[Run], path: Path) -> None:
 
 
 def _stages(run: Run) -> dict[str, float]:
-    """Mean ms of every outermost stage, with the stages inside it."""
+    """Mean ms of every outermost stage, including its nested stages."""
     stages: dict[str, float] = {}
     for name, ms in run.values.items():
         if name.startswith(STAGE):
@@ -82,9 +82,9 @@ def _stages(run: Run) -> dict[str, float]:
 def quality_plot(
     lines: Sequence[Repeated], metric: str, unit: float, axis: str, stem: str, shows: str
 ) -> Plot:
-    """`quality_against` as a part of a page: a mark says its label, its PSNR and its `metric`.
+    """`quality_against` as a part of a page: each mark tells its label, PSNR and `metric`.
 
-    A line without one of the two has no mark.
+    A line that lacks one of these figures has no mark.
     """
     marks = {
         MARK.format(number): Mark(f"{line.label}: PSNR {quality} dB, {cost} {axis}", line.keys)
@@ -99,9 +99,9 @@ def quality_plot(
 def quality_against(
     lines: Sequence[Repeated], metric: str, unit: float, axis: str, path: Path
 ) -> None:
-    """Write a PNG: PSNR of each of `lines` against its `metric`, divided by `unit`, on `axis`.
+    """Write a PNG: PSNR of each of `lines` against its `metric` / `unit`; `axis` is the label.
 
-    Bars show the intervals of both where there are several seeds.
+    With several seeds, error bars show the intervals of both.
     """
     labels = [textwrap.fill(line.label, LEGEND_WIDTH) for line in lines]
     half = -(-len(labels) // 2)  # the legend has two columns
@@ -132,13 +132,13 @@ def quality_against(
 
 
 def _steps_of_a_decade(low: float, high: float) -> tuple[int, ...]:
-    """Which multiples of the powers of ten have a tick from `low` to `high`: few over many."""
+    """Which multiples of powers of ten get a tick: the wider the range, the fewer."""
     decades = math.log10(high / low)
     return (1, 2, 3, 5, 7) if decades < 1.5 else (1, 2, 5) if decades < 3 else (1,)
 
 
 def quality_over_frames(runs: Sequence[Run], path: Path) -> None:
-    """Write a PNG: PSNR of every frame of the path with a ground truth, one curve per run.
+    """Write a PNG: PSNR of every frame with a ground truth along the path, one curve per run.
 
     Cold frames are hollow.
     """
@@ -158,8 +158,8 @@ class Curve:
 
     Attributes:
         panel: the title of the panel that shows it.
-        label: its name there.
-        points: steps of the training, and what was measured after them.
+        label: its name in the panel.
+        points: training steps, each with what was measured after it.
     """
 
     panel: str
@@ -168,9 +168,9 @@ class Curve:
 
 
 def quality_over_training(curves: Sequence[Curve], path: Path) -> None:
-    """Write a PNG: PSNR over the steps of the training, a panel for each that `curves` name.
+    """Write a PNG: PSNR over training steps (log scale), one panel for each `panel` of `curves`.
 
-    Bars show the intervals where there are several seeds. Steps have a logarithmic scale.
+    With several seeds, error bars show the intervals.
     """
     titles = list(dict.fromkeys(curve.panel for curve in curves))
     figure = Figure(figsize=(4.2 * len(titles), 3.6), layout="constrained")
@@ -198,7 +198,7 @@ def quality_over_training(curves: Sequence[Curve], path: Path) -> None:
 
 
 def _psnr_axes(height: float, across: str) -> tuple[Figure, Axes]:
-    """Axes with PSNR upwards and the label `across`; `height` in inches."""
+    """Axes with PSNR as y and the x label `across`; `height` in inches."""
     figure = Figure(figsize=(8, height), layout="constrained")
     axes = figure.subplots()
     _label_psnr(axes, across)
@@ -215,13 +215,13 @@ def _label_psnr(axes: Axes, across: str) -> None:
 def frontier_plot(rows: Sequence[Row], path: Path) -> None:
     """Write a PNG: error of a frame against its time, log-log, one point per setting.
 
-    The left panel has the error against the ground truth, with the Pareto frontier as a staircase;
-    the right one that against everything off. Settings on the frontier are circled, and named where
-    there is room; so is the unchanged setting.
+    The left panel shows the error against the ground truth, with the Pareto frontier as a
+    staircase; the right panel, the error against everything off. Settings on the frontier and the
+    unchanged setting are circled, and named if there is room.
 
     Args:
-        rows: everything off, the unchanged setting, others. Each has its knob, setting, ms, ms_lo,
-            ms_hi, psnr, psnr_to_first and instead: its own setting if it lies on the frontier.
+        rows: everything off, the unchanged setting, then others. Each has knob, setting, ms, ms_lo,
+            ms_hi, psnr, psnr_to_first and instead, which equals setting on the frontier.
     """
     figure = Figure(figsize=(13, 7), layout="constrained")
     truth, off = figure.subplots(1, 2, sharex=True)
@@ -229,20 +229,20 @@ def frontier_plot(rows: Sequence[Row], path: Path) -> None:
     for axes, column in ((truth, "psnr"), (off, "psnr_to_first")):
         _error_against_time(axes, rows, column)
     fastest, slowest = truth.get_xlim()
-    truth.set_xlim(fastest * (fastest / slowest) ** 0.2, slowest)  # names stand to the left
+    truth.set_xlim(fastest * (fastest / slowest) ** 0.2, slowest)  # room for names on the left
     stairs = [row["ms"] for row in best], [_rms(row["psnr"]) for row in best]
     truth.step(*stairs, where="post", color="black", linewidth=1, label="frontier")
     truth.set_title("against the ground truth: lower left is better")
     off.set_title("against the same model with everything off")
     figure.legend(*truth.get_legend_handles_labels(), loc="outside lower center", ncols=6)
-    figure.draw_without_rendering()  # fixes where a point lies on the page
+    figure.draw_without_rendering()  # fixes the positions of points on the page
     _circle(truth, [*rows[1:2], *best], "psnr")
     _circle(off, rows[1:2], "psnr_to_first")
     figure.savefig(path, dpi=100)
 
 
 def _circle(axes: Axes, rows: Sequence[Row], column: str) -> None:
-    """Circle the points of `rows`; name each to its left, unless another name is there already."""
+    """Circle the points of `rows`, and name each on its left unless another name is there."""
     style: dict[str, Any] = {"textcoords": "offset points", "size": 8, "ha": "right", "va": "top"}
     names: list[np.ndarray] = []
     for row in rows:
@@ -255,7 +255,7 @@ def _circle(axes: Axes, rows: Sequence[Row], column: str) -> None:
 
 
 def _error_against_time(axes: Axes, rows: Sequence[Row], column: str) -> None:
-    """The points of one panel; a knob has one colour and one marker."""
+    """Draw the points of one panel; each knob has its colour and marker."""
     for number, knob in enumerate(dict.fromkeys(row["knob"] for row in rows)):
         some = [row for row in rows if row["knob"] == knob and math.isfinite(row[column])]
         low = [row["ms"] - row["ms_lo"] for row in some]
@@ -273,7 +273,7 @@ def _error_against_time(axes: Axes, rows: Sequence[Row], column: str) -> None:
     axes.loglog()
     axes.margins(0.15, 0.12)
     errors = [float(_rms(row[column])) for row in rows if math.isfinite(row[column])]
-    if errors and max(errors) < 1.01 * min(errors):  # a margin of nothing is nothing
+    if errors and max(errors) < 1.01 * min(errors):  # autoscale needs a range to work with
         axes.set_autoscaley_on(False)
         axes.set_ylim(min(errors) / 2, max(errors) * 2)
     axes.set_xlabel("ms of a frame: median of the rounds, bars from the fastest to the slowest")
@@ -304,15 +304,15 @@ def growth_panels(
     exponents: Mapping[tuple[str, str], float],
     path: Path,
 ) -> None:
-    """Write a PNG: how figures grow, a column of panels per axis and a line of panels per figure.
+    """Write a PNG of how figures grow: one column of panels per axis, one row per figure.
 
-    Both scales are logarithmic, so that a power is a straight line; an axis that begins at 0 is
+    Both scales are logarithmic, so that a power law is a straight line; an axis that starts at 0 is
     linear.
 
     Args:
-        axes: by name, rows with "value", its "label" and a value of every figure.
-        figures: key in a row, and label with unit.
-        exponents: by axis and figure, shown where they are finite.
+        axes: by name, rows with "value", its "label" and every figure.
+        figures: by key in a row, the label with unit.
+        exponents: by axis and figure; shown if finite.
     """
     size = (0.5 + 2.2 * len(axes), 0.5 + 2.0 * len(figures))
     figure = Figure(figsize=size, layout="constrained")

@@ -1,4 +1,4 @@
-"""A frame of several runs in one image: ground truth, renderings, a detail of each, error maps."""
+"""Composes a frame of several runs into one image: truth, renderings, details, error maps."""
 
 from __future__ import annotations
 
@@ -18,40 +18,42 @@ from reports.parts import Detail, Frame, Picture, View
 from reports.runs import Run
 
 MOST_FRAMES = 3
-"""Frames of a run on a page, however many it kept."""
+"""Maximum number of frames of a run on a page."""
 
 MOST_RENDERINGS = 4
-"""Renderings in one image, beside the ground truth; more runs get further images."""
+"""Maximum number of renderings in one image beside the ground truth; more runs get more images."""
 
 NARROW_PX, WIDE_PX = 200, 400
-"""Pictures of these widths are shown pixel by pixel; others are enlarged or reduced."""
+"""Pictures within these widths are shown pixel by pixel; others are enlarged or reduced."""
 
 GAP_PX = 8
 LINE_PX = 24
 INK, PAPER, MARK = (30, 30, 30), (255, 255, 255), (214, 0, 110)
 
 ZOOM = 4
-"""Enlargement of the detail over the picture that it is taken from."""
+"""Magnification of the detail relative to its picture."""
 
 
 @dataclass(frozen=True)
 class Band:
-    """One line of panels below a caption; None leaves a place empty."""
+    """One row of panels below a caption; None leaves a place empty."""
 
     caption: str
     panels: Sequence[Image.Image | None]
 
 
 def kept_frames(runs: Sequence[Run]) -> list[str]:
-    """Frames whose pictures all `runs` kept, at most `MOST_FRAMES` of them, evenly spread: how the
-    names of their files begin."""
+    """File name prefixes of the frames whose pictures all `runs` kept.
+
+    At most `MOST_FRAMES` of them, evenly spread.
+    """
     kept = [{path.name.split("-")[0] for path in run.pictures.glob("*-truth.png")} for run in runs]
     common = sorted(set.intersection(*kept))
     return [common[index] for index in spread(len(common), MOST_FRAMES)]
 
 
 def frame_section(runs: Sequence[Run], frame: str, stem: str) -> Iterator[str | Frame]:
-    """`frame` of `runs` as parts of a page: its heading, its pictures and a caption."""
+    """`frame` of `runs` as parts of a page: heading, pictures and caption."""
     truth = _read(runs[0].pictures / f"{frame}-truth.png")
     views = [_view(run, frame) for run in runs]
     detail = find_detail(truth, [view.rendering for view in views])
@@ -67,9 +69,9 @@ def frame_section(runs: Sequence[Run], frame: str, stem: str) -> Iterator[str | 
 
 
 def still_images(frame: Frame) -> Iterator[Picture]:
-    """Images that show all of `frame` without a click, at most `MOST_RENDERINGS` in each."""
+    """Static images that show all renderings of `frame`, at most `MOST_RENDERINGS` in each."""
     count = len(frame.views)
-    width = math.ceil(count / math.ceil(count / MOST_RENDERINGS))  # all about as wide
+    width = math.ceil(count / math.ceil(count / MOST_RENDERINGS))  # evenly filled images
     for first in range(0, count, width):
         group = frame.views[first : first + width]
         draw = partial(write_image, frame.truth, group, frame.detail, frame.errors)
@@ -79,7 +81,7 @@ def still_images(frame: Frame) -> Iterator[Picture]:
 
 
 def _view(run: Run, frame: str) -> View:
-    """A kept frame of a run, titled with its own PSNR and time."""
+    """A kept frame of a run, with its own PSNR and time in the title."""
     figures = run.frames.set_index("frame").loc[int(frame)]
     title = f"PSNR {figures['psnr']:.2f} dB, {figures['frame_ms']:.1f} ms"
     if figures["phase"] == COLD:
@@ -94,10 +96,10 @@ def _read(path: Path) -> np.ndarray:
 
 
 def find_detail(truth: np.ndarray, renderings: Sequence[np.ndarray]) -> Detail:
-    """The part of a frame with the largest mean difference between its pictures.
+    """Find the part of a frame where its pictures differ most, on average.
 
-    Several renderings are compared with each other, a single one with the ground truth. Where
-    nothing differs, it is the middle.
+    Several renderings are compared with each other, a single one with the ground truth. If nothing
+    differs, the centre is used.
     """
     alone = len(renderings) == 1
     stack = np.stack([*renderings, truth] if alone else renderings).astype(float)
@@ -117,9 +119,9 @@ def find_detail(truth: np.ndarray, renderings: Sequence[np.ndarray]) -> Detail:
 def write_image(
     truth: np.ndarray, views: Sequence[View], detail: Detail, errors: str, path: Path
 ) -> None:
-    """Write a PNG with the ground truth and the `views`, the `detail` of each, and error maps.
+    """Write a PNG with the ground truth, the `views`, the `detail` of each, and error maps.
 
-    `errors` says what the error maps show. A single view takes two lines, several take three.
+    `errors` says what the error maps show. A single view takes two rows, several take three.
     """
     pictures = [truth, *(view.rendering for view in views)]
     maps = [view.error for view in views]
@@ -154,7 +156,7 @@ def _whole(picture: np.ndarray, detail: Detail) -> Image.Image:
 
 
 def _part(picture: np.ndarray, detail: Detail) -> Image.Image:
-    """The outlined part, as large as the picture is shown, its pixels kept apart."""
+    """The outlined part, enlarged to the size of the panel without interpolation."""
     part = Image.fromarray(picture).crop(detail.box)
     panel = part.resize(_shown(*picture.shape[:2]), Image.Resampling.NEAREST)
     _outline(panel, [0, 0, panel.width - 1, panel.height - 1])
@@ -166,7 +168,7 @@ def _outline(panel: Image.Image, box: Sequence[int]) -> None:
 
 
 def _compose(titles: Sequence[Sequence[str]], bands: Sequence[Band]) -> Image.Image:
-    """Panels in lines and columns, titles above the columns, captions above the lines."""
+    """Arrange panels in rows and columns, with titles above columns and captions above rows."""
     width, height = next(panel.size for panel in bands[0].panels if panel)
     heads = max(map(len, titles))
     captions = sum(bool(band.caption) for band in bands)
@@ -190,7 +192,7 @@ def _compose(titles: Sequence[Sequence[str]], bands: Sequence[Band]) -> Image.Im
 
 
 def _write(draw: ImageDraw.ImageDraw, place: tuple[int, int], text: str, room_px: int) -> None:
-    """Write one line, smaller where it would not fit."""
+    """Write one line of text, in a smaller size if it does not fit."""
     size = 16
     while size > 8 and draw.textlength(text, font=ImageFont.load_default(size)) > room_px:
         size -= 1

@@ -1,4 +1,4 @@
-"""Runs that look broken: rules, each a function of runs, that yield the outliers and say why."""
+"""Finds runs that look broken. Each rule is a function that yields outliers with the reason."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ REFERENCES = Path(__file__).parent / "paper" / "scenes.toml"
 """Published PSNR of well-known scenes."""
 
 OTHER_SCENES_DB = 12.0
-"""Below the median of a method's scenes. The hardest scene of NeRF-Synthetic, drums, is 9 dB below
-the median of its eight."""
+"""An outlier is this far below the median over a method's scenes. drums, the hardest scene of
+NeRF-Synthetic, is 9 dB below the median of the eight."""
 
 REFERENCE_DB = 10.0
-"""Below the published PSNR of the same scene."""
+"""An outlier is this far below the published PSNR of the same scene."""
 
 INT8_DB = 1.0
-"""Below the same network in fp32. The paper loses 0.6 dB against FP16."""
+"""An outlier is this far below the same network in fp32. The paper's int8 loses 0.6 dB to FP16."""
 
 OUTSIDE_STAGES, OUTSIDE_MS = 0.02, 3.0
-"""Share of a frame's time outside all stages, and time that any frame may spend there: to place the
-camera and to put the result together takes two milliseconds of a small frame, too."""
+"""Share of a frame's time allowed outside all stages, and ms that are always allowed: placing the
+camera and assembling the result take two milliseconds even for a small frame."""
 
 MORE_PIXELS = 4
-"""So many times the pixels take longer on one machine, though its times drift by a factor of 2."""
+"""With this many times the pixels a frame must take longer, though times drift by a factor of 2."""
 
 FACTS = ("method", "scene", "budget", "precision", "seed")
-"""Columns that identify a run to a reader."""
+"""Columns that identify a run for a reader."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Outlier:
 
 
 def outliers(runs: Sequence[Run]) -> list[Outlier]:
-    """The outliers among `runs` by every rule."""
+    """The outliers among `runs`, by all rules."""
     published = tomllib.loads(REFERENCES.read_text(encoding="utf-8"))
     return [
         *far_from_other_scenes(runs),
@@ -60,7 +60,7 @@ def outliers(runs: Sequence[Run]) -> list[Outlier]:
 
 
 def far_from_other_scenes(runs: Sequence[Run]) -> Iterator[Outlier]:
-    """PSNR far below the median of the same method and settings on at least three scenes."""
+    """PSNR far below the median over at least three scenes with the same method and settings."""
     scored = [run for run in runs if math.isfinite(_psnr(run))]
     for group in _grouped(scored, lambda run: _settings(run, "scene", "seed", "method.seed")):
         scenes: dict[str, list[float]] = {}
@@ -78,7 +78,7 @@ def far_from_other_scenes(runs: Sequence[Run]) -> Iterator[Outlier]:
 def far_from_reference(
     runs: Sequence[Run], published: Mapping[str, float], method: str
 ) -> Iterator[Outlier]:
-    """PSNR far below the `published` one of `method` on the same scene, after a whole training."""
+    """PSNR of `method` after a full training far below the `published` one on the same scene."""
     for run in runs:
         if run.record["made_of"]["config"]["method"].get("after", 1) < 1:
             continue
@@ -89,7 +89,7 @@ def far_from_reference(
 
 
 def stages_do_not_add_up(runs: Sequence[Run]) -> Iterator[Outlier]:
-    """The named stages take more or less time than the frame, where stages were timed."""
+    """The stages, if they were timed, do not sum up to the frame time."""
     for run in runs:
         if not run.record["protocol"]["stages"]:
             continue
@@ -104,7 +104,7 @@ def stages_do_not_add_up(runs: Sequence[Run]) -> Iterator[Outlier]:
 
 
 def int8_far_from_fp32(runs: Sequence[Run]) -> Iterator[Outlier]:
-    """int8 loses more than rounding should; without calibration nobody knows how much that is."""
+    """int8 loses more than rounding explains; uncalibrated int8 has no known limit."""
     for group in _grouped(runs, lambda run: _settings(run, "engine", "precision", "method.engine")):
         exact = [_psnr(run) for run in group if run.facts["precision"] == "fp32"]
         for run in group:
@@ -116,7 +116,7 @@ def int8_far_from_fp32(runs: Sequence[Run]) -> Iterator[Outlier]:
 
 
 def faster_with_more_pixels(runs: Sequence[Run]) -> Iterator[Outlier]:
-    """Less time than the same on many times fewer pixels; only for frames of one size."""
+    """Faster than the same settings with far fewer pixels; only for frames of one size."""
     size = ("scene.width", "scene.height", "scene.downscale", "seed", "method.seed")
     sized = [run for run in runs if run.facts["resolution"] != MIXED]
     for group in _grouped(sized, lambda run: (_settings(run, *size), run.computer)):
@@ -129,7 +129,7 @@ def faster_with_more_pixels(runs: Sequence[Run]) -> Iterator[Outlier]:
 
 
 def outlier_table(found: Sequence[Outlier], runs: Sequence[Run]) -> Table:
-    """Those of the outliers `found` that are among `runs`."""
+    """A table of the outliers `found` that are among `runs`."""
     facts = {run.key: run.facts for run in runs}
     lines = tuple(
         (outlier.key, *(str(facts[outlier.key][name]) for name in FACTS), outlier.why)
@@ -156,7 +156,7 @@ def _grouped(runs: Sequence[Run], key: Callable[[Run], object]) -> list[list[Run
 
 
 def _settings(run: Run, *without: str) -> str:
-    """A key that is equal for runs whose settings are equal, apart from those `without`."""
+    """A key that is equal for runs with equal settings, ignoring the settings in `without`."""
     kept = {**run.record["made_of"]["config"]}
     for name in without:
         group, _, setting = name.partition(".")

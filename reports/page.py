@@ -1,4 +1,4 @@
-"""A page about measured runs: one table of all, pictures, and where every figure comes from."""
+"""Writes a page about measured runs: one table of all, pictures, provenance of every figure."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def write_page(
 ) -> Path:
     """Write `folder/report.md` with its pictures, and the same as `report.html`; return the former.
 
-    The page replaces an earlier one only when it is whole.
+    The page replaces an earlier one only once it is complete.
 
     Args:
-        store: where the runs are.
-        labels: the name of each run on the page, by its key, in the order of the page.
-        folder: made if missing.
+        store: holds the runs.
+        labels: the name of each run on the page, by key, in the order of the page.
+        folder: created if missing.
         failures: why a run is missing, by its label.
 
     Raises:
@@ -50,7 +50,7 @@ def write_page(
 
 
 def _heading(runs: Sequence[Run], failures: Mapping[str, str]) -> Iterator[Part]:
-    """Title, the table of all runs and how to read it."""
+    """Title, the table of all runs, and how to read it."""
     few = len(runs) <= MOST_RENDERINGS
     labels = ", ".join(run.label for run in runs) if few else f"{len(runs)} runs"
     scenes = ", ".join(dict.fromkeys(run.facts["scene"] for run in runs))
@@ -74,13 +74,13 @@ def _heading(runs: Sequence[Run], failures: Mapping[str, str]) -> Iterator[Part]
 
 
 def missing_figures(runs: Sequence[Run]) -> list[str]:
-    """A note for every metric that could not be measured."""
+    """Notes about every metric that could not be measured."""
     notes = (f"{name}: n/a. {why}" for run in runs for name, why in run.record["missing"].items())
     return list(dict.fromkeys(notes))
 
 
 def _tradeoffs(runs: Sequence[Run]) -> Iterator[Part]:
-    """Plots of the quality against what it costs, where there are runs to compare."""
+    """Plots of quality against its costs, if there are runs to compare."""
     lines = [Repeated(run.label, [run]) for run in runs]
     for title, stem, metric, unit, axis, better in TRADEOFFS:
         shows = f"PSNR in dB against {axis}, one mark a run"
@@ -108,7 +108,7 @@ def _time(runs: Sequence[Run]) -> Iterator[Part]:
 
 
 def _pictures(runs: Sequence[Run]) -> Iterator[Part]:
-    """Images of the kept frames; runs that rendered the same frames share them."""
+    """Images of the kept frames; runs that rendered the same frames share images."""
     groups: dict[tuple[object, ...], list[Run]] = {}
     for run in runs:
         groups.setdefault(run.views, []).append(run)
@@ -130,7 +130,7 @@ def _figures(run: Run) -> Iterator[Part]:
 
 
 def _provenance(runs: Sequence[Run]) -> Iterator[Part]:
-    """The commands, then one line for each fact that all runs share, one per run for others."""
+    """The commands, then facts: one line if all runs share it, otherwise one line per run."""
     commands = "\n".join(dict.fromkeys(run.record["command"] for run in runs))
     of_runs = [facts(run) for run in runs]
     lines = []

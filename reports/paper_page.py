@@ -1,6 +1,6 @@
-"""The page about the tables of the paper: figures beside the published ones, trends, pictures.
+"""Writes the page about the paper's tables: measured and published figures, trends, pictures.
 
-Its words, and which lines its plots and images show, stand in `paper/page.toml`.
+Its texts, and the lines that its plots and images show, are in `paper/page.toml`.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ def write_paper_page(
 
     Args:
         tables: in the order of the page.
-        lines: the measured ones of any of them.
-        found: outliers, also among runs that the page does not show.
-        folder: made if missing.
-        missing: why scenes of the data set are left out, by their names.
+        lines: the measured lines of the tables, as far as there are any.
+        found: outliers, including runs that the page does not show.
+        folder: created if missing.
+        missing: why scenes of the data set are left out, by name.
 
     Raises:
         SteerbenchError: `folder` cannot be written to.
@@ -64,7 +64,7 @@ def write_paper_page(
 
 
 def _plot(plot: Mapping[str, Any], tables: Sequence[PaperTable], lines: Lines) -> Iterator[Part]:
-    """A plot with its heading and caption, if anything that it shows was measured."""
+    """A plot with heading and caption, if any of its lines was measured."""
     stem, title = plot["file"], plot["title"]
     if "metric" in plot:
         listed = {line.label for table in tables for block in table.blocks for line in block.lines}
@@ -72,7 +72,7 @@ def _plot(plot: Mapping[str, Any], tables: Sequence[PaperTable], lines: Lines) -
             replace(line, label=label.format(line.label))
             for table, label in plot["tables"].items()
             for line in lines.get(table, ())
-            if line.runs and line.label in listed  # and not a point of a curve
+            if line.runs and line.label in listed  # but not a point of a curve
         ]
         axis = plot["metric"], plot["unit"], plot["axis"]
         drawn = figures.quality_plot(shown, *axis, stem, title)
@@ -90,13 +90,13 @@ def _plot(plot: Mapping[str, Any], tables: Sequence[PaperTable], lines: Lines) -
 
 
 def _curves(table: PaperTable, lines: Lines) -> Iterator[figures.Curve]:
-    """The measured lines of `table` over their trainings, if it has curves."""
+    """The measured lines of `table` over the course of their training, if it has curves."""
     measured = {line.label: line for line in lines.get(table.name, ()) if line.runs}
     for line in table.lines if table.curve else ():
         labels = {share: table.marks[line.label, share].label for share in SHARES if line.job}
         marks = {share: measured[label] for share, label in labels.items() if label in measured}
         seeds = {run.facts["seed"] for mark in marks.values() for run in mark.runs}
-        if whole := measured.get(line.label):  # of the same trainings
+        if whole := measured.get(line.label):  # end points, of the same trainings
             runs = [run for run in whole.runs if run.facts["seed"] in seeds]
             marks |= {1.0: replace(whole, runs=runs)} if runs else {}
         points = {
@@ -107,7 +107,7 @@ def _curves(table: PaperTable, lines: Lines) -> Iterator[figures.Curve]:
 
 
 def _images(images: Mapping[str, Any], lines: Lines) -> Iterator[Part]:
-    """The middle one of the frames that all runs kept."""
+    """Images of the middle one of the frames that all runs kept."""
     runs = _chosen(images["lines"], lines, one_scene=True)
     runs = [run for run in runs if run.views == runs[0].views]
     if runs and (frames := kept_frames(runs)):
@@ -119,9 +119,9 @@ def _images(images: Mapping[str, Any], lines: Lines) -> Iterator[Part]:
 def _chosen(
     wanted: Mapping[str, Sequence[str]], lines: Lines, one_scene: bool = False
 ) -> list[Run]:
-    """The first run of each line of `wanted`, which has table and line by label, that has one.
+    """The first run of each measured line in `wanted`, which lists lines by label for each table.
 
-    It is the mean over all scenes, unless `one_scene` asks for that of the first.
+    A run is the mean over all scenes, or with `one_scene` that of the first scene.
     """
     known = {(table, line.label): line for table in lines for line in lines[table]}
     found = ((label, known.get((table, line))) for label, (table, line) in wanted.items())

@@ -1,4 +1,4 @@
-"""The tables of the paper, read from `paper/table*.toml`, and measured figures beside them."""
+"""The paper's tables, read from `paper/table*.toml`, with measured figures beside the published."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from reports.trends import Trend, steps, trend_table
 FOLDER = Path(__file__).parent / "paper"
 METHOD = "method"
 AFTER, SHARES = "method.after", (0.125, 0.25, 0.5)
-"""The setting of the share of a training after which a method is rendered, and shares before its
-end."""
+"""The setting for the share of the training after which a method is rendered, and the shares that
+curves show besides the end."""
 OF_CURVES = {"protocol.name": "psnr", "protocol.lpips": "[]"}
-"""Curves show PSNR, and LPIPS takes most of the time of a frame at 200x200."""
+"""Curves need only PSNR; at 200x200 LPIPS would take most of a frame's time."""
 ABSENT = "–"
-"""In place of a figure that the paper does not give or that nothing here can measure."""
+"""Stands for a figure that the paper does not give or that cannot be measured here."""
 
 
 Lines = Mapping[str, Sequence[Repeated]]
-"""The measured lines of each table, by the name of the table."""
+"""The measured lines of each table, by table name."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class Line:
 
     Attributes:
         label: its name.
-        job: the settings that measure it, beside those of all lines; None if no method here does.
-            Without a method it is of the paper's.
-        published: the paper's figures by metric; bytes, ms, dB as in our rows.
+        job: the settings that measure it, beside those of all lines; None if no method here can.
+            Without a `method` it is a line of the paper's method.
+        published: the paper's figures by metric, in bytes, ms and dB as in our rows.
     """
 
     label: str
@@ -51,18 +51,19 @@ class PaperTable:
     """A table of the paper.
 
     Attributes:
-        name: that of the experiment that measures it.
+        name: the name of the experiment that measures it.
         title: what it shows.
         published_on: scenes, size and machine of the paper's figures.
         metrics: its columns.
         lines: in the paper's order.
         notes: what a reader should know before comparing.
         trends: what the paper concludes from it.
-        beyond: a further method with the lines of the paper's; None without one.
-        beyond_notes: the notes about that.
-        scenes: the metrics that are also shown of every scene of a data set; none: no such table.
-        in_turns: the lines of a block are measured frame by frame in turns: it compares times.
-        curve: the lines of the paper's method are also shown as curves over the training.
+        beyond: a method beyond the paper, shown with the same lines as the paper's method, or None.
+        beyond_notes: the notes about `beyond`.
+        scenes: the metrics that are also shown for every scene of a data set; empty: no such table.
+        in_turns: whether the lines of a block are measured in turns, frame by frame, because the
+            table compares times.
+        curve: whether the lines of the paper's method are also shown as curves over the training.
     """
 
     name: str
@@ -80,13 +81,15 @@ class PaperTable:
 
     @property
     def number(self) -> str:
-        """As the paper counts it: "Table 3"."""
+        """The table's number in the paper: "Table 3"."""
         return self.name.replace("table", "Table ")
 
     @property
     def marks(self) -> dict[tuple[str, float], Line]:
-        """What is measured besides for the curves: by the label of a line and the share of the
-        training after which it is rendered."""
+        """The additional lines measured for the curves.
+
+        Keys are the label of a line and the share of the training after which it is rendered.
+        """
         return {
             (line.label, share): Line(
                 f"{line.label}, after {share}", {**line.job, AFTER: str(share), **OF_CURVES}
@@ -98,12 +101,14 @@ class PaperTable:
 
     @property
     def blocks(self) -> list[PaperTable]:
-        """The table, and the one of the method beyond the paper, where there is one."""
+        """The table, then the same for the method beyond the paper, if there is one."""
         return [self, self._of_beyond()] if self.beyond else [self]
 
     def shown(self, measured: Container[str]) -> list[PaperTable]:
-        """The blocks to show where the lines with the labels `measured` are there: a budget may
-        leave out the method beyond the paper."""
+        """The blocks to show if the lines with the labels `measured` exist.
+
+        A budget may leave out the method beyond the paper.
+        """
         return [
             block
             for block in self.blocks
@@ -111,7 +116,7 @@ class PaperTable:
         ]
 
     def _of_beyond(self) -> PaperTable:
-        """The lines of the paper's method, and the trends, for the method `beyond`."""
+        """The table for the method `beyond`: the lines of the paper's method, and the trends."""
         jobs = {
             line.label: {**line.job, METHOD: str(self.beyond)}
             for line in self.lines
@@ -147,14 +152,14 @@ def _table(path: Path) -> PaperTable:
 
 
 def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table:
-    """Measured figures, the paper's and their difference.
+    """A table of measured figures, the paper's figures and their differences.
 
-    The best measured figure of a column is bold, the second of at least three italic, among those
-    of the same conditions.
+    Among measured figures under the same conditions, the best of a column is bold and, of at least
+    three, the second best is italic.
 
     Args:
-        table: of the paper.
-        measured: by the label of a line; lines may be missing.
+        table: a table of the paper.
+        measured: lines by label; some may be missing.
     """
     lines = [measured.get(line.label, Repeated(line.label, ())) for line in table.lines]
     beside = any(line.published for line in table.lines)
@@ -179,7 +184,7 @@ def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
 
 
 def section(table: PaperTable, lines: Sequence[Repeated]) -> list[str | Table]:
-    """A table as parts of a page: the paper's, the lines of a method beyond it, each scene."""
+    """A table as parts of a page: the paper's lines, those of a method beyond it, each scene."""
     measured = {line.label: line for line in lines}
     first, *further = table.shown(measured)
     heading = f"## {table.number}: {table.title}"
@@ -195,7 +200,7 @@ def section(table: PaperTable, lines: Sequence[Repeated]) -> list[str | Table]:
 def _block(
     table: PaperTable, measured: Mapping[str, Repeated], published: str = ""
 ) -> list[str | Table]:
-    """Conditions of the measured and of the published figures, the figures, trends, notes."""
+    """Conditions of the measured and the published figures, then the figures, trends, notes."""
     labels = [line.label for line in table.lines]
     runs = [run for label in labels if label in measured for run in measured[label].runs]
     where = f"Measured: {conditions_of(runs)}, {_origin(runs)}." if runs else ""
@@ -221,13 +226,13 @@ def _origin(runs: Sequence[Run]) -> str:
 
 
 def _marked(found: Repeated, metric: str, mark: str) -> str:
-    """A measured figure; `mark` goes around it."""
+    """A measured figure, enclosed in `mark`."""
     shown = written(found, metric)
     return f"{mark}{shown}{mark}" if shown else ABSENT
 
 
 def _beside(text: str, measured: float | None, published: float | None, metric: str) -> str:
-    """The measured figure, as `text`, the published one and their difference."""
+    """A cell: the measured figure (as `text`), the published one and their difference."""
     if measured is None and published is None:
         return ABSENT
     _, write = metric_format(metric)

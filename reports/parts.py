@@ -1,4 +1,4 @@
-"""What a page is made of. `publish` writes the same parts as Markdown and as HTML."""
+"""The parts of a page. `publish` writes the same parts as Markdown and as HTML."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class Picture:
     """A drawing.
 
     Attributes:
-        stem: how the name of its file begins.
-        shows: what it shows, in words, for those who do not see it.
-        draw: writes it to a path, in the format that the ending names.
+        stem: prefix of its file name.
+        shows: alternative text: what it shows, in words.
+        draw: writes it to a path, in the format given by the ending.
     """
 
     stem: str
@@ -28,7 +28,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Mark:
-    """A mark of a plot: its name and figures in words, and the keys of the runs behind it."""
+    """A mark in a plot: its name and figures in words, and the keys of the runs behind it."""
 
     says: str
     sources: tuple[str, ...]
@@ -36,14 +36,14 @@ class Mark:
 
 @dataclass(frozen=True)
 class Plot(Picture):
-    """A drawing by matplotlib. `marks` are by the `gid` that `draw` gives to the artist of each."""
+    """A drawing by matplotlib; `marks` are keyed by the `gid` that `draw` gives their artists."""
 
     marks: Mapping[str, Mark] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class View:
-    """A frame as one run rendered it: titles, and uint8 [H, W, 3] with its error map."""
+    """A frame rendered by one run: titles, rendering and error map, uint8 [H, W, 3] each."""
 
     titles: tuple[str, ...]
     rendering: np.ndarray
@@ -52,7 +52,7 @@ class View:
 
 @dataclass(frozen=True)
 class Detail:
-    """The part of a frame that is enlarged: left, top, right, bottom, and why this part."""
+    """The part of a frame to enlarge: left, top, right, bottom, and why this part was chosen."""
 
     box: tuple[int, int, int, int]
     where: str
@@ -60,11 +60,11 @@ class Detail:
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame of several runs, to be compared.
+    """A frame of several runs, for comparison.
 
     Attributes:
         name: scene, view and number.
-        stem: how the names of its files begin.
+        stem: prefix of its file names.
         truth: uint8 [H, W, 3].
         errors: what the error maps show.
     """
@@ -78,4 +78,4 @@ class Frame:
 
 
 Part = str | Table | Plot | Frame
-"""A text is Markdown."""
+"""A part that is a string is Markdown."""

@@ -10,7 +10,7 @@ from reports.runs import Run
 
 
 def facts(run: Run) -> dict[str, str]:
-    """Everything but the command and the settings, by name."""
+    """All provenance except the command and the settings, by name."""
     machine, record, row = run.record["machine"], run.record, run.facts
     memory = f"{machine['memory_bytes'] / 2**30:.0f} GiB"
     computed = {name: row[name] for name in ("device", "backend", "engine", "precision")}
@@ -33,14 +33,16 @@ def facts(run: Run) -> dict[str, str]:
 
 
 def _beside(record: Mapping[str, Any]) -> str:
-    """What other processes did while frames were timed; older runs and scores do not know."""
+    """What other processes used while frames were timed; unknown for older runs and scores."""
     seen = record.get("neighbours")
     return str(Neighbours(**seen)) if seen else "not recorded"
 
 
 def settings(run: Run) -> dict[str, str]:
-    """The settings of its method as one types them, with their values; of a run that no command
-    of ours measured there are none."""
+    """The settings of the run's method, named as one types them, with their values.
+
+    Empty for a run that steerbench did not measure.
+    """
     config = run.record["made_of"].get("config", {})
     return dict(_flat("method", config.get("method", {})))
 
@@ -50,7 +52,7 @@ def _flat(name: str, value: Any) -> Iterator[tuple[str, str]]:
         yield name, str(value)
     else:
         for key, inner in value.items():
-            if not key.startswith("_"):  # Hydra's own, as `_target_`
+            if not key.startswith("_"):  # Hydra's own, such as `_target_`
                 yield from _flat(f"{name}.{key}", inner)
 
 

@@ -1,6 +1,6 @@
-"""A page in its two forms: Markdown with its pictures beside it, one HTML file that holds all.
+"""Writes a page in two forms: Markdown with pictures beside it, and one self-contained HTML file.
 
-Both are written from the same parts, so neither can show what the other does not.
+Both are made from the same parts, so that they show the same content.
 """
 
 from __future__ import annotations
@@ -21,19 +21,18 @@ from reports.runs import Run
 from reports.tables import Table
 
 PICTURE = re.compile(r".+-[0-9a-f]{12}\.png")
-"""What the pictures of a page are called: a stem, then a digest of the content."""
+"""File names of a page's pictures: a stem, then a digest of the content."""
 
 
 def publish(parts: Sequence[Part], folder: Path, runs: Sequence[Run] = ()) -> Path:
-    """Write `parts` as `report.md` and `report.html`, each of which appears whole or not at all;
-    return the former.
+    """Write `parts` as `report.md` and `report.html`, each atomically; return the former.
 
-    Pictures of an earlier page stay until that is replaced.
+    Pictures of an earlier page are kept until that page is replaced.
 
     Args:
         parts: the page from top to bottom; it begins with its title as a heading.
-        folder: made if missing.
-        runs: those behind the figures, whose origin the HTML page has at hand.
+        folder: created if missing.
+        runs: the runs behind the figures; the HTML page shows their provenance.
 
     Raises:
         SteerbenchError: `folder` cannot be written to.
@@ -46,13 +45,13 @@ def publish(parts: Sequence[Part], folder: Path, runs: Sequence[Run] = ()) -> Pa
                 new.write_text(content, encoding="utf-8")
     for picture in (folder / "pictures").glob("*.png"):
         if PICTURE.fullmatch(picture.name) and f"(pictures/{picture.name})" not in text:
-            with suppress(OSError):  # the page is published
+            with suppress(OSError):  # the page is already published
                 picture.unlink()
     return folder / "report.md"
 
 
 def markdown(parts: Sequence[Part], folder: Path) -> str:
-    """`parts` in GitHub's Markdown, their pictures written below `folder`."""
+    """`parts` in GitHub's Markdown; writes their pictures below `folder`."""
     return "\n\n".join(_markdown(part, folder) for part in parts)
 
 
@@ -68,7 +67,7 @@ def _markdown(part: Part, folder: Path) -> str:
 
 
 def _shown(picture: Picture, folder: Path) -> str:
-    """Draw `picture` into `folder`, named after its content; the Markdown that shows it."""
+    """Draw `picture` into `folder`, named after its content; return the Markdown that shows it."""
     with tempfile.TemporaryDirectory() as place:
         picture.draw(drawn := Path(place) / f"{picture.stem}.png")
         content = drawn.read_bytes()

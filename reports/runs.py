@@ -1,4 +1,4 @@
-"""Runs of the store, with everything that tables and pages read of them."""
+"""Runs of the store, with everything that tables and pages need from them."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class Run:
     """One run of the store.
 
     Attributes:
-        key: in the store.
+        key: its key in the store.
         label: its name in a table or figure.
         rows: one metric per row.
-        read_frames: reads `frames`, which few reports need and which are most of a run.
+        read_frames: reads `frames` on demand: few reports need them, and they are most of a run.
         record: what the figures mean, and where they come from.
         pictures: folder of ground truths, renderings and error maps.
     """
@@ -46,7 +46,7 @@ class Run:
 
     @cached_property
     def headline(self) -> pd.DataFrame:
-        """One row per metric: of the steady frames, or of the cold ones if there are no others."""
+        """One row per metric, for the steady frames, or the cold ones if there are no others."""
         return headline(self.rows).set_index("metric")
 
     @cached_property
@@ -55,7 +55,7 @@ class Run:
         return {str(metric): value for metric, value in self.headline["value"].items()}
 
     def phases(self) -> list[Run]:
-        """The run once for each of its phases, with the figures of that phase alone."""
+        """The run once per phase, with only the figures of that phase."""
         whole = self.rows[self.rows["phase"] == WHOLE]
         return [
             replace(self, label=self.label + suffix(phase), rows=pd.concat([of_phase, whole]))
@@ -63,13 +63,13 @@ class Run:
         ]
 
     def _repr_markdown_(self) -> str:
-        """Its tables, as a notebook shows them."""
+        """The run's tables, for display in a notebook."""
         tables = "\n\n".join(table.section(level=4) for table in run_tables(self.rows))
         return f"### {self.label}\n\n{tables}"
 
     @cached_property
     def facts(self) -> pd.Series:
-        """What all rows of the run have in common: method, scene, protocol, device and so on."""
+        """The columns that are equal in all rows: method, scene, protocol, device and so on."""
         return self.rows.iloc[0]
 
     @property
@@ -80,26 +80,26 @@ class Run:
 
     @property
     def computer(self) -> tuple[str, ...]:
-        """Equal for runs on the same device of machines with the same processors."""
+        """Equal for runs on the same device and the same kind of processor."""
         machine = self.record["machine"]
         return (self.facts["device"], machine["cpu"], *machine["gpus"])
 
     @property
     def conditions(self) -> tuple[object, ...]:
-        """Equal for runs whose figures may be compared."""
+        """Equal for runs whose figures are comparable."""
         phase = self.headline["phase"].iloc[0]
         return (*self.views, phase, self.facts["protocol"], *self.computer)
 
 
 @dataclass(frozen=True)
 class Repeated:
-    """Runs that differ in their seed alone. Figures are means over them.
+    """Runs that differ only in their seed. Figures are means over them.
 
     Attributes:
-        label: name of the line of a table that they fill.
-        runs: one for each seed that was measured; of a data set their means over scenes.
-        gaps: why others are missing.
-        by_scene: of a data set all runs that were measured, by scene, those in the means first.
+        label: name of the table line that they fill.
+        runs: one for each measured seed; for a data set, each is a mean over scenes.
+        gaps: why other runs are missing.
+        by_scene: for a data set, all measured runs by scene; first the scenes in the means.
     """
 
     label: str
@@ -109,17 +109,17 @@ class Repeated:
 
     @property
     def measured(self) -> list[Run]:
-        """The runs of the store behind the figures, each of one scene."""
+        """The stored runs behind the figures, each of a single scene."""
         return [run for runs in self.by_scene.values() for run in runs] or list(self.runs)
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """The keys of the runs of the store behind the figures."""
+        """The keys of the stored runs behind the figures."""
         return tuple(run.key for run in self.measured)
 
     @cached_property
     def values(self) -> dict[str, float]:
-        """Means by metric, of the metrics that all runs have."""
+        """Means by metric, for the metrics that all runs have."""
         if not self.runs:
             return {}
         tables = [run.values for run in self.runs]
@@ -132,16 +132,16 @@ class Repeated:
         return self.runs[0].conditions if self.runs else ()
 
     def mean(self, metric: str) -> float | None:
-        """The mean of a metric; of a stage with the stages inside it; None without figures."""
+        """The mean of a metric; a stage includes its nested stages. None without figures."""
         figures = self._figures(metric)
         return float(np.mean(figures)) if figures else None
 
     def half(self, metric: str) -> float:
-        """Half of the 95 % interval of that mean; nan with fewer than two seeds."""
+        """Half the 95 % interval of this mean; nan with fewer than two seeds."""
         return half_interval(np.array(self._figures(metric)))
 
     def _figures(self, metric: str) -> list[float]:
-        """The metric, with the stages inside it, of every run that has it."""
+        """The metric of every run that has it; a stage includes its nested stages."""
         of_runs = (
             [
                 value
@@ -154,11 +154,12 @@ class Repeated:
 
 
 def over_common_frames(runs: Sequence[Run]) -> list[Run]:
-    """The same runs with the steady figures of common frames: of the frames alone that are steady
-    in all of the runs that render the same views. A method that looks back has fewer than one that
-    does not, and the first of a path are no average ones.
+    """The same runs, with steady figures recomputed over the frames that are steady in all of them.
 
-    Runs without steady frames stay as they are, as do all that have no such frame in common.
+    "All" means the runs that render the same views. A method with memory has fewer steady ones, and
+    the first frames of a path are not typical, so that means over different frames would mislead.
+
+    Runs without steady frames stay unchanged, and so do runs without any common steady frame.
     """
     steady = [set(run.frames.loc[run.frames["phase"] == STEADY, "frame"]) for run in runs]
     common: dict[tuple[object, ...], set[int]] = {}
@@ -172,7 +173,7 @@ def over_common_frames(runs: Sequence[Run]) -> list[Run]:
 
 
 def _over(run: Run, kept: Collection[int]) -> Run:
-    """With the steady figures of the frames `kept`; as they were if there is none."""
+    """The run with steady figures computed over the frames `kept`; unchanged if that is empty."""
     if not kept:
         return run
     frames = run.frames
@@ -186,10 +187,10 @@ def _over(run: Run, kept: Collection[int]) -> Run:
 
 
 def load(store: Store, labels: Mapping[str, str]) -> list[Run]:
-    """The runs whose keys `labels` has, in its order.
+    """Load the runs whose keys are in `labels`, in its order.
 
     Raises:
-        SteerbenchError: one of them is not in the store, or of a schema that cannot be read.
+        SteerbenchError: a run is not in the store, or has a schema that cannot be read.
     """
     records = {key: store.record(key) for key in labels}
     by_run = _rows_by_run(store, labels)
@@ -215,7 +216,9 @@ def _run(store: Store, key: str, label: str, rows: pd.DataFrame, record: Mapping
 
 
 def _rows_by_run(store: Store, keys: Collection[str] | None = None) -> dict[str, pd.DataFrame]:
-    """The rows of every run that can be read, or of those with `keys`; others are left out without
-    a warning."""
+    """The rows of every readable run, or only of those in `keys`; unreadable ones are skipped.
+
+    There is no warning about skipped runs.
+    """
     rows = store.rows(report=lambda unreadable: None, keys=keys)
     return {str(run): of_run for run, of_run in rows.groupby("run")}

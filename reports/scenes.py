@@ -1,4 +1,4 @@
-"""Means over scenes, and the table of the scenes behind them."""
+"""Computes means over scenes, and the table of the individual scenes."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from reports.runs import Repeated, Run
 from reports.tables import NOT_AVAILABLE, Table
 
 FIGURES = ("metric", "unit", "phase", "value", "n", "lo", "hi")
-"""The columns of rows that are no facts about the whole run."""
+"""The columns of rows that are not facts about the whole run."""
 
 PARTS = ("stage_ms.", "work.")
-"""How metrics begin that a run only has if something happened in it."""
+"""Prefixes of metrics that a run lacks if the stage or the work did not occur in it."""
 
 
 def over_scenes(runs: Sequence[Run]) -> Run:
-    """The mean of runs of different scenes as a run: its rows are the means of their headlines, of
-    the metrics that all of them have; its frames are those of all.
+    """Average runs of different scenes into one run.
 
-    Time and work that one of them does not have are 0 there.
+    Its rows are means of their headline rows, for the metrics that all of them have; its frames are
+    the frames of all. A stage or counter that a run lacks counts as 0 for it.
     """
     if len(runs) == 1:
         return runs[0]
@@ -49,8 +49,7 @@ def over_scenes(runs: Sequence[Run]) -> Run:
 
 
 def scene_table(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:
-    """Every scene on its own: the means over seeds of `metrics`, a line each for a scene and one
-    of `lines`."""
+    """A table of individual scenes: means of `metrics` over seeds, one line per scene and line."""
     scenes = dict.fromkeys(sorted(scene for line in lines for scene in line.by_scene))
     shown = [
         (f"{scene}: {line.label}", Repeated(line.label, line.by_scene[scene]))
@@ -67,7 +66,7 @@ def scene_table(metrics: Sequence[str], lines: Sequence[Repeated]) -> Table:
 
 
 def _frames(by_scene: Mapping[str, Run]) -> pd.DataFrame:
-    """The frames of all scenes, each named after its scene, too."""
+    """The frames of all scenes, with the scene's name added to their names."""
     return pd.concat(
         [
             run.frames.assign(name=f"{scene}/" + run.frames["name"].fillna(""))
@@ -78,7 +77,7 @@ def _frames(by_scene: Mapping[str, Run]) -> pd.DataFrame:
 
 
 def _record(runs: Sequence[Run]) -> dict[str, Any]:
-    """The record of the first, with the scenes, machines and missing figures of all."""
+    """The record of the first run, with the scenes, machines and missing figures of all."""
     records = [run.record for run in runs]
     machines = [record["machine"] for record in records]
     machine = {name: _joined([of[name] for of in machines]) for name in ("cpu", "threads")}
@@ -93,6 +92,6 @@ def _record(runs: Sequence[Run]) -> dict[str, Any]:
 
 
 def _joined(values: Sequence[Any]) -> Any:
-    """The value if it is the same everywhere, else all of them as text."""
+    """The value if all are equal, otherwise all of them as text."""
     distinct = list(dict.fromkeys(values))
     return distinct[0] if len(distinct) == 1 else " / ".join(map(str, distinct))

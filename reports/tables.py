@@ -1,10 +1,10 @@
-"""Tables of text, for the terminal and for pages, and how a figure is written in them.
+"""Tables of text for the terminal and for pages, and the format of figures in them.
 
-Units are those of the field: dB, milliseconds, MB = 10^6 bytes. Every LPIPS column names its
-network. A missing figure reads `n/a`.
+Units are dB, milliseconds and MB = 10^6 bytes. Every LPIPS column names its network. A missing
+figure is shown as `n/a`.
 
 The headline figures of a run are those of its steady frames. Cold frames, which have fewer
-preceding frames than the method can use, are listed apart.
+preceding frames than the method can use, are listed separately.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from bench.results import COLD, STEADY
 NOT_AVAILABLE = "n/a"
 
 DENSE = ".dense"
-"""Ending of a work counter that says what a method that skips nothing would have done."""
+"""Suffix of a work counter for the work of a method that skips nothing."""
 
 QUALITY = {
     "psnr": ("PSNR, dB ↑", 2),
@@ -29,7 +29,7 @@ QUALITY = {
     "lpips_squeeze": ("LPIPS squeeze ↓", 4),
     "flicker": ("flicker ↓", 4),
 }
-"""Label and decimals of each quality metric. The arrow points to better."""
+"""Label and decimals of each quality metric. The arrow points to better values."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class Table:
     """Lines of text under columns.
 
     Attributes:
-        columns: the first is a label; the others are figures, or text when `figures` is False.
+        columns: the first is a label; the others are figures, or text if `figures` is False.
         bold: line and column, both from 0, of every bold cell.
-        sources: the keys of the runs behind each line; empty: of none.
+        sources: the keys of the runs behind each line; empty: no line has any.
     """
 
     title: str
@@ -59,7 +59,7 @@ class Table:
         return "\n".join(f"| {' | '.join(line)} |" for line in (self.columns, rule, *lines))
 
     def section(self, level: int = 2) -> str:
-        """The table in Markdown under its title as a heading."""
+        """The table in Markdown, with its title as a heading."""
         return f"{'#' * level} {self.title}\n\n{self.markdown()}"
 
     def _cell(self, text: str, place: tuple[int, int]) -> str:
@@ -68,7 +68,7 @@ class Table:
 
 
 def decimal(value: float | None, decimals: int) -> str:
-    """`value` with so many decimals, or `n/a`. What rounds to 0 has no sign."""
+    """`value` with this number of `decimals`, or `n/a`. A value that rounds to 0 gets no sign."""
     if value is None or math.isnan(value):
         return NOT_AVAILABLE
     return f"{round(value, decimals) + 0.0:,.{decimals}f}"
@@ -85,25 +85,27 @@ def share(part: float, whole: float) -> str:
 
 
 def headline(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows of whole runs and of their steady frames; of cold ones for runs without steady."""
+    """The rows of whole runs and of steady frames; of cold frames for runs without steady ones."""
     steady = set(rows.loc[rows["phase"] == STEADY, "run"])
     return rows[(rows["phase"] != COLD) | ~rows["run"].isin(steady)]
 
 
 def phases(rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
-    """The rows of one run by phase, steady ones first, without those of the whole run."""
+    """The rows of one run by phase, steady first, without rows about the whole run."""
     by_phase = [(phase, rows[rows["phase"] == phase]) for phase in (STEADY, COLD)]
     return [(phase, of_phase) for phase, of_phase in by_phase if len(of_phase)]
 
 
 def suffix(phase: str) -> str:
-    """Ending of a label for figures of `phase`: empty for steady frames."""
+    """Suffix of a label for figures of `phase`; empty for steady frames."""
     return "" if phase == STEADY else f", {phase}"
 
 
 def run_tables(rows: pd.DataFrame) -> list[Table]:
-    """The tables of one run: quality, time by stage and work of each phase; memory. Of
-    pictures that nobody rendered here there is the quality alone."""
+    """The tables of one run: quality, time by stage and work for each phase; memory.
+
+    For pictures that were only scored, there is only quality.
+    """
     tables = [
         table(of_phase, suffix(phase))
         for phase, of_phase in phases(rows)
@@ -113,7 +115,7 @@ def run_tables(rows: pd.DataFrame) -> list[Table]:
 
 
 def _values(rows: pd.DataFrame, prefix: str = "", column: str = "value") -> dict[str, float]:
-    """Figures of one run by metric, for metrics that begin with `prefix`, which is cut off."""
+    """Figures of one run by metric, for metrics with `prefix`, which is removed from the names."""
     return {
         metric.removeprefix(prefix): figure
         for metric, figure in zip(rows["metric"], rows[column], strict=True)
@@ -149,7 +151,7 @@ def _time(rows: pd.DataFrame, suffix: str) -> Table:
 
 
 def _work(rows: pd.DataFrame, suffix: str) -> Table:
-    """What was done, beside what a method that skips nothing would have done."""
+    """The work done, beside the work of a method that skips nothing."""
     value = _values(rows, "work.")
     lines = []
     for name, done in value.items():

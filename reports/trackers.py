@@ -1,7 +1,8 @@
 """Sends a run of the store to an experiment tracker, under the run's key.
 
-One class a tracker. Each takes the figures of every frame as a series, the headline as its summary,
-the pictures, and where all of it comes from. What was sent under the same key is replaced or kept.
+There is one class per tracker. Each sends the figures of every frame as a series, the headline
+figures as a summary, the pictures and the provenance. A run already sent under the same key is
+replaced or kept.
 """
 
 from __future__ import annotations
@@ -18,17 +19,17 @@ from bench.errors import SteerbenchError, Unavailable, install_command
 from reports.runs import Run
 
 PROJECT = "steerbench"
-"""The name of the project, or of the experiment, in a tracker."""
+"""The name of the project or experiment in a tracker."""
 
 FACTS = ("method", "scene", "resolution", "trajectory", "budget", "protocol", "seed", "device")
 """Columns of the rows that say what was measured."""
 
 
 class Tracker(Protocol):
-    """Where runs are sent.
+    """An experiment tracker, to which runs are sent.
 
     Attributes:
-        package: what must be installed for it.
+        package: the package that it needs.
     """
 
     package: str
@@ -38,7 +39,7 @@ class Tracker(Protocol):
 
 
 class WandB:
-    """Weights & Biases: a run whose id is the key. Its own environment variables say where to."""
+    """Weights & Biases: a run with the key as id. W&B's environment variables set the target."""
 
     package = "wandb"
 
@@ -60,7 +61,7 @@ class WandB:
 
 
 class MLflow:
-    """MLflow: a run with the key as its tag. Its own environment variables say where to."""
+    """MLflow: a run with the key as a tag. MLflow's environment variables set the target."""
 
     package = "mlflow"
 
@@ -81,7 +82,7 @@ class MLflow:
 
 
 def _flat(figures: Mapping[str, float]) -> dict[str, float]:
-    """For MLflow, to which a name with a slash is a file in a folder."""
+    """Rename figures for MLflow, which treats a name with a slash as a file in a folder."""
     return {name.replace("/", "."): value for name, value in figures.items()}
 
 
@@ -117,10 +118,10 @@ TRACKERS: Mapping[str, Tracker] = {
 
 
 def tracker(name: str) -> Tracker:
-    """The tracker of this name.
+    """The tracker called `name`.
 
     Raises:
-        SteerbenchError: there is none.
+        SteerbenchError: there is no such tracker.
         Unavailable: its package is not installed.
     """
     if name not in TRACKERS:
@@ -134,26 +135,26 @@ def tracker(name: str) -> Tracker:
 
 
 def settings(run: Run) -> dict[str, Any]:
-    """What was measured, with which command, from which commit and on which machine."""
+    """What was measured, by which command, at which commit and on which machine."""
     facts = {name: str(run.facts[name]) for name in FACTS}
     record = {name: run.record[name] for name in ("command", "commit")}
     return facts | record | {"cpu": run.record["machine"]["cpu"]}
 
 
 def headline(run: Run) -> dict[str, float]:
-    """The figures of the whole run, without those that it lacks."""
+    """The headline figures of the run, without missing ones."""
     return {name: value for name, value in run.values.items() if np.isfinite(value)}
 
 
 def series(run: Run) -> Iterator[tuple[int, dict[str, float]]]:
-    """The number of each frame and its figures, without those that it lacks."""
+    """The number of each frame and its figures, without missing ones."""
     for row in run.frames.select_dtypes("number").to_dict("records"):
         frame = int(row.pop("frame"))
         yield frame, {str(name): float(x) for name, x in row.items() if np.isfinite(x)}
 
 
 def pictures(run: Run) -> Iterator[tuple[str, Path]]:
-    """The files of the pictures by names such as "rendered/0012"."""
+    """The files of the pictures, with names such as "rendered/0012"."""
     for path in sorted(run.pictures.glob("*.png")):
         frame, what = path.stem.split("-")
         yield f"{what}/{frame}", path

@@ -1,4 +1,4 @@
-"""Time against error: the tables and the page of kernels and of whole methods."""
+"""Time against error: tables and a page, for kernels and for whole methods."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ON_FRONTIER = "— (frontier)"
 
 
 def experiment_table(rows: Sequence[Row]) -> Table:
-    """Every setting of every experiment; the first line of an experiment has its observed order."""
+    """A table of all settings of all experiments; first lines show the observed order."""
     lines = []
     for subject, some in groupby(rows, lambda row: row["subject"]):
         for number, row in enumerate(some):
@@ -48,7 +48,7 @@ def experiment_table(rows: Sequence[Row]) -> Table:
 
 
 def setting_table(rows: Sequence[Row]) -> Table:
-    """Every setting, the fastest first; those on the Pareto frontier are bold."""
+    """A table of all settings, fastest first; those on the Pareto frontier are bold."""
     lines = tuple(
         (
             row["setting"],
@@ -71,14 +71,15 @@ def setting_table(rows: Sequence[Row]) -> Table:
 def write_tradeoff(
     experiments: Sequence[Row], settings: Sequence[Row], folder: Path, command: str
 ) -> Path:
-    """Write `folder/report.md` and `report.html`, with the plot and all rows as CSV beside them;
-    return the path of the first.
+    """Write `folder/report.md` and `report.html`, with the plot and all rows as CSV beside them.
+
+    Returns the path of report.md.
 
     Args:
         experiments: rows of kernels, for `experiment_table`.
-        settings: rows of methods, for `setting_table` and `frontier_plot`; empty: both are left
+        settings: rows of methods, for `setting_table` and `frontier_plot`; if empty, both are left
             out.
-        command: as it was typed.
+        command: the command line.
 
     Raises:
         SteerbenchError: `folder` cannot be written to.
@@ -104,7 +105,7 @@ def _write_csv(rows: Sequence[Row], path: Path) -> None:
 
 
 def _setting(value: float | str) -> str:
-    """A number in few digits, a power of two below 1 as a fraction; a text as it is."""
+    """A short number, with powers of two below 1 as fractions; text is unchanged."""
     if isinstance(value, str):
         return value
     if 0 < value < 1 and math.frexp(value)[0] == 0.5:

@@ -1,4 +1,4 @@
-"""Trends of the paper, step by step: whether a metric grows here as it grows there."""
+"""Checks the paper's trends step by step: whether a metric grows here as it does there."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from reports.tables import Table
 HOLDS, FAILS, OPEN = "holds", "does not hold", "cannot be told"
 SMALLER = "smaller than the paper's step"
 SEEN, REVERSED = "so, by one seed", "the reverse, by one seed"
-"""Verdicts from the frames of one seed: another training may turn them around."""
+"""Verdicts from the frames of one seed; another training may reverse them."""
 
 COMPUTED = "computed, not sampled"
 
 
 @dataclass(frozen=True)
 class Trend:
-    """`metric` grows along the lines `rising`, which are labels."""
+    """A claim: `metric` grows along the lines with the labels `rising`."""
 
     metric: str
     rising: Sequence[str]
@@ -33,13 +33,13 @@ class Trend:
 
 @dataclass(frozen=True)
 class Growth:
-    """Of a metric from one line to another.
+    """The growth of a metric from one line to another.
 
     Attributes:
         by: the mean difference.
-        half: half of its 95 % interval; nan where it is not known.
-        over: the samples that `by` is the mean of, in words.
-        proves: whether the interval covers the differences between trainings.
+        half: half its 95 % interval; nan if unknown.
+        over: the samples that `by` averages, in words.
+        proves: whether the interval accounts for differences between trainings.
     """
 
     by: float
@@ -50,10 +50,10 @@ class Growth:
 
 @dataclass(frozen=True)
 class Step:
-    """From one line of a trend to the next.
+    """The step from one line of a trend to the next.
 
     Attributes:
-        paper: by how much the metric grows in the paper; nan where it does not give both figures.
+        paper: growth of the metric in the paper; nan if the paper does not give both figures.
     """
 
     metric: str
@@ -64,8 +64,7 @@ class Step:
 
     @property
     def verdict(self) -> str:
-        """Whether the metric grows here, does not, grows less than in the paper, or whether that
-        cannot be told."""
+        """Whether the metric grows here, shrinks, grows less than in the paper, or is undecided."""
         low, high = self.here.by - self.here.half, self.here.by + self.here.half
         if low > 0:
             return HOLDS if self.here.proves else SEEN
@@ -79,10 +78,10 @@ def steps(
     lines: Mapping[str, Repeated],
     published: Mapping[str, Mapping[str, float]],
 ) -> Iterator[Step]:
-    """Every step of `trend` between two lines that were measured.
+    """Every step of `trend` between two measured lines.
 
     Args:
-        lines: measured, by label.
+        lines: the measured lines, by label.
         published: the paper's figures, by label and metric.
     """
     for smaller, larger in pairwise(trend.rising):
@@ -96,9 +95,9 @@ def steps(
 
 
 def _growth(one: Repeated, other: Repeated, metric: str) -> Growth | None:
-    """The mean difference of pairs; None if there are none.
+    """The mean difference over pairs; None if there are no pairs.
 
-    Pairs have the same seed if there are several seeds, else they are the same frame of one seed.
+    With several seeds, a pair has the same seed; with one seed, a pair is the same frame.
     """
     anywhere = not (metric in LIMITS and LIMITS[metric].here)
     pairs = [
@@ -127,7 +126,7 @@ def _growth(one: Repeated, other: Repeated, metric: str) -> Growth | None:
 
 
 def trend_table(found: Sequence[Step]) -> Table:
-    """The steps `found`, a line each."""
+    """A table of the steps `found`, one line each."""
     columns = ("grows in the paper", "paper", "here", "over", "")
     return Table("Trends", columns, tuple(map(_line, found)))
 

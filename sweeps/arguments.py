@@ -1,4 +1,4 @@
-"""The arguments of the subcommands of `steerbench`, which commands.toml lists and explains."""
+"""The arguments of the subcommands of `steerbench`; commands.toml lists and explains these."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 FORMATS = ("latex", "csv")
-"""Of the tables of the paper; see `reports.export`."""
+"""Formats in which the paper's tables can be exported; see `reports.export`."""
 
 Arguments = list[tuple[tuple[str, ...], dict[str, Any]]]
-"""Names and options of each argument, as of `ArgumentParser.add_argument`."""
+"""Names and options of each argument, as for `ArgumentParser.add_argument`."""
 
 COMMANDS: dict[str, dict[str, str]] = tomllib.loads(
     (Path(__file__).parent / "commands.toml").read_text(encoding="utf-8")
@@ -26,7 +26,7 @@ def positive_int(text: str) -> int:
 
 
 def config_dir(text: str) -> str:
-    """The word for the folder `text`, which must exist; see `sweeps.overrides`."""
+    """`--config-dir=` and the folder `text`, which must exist; see `sweeps.overrides`."""
     if not Path(text).is_dir():
         raise argparse.ArgumentTypeError(f"expected a folder, there is none at {text}")
     return f"--config-dir={Path(text).resolve()}"
@@ -223,12 +223,15 @@ ARGUMENTS = {
         ),
     ],
 }
-"""Of each command but `run`, whose arguments Hydra reads."""
+"""Arguments of each command but `run`, whose arguments Hydra parses."""
 
 
 def add_commands(parser: argparse.ArgumentParser) -> None:
-    """Add all commands to `parser`. The result of parsing has the name of the `command`, None
-    without one, and the innermost `parser`."""
+    """Add all commands to `parser`.
+
+    The parsed arguments hold the name of the `command`, None if there was none, and the innermost
+    `parser`.
+    """
     parser.set_defaults(command=None, parser=parser)
     commands = parser.add_subparsers(prog=parser.prog, help=argparse.SUPPRESS)
     for name, about in COMMANDS.items():
@@ -239,7 +242,7 @@ def add_commands(parser: argparse.ArgumentParser) -> None:
 
 
 def overview() -> str:
-    """All commands in their groups, a line each."""
+    """All commands by group, one line each."""
     groups: dict[str, list[str]] = {}
     for name, about in COMMANDS.items():
         groups.setdefault(about["group"], []).append(f"  {name:11}{about['purpose']}\n")

@@ -1,4 +1,4 @@
-"""Objects from the nodes of a configuration, with errors that name the setting."""
+"""Builds objects from the nodes of a configuration; errors name the setting."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sweeps.names import unknown
 from sweeps.overrides import choices
 
 STANDS_FOR = {"Path": str, "tuple": list, "Sequence": list, "Mapping": dict, "float": float | int}
-"""What a configuration holds where a signature has a type of the name on the left."""
+"""By the name of a type in a signature: the type that a configuration holds instead."""
 
 
 def target_of(node: Mapping[str, Any] | DictConfig) -> Any:
@@ -38,10 +38,10 @@ def target_of(node: Mapping[str, Any] | DictConfig) -> Any:
 
 
 def engine_kinds(words: Sequence[str] = ()) -> dict[str, Any]:
-    """The class of each engine by its name; torch, the standard, first.
+    """The class of each engine by name; torch, the standard, comes first.
 
     Args:
-        words: they may name folders with further engines.
+        words: words of a command; they may name folders with further engines.
     """
     files = choices("engine", words)
     names = sorted(files, key=lambda name: (name != "torch", name))
@@ -51,18 +51,18 @@ def engine_kinds(words: Sequence[str] = ()) -> dict[str, Any]:
 def build(config: DictConfig, group: str, *args: Any, **extra: Any) -> Any:
     """Call the `_target_` of `config[group]` with its settings, `args` and `extra`.
 
-    Nodes below it that have a `_target_` are built first. What a target raises passes through.
+    Nodes below it that have a `_target_` are built first. Exceptions of a target pass through.
 
     Raises:
-        SteerbenchError: a setting is missing, unknown to its target, or of another type, or there
-            is no such target.
+        SteerbenchError: a setting is missing, unknown to its target, or of the wrong type, or the
+            target does not exist.
     """
     try:
         missing = sorted(OmegaConf.missing_keys(config[group]))  # full keys: "scene.path"
         if missing:
             raise SteerbenchError(f"{missing[0]} is not set: give {missing[0]}=...")
         node: Any = OmegaConf.to_container(config[group], resolve=True)
-    except OmegaConfBaseException as error:  # a setting was removed (~backend) that others use
+    except OmegaConfBaseException as error:  # a setting that others use was removed (~backend)
         raise SteerbenchError(f"{group}: {str(error).splitlines()[0]}") from error
     target = target_of(node)
     given = [*list(inspect.signature(target).parameters)[: len(args)], *extra]
@@ -78,29 +78,29 @@ def build(config: DictConfig, group: str, *args: Any, **extra: Any) -> Any:
 
 
 def _refused(group: str, error: BaseException) -> SteerbenchError:
-    """The error for a value that the target refused in a message that names the setting."""
+    """The error for a value that the target rejected; the target's message names the setting."""
     return SteerbenchError(f"{group}: {error}")
 
 
 def check_settings(
     target: Any, settings: Mapping[str, Any], prefix: str = "", given: Collection[str] = ()
 ) -> None:
-    """Raise `SteerbenchError` unless `target` takes these settings, by name and by type.
+    """Raise `SteerbenchError` unless `target` accepts these settings, by name and type.
 
-    Errors put `prefix` before their names. Parameters `given` by the caller are no settings.
-    Settings that are nodes with a `_target_` are checked against that.
+    Errors put `prefix` before the names. Parameters `given` by the caller are not settings.
+    Settings that are nodes with a `_target_` are checked against that target.
     """
-    # The types of inherited fields of a dataclass are names of the modules of its bases.
+    # Types of inherited dataclass fields must be looked up in the modules of its bases.
     plain = inspect.isclass(target) and not is_dataclass(target)
     hints = get_type_hints(target.__init__ if plain else target)
     parameters = inspect.signature(target).parameters
     names = [name for name in parameters if name not in given]
     if not settings.get("_partial_"):
-        for name in names:  # ~name removes what the configurations give
+        for name in names:  # ~name removes a default of the configurations
             if _required(parameters[name]) and name not in settings:
                 raise SteerbenchError(f"{prefix}{name} is not set: give {prefix}{name}=...")
     for name, value in settings.items():
-        if name.startswith("_"):  # of Hydra: _target_, _convert_
+        if name.startswith("_"):  # Hydra's own: _target_, _convert_
             continue
         if name not in names:
             raise unknown("setting", f"{prefix}{name}", [f"{prefix}{other}" for other in names])
@@ -117,12 +117,12 @@ def _required(parameter: inspect.Parameter) -> bool:
 
 
 def _choices(hint: Any) -> tuple[object, ...]:
-    """The values a `Literal` allows; none for other types."""
+    """The values that a `Literal` allows; empty for other types."""
     return get_args(hint) if get_origin(hint) is Literal else ()
 
 
 def _fits(value: object, hint: Any) -> bool:
-    """Whether a plain YAML `value` has the type `hint`; if that cannot be decided, it has."""
+    """Whether a plain YAML `value` has the type `hint`; True if that cannot be decided."""
     if get_origin(hint) is UnionType:
         return any(_fits(value, option) for option in get_args(hint))
     if choices := _choices(hint):

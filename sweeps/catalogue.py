@@ -1,4 +1,4 @@
-"""`steerbench list`: what can be chosen, and what of it cannot be used here, and why."""
+"""`steerbench list`: what can be chosen, and why some of it cannot be used here."""
 
 from __future__ import annotations
 
@@ -19,10 +19,9 @@ GROUPS = ("method", "engine", "scene", "trajectory", "protocol", "budget", "expe
 
 
 def main(options: argparse.Namespace) -> int:
-    """Print the choices of `steerbench run`; with `--here` the usable backends and engines, too.
+    """Print the choices of `steerbench run`; with `--here`, also the usable backends and engines.
 
-    Those are asked for: only torch and the engines themselves know, and importing them takes
-    seconds.
+    `--here` is optional because it takes seconds: it imports torch and the engines.
     """
     words = options.config_dir
     files = [
@@ -51,7 +50,7 @@ def _show(title: str, columns: tuple[str, str], lines: Sequence[tuple[str, str]]
 
 
 def described(group: str, words: Sequence[str] = ()) -> dict[str, str]:
-    """Every choice of `group`, also of the folders that `words` name, and what it is."""
+    """Every choice of `group`, including folders named in `words`, with its description."""
     return {name: _comment(path.read_text()) for name, path in choices(group, words).items()}
 
 
@@ -60,7 +59,7 @@ def _plug_ins(words: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def _brings(plug_in: PlugIn, words: Sequence[str]) -> str:
-    """The choices of a plug-in, or why there are none."""
+    """The choices of a plug-in, or why it has none."""
     if plug_in.folder is None:
         return f"cannot be used: {plug_in.fault}"
     found = []
@@ -76,12 +75,12 @@ def _state(name: str, kind: Any) -> str:
         kind(kind.precisions[0])
     except (Unavailable, SteerbenchError) as reason:
         return str(reason)
-    with suppress(metadata.PackageNotFoundError):  # an engine need not be called as its library
+    with suppress(metadata.PackageNotFoundError):  # an engine's name may differ from its library's
         return f"usable (version {metadata.version(name)})"
     return "usable"
 
 
 def _comment(text: str) -> str:
-    """The first comment that is not a directive of Hydra's (`# @package`)."""
+    """The first comment that is not a Hydra directive (`# @package`)."""
     lines = (line.removeprefix("#").strip() for line in text.splitlines() if line.startswith("#"))
     return next((line for line in lines if not line.startswith("@")), "")

@@ -1,8 +1,8 @@
-"""The command `steerbench`: its subcommands, and how errors and signals end it.
+"""The command `steerbench`: dispatches to subcommands and maps errors and signals to exit statuses.
 
-Exit statuses: 0 done, 1 a check failed (a kernel is wrong, a file differs), a job of the tables
-failed, or a bug (with its traceback), 2 an error the user can act on, 130 interrupted, 141 the
-reader of a pipe went away, 143 terminated.
+Exit statuses: 0 done; 1 a check failed (a kernel is wrong, a file differs), a job of the tables
+failed, or a bug (with its traceback); 2 an error the user can act on; 130 interrupted; 141 the
+reader of a pipe closed it; 143 terminated.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ examples
 `steerbench COMMAND --help` explains a command.
 """
 
-# What the disk refuses: worth a plain sentence, not a traceback.
+# Errors of the file system that deserve a plain sentence rather than a traceback.
 REFUSALS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR}
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors end the program as all others do."""
+    """An argument parser that raises its errors as SteerbenchError instead of exiting."""
 
     def error(self, message: str) -> NoReturn:
         raise SteerbenchError(f"{message}\n{self.format_usage().rstrip()}")
@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
-    """Run `command`; its end becomes an exit status and at most one message."""
+    """Run `command` and turn how it ends into an exit status and at most one message."""
     try:
         status = command(argv)
         sys.stdout.flush()
@@ -63,7 +63,7 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     except KeyboardInterrupt:
         return _fail("interrupted", 130)
     except BrokenPipeError:
-        # Python flushes standard output once more at exit; let it do so into nothing.
+        # Python flushes standard output again at exit; redirect that to /dev/null.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except OSError as error:
@@ -73,7 +73,7 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
 
 
 def dispatch(argv: Sequence[str]) -> int:
-    """Hand `argv` to its subcommand, which is imported only then."""
+    """Pass `argv` to its subcommand, which is imported only now."""
     if argv[:1] == ["run"] or argv[:1] in (["-sc"], ["--shell-completion"]):
         from sweeps import run
 
@@ -96,7 +96,7 @@ def parsed(argv: Sequence[str]) -> argparse.Namespace:
     if argv and not argv[0].startswith("-") and argv[0] not in COMMANDS:
         raise unknown("command", argv[0], COMMANDS)
     options, unread = parser.parse_known_args(argv)
-    if "overrides" in options:  # argparse reads only those before the next option
+    if "overrides" in options:  # argparse stops reading them at the next option
         options.overrides += [word for word in unread if not word.startswith("-")]
         options.overrides = [*options.config_dir, *options.overrides]
         unread = [word for word in unread if word.startswith("-")]
@@ -119,7 +119,7 @@ def _parser() -> Parser:
 
 
 def _terminate(signum: int, frame: object) -> NoReturn:
-    """Leave through every `finally`: checkpoints are kept, temporary files are removed."""
+    """Exit through every `finally`, so that checkpoints are saved and temporary files removed."""
     sys.exit(128 + signum)
 
 

@@ -1,4 +1,4 @@
-"""What the configuration of a run describes, made from it: its settings, its scene, its method."""
+"""Makes what the configuration of a run describes: its settings, its scene, its trained method."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from sweeps.build import build, check_settings
 from sweeps.overrides import VALIDATION
 
 HELD_OUT = 8
-"""Of so many training pictures one is held out, where a trajectory goes to these."""
+"""One in this many training pictures is held out if a trajectory renders held-out pictures."""
 
 USUAL_THREADS = torch.get_num_threads()
-"""How many threads torch uses by default."""
+"""Number of threads that torch uses by default."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings of a run that are no choices; run.yaml explains each of them."""
+    """The settings of a run that are plain values; run.yaml explains each of them."""
 
     seed: int
     split: Literal["test", "validation"]
@@ -42,10 +42,10 @@ class Settings:
 
 
 def checked_settings(config: DictConfig) -> Settings:
-    """The settings in `config`. From now on torch uses as many threads as they say.
+    """The settings in `config`. Also sets torch's number of threads as they say.
 
     Raises:
-        SteerbenchError: one of them is wrong.
+        SteerbenchError: a setting is wrong.
     """
     names = [field.name for field in fields(Settings)]
     if missing := [name for name in names if name not in config]:
@@ -86,8 +86,10 @@ def trained(config: DictConfig, log: Log) -> Method:
 
 
 def scene_of(config: DictConfig) -> Scene:
-    """The scene that `config` describes. Where its trajectory is through training pictures that are
-    held out, they are: what is trained on all of them is never scored on some of them.
+    """The scene that `config` describes.
+
+    If its trajectory renders held-out training pictures, these are removed from the training split,
+    so that a model is never scored on pictures that it was trained on.
 
     Raises:
         SteerbenchError: the scene cannot be loaded, or has too few training pictures.
@@ -101,7 +103,7 @@ def scene_digest(config: DictConfig) -> str:
 
 
 def scene_folder(config: DictConfig) -> str | None:
-    """Where the scene lies; None if it is embedded."""
+    """The folder of the scene; None for an embedded scene."""
     return str(Path(config.scene.path).resolve()) if "path" in config.scene else None
 
 
@@ -113,7 +115,7 @@ def _contents(config: DictConfig) -> tuple[str, Path, bool]:
 
 @cache
 def _digest(node: str, root: Path, held_out: bool) -> str:
-    """Kept, because to find it the whole scene is loaded."""
+    """Cached, because it takes loading the whole scene."""
     return _divided(node, root, held_out).digest
 
 
@@ -124,5 +126,5 @@ def _divided(node: str, root: Path, held_out: bool) -> Scene:
 
 @lru_cache(maxsize=1)
 def _scene(node: str, root: Path) -> Scene:
-    """The scene that `node`, as YAML, describes, kept for the next job of a sweep."""
+    """The scene described by `node` (YAML), cached for the next job of a sweep."""
     return build(OmegaConf.create({"scene": OmegaConf.create(node)}), "scene", log=ConsoleLog(root))

@@ -1,4 +1,4 @@
-"""The scenes of a data set in a folder: NeRF-Synthetic, or Tanks & Temples as NSVF lays it out."""
+"""Finds the scenes of a data set: NeRF-Synthetic, or Tanks & Temples in NSVF's layout."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bench.scenes.nsvf import picture_files
 from reports.outliers import REFERENCES
 
 MARKS = {"blender": camera_file("train"), "nsvf": "bbox.txt"}
-"""The file that shows the layout of a scene's folder, by the choice of `scene=` that reads it."""
+"""The file by which a scene's layout is recognised, by the value of `scene=` that reads it."""
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class DataSet:
     """Scenes of one layout.
 
     Attributes:
-        layout: the choice of `scene=` that reads them.
-        scenes: the folder of each, by its name.
-        missing: why other scenes of the data set are left out, by their names.
+        layout: the value of `scene=` that reads them.
+        scenes: the folder of each scene by name.
+        missing: why other scenes of the data set are left out, by name.
     """
 
     layout: str
@@ -33,7 +33,7 @@ class DataSet:
 
 
 def find(path: str) -> DataSet:
-    """Every scene whose folder lies in the folder `path` and has its pictures.
+    """Every scene in a subfolder of `path` that has its pictures.
 
     Raises:
         SteerbenchError: there is none, or there are scenes of both layouts.
@@ -73,7 +73,7 @@ def _known() -> list[set[str]]:
 
 
 def _lack(folder: Path, layout: str) -> str | None:
-    """What a scene lacks of its pictures, as far as their names show it."""
+    """Which pictures a scene lacks, judged by file names; None if none."""
     root = data_folder(folder)
     try:
         files = picture_files(root) if layout == "nsvf" else _pictures_of_blender(root)
@@ -86,7 +86,7 @@ def _lack(folder: Path, layout: str) -> str | None:
 
 
 def _pictures_of_blender(root: Path) -> list[Path]:
-    """The pictures that the camera files of both splits name, whether they exist or not."""
+    """The pictures named in the camera files of both splits, whether they exist or not."""
     names = [root / camera_file(split) for split in ("train", "test")]
     frames = [frame for path in names for frame in frames_of(read_json(root, path.name), path)]
     return [picture_path(root, frame["file_path"], where) for where, frame in frames]

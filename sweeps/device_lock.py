@@ -1,4 +1,4 @@
-"""One timed process at a time on each device: what runs beside other work is not worth timing."""
+"""Lets only one process at a time measure on a device, because parallel work distorts the times."""
 
 from __future__ import annotations
 
@@ -19,21 +19,23 @@ FOLDER = "STEERBENCH_LOCKS"
 
 
 def device_lock(device: str, log: Log) -> AbstractContextManager[None]:
-    """Wait until no other process of this machine measures on `device`, as `steerbench run` names
-    it, and keep others waiting. The system releases the lock of a process that is killed."""
+    """Wait until no other process of this machine measures on `device`, then hold the lock.
+
+    `device` is named as in `steerbench run`. If a process is killed, the system releases its lock.
+    """
     waiting = f"waiting: another process measures on {device}"
     return locked(lock_file(device), waiting, log)
 
 
 def on_gpu(device: str) -> bool:
-    """Whether `device`, as `steerbench run` names it, is a GPU."""
+    """Whether `device`, named as in `steerbench run`, is a GPU."""
     return device.startswith("cuda") or (device == "auto" and torch.cuda.is_available())
 
 
 def lock_file(device: str) -> Path:
-    """The file to lock. It is not in `outputs`, which may lie on a file system without locks.
+    """The file to lock. It is not in `outputs`, which may be on a file system without locks.
 
-    GPUs are told apart by their UUID: each job may see its own as the first.
+    GPUs are identified by UUID, because each job may see its own GPU as the first one.
     """
     if device == "auto":
         device = "cuda" if on_gpu(device) else "cpu"
@@ -43,7 +45,7 @@ def lock_file(device: str) -> Path:
 
 
 def _folder() -> Path:
-    """One for all users and jobs: Slurm gives each job a /tmp and a /dev/shm of its own."""
+    """The folder shared by all users and jobs; Slurm gives each job its own /tmp and /dev/shm."""
     if chosen := os.environ.get(FOLDER):
         return Path(chosen)
     shared = Path("/var/tmp")

@@ -1,4 +1,4 @@
-"""Why a job failed, kept below `outputs` until it succeeds: reports show it in place of figures."""
+"""Records in `outputs` why a job failed, until it succeeds; reports show that in its place."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def reason(error: BaseException) -> str:
 
 @contextmanager
 def printed() -> Iterator[None]:
-    """Print an error of the body and go on: it must not hide the failure that it is about."""
+    """Print an error of the body and go on, so that it does not hide the failure being recorded."""
     try:
         yield
     except Exception as error:
@@ -28,7 +28,7 @@ def printed() -> Iterator[None]:
 
 
 def keep(outputs: Path, job: Mapping[str, Any], why: str) -> None:
-    """Write down why the `job` with these settings failed."""
+    """Record why the `job` with these settings failed."""
     path = _path(outputs, job)
     with explained(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -37,12 +37,12 @@ def keep(outputs: Path, job: Mapping[str, Any], why: str) -> None:
 
 
 def forget(outputs: Path, job: Mapping[str, Any]) -> None:
-    """Remove the note on `job`, which has succeeded."""
+    """Remove the record of `job`, which has succeeded."""
     _path(outputs, job).unlink(missing_ok=True)
 
 
 def found(outputs: Path, job: Mapping[str, Any]) -> str | None:
-    """Why `job` failed when it ran last; None if it did not."""
+    """Why `job` failed in its last attempt; None if it did not."""
     path = _path(outputs, job)
     return path.read_text(encoding="utf-8").strip() if path.exists() else None
 

@@ -1,4 +1,4 @@
-"""What the store has of the jobs of the paper's tables, and why the rest is missing."""
+"""Collects the runs of the paper's tables from the store, and why others are missing."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sweeps.plan import Planned
 
 @dataclass(frozen=True)
 class Outcome:
-    """A job with its run, if it has one, and with what is wrong, if anything is."""
+    """A job with its run, if there is one, and the reason why it is missing or in doubt."""
 
     job: Planned
     run: Run | None
@@ -24,8 +24,10 @@ class Outcome:
 
 
 def newest(store: Store) -> dict[str, list[Run]]:
-    """The runs of the store by the key of their job, the newest first: of each scene that has the
-    settings of the job, the run that was stored last."""
+    """The latest run of each job and scene, by job key, newest first.
+
+    A job has several if its settings fit scenes in different folders.
+    """
     found: dict[str, dict[str, Run]] = {}
     for run in reversed(readable(store)):
         parts = run.record["made_of"]
@@ -38,13 +40,13 @@ def newest(store: Store) -> dict[str, list[Run]]:
 def gather(
     jobs: Sequence[Planned], runs: Mapping[str, Sequence[Run]], outputs: Path
 ) -> dict[str, list[Repeated]]:
-    """The lines of every table: the runs of each, and why others are missing.
+    """The lines of every table, each with its runs and the reasons why others are missing.
 
-    Of several scenes a run is the mean with one seed over the scenes that all lines of its block
-    have. A line of which nothing was measured does not count.
+    With several scenes, a run of a line is the mean of one seed over the scenes that all lines of
+    the block have. Lines without any measurement are ignored for this.
 
     Args:
-        runs: as `newest` has them.
+        runs: as returned by `newest`.
     """
     blocks: dict[tuple[str, str], dict[str, list[Outcome]]] = {}
     for job in jobs:
@@ -66,7 +68,7 @@ def _outcome(job: Planned, runs: Mapping[str, Sequence[Run]], outputs: Path) -> 
 
 
 def _lines(of_block: Mapping[str, Sequence[Outcome]]) -> list[Repeated]:
-    """The lines of a block, each from the outcomes of its jobs, over their common frames."""
+    """The lines of a block, made from the outcomes of their jobs over common frames."""
     of_block = _over_common_frames(of_block)
     measured = [{each.job.scene for each in line if each.run} for line in of_block.values()]
     common = set.intersection(*filter(None, measured)) if any(measured) else set()
@@ -85,7 +87,7 @@ def _over_common_frames(
 
 
 def _line(label: str, outcomes: Sequence[Outcome], common: set[str]) -> Repeated:
-    """A line whose runs are means over the scenes `common`, of the seeds that have all of them."""
+    """A line whose runs are means over the scenes `common`, one per seed that has all of them."""
     by_seed: dict[int, list[Run]] = {}
     by_scene: dict[str, list[Run]] = {}
     for each in sorted(outcomes, key=lambda each: each.job.scene not in common):
@@ -102,7 +104,7 @@ def _line(label: str, outcomes: Sequence[Outcome], common: set[str]) -> Repeated
 
 
 def _gaps(outcomes: Sequence[Outcome]) -> Iterator[str]:
-    """What is wrong, each reason once, with the seeds and scenes where it is not all of them."""
+    """Each reason for gaps once, with its seeds and scenes unless it concerns all of them."""
     seeds = {each.job.config.seed for each in outcomes}
     scenes = {each.job.scene for each in outcomes}
     for why in dict.fromkeys(each.gap for each in outcomes if each.gap):

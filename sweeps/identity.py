@@ -1,4 +1,4 @@
-"""What makes a run the one it is: its settings, its scene, the code that computes it."""
+"""What identifies a run: its settings, its scene, the code that computes it."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from sweeps.build import target_of
 from sweeps.configured import scene_digest, scene_folder
 
 PLACES = ("outputs", "report", "tracker", "weights_dir")
-"""Settings that say where things lie: they do not change a row."""
+"""Settings that are only locations and do not change a row."""
 
 
 def described(config: DictConfig) -> dict[str, Any]:
-    """The settings that decide a run; equal for equal jobs.
+    """The settings that determine a run; equal for equal jobs.
 
-    Without the places of weights and scenes, except for the last name of a scene's folder, which
-    rows show; without `split`, which the trajectory has, and `sizing`, which methods have; without
-    the engine where the method uses none; and without what the budget says about other jobs.
+    Left out are: locations, except the last part of a scene's folder, which rows show; `split`,
+    which is in the trajectory, and `sizing`, which is in the method; the engine, if the method uses
+    none; and settings of the budget about other jobs.
     """
     try:
         plain: Any = OmegaConf.to_container(config, resolve=True)
-    except OmegaConfBaseException as error:  # a setting was removed that others use
+    except OmegaConfBaseException as error:  # a setting that others use was removed
         raise SteerbenchError(" ".join(str(error).split())) from error
     unused = () if "engine" in plain["method"] else ("engine", "precision")
     left_out = ("split", "sizing", *PLACES, *unused)
@@ -47,13 +47,16 @@ def described(config: DictConfig) -> dict[str, Any]:
 
 
 def job_key(settings: Mapping[str, Any], turns: str) -> str:
-    """Equal for jobs with the same `settings`, as of `described`, measured in the same `turns`."""
+    """Equal for jobs with the same `settings` (see `described`) and the same `turns`."""
     return content_key({"settings": settings, "turns": turns} if turns else settings)
 
 
 def of_scene(run: Run, config: DictConfig) -> bool:
-    """Whether `run`, which has the settings of `config`, shows this scene, and not another whose
-    folder has the same last name. Of a folder that is not here only the name is compared."""
+    """Whether `run`, which has the settings of `config`, also has its scene.
+
+    The settings do not tell apart folders with the same last name. If the folder does not exist
+    here, only this name counts.
+    """
     folder = scene_folder(config)
     if folder is None or run.record.get("scene_path") == folder or not Path(folder).is_dir():
         return True
@@ -63,7 +66,7 @@ def of_scene(run: Run, config: DictConfig) -> bool:
 def run_parts(
     config: DictConfig, scene: Scene, method: Method, trajectory: Trajectory
 ) -> dict[str, Any]:
-    """Everything that can change the rows, except for the weights of LPIPS: a run's key."""
+    """The parts of a run's key: everything that can change its rows, except the LPIPS weights."""
     settings = described(config)
     things = [measure_in_turns, *_targets(settings)]
     files = (*getattr(method, "reads", ()), *trajectory.reads)
@@ -78,7 +81,7 @@ def run_parts(
 
 
 def _targets(node: Any) -> Iterator[Any]:
-    """The classes and functions that `node` and all nodes below it name."""
+    """The classes and functions named by the `_target_` of `node` and all nodes below it."""
     if isinstance(node, Mapping):
         if "_target_" in node:
             yield target_of(node)

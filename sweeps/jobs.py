@@ -1,4 +1,4 @@
-"""One job among others: its line at the terminal, and what it leaves in the folder of a sweep."""
+"""One job among others: its line at the terminal, and its record in the folder of a sweep."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class Job:
 
     Attributes:
         number: from 0, in the order of the sweep.
-        method: the name that was chosen for it.
-        overrides: as Hydra hands them to the job, `key=value` each.
+        method: the chosen name of its method.
+        overrides: as Hydra passes them to the job, `key=value` each.
         outputs: the folder with its store.
         report: the folder of its page, or None.
-        begun: seconds since the epoch.
-        measured: whether it had to be measured; False when the store had it.
-        run: its key in the store, or None when it failed.
+        begun: when it started, in seconds since the epoch.
+        measured: whether it had to be measured; False if the store had it.
+        run: its key in the store, or None if it failed.
         failure: why it failed, in one line.
     """
 
@@ -49,14 +49,14 @@ class Job:
     failure: str | None = None
 
     def write(self, folder: Path) -> None:
-        """Write it to `folder`; it appears there whole or not at all."""
+        """Write the job to `folder`, atomically."""
         with explained(folder), whole(folder / f"{self.number}{SUFFIX}") as new:
             new.write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
 
     def label(self, names: Collection[str]) -> str:
-        """The name of the job beside others: its method, and its settings of these `names`.
+        """The label of the job among others: its method, and its values of the settings `names`.
 
-        Of a name its last part is enough, unless another of them ends in the same.
+        A name is shortened to its last part unless that is ambiguous.
         """
         ends = [name.rpartition(".")[2] for name in names]
         shown = [
@@ -68,13 +68,13 @@ class Job:
 
     @property
     def settings(self) -> dict[str, str]:
-        """The overrides by name, without the method."""
+        """The overrides by name, except the method."""
         pairs = (override.split("=", 1) for override in self.overrides if "=" in override)
         return {name: value for name, value in pairs if name != "method"}
 
 
 def read(folder: Path) -> list[Job]:
-    """Every job that has ended, in the order of the sweep."""
+    """Read every job that has ended, in the order of the sweep."""
     texts = (path.read_text(encoding="utf-8") for path in folder.glob(f"*{SUFFIX}"))
     jobs = [
         Job(**fields | {"overrides": tuple(fields["overrides"])})
@@ -84,13 +84,13 @@ def read(folder: Path) -> list[Job]:
 
 
 def varying(jobs: Sequence[Job]) -> list[str]:
-    """Names of the settings that are not the same in all jobs."""
+    """Names of the settings that differ between jobs."""
     names = dict.fromkeys(name for job in jobs for name in job.settings)
     return [name for name in names if len({job.settings.get(name) for job in jobs}) > 1]
 
 
 def attempt(config: DictConfig, command: Sequence[str], name: str) -> Obtained:
-    """Obtain the run that `config` describes; a failure is printed at once and kept for reports.
+    """Obtain the run that `config` describes; print a failure at once and keep it for reports.
 
     Raises as `obtain` does.
     """
@@ -100,7 +100,7 @@ def attempt(config: DictConfig, command: Sequence[str], name: str) -> Obtained:
 def attempt_in_turns(
     jobs: Sequence[tuple[DictConfig, Sequence[str], str]], turns: str = ""
 ) -> list[Obtained]:
-    """`attempt` several jobs, see `obtain_in_turns`; if one fails, all of them do."""
+    """`attempt` several jobs in turns, see `obtain_in_turns`; if one fails, all fail."""
     try:
         return obtain_in_turns([(config, command) for config, command, _ in jobs], turns)
     except Exception as error:
@@ -119,7 +119,7 @@ def say(obtained: Obtained, name: str, more: str) -> None:
 
 
 def time_left(seconds: float, measured: int, jobs: int) -> str:
-    """How long `jobs` may take after `measured` ones took `seconds`; empty where nobody knows."""
+    """Estimated time for `jobs` if `measured` ones took `seconds`; empty if none was measured."""
     if not (measured and jobs):
         return ""
     return f", about {timedelta(seconds=round(seconds / measured * jobs))} left"

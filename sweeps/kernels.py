@@ -1,4 +1,4 @@
-"""`steerbench kernels`: error and throughput of every kernel; a wrong kernel has no throughput."""
+"""`steerbench kernels`: error and throughput of every kernel; a wrong kernel is not timed."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from sweeps.device_lock import device_lock
 from sweeps.terminal import console, rich_table
 
 COLUMNS = ("kernel", "case", "backend", "dtype", "error", "tolerance", "ms", "M items/s", "ratio")
-"""`ratio`: time of the reference backend over that of this one, same case, same run."""
+"""`ratio`: time of the reference backend over time of this one, in the same case and run."""
 
 
 def main(options: argparse.Namespace) -> int:
-    """Print a table and, as the last line, the same rows as JSON; 1 if any kernel is wrong."""
+    """Print a table, then its rows as JSON in the last line; return 1 if any kernel is wrong."""
     import torch
 
     from methods.checks import found

@@ -1,4 +1,4 @@
-"""One measurement from its configuration: built, looked up in the store or made, shown."""
+"""One measurement: builds it from a configuration, finds it in the store or makes it, shows it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Asked = tuple[DictConfig, Sequence[str]]
 
 @dataclass(frozen=True)
 class Obtained:
-    """A run that is in the store; `measured` says whether it had to be measured for that."""
+    """A run in the store; `measured` says whether it had to be measured just now."""
 
     store: Store
     run: str
@@ -44,25 +44,25 @@ class Obtained:
 def execute(config: DictConfig, command: Sequence[str]) -> None:
     """Obtain the run that `config` describes, print its tables, write its page.
 
-    Raises as `obtain` does, and where the page cannot be written.
+    Raises as `obtain` does, and if the page cannot be written.
     """
     obtained = obtain(config, command)
     label = {obtained.run: HydraConfig.get().runtime.choices["method"]}
     (run,) = load(obtained.store, label)
     _show(run, explain=not obtained.measured)
     if config.report:
-        from reports.page import write_page  # and matplotlib, which only a page needs
+        from reports.page import write_page  # loads matplotlib, which only a page needs
 
         page = write_page(obtained.store, label, Path(config.report))
         ConsoleLog(Path(config.outputs)).info(f"report: {page}")
 
 
 def obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
-    """Measure what `config` describes, unless the store has it; its failures are forgotten then.
+    """Measure what `config` describes, unless the store has it; then forget its earlier failures.
 
     Args:
         config: the composed run.yaml.
-        command: the words that were typed, for the record.
+        command: the words of the command line, for the record.
 
     Raises:
         SteerbenchError: a setting is wrong, or something in the measurement went wrong.
@@ -71,10 +71,10 @@ def obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
 
 
 def obtain_in_turns(jobs: Sequence[Asked], turns: str = "") -> list[Obtained]:
-    """`obtain` several jobs, which share scene, trajectory, protocol and seed, under the name
-    `turns`: unless the store has all of them, they draw each frame one after the other, see
-    `bench.run.measure_in_turns`. A job alone has no such name.
+    """`obtain` several jobs side by side; they share scene, trajectory, protocol and seed.
 
+    Unless the store has all of them, each frame is rendered by all before the next one, see
+    `bench.run.measure_in_turns`. `turns` is the name of the group; a single job has none.
     Raises as `obtain` does.
     """
     log = ConsoleLog(Path(jobs[0][0].outputs))
@@ -85,7 +85,7 @@ def obtain_in_turns(jobs: Sequence[Asked], turns: str = "") -> list[Obtained]:
     missing = [one for one in ready if not one.stored]
     if missing:
         with device_lock(missing[0].method.settings()["device"], log):
-            missing = [one for one in missing if not one.stored]  # by who had the lock before
+            missing = [one for one in missing if not one.stored]  # by another process meanwhile
             if missing:
                 methods = [one.method for one in ready]
                 found = measure_in_turns(methods, missing[0].task, log)
@@ -102,16 +102,16 @@ def obtain_in_turns(jobs: Sequence[Asked], turns: str = "") -> list[Obtained]:
 
 
 def _send(one: _Ready, to: Tracker, log: Log) -> None:
-    """Send a stored run to a tracker. What goes wrong there is said: the measurement stands."""
+    """Send a stored run to a tracker. Errors are only logged, because the measurement is valid."""
     try:
         to.send(load(one.store, {one.run: one.method.name})[0], Path(one.config.outputs))
         log.info(f"sent to {one.config.tracker}: {one.run}")
-    except Exception as error:  # of a library that we do not know
+    except Exception as error:  # third-party library: any exception
         log.info(f"not sent to {one.config.tracker}: {one.run}: {failures.reason(error)}")
 
 
 def stored(jobs: Sequence[Asked], turns: str = "") -> list[Obtained]:
-    """What `obtain_in_turns` would find of these jobs in the store: all of them, or nothing.
+    """The runs that `obtain_in_turns` would find in the store, if it has all; otherwise none.
 
     Raises as `obtain` does.
     """
@@ -127,7 +127,7 @@ def stored(jobs: Sequence[Asked], turns: str = "") -> list[Obtained]:
 
 @dataclass(frozen=True, eq=False)
 class _Ready:
-    """A measurement that can begin, and everything that can change its rows: its `parts`."""
+    """A measurement ready to start; `parts` is everything that can change its rows."""
 
     config: DictConfig
     command: Sequence[str]
@@ -166,15 +166,18 @@ class _Ready:
         log.info(f"already measured; to measure again, remove {self.store.folder / self.run}")
 
     def keep(self, measurement: Measurement) -> None:
-        """Put it into the store, with where it comes from."""
+        """Store the measurement, with its command and the folder of its scene."""
         more = {"command": shlex.join(self.command), "scene_path": scene_folder(self.config)}
         record = {**measurement.record, **more}
         self.store.save(self.parts, replace(measurement, record=record))
 
 
 def _ready(jobs: Sequence[Asked], turns: str, log: Log) -> list[_Ready]:
-    """The measurements of `jobs`. The key of one in turns names those beside it: if one of them is
-    new, all of them are, and no two lines of a table come from different hours."""
+    """The measurements of `jobs`.
+
+    With `turns`, each key includes the keys of the whole group: if one job changes, all are
+    measured again, so that the lines of a table come from the same hour.
+    """
     ready = [_Ready.of(config, command, turns, log) for config, command in jobs]
     if not turns:
         return ready
@@ -183,7 +186,7 @@ def _ready(jobs: Sequence[Asked], turns: str, log: Log) -> list[_Ready]:
 
 
 def _show(run: Run, explain: bool) -> None:
-    """Print the tables of one run and, unless the log just said so, why a figure is missing."""
+    """Print the tables of one run and, if `explain`, why figures are missing."""
     what = run.facts[["method", "scene", "trajectory", "resolution", "budget", "protocol"]]
     out = console()
     out.print(f"{', '.join(what)}, seed {run.facts['seed']}: run {run.key}", style="bold")

@@ -1,4 +1,4 @@
-"""Errors about names: what was typed, what it is called now or is nearest to it, what exists."""
+"""Errors about unknown names: they give the name's replacement or near matches, and what exists."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ RENAMED |= {
     }.items()
     for name in names.split()
 }
-"""What an earlier version understood, and its name now; it stands for all settings below it."""
+"""Names of earlier versions and their present names; each also covers all settings below it."""
 
 REMOVED = {
     "method=ngp_guided",
@@ -44,7 +44,7 @@ REMOVED = {
 
 
 def unknown(kind: str, name: str, existing: Iterable[str]) -> SteerbenchError:
-    """The error for a `name` that is none of the `existing` ones: its new name, or near ones."""
+    """The error for a `name` not among `existing`; it suggests the new name, or near ones."""
     old, below = name if kind == "setting" else f"{kind}={name}", ""
     while old and old not in RENAMED and old not in REMOVED:
         old, dot, last = old.rpartition(".")
@@ -61,7 +61,7 @@ def unknown(kind: str, name: str, existing: Iterable[str]) -> SteerbenchError:
 
 
 def _nearest(name: str, names: Sequence[str]) -> list[str]:
-    """Names beside it (scene.path for scene.pth) if any is near, else near ones from anywhere."""
+    """Near names on the same level (scene.path for scene.pth); if none, near names anywhere."""
     place = name[: name.rfind(".") + 1]
     beside = {other.removeprefix(place): other for other in names if other.startswith(place)}
     near = get_close_matches(name.removeprefix(place), beside)

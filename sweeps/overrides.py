@@ -1,7 +1,7 @@
-"""The configuration that the words of a command describe, and errors that quote these words.
+"""Composes the configuration from the words of a command; errors quote these words.
 
-Words are overrides as `steerbench run` takes them (scene=wires), and `--config-dir=DIR` for a
-folder with further choices.
+Words are overrides as for `steerbench run` (scene=wires), and `--config-dir=DIR` for a folder with
+further choices.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ CONFIGS = Path(__file__).parent / "configs"
 FLAGS = ("--config-dir", "-cd")
 
 VALIDATION = "validation"
-"""The split of training pictures that are held out, and the trajectory that goes to them."""
+"""The split of held-out training pictures, and the trajectory that renders them."""
 
 
 def composed(words: Sequence[str], **options: bool) -> DictConfig:
-    """The configuration of a run; `options` as of Hydra's `compose`.
+    """The configuration of a run; `options` are those of Hydra's `compose`.
 
     Raises:
         SteerbenchError: a setting or a choice does not exist, or cannot be read.
@@ -50,9 +50,9 @@ def composed(words: Sequence[str], **options: bool) -> DictConfig:
 
 
 def settled(config: DictConfig) -> DictConfig:
-    """`config` with the trajectory that split=validation asks for, unless its own goes there.
+    """Give `config` the validation trajectory if split=validation asks for it.
 
-    From here on the trajectory alone says what is scored, and with that what is held out.
+    From here on only the trajectory determines which pictures are scored, hence held out.
     """
     asked, there = (OmegaConf.select(config, name) for name in ("split", "trajectory.split"))
     if asked == VALIDATION and there != VALIDATION:
@@ -62,7 +62,7 @@ def settled(config: DictConfig) -> DictConfig:
 
 
 def changed(config: DictConfig, words: Sequence[str]) -> DictConfig:
-    """A copy of `config` with other values, read as Hydra reads them: composing anew is slower."""
+    """A copy of `config` with values changed as Hydra would; faster than composing it anew."""
     copy = config.copy()
     for override in OverridesParser.create().parse_overrides(list(words)):
         OmegaConf.update(copy, override.get_key_element(), override.value())
@@ -70,17 +70,17 @@ def changed(config: DictConfig, words: Sequence[str]) -> DictConfig:
 
 
 def choices(group: str, words: Sequence[str] = ()) -> dict[str, Path]:
-    """The file of every choice of `group` by its name, also of the folders that `words` name."""
+    """The file of every choice of `group` by name, including folders named in `words`."""
     found = {
         path.stem: path
-        for folder in reversed(_folders(words))  # of one name, the first folder has the choice
+        for folder in reversed(_folders(words))  # for equal names, the first folder wins
         for path in (folder / group).glob("*.yaml")
     }
     return dict(sorted(found.items()))
 
 
 def setting(name: str, text: str) -> str:
-    """The word that sets `name` to `text`, quoted where Hydra would read something else."""
+    """The word that sets `name` to `text`, quoted if Hydra would misread it."""
     if re.fullmatch(r"[\w/.+-]+", text):
         return f"{name}={text}"
     escaped = text.replace("'", r"\'")
@@ -88,17 +88,20 @@ def setting(name: str, text: str) -> str:
 
 
 def of_hydra(error: Exception) -> bool:
-    """Whether Hydra raised it: for some mistakes (budget=0.0) it raises no exception of its own,
-    but a ValueError or what its parser stumbled over."""
+    """Whether the error comes from Hydra.
+
+    For some mistakes (budget=0.0) Hydra raises a ValueError, or an error of its parser, instead of
+    an exception of its own.
+    """
     *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
     return innermost.f_globals["__name__"].partition(".")[0] in ("hydra", "omegaconf", "antlr4")
 
 
 def swept(words: Sequence[str], loader: ConfigLoader | None = None) -> dict[str, list[str]]:
-    """The values of every setting that has several (seed=0,1,2); the last word for it counts.
+    """The values of every setting with several values (seed=0,1,2); the last word for it counts.
 
     Args:
-        loader: Hydra's, where a choice may be a pattern (method=*).
+        loader: Hydra's loader, needed if a choice may be a pattern (method=*).
 
     Raises:
         SteerbenchError: a word cannot be read.
@@ -119,7 +122,7 @@ def swept(words: Sequence[str], loader: ConfigLoader | None = None) -> dict[str,
 
 
 def explain(error: Exception, words: Sequence[str]) -> SteerbenchError:
-    """Translate an error of Hydra's; names that do not exist come with the nearest that do."""
+    """Translate an error of Hydra; for unknown names it suggests the nearest existing ones."""
     if isinstance(error, OverrideParseException):
         return SteerbenchError(
             f"cannot read '{error.override}': settings are written key=value, "
@@ -140,7 +143,7 @@ def explain(error: Exception, words: Sequence[str]) -> SteerbenchError:
 
 
 def _settings(words: Sequence[str]) -> list[str]:
-    """All that can be set with the choices (scene=blender) in `words`."""
+    """All settings that exist with the choices (scene=blender) in `words`."""
     folders = _folders(words)
     groups = {path.name for folder in folders for path in folder.iterdir() if path.is_dir()}
     there = {f"{group}={name}" for group in groups for name in choices(group, words)}
@@ -163,12 +166,12 @@ def _overrides(words: Sequence[str]) -> list[str]:
 
 
 def _folders(words: Sequence[str]) -> list[Path]:
-    """Our configurations, the folders that `words` name, and those of installed plug-ins."""
+    """Our configurations, the folders named in `words`, and those of installed plug-ins."""
     return [CONFIGS, *_typed(words), *plug_ins.folders()]
 
 
 def _typed(words: Sequence[str]) -> list[Path]:
-    """The folders that `words` name: `--config-dir=DIR` or, as Hydra takes it too, in two words."""
+    """The folders named in `words` by `--config-dir=DIR` or by its form in two words."""
     further = []
     for word, after in pairwise([*words, ""]):
         name, equals, value = word.partition("=")

@@ -1,5 +1,5 @@
-"""`steerbench paper` measures every table of the SteerNeRF paper as one page; `steerbench report`
-writes the same page from the store alone."""
+"""`steerbench paper` measures every table of the SteerNeRF paper and writes a page about them;
+`steerbench report` writes the same page from the store alone."""
 
 from __future__ import annotations
 
@@ -25,13 +25,15 @@ from sweeps.terminal import console, show
 from sweeps.train_ahead import room, train_ahead
 
 DATA = "data="
-"""How the word begins that names the folder of a data set."""
+"""Prefix of the word that names the folder of a data set."""
 
 
 def main(options: argparse.Namespace) -> int:
-    """Measure what the store does not have, unless a report is enough, and write the page; return 1
-    if a job failed that can run here. With `check`, name the runs that look broken, and return 1 if
-    there are any."""
+    """Measure what the store lacks (unless only a report is wanted) and write the page.
+
+    Returns 1 if a job failed that can run here. With `check`, instead names the runs that look
+    broken, and returns 1 if there are any.
+    """
     words, data = data_set(options.overrides)
     if options.command == "report" and options.check:
         return _check(Store(Path(composed(words).outputs)))
@@ -54,10 +56,10 @@ def main(options: argparse.Namespace) -> int:
 
 
 def data_set(words: Sequence[str]) -> tuple[list[str], DataSet | None]:
-    """The settings among `words`, and the data set that one of them names (data=DIR), if any does.
+    """The settings among `words`, and the data set if one of them names it (data=DIR).
 
     Raises:
-        SteerbenchError: another one names a scene; or there are no scenes.
+        SteerbenchError: another word names a scene; or the data set has no scenes.
     """
     settings = [word for word in words if not word.startswith(DATA)]
     named = [word.removeprefix(DATA) for word in words if word.startswith(DATA)]
@@ -72,10 +74,10 @@ def data_set(words: Sequence[str]) -> tuple[list[str], DataSet | None]:
 
 
 def _run(jobs: Sequence[Planned]) -> int:
-    """Run the jobs, equal ones once; return how many failed, of those that can run here.
+    """Run the jobs, equal ones only once; return how many of those that can run here failed.
 
-    Of one scene after the other, all models are trained that can be trained side by side; then all
-    lines of all tables are measured with the first seed, then with the next.
+    Goes scene by scene: first trains all models, in parallel where possible; then measures all
+    lines of all tables with the first seed, then with the next.
     """
     distinct = {job.key: job for job in reversed(jobs)}
     jobs = [job for job in jobs if distinct[job.key] is job]
@@ -85,7 +87,7 @@ def _run(jobs: Sequence[Planned]) -> int:
     seconds, measured, failed, ended = 0.0, 0, 0, 0
     for together in of_scenes.values():
         there: dict[str, Obtained] = {}
-        if room(together[0].config) > 1:  # or else each job is looked up when its turn comes
+        if room(together[0].config) > 1:  # otherwise each job is looked up in its turn
             there = {
                 job.key: found
                 for group in _groups(together)
@@ -100,7 +102,7 @@ def _run(jobs: Sequence[Planned]) -> int:
             begun = time.monotonic()
             try:
                 obtained = _obtained(group, there)
-            except Exception as error:  # it was printed: the other jobs still run
+            except Exception as error:  # already printed; the other jobs still run
                 failed += 0 if isinstance(error, Unavailable) else len(group)
                 continue
             measured += sum(of_job.measured for of_job in obtained)
@@ -112,7 +114,7 @@ def _run(jobs: Sequence[Planned]) -> int:
 
 
 def _obtained(group: Sequence[Planned], there: Mapping[str, Obtained]) -> list[Obtained]:
-    """What is `there` of all jobs of a group, by their keys, or else is measured now."""
+    """The runs of a group: from `there`, by key, if it has all of them; otherwise measured now."""
     if all(job.key in there for job in group):
         return [there[job.key] for job in group]
     wanted = [(job.config, job.command, job.name) for job in group]
@@ -120,8 +122,10 @@ def _obtained(group: Sequence[Planned], there: Mapping[str, Obtained]) -> list[O
 
 
 def _stored(group: Sequence[Planned]) -> list[Obtained]:
-    """What the store has of all jobs of a group, or nothing; nothing, too, where one cannot even
-    begin: measuring it says why."""
+    """The runs of a group if the store has all of them; otherwise none.
+
+    Also none if a job cannot even start; the error is reported when it is measured.
+    """
     try:
         return stored([(job.config, job.command) for job in group], group[0].turns)
     except SteerbenchError:
@@ -129,7 +133,7 @@ def _stored(group: Sequence[Planned]) -> list[Obtained]:
 
 
 def _groups(jobs: Sequence[Planned]) -> list[list[Planned]]:
-    """The jobs that are measured in turns, together; each of the others alone."""
+    """Group the jobs that are measured in turns; each other job is a group of its own."""
     groups: dict[object, list[Planned]] = {}
     for job in jobs:
         groups.setdefault(job.turns or job.key, []).append(job)

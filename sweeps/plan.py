@@ -20,16 +20,16 @@ from sweeps.names import unknown
 from sweeps.overrides import changed, choices, composed, setting, swept
 
 REPEATED = "seed"
-"""The setting that may have several values: a cell then has a mean and an interval."""
+"""The only setting that may have several values; a cell then shows mean and interval."""
 
 
 @dataclass(frozen=True)
 class Planned:
     """A job: the line of a table that it fills, its configuration, and the command that runs it.
 
-    `block` is the title of the lines that it is compared with. `scene` is the name of its scene
-    among those of a data set, empty without one. Jobs with the same `turns` are measured in turns;
-    without one a job is measured alone.
+    `block` is the title of the group of lines that it is compared with. `scene` is its scene in a
+    data set, empty without a data set. Jobs with the same `turns` are measured in turns; if it is
+    empty, the job is measured alone.
     """
 
     table: str
@@ -48,7 +48,7 @@ class Planned:
 
     @cached_property
     def settings(self) -> dict[str, Any]:
-        """What decides its run."""
+        """The settings that determine its run."""
         return described(self.config)
 
     @cached_property
@@ -58,8 +58,7 @@ class Planned:
 
 
 def chosen(name: str | None, methods: Sequence[str]) -> list[PaperTable]:
-    """The table called `name`, all of them without one; the table of methods has a line more for
-    each of `methods`.
+    """The table called `name`, or all of them; `methods` get extra lines in the table of methods.
 
     Raises:
         SteerbenchError: there is no such table, or it compares no methods.
@@ -79,24 +78,26 @@ def chosen(name: str | None, methods: Sequence[str]) -> list[PaperTable]:
 
 
 def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -> list[Planned]:
-    """The jobs of the experiment of `table` under the settings in `words`: one for each line that
-    has a job, for each seed (those in `words`; or as many as the budget says, and for curves and
-    other methods than the paper's the first of these), and for each scene of `data`.
+    """The jobs of the experiment of `table` under the settings in `words`.
 
-    What a line does not set is as the experiment has it. A job of the sweep that no line names is
-    left out: Instant-NGP has no 2D renderer to compute in int8. So is a line at a precision that
-    the engine does not have. On a GPU the engine is torch, unless `words` choose one.
+    One for each line that has a job, each seed, and each scene of `data`. Seeds are those in
+    `words`, otherwise those of the budget; curves and methods other than the paper's then use only
+    the first one.
+
+    Settings that a line does not give are those of the experiment. Jobs of the sweep that no line
+    names are left out (Instant-NGP has no 2D renderer to compute in int8), and so are lines at a
+    precision that the engine lacks. On a GPU the engine is torch, unless `words` choose another.
 
     Raises:
-        SteerbenchError: a word cannot be read, names nothing, or gives several values to another
-            setting than the seed; or a line asks for a job that the experiment does not have.
+        SteerbenchError: a word cannot be read, names nothing, or gives several values to a setting
+            other than the seed; or the experiment does not have the job that a line asks for.
     """
     fixed, seeds = _seeds(words)
     fixed += [f"scene={data.layout}"] if data else []
     scenes = {name: str(folder) for name, folder in data.scenes.items()} if data else {"": ""}
     experiment = composed([f"+experiment={table.name}", *fixed], return_hydra_config=True)
     if on_gpu(str(experiment.get("device"))):
-        fixed = ["engine=torch", *fixed]  # Table 1 has OpenVINO, which computes on a CPU
+        fixed = ["engine=torch", *fixed]  # Table 1 uses OpenVINO, which computes on a CPU
         experiment = composed([f"+experiment={table.name}", *fixed], return_hydra_config=True)
     engine = experiment.engine
     precisions = target_of(engine).precisions
@@ -105,11 +106,11 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     params = experiment.hydra.sweeper.params
     grid = swept([f"{name}={values}" for name, values in params.items()])
 
-    @cache  # values are changed afterwards, without composing anew
+    @cache  # values are set afterwards without composing again
     def with_choices(*groups: str) -> DictConfig:
         return composed([f"+experiment={table.name}", *fixed, *groups])
 
-    besides = {AFTER, *OF_CURVES}  # of curves, which no experiment has
+    besides = {AFTER, *OF_CURVES}  # settings of curves, which are in no experiment
     jobs = []
     for block, line, repeated in _lines(table, budget.beyond):
         if line.job is None or line.job.get("precision", engine.precision) not in precisions:
@@ -132,7 +133,7 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
             job = changed(config, [*values, word])
             if data:
                 job.scene.path = folder
-            OmegaConf.resolve(job)  # once: what is built of it would read each `${...}` anew
+            OmegaConf.resolve(job)  # once, or each build would resolve `${...}` again
             place = [setting("scene.path", folder)] if data else []
             given = [f"+experiment={table.name}", *fixed, *settings, *place, word]
             command = ["steerbench", "run", *given, "hydra.mode=RUN"]
@@ -142,9 +143,11 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
 
 
 def _lines(table: PaperTable, beyond: bool) -> Iterator[tuple[str, Line, bool]]:
-    """The lines of all blocks of a table and those of its curves, each with the title of its block
-    and whether several seeds repeat it: the paper's conclusions are about its own method. A table
-    that varies the training is of that alone, unless those `beyond` it are to be trained as often.
+    """The lines of a table's blocks and curves, each with its block's title and whether it repeats.
+
+    Only lines of the paper's method are repeated with several seeds, because the paper's
+    conclusions are about it. A table that varies the training omits the method beyond the paper
+    unless `beyond`.
     """
     for block in table.blocks if beyond or not table.curve else [table]:
         yield from ((block.title, line, METHOD not in (line.job or {})) for line in block.lines)
@@ -152,7 +155,7 @@ def _lines(table: PaperTable, beyond: bool) -> Iterator[tuple[str, Line, bool]]:
 
 
 def _seeds(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The words that all jobs share, and the seeds that the others name, if any does."""
+    """The words that all jobs share, and the seeds given by the other words."""
     several = swept(words)
     if others := sorted(several.keys() - {REPEATED}):
         raise SteerbenchError(

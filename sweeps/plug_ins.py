@@ -1,4 +1,4 @@
-"""Choices of installed packages: folders like `sweeps/configs` that their entry points name."""
+"""Choices from installed packages: folders like `sweeps/configs`, named by entry points."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 
 GROUP = "steerbench.configs"
-"""Of the entry points; the value of one is the package that holds the YAML files."""
+"""Group of the entry points; the value of each is the package that holds the YAML files."""
 
 
 @dataclass(frozen=True)
 class PlugIn:
-    """What an entry point leads to.
+    """The package behind an entry point.
 
     Attributes:
-        name: of the entry point, and the distribution that has it: "mine (mine-renderers 1.0)".
-        folder: with a folder of YAML files for each group; None: it cannot be used.
-        fault: why not.
+        name: the entry point and its distribution: "mine (mine-renderers 1.0)".
+        folder: contains a folder of YAML files for each group; None: it cannot be used.
+        fault: why it cannot be used.
     """
 
     name: str
@@ -36,13 +36,13 @@ class PlugIn:
 
 @cache
 def installed() -> tuple[PlugIn, ...]:
-    """All of this environment, those that cannot be used too."""
+    """All plug-ins of this environment, including unusable ones."""
     entries = sorted(metadata.entry_points(group=GROUP), key=lambda entry: entry.name)
     return tuple(_found(entry) for entry in entries)
 
 
 def folders() -> list[Path]:
-    """Of all that can be used."""
+    """The folders of all usable plug-ins."""
     return [one.folder for one in installed() if one.folder]
 
 
@@ -51,7 +51,7 @@ def _found(entry: metadata.EntryPoint) -> PlugIn:
     if entry.dist is not None:
         name = f"{name} ({entry.dist.name} {entry.dist.version})"
     try:
-        spec = util.find_spec(entry.value)  # it imports the packages above
+        spec = util.find_spec(entry.value)  # imports the parent packages
     except Exception as error:  # whatever their code raises
         return PlugIn(name, None, f"{type(error).__name__}: {error}")
     if spec is None or not spec.submodule_search_locations:
@@ -60,7 +60,7 @@ def _found(entry: metadata.EntryPoint) -> PlugIn:
 
 
 class _InstalledChoices(SearchPathPlugin):
-    """Shows their folders to Hydra, behind its own: a name that exists already stays ours."""
+    """Appends the plug-ins' folders to Hydra's search path, so that our names take precedence."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         for folder in folders():

@@ -1,4 +1,4 @@
-"""`steerbench pretrain`: train the weights that the 2D renderer of every scene starts from."""
+"""`steerbench pretrain`: trains the initial weights of the 2D renderer for all scenes."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ SETTINGS = (
     "method=steernerf_lean",
     "scene=medley",
     "budget=pretrain",
-    "method.model.channels=3",  # features beyond colour mean something else in every scene
+    "method.model.channels=3",  # features beyond colour have another meaning in every scene
     "method.renderer.init=scratch",
 )
 
 
 def main(options: argparse.Namespace) -> int:
-    """Fit a field to each of many random scenes, train one renderer on all, write its weights."""
+    """Fit a field to each of many random scenes, train one renderer on all of them, write it."""
     config = composed([*SETTINGS, *options.overrides])
     log = ConsoleLog(Path(checked_settings(config).outputs))
     method, budget = build(config, "method"), build(config, "budget")

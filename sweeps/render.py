@@ -1,4 +1,4 @@
-"""`steerbench render`: every frame of a trajectory as a picture, and as a video."""
+"""`steerbench render`: renders every frame of a trajectory, as pictures and as a video."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from sweeps.overrides import composed, setting
 
 
 def main(options: argparse.Namespace) -> int:
-    """Render, write `0000.png` and so on, the path and the video; say where they are."""
+    """Render; write `0000.png` and so on, the path and the video; print where they are."""
     words = [*words_of_run(options.run, options.overrides), *options.overrides]
     if options.path:
         place = setting("trajectory.path", str(options.path.resolve()))
@@ -63,14 +63,14 @@ def main(options: argparse.Namespace) -> int:
 
 @torch.no_grad()
 def _drawn(method: Method, camera: Camera, index: int) -> np.ndarray:
-    """The next frame of `method`, uint8 [H, W, 3]."""
+    """Render the next frame of `method` as uint8 [H, W, 3]."""
     frame = method.render(camera, NullProbe())
     check_frame(frame, camera, method.name, index)
     return as_bytes(quantise(frame.rgb.cpu()))
 
 
 def words_of_run(key: str | None, words: Sequence[str]) -> list[str]:
-    """The words of the command that measured a run of the store."""
+    """The words of the command that measured the run `key` of the store."""
     if key is None:
         return []
     store = Store(Path(composed(words).outputs))

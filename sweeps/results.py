@@ -1,4 +1,4 @@
-"""`steerbench results`: every row of the store, for people or for programs."""
+"""`steerbench results`: prints every row of the store, for people or for programs."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ SHOWN = (
     *("run", "method", "scene", "trajectory", "seed", "phase"),
     *("metric", "value", "lo", "hi", "n", "unit"),
 )
-"""The columns shown as a table; csv and json have all of them."""
+"""The columns of the printed table; csv and json have all columns."""
 
 FILTERS = ("method", "scene", "metric")
 
 
 def main(options: argparse.Namespace) -> int:
-    """Print the rows below `options.outputs`, all or some, as a table, csv or json.
+    """Print the rows below `options.outputs`, filtered if asked, as a table, csv or json.
 
     Raises:
-        SteerbenchError: nothing was measured, or nothing that the filters let through.
+        SteerbenchError: nothing was measured, or nothing passes the filters.
     """
     rows = Store(options.outputs).rows(report=lambda message: print(message, file=sys.stderr))
     if rows.empty:

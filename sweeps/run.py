@@ -18,13 +18,13 @@ from sweeps.sweep_callback import SweepCallback
 def main(argv: Sequence[str]) -> int:
     """Run one job, a sweep, or Hydra's own help, as the overrides and flags in `argv` say.
 
-    In a sweep, a job that fails is named at once and the others still run; the table at the end has
-    all of them.
+    In a sweep, a failed job is reported at once and the others still run; the table at the end
+    lists all of them.
 
     Raises:
         SteerbenchError: a setting or a choice does not exist, or a job failed.
     """
-    # Hydra's parser takes the overrides in one piece only, so the flags go first.
+    # Hydra's parser accepts overrides only in one contiguous block, so flags go first.
     sys.argv = [sys.argv[0], *sorted(argv, key=_is_override)]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors instead of printing them
     _hide_subcommand_from_completion()
@@ -40,11 +40,11 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _launch(argv: Sequence[str]) -> Exception | None:
-    """Let Hydra run every job; return the error that a job or a setting ended with."""
+    """Let Hydra run every job; return the error of a job or of a wrong setting, if any."""
     failures: list[Exception] = []
 
     def job(config: DictConfig) -> None:
-        # These load torch, which --help and completion can do without.
+        # These load torch, which --help and completion do not need.
         from sweeps.measurement import execute
         from sweeps.sweep import run_job
 
@@ -55,7 +55,7 @@ def _launch(argv: Sequence[str]) -> Exception | None:
         try:
             execute(settled(config), command)
         except Exception as error:
-            failures.append(error)  # past Hydra, which would print it in its own way
+            failures.append(error)  # bypasses Hydra, which would print it in its own way
 
     try:
         hydra.main(str(CONFIGS), "run", version_base="1.3")(job)()
@@ -69,7 +69,7 @@ def _launch(argv: Sequence[str]) -> Exception | None:
 
 
 def _config_dir() -> list[str]:
-    """The folder of further choices that was typed, as one word: the command needs it."""
+    """The folder of further choices from the command line, as one word, for the job's command."""
     sources = HydraConfig.get().runtime.config_sources
     return [f"--config-dir={x.path}" for x in sources if x.provider == "command-line"]
 
@@ -79,7 +79,7 @@ def _is_override(argument: str) -> bool:
 
 
 def _hide_subcommand_from_completion() -> None:
-    """Hydra's completion knows no subcommands: show it `steerbench a=b` for `... run a=b`."""
+    """Hydra's completion knows no subcommands: show it `steerbench run a=b` as `steerbench a=b`."""
     program, _, rest = os.environ.get("COMP_LINE", "").lstrip().partition(" ")
     if rest.lstrip().startswith("run "):
         os.environ["COMP_LINE"] = f"{program} {rest.lstrip().removeprefix('run ')}"

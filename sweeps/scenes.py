@@ -1,4 +1,4 @@
-"""`steerbench scenes`: gets published data sets, and checks copies of them."""
+"""`steerbench scenes`: downloads published data sets, and checks copies of them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from bench.scenes.published import Published, get, published
 from sweeps.names import unknown
 
 SHOWN = 5
-"""Names printed of files that are missing or extra: there may be hundreds."""
+"""Missing or extra files to print by name, because there may be hundreds."""
 
 
 def main(options: argparse.Namespace) -> int:
-    """Do what `options.action` says; 1 if a file is not the official one, or none is there."""
+    """Do what `options.action` says; return 1 if a file differs from the release or none exists."""
     log = ConsoleLog(Path("outputs"))
     if options.action == "get":
         return _get(options.name, options.to, log)
@@ -34,7 +34,7 @@ def _get(name: str, to: Path, log: ConsoleLog) -> int:
 
 
 def _found(name: str) -> tuple[Published, Sequence[str]]:
-    """The data set of this name with all of its scenes, or the one with a scene of this name."""
+    """The data set called `name` and all its scenes, or the one with a scene called `name`."""
     known = published()
     for data in known:
         if name == data.name:

@@ -1,4 +1,4 @@
-"""`steerbench score`: pictures of any program against true ones, under a named protocol."""
+"""`steerbench score`: scores pictures of any program against true ones, under a named protocol."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from sweeps.overrides import composed
 from sweeps.terminal import console, rich_table
 
 NOTHING = "-"
-"""For facts of a row that pictures do not have."""
+"""Stands for facts of a row that do not apply to given pictures."""
 
 
 def main(options: argparse.Namespace) -> int:
@@ -56,14 +56,14 @@ def scored(
     match: Match = "name",
     sequence: bool = False,
 ) -> Run:
-    """The pictures in `folder` scored against those in `truth`, or against the split of a scene, as
-    a run of the store.
+    """Score the pictures in `folder` against those in `truth`, and store the result as a run.
 
     Args:
-        words: settings as of `steerbench run`: protocol, scene, split, outputs.
-        name: of the method in the rows; None: that of the folder.
-        match: how a picture finds its truth.
-        sequence: whether the pictures follow one another: the flicker is scored, too.
+        truth: the folder of true pictures; None: the split of a scene.
+        words: settings as for `steerbench run`: protocol, scene, split, outputs.
+        name: name of the method in the rows; None: the name of the folder.
+        match: how pictures are matched to true ones.
+        sequence: whether the pictures are consecutive frames, so that flicker is scored, too.
 
     Raises:
         SteerbenchError: a setting is wrong; pictures are missing, damaged or of another size.
@@ -112,7 +112,7 @@ def scored(
 def _against_scene(
     folder: Path, config: DictConfig, protocol: EvaluationProtocol, match: Match
 ) -> tuple[list[Pair], dict[str, Any]]:
-    """The pictures with those of the scene's split, and the facts of their rows."""
+    """Pairs of the pictures with those of the scene's split, and the facts for their rows."""
     OmegaConf.update(config, "scene.background", protocol.background)
     scene, split = scene_of(config), config.split
     if split not in scene.splits:
@@ -129,7 +129,7 @@ def _command(
     match: Match,
     sequence: bool,
 ) -> list[str]:
-    """The command that does the same."""
+    """The command line that does the same."""
     named = (("--truth", truth), ("--name", name), ("--match", match))
     given = [str(word) for pair in named if pair[1] is not None for word in pair]
     flag = ["--sequence"] if sequence else []
@@ -137,5 +137,5 @@ def _command(
 
 
 def _example(pairs: Sequence[Pair]) -> str:
-    """How the first one was matched, for the eye."""
+    """How the first picture was matched, for the user to check."""
     return f"{pairs[0].picture.name} is scored against {pairs[0].name}"

@@ -1,4 +1,4 @@
-"""`steerbench stress`: runs all cases, by every backend, engine and precision."""
+"""`steerbench stress`: runs all cases with every backend, engine and precision."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ CASE_COLUMNS = (
     "status",
     "the tolerance",
 )
-"""A line a case, with the figures of the cell that is nearest to its tolerance."""
+"""Columns with one line per case, which shows the cell nearest to its tolerance."""
 
 
 def main(options: argparse.Namespace) -> int:
-    """Print a table and, as the last line, the same rows as JSON; 1 if anything fails."""
+    """Print a table, then its rows as JSON in the last line; return 1 if anything fails."""
     import torch
 
     from methods.checks import found
@@ -71,7 +71,7 @@ def _line(row: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _end(row: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Worst, at most, status."""
+    """The cells of the columns "worst", "at most" and "status"."""
     seen = "not finite" if row["error"] is None else f"{row['error']:.1e}"
     if row["status"].startswith("unavailable"):
         seen = ""
@@ -79,7 +79,7 @@ def _end(row: Mapping[str, Any]) -> tuple[str, str, str]:
 
 
 def _case_lines(rows: Iterable[Mapping[str, Any]]) -> Iterator[tuple[str, ...]]:
-    """A line a case, with the cell that is nearest to its tolerance, or beyond it."""
+    """One line per case, with the cell that is nearest to its tolerance or exceeds it."""
     for (subject, case), cells in groupby(rows, key=lambda row: (row["subject"], row["case"])):
         those = list(cells)
         worst = max(those, key=_nearness)

@@ -1,6 +1,6 @@
-"""A sweep: its jobs one by one, and at its end one table and one page about all of them.
+"""A sweep: runs its jobs one by one, and at the end makes one table and one page about all.
 
-Jobs may run in other processes, so they share nothing but the folder of the sweep and the store.
+Jobs may run in other processes, so they share only the folder of the sweep and the store.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sweeps.terminal import console, show
 
 
 def run_job(config: DictConfig, command: Sequence[str]) -> None:
-    """Run the present job of a sweep, write down how it ended, print that in a line.
+    """Run the current job of a sweep, record how it ended, and print that in one line.
 
     `command` runs this job alone. Raises what the measurement raises.
     """
@@ -52,7 +52,7 @@ def run_job(config: DictConfig, command: Sequence[str]) -> None:
 
 
 def finish(folder: Path) -> None:
-    """Print one table of all jobs that ended, and write the pages that they asked for.
+    """Print one table of all jobs that have ended, and write the pages that they requested.
 
     Raises:
         SteerbenchError: a page cannot be written.
@@ -70,7 +70,7 @@ def finish(folder: Path) -> None:
 
 
 def _progress(ended: Sequence[Job]) -> str:
-    """How many jobs are done and, from those that had to be measured, how long the rest takes."""
+    """How many jobs are done, and an estimate of the remaining time from the measured ones."""
     total, measured = prod(SweepCallback.sizes.values()), sum(job.measured for job in ended)
     if SweepCallback.folder is None or len(ended) > total:
         return ""
@@ -80,13 +80,13 @@ def _progress(ended: Sequence[Job]) -> str:
 
 
 def _labels(jobs: Sequence[Job], names: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
-    """The labels of the runs by their keys, and why others failed, by their labels."""
+    """Labels of the runs by key, and reasons of failed jobs by label."""
     runs = {job.run: job.label(names) for job in jobs if job.run}
     return runs, {job.label(names): job.failure for job in jobs if job.failure}
 
 
 def _show(store: Store, labels: dict[str, str], failed: dict[str, str]) -> None:
-    """Print the table of all jobs, and why a figure is missing."""
+    """Print the table of all jobs, and why figures are missing."""
     runs = over_common_frames(load(store, labels))
     show(comparison(runs, failed))
     for note in dict.fromkeys(

@@ -1,4 +1,4 @@
-"""What Hydra says about a sweep before its first job, in the process that began it."""
+"""Records what Hydra knows about a sweep before its first job, in the process that started it."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from sweeps.overrides import swept
 
 
 class SweepCallback(Callback):
-    """Notes the sweep that begins; run.yaml names it among Hydra's callbacks.
+    """Records that a sweep starts; run.yaml lists it among Hydra's callbacks.
 
-    Hydra makes the object and gives it to nobody, so the notes are on the class.
+    Hydra creates the object and never hands it out, so the record is kept on the class.
 
     Attributes:
-        folder: where the jobs write how they ended; None without a sweep.
-        sizes: the number of values of each setting that has several.
+        folder: where jobs record how they ended; None without a sweep.
+        sizes: number of values, for each setting with several values.
     """
 
     folder: ClassVar[Path | None] = None
     sizes: ClassVar[dict[str, int]] = {}
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Note the folder of the sweep and its size."""
+        """Record the folder of the sweep and its sizes."""
         SweepCallback.folder = Path(config.hydra.sweep.dir)
         params = config.hydra.sweeper.get("params") or {}
         words = [f"{name}={values}" for name, values in params.items()]

@@ -1,4 +1,4 @@
-"""Tables at the terminal."""
+"""Prints tables at the terminal."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from rich.table import Table as RichTable
 from reports.tables import Table
 
 PIPE_WIDTH = 200
-"""Columns of text where there is no terminal to ask: wide enough for every table."""
+"""Width of text without a terminal: wide enough for every table."""
 
 
 class _Output(Console):
     def on_broken_pipe(self) -> None:
-        """Leave it to the command line to end the program; rich would exit by itself."""
+        """Leave it to `sweeps.cli` to end the program; rich would exit by itself."""
         raise BrokenPipeError
 
 
 def console() -> Console:
-    """Standard output; tables are not cut to 80 columns when it is a file or a pipe."""
+    """Standard output; in a file or pipe, tables are not cut to 80 columns."""
     return _Output(width=None if sys.stdout.isatty() else PIPE_WIDTH, highlight=False)
 
 
@@ -32,7 +32,7 @@ def show(*tables: Table) -> None:
 
 
 def rich_table(table: Table) -> RichTable:
-    """`table` with labels and text to the left and figures to the right."""
+    """`table` with labels and text aligned left and figures aligned right."""
     grid = RichTable(title=table.title, title_justify="left")
     for index, column in enumerate(table.columns):
         grid.add_column(column, justify="right" if index and table.figures else "left")

@@ -1,4 +1,4 @@
-"""Trainings of many jobs, several at a time: small ones gain little from a second core."""
+"""Trains the models of many jobs in parallel, because small ones gain little from a second core."""
 
 from __future__ import annotations
 
@@ -32,11 +32,10 @@ CHOSEN_AFTERWARDS = {
 
 
 def train_ahead(jobs: Sequence[Planned], measured: Collection[str]) -> None:
-    """Do the trainings of `jobs`, which share their budget, as many at a time as there is room for;
-    not those behind a job whose key is among the `measured` ones.
+    """Train the models of `jobs`, which share one budget, as many at a time as the cores allow.
 
-    They are found again when the jobs are measured. What fails here fails there once more, and is
-    reported then.
+    Trainings of jobs whose key is in `measured` are skipped. The jobs load the stored stages when
+    they are measured. A training that fails here fails again then, and is reported then.
     """
     todo: dict[str, Planned] = {}
     for job in jobs:
@@ -58,8 +57,7 @@ def train_ahead(jobs: Sequence[Planned], measured: Collection[str]) -> None:
 
 
 def room(config: DictConfig) -> int:
-    """How many trainings the cores have room for; 1 on a GPU, or where the budget does not say how
-    many threads one has."""
+    """How many trainings can run at a time; 1 on a GPU, or if the budget sets no `threads`."""
     threads = build(config, "budget").threads
     if threads is None or on_gpu(config.device):
         return 1
@@ -67,7 +65,7 @@ def room(config: DictConfig) -> int:
 
 
 def _training(job: Planned) -> str:
-    """Equal for jobs that share a training: a key of all settings that it may depend on."""
+    """A key of all settings that a training may depend on; equal for jobs that share it."""
     settings = _kept(job.settings)
     return content_key(settings | {"method": _kept(settings["method"])})
 
@@ -77,19 +75,19 @@ def _kept(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _train(config: DictConfig) -> float:
-    """In a process of its own: the seconds of a training that may have been done before."""
+    """Train, or load the training, in a worker process; return the seconds it took."""
     return trained(config, ConsoleLog(Path(config.outputs), quiet=True)).train_s
 
 
 def _said(ended: Future[float]) -> str:
-    """How a training ended."""
+    """How a training ended, in words."""
     error = ended.exception()
     return f"trained in {ended.result():.0f} s" if error is None else f"failed: {reason(error)}"
 
 
 @contextmanager
 def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Processes that end with this one, however it ends."""
+    """Worker processes that end with this one, however it ends."""
     fresh = multiprocessing.get_context("spawn")  # threads do not survive a fork
     pool = ProcessPoolExecutor(workers, mp_context=fresh, initializer=_end_with_parent)
     try:

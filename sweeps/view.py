@@ -1,4 +1,4 @@
-"""`steerbench view`: methods in a browser, their camera steered with the mouse."""
+"""`steerbench view`: shows methods in a browser, with a camera steered by mouse."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sweeps.viewer import AS_GIVEN, Viewer
 
 
 def main(options: argparse.Namespace) -> int:
-    """Train the methods or find them, serve the page, draw until interrupted."""
+    """Train or load the methods, serve the page, render until interrupted."""
     viewer = opened(options)
     try:
         while True:
@@ -27,10 +27,10 @@ def main(options: argparse.Namespace) -> int:
 
 
 def opened(options: argparse.Namespace) -> Viewer:
-    """The viewer that the command describes; it says where it is.
+    """Open the viewer that the command describes, and print its address.
 
     Raises:
-        SteerbenchError: a setting is wrong, the training failed, or viser is not there.
+        SteerbenchError: a setting is wrong, the training failed, or viser is not installed.
     """
     words = [*words_of_run(options.run, options.overrides), *options.overrides]
     beside = [[*words, f"method={options.beside}"]] if options.beside else []
@@ -61,7 +61,7 @@ def opened(options: argparse.Namespace) -> Viewer:
 
 
 class _Tuned:
-    """The words that describe a method, and what its knobs were turned to."""
+    """The words that describe a method, and the current settings of its knobs."""
 
     def __init__(self, words: Sequence[str]) -> None:
         self._words = words
@@ -69,7 +69,7 @@ class _Tuned:
         self.chosen: dict[str, str] = {}
 
     def words(self) -> list[str]:
-        """Of the method with its knobs as they are."""
+        """The words of the method with its knobs as currently set."""
         words = [*self._words]
         for knob, setting in self.chosen.items():
             if setting != AS_GIVEN:

@@ -1,4 +1,4 @@
-"""The page of `steerbench view`, on viser: a camera for the mouse, settings and figures."""
+"""The page of `steerbench view`, built on viser: a camera steered by mouse, knobs and figures."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle, ViserServer
 
 TALLEST = 2160
-"""Rows of a picture at most."""
+"""Maximum height of a picture in pixels."""
 
 LAST = 1e6
-"""Place of what stands below all that has no place of its own."""
+"""Order of elements below all those without an order of their own."""
 
 JPEG_QUALITY = 90
 
 AS_GIVEN = "as given"
-"""The setting of a knob that nobody has turned."""
+"""The setting of a knob that was not changed."""
 
 SIDE, DIFFERENCE, ERROR, TRUTH = "side by side", "difference x 4", "error x 4", "exact picture"
 EXACT = (ERROR, TRUTH)
-"""What needs the exact picture."""
+"""The views that need the exact picture."""
 
 
 @dataclass
 class Browser:
-    """What one browser has chosen, and the cameras that it records."""
+    """The state of one browser: its choices, and the cameras that it records."""
 
     client: ClientHandle
     shown: Any
@@ -63,17 +63,17 @@ class Browser:
     path: list[Camera] = field(default_factory=list)
     camera: Camera | None = None
     drawn: list[Drawn] | None = None
-    """What `camera` saw last; None: the methods are others now."""
+    """The latest pictures of `camera`; None: out of date because the methods have changed."""
 
 
 class Viewer:
-    """Serves the page and draws, until it is stopped.
+    """Serves the page and renders until it is stopped.
 
     Args:
-        painter: with one method, or with two to compare.
-        knobs: by method and knob, the names of its settings.
-        turn: is called with method, knob and setting; it gives the painter another method.
-        folder: where recorded paths go.
+        painter: has one method, or two to compare.
+        knobs: for each method, the names of the settings of each knob.
+        turn: called with method, knob and setting; replaces the method in the painter.
+        folder: where recorded paths are written.
 
     Raises:
         Unavailable: viser is not installed.
@@ -105,12 +105,11 @@ class Viewer:
 
     @property
     def port(self) -> int:
-        """On which it is served: the next free one where the one asked for was taken."""
+        """The port of the server: the next free one if the requested port is taken."""
         return self.server.get_port()
 
     def draw(self, timeout: float | None = None) -> bool:
-        """Draw for the browser that has waited longest; whether there was one within `timeout`
-        seconds."""
+        """Render for the browser that has waited longest; False if none waits for `timeout` s."""
         found = self.turns.next(timeout)
         while self._turned:
             self._turn(*self._turned.pop(0))
@@ -118,7 +117,7 @@ class Viewer:
             return False
         who, ask = found
         browser = self.browsers.get(who)
-        if browser is not None:  # it did not leave
+        if browser is not None:  # it is still connected
             try:
                 self._draw(browser, ask)
             except SteerbenchError as error:
@@ -126,7 +125,7 @@ class Viewer:
         return True
 
     def _draw(self, browser: Browser, ask: Ask) -> None:
-        """Draw what a browser asks for, unless its last picture was of the same camera."""
+        """Render what a browser requests, or reuse its last picture if the camera is the same."""
         who, camera = browser.client.client_id, self.painter.sized(ask)
         whole = camera is ask.camera
         if not (browser.drawn and browser.camera and _same(browser.camera, camera)):
@@ -144,12 +143,12 @@ class Viewer:
             self._save(browser)
 
     def stop(self) -> None:
-        """Serve no longer."""
+        """Stop the server."""
         with redirect_stdout(StringIO()):
             self.server.stop()
 
     def _look(self, at: Any, camera: Camera) -> None:
-        """Point a camera of viser, that of a browser or the initial one."""
+        """Point a camera of viser, of a browser or the initial one, like `camera`."""
         position, middle = camera.c2w[:, 3], self.scene.bounds.mean(dim=0)
         ahead = camera.c2w[:, 2]
         distance = torch.dot(middle - position, ahead).clamp(min=0.1)
@@ -182,7 +181,7 @@ class Viewer:
             browser.drawn = None
 
     def _refuse(self, what: str, error: SteerbenchError) -> None:
-        """Say, here and in all browsers, what did not work."""
+        """Report, here and in all browsers, what did not work."""
         self.log.info(f"{what}: {error}")
         for browser in list(self.browsers.values()):
             browser.client.add_notification(what, str(error), color="red")
@@ -222,7 +221,7 @@ class Viewer:
             self.turns.want(who, Ask(_camera(browser.client.camera, int(browser.height.value))))
 
     def _save(self, browser: Browser) -> None:
-        """Write the path that was recorded, and forget it."""
+        """Write the recorded path to a file and discard it."""
         last = browser.path[-1]
         cameras = [c for c in browser.path if (c.width, c.height) == (last.width, last.height)]
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -237,7 +236,7 @@ class Viewer:
     def _show(self, browser: Browser, drawn: Sequence[Drawn], truth: Tensor | None) -> None:
         picture = self._picture(browser, drawn, truth)
         client = browser.client
-        if client.client_id in self.browsers:  # it did not leave while this was drawn
+        if client.client_id in self.browsers:  # still connected
             client.scene.set_background_image(as_bytes(picture), "jpeg", jpeg_quality=JPEG_QUALITY)
             browser.figures.content = _figures(self.painter, drawn, truth)
 
@@ -259,7 +258,7 @@ def _serve(host: str, port: int) -> ViserServer:
     except ImportError as error:
         raise Unavailable(f"view needs viser: {install_command('viewer')}") from error
     try:
-        with redirect_stdout(StringIO()):  # it would print its address in a frame
+        with redirect_stdout(StringIO()):  # viser would print its address in a box
             server = viser.ViserServer(host=host, port=port, label="steerbench", verbose=False)
     except OSError as error:
         raise SteerbenchError(f"cannot serve {host}:{port}: {error}") from error
@@ -268,7 +267,7 @@ def _serve(host: str, port: int) -> ViserServer:
 
 
 def _camera(handle: CameraHandle, height: int) -> Camera:
-    """The camera of a browser, with so many rows and square pixels."""
+    """The camera of a browser, with `height` rows and square pixels."""
     import viser.transforms
 
     rotation = viser.transforms.SO3(handle.wxyz).as_matrix()
@@ -286,7 +285,7 @@ def _three(vector: Tensor) -> tuple[float, float, float]:
 
 
 def _figures(painter: Painter, drawn: Sequence[Drawn], truth: Tensor | None) -> str:
-    """Frame times, the stages of each and PSNR, as Markdown."""
+    """Frame times, times of stages and PSNR of each method, as Markdown."""
     height, width = drawn[0].rgb.shape[:2]
     lines = [f"{width} x {height} pixels", ""]
     for method, one in zip(painter.methods, drawn, strict=True):

@@ -1,1 +1,1 @@
-"""Data sets and embedded scenes, each loader a module with `load(...) -> Scene`."""
+"""Data sets and embedded scenes. Each loader is a module with `load(...) -> Scene`."""

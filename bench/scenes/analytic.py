@@ -1,6 +1,6 @@
-"""The embedded scenes: exact colour, depth and opacity at any pose and any resolution.
+"""The embedded scenes: exact colour, depth and opacity at any pose and resolution.
 
-A scene is written once, in NeRF-Synthetic's layout, and then read by that loader.
+A scene is written once in NeRF-Synthetic's layout, then read by the loader of that layout.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ ANGLE_X = 0.69
 """Horizontal field of view in radians."""
 
 DISTANCE = 4.3
-"""Distance of all cameras from the middle of the scene, in the model's units."""
+"""Distance of all cameras from the centre of the scene, in the model's units."""
 
 MEDLEY = re.compile("medley-(0|[1-9][0-9]*)")
 """Names of the variants of `medley`."""
@@ -52,16 +52,17 @@ def load(
     root: str | Path = "outputs/scenes",
     log: Log,
 ) -> Scene:
-    """Read an embedded scene, after writing it if it is not there yet.
+    """Read an embedded scene; write it first if it does not exist yet.
 
     Args:
-        name: one of `MODELS`, `medley`, or `medley-N` for variant N of it.
-        variant: of `medley`, and of no other scene.
-        width, height: of its pictures; square when no height is given.
-        train: pictures from all around, 10 degrees below to 80 above the horizon.
-        test: pictures of a smooth orbit, 1 degree of azimuth apart: 360 of them close it.
-        seed: of the training poses.
-        downscale, background, bounds: as of `blender.load`.
+        name: one of `MODELS`, `medley`, or `medley-N` for its variant N.
+        variant: variant number; only for `medley`.
+        width, height: size of the pictures; square if no height is given.
+        train: number of training pictures, from all around, 10 degrees below to 80 degrees above
+            the horizon.
+        test: number of test pictures, on a smooth orbit, 1 degree of azimuth apart (360 close it).
+        seed: seed of the training poses.
+        downscale, background, bounds: see `blender.load`.
         root: where scenes are written, each into a folder of its own.
 
     Raises SteerbenchError when an option is out of range or `root` cannot be written.
@@ -94,7 +95,7 @@ def load(
 
 
 def find(name: str) -> Model:
-    """The model of that name; Unavailable when there is none."""
+    """The model called `name`; raises Unavailable if there is none."""
     if match := MEDLEY.fullmatch(name):
         return medley(int(match[1]))
     if name not in MODELS:
@@ -112,7 +113,7 @@ def picture(model: Model, camera: Camera) -> Tensor:
 
 
 def write(folder: Path, settings: dict, log: Log) -> None:
-    """Render a scene in NeRF-Synthetic's layout, and move it to `folder` when it is whole."""
+    """Render a scene in NeRF-Synthetic's layout, and move it to `folder` once complete."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as temporary:
@@ -121,7 +122,7 @@ def write(folder: Path, settings: dict, log: Log) -> None:
             try:
                 scene.rename(folder)
             except OSError:
-                if not folder.is_dir():  # else another process was faster
+                if not folder.is_dir():  # otherwise another process was faster
                     raise
     except OSError as error:
         raise SteerbenchError(f"{folder}: the scene cannot be written: {error}") from error
@@ -153,7 +154,7 @@ def _write_pictures(folder: Path, settings: dict, log: Log) -> None:
 
 
 def train_poses(count: int, seed: int) -> list[Tensor]:
-    """Poses spread evenly over a zone of the sphere by the golden angle, from a seeded start."""
+    """Poses spread evenly over a zone of the sphere by the golden angle; `seed` sets the start."""
     phase, shift = torch.rand(2, generator=torch.Generator().manual_seed(seed)).tolist()
     low, high = math.sin(math.radians(-10)), math.sin(math.radians(80))
     golden = math.pi * (3 - math.sqrt(5))
@@ -173,7 +174,7 @@ def orbit_poses(count: int) -> list[Tensor]:
 
 
 def pose_on_sphere(azimuth: float, elevation: float) -> Tensor:
-    """Camera-to-world [3, 4] float64 at DISTANCE, looking at the middle, z up; radians."""
+    """Camera-to-world [3, 4] float64 at DISTANCE, looking at the centre, z up; radians."""
     level = math.cos(elevation)
     direction = (level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation))
     eye = DISTANCE * torch.tensor(direction, dtype=torch.float64)

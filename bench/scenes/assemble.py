@@ -1,4 +1,4 @@
-"""From described views to a Scene: the last step that all loaders share."""
+"""Makes a Scene from described views: the last step of every loader."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from bench.scenes.images import Pictures, View, describe_all
 from bench.types import BACKGROUNDS, Log, Scene, Split, SteerbenchError
 
 SMALLEST, LARGEST = torch.finfo(torch.float32).tiny, torch.finfo(torch.float32).max
-"""Lengths that float32 has at its full precision."""
+"""Range of lengths that float32 holds at full precision."""
 
 
 def every_nth(views: Sequence[View], step: int, where: Path) -> dict[str, list[View]]:
-    """Views in the order of their names: 0, step, 2 * step ... as test, all others as train.
+    """Split views, sorted by name: 0, step, 2 * step ... are the test split, the others train.
 
     Raises:
-        SteerbenchError: `step` is less than 2, or nothing is left to train on; `where` is named.
+        SteerbenchError: `step` is less than 2, or nothing is left to train on. It names `where`.
     """
     whole_number(step, "split_every", 2)
     views = sorted(views, key=lambda view: view.name)
@@ -33,10 +33,10 @@ def every_nth(views: Sequence[View], step: int, where: Path) -> dict[str, list[V
 
 
 def leave_out(missing: Sequence[str], views: Sequence[View], where: str, log: Log) -> None:
-    """Log the names of pictures that are `missing` beside `views`.
+    """Log the names of `missing` pictures; the scene is made from the other `views`.
 
     Raises:
-        SteerbenchError: there are no views.
+        SteerbenchError: there are no other views.
     """
     if not views:
         raise unexpected(where, "pictures", f"none of {len(missing)} files is there")
@@ -48,7 +48,7 @@ def leave_out(missing: Sequence[str], views: Sequence[View], where: str, log: Lo
 def describe_splits(
     views: Mapping[str, Sequence[View]], downscale: int, log: Log
 ) -> dict[str, Pictures]:
-    """The pictures of every split, each read once; pixels are decoded when they are asked for."""
+    """The pictures of every split, each file read once; pixels are decoded on demand."""
     whole_number(downscale, "downscale", 1)
     found = iter(describe_all([view for split in views.values() for view in split], downscale, log))
     return {name: Pictures([next(found) for _ in split], log) for name, split in views.items()}
@@ -62,11 +62,11 @@ def assemble(
     background: str,
     camera_files: Iterable[Path],
 ) -> Scene:
-    """The scene in units in which `box` fills the unit cube.
+    """The scene, scaled so that `box` fills the unit cube.
 
     The digest covers the bytes of `camera_files` and of all picture files, the background, the
     resolution and the box.
-    Raises SteerbenchError where the box, or a camera in its units, is beyond float32.
+    Raises SteerbenchError if the box, or a camera in its units, exceeds the range of float32.
     """
     if background not in BACKGROUNDS:
         names = " or ".join(BACKGROUNDS)
@@ -107,7 +107,7 @@ def assemble(
 
 
 def _check_float32(where: str, lengths: Sequence[float], others: Sequence[float]) -> None:
-    """Raise unless float32 holds all of them, and `lengths` are more than 0 there."""
+    """Raise unless all numbers fit into float32 and `lengths` stay positive in it."""
     good = all(SMALLEST <= x <= LARGEST for x in lengths) and all(abs(x) <= LARGEST for x in others)
     if not good:
         raise SteerbenchError(

@@ -1,4 +1,4 @@
-"""NeRF-Synthetic: `transforms_{train,val,test}.json` beside RGBA pictures."""
+"""Loads NeRF-Synthetic: `transforms_{train,val,test}.json` beside RGBA pictures."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ def load(
 
     Args:
         path: the folder with the `transforms_*.json`.
-        downscale: average blocks of this many pixels squared; what does not fill a block, at the
-            right and the bottom, is left out.
+        downscale: average blocks of downscale x downscale pixels; pixels at the right and bottom
+            that do not fill a block are dropped.
         background: "white" or "black", what RGBA pictures are composited onto.
         bounds: what fills the unit cube. "auto": the box of the visual hull of the training masks,
             or [-1.5, 1.5]^3 without masks; "full": [-1.5, 1.5]^3; or [[x, y, z], [x, y, z]].
-        name: the scene's name in result rows; the folder's name when not given.
+        name: the scene's name in result rows; by default the folder's name.
 
-    A split other than train and test none of whose pictures exist is left out.
-    Raises SteerbenchError naming file and field when anything is not as it should be.
+    A split other than train and test is left out if none of its pictures exist.
+    Raises SteerbenchError, naming file and field, if the data are not as described.
     """
     root = data_folder(path)
     found = {split: read_split(root, split, log) for split in ("train", "val", "test")}
@@ -61,7 +61,7 @@ def camera_file(split: str) -> str:
 
 
 def read_split(root: Path, split: str, log: Log) -> list[View]:
-    """The views of a split; none when it is optional and its pictures are not there."""
+    """The views of a split; empty if it is optional and its pictures do not exist."""
     optional = split == "val"
     path = root / camera_file(split)
     if optional and not path.exists():
@@ -89,13 +89,13 @@ def read_split(root: Path, split: str, log: Log) -> list[View]:
 
 
 def picture_path(root: Path, file_path: str, where: str) -> Path:
-    """The picture that a `file_path` with or without its extension means."""
+    """The picture that `file_path` refers to, with or without its extension."""
     path = inside(root, file_path, where)
     return path if path.is_file() else inside(root, f"{file_path}.png", where)
 
 
 def scene_box(bounds: str | list, train: Pictures, log: Log) -> Box:
-    """The box in the data set's units that `bounds`, as of `load`, means."""
+    """The box, in the data set's units, that `bounds` of `load` stands for."""
     space = cube(HALF_EXTENT)
     if bounds == "full":
         return space

@@ -1,4 +1,4 @@
-"""What part of a data set's space is rendered, and its place in the unit cube."""
+"""Finds the part of a data set's space to render, and its place in the unit cube."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from bench.threads import torch_threads
 from bench.types import Camera, SteerbenchError
 
 MARGIN = 0.05
-"""The box of a visual hull grows by this share of its longest side, half of it at each end."""
+"""The box of a visual hull is enlarged by this share of its longest side, half at each end."""
 
 CELLS = 64
-"""Cells along each side of the cube in which a visual hull is looked for."""
+"""Cells along each side of the cube that is searched for the visual hull."""
 
 BLOCK, GLANCES = 4, 16
-"""Before single cells, blocks of as many along each side are looked for, in the first so many
-pictures: where a block is dropped, so would be each of its cells."""
+"""Before single cells, blocks of BLOCK^3 cells are tested against the first GLANCES pictures: a
+dropped block drops all its cells."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,12 @@ class Box:
         return (self.lower + self.upper) / 2 - self.side / 2
 
     def in_unit_cube(self) -> Tensor:
-        """[2, 3] float32 corners after the longest side fills the unit cube, centred."""
+        """[2, 3] float32 corners once the box is centred and its longest side has length 1."""
         corners = torch.stack((self.lower, self.upper))
         return ((corners - self.origin) / self.side).float().clamp(0, 1)
 
     def grown(self, share: float) -> Box:
-        """The box with `share` of its longest side more along every axis."""
+        """The box, longer along every axis by `share` of its longest side."""
         return Box(self.lower - share * self.side / 2, self.upper + share * self.side / 2)
 
 
@@ -75,8 +75,8 @@ def parse_box(value: object) -> Box:
 def hull_box(cameras: Sequence[Camera], images: Sequence[Tensor], space: Box) -> Box | None:
     """The box of the visual hull of the pictures' masks (alpha > 0) inside `space`.
 
-    Conservative: a cell is dropped only where its whole projection, and one pixel around it, lies
-    inside a picture and shows nothing. None when the pictures are opaque or nothing is left.
+    Conservative: a cell is dropped only if its whole projection, plus one pixel around it, lies
+    inside a picture and shows nothing. None if the pictures are opaque or no cell is left.
     """
     if any(image.shape[2] < 4 for image in images):
         return None
@@ -95,14 +95,14 @@ def hull_box(cameras: Sequence[Camera], images: Sequence[Tensor], space: Box) ->
 
 
 def _grid(side: int) -> Tensor:
-    """The places [side^3, 3] of a cube of cells."""
+    """The integer positions [side^3, 3] of a cube of cells."""
     return torch.cartesian_prod(*(torch.arange(side, dtype=torch.float32),) * 3)
 
 
 def _left(
     cells: Tensor, views: Sequence[tuple[Camera, Tensor]], lower: Tensor, size: Tensor
 ) -> Tensor:
-    """Those of `cells` [M, 3] of `size` [3], counted from `lower` [3], that no picture drops."""
+    """The `cells` [M, 3] of `size` [3], counted from `lower` [3], that no picture drops."""
     for camera, image in views:
         corners = lower + size * (cells[:, None] + _grid(2))  # [M, 8, 3]
         cells = cells[maybe_seen(camera, image[..., 3] > 0, corners.float())]
@@ -110,7 +110,7 @@ def _left(
 
 
 def maybe_seen(camera: Camera, mask: Tensor, corners: Tensor) -> Tensor:
-    """[M] bool: whether a cell of `corners` [M, 8, 3] may hold what `mask` [H, W] shows."""
+    """[M] bool: whether a cell, given by its `corners` [M, 8, 3], may be seen in `mask` [H, W]."""
     pixels, depth = project(camera, corners.reshape(-1, 3))
     pixels, depth = pixels.reshape(-1, 8, 2), depth.reshape(-1, 8)
     first = pixels.amin(1).floor() - 1
@@ -119,7 +119,7 @@ def maybe_seen(camera: Camera, mask: Tensor, corners: Tensor) -> Tensor:
     inside = ((first >= 0) & (last <= limit)).all(1) & (depth > 0).all(1)
     (u0, v0), (u1, v1) = (edge[inside].long().unbind(1) for edge in (first, last))
     # A summed-area table counts the mask's pixels in any rectangle with four look-ups. NumPy's
-    # running sums of 32 bits take a quarter of the time of torch's, which are of 64.
+    # 32-bit cumsum takes a quarter of the time of torch's, which is 64-bit.
     sums = mask.numpy().cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32)
     table = torch.from_numpy(np.pad(sums, ((1, 0), (1, 0))))
     count = table[v1, u1] - table[v0, u1] - table[v1, u0] + table[v0, u0]

@@ -1,4 +1,4 @@
-"""A capture that COLMAP has put together: its sparse model beside the pictures."""
+"""Loads a capture reconstructed by COLMAP: a sparse model beside the pictures."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from bench.scenes.images import View, image_size
 from bench.types import Camera, Log, Scene
 
 MODELS = ("sparse/0", "colmap/sparse/0", "sparse", ".")
-"""Where a model may lie in a capture's folder; the first that is there is taken."""
+"""Where the model may be in a capture's folder; the first one found is used."""
 
 LISTS = {"frames": (64, "<I", 16), "images": (64, "<Q", 24), "points3D": (43, "<Q", 8)}
-"""Of an entry of a binary list: the bytes before the number of its parts (of an image a name, too),
-the type of that number, the bytes of a part."""
+"""Layout of an entry in each binary list: bytes before the count of its parts (for an image, plus a
+name), the type of this count, bytes per part."""
 
 STRAY = 0.01
-"""Share of the points, at either end of an axis, that the box need not hold."""
+"""Share of the points, at either end of an axis, that the box may exclude."""
 
 ASPECT = 0.01
-"""Largest difference between the aspect ratios of a picture and its camera, as a share."""
+"""Largest relative difference between the aspect ratios of a picture and its camera."""
 
 
 def load(
@@ -53,18 +53,18 @@ def load(
         images: its folder of pictures. They may be smaller than those that COLMAP saw.
         model: its folder with `cameras`, `images` and `points3D`, `.bin` or `.txt`; None: the first
             of `MODELS` that has them.
-        split_every: as of `bench.scenes.transforms.load`.
-        bounds: what fills the unit cube. "auto": the box of the points, but for the outermost;
+        split_every: see `bench.scenes.transforms.load`.
+        bounds: what fills the unit cube. "auto": the box of the points without outliers;
             or [[x, y, z], [x, y, z]].
-        downscale, background: as of `bench.scenes.blender.load`.
+        downscale, background: see `bench.scenes.blender.load`.
 
-    Every camera model of COLMAP that has a focal length is undone, and pictures are cropped to what
-    the lens saw. Pictures that COLMAP did not register do not count. Registered ones that are not
-    there are logged and left out.
+    Lens distortion is undone for every COLMAP camera model that has a focal length, and pictures
+    are cropped to what the lens saw. Pictures that COLMAP did not register are ignored. Registered
+    pictures that are missing are logged and left out.
 
     Raises:
         Unavailable: pycolmap is not installed.
-        SteerbenchError: naming the file, when anything is not as it should be.
+        SteerbenchError: the data are not as described; names the file.
     """
     root = data_folder(path)
     folder = model_folder(root, model)
@@ -87,7 +87,7 @@ def model_folder(root: Path, model: str | None) -> Path:
 
 
 def _kind(folder: Path) -> str:
-    """The ending of the files of a model: binary before text, as COLMAP reads them; or nothing."""
+    """The file ending of a model: binary before text, as in COLMAP; empty if there is no model."""
     return next((end for end in (".bin", ".txt") if (folder / f"cameras{end}").is_file()), "")
 
 
@@ -108,8 +108,10 @@ def read_model(folder: Path) -> Any:
 
 
 def check_length(file: Path) -> None:
-    """Raise if a binary list is shorter than it says: pycolmap would read on for minutes, and take
-    gigabytes."""
+    """Raise if a binary list is shorter than its counts say.
+
+    pycolmap would keep reading for minutes and take gigabytes.
+    """
     if not file.is_file():
         return
     content = file.read_bytes()
@@ -131,7 +133,7 @@ def check_length(file: Path) -> None:
 
 
 def read_views(root: Path, images: str, folder: Path, found: Any, log: Log) -> list[View]:
-    """The views of all registered images whose picture is there."""
+    """The views of all registered images whose picture exists."""
     pictures = inside(root, images, "scene.images")
     views, missing = [], []
     for image in found.images.values():
@@ -149,7 +151,7 @@ def read_views(root: Path, images: str, folder: Path, found: Any, log: Log) -> l
 
 
 def read_camera(image: Any, file: Path, where: str) -> tuple[Camera, Lens | None]:
-    """The pinhole of an image, of the size of its picture, and its lens."""
+    """The pinhole camera of an image, at the size of its picture, and its lens."""
     of_image = image.camera
     if not of_image.focal_length_idxs():
         raise unexpected(where, "a camera model with a focal length", of_image.model_name)
@@ -177,7 +179,7 @@ def read_camera(image: Any, file: Path, where: str) -> tuple[Camera, Lens | None
 
 @dataclass(frozen=True)
 class ColmapLens:
-    """A lens of COLMAP's: `model` by name, with its `params`."""
+    """A lens of COLMAP, given by the name of its `model` and its `params`."""
 
     model: str
     params: tuple[float, ...]
@@ -198,7 +200,7 @@ class ColmapLens:
 
 
 def points_box(found: Any, folder: Path) -> Box:
-    """The box of the points of a model, but for the outermost."""
+    """The box of a model's points, without the share `STRAY` at either end of each axis."""
     if not found.num_points3D():
         raise unexpected(folder, "points, or scene.bounds=[[x,y,z],[x,y,z]]", "no point")
     box = found.compute_bounding_box(STRAY, 1 - STRAY)

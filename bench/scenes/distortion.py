@@ -1,7 +1,7 @@
-"""Lenses, and how a picture becomes that of a pinhole with the same intrinsics.
+"""Lenses, and how to undistort a picture to that of a pinhole with the same intrinsics.
 
-A lens takes points [N, 2] of a pinhole's image plane at distance 1, float64, to where it shows them
-in that plane. It is hashable.
+A lens is a function from points [N, 2] (float64) on a pinhole's image plane at distance 1 to where
+the lens shows them in that plane. It is hashable.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Lens = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class RadialTangential:
-    """OpenCV's lens with `coefficients` (k1, k2, p1, p2, k3), or with (k4, k5, k6) besides."""
+    """OpenCV's lens with `coefficients` (k1, k2, p1, p2, k3), optionally also (k4, k5, k6)."""
 
     coefficients: tuple[float, ...]
 
@@ -47,21 +47,21 @@ class Fisheye:
 
 
 def undistort(image: Tensor, camera: Camera, lens: Lens, where: Path) -> Tensor:
-    """The pinhole picture of `undistorted_camera`.
+    """Undistort `image` to the pinhole picture of `undistorted_camera`.
 
     Args:
         image: uint8 [H, W, C].
-        camera: intrinsics of the distorted picture; they stay those of the pinhole.
-        lens: that the picture was taken with.
+        camera: intrinsics of the distorted picture, which the pinhole keeps.
+        lens: the lens that the picture was taken with.
         where: the picture, for messages.
 
-    Raises SteerbenchError when the lens folds the picture over itself.
+    Raises SteerbenchError if the lens folds the picture over itself.
     """
     source, _, _ = _window(camera, lens, where)
     planes = image.permute(2, 0, 1)[None].float()
     alpha = planes[:, 3:] / 255
-    planes[:, :3] *= alpha if alpha.numel() else 1  # between pixels, colours weigh by their alpha
-    # kornia counts from the centre of the first pixel, we from its corner.
+    planes[:, :3] *= alpha if alpha.numel() else 1  # interpolate premultiplied colours
+    # kornia's origin is the centre of the first pixel, ours is its corner.
     u, v = (source - 0.5).unbind(-1)
     planes = remap(planes, u[None], v[None], align_corners=True)
     alpha = planes[:, 3:] / 255
@@ -70,14 +70,16 @@ def undistort(image: Tensor, camera: Camera, lens: Lens, where: Path) -> Tensor:
 
 
 def undistorted_camera(camera: Camera, lens: Lens, where: Path) -> Camera:
-    """The camera of the pinhole picture, cropped to a rectangle in which every pixel was seen: no
-    invented border. Arguments and errors are those of `undistort`."""
+    """The camera of the undistorted picture; arguments and errors are those of `undistort`.
+
+    It is cropped to a rectangle in which the lens saw every pixel, so that no border is invented.
+    """
     source, left, top = _window(camera, lens, where)
     return crop_camera(camera, left, top, source.shape[1], source.shape[0])
 
 
 def _window(camera: Camera, lens: Lens, where: Path) -> tuple[Tensor, int, int]:
-    """See `pinhole_window`."""
+    """`pinhole_window` of `camera`; an error names the picture."""
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     try:
         return pinhole_window(camera.width, camera.height, intrinsics, lens)
@@ -90,14 +92,14 @@ def _window(camera: Camera, lens: Lens, where: Path) -> tuple[Tensor, int, int]:
 def pinhole_window(
     width: int, height: int, intrinsics: tuple[float, float, float, float], lens: Lens
 ) -> tuple[Tensor, int, int]:
-    """Where the pinhole's pixels lie in the distorted picture, for those that lie inside.
+    """Positions in the distorted picture of those pinhole pixels that lie inside it.
 
-    Returns [h, w, 2] as (u, v), and the column and row of its first pixel.
+    Returns [h, w, 2] as (u, v), and the column and row of the first of these pixels.
     """
     focal, centre = torch.tensor(intrinsics, dtype=torch.float64).split(2)
     points = lens((pixel_grid(width, height).double() - centre) / focal)
     source = (points * focal + centre).reshape(height, width, 2).float()
-    if not (area_of_cells(source) > 0).all():  # nor is what is no number
+    if not (area_of_cells(source) > 0).all():  # also False for NaN
         raise ValueError("it folds the picture over itself")
     left, top, right, bottom = seen_rectangle(source)
     return source[top:bottom, left:right], left, top
@@ -110,14 +112,14 @@ def area_of_cells(source: Tensor) -> Tensor:
 
 
 def seen_rectangle(source: Tensor) -> tuple[int, int, int, int]:
-    """left, top, right, bottom of a rectangle of pixels that all lie in the distorted picture.
+    """(left, top, right, bottom) of a rectangle whose pixels all lie in the distorted picture.
 
-    Starts from the whole picture and takes off the side with the largest unseen share until
-    nothing unseen is left on the border.
+    Starts from the whole picture and removes the side with the largest unseen share until the
+    border has no unseen pixel.
     """
     height, width = source.shape[:2]
     limit = source.new_tensor((width, height)) - 0.5  # last pixel centre: bilinear needs no border
-    unseen = ~((source >= 0.5) & (source <= limit)).all(-1)  # what is no number, too
+    unseen = ~((source >= 0.5) & (source <= limit)).all(-1)  # True for NaN, too
     # A summed-area table: every side of every rectangle costs the same.
     table = pad(unseen.int(), (1, 0, 1, 0)).cumsum(0).cumsum(1).numpy()
 

@@ -1,6 +1,6 @@
-"""Reads the files of a data set: nothing outside its folder, and every error names its place.
+"""Reads the files of a data set: never outside its folder, and every error says where it occurred.
 
-A `where` is what an error message starts with: the file, and the field inside it.
+The argument `where` is the start of an error message: the file, and the field inside it.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from torch import Tensor
 from bench.types import SteerbenchError
 
 SMALLEST_ANGLE = 1e-9
-"""Smallest angle of view in radians: less than any telescope's, and its tangent is not 0."""
+"""Smallest angle of view in radians: below any telescope's, but its tangent is not 0."""
 
 ORTHONORMAL_TOLERANCE = 1e-3
-"""Largest entry of R^T R - I: poses are stored with three digits or more."""
+"""Largest entry of R^T R - I. Poses are stored with at least three digits."""
 
 
 def unexpected(where: str | Path, expected: str, got: object) -> SteerbenchError:
-    """The error that says what was expected at `where` and what came."""
+    """The error that says what was expected at `where` and what was found."""
     return SteerbenchError(f"{where}: expected {expected}, got {got}")
 
 
 def data_folder(path: str | Path) -> Path:
-    """The data set's folder with all links resolved; SteerbenchError when it is not one."""
+    """The data set's folder with all links resolved; SteerbenchError if it is not a folder."""
     root = Path(path).expanduser()
     if not root.is_dir():
         raise unexpected(root, "a folder", "a file" if root.exists() else "nothing there")
@@ -37,11 +37,11 @@ def data_folder(path: str | Path) -> Path:
 
 
 def inside(root: Path, relative: str, where: str | Path) -> Path:
-    """`root / relative`, refused when it lies outside `root` (.., an absolute path, a link)."""
+    """`root / relative`; raises if that is outside `root` (.., an absolute path, a link)."""
     try:
         path = (root / relative).resolve()
-        path.exists()  # refuses names that are too long
-    except (ValueError, RuntimeError, OSError) as error:  # a NUL, a circle of links, a long name
+        path.exists()  # raises for names that are too long
+    except (ValueError, RuntimeError, OSError) as error:  # a NUL, a cycle of links, a long name
         raise unexpected(where, "the name of a file", f"{relative!r} ({error})") from error
     if not path.is_relative_to(root):
         raise unexpected(where, f"a path inside {root}", repr(relative))
@@ -49,7 +49,7 @@ def inside(root: Path, relative: str, where: str | Path) -> Path:
 
 
 def read_text(root: Path, relative: str) -> str:
-    """The text of a file of the data set."""
+    """Read a text file of the data set."""
     path = inside(root, relative, root / relative)
     if not path.is_file():
         raise unexpected(path, "a file", "nothing there")
@@ -60,7 +60,7 @@ def read_text(root: Path, relative: str) -> str:
 
 
 def read_json(root: Path, relative: str) -> dict:
-    """The object in a JSON file of the data set."""
+    """Read a JSON file of the data set that holds an object."""
     path = root / relative
     try:
         value = json.loads(read_text(root, relative))
@@ -75,7 +75,7 @@ def read_json(root: Path, relative: str) -> dict:
 
 
 def frames_of(record: Mapping, path: Path) -> list[tuple[str, dict]]:
-    """The frames of a `transforms*.json`, not empty, each an object with a path after its place."""
+    """The frames of a `transforms*.json` as (position for messages, object); at least one."""
     frames = record.get("frames")
     if not isinstance(frames, list) or not frames:
         raise unexpected(f"{path}: frames", "a list with at least one frame", describe(frames))
@@ -91,7 +91,7 @@ def frames_of(record: Mapping, path: Path) -> list[tuple[str, dict]]:
 def number(value: object, where: str, low: float = -math.inf, high: float = math.inf) -> float:
     """A finite number with low < value < high."""
     if isinstance(value, int | float) and not isinstance(value, bool):
-        # Comparing before converting: an integer of hundreds of digits has no float.
+        # Compare before converting: an integer of hundreds of digits overflows a float.
         fits = low < value < high and abs(value) < sys.float_info.max
         if fits:
             return float(value)
@@ -106,14 +106,14 @@ def focal_length(angle: object, size: float, where: str) -> float:
 
 
 def whole_number(value: object, where: str, low: int) -> int:
-    """An integer from `low` on."""
+    """An integer, at least `low`."""
     if isinstance(value, int) and not isinstance(value, bool) and value >= low:
         return value
     raise unexpected(where, f"a whole number from {low} on", describe(value))
 
 
 def numbers(text: str, where: str | Path) -> list[list[float]]:
-    """The numbers of a text file, line by line, empty lines left out."""
+    """The numbers of a text, line by line, without empty lines."""
     try:
         return [
             [float(word) for word in line.split()] for line in text.splitlines() if line.split()
@@ -123,9 +123,9 @@ def numbers(text: str, where: str | Path) -> list[list[float]]:
 
 
 def rigid_pose(value: object, where: str) -> Tensor:
-    """A camera-to-world matrix from nested lists 4x4 (or 3x4): [3, 4] float64, checked.
+    """A camera-to-world matrix [3, 4] float64 from nested lists, 4x4 or 3x4.
 
-    The rotation must be orthonormal and right-handed, the last row (0, 0, 0, 1).
+    Raises unless the rotation is orthonormal and right-handed and the last row is (0, 0, 0, 1).
     """
     rows = value if isinstance(value, list) else []
     if len(rows) not in (3, 4) or any(not isinstance(r, list) or len(r) != 4 for r in rows):
@@ -144,18 +144,18 @@ def rigid_pose(value: object, where: str) -> Tensor:
 
 
 def opengl_pose(frame: Mapping, where: str) -> Tensor:
-    """The `transform_matrix` of a frame of a `transforms*.json`, as `rigid_pose`, OpenCV axes."""
+    """The pose in a frame of a `transforms*.json`, as from `rigid_pose` but with OpenCV axes."""
     matrix = rigid_pose(frame.get("transform_matrix"), f"{where}.transform_matrix")
     return opengl_to_opencv(matrix)
 
 
 def opengl_to_opencv(pose: Tensor) -> Tensor:
-    """Camera-to-world [3, 4] from OpenGL axes (y up, z backward) to OpenCV's (down, forward)."""
+    """Convert camera-to-world [3, 4] from OpenGL axes (y up, z back) to OpenCV (down, forward)."""
     return pose * pose.new_tensor((1, -1, -1, 1))
 
 
 def describe(value: object) -> str:
-    """A value as it stands in a message: short, and naming its type when it is a container."""
+    """Format a value for an error message: shortened; a container is described by its type."""
     if isinstance(value, list | dict):
         return f"{type(value).__name__} of {len(value)}"
     return "nothing" if value is None else repr(value)

@@ -1,4 +1,4 @@
-"""Training pictures held out of the training, to choose settings on."""
+"""Holds training pictures out of the training, to choose settings on them."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from bench.types import Scene, Split, SteerbenchError
 
 
 def hold_out(scene: Scene, split: str, every: int) -> Scene:
-    """`scene` without the middle one of every `every` training pictures, which are its `split`.
+    """Move the middle one of every `every` training pictures to a split called `split`.
 
-    Of a capture along a path, the first and the last picture stay in the training, so that what is
-    held out lies between pictures to learn from. A split that is called `split` already is
-    replaced. The digest is another, so that no training with these pictures is taken for one
-    without.
+    In a capture along a path, the first and last picture stay in the training, so that held-out
+    pictures lie between training pictures. An existing split of that name is replaced. The digest
+    changes, so that trainings with and without these pictures are not confused.
 
     Raises:
         SteerbenchError: there are fewer than `every` training pictures.
@@ -34,7 +33,7 @@ def hold_out(scene: Scene, split: str, every: int) -> Scene:
 
 
 def _taken(split: Split, indices: Sequence[int]) -> Split:
-    images = list(split.images)  # decoded together, which is faster than one after the other
+    images = list(split.images)  # decode all in parallel, which is faster than one by one
     return Split(
         [split.cameras[index] for index in indices],
         [images[index] for index in indices],

@@ -1,4 +1,4 @@
-"""Pictures of a data set: decoded when they are asked for, kept as 8-bit tensors."""
+"""Pictures of a data set, decoded on demand and kept as 8-bit tensors."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from bench.scenes.parallel import in_parallel
 from bench.types import Camera, Log
 
 MOST_PIXELS = 1 << 26
-"""Of a picture: decoded, converted and copied it takes 12 bytes a pixel, 0.8 GB. A header of a few
-bytes can announce more than any machine holds."""
+"""Upper limit for a picture. Decoding, converting and copying take 12 bytes per pixel: 0.8 GB. A
+header of a few bytes can announce more than any machine can hold."""
 
 
 @dataclass(frozen=True)
 class View:
-    """A picture that a data set describes: `camera` in the data set's units, OpenCV axes, float64,
-    because a scene may lie far from its data set's origin.
+    """A picture that a data set describes.
 
-    `lens` is None for a pinhole.
+    `camera` is in the data set's units, with OpenCV axes, in float64 because a scene may lie far
+    from the origin. `lens` is None for a pinhole.
     """
 
     name: str
@@ -42,8 +42,10 @@ class View:
 
 @dataclass(frozen=True)
 class Picture:
-    """A view at 1 / `downscale` of its resolution, of which no pixel was decoded yet: its pinhole
-    `camera`, and the hash of its file."""
+    """A view at 1 / `downscale` of its resolution, not decoded yet.
+
+    Has its pinhole `camera` and the hash of its file.
+    """
 
     view: View
     downscale: int
@@ -52,11 +54,12 @@ class Picture:
 
 
 class Pictures(Sequence[Tensor]):
-    """The pixels of what is `described`, uint8 [H, W, 3 or 4] each: decoded when they are first
-    asked for, and kept. Who iterates gets all of them, decoded in parallel.
+    """The pixels of the `described` pictures, uint8 [H, W, 3 or 4] each.
+
+    Decoded on first access and kept. Iteration decodes all of them in parallel.
 
     Raises:
-        SteerbenchError: a file is damaged, or another one than it was.
+        SteerbenchError: a file is damaged, or has changed since it was described.
     """
 
     def __init__(self, described: Sequence[Picture], log: Log) -> None:
@@ -77,17 +80,17 @@ class Pictures(Sequence[Tensor]):
         return iter(self[:])
 
     def _at(self, index: int) -> Tensor:
-        if index not in self._decoded:  # two threads may both decode it, to the same
+        if index not in self._decoded:  # two threads may both decode it, with equal results
             self._decoded[index] = decode(self.described[index])
         return self._decoded[index]
 
 
 @contextmanager
 def opened(source: Path | io.BytesIO, where: Path) -> Iterator[Image.Image]:
-    """The picture in `source`, of which nothing but the header was read yet.
+    """The picture in `source`, with only its header read.
 
     Raises:
-        SteerbenchError: it is none, or too large, or turns out to be damaged while it is used.
+        SteerbenchError: not a picture, too large, or found to be damaged while it is used.
     """
     try:
         with Image.open(source) as image:
@@ -100,21 +103,21 @@ def opened(source: Path | io.BytesIO, where: Path) -> Iterator[Image.Image]:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height in pixels, from the file's header alone."""
+    """Width and height in pixels, read from the file's header only."""
     with opened(path, path) as image:
         return image.size
 
 
 def describe_all(views: Sequence[View], downscale: int, log: Log) -> list[Picture]:
-    """What is known of every view before its pixels are; read in parallel, the order stays."""
+    """`describe` all views in parallel, in the given order."""
     return in_parallel(lambda view: describe(view, downscale), views, "read pictures", log)
 
 
 def describe(view: View, downscale: int) -> Picture:
-    """One view as a pinhole picture at 1 / downscale of its resolution.
+    """Describe a view as a pinhole picture at 1 / downscale of its resolution, without decoding it.
 
     Raises:
-        SteerbenchError: it is no picture, of another size, or too small.
+        SteerbenchError: not a picture, not of the expected size, or too small.
     """
     content, camera = contents(view.path), view.camera
     with opened(io.BytesIO(content), view.path) as image:
@@ -129,7 +132,7 @@ def describe(view: View, downscale: int) -> Picture:
 
 
 def decode(picture: Picture) -> Tensor:
-    """The pixels of a picture, as `Pictures` gives them."""
+    """Decode the pixels of a picture, as `Pictures` returns them."""
     view, content = picture.view, contents(picture.view.path)
     if hashlib.sha256(content).hexdigest() != picture.sha256:
         raise unexpected(view.path, "the picture that was there at the start", "another one")
@@ -148,7 +151,7 @@ def contents(path: Path) -> bytes:
 
 
 def decode_bytes(content: bytes, path: Path) -> Tensor:
-    """The 8-bit picture in `content` as uint8 [H, W, 3], or [H, W, 4] when it has an alpha."""
+    """Decode the 8-bit picture in `content` to uint8 [H, W, 3], or [H, W, 4] if it has alpha."""
     with opened(io.BytesIO(content), path) as image:
         check_mode(image, path)
         if image.mode == "P" and image.palette is None:
@@ -158,15 +161,15 @@ def decode_bytes(content: bytes, path: Path) -> Tensor:
 
 
 def check_mode(image: Image.Image, path: Path) -> None:
-    """Raise unless the picture has 8 bits a channel."""
+    """Raise unless the picture has 8 bits per channel."""
     if image.mode.startswith(("I", "F")):
         raise unexpected(path, "8 bits a channel", f"mode {image.mode}")
 
 
 def shrink(image: Tensor, factor: int) -> Tensor:
-    """Average blocks of `factor` x `factor` pixels; colours weigh by their alpha.
+    """Average blocks of `factor` x `factor` pixels; colours are weighted by alpha.
 
-    Columns and rows that do not fill a block, at the right and the bottom, are left out. Means are
+    Columns and rows at the right and bottom that do not fill a block are dropped. Means are
     rounded to the nearest 8-bit value.
     """
     if factor == 1:
@@ -185,10 +188,10 @@ def shrink(image: Tensor, factor: int) -> Tensor:
 
 
 def shrunk_camera(camera: Camera, factor: int, where: Path) -> Camera:
-    """The exact camera of what `shrink` leaves.
+    """The exact camera of a picture after `shrink`.
 
     Raises:
-        SteerbenchError: there is no whole block.
+        SteerbenchError: the picture is smaller than a block.
     """
     if factor == 1:
         return camera

@@ -14,13 +14,13 @@ from bench.types import Log
 
 @dataclass(frozen=True)
 class VerifyReport:
-    """The result of a check: files by their path in the release.
+    """The result of a check: lists of files by their path in the release.
 
     Attributes:
-        ok: there, with the official content.
-        wrong: there, with other content or not readable.
-        missing: on the list and not there.
-        extra: there and not on the list.
+        ok: present, with the official content.
+        wrong: present, but with other content or unreadable.
+        missing: on the list, but not present.
+        extra: present, but not on the list.
     """
 
     ok: Sequence[str]
@@ -30,7 +30,7 @@ class VerifyReport:
 
     @property
     def passed(self) -> bool:
-        """Whether no file differs; files that are missing were perhaps never copied."""
+        """Whether no file is wrong. Missing files do not count: perhaps they were never copied."""
         return bool(self.ok) and not self.wrong
 
     def __str__(self) -> str:
@@ -39,9 +39,9 @@ class VerifyReport:
 
 
 def verify(path: str | Path, log: Log) -> VerifyReport:
-    """Check the whole release, or one scene of it, as the names of the folders say.
+    """Check the whole release, or one scene of it; folder names tell which.
 
-    Raises SteerbenchError when `path` does not look like either.
+    Raises SteerbenchError if `path` looks like neither.
     """
     root = data_folder(path)
     base, expected = _expected(root)
@@ -62,7 +62,7 @@ def verify(path: str | Path, log: Log) -> VerifyReport:
 
 
 def _expected(root: Path) -> tuple[Path, Mapping[str, str]]:
-    """The folder that the paths of a list begin in, and the list."""
+    """The folder that the listed paths are relative to, and the list of hashes."""
     known = published()
     for data in known:
         if root.name in data.scenes:

@@ -24,15 +24,15 @@ class Ball:
 
 @dataclass(frozen=True)
 class Cloud:
-    """Balls whose densities add where they overlap; the colour there is the density-weighted mean.
+    """Balls whose densities add where they overlap; their colours are averaged, density-weighted.
 
-    Between two neighbouring crossings of sphere surfaces the density k (per unit of t) and the
-    colour c are constant, so with transmittance T at the start of a piece [a, b]
+    Between two consecutive crossings of sphere surfaces the density k (per unit of t) and the
+    colour c are constant. With transmittance T at the start of such a piece [a, b]
 
         opacity += T (1 - e^-x),    rgb += T (1 - e^-x) c,    x = k (b - a),
         depth   += T ((1 - e^-x) a + (1 - e^-x - x e^-x) / k),
 
-    the last being the integral of t k e^(-k (t - a)).
+    where the last line is the integral of t k e^(-k (t - a)).
     """
 
     balls: Sequence[Ball]
@@ -44,7 +44,7 @@ class Cloud:
         return centres + signs * torch.tensor([ball.radius for ball in self.balls])[:, None, None]
 
     def trace(self, band: Band, spans: Sequence[Span]) -> Traced:
-        """Integrate all balls in `spans` together, for the rays that meet one."""
+        """Integrate all balls in `spans` together, for the rays that hit any of them."""
         shape = (band.y.shape[0], *band.x.shape[1:])
         balls = [self.balls[number] for number, _, _ in spans]
         directions = band.directions(torch.eye(3, device=band.x.device), slice(None))
@@ -72,7 +72,7 @@ def integrate(
     """rgb [N, 3], opacity [N] and depth times opacity [N] of rays through B overlapping media.
 
     Args:
-        enter, leave: [B, N] interval of each medium along each ray; equal where it is missed.
+        enter, leave: [B, N] interval of each medium along each ray; equal where the ray misses it.
         speed: [N] length of a ray's direction.
         density, colour: [B] and [B, 3] of the media.
     """
@@ -85,7 +85,7 @@ def integrate(
     for piece in range(len(ends) - 1):
         k = k + step[order[piece]]
         glow = glow + emission[order[piece]]
-        # What is left of k outside all media is rounding: the thinnest medium is far above it.
+        # Outside all media k is only rounding error, far below the density of the thinnest medium.
         outside = ~(k > 1e-3 * density.min())
         rate = (k * speed).masked_fill(outside, 1)
         x = (rate * (ends[piece + 1] - ends[piece])).masked_fill(outside, 0)

@@ -1,8 +1,8 @@
-"""A heap of random solids, a different one for every variant: any number of scenes to train on.
+"""Heaps of random solids, one per variant number: an unlimited supply of training scenes.
 
-Big parts make a core; smaller ones and rods are put on their surfaces, half inside, so that parts
-touch, cross and hide one another. Everything follows from `random.Random(variant).random`, whose
-sequence Python promises never to change; its other methods may draw differently one day.
+Big parts form a core; smaller parts and rods are placed on its surface, half inside, so that parts
+touch, cross and occlude one another. All draws use `random.Random(variant).random`, whose sequence
+Python promises never to change; other methods of `Random` may change.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from bench.scenes.textures import Colour, Texture
 Item = TypeVar("Item")
 
 REACH = 1.2
-"""All parts lie in the ball of this radius: in the models' cube, and in every picture."""
+"""All parts lie in a ball of this radius, inside the models' cube and inside every picture."""
 
 CORE = 5
-"""The number of parts that the others are put on."""
+"""Number of core parts, on which the other parts are placed."""
 
 FINEST = 0.016
-"""Width of the finest stripes and dots: two pixels of a picture 400 wide."""
+"""Width of the finest stripes and dots: two pixels in a picture 400 pixels wide."""
 
 
 class Draw:
@@ -64,7 +64,7 @@ class Draw:
         return items[self.whole(0, len(items) - 1)]
 
     def deck(self, items: Sequence[Item], count: int) -> list[Item]:
-        """`count` of the items in random order; none is repeated before all were drawn."""
+        """Draw `count` items in random order; none repeats before all have been drawn."""
         drawn: list[Item] = []
         while len(drawn) < count:
             drawn += sorted(items, key=lambda _: self.share())
@@ -78,7 +78,7 @@ class Draw:
 
 
 def medley(variant: int) -> Solids:
-    """The heap of that number: a core of five bulky solids and 8 to 11 parts of any kind on it."""
+    """Heap number `variant`: a core of five bulky solids, with 8 to 11 parts of any kind on it."""
     draw = Draw(variant)
     more = draw.whole(8, 11)
     shapes = [
@@ -103,20 +103,20 @@ def medley(variant: int) -> Solids:
 
 
 def place(draw: Draw, shape: Shape, core: Sequence[Part]) -> Triple:
-    """Draw the centre of a part: the middle for the first one, else near the surface of the core.
+    """Draw the centre of a part: the origin for the first one, otherwise near the core's surface.
 
-    The core surrounds its first part; the others are on the outer side of a part of the core.
+    Core parts surround the first one; other parts go on the outer side of a core part.
     """
     if not core:
         return (0.0, 0.0, 0.0)
     ground = draw.one(core) if len(core) == CORE else core[0]
     outward = ground.centre
-    if len(core) in (2, 4):  # opposite to the one before
+    if len(core) in (2, 4):  # opposite to the previous part
         outward = scaled(core[-1].centre, -1)
     direction = draw.direction()
     if dot(direction, outward) < 0:
         direction = scaled(direction, -1)
-    # On an ellipsoid that every bulky shape holds, in the frame of the part, then in the model's.
+    # On an ellipsoid that fits inside every bulky shape; in the part's frame, then in the model's.
     axes = ground.frame.T.tolist()
     steps = (dot(axis, direction) * h for axis, h in zip(axes, ground.shape.extent(), strict=True))
     centre = ground.centre
@@ -157,14 +157,14 @@ def beam(draw: Draw, size: float) -> Shape:
 
 
 def bowl(draw: Draw, size: float) -> Shape:
-    """A ball with another one taken out of it."""
+    """A ball minus another ball."""
     size = 1.2 * size
     bite = ball(draw.between(0.75, 0.95) * size)
     return Carved(ball(size), [Shifted(bite, (0.0, 0.0, 0.5 * size))])
 
 
 def niches(draw: Draw, size: float) -> Shape:
-    """A box with hollows in four of its sides."""
+    """A box with niches in four of its sides."""
     bite = ball(draw.between(0.5, 0.75) * size)
     sides = [(size, 0.0, 0.0), (-size, 0.0, 0.0), (0.0, size, 0.0), (0.0, -size, 0.0)]
     body = Box((size, size, draw.between(0.5, 1.0) * size))
@@ -215,7 +215,7 @@ SHAPES: dict[str, Callable[[Draw, float], Shape]] = {
     "ring": ring,
     "window": window,
 }
-"""Makers of solids by kind; each takes the size, roughly half the width of its solid."""
+"""Functions that make a solid, by kind. Each takes a size, roughly half the width of the solid."""
 
 BULKY = ("ball", "egg", "block", "drum", "die", "barrel")
 FLAT, LONG = ("plate", "disc", "petal"), ("beam", "pill", "rod", "rod", "rod")
@@ -223,7 +223,7 @@ SMALLER = (*FLAT, *LONG, "bowl", "niches", "ring", "window", "ball", "block", "d
 
 
 def palette(draw: Draw) -> list[Colour]:
-    """Six, eight or ten colours of all hues, light and dark ones in turn."""
+    """Six, eight or ten colours of all hues, alternately light and dark."""
     start = draw.share()
     return [
         hsv_to_rgb(
@@ -236,7 +236,7 @@ def palette(draw: Draw) -> list[Colour]:
 
 
 def pair(draw: Draw, colours: list[Colour]) -> tuple[Colour, Colour]:
-    """A light one and a dark one, either first."""
+    """A light and a dark colour, in random order."""
     light, dark = draw.one(colours[::2]), draw.one(colours[1::2])
     return (light, dark) if draw.share() < 0.5 else (dark, light)
 
@@ -261,12 +261,12 @@ def dots(draw: Draw, colours: list[Colour], size: float) -> Texture:
 
 
 def stripe(draw: Draw, size: float) -> float:
-    """A random width of stripes on a part of that size, more often fine than coarse."""
+    """A random stripe width for a part of this size, more often fine than coarse."""
     return draw.small(FINEST, max(0.4 * size, 2 * FINEST))
 
 
 def around(size: float, width: float) -> int:
-    """How many pairs of stripes of `width` go around a part."""
+    """How many pairs of stripes of `width` fit around a part."""
     return max(round(math.pi * size / width), 2)
 
 
@@ -289,4 +289,4 @@ PAINTERS: tuple[Painter, ...] = (
     lambda draw, colours, size: textures.plain(draw.one(colours)),
     lambda draw, colours, size: textures.eye(draw.one(colours)),
 )
-"""Makers of textures from some of the colours, for a part of the given size."""
+"""Functions that make a texture from some of the colours, for a part of the given size."""

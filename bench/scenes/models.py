@@ -41,7 +41,7 @@ PINE, BARK = (0.76, 0.52, 0.28), (0.40, 0.23, 0.10)
 
 
 def totem() -> Solids:
-    """Stacked textured and glossy solids that hide one another; the demo."""
+    """Stacked textured and glossy solids that occlude one another; the scene of the demo."""
     return Solids([*pedestal(), *face(), *crown()])
 
 
@@ -114,7 +114,7 @@ def crown() -> list[Part]:
 
 
 def wires() -> Solids:
-    """Thin structures: a cage, a helix and a spoked wheel, 0.012 and 0.02 across."""
+    """Thin structures: a cage, a helix and a spoked wheel, 0.012 and 0.02 thick."""
     return Solids([*cage(), *helix(), *wheel()])
 
 
@@ -187,7 +187,7 @@ def cloud() -> Cloud:
 
 
 def void() -> Solids:
-    """Almost nothing: one small ball away from the middle."""
+    """Almost nothing: one small ball off the centre."""
     return Solids([Part(ball(0.06), plain(CORAL), (0.35, -0.2, 0.15), gloss=0.5)])
 
 

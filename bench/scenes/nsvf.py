@@ -1,4 +1,4 @@
-"""NSVF's layout, also used for Tanks & Temples: `bbox.txt intrinsics.txt pose/*.txt rgb/*`."""
+"""Loads NSVF's layout, also of Tanks & Temples: `bbox.txt intrinsics.txt pose/*.txt rgb/*`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from bench.scenes.images import View, image_size
 from bench.types import Camera, Log, Scene
 
 SPLITS = {"0": "train", "1": "val", "2": "test"}
-"""What the first character of a picture's name means."""
+"""The split of a picture, by the first character of its name."""
 
 PICTURE_NAME = re.compile(r"[012]_.*\.(png|jpg|jpeg)", re.IGNORECASE)
 
@@ -32,12 +32,12 @@ def load(path: str | Path, *, downscale: int = 1, background: str = "white", log
 
     Args:
         path: the folder with `bbox.txt`, `intrinsics.txt`, `pose/` and `rgb/`.
-        downscale, background: as of `bench.scenes.blender.load`.
+        downscale, background: see `bench.scenes.blender.load`.
 
-    Pictures are named 0_* (train), 1_* (val) and 2_* (test), poses alike; poses have OpenCV axes.
-    Without any 2_* the 1_* are the test split, as in Tanks & Temples. The box of `bbox.txt`, with a
-    margin of 5 % of its longest side, fills the unit cube.
-    Raises SteerbenchError naming file and field when anything is not as it should be.
+    Pictures and poses are named 0_* (train), 1_* (val) and 2_* (test); poses have OpenCV axes.
+    If there are no 2_*, the 1_* are the test split, as in Tanks & Temples. The box of `bbox.txt`,
+    with a margin of 5 % of its longest side, fills the unit cube.
+    Raises SteerbenchError, naming file and field, if the data are not as described.
     """
     root = data_folder(path)
     box = read_box(root)
@@ -63,7 +63,7 @@ def load(path: str | Path, *, downscale: int = 1, background: str = "white", log
 
 
 def read_box(root: Path) -> Box:
-    """The box of `bbox.txt`, x0 y0 z0 x1 y1 z1 and a voxel size that is not used, with a margin."""
+    """The box of `bbox.txt` (x0 y0 z0 x1 y1 z1 and an unused voxel size), with a margin."""
     path = root / "bbox.txt"
     values = [x for row in numbers(read_text(root, path.name), path) for x in row]
     if len(values) not in (6, 7):
@@ -78,7 +78,7 @@ def read_box(root: Path) -> Box:
 def read_intrinsics(root: Path) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy in pixels, from either form of `intrinsics.txt`.
 
-    A 4x4 or 3x3 matrix, or a first line "f cx cy 0" with other things below it.
+    The file holds a 4x4 or 3x3 matrix, or a first line "f cx cy 0" with other data below it.
     """
     path = root / "intrinsics.txt"
     rows = numbers(read_text(root, path.name), path)

@@ -17,7 +17,7 @@ LIGHT = (0.48, -0.6, 0.64)
 """Unit direction to the light."""
 
 LIFT = 1e-4
-"""A shadow ray starts this far above its surface, in the model's units."""
+"""Distance of a shadow ray's start above the surface, in the model's units."""
 
 SKY, GROUND, SUN = 0.52, 0.24, 0.62
 """Light from above, from below, and from the light's direction, as shares of a surface's colour."""
@@ -25,14 +25,14 @@ SKY, GROUND, SUN = 0.52, 0.24, 0.62
 
 @dataclass(frozen=True)
 class Part:
-    """A solid in its place.
+    """A solid placed in a model.
 
     Attributes:
-        shape: in its own frame.
-        texture: colour at points of that frame.
-        centre: of the frame, in the model's units.
-        turn: degrees about x, then y, then z.
-        gloss: height of the highlight, 0 for a matt surface.
+        shape: the solid, in its own frame.
+        texture: colour at points of this frame.
+        centre: origin of the frame, in the model's units.
+        turn: rotation in degrees about x, then y, then z.
+        gloss: strength of the highlight, 0 for a matt surface.
         sharpness: exponent of the highlight.
     """
 
@@ -73,7 +73,7 @@ class Solids:
         return torch.stack([part.box() for part in self.parts])
 
     def trace(self, band: Band, spans: Sequence[Span]) -> Traced:
-        """The nearest surface of all, shaded once it is known."""
+        """Find the nearest surface over all parts, then shade only that."""
         shape = (band.y.shape[0], *band.x.shape[1:])
         depth = band.x.new_full(shape, math.inf)
         owner = torch.full(shape, -1, dtype=torch.int16, device=depth.device)
@@ -98,13 +98,13 @@ class Solids:
         return Traced(rgb, seen.to(depth.dtype), depth.masked_fill_(~seen, 0))
 
     def shade(self, number: int, points: Tensor, directions: Tensor) -> Tensor:
-        """Colours [N, 3] of a part's `points` seen along `directions`: Lambert and Blinn-Phong."""
+        """Lambert and Blinn-Phong colours [N, 3] of a part's `points`, seen along `directions`."""
         part = self.parts[number]
         frame, light = part.frame.to(points), points.new_tensor(LIGHT)
         local = (points - points.new_tensor(part.centre)) @ frame
         normals = part.shape.normal(local) @ frame.T
         toward = -unit(directions)
-        # The side of the surface that is looked at is the one that is lit.
+        # The normal points to the viewer's side of the surface.
         facing = (normals * toward).sum(1, keepdim=True)
         normals = torch.where(facing < 0, -normals, normals)
         height = 0.5 + 0.5 * normals[:, 2:]
@@ -132,10 +132,10 @@ class Solids:
         return dark
 
     def casters(self, number: int, points: Tensor) -> list[int]:
-        """The parts that may stand between these points of part `number` and the light.
+        """The parts that may lie between these points of part `number` and the light.
 
-        Seen from the light, their box overlaps that of the points and reaches nearer. A convex
-        part does not shadow itself: its dark side faces away from the light.
+        Seen from the light, their box overlaps the box of the points and reaches nearer. A convex
+        part is skipped for itself: it casts no shadow on its own lit side.
         """
         if not len(points):
             return []

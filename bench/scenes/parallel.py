@@ -1,4 +1,4 @@
-"""Runs a function on many items, on all cores."""
+"""Applies a function to many items, on all cores."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 WORKERS = min(os.cpu_count() or 1, 8)
-"""Threads at work; beyond eight they would wait for Python's lock more than they compute."""
+"""Number of threads; more than eight would mostly wait for Python's GIL."""
 
 
 def in_parallel(
     work: Callable[[Item], Result], items: Sequence[Item], label: str, log: Log
 ) -> list[Result]:
-    """[work(item) for item in items] under a progress bar; the first fault ends it."""
+    """[work(item) for item in items], in parallel with a progress bar; the first error stops it."""
     with (
         torch_threads(1),
         log.progress(label, len(items)) as bar,
@@ -32,6 +32,6 @@ def in_parallel(
             for future in futures:
                 results.append(future.result())
                 bar.advance()
-        finally:  # after a fault, what still waits is not begun
+        finally:  # after an error, waiting items are not started
             pool.shutdown(wait=False, cancel_futures=True)
     return results

@@ -1,4 +1,4 @@
-"""Published data sets: where they can be had, and the SHA-256 of each of their files."""
+"""Published data sets: where to download them, and the SHA-256 of each file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bench.types import Log
 
 HERE = Path(__file__).parent
 GROUND_TRUTH = ("_depth_", "_normal_")
-"""In the names of pictures that no scene is read from: an archive may lack them."""
+"""Marks in the names of pictures that no loader reads; an archive may lack these pictures."""
 
 
 @dataclass(frozen=True)
@@ -26,10 +26,10 @@ class Published:
     """A data set, as `published.toml` describes it.
 
     Attributes:
-        archive: the address of a zip file with the folder of one `{scene}`; or
-        folder: the address below which each file lies.
-        layout: the choice of `scene=` that reads its scenes.
-        licence: under which it may be used.
+        archive: URL of a zip file with the folder of one `{scene}`; or
+        folder: URL of the folder with all files.
+        layout: the value of `scene=` that reads its scenes.
+        licence: the licence of the data.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Published:
 
     @cached_property
     def hashes(self) -> Mapping[str, str]:
-        """The SHA-256 of each file by its path, which begins with the name of its scene."""
+        """SHA-256 of each file, by its path, which starts with the scene's name."""
         text = (HERE / f"{self.name}.sha256.txt").read_text()
         lines = (line.split(maxsplit=1) for line in text.splitlines())
         return {name: digest for digest, name in lines}
@@ -51,18 +51,18 @@ class Published:
         return {name.split("/")[0] for name in self.hashes}
 
     def of(self, scene: str) -> dict[str, str]:
-        """The part of `hashes` that is of one scene."""
+        """The part of `hashes` that belongs to `scene`."""
         return {name: d for name, d in self.hashes.items() if name.split("/")[0] == scene}
 
 
 def published() -> list[Published]:
-    """All that are known."""
+    """All known published data sets."""
     content = tomllib.loads((HERE / "published.toml").read_text(encoding="utf-8"))
     return [Published(name, **about) for name, about in content.items()]
 
 
 def sha256(path: Path) -> str | None:
-    """SHA-256 of a file's content; None when it cannot be read."""
+    """SHA-256 of a file's content; None if it cannot be read."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -71,11 +71,12 @@ def sha256(path: Path) -> str | None:
 
 
 def get(data: Published, scene: str, folder: Path, log: Log) -> Path:
-    """Download a scene of `data` into `folder` / `scene`. Files that are there and right are kept,
-    and what an interrupted call got is used.
+    """Download a scene of `data` into `folder` / `scene`.
+
+    Correct existing files are kept, and an interrupted download is resumed.
 
     Raises:
-        Unavailable: no answer, an answer that breaks off, or files of another content.
+        Unavailable: no answer, the connection breaks off, or files have other content.
         OSError: `folder` cannot be written to.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -90,13 +91,13 @@ def get(data: Published, scene: str, folder: Path, log: Log) -> Path:
             archive = fetch(data.archive.format(scene=scene), folder / f"{scene}.zip", None, log)
             try:
                 _unpack(archive, wanted, folder)
-            finally:  # it is not needed any more, or not what it should be
+            finally:  # no longer needed, or damaged
                 archive.unlink()
     return folder / scene
 
 
 def _unpack(archive: Path, wanted: Mapping[str, str], folder: Path) -> None:
-    """Move the files on the list, if they are right, from the zip file into `folder`."""
+    """Extract the `wanted` files, if they are correct, from the zip file into `folder`."""
     with tempfile.TemporaryDirectory(dir=folder) as new:
         try:
             with zipfile.ZipFile(archive) as file:
@@ -115,7 +116,7 @@ def _unpack(archive: Path, wanted: Mapping[str, str], folder: Path) -> None:
 
 
 def _wrong(folder: Path, wanted: Mapping[str, str]) -> list[str]:
-    """The files on the list that are needed and missing, or there and not right."""
+    """The `wanted` files that are present but differ, or missing although a loader needs them."""
     return [name for name, digest in wanted.items() if _differs(folder / name, digest)]
 
 

@@ -1,7 +1,7 @@
-"""Exact pictures of analytic models: every sub-pixel ray is solved in closed form.
+"""Renders exact pictures of analytic models: every sub-pixel ray is solved in closed form.
 
-A picture is rendered in bands of rows; a part of a model is traced only in the columns that its
-bounding box can cover in a band.
+A picture is rendered in bands of rows. In each band, a part of a model is traced only in the
+columns that its bounding box can cover.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from bench.cameras import project
 from bench.types import EMPTY_ALPHA, Camera, Frame, SteerbenchError
 
 BAND_RAYS = 1 << 18
-"""Rays of a band: enough to hide the cost of a call, few enough to stay in the cache."""
+"""Rays per band: enough to hide the cost of calls, few enough to stay in the cache."""
 
 Span = tuple[int, int, int]
-"""A part's number, the first column it can cover in a band, and one past the last."""
+"""A part's number, the first column that it can cover in a band, and one past the last."""
 
 
 @dataclass(frozen=True)
 class Band:
-    """The rays of some rows of a picture, [rows, W, S]: a pencil from `origin` [3].
+    """The rays of some rows of a picture, [rows, W, S], all from `origin` [3].
 
-    The direction at image-plane coordinates x [1, W, S] and y [rows, 1, S] is rotation (x, y, 1).
+    The direction at image-plane coordinates x [1, W, S], y [rows, 1, S] is `rotation` @ (x, y, 1).
     """
 
     origin: Tensor
@@ -37,7 +37,7 @@ class Band:
     y: Tensor
 
     def directions(self, frame: Tensor, columns: slice) -> tuple[Tensor, Tensor, Tensor]:
-        """Components of the directions of some columns along the columns of `frame` [3, 3]."""
+        """Directions of the rays in `columns`, as components along the axes of `frame` [3, 3]."""
         matrix = (frame.T @ self.rotation).tolist()
         x = self.x[:, columns]
         across, down, ahead = ([row[i] for row in matrix] for i in range(3))
@@ -47,7 +47,7 @@ class Band:
 
 @dataclass(frozen=True)
 class Traced:
-    """What rays [rows, W, S] see: `rgb` (times opacity), `alpha`, and `depth` (times opacity)."""
+    """What rays [rows, W, S] see: `rgb` (premultiplied), `alpha`, `depth` (premultiplied)."""
 
     rgb: Tensor
     alpha: Tensor
@@ -55,21 +55,21 @@ class Traced:
 
 
 class Model(Protocol):
-    """Something with parts that a band of rays can be traced through."""
+    """A model made of parts, through which a band of rays can be traced."""
 
     def boxes(self) -> Tensor:
         """Corners of a box around each part, [P, 8, 3]."""
 
     def trace(self, band: Band, spans: Sequence[Span]) -> Traced:
-        """What the rays see of the parts in `spans`; outside its span a part is not seen."""
+        """What the rays see of the parts in `spans`; a part is never seen outside its span."""
 
 
 def render(model: Model, camera: Camera, background: Tensor, samples: int) -> Frame:
-    """The picture of `model`, averaged over `samples` rays a pixel, a power of two.
+    """Render `model`, averaged over `samples` rays per pixel (a power of two).
 
-    `camera` is in the model's units and `background` [3] is what the rays that see nothing show.
-    Of a pixel's rays, alpha is the mean opacity, depth the mean z-depth weighted by opacity
-    (+inf where alpha is below EMPTY_ALPHA), and rgb the mean colour. One sample is the centre's.
+    `camera` is in the model's units; rays that hit nothing show `background` [3]. Over the rays of
+    a pixel, alpha is the mean opacity, depth the mean z-depth weighted by opacity (+inf where alpha
+    is below EMPTY_ALPHA), and rgb the mean colour. A single sample is at the centre.
     """
     device, width, height = camera.c2w.device, camera.width, camera.height
     offsets = sample_offsets(samples).to(device)
@@ -96,7 +96,7 @@ def render(model: Model, camera: Camera, background: Tensor, samples: int) -> Fr
 
 
 def sample_offsets(samples: int) -> Tensor:
-    """[samples, 2] places in a pixel, Hammersley's: no two share a row or a column of the pixel."""
+    """Hammersley points [samples, 2] in a pixel, one in each of `samples` rows and columns."""
     if samples < 1 or samples & (samples - 1):
         raise SteerbenchError(f"samples: expected a power of two, got {samples}")
     bits = samples.bit_length() - 1
@@ -115,19 +115,19 @@ class ProjectedBoxes:
         self.in_front = (depth.reshape(-1, 8) > 0).all(1)
         self.behind = (depth.reshape(-1, 8) <= 0).all(1)
         pairs = torch.combinations(torch.arange(8, device=boxes.device))
-        # A convex outline lies in the hull of the segments between all pairs of its corners.
+        # The outline of a convex box lies in the hull of the segments between pairs of corners.
         corners = pixels.reshape(-1, 8, 2)
         self.start, self.end = corners[:, pairs[:, 0]], corners[:, pairs[:, 1]]  # [P, 28, 2]
 
     def spans(self, top: int, bottom: int) -> list[Span]:
-        """The parts that may show in rows top <= row < bottom, each with its columns.
+        """The parts that may be visible in rows top <= row < bottom, each with its columns.
 
-        A part that reaches behind the camera may show anywhere, one that lies behind it nowhere.
+        A part that reaches behind the camera may be visible anywhere; one behind it is not visible.
         """
         (u0, v0), (u1, v1) = self.start.unbind(-1), self.end.unbind(-1)
         flat = v0 == v1
         rise = (v1 - v0).masked_fill(flat, 1)
-        # The shares of each segment between the rows, with one pixel of room for rounding.
+        # The range of each segment between the rows, with one pixel of margin for rounding.
         low = ((top - 1 - v0) / rise).clamp(0, 1).masked_fill(flat, 0)
         high = ((bottom + 1 - v0) / rise).clamp(0, 1).masked_fill(flat, 1)
         meets = (torch.minimum(v0, v1) <= bottom + 1) & (torch.maximum(v0, v1) >= top - 1)

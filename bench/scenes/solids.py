@@ -1,9 +1,9 @@
 """Shapes whose intersection with a ray has a closed form.
 
-Every shape is centred, in its own frame. Rays come as components, three origins and three
-directions that broadcast: a camera has one origin (three floats) and many directions, a light at
-infinity one direction and many origins. Positions along a ray are its parameter t; where a ray
-misses, t is +inf. Points are [N, 3].
+Every shape is centred in its own frame. Rays are given by components: three for the origin and
+three for the direction, which broadcast. A camera has one origin (three floats) and many
+directions; a light at infinity has one direction and many origins. Positions along a ray are its
+parameter t, +inf where the ray misses. Points are [N, 3].
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ class Shape(Protocol):
     """A solid."""
 
     def extent(self) -> Triple:
-        """Half sizes of a box around the shape."""
+        """Half sizes of a bounding box of the shape."""
 
     def hit(self, origin: Origin, directions: Directions) -> Tensor:
-        """The first crossing of the surface at t > 0, +inf where there is none."""
+        """The first crossing of the surface at t > 0; +inf if there is none."""
 
     def distance(self, points: Tensor) -> Tensor:
-        """[N]: 0 on the surface, negative inside; near the surface about the distance to it."""
+        """[N] signed distance, negative inside; only approximate away from the surface."""
 
     def normal(self, points: Tensor) -> Tensor:
         """[N, 3]: outward unit normals at points of the surface."""
 
 
 class Convex(Shape, Protocol):
-    """A shape that a ray crosses in one interval."""
+    """A convex shape: its intersection with a ray is one interval."""
 
     def interval(self, origin: Origin, directions: Directions) -> Interval:
-        """Where rays enter and leave: enter > leave where they miss."""
+        """Where rays enter and leave; enter > leave if they miss."""
 
     def hit(self, origin: Origin, directions: Directions) -> Tensor:
         enter, leave = self.interval(origin, directions)
@@ -60,7 +60,7 @@ class Ellipsoid(Convex):
         return self.radii
 
     def interval(self, origin: Origin, directions: Directions) -> Interval:
-        """Computed in the space where the ellipsoid is the unit sphere."""
+        """As `Convex.interval`, computed in the space where the ellipsoid is the unit sphere."""
         o = [x / r for x, r in zip(origin, self.radii, strict=True)]
         d = [x / r for x, r in zip(directions, self.radii, strict=True)]
         return ball_interval(o, d, 1.0)
@@ -140,7 +140,7 @@ class Capsule(Convex):
         return (self.radius, self.radius, self.half + self.radius)
 
     def interval(self, origin: Origin, directions: Directions) -> Interval:
-        """The union of an open cylinder and two balls: convex, so the outermost ends."""
+        """The outermost ends of an open cylinder and two balls, because their union is convex."""
         wall = ball_interval(origin[:2], directions[:2], self.radius)
         enter, leave = overlap(wall, slab(origin[2], directions[2], self.half))
         missed = enter > leave
@@ -164,13 +164,13 @@ class Capsule(Convex):
 
 @dataclass(frozen=True)
 class Shifted(Convex):
-    """A convex shape moved by `offset`: an operand of `Carved` or `Common`."""
+    """A convex shape moved by `offset`, as an operand of `Carved` or `Common`."""
 
     shape: Convex
     offset: Triple
 
     def extent(self) -> Triple:
-        """Half sizes of a centred box that holds the moved shape."""
+        """Half sizes of a centred box that contains the moved shape."""
         x, y, z = (abs(o) + e for o, e in zip(self.offset, self.shape.extent(), strict=True))
         return x, y, z
 
@@ -211,7 +211,7 @@ class Common(Convex):
 
 @dataclass(frozen=True)
 class Carved(Shape):
-    """A convex `body` with the convex `bites` taken out of it."""
+    """A convex `body` minus the convex `bites`."""
 
     body: Convex
     bites: Sequence[Convex]
@@ -220,10 +220,10 @@ class Carved(Shape):
         return self.body.extent()
 
     def hit(self, origin: Origin, directions: Directions) -> Tensor:
-        """The nearest end of any operand's interval that is a surface of the difference.
+        """The nearest end of any operand's interval that lies on the surface of the difference.
 
-        An end of the body counts outside all bites; an end of a bite counts inside the body and
-        outside the other bites.
+        An end of the body's interval lies on it if it is outside all bites; an end of a bite's
+        interval, if it is inside the body and outside the other bites.
         """
         operands = [self.body, *self.bites]
         intervals = [operand.interval(origin, directions) for operand in operands]
@@ -244,7 +244,7 @@ class Carved(Shape):
         return torch.maximum(self.body.distance(points), bites.amax(0))
 
     def normal(self, points: Tensor) -> Tensor:
-        """The normal of the operand whose surface a point lies on; of a bite, into the bite."""
+        """The normal of the operand whose surface a point lies on; for a bite, pointing into it."""
         nearest = self.body.distance(points).abs()
         normal = self.body.normal(points)
         for bite in self.bites:
@@ -257,8 +257,8 @@ class Carved(Shape):
 def ball_interval(origin: Sequence, directions: Sequence[Tensor], radius: float) -> Interval:
     """Where rays are within `radius` of 0, in as many dimensions as there are components.
 
-    Measured from the ray's point nearest to 0: the textbook's b^2 - 4 a c loses a thin wire seen
-    from afar to rounding. A direction of length 0 stays at the origin for ever.
+    Computed from the ray's nearest point to 0: with the textbook's b^2 - 4 a c, rounding loses a
+    thin wire seen from afar. With a direction of length 0, all of the ray is its origin.
     """
     a = sum_of_products(directions, directions).clamp_(min=1e-30)
     middle = -sum_of_products(origin, directions) / a
@@ -276,14 +276,14 @@ def overlap(first: Interval, second: Interval) -> Interval:
 
 def slab(origin: float | Tensor, direction: Tensor, half: float) -> Interval:
     """Where rays are within `half` of 0 along one axis."""
-    # A ray along the slab never leaves it or never enters: a tiny slope says so without 0 / 0.
+    # A ray parallel to the slab never leaves or never enters it; a tiny slope avoids 0 / 0.
     slope = torch.where(direction.abs() < 1e-12, torch.full_like(direction, 1e-12), direction)
     low, high = (-half - origin) / slope, (half - origin) / slope
     return torch.minimum(low, high), torch.maximum(low, high)
 
 
 def sum_of_products(first: Sequence, second: Sequence) -> Tensor:
-    """Dot product by components."""
+    """Dot product of vectors given as components."""
     return sum((a * b for a, b in zip(first[1:], second[1:], strict=True)), first[0] * second[0])
 
 

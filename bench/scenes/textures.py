@@ -1,4 +1,4 @@
-"""Procedural colours: functions of a point in a part's own frame, [N, 3] -> [N, 3] in [0, 1]."""
+"""Procedural textures: from points in a part's own frame to colours, [N, 3] -> [N, 3] in [0, 1]."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Settings = ParamSpec("Settings")
 
 
 def texture(paint: Callable[Concatenate[Tensor, Settings], Tensor]) -> Callable[Settings, Texture]:
-    """Turn a function of points and settings into one that makes a texture from the settings."""
+    """Turn a function of points and settings into one that takes settings and returns a texture."""
 
     def make(*settings: Settings.args, **named: Settings.kwargs) -> Texture:
         return wraps(paint)(lambda points: paint(points, *settings, **named))
@@ -66,7 +66,7 @@ def chevrons(points: Tensor, first: Colour, second: Colour, period: float, slope
 
 @texture
 def pips(points: Tensor, ground: Colour, dot: Colour, spacing: float, radius: float) -> Tensor:
-    """Dots on a lattice; on a face of a box, round ones."""
+    """Dots on a lattice, round on the faces of a box."""
     cell = (points / spacing).round() * spacing
     return pick((points - cell).norm(dim=1) < radius, dot, ground)
 
@@ -82,7 +82,7 @@ def eye(points: Tensor, iris: Colour) -> Tensor:
 
 @texture
 def marble(points: Tensor, ground: Colour, vein: Colour, scale: float) -> Tensor:
-    """Veins: a sine along x, bent by noise."""
+    """Veins: a sine along x, distorted by noise."""
     bend = noise(points * scale) + 0.5 * noise(points * (2.1 * scale))
     wave = torch.sin((points[:, 0] + 0.6 * points[:, 2]) * 2 * scale + 5 * bend).abs()
     return mix(wave.clamp(max=0.55) / 0.55, vein, ground)
@@ -90,7 +90,7 @@ def marble(points: Tensor, ground: Colour, vein: Colour, scale: float) -> Tensor
 
 @texture
 def wood(points: Tensor, light: Colour, dark: Colour, rings: float) -> Tensor:
-    """Year rings around an axis along x that runs outside the part, bent by noise."""
+    """Growth rings around an axis along x outside the part, distorted by noise."""
     _, y, z = points.unbind(1)
     radius = torch.hypot(y + 0.7, 2 * z + 0.4) + 0.08 * noise(points * 3)
     phase = radius * rings
@@ -99,17 +99,17 @@ def wood(points: Tensor, light: Colour, dark: Colour, rings: float) -> Tensor:
 
 @texture
 def mottled(points: Tensor, first: Colour, second: Colour, scale: float) -> Tensor:
-    """Two octaves of noise between two colours."""
+    """Two octaves of noise that blend two colours."""
     share = 0.65 * noise(points * scale) + 0.35 * noise(points * (4.3 * scale))
     return mix(share, first, second)
 
 
 def noise(points: Tensor) -> Tensor:
-    """[N] in [0, 1]: random values at whole coordinates, smooth between, period 32."""
+    """[N] in [0, 1]: random values at integer coordinates, smooth in between, with period 32."""
     table = lattice().to(points.device, points.dtype)
     cell = points.floor()
     part = points - cell
-    # Trilinear at a place that slows down towards the cell's borders: no creases there.
+    # Trilinear at smoothstep coordinates, which avoids creases at the borders of cells.
     place = (cell + part * part * (3 - 2 * part)) / (table.shape[-1] - 1)
     place = (place - place.floor()) * 2 - 1  # [-1, 1] spans the table from first to last vertex
     values = torch.nn.functional.grid_sample(
@@ -120,7 +120,7 @@ def noise(points: Tensor) -> Tensor:
 
 @cache
 def lattice() -> Tensor:
-    """[33, 33, 33] random values whose last planes repeat the first."""
+    """[33, 33, 33] random values; the last planes repeat the first ones."""
     values = torch.rand(32, 32, 32, generator=torch.Generator().manual_seed(1))
     return torch.nn.functional.pad(values[None, None], (0, 1) * 3, mode="circular")[0, 0]
 
@@ -132,6 +132,6 @@ def pick(condition: Tensor, first: Colour, second: Colour) -> Tensor:
 
 
 def mix(share: Tensor, first: Colour, second: Colour) -> Tensor:
-    """From `first` at share 0 to `second` at share 1: [N, 3]."""
+    """Blend from `first` at share 0 to `second` at share 1: [N, 3]."""
     start, end = share.new_tensor(first), share.new_tensor(second)
     return start + share[:, None] * (end - start)

@@ -1,4 +1,4 @@
-"""A hand-held capture: the `transforms.json` of instant-ngp and nerfstudio."""
+"""Loads a hand-held capture: the `transforms.json` of instant-ngp and nerfstudio."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from bench.types import Camera, Log, Scene
 CAMERA_FILE = "transforms.json"
 
 NGP_SCALE, NGP_OFFSET = 0.33, (0.5, 0.5, 0.5)
-"""instant-ngp's unit cube holds scale * x + offset of the file's coordinates x."""
+"""instant-ngp maps the file's coordinates x to scale * x + offset in its unit cube."""
 
 USUAL = ("k1", "k2", "p1", "p2", "k3")
 LENSES: Mapping[str, tuple[type[RadialTangential | Fisheye], tuple[str, ...]]] = {
@@ -42,7 +42,7 @@ LENSES: Mapping[str, tuple[type[RadialTangential | Fisheye], tuple[str, ...]]] =
 """The lens of a `camera_model`, and the names of its coefficients."""
 
 OTHER_TERMS = ("k3", "k4", "k5", "k6", "p1", "p2", "ftheta_p0", "rolling_shutter")
-"""What would bend a picture, too, and is refused where a lens does not have it."""
+"""Further distortion terms; a file is rejected if it has one that its lens does not support."""
 
 
 def load(
@@ -58,15 +58,15 @@ def load(
 
     Args:
         path: the folder with `transforms.json`.
-        split_every: in the order of their names, pictures 0, split_every, 2 * split_every ... are
-            the test split and all others the training.
-        aabb_scale: the side of our unit cube in sides of instant-ngp's, x * 0.33 + 0.5; by default
-            what the file says, or 1. The `scale` and `offset` of the file are used, if any.
-        downscale, background: as of `bench.scenes.blender.load`.
+        split_every: pictures 0, split_every, 2 * split_every ..., in the order of their names, are
+            the test split, and all others the training split.
+        aabb_scale: side of our unit cube relative to that of instant-ngp, x * 0.33 + 0.5; by
+            default the value in the file, or 1. `scale` and `offset` in the file replace 0.33, 0.5.
+        downscale, background: see `bench.scenes.blender.load`.
 
-    Intrinsics of a frame go before those of the file. Lens distortion is undone, and pictures are
-    cropped to what the lens saw. Frames without a picture are logged and left out.
-    Raises SteerbenchError naming file and field when anything is not as it should be.
+    Intrinsics of a frame take precedence over those of the file. Lens distortion is undone, and
+    pictures are cropped to what the lens saw. Frames without a picture are logged and left out.
+    Raises SteerbenchError, naming file and field, if the data are not as described.
     """
     root = data_folder(path)
     record, path = read_json(root, CAMERA_FILE), root / CAMERA_FILE
@@ -77,7 +77,7 @@ def load(
 
 
 def read_views(root: Path, record: dict, log: Log) -> list[View]:
-    """The views of all frames whose picture is there."""
+    """The views of all frames whose picture exists."""
     path = root / CAMERA_FILE
     views, missing = [], []
     for where, frame in frames_of(record, path):
@@ -94,10 +94,10 @@ def read_views(root: Path, record: dict, log: Log) -> list[View]:
 
 
 def read_camera(settings: ChainMap, pose: torch.Tensor, file: Path, where: str) -> Camera:
-    """The pinhole of a frame; a size that is missing is read from the picture's header.
+    """The pinhole camera of a frame; a missing size is read from the picture's header.
 
-    Focal lengths come from fl_x and fl_y or from camera_angle_x and camera_angle_y; the vertical
-    one is the horizontal when missing, and the principal point the middle.
+    Focal lengths come from fl_x and fl_y or from camera_angle_x and camera_angle_y. A missing
+    vertical one equals the horizontal one; a missing principal point is the centre.
     """
     size = dict(zip(("w", "h"), image_size(file), strict=True))
     width, height = (number(settings.get(k, size[k]), f"{where}.{k}", 0) for k in ("w", "h"))
@@ -111,9 +111,9 @@ def read_camera(settings: ChainMap, pose: torch.Tensor, file: Path, where: str) 
 
 
 def focal(settings: ChainMap, axis: str, size: float, where: str) -> float | None:
-    """Focal length in pixels along an axis of `size` pixels; None when there is none.
+    """Focal length in pixels along an axis of `size` pixels; None if not given.
 
-    A frame's angle of view goes before the file's focal length: they mean the same thing.
+    A frame's angle of view takes precedence over the file's focal length: both mean the same.
     """
     length, angle = f"fl_{axis}", f"camera_angle_{axis}"
     for level in settings.maps:
@@ -125,11 +125,11 @@ def focal(settings: ChainMap, axis: str, size: float, where: str) -> float | Non
 
 
 def read_lens(settings: Mapping, where: str) -> Lens | None:
-    """The lens of a frame, None for a pinhole. `is_fisheye`, of instant-ngp, means OPENCV_FISHEYE.
+    """The lens of a frame; None for a pinhole. instant-ngp's `is_fisheye` means OPENCV_FISHEYE.
 
     Raises:
-        SteerbenchError: the model is none of `LENSES`, or the lens has a further term. By k4 of
-            the model OPENCV nerfstudio and OpenCV mean different things.
+        SteerbenchError: the model is not in `LENSES`, or the file has a term that it does not
+            support. k4 of the model OPENCV means different things in nerfstudio and OpenCV.
     """
     model = settings.get("camera_model", "OPENCV")
     if settings.get("is_fisheye"):
@@ -145,7 +145,7 @@ def read_lens(settings: Mapping, where: str) -> Lens | None:
 
 
 def capture_box(path: Path, record: dict, aabb_scale: float | None) -> Box:
-    """The cube around instant-ngp's unit cube, `aabb_scale` times as large, in the file's units."""
+    """The cube `aabb_scale` times as large as instant-ngp's unit cube, in the file's units."""
     scale = number(record.get("scale", NGP_SCALE), f"{path}: scale", 0)
     offset = record.get("offset", list(NGP_OFFSET))
     if not isinstance(offset, list) or len(offset) != 3:

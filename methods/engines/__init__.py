@@ -1,7 +1,7 @@
-"""Engines: they compute the trained network of a 2D renderer, each at its precisions.
+"""Engines run the trained network of a 2D renderer, each at the precisions that it supports.
 
-An engine turns a network, and inputs of it from real frames, into a function of the same tensors.
-Kernels, reprojection and the field do not pass through an engine.
+An engine turns a network, and sample inputs from real frames, into a function on the same tensors.
+Kernels, reprojection and the field do not use an engine.
 """
 
 from __future__ import annotations
@@ -28,31 +28,31 @@ from methods.engines.network import Network as Network
 Precision = Literal["fp32", "bf16", "fp16", "int8"]
 
 Calibration = Literal["frames", "none"]
-"""What gives the ranges of 8-bit activations: real frames, or nothing (`fixed_ranges`)."""
+"""Source of the ranges of 8-bit activations: real frames, or none (see `fixed_ranges`)."""
 
 Inputs = tuple[Tensor, ...]
 
 Samples = Callable[[], Sequence[Inputs]]
-"""Gives the inputs of a network in several frames. Called only if something is built from them."""
+"""Returns the inputs of a network in several frames. Called only if a build needs them."""
 
 Folder = Callable[[], Path]
-"""Gives a folder of one network and engine alone. Called only if something is kept there."""
+"""Returns a folder reserved for one network and engine. Called only if a build stores something."""
 
 CALIBRATION = 16
-"""Frames whose inputs give the range of every number that is rounded to 8 bits, and the sizes of
-varying axes to expect."""
+"""Number of frames whose inputs determine the ranges of all 8-bit numbers, and the sizes of varying
+axes to expect."""
 
 SIZES = "steerbench_sizes"
-"""Key, in a stored model, of the sizes of varying axes to prepare."""
+"""Metadata key in a stored model for the sizes of varying axes to prepare."""
 
 
 @dataclass(frozen=True)
 class Built:
-    """A network as an engine runs it.
+    """A network built by an engine.
 
     Attributes:
-        run: as the network. What it returns may be overwritten by the next call.
-        size: bytes of its weights in a file at its precision.
+        run: called like the network. The next call may overwrite the returned tensors.
+        size: bytes of the weights in a file at this precision.
     """
 
     run: Callable[..., Inputs]
@@ -64,15 +64,15 @@ class Engine(ABC):
 
     Args:
         precision: one of `precisions`.
-        calibration: of int8; no other precision depends on it.
+        calibration: for int8 only; other precisions do not depend on it.
 
     Attributes:
-        uncalibrated: whether it is int8 without calibration.
-        name: as it stands in rows.
-        precisions: those it has.
-        libraries: distributions that it loads when it is made.
-        prepares_sizes: whether it prepares, before a frame is rendered, for the sizes of varying
-            axes that it has seen.
+        uncalibrated: whether this is int8 without calibration.
+        name: as shown in rows.
+        precisions: the supported precisions.
+        libraries: distributions that the constructor loads.
+        prepares_sizes: whether it prepares for the sizes of varying axes seen in the samples,
+            before any frame is rendered.
 
     Raises:
         Unavailable: the engine does not have this precision, or cannot be used here.
@@ -93,7 +93,7 @@ class Engine(ABC):
         self.uncalibrated = precision == "int8" and calibration == "none"
 
     def check(self, device: torch.device) -> None:
-        """Raise `Unavailable` unless the engine computes at this precision on `device`."""
+        """Raise `Unavailable` unless the engine can compute at this precision on `device`."""
         if device.type != "cpu":
             raise Unavailable(
                 f"engine={self.name} computes on the CPU, this is device={device}: use "
@@ -101,22 +101,22 @@ class Engine(ABC):
             )
 
     def computed(self, device: torch.device) -> str:
-        """The precision that products really have on `device`, as it stands in rows.
+        """The precision that products really have on `device`, as shown in rows.
 
-        With int8 a second part, after `+`, is the precision of everything that is not quantised.
+        For int8, a second part after `+` is the precision of everything that is not quantised.
         """
         if self.precision != "int8":
             return self.precision
         return "int8 uncalibrated+fp32" if self.uncalibrated else "int8+fp32"
 
     def samples(self, network: Network) -> int:
-        """Number of frames whose inputs `build` needs. Of one frame it reads the shapes alone."""
+        """Number of frames whose inputs `build` needs. If it is 1, only their shapes are read."""
         calibrated = self.precision == "int8" and not self.uncalibrated
         several = calibrated or (self.prepares_sizes and any(network.varying))
         return CALIBRATION if several else 1
 
     def key(self) -> dict[str, object]:
-        """Everything that the built network depends on, beside the network and its inputs."""
+        """Everything that the built network depends on, besides the network and its inputs."""
         kind = type(self)
         return {
             "engine": self.name,
@@ -128,21 +128,21 @@ class Engine(ABC):
 
     @abstractmethod
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
-        """Make `network` run, or load what an earlier build of the same kept.
+        """Build `network`, or load an earlier build of it.
 
         Args:
             network: on the device where it will run.
-            samples: of `self.samples(network)` frames.
-            folder: for what is built.
-            log: for progress, and where a built network was found.
+            samples: inputs of `self.samples(network)` frames.
+            folder: where builds are stored.
+            log: shows progress, and where an earlier build was found.
         """
 
 
 def keep(path: Path, write: Callable[[Path], None], log: Log) -> None:
-    """Have `write` make the file `path`, unless it exists: whole or not at all, by one process.
+    """Let `write` create the file `path` unless it exists: atomically, and in one process only.
 
-    `write` gets a path of the same name in a temporary folder. Of what it leaves there, the files
-    that differ from `path` in their suffix are kept, too.
+    `write` gets a path with the same name in a temporary folder. Files that it leaves there which
+    differ from `path` only in their suffix are kept, too.
 
     Raises:
         SteerbenchError: the folder of `path` cannot be written to.
@@ -159,14 +159,14 @@ def keep(path: Path, write: Callable[[Path], None], log: Log) -> None:
 
 
 def readable(network: Network) -> Network:
-    """A copy of `network` in plain torch, which the converters of engines can follow."""
+    """A copy of `network` in plain torch, which converters of engines can trace."""
     copy = deepcopy(network)
     copy.backend = "reference"
     return copy
 
 
 def sizes_to_expect(samples: Sequence[Inputs], network: Network) -> list[int]:
-    """The sizes of varying axes in `samples`, those between, and one quantum beyond either end."""
+    """Sizes of varying axes to prepare: the range in `samples`, plus one quantum at each end."""
     seen = {
         x.shape[axis]
         for inputs in samples

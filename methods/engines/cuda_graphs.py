@@ -1,7 +1,7 @@
-"""CUDA graphs: a network's kernel launches, recorded once for each size of inputs and replayed.
+"""CUDA graphs: a network's kernel launches, recorded once per input size and then replayed.
 
 In plain torch the lean network is some two hundred small operations, which the CPU launches one
-after the other. A graph is launched at once.
+by one. A graph needs a single launch.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from torch import Tensor
 from methods.engines import Inputs
 
 WARM_UP = 3
-"""Runs before the recording, in which libraries choose algorithms and take their workspace."""
+"""Runs before recording, in which libraries choose algorithms and allocate workspace."""
 
 
 class Replayed:
-    """`run`, recorded for every size of its inputs when that size first comes.
+    """Replays `run`; it is recorded for every input size when that size first occurs.
 
-    The next call, of whatever size, overwrites the outputs: all recordings share memory.
+    The next call, of any size, overwrites the outputs, because all recordings share memory.
 
     Args:
         run: computes on a CUDA GPU, without waiting for it.
-        record: turns a function without arguments into one that replays it, and its outputs, which
-            every replay computes again.
+        record: turns a function without arguments into a function that replays it, and the output
+            tensors, which every replay overwrites.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class Replayed:
 
     def __call__(self, *inputs: Tensor) -> Inputs:
         if not all(x.numel() for x in inputs):
-            return self._run(*inputs)  # launches nothing, and CUDA records no empty graph
+            return self._run(*inputs)  # launches nothing, and CUDA cannot record an empty graph
         with torch.cuda.device_of(inputs[0]):
             recording = self._recording(inputs)
             for held, x in zip(recording.inputs, inputs, strict=True):
@@ -62,14 +62,14 @@ class _Recording(NamedTuple):
 
 
 class _Recorder:
-    """Records graphs, all with one pool of memory: no two of them are replayed at a time."""
+    """Records graphs that share one memory pool, because no two are replayed at the same time."""
 
     def __init__(self) -> None:
         self._stream: torch.cuda.Stream | None = None
         self._pool = torch.cuda.graph_pool_handle()
 
     def __call__(self, run: Callable[[], Inputs]) -> tuple[Callable[[], Any], Inputs]:
-        stream = self._stream = self._stream or torch.cuda.Stream()  # of the device of the first
+        stream = self._stream = self._stream or torch.cuda.Stream()  # on the first call's device
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):
             for _ in range(WARM_UP):

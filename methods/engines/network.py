@@ -1,4 +1,7 @@
-"""A network as engines run it. Apart from them: what is trained does not depend on any engine."""
+"""The interface of a network that engines can run.
+
+A module of its own, so that trainings do not depend on any engine.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,13 @@ from torch import Tensor, nn
 
 
 class Network(nn.Module, ABC):
-    """A network that engines can run: tensors to a tuple of tensors.
+    """A network that engines can run: it maps tensors to a tuple of tensors.
 
     Attributes:
-        varying: of each input, the axes whose size, the same for all of them, differs from frame to
-            frame.
-        quantum: that size is a multiple of this while frames are rendered.
-        backend: of its kernels; engines read "reference", which is plain torch.
+        varying: for each input, the axes whose size differs from frame to frame; all of them have
+            the same size.
+        quantum: this size is a multiple of `quantum` while frames are rendered.
+        backend: backend of its kernels; engines convert it with "reference", which is plain torch.
     """
 
     varying: tuple[tuple[int, ...], ...]
@@ -23,4 +26,4 @@ class Network(nn.Module, ABC):
 
     @abstractmethod
     def products(self, *inputs: Tensor) -> int:
-        """Multiplications by weights that `inputs` take."""
+        """Number of multiplications by weights for `inputs`."""

@@ -1,4 +1,4 @@
-"""A network as an ONNX model, for the engines that read one: exported, and quantised to 8 bits."""
+"""Exports a network as an ONNX model, for engines that read one, and quantises it to 8 bits."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from methods.engines.fixed_ranges import largest
 OPSET = 17
 
 PRODUCTS = ("Conv", "Gemm", "MatMul")
-"""Operators that are quantised. Sums and activations in 8 bits cost quality and save nothing."""
+"""Operators to quantise. Sums and activations in 8 bits would cost quality and save nothing."""
 
 
 def kept(
@@ -41,16 +41,16 @@ def kept(
     log: Log,
     options: Mapping[str, Any] | None = None,
 ) -> Path:
-    """The path of `network` in `folder` as a model, which is made if it is missing.
+    """The path of the ONNX model of `network` in `folder`; the model is made if it is missing.
 
     Args:
-        network: to be exported.
-        samples: of one frame, or of those to calibrate on.
-        folder: of this network and engine alone.
+        network: the network to export.
+        samples: inputs of one frame, or of the frames to calibrate on.
+        folder: reserved for this network and engine.
         engine: its precision is that of the model: fp32; fp16, with inputs and outputs in float32;
-            or int8, with what is not quantised in float32, on `fixed_ranges` if it is uncalibrated.
-        log: of what is found or made.
-        options: further ones of ONNX Runtime's quantiser.
+            or int8, with the rest in float32, and with `fixed_ranges` if uncalibrated.
+        log: shows what is found or made.
+        options: further options of ONNX Runtime's quantiser.
 
     Raises:
         SteerbenchError: the folder cannot be written to.
@@ -86,7 +86,7 @@ def output_names(count: int) -> list[str]:
 
 
 def sizes(path: Path) -> list[int]:
-    """The sizes of varying axes to expect, noted in a model when it was made."""
+    """The sizes of varying axes to expect, as stored in the model's metadata."""
     import onnx
 
     noted = {entry.key: entry.value for entry in onnx.load(path).metadata_props}
@@ -126,7 +126,7 @@ def _export(module: nn.Module, network: Network, sample: Inputs, path: Path) -> 
     varying = dict(zip(names, map(list, network.varying), strict=True))
     with torch.no_grad(), warnings.catch_warnings():
         outputs = len(module(*sample))
-        warnings.simplefilter("ignore")  # the exporter warns about itself
+        warnings.simplefilter("ignore")  # the exporter's own deprecations
         torch.onnx.export(
             module,
             sample,
@@ -146,9 +146,9 @@ def _prepare(exported: Path, prepared: Path) -> None:
 
 
 def _uncalibrated(prepared: Path) -> dict[str, Any]:
-    """Options of the quantiser for `fixed_ranges`, whatever numbers the samples have.
+    """Options of the quantiser that set `fixed_ranges`, whatever the samples contain.
 
-    What is padded with zeros keeps its range.
+    A tensor padded with zeros keeps its range.
     """
     import onnx
 
@@ -176,7 +176,7 @@ def _quantise(
     path: Path,
     options: Mapping[str, Any],
 ) -> None:
-    """Write the model `prepared` to `path` with 8-bit products, calibrated on `samples`."""
+    """Quantise the products of the model `prepared` to 8 bits, calibrated on `samples`."""
     from onnxruntime import quantization
 
     arrays = [[x.numpy() for x in inputs] for inputs in samples]

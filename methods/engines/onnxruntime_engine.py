@@ -1,4 +1,4 @@
-"""ONNX Runtime as an engine: fp32, and 8-bit integers by its own static quantisation."""
+"""ONNX Runtime as an engine: fp32, and int8 by its own static quantisation."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from methods.engines import (
 
 
 class OnnxRuntime(Engine):
-    """ONNX Runtime on the CPU. With int8, what is not quantised is computed in float32.
+    """ONNX Runtime on the CPU. With int8, everything not quantised is computed in float32.
 
     Raises:
-        Unavailable: it, or onnx, is not installed.
+        Unavailable: ONNX Runtime or onnx is not installed.
     """
 
     name = "onnxruntime"

@@ -1,4 +1,4 @@
-"""OpenVINO as an engine: fp32, bfloat16, and 8-bit integers by NNCF."""
+"""OpenVINO as an engine: fp32, bfloat16, and int8 by NNCF."""
 
 from __future__ import annotations
 
@@ -34,23 +34,24 @@ from methods.engines import (
 )
 from methods.engines.fixed_ranges import largest
 
-# Keeps OpenVINO and NNCF from reporting their use to anybody: both work without this package.
+# Disables the telemetry of OpenVINO and NNCF; both work without this package.
 sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
 
 Varying = tuple[tuple[int, ...], ...]
 
 NO_PRODUCTS = ("Add", "Multiply", "MaxPool")
-"""Operators whose inputs NNCF would round, too, which `fixed_ranges` do not."""
+"""Operators whose inputs NNCF would also round, unlike `fixed_ranges`."""
 
 
 class OpenVino(Engine):
     """OpenVINO on the CPU.
 
-    With int8, what is not quantised is computed in bfloat16 if the CPU has it, else in float32.
+    With int8, everything not quantised is computed in bfloat16 if the CPU has it, otherwise in
+    float32.
 
     Raises:
-        Unavailable: it, or for int8 NNCF, is not installed; or this CPU has no bfloat16, and
-            OpenVINO would compute in float32 without saying so.
+        Unavailable: OpenVINO, or NNCF for int8, is not installed; or bfloat16 is wanted and this
+            CPU lacks it, so that OpenVINO would silently compute in float32.
     """
 
     name = "openvino"
@@ -99,7 +100,7 @@ class OpenVino(Engine):
             for x, axes in zip(samples[0], network.varying, strict=True)
         ]
         with torch.no_grad(), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about the tracer itself and checks of arguments
+            warnings.simplefilter("ignore")  # from the tracer, and about argument checks
             model = self._openvino.convert_model(
                 readable(network), example_input=samples[0], input=shapes
             )
@@ -122,7 +123,7 @@ class OpenVino(Engine):
 
 
 def _uncalibrated(nncf: Any) -> dict[str, Any]:
-    """Options with which NNCF rounds the inputs of products alone, and corrects no bias."""
+    """Options that make NNCF round only the inputs of products, without bias correction."""
     return {
         "ignored_scope": nncf.IgnoredScope(types=list(NO_PRODUCTS), validate=False),
         "advanced_parameters": nncf.AdvancedQuantizationParameters(disable_bias_correction=True),
@@ -130,7 +131,7 @@ def _uncalibrated(nncf: Any) -> dict[str, Any]:
 
 
 def _fix_ranges(model: Any) -> None:
-    """Put `fixed_ranges` in the place of those on which `model` rounds activations."""
+    """Replace the ranges on which `model` rounds activations by `fixed_ranges`."""
     from openvino import opset13
 
     for op in model.get_ops():
@@ -139,7 +140,7 @@ def _fix_ranges(model: Any) -> None:
         maker = op.input_value(0).get_node().get_type_name()
         most = largest(None if maker == "Parameter" else maker)
         bounds = (np.float32(-most * 128 / 127), np.float32(most))
-        for place, bound in enumerate(2 * bounds, start=1):  # of what goes in, of what comes out
+        for place, bound in enumerate(2 * bounds, start=1):  # ranges of input and output
             op.input(place).replace_source_output(opset13.constant(bound).output(0))
 
 
@@ -148,9 +149,9 @@ def _capabilities(openvino: Any) -> list[str]:
 
 
 class _Compiled:
-    """A model, compiled for every size of its inputs when it first comes.
+    """A model, compiled for every input size when that size first occurs.
 
-    Compiled for a fixed size it is a third faster than for any size.
+    Compiled for a fixed size, it is a third faster than for dynamic sizes.
     """
 
     def __init__(self, openvino: Any, model: Any, varying: Varying, *, half: bool) -> None:
@@ -163,7 +164,7 @@ class _Compiled:
         }
 
     def prepare(self, size: int) -> None:
-        """Compile for varying axes of `size`, and do the work of the first call."""
+        """Compile for varying axes of `size`, and do the one-time work of the first call."""
         inputs = []
         for port, axes in zip(self._model.inputs, self._varying, strict=True):
             shape = [

@@ -1,6 +1,6 @@
-"""TensorRT as an engine: fp32, fp16, and 8-bit integers quantised by ONNX Runtime.
+"""TensorRT as an engine: fp32, fp16, and int8 quantised by ONNX Runtime.
 
-TensorRT 11 computes in the types that a model has (strong typing), so the ONNX model has them:
+TensorRT 11 computes in the types of the model (strong typing), so the ONNX model contains them:
 fp16 by casting the network, int8 by pairs of QuantizeLinear and DequantizeLinear. TensorRT requires
 that these are symmetric and leave the bias in float32
 (https://docs.nvidia.com/deeplearning/tensorrt, "Explicit Quantization").
@@ -37,9 +37,9 @@ QUANTISED = {"ActivationSymmetric": True, "QuantizeBias": False}
 class TensorRt(Engine):
     """TensorRT on a CUDA GPU.
 
-    It builds plans. A plan serves one GPU, one version and up to so many cells: a power of two.
-    Plans for the sizes to expect are built beforehand, others when such a view comes. With int8,
-    what is not quantised is computed in float32.
+    It builds plans. A plan is valid for one GPU model, one version, and up to a number of cells,
+    which is a power of two. Plans for expected sizes are built beforehand, others on demand. With
+    int8, everything not quantised is computed in float32.
 
     Raises:
         Unavailable: there is no CUDA GPU, or TensorRT, onnx or ONNX Runtime is not installed.
@@ -80,9 +80,9 @@ class TensorRt(Engine):
 
 
 class _Plans:
-    """A model, built for up to 2^n cells for every n when it first comes.
+    """The plans of a model: for every n, one for up to 2^n cells, built when it is first needed.
 
-    `exact`: what is in float32 is computed so, and not in TF32.
+    `exact`: compute float32 in float32, not in TF32.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class _Plans:
         self._executions: dict[int, _Execution] = {}
 
     def prepare(self, sizes: Sequence[int]) -> None:
-        """Build the plans for these numbers of cells; for a network of fixed size, its one plan."""
+        """Build the plans for these numbers of cells; a network of fixed size has one plan."""
         ceilings = sorted({_ceiling(size) for size in sizes or [1]})
         with self._log.progress("building for TensorRT", len(ceilings)) as progress:
             for ceiling in ceilings:
@@ -120,7 +120,7 @@ class _Plans:
         return self._executions[ceiling]
 
     def _build(self, ceiling: int, path: Path) -> None:
-        """Write the plan for 1 to `ceiling` cells, fastest at `ceiling`."""
+        """Write the plan for 1 to `ceiling` cells, optimised for `ceiling`."""
         trt = self._tensorrt
         builder = trt.Builder(self._logger)
         typed = 1 << int(trt.NetworkDefinitionCreationFlag.STRONGLY_TYPED)
@@ -135,7 +135,7 @@ class _Plans:
         for tensor in map(network.get_input, range(network.num_inputs)):
             shapes = (
                 [size if axis == -1 else axis for axis in tensor.shape]
-                for size in (1, ceiling, ceiling)  # the least, the usual, the most
+                for size in (1, ceiling, ceiling)  # minimum, optimum, maximum
             )
             profile.set_shape(tensor.name, *shapes)
         config.add_optimization_profile(profile)
@@ -149,7 +149,7 @@ class _Plans:
 
 
 class _Execution:
-    """A plan on a stream of its own: on torch's default stream TensorRT waits for the device."""
+    """A plan run on its own stream: on torch's default stream TensorRT would synchronise."""
 
     def __init__(self, tensorrt: Any, path: Path, logger: Any, inputs: Sequence[str]) -> None:
         engine = tensorrt.Runtime(logger).deserialize_cuda_engine(path.read_bytes())
@@ -188,5 +188,5 @@ def _refused(inputs: Inputs) -> SteerbenchError:
 
 
 def _ceiling(size: int) -> int:
-    """The least power of two that is not less than `size`, 1 or more."""
+    """The smallest power of two that is at least `size`; at least 1."""
     return 1 << (size - 1).bit_length()

@@ -1,4 +1,4 @@
-"""torch as an engine: the network as trained, or in half precision; on a GPU as CUDA graphs."""
+"""torch as an engine: the network as trained or in half precision, on a GPU with CUDA graphs."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 
 class TorchEngine(Engine):
-    """The network itself; below fp32, its products and convolutions in half precision.
+    """Runs the network itself; below fp32, products and convolutions are in half precision.
 
-    A device without products of bfloat16 multiplies numbers that were rounded to bfloat16 in
-    float32: rows then say `bf16 in fp32`.
+    A device without bfloat16 products multiplies numbers rounded to bfloat16 in float32; rows then
+    say `bf16 in fp32`.
     """
 
     name = "torch"
@@ -47,7 +47,7 @@ class TorchEngine(Engine):
         return "bf16 in fp32" if emulated else super().computed(device)
 
     def samples(self, network: Network) -> int:
-        """See `Engine.samples`: none on a CPU, which runs the network as it is."""
+        """See `Engine.samples`: none on a CPU, which runs the network directly."""
         return 0 if _on_cpu(network) else super().samples(network)
 
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
@@ -63,7 +63,7 @@ class TorchEngine(Engine):
 
 
 def _recorded(run: Callable[..., Inputs], network: Network, samples: Samples, log: Log) -> Replayed:
-    """`run` as CUDA graphs, recorded for the sizes to expect."""
+    """`run` as CUDA graphs, recorded beforehand for the expected sizes."""
     replayed, seen = Replayed(run), samples()
     sizes = sizes_to_expect(seen, network) or [1]  # a network of fixed size has one graph
     with torch.no_grad(), log.progress("recording CUDA graphs", len(sizes)) as progress:
@@ -74,7 +74,7 @@ def _recorded(run: Callable[..., Inputs], network: Network, samples: Samples, lo
 
 
 def _arithmetic(device: torch.device, dtype: torch.dtype) -> AbstractContextManager[object]:
-    """Products in `dtype`. On a GPU, float32 convolutions would otherwise be computed in TF32."""
+    """Context for products in `dtype`. On a GPU it keeps float32 convolutions from using TF32."""
     if dtype != torch.float32:
         return torch.autocast(device.type, dtype)
     if device.type == "cuda":

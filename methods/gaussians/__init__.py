@@ -1,1 +1,1 @@
-"""3D Gaussian Splatting (Kerbl et al. 2023), of a fixed number (Kheradmand et al. 2024)."""
+"""3D Gaussian Splatting (Kerbl et al. 2023), with a fixed count (Kheradmand et al. 2024)."""

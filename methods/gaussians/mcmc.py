@@ -1,7 +1,7 @@
 """Densification as sampling (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte
 Carlo").
 
-The number of Gaussians is fixed. Those that have faded move to where others are, and noise lets the
+The number of Gaussians is fixed. Those that have faded are relocated to others, and noise lets the
 faint ones explore.
 """
 
@@ -16,10 +16,10 @@ from methods.gaussians.model import Gaussians
 from methods.kernels.gaussian_projection import covariances
 
 DEAD = 0.005
-"""Opacity below which a Gaussian is moved."""
+"""A Gaussian whose opacity is at most this is dead, and is relocated."""
 
 MOST_COPIES = 51
-"""Most Gaussians at one place after a move; of the release."""
+"""Maximum number of Gaussians in one place after a relocation, as in the release."""
 
 STEEPNESS, FAINT = 100.0, 0.005
 """Noise falls off around the opacity `FAINT` as a sigmoid of this steepness (their Eq. 10)."""
@@ -29,10 +29,10 @@ STEEPNESS, FAINT = 100.0, 0.005
 def relocate(
     gaussians: Gaussians, optimiser: torch.optim.Optimizer, generator: torch.Generator
 ) -> int:
-    """Move dead Gaussians to living ones, drawn in proportion to opacity; the number that moved.
+    """Move dead Gaussians to living ones, drawn in proportion to opacity; return how many moved.
 
-    A living one and the copies made of it get opacities and scales with which they look together as
-    it did alone (their Eq. 9). Moments of what was changed are set to 0.
+    A living one and its copies get opacities and scales such that together they look as it did
+    alone (their Eq. 9). The optimiser's moments of all Gaussians that changed are set to 0.
     """
     opacities = gaussians.opacities
     dead = (opacities <= DEAD).nonzero().squeeze(1)
@@ -55,8 +55,8 @@ def relocate(
 
 
 def shared_between(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
-    """Opacity of each of `copies` [N] Gaussians in place of one of `opacities` [N], and the factor
-    of its scales (Eq. 9).
+    """Opacity of each of `copies` [N] Gaussians that replace one of `opacities` [N], and the factor
+    on its scales (Eq. 9).
 
     1 - (1 - o_new)^n = o, and the factor keeps the integral of the opacity along a ray through the
     centre.
@@ -74,7 +74,7 @@ def shared_between(opacities: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def disturb(gaussians: Gaussians, amount: float, generator: torch.Generator) -> None:
-    """Move the means by noise of the shape of each Gaussian, the more the fainter it is (Eq. 8)."""
+    """Add noise to the means, in the shape of each Gaussian, and more the fainter it is (Eq. 8)."""
     means = gaussians.means
     faintness = torch.sigmoid(STEEPNESS * (FAINT - gaussians.opacities))
     noise = torch.randn(means.shape, generator=generator, device=means.device)

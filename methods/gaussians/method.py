@@ -29,19 +29,19 @@ from methods.training import loop
 
 
 class GaussianSplatting:
-    """3D Gaussians, whose number is a setting. A training leaves them as a PLY file, too.
+    """3D Gaussians, whose number is a setting. A training also writes them to a PLY file.
 
     Args:
-        grid, training, precision: of the field that they start from; shared with every method that
-            trains it in the same way.
+        grid, training, precision: of the field that they start from; all methods with the same
+            options share it.
         count: number of Gaussians.
-        degree: of the spherical harmonics of a colour, 0 to 3.
+        degree: degree of the spherical harmonics of a colour, 0 to 3.
         start: "field": on the surfaces of a trained Instant-NGP field; "scratch": anywhere.
-        fitting: how they learn, in `budget.renderer_steps` steps.
+        fitting: how they are trained, for `budget.renderer_steps` steps.
         checkpoint: a PLY file to show instead of training, in the coordinates of the data set.
-        stored: "fp32", or "int8": rounded after the training, means to 16 bits and all else to 8.
+        stored: "fp32", or "int8": rounded after training, means to 16 bits, everything else to 8.
         stop: transmittance at which a pixel ends, less than 1.
-        name: as it stands in result rows.
+        name: as shown in result rows.
     """
 
     memory = 0
@@ -85,7 +85,7 @@ class GaussianSplatting:
         self.train_s = 0.0
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
-        """Train field and Gaussians, or load what the same trainings, or others, left behind."""
+        """Train field and Gaussians, load what was trained before, or read the `checkpoint`."""
         if self.reads:
             gaussians = ply.read(self.reads[0], scene).to(self.setup.device)
         else:
@@ -115,7 +115,7 @@ class GaussianSplatting:
         return gaussians
 
     def _untrained(self, field: TrainedField | None, scene: Scene, blank: bool) -> Gaussians:
-        """What the training begins with; with `blank`, only of the same shape."""
+        """The Gaussians before training; with `blank`, placeholders of the same shape."""
         setup = self.setup
         generator = torch.Generator(setup.device).manual_seed(setup.seed)
         if blank:
@@ -131,7 +131,7 @@ class GaussianSplatting:
         return Gaussians.at(points, colours, scales, self.fitting.opacity, self.degree)
 
     def _key(self, scene: Scene, budget: Budget) -> dict[str, object]:
-        """Everything the Gaussians depend on, beside the field that they start from."""
+        """Everything the Gaussians depend on, besides the field that they start from."""
         return {
             "scene": scene.digest,
             "steps": budget.renderer_steps,
@@ -150,7 +150,7 @@ class GaussianSplatting:
 
     @torch.no_grad()
     def render(self, camera: Camera, probe: Probe) -> Frame:
-        """One frame at the camera's full resolution."""
+        """Render one frame at the camera's full resolution."""
         camera = place_camera(camera, self.setup.device)
         pixels = self.gaussians.render(camera, self.stop, probe, self.setup.backend)
         with probe.stage("finish"):

@@ -27,7 +27,7 @@ class Gaussians(nn.Module):
         rotations: [N, 4] quaternions (w, x, y, z), not normalised.
         logits: [N] logits of the opacity at the centre.
         base: [N, 1, 3] coefficients of the first spherical harmonic.
-        view: [N, C - 1, 3] of the others, in the order of `methods.kernels.spherical`.
+        view: [N, C - 1, 3] those of the others, in the order of `methods.kernels.spherical`.
     """
 
     def __init__(
@@ -51,8 +51,8 @@ class Gaussians(nn.Module):
     def at(
         cls, points: Tensor, colours: Tensor, scales: Tensor, opacity: float, degree: int
     ) -> Gaussians:
-        """Round ones of `colours` [N, 3] at `points` [N, 3], with standard deviations `scales` [N];
-        the same from all sides."""
+        """Make round Gaussians at `points` [N, 3], with standard deviations `scales` [N] and
+        `colours` [N, 3] that are the same from all sides."""
         count = len(points)
         return cls(
             points.clone(),
@@ -72,10 +72,10 @@ class Gaussians(nn.Module):
         return self.logits.sigmoid()
 
     def render(self, camera: Camera, stop: float, probe: Probe, backend: str = "auto") -> Pixels:
-        """The pixels of `camera`, row by row, not composited on a background.
+        """Render the pixels of `camera`, row by row, not composited on a background.
 
-        Differentiable in all parameters, but for the change of a colour with the direction in which
-        the mean is seen.
+        Differentiable in all parameters, except for the change of a colour with the direction in
+        which the mean is seen.
         """
         with probe.stage("project"):
             opacities = self.opacities

@@ -2,8 +2,8 @@
 
 Coordinates are those of the data set. Properties of a vertex: x y z, nx ny nz (zeros), f_dc_0..2
 (the first harmonic), f_rest_* (the others, all of red, then green, then blue), opacity (a logit),
-scale_0..2 (logarithms), rot_0..3 (w x y z). Their harmonics have the Condon-Shortley phase, ours
-have not: odd orders m change sign.
+scale_0..2 (logarithms), rot_0..3 (w x y z). The file's harmonics have the Condon-Shortley phase,
+ours do not: those of odd order m change sign.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ def write(gaussians: Gaussians, scene: Scene, path: Path) -> None:
 
 
 def read(path: Path, scene: Scene) -> Gaussians:
-    """The Gaussians of a file in the coordinates of the data set of `scene`.
+    """Read the Gaussians of a file in the coordinates of the data set of `scene`.
 
     Raises:
-        SteerbenchError: the file is missing, cut or of another kind; values are not finite;
+        SteerbenchError: the file is missing, truncated or of another kind; values are not finite;
             rotations are zeros; nothing lies inside the bounds of the scene.
     """
     vertices = _vertices(path)
@@ -112,6 +112,6 @@ def _vertices(path: Path) -> np.ndarray:
 
 
 def _flipped(view: Tensor) -> Tensor:
-    """Harmonics beyond the first [N, C - 1, 3] with the other phase."""
+    """Convert harmonics beyond the first [N, C - 1, 3] to or from the other phase."""
     odd = ODD[1 : view.shape[1] + 1].to(view.device)
     return torch.where(odd[:, None], -view, view)

@@ -1,4 +1,4 @@
-"""Where Gaussians begin: on the surfaces of a trained field, or anywhere."""
+"""Initial Gaussians: on the surfaces of a trained field, or anywhere."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from methods.instant_ngp.training import PixelBatches
 from methods.rendering.rays import render_rays
 
 SOLID = 0.5
-"""Opacity of a ray from which on it ends at a surface."""
+"""Opacity above which a ray counts as ending at a surface."""
 
 NEIGHBOURS = 3
 
@@ -21,7 +21,8 @@ NEIGHBOURS = 3
 def on_surfaces(
     trained: TrainedField, scene: Scene, count: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """`count` points where rays of random training pixels end, and their colours: [count, 3] twice.
+    """Choose `count` points where rays of random training pixels end, and their colours: [count, 3]
+    each.
 
     If the pictures show too little matter, points are taken more than once.
     """
@@ -29,7 +30,7 @@ def on_surfaces(
     batches = PixelBatches(scene.splits["train"], field.device)
     points: list[Tensor] = []
     colours: list[Tensor] = []
-    for _ in range(64):  # pictures with less than a 64th of matter give fewer points
+    for _ in range(64):  # too few if less than 1/64 of the pixels show matter
         rays, _ = batches.draw(count, generator)
         pixels = render_rays(field, rays, trained.occupancy, NullProbe(), trained.march)
         hit = pixels.alpha > SOLID
@@ -46,7 +47,7 @@ def on_surfaces(
 
 
 def anywhere(scene: Scene, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """`count` points spread evenly over the bounds of `scene`, of random colours."""
+    """Draw `count` points uniformly inside the bounds of `scene`, with random colours."""
     low, high = scene.bounds.to(generator.device)
     unit = torch.rand(2, count, 3, generator=generator, device=generator.device)
     return low + unit[0] * (high - low), unit[1]

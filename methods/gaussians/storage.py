@@ -1,4 +1,4 @@
-"""Gaussians in few bytes: every parameter rounded to the levels between its extremes."""
+"""Compact storage of Gaussians: every parameter is rounded to levels between its extremes."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from torch.nn import functional
 from methods.gaussians.model import Gaussians
 
 OUTLIERS = 1e-3
-"""Share of the harmonics, at either end, that is clipped: a few would make all steps coarse."""
+"""Share of the harmonics, at either end, that is clipped: a few outliers make all steps coarse."""
 
 
 def rounded(gaussians: Gaussians) -> Gaussians:
-    """As they come back from storage: means in 16 bits, all else in 8.
+    """Gaussians as they come back from storage: means in 16 bits, everything else in 8.
 
     Levels are spread evenly from the least to the largest value of a column. Opacities are stored
     as they are, scales as logarithms, rotations normalised.

@@ -1,4 +1,4 @@
-"""Gaussians learn from whole pictures (Kerbl et al. 2023, Section 5; Kheradmand et al. 2024)."""
+"""Training of Gaussians on pictures (Kerbl et al. 2023, Section 5; Kheradmand et al. 2024)."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from methods.training import checkpoint, loop
 
 @dataclass(frozen=True)
 class Fitting:
-    """How Gaussians learn; rates are those of Adam.
+    """How to train Gaussians; rates are those of Adam.
 
     Attributes:
-        means, scales, rotations, opacities, colours: rates; of the harmonics beyond the first, a
-            twentieth of `colours`. Means are in scene units.
+        means, scales, rotations, opacities, colours: learning rates; harmonics beyond the first
+            have a twentieth of `colours`. Means are in scene units.
         final_means: share of the rate of the means that is left at the end; it falls exponentially.
-        similarity: weight of 1 - SSIM; the rest is of the mean absolute error.
-        opacity_cost, scale_cost: weights of the mean opacity and of the mean scale: what is not
-            needed fades.
-        noise: of the means, times their rate.
-        every: steps between two relocations of what has faded.
-        relocate_from, relocate_to: shares of the training in which there are any.
+        similarity: weight of 1 - SSIM; the mean absolute error has the rest.
+        opacity_cost, scale_cost: weights of the mean opacity and of the mean scale, so that
+            Gaussians that are not needed fade.
+        noise: noise on the means, as a multiple of their rate.
+        every: steps between two relocations of faded Gaussians.
+        relocate_from, relocate_to: shares of the training between which they are relocated.
         half: share of the training, at its beginning, on pictures of half the resolution.
-        opacity: at the beginning.
-        size: scales at the beginning, times the distance between neighbours.
+        opacity: initial opacity.
+        size: initial scales, as a multiple of the distance between neighbours.
     """
 
     means: float = 3e-4
@@ -62,7 +62,7 @@ class Fitting:
 
 
 class GaussianTraining:
-    """The training as a `methods.training.loop.Training`: a picture a step."""
+    """Trains Gaussians, as a `methods.training.loop.Training`: on one picture per step."""
 
     advice = "Try a smaller rate (method.fitting.means)."
     asked: loop.Asked | None = None
@@ -81,11 +81,11 @@ class GaussianTraining:
         self.step, self.steps, self.seconds = 0, steps, 0.0
         self.split, self.background = scene.splits["train"], scene.background.to(device)
         self.generator = torch.Generator(device).manual_seed(seed)
-        self.views: list[int] = []  # of this round through the pictures, still to come
+        self.views: list[int] = []  # still to come in this pass over the pictures
 
     @cached_property
     def optimiser(self) -> torch.optim.Adam:
-        """Made when it is needed, as that of a field."""
+        """Created when first needed, like that of a field."""
         options = self.options
         rates = {
             "means": options.means,
@@ -101,7 +101,7 @@ class GaussianTraining:
         return torch.optim.Adam(groups, eps=1e-15, fused=True)
 
     def advance(self) -> dict[str, float]:
-        """One step; its mean squared error, see `loop.look`.
+        """Take one step; return its mean squared error, see `loop.look`.
 
         Raises:
             SteerbenchError: the error is not finite.
@@ -132,7 +132,7 @@ class GaussianTraining:
         return errors
 
     def _picture(self, half: bool) -> tuple[Camera, Tensor]:
-        """A training view and its picture [H, W, 3]; every view has its turn in a round."""
+        """The next training view and its picture [H, W, 3]; a pass uses every view once."""
         if not self.views:
             order = torch.randperm(
                 len(self.split), generator=self.generator, device=self.generator.device
@@ -158,11 +158,11 @@ class GaussianTraining:
         return {name: value.detach() for name, value in self.gaussians.named_parameters()}
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
-        """Put back what `result` gave."""
+        """Restore what `result` returned."""
         self.gaussians.load_state_dict({name: tensors[name] for name in self.result()})
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """The optimiser, random numbers, views to come."""
+        """The optimiser, random numbers, and the views still to come."""
         more = {
             "generator": self.generator.get_state(),
             "views": torch.tensor(self.views, dtype=torch.int64),

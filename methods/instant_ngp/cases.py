@@ -1,4 +1,4 @@
-"""Cases of fields and their training: the whole step by all backends, hopeless data, extremes."""
+"""Test cases of fields and their training: a whole step on all backends, bad data, extremes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from methods.training import loop
 
 SAMPLES = 1 << 15
 RAYS = 3000
-"""Rays that bring about `SAMPLES` samples in the hollow sphere below."""
+"""Rays that have about `SAMPLES` samples in the hollow sphere below."""
 
 GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)
 STEPS = 6
@@ -35,7 +35,7 @@ BY = [("reference", "fp32"), ("cpu", "fp32"), ("cpu", "bf16")]
 QUICK = TrainingOptions(grid_samples=1 << 12, max_rays=MIN_RAYS)
 
 FORGOTTEN_AFTER = math.ceil((LOG_DENSITY_CLAMP - math.log(THRESHOLD)) / -math.log(DECAY))
-"""Visits after which a cell of the largest density counts as empty."""
+"""Visits after which a cell of the largest possible density counts as empty again."""
 
 
 def cases() -> list[Case]:
@@ -89,7 +89,7 @@ def cases() -> list[Case]:
 
 
 def _prepare_step(device: str) -> Callable[[str], tuple[Tensor, ...]]:
-    """One step of a young field around a hollow sphere, the same batch for every backend."""
+    """One step of an untrained field in a hollow sphere, with the same batch for every backend."""
     trainings: dict[str, FieldTraining] = {}
     scene, occupancy = _noise_scene(), _hollow_sphere(device)
 
@@ -102,7 +102,7 @@ def _prepare_step(device: str) -> Callable[[str], tuple[Tensor, ...]]:
                 field.to(device), scene, budget, TrainingOptions(), seed=0
             )
         training = trainings[backend]
-        # At a step that does not update the grid, but whose error is looked at.
+        # A step that does not update the grid, but whose error is read back.
         training.step, training.rays = loop.LOOK_EVERY, RAYS
         training.generator.manual_seed(0)
         training.grid.occupancy = occupancy
@@ -132,7 +132,7 @@ def _noise_scene() -> Scene:
 
 
 def _scene(level: int, *, alpha: int = 255, size: int = 8, apart: float = 1.0) -> Scene:
-    """Pictures of one `level`, from all around."""
+    """Pictures of a single grey `level`, from all around."""
     cameras = []
     for view in range(6):
         angle = apart * math.pi * view / 3
@@ -146,7 +146,7 @@ def _scene(level: int, *, alpha: int = 255, size: int = 8, apart: float = 1.0) -
 
 
 def _towards_the_middle(away: Tensor) -> Tensor:
-    """The pose of a camera that is `away` from the middle of the cube and looks at it."""
+    """The pose of a camera in direction `away` from the middle of the cube, looking at it."""
     return look_at(0.5 + 1.3 * away, torch.full((3,), 0.5), torch.tensor([0.0, 0.0, 1.0]))
 
 
@@ -189,7 +189,7 @@ def _keeps_a_good_state(rate: float, backend: str, device: str, precision: str) 
             for _ in range(STEPS):
                 training.advance()
                 loop.save(training, kept)
-        except Unavailable:  # which is no breakdown of a training
+        except Unavailable:  # the training did not break down
             raise
         except SteerbenchError:
             training = new()
@@ -227,7 +227,7 @@ def _rendered(field: HashField, device: str) -> Tensor:
 
 
 def _shrunk_gradient_error(backend: str, device: str, precision: str) -> float:
-    """Of all parameters, over the largest of each."""
+    """Largest error of the gradients of all parameters, relative to the largest of each."""
     field = _field(backend, device, precision)
     learned = list(field.parameters())
     whole = torch.autograd.grad(_rendered(field, device), learned)
@@ -263,5 +263,5 @@ def _unforgotten(backend: str, device: str, precision: str) -> float:
             field.layers["density_out"].fill_(weight)
             field.repack()
             for _ in range(updates):
-                grid.update(field, generator, 256)  # every one of the four cells
+                grid.update(field, generator, 256)  # visits all four cells
     return float(grid.occupancy.cells.sum())

@@ -17,7 +17,7 @@ GRID = HashGrid(log2_table=17)
 
 
 def experiments() -> list[Experiment]:
-    """The table alone; the networks alone, on a table that bfloat16 holds exactly."""
+    """One on the table alone; two on the networks alone, on a table that bfloat16 holds exactly."""
     generator = torch.Generator().manual_seed(0)
     table = torch.empty(GRID.entries, GRID.features).uniform_(-1, 1, generator=generator)
     positions = torch.rand(SAMPLES, 3, generator=generator)

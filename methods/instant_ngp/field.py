@@ -19,10 +19,10 @@ from methods.rendering.field import LOG_DENSITY_CLAMP, ROUND_SAMPLES
 Precision = Literal["bf16", "fp32"]
 
 HIDDEN_CHANNELS = 64
-"""Of every layer between input and output."""
+"""Width of every layer between input and output."""
 
 GEOMETRY_CHANNELS = 16
-"""Outputs of the density network; the first is log density, all feed the feature network."""
+"""Outputs of the density network. The first is the log density; all feed the feature network."""
 
 
 class HashField(nn.Module):
@@ -31,9 +31,9 @@ class HashField(nn.Module):
     No biases, ReLU between layers, exp for density, sigmoid for features (Instant-NGP, Section 5.4;
     ngp_pl `networks.py`).
 
-    With precision "bf16" the table is read as packed bfloat16, and the matrix products are those of
-    bfloat16 weights with float32 accumulation; parameters, gradients of the table and outputs stay
-    float32. So do the activations where the device has no products of bfloat16.
+    With precision "bf16" the table is read as packed bfloat16, and matrix products use bfloat16
+    weights and float32 accumulation; parameters, gradients of the table and outputs stay float32.
+    Activations stay float32 as well if the device has no bfloat16 products.
     """
 
     round_samples = ROUND_SAMPLES
@@ -67,13 +67,13 @@ class HashField(nn.Module):
         self.grad_buffer: Tensor | None = None  # set by a training that updates the table sparsely
 
     def repack(self) -> None:
-        """Bring the packed copy up to date after the table was changed from outside."""
+        """Update the packed copy after the table was changed from outside."""
         if self.packed is not None:
             self.packed.copy_(pack(self.table))
 
     def widen(self, channels: int, generator: torch.Generator | None = None) -> None:
-        """Append features up to `channels`: random ones, of first weights from `generator`, or
-        without one features that are 1/2 everywhere until they are trained.
+        """Append features up to `channels`, with random initial weights from `generator`; without a
+        generator, they are 1/2 everywhere until they are trained.
 
         Raises:
             ValueError: there are more features than `channels` already.
@@ -89,7 +89,7 @@ class HashField(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where table and networks lie."""
+        """The device of table and networks."""
         return self.table.device
 
     def encode_directions(self, directions: Tensor) -> Tensor:
@@ -119,14 +119,14 @@ class HashField(nn.Module):
         return self._linear(hidden, layers["feature_out"]).to(self.table.dtype).sigmoid()
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
-        """Count the work of the densities of `samples` and of the features of `shaded`."""
+        """Count the work of `samples` densities and `shaded` features."""
         density = self.layers["density_in"].numel() + self.layers["density_out"].numel()
         features = sum(self.layers[f"feature_{name}"].numel() for name in ("in", "mid", "out"))
         probe.count("table_reads", 8 * self.grid.levels * samples)
         probe.count("products", density * samples + features * shaded)
 
     def sizes(self) -> dict[str, int]:
-        """Bytes of table and networks at the precision in which they are read."""
+        """Bytes of table and networks at the precision at which they are read."""
         width = 2 if self.precision == "bf16" else 4
         networks = sum(layer.numel() for layer in self.layers.values())
         return {"hash_table": self.table.numel() * width, "field_networks": networks * width}

@@ -26,7 +26,7 @@ class InstantNgp:
         training: how the field is trained.
         precision: "bf16" (packed table, bfloat16 networks) or "fp32".
         stop: transmittance at which a ray ends when rendering, less than 1.
-        name: as it stands in result rows.
+        name: as shown in result rows.
     """
 
     memory = 0
@@ -57,7 +57,7 @@ class InstantNgp:
         self.train_s = 0.0
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
-        """Train the field, or load the one that the same training left behind."""
+        """Train the field, or load it if it was trained before."""
         with torch_threads(budget.threads):
             self.trained = train_field(self.setup, scene, budget, log)
         self.train_s = self.trained.train_s
@@ -68,7 +68,7 @@ class InstantNgp:
 
     @torch.no_grad()
     def render(self, camera: Camera, probe: Probe) -> Frame:
-        """One frame at the camera's full resolution."""
+        """Render one frame at the camera's full resolution."""
         camera = place_camera(camera, self.setup.device)
         field, occupancy = self.trained.field, self.trained.occupancy
         march = replace(self.trained.march, stop=self.stop)

@@ -15,9 +15,9 @@ from methods.training.optimiser import step_at
 
 
 class FieldOptimiser:
-    """Adam for the networks of `field`, and for its table one that changes touched entries only.
+    """Adam for the networks of `field`, and for its table one that skips untouched entries.
 
-    From now on the field collects the gradients of its table in `grad_buffer`.
+    Once this exists, the field collects the gradients of its table in `grad_buffer`.
     """
 
     def __init__(self, field: HashField, *, fused: bool = False) -> None:
@@ -27,12 +27,12 @@ class FieldOptimiser:
 
     @cached_property
     def _networks(self) -> torch.optim.Adam:
-        # Made when it is needed: the first one of a process imports torch's compiler, in seconds.
+        # Created when needed: a process's first one imports torch's compiler, which takes seconds.
         parameters = list(self._field.layers.values())
         return torch.optim.Adam(parameters, betas=(0.9, 0.99), eps=1e-15, fused=self._fused)
 
     def step(self, rate: float) -> None:
-        """Change table and networks at learning rate `rate`."""
+        """Update table and networks at learning rate `rate`."""
         step_at(self._networks, rate)
         field = self._field
         assert field.grad_buffer is not None
@@ -47,7 +47,7 @@ class FieldOptimiser:
 
     @property
     def table_moments(self) -> Tensor:
-        """Not finite where a moment of the table is not."""
+        """The sum of the table's moments, which is not finite where one of them is not."""
         return self._table.first + self._table.second
 
     def tensors(self) -> dict[str, Tensor]:
@@ -56,6 +56,6 @@ class FieldOptimiser:
         return self._table.tensors("adam.") | networks
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Put back what `tensors` gave."""
+        """Restore what `tensors` returned."""
         self._table = AdamState.of(tensors, "adam.", self._field.table.device)
         checkpoint.restore_optimiser(self._networks, tensors, "network.")

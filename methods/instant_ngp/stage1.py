@@ -1,4 +1,4 @@
-"""The trained field of a scene: made once, found again by every method that stands on it."""
+"""The trained field of a scene: trained once and shared by every method that builds on it."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ class Setup:
         device: str,
         seed: int,
     ) -> Setup:
-        """With `auto` replaced by what it stands for here.
+        """Make a setup with `auto` replaced by what it means on this machine.
 
         Raises:
-            ValueError: the grid cannot be had at this precision, or `device` is no name of one.
+            ValueError: the grid does not exist at this precision, or `device` names no device.
             Unavailable: the backend cannot be used here.
         """
         if not DEVICE.fullmatch(device):
@@ -94,7 +94,7 @@ class Setup:
 @dataclass(frozen=True)
 class TrainedField:
     """A trained `field`, the `grid` of its densities, how its rays were marched (`march`), and the
-    seconds its training took."""
+    seconds that its training took."""
 
     field: HashField
     grid: DensityGrid
@@ -112,9 +112,9 @@ class TrainedField:
 
 
 def train_field(setup: Setup, scene: Scene, budget: Budget, log: Log) -> TrainedField:
-    """Train a field on the pictures of `scene`, or load the one of the same training.
+    """Train a field on the pictures of `scene`, or load the result of the same training.
 
-    A training that was killed goes on from its last checkpoint.
+    A killed training resumes from its last checkpoint.
     """
     generator = torch.Generator().manual_seed(setup.seed)
     field = HashField(

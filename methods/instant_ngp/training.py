@@ -21,23 +21,23 @@ from methods.training import checkpoint, loop
 from methods.training.optimiser import cosine
 
 MIN_RAYS = 64
-"""Fewest rays of a step."""
+"""Minimum number of rays in a step."""
 
 GRID_YOUTH_STEPS = 256
-"""Until this step the density grid is visited four times as much: most of it is still unknown."""
+"""Up to this step the density grid is visited four times as much: most of it is still unknown."""
 
 
 @dataclass(frozen=True)
 class PixelOptions:
-    """How anything learns from random pixels; the defaults follow ngp_pl where facts are known.
+    """How to train on random pixels; the defaults follow ngp_pl where facts are known.
 
     Attributes:
-        rate: learning rate at the beginning.
+        rate: initial learning rate.
         final_rate: share of `rate` left at the end of the cosine schedule.
         opacity_entropy: weight of -o ln o, which drives the opacity of a ray to 0 or 1.
-        random_background: train RGBA pictures on a random colour a ray instead of the scene's
+        random_background: composite RGBA pictures on a random colour per ray instead of the scene's
             background, so that no density can pass for background.
-        max_rays: most rays of a step.
+        max_rays: maximum number of rays in a step.
     """
 
     rate: float = 1e-2
@@ -57,11 +57,11 @@ class PixelOptions:
 
 @dataclass(frozen=True)
 class MarchOptions(PixelOptions):
-    """How a field learns that is sampled along rays.
+    """How to train a field that is sampled along rays.
 
     Attributes:
-        march_step: length of a ray-marching step, in diagonals of the cube / 1024; the release
-            has 1. None: by the steps of the training of the field, see `suitable_step`.
+        march_step: length of a ray-marching step, in diagonals of the cube / 1024; 1 in the
+            release. None: it follows from the steps of the field's training, see `suitable_step`.
     """
 
     march_step: float | None = None
@@ -72,7 +72,7 @@ class MarchOptions(PixelOptions):
             check_step("march_step", self.march_step)
 
     def march(self, budget: Budget) -> March:
-        """Of the rays of a training within `budget`, and of what is shown as it was trained."""
+        """How rays are marched in a training within `budget`, and later to render its result."""
         if self.march_step is None:
             return March(step=suitable_step(budget.steps))
         return March(step=self.march_step * STEP)
@@ -80,10 +80,10 @@ class MarchOptions(PixelOptions):
 
 @dataclass(frozen=True)
 class TrainingOptions(MarchOptions):
-    """How a field of stage 1 is trained; `rate` is that of table and networks.
+    """How to train a field in stage 1; `rate` is that of table and networks.
 
     Attributes:
-        grid_samples: visits of an update of the density grid.
+        grid_samples: cells visited in an update of the density grid.
     """
 
     grid_samples: int = 1 << 17
@@ -119,7 +119,7 @@ class PixelBatches:
         return len(self._pixels)
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Rays, Tensor]:
-        """`count` rays through pixel centres, and their colours [count, 3 or 4] in [0, 1]."""
+        """Draw `count` rays through pixel centres, and their colours [count, 3 or 4] in [0, 1]."""
         total = len(self._pixels)
         pixel = torch.randint(total, (count,), generator=generator, device=self._device)
         view = torch.searchsorted(self._ends, pixel, right=True)
@@ -134,7 +134,7 @@ class PixelBatches:
 
 
 def new_grid(scene: Scene, device: torch.device) -> DensityGrid:
-    """The density grid of a training of `scene` before its first step."""
+    """Make the density grid for a training of `scene`, as it is before the first step."""
     cells = learnable_cells(scene.bounds.to(device), scene.splits["train"].cameras)
     if not cells.any():
         raise SteerbenchError(
@@ -145,9 +145,9 @@ def new_grid(scene: Scene, device: torch.device) -> DensityGrid:
 
 
 class PixelTraining(ABC):
-    """A training whose steps render random pixels of the training pictures, as a `loop.Training`.
+    """A `loop.Training` whose steps render random pixels of the training pictures.
 
-    What is trained, and how its rays are rendered and its parameters updated, is a subclass's.
+    Subclasses say what is trained, how its rays are rendered and how its parameters are updated.
 
     Args:
         samples: samples with a gradient that a step aims at; the number of rays follows from it.
@@ -175,12 +175,12 @@ class PixelTraining(ABC):
 
     @abstractmethod
     def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
-        """The pixels of `rays`, R of them, on `background` [3] or [R, 3], differentiably, and the
-        number of samples that took part; `jitter` [R] in [0, 1) is the phase of samples."""
+        """Render R `rays` on `background` [3] or [R, 3], differentiably; also return the number of
+        samples that were composited. `jitter` [R] in [0, 1) is the phase of the samples."""
 
     @abstractmethod
     def _update(self) -> None:
-        """A step of the optimiser; the gradients are used up."""
+        """Take a step of the optimiser and clear the gradients."""
 
     @abstractmethod
     def watched(self) -> Mapping[str, Tensor]:
@@ -195,11 +195,11 @@ class PixelTraining(ABC):
         """See `loop.Training`."""
 
     def learning_rate(self) -> float:
-        """Of the next step."""
+        """The learning rate of the next step."""
         return self.options.rate * cosine(self.step / self.steps, self.options.final_rate)
 
     def advance(self) -> dict[str, float]:
-        """One step; its mean squared error, see `loop.look`.
+        """Take one step; return its mean squared error, see `loop.look`.
 
         Raises:
             SteerbenchError: the loss is not finite.
@@ -218,7 +218,7 @@ class PixelTraining(ABC):
         return errors
 
     def _target(self, colours: Tensor) -> tuple[Tensor, Tensor]:
-        """Colours composited on the background, and that background ([3] or a ray's own [R, 3])."""
+        """Composite colours on a background; also return that background, [3] or [R, 3]."""
         if colours.shape[-1] == 3:
             return colours, self.background
         background = self.background
@@ -230,12 +230,12 @@ class PixelTraining(ABC):
         return rgb * alpha + background * (1 - alpha), background
 
     def _fit_batch(self, samples: int) -> None:
-        """Choose the next number of rays so that it brings about `self.samples` samples."""
+        """Choose the number of rays so that the next step has about `self.samples` samples."""
         change = min(max(self.samples / max(samples, 1), 0.5), 1.25)
         self.rays = min(max(int(self.rays * change), MIN_RAYS), self.options.max_rays)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Random numbers, size of the batch."""
+        """Random numbers and number of rays."""
         return {"generator": self.generator.get_state()}, {"rays": self.rays}
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
@@ -246,7 +246,7 @@ class PixelTraining(ABC):
 
 
 class FieldTraining(PixelTraining):
-    """Stage 1."""
+    """Stage 1: trains a hash-grid field and its density grid."""
 
     def __init__(
         self, field: HashField, scene: Scene, budget: Budget, options: TrainingOptions, seed: int
@@ -257,7 +257,7 @@ class FieldTraining(PixelTraining):
         self.optimiser = FieldOptimiser(field)
 
     def advance(self) -> dict[str, float]:
-        """One step; its mean squared error."""
+        """Take one step; return its mean squared error."""
         if self.step % EVERY == 0:
             young = self.step < GRID_YOUTH_STEPS
             samples = self.grid_samples * (4 if young else 1)
@@ -288,11 +288,11 @@ class FieldTraining(PixelTraining):
         return tensors | {"grid.density": self.grid.density}
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
-        """Put back what `result` gave."""
+        """Restore what `result` returned."""
         restore_field(self.field, self.grid, tensors)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Optimisers, random numbers, size of the batch."""
+        """Optimisers, random numbers, number of rays."""
         tensors, figures = super().state()
         return self.optimiser.tensors() | tensors, figures
 
@@ -303,7 +303,7 @@ class FieldTraining(PixelTraining):
 
 
 def restore_field(field: HashField, grid: DensityGrid, tensors: Mapping[str, Tensor]) -> None:
-    """Put back what `FieldTraining.result` gave."""
+    """Restore what `FieldTraining.result` returned."""
     field.load_state_dict(checkpoint.part(tensors, "field."))
     field.repack()
     grid.restore(tensors["grid.density"])

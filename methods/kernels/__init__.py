@@ -1,7 +1,7 @@
-"""Operations of radiance-field rendering, each as a plain torch reference beside fast backends.
+"""Operations of radiance-field rendering, each with a plain-torch reference and fast backends.
 
-A kernel is a folder: `__init__` holds its signature and meaning, `reference` the plain torch
-version (any dtype, any device, differentiable; all others are compared with it), `cpu` the numba
+A kernel is a folder: `__init__` has its signature and documentation, `reference` the plain-torch
+version (any dtype, any device, differentiable; the others are compared with it), `cpu` the numba
 version, `gpu` the Triton version. All backends of a kernel have the same signature.
 """
 

@@ -1,4 +1,4 @@
-"""Which backend computes a kernel: by name, or by the device of the tensors."""
+"""Selects the backend of a kernel, by name or by the device of the tensors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BACKENDS = ("reference", "cpu", "gpu")
 
 @cache
 def availability() -> dict[str, str]:
-    """For each backend, "" where it can be used here, else why not and how to get it."""
+    """For each backend, "" if it can be used here, otherwise why not and how to get it."""
     reasons = dict.fromkeys(BACKENDS, "")
     if importlib.util.find_spec("numba") is None:
         reasons["cpu"] = "numba is not installed: pip install numba"
@@ -31,16 +31,18 @@ def availability() -> dict[str, str]:
 
 
 def interpreted() -> bool:
-    """Whether Triton interprets the kernels of `gpu` on CPU tensors, slowly, and compiles none. For
-    tests without a GPU."""
+    """Whether Triton interprets the kernels of `gpu` on CPU tensors instead of compiling them.
+
+    This is slow, and meant for tests without a GPU.
+    """
     return os.environ.get("TRITON_INTERPRET") == "1"
 
 
 def resolve(backend: str, device: torch.device | str) -> str:
     """The name of the backend that computes on `device`.
 
-    `auto` goes by the device alone: `cpu` for CPU tensors, `reference` for all others. The kernels
-    of `gpu` were never run on one: they have to be chosen by name.
+    `auto` depends only on the device: `cpu` for CPU tensors, `reference` for all others. The
+    kernels of `gpu` have never been run on a GPU, so they must be chosen by name.
 
     Raises:
         Unavailable: the named backend is unknown, cannot be used here, or does not compute on this
@@ -74,7 +76,7 @@ def resolve(backend: str, device: torch.device | str) -> str:
 def multiplies_bf16(kind: str) -> bool:
     """Whether devices of this kind ("cpu", "cuda") here have products of bfloat16.
 
-    A CPU without them, any x86 with AVX2 alone, takes ten times as long as for those of float32.
+    A CPU without them, such as an x86 with only AVX2, needs ten times as long as for float32.
     """
     if kind == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
@@ -91,13 +93,13 @@ def implementation(kernel: str, backend: str, device: torch.device) -> ModuleTyp
 
 
 def served(kernel: str) -> list[str]:
-    """The backends that have `kernel`."""
+    """The backends that implement `kernel`."""
     folder = Path(__file__).parent / kernel
     return [name for name in BACKENDS if (folder / f"{name}.py").exists()]
 
 
 def compiled(device: str) -> list[str]:
-    """The backends that compute on `device` here at full speed: an interpreted one does not."""
+    """The backends that run on `device` here at full speed, which excludes an interpreted one."""
     usable = []
     for name in BACKENDS:
         try:
@@ -107,5 +109,5 @@ def compiled(device: str) -> list[str]:
     return [name for name in usable if not (name == "gpu" and interpreted())]
 
 
-# Imported when first used: numba and Triton are heavy, and not every machine has both.
+# Imported on first use, because numba and Triton are heavy and not every machine has both.
 _load = cache(importlib.import_module)

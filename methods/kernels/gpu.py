@@ -1,7 +1,7 @@
-"""What all Triton kernels share. In the package only files named `gpu.py` import Triton.
+"""Functions shared by all Triton kernels. In this package only files named `gpu.py` import Triton.
 
-On a machine without a GPU they run in Triton's interpreter, slowly, where the environment says
-TRITON_INTERPRET=1: the tests do so.
+On a machine without a GPU, the kernels run (slowly) in Triton's interpreter if TRITON_INTERPRET=1
+is set in the environment, as the tests do.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from torch import Tensor
 def launch(
     kernel: triton.JITFunction, grid: tuple[int, ...], *arguments: Any, **options: Any
 ) -> None:
-    """Run `kernel` on `grid` unless that is empty, on the device of the first argument, a tensor.
+    """Run `kernel` on `grid`, unless that is empty, on the device of the first argument, a tensor.
 
-    Products and sums are not contracted, so that the march has the bits of the reference; a
-    quotient and an exponential are within 2 ulp.
+    Multiply-adds are not fused, so that the march gives the same bits as the reference. Division
+    and exponential are within 2 ulp.
     """
     if all(grid):
         with torch.cuda.device_of(arguments[0]):
@@ -30,7 +30,7 @@ def launch(
 
 
 def check_types(*served: torch.dtype, **tensors: Tensor) -> None:
-    """Raise ValueError unless all `tensors` are of one of the types that are `served`."""
+    """Raise ValueError unless every tensor has one of the `served` types."""
     for name, tensor in tensors.items():
         if tensor.dtype not in served:
             expected = " or ".join(str(dtype).removeprefix("torch.") for dtype in served)
@@ -42,8 +42,11 @@ def check_types(*served: torch.dtype, **tensors: Tensor) -> None:
 
 @contextmanager
 def gradient(buffer: Tensor | None, shape: torch.Size, device: torch.device) -> Iterator[Tensor]:
-    """What a kernel adds a gradient to, contiguous float32: `buffer` itself, if it is that; else
-    zeros of `shape`, which are added to a buffer in the end."""
+    """A contiguous float32 tensor for a kernel to add a gradient to.
+
+    It is `buffer` itself if that is contiguous float32; otherwise zeros of `shape`, which are added
+    to any `buffer` at the end.
+    """
     if buffer is not None and buffer.dtype == torch.float32 and buffer.is_contiguous():
         yield buffer
         return
@@ -55,7 +58,7 @@ def gradient(buffer: Tensor | None, shape: torch.Size, device: torch.device) -> 
 
 @triton.jit
 def vector(vectors, i, there):
-    """x, y and z of `vectors` [N, 3] at `i`; 0 where they are not `there`."""
+    """x, y and z of `vectors` [N, 3] at `i`; 0 where the mask `there` is false."""
     return (
         tl.load(vectors + 3 * i, mask=there, other=0.0),
         tl.load(vectors + 3 * i + 1, mask=there, other=0.0),
@@ -65,6 +68,6 @@ def vector(vectors, i, there):
 
 @triton.jit
 def opacity(tau):
-    """1 - exp(-tau), by its series where the difference would cancel."""
+    """1 - exp(-tau), by its series where the difference would lose digits."""
     series = tau * (1 - tau / 2 * (1 - tau / 3 * (1 - tau / 4 * (1 - tau / 5))))
     return tl.where(tau < 0.06, series, 1 - tl.exp(-tau))

@@ -37,12 +37,12 @@ DENSITY_LAYERS = ("in", "mid", "density")
 
 
 class KiloField(StudentField):
-    """Small networks on a grid; density and colour are 0 where there is none.
+    """Small networks on a grid; density and colour are 0 where there is no network.
 
     Args:
         grid: where the networks are.
-        backend: of the kernels.
-        generator: of the weights, which are the same in all networks at the beginning.
+        backend: backend of the kernels.
+        generator: source of the weights, which are the same in all networks at the beginning.
     """
 
     round_samples = 8  # measured: docs/log.md
@@ -59,14 +59,14 @@ class KiloField(StudentField):
         self.count_networks = grid.count
         self.weights, self.biases = nn.ParameterDict(), nn.ParameterDict()
         for name, (inputs, outputs) in SHAPES.items():
-            # As torch's linear layers: uniform, by the number of inputs.
+            # As in torch's linear layers: uniform, with a bound from the number of inputs.
             bound = 1 / math.sqrt(inputs)
             for kind, shape in ((self.weights, (inputs, outputs)), (self.biases, (outputs,))):
                 values = torch.empty(*shape).uniform_(-bound, bound, generator=generator)
                 kind[name] = nn.Parameter(values.repeat(self.count_networks, *[1] * len(shape)))
 
     def raw_density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """Density [S] over `REACH` before its activation, and what `features` needs [S, 33]."""
+        """Density [S] times `REACH` before its activation, and what `features` needs [S, 33]."""
         grid = self.networks, self.corner, self.side
         numbers, local = locate(positions, *grid, backend=self.backend)
         return densities(local, numbers, self._layers, backend=self.backend)
@@ -92,7 +92,7 @@ class KiloField(StudentField):
         probe.count("products", density * samples + (sum(products.values()) - density) * shaded)
 
     def sizes(self) -> dict[str, int]:
-        """Bytes of the networks, and of the grid that names them."""
+        """Bytes of the networks, and of the grid that holds their numbers."""
         parameters = sum(parameter.numel() for parameter in self.parameters())
         return {"networks": 4 * parameters, "network_grid": 2 * self.networks.numel()}
 

@@ -1,4 +1,4 @@
-"""Where the networks are: cubes of a grid around the scene, those with matter in them."""
+"""Where the networks are: in those cubes of a grid around the scene that hold matter."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from methods.kernels.march import Occupancy
 
 @dataclass(frozen=True)
 class Grid:
-    """Cubes side by side, some with a network.
+    """Cubes side by side, some of which have a network.
 
     Attributes:
-        networks: [X, Y, Z] int16, the number of the network of a cube, -1: none.
-        corner: [3] where the first cube begins, in the unit cube.
-        side: [] length of a cube.
+        networks: [X, Y, Z] int16, the number of each cube's network, -1 for none.
+        corner: [3] lower corner of the first cube, in the unit cube.
+        side: [] side of a cube.
     """
 
     networks: Tensor
@@ -44,9 +44,9 @@ class Pieces:
     offsets: Tensor
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """`count` random points [N * count, 3]: as many of each network, network by network.
+        """Draw `count` random points for each network: [N * count, 3], network by network.
 
-        A piece of a network is as likely as another, whatever its size.
+        All pieces of a network are equally likely, whatever their size.
         """
         device = self.low.device
         sizes = self.offsets.diff()
@@ -59,9 +59,10 @@ class Pieces:
 
 
 def place_networks(occupancy: Occupancy, bounds: Tensor, along: int) -> tuple[Grid, Pieces]:
-    """Cubes, `along` of them on the longest side of `bounds` [2, 3], as few as cover the others.
+    """Cover `bounds` [2, 3] with cubes: `along` of them on its longest side, as few as possible on
+    the others.
 
-    A cube has a network if some of an occupied cell lies in it.
+    A cube has a network if it overlaps an occupied cell.
 
     Returns:
         the cubes, and the occupied parts of those that have a network.
@@ -75,7 +76,7 @@ def place_networks(occupancy: Occupancy, bounds: Tensor, along: int) -> tuple[Gr
     first = ((low - corner) / side).floor().int()
     last = ((high - corner) / side).ceil().int() - 1
     parts = []
-    # A cell lies in several cubes where a face crosses it.
+    # A cell that is crossed by a face lies in several cubes.
     reach = int((last - first).max()) + 1 if len(cells) else 1
     steps = torch.arange(reach, device=device)
     for shift in torch.cartesian_prod(steps, steps, steps):

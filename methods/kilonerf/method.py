@@ -16,7 +16,7 @@ from methods.students.fields import FieldStudent
 from methods.training import checkpoint
 
 MOST = 32
-"""Networks along an axis: their numbers are int16."""
+"""Maximum number of networks along an axis: they are numbered in int16."""
 
 
 class KiloNerf(FieldStudent):
@@ -24,11 +24,11 @@ class KiloNerf(FieldStudent):
 
     Args:
         teacher: the field that it starts from, and where it runs.
-        training: how the networks learn.
+        training: how the networks are trained.
         networks: how many there are along the longest side of the scene, 1 to 32.
         stop: transmittance at which a ray ends when rendering, less than 1.
-        name: as it stands in result rows.
-        steps: of its own training; None: `budget.renderer_steps`.
+        name: as shown in result rows.
+        steps: steps of its own training; None: `budget.renderer_steps`.
     """
 
     kind = "kilonerf"

@@ -1,4 +1,4 @@
-"""Distillation of the teacher into the small networks, then the photos (Section 3.2)."""
+"""Distillation of the teacher into the small networks, then training on photos (Section 3.2)."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from methods.kilonerf.grid import Pieces
 from methods.students.fields import FieldLessons, StudentTraining
 
 LEAK = 0.01
-"""Slope of the density below 0 in distillation: where nothing is, its gradient does not vanish."""
+"""Slope of the density below 0 in distillation, so that its gradient does not vanish in empty
+space."""
 
 
 @dataclass(frozen=True)
 class KiloLessons(FieldLessons):
-    """How the networks learn; `rate` is below that of a hash grid.
+    """How to train the networks; `rate` is below that of a hash grid.
 
     Attributes:
         points_each: points of each network in a step of the distillation.
-        view_cost: weight of the norms of the weights that see directions, while learning from rays.
+        view_cost: weight of the norms of the weights that see directions, in training on rays.
     """
 
     rate: float = 3e-3
@@ -38,7 +39,7 @@ class KiloLessons(FieldLessons):
 
 
 class KiloTraining(StudentTraining):
-    """As `StudentTraining`, with as many points for each network."""
+    """Like `StudentTraining`, with the same number of points for each network."""
 
     def __init__(
         self,
@@ -61,7 +62,7 @@ class KiloTraining(StudentTraining):
         return positions, functional.normalize(directions, dim=1)
 
     def _learned(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """As the base has it, with a density that may fall below 0."""
+        """As in the base class, with a density that may fall below 0."""
         thickness, geometry = self.networks.raw_density(positions)
         encoded = self.networks.encode_directions(directions)
         opacity = 1 - torch.exp(-functional.leaky_relu(thickness, LEAK))
@@ -74,7 +75,7 @@ class KiloTraining(StudentTraining):
 
     @torch.no_grad()
     def _smooth_views(self) -> None:
-        """Add the gradient of `view_cost` times the norms, not squared, of the layers behind the
+        """Add the gradient of `view_cost` times the norms, not squared, of the layers that see the
         directions (Section 3.2)."""
         for name in ("direction", "colour"):
             for parameter in (self.networks.weights[name], self.networks.biases[name]):

@@ -1,4 +1,4 @@
-"""Rendering as NeRF was published: every sample of every ray, whether anything is there or not."""
+"""Rendering as NeRF was published: every sample of every ray, without skipping empty space."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from methods.rendering.frame import Render
 from methods.rendering.march import March
 
 CHUNK_RAYS = 1 << 9
-"""Rays whose samples are evaluated together: 200 MiB of what a trunk of 256 channels gives."""
+"""Rays whose samples are evaluated together: 200 MiB of outputs of a trunk of 256 channels."""
 
 
 def whole_cube(occupancy: Occupancy) -> Occupancy:
-    """With all cells of as fine a grid occupied."""
+    """An occupancy of the same resolution with all cells occupied."""
     return Occupancy(torch.ones_like(occupancy.cells))
 
 
 def every_sample(
     field: Field, occupancy: Occupancy, cube: Occupancy, probe: Probe, how: March
 ) -> Render:
-    """What renders rays for `render_frame`: density and colour of all their samples in `cube`, the
-    whole one.
+    """Make the argument `render` of `render_frame` that evaluates density and colour of all samples
+    in `cube`, the whole one.
 
     Samples outside the cells of `occupancy` then count as empty, so that the picture is that of
-    `rendering.frame.everywhere`, but for the colours of samples too faint to be seen.
+    `rendering.frame.everywhere`, except for the colours of samples too faint to be seen.
     """
 
     def render(_: Tensor, rays: Rays) -> Pixels:

@@ -22,10 +22,10 @@ WIDTH = 256
 """Outputs of every layer of the trunk."""
 
 LAYERS = 8
-"""Of the trunk."""
+"""Layers of the trunk."""
 
 SKIP = 5
-"""Layers of the trunk after which the encoded position is put in again."""
+"""Layers of the trunk after which the encoded position is concatenated again."""
 
 VIEW_WIDTH = 128
 """Outputs of the layer that sees the direction."""
@@ -34,7 +34,7 @@ POSITION_FREQUENCIES = 10
 DIRECTION_FREQUENCIES = 4
 
 DENSITY = 1 / REACH
-"""Density for an output of 1 of the network, whose weights then are of the usual size."""
+"""Density at a network output of 1, chosen so that the weights are of the usual size."""
 
 CHUNK = 1 << 14
 """Samples that go through the network together: 16 MiB of activations."""
@@ -43,12 +43,12 @@ CHUNK = 1 << 14
 class NerfField(StudentField):
     """One network of 595,844 parameters (Mildenhall et al. 2020, Figure 7).
 
-    Positions of the unit cube are taken to [-1, 1], as Section 5.1 has it.
+    Positions in the unit cube are mapped to [-1, 1], as in Section 5.1.
 
     Args:
-        precision: of the products, "bf16" or "fp32".
-        backend: of the kernels that render it.
-        generator: of the first weights.
+        precision: precision of the products, "bf16" or "fp32".
+        backend: backend of the kernels that render it.
+        generator: source of the initial weights.
     """
 
     round_samples = 2  # a sample costs half a million products
@@ -68,7 +68,7 @@ class NerfField(StudentField):
         self.colour = Dense(VIEW_WIDTH, 3, precision, generator)
 
     def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """See `Field`; the geometry is what the trunk makes of a position."""
+        """See `Field`; the geometry is the output of the trunk."""
         parts = [self._density(part) for part in positions.split(CHUNK)]
         sigma, geometry = (torch.cat(column) for column in zip(*parts, strict=True))
         return sigma, geometry
@@ -97,8 +97,8 @@ class NerfField(StudentField):
         return self.colour(hidden).to(encoded.dtype).sigmoid()
 
     def _view(self, geometry: Tensor, encoded: Tensor) -> Tensor:
-        """The layer that sees the direction, behind the bottleneck. No activation separates the
-        two, so that one product with both weights spares two thirds of the work of a colour."""
+        """The bottleneck and the layer that sees the direction. No activation separates the two, so
+        one product with their merged weights saves two thirds of the work of a colour."""
         of_feature, of_direction = self.view.weight.split((WIDTH, encoded.shape[1]), dim=1)
         weight = torch.cat((of_feature @ self.bottleneck.weight, of_direction), dim=1)
         bias = self.view.bias + of_feature @ self.bottleneck.bias

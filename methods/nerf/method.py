@@ -18,7 +18,7 @@ from methods.students.networks import NetworkLessons
 
 
 class Nerf(FieldStudent):
-    """One NeRF network, rendered where its teacher found something, or everywhere.
+    """One NeRF network, rendered where its teacher is occupied, or everywhere.
 
     Args:
         skip: leave out the samples outside the occupied cells; the picture is the same.
@@ -42,7 +42,7 @@ class Nerf(FieldStudent):
         self.skip = skip
 
     def model_settings(self) -> Mapping[str, object]:
-        """See `Student`: none, the network is the published one."""
+        """See `Student`: none; the network is the published one."""
         return {}
 
     def new_field(self) -> NerfField:

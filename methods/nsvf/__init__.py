@@ -1,1 +1,1 @@
-"""Neural Sparse Voxel Fields (Liu et al. 2020): a network of what the corners of voxels hold."""
+"""Neural Sparse Voxel Fields (Liu et al. 2020): a network on embeddings at voxel corners."""

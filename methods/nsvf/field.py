@@ -32,10 +32,11 @@ EMBEDDING_FREQUENCIES = 6
 DIRECTION_FREQUENCIES = 4
 
 FREE_ENERGY = 7.0
-"""What the release multiplies lengths with before the opacity."""
+"""Factor by which the release multiplies lengths before it computes the opacity."""
 
 ACROSS = 3.0
-"""The cube in units of the published scenes, in which lengths are measured there: about."""
+"""Side of the cube, approximately, in the units of the published scenes, in which the release
+measures lengths."""
 
 CHUNK = 1 << 14
 """Samples that go through the network together: 16 MiB of activations."""
@@ -53,10 +54,10 @@ class Layer(nn.Sequential):
 
 
 class Norm(nn.LayerNorm):
-    """LayerNorm in the type of its inputs; means and variances are float32 all the same."""
+    """LayerNorm in the dtype of its inputs; means and variances are float32 all the same."""
 
     def forward(self, input: Tensor) -> Tensor:
-        """Of [S, C]: [S, C]."""
+        """Map [S, C] to [S, C]."""
         weight, bias = self.weight.to(input.dtype), self.bias.to(input.dtype)
         return functional.layer_norm(input, self.normalized_shape, weight, bias, self.eps)
 
@@ -67,9 +68,9 @@ class NsvfField(StudentField):
 
     Args:
         occupancy: its cells are the voxels.
-        precision: of the products, "bf16" or "fp32".
-        backend: of the kernels that render it.
-        generator: of the first weights and embeddings.
+        precision: precision of the products, "bf16" or "fp32".
+        backend: backend of the kernels that render it.
+        generator: source of the initial weights and embeddings.
     """
 
     round_samples = 2  # a sample costs half a million products
@@ -92,7 +93,7 @@ class NsvfField(StudentField):
         index = torch.full(cells.shape, -1, dtype=torch.int32)
         index[cells] = torch.arange(len(coordinates), dtype=torch.int32)
         for name, value in (("index", index), ("corners", corners), ("vertices", vertices)):
-            self.register_buffer(name, value, persistent=False)  # follow from the occupied cells
+            self.register_buffer(name, value, persistent=False)  # derived from the occupied cells
         first = torch.randn(len(vertices), EMBEDDING, generator=generator)
         self.embeddings = nn.Parameter(first * EMBEDDING**-0.5)
 
@@ -111,7 +112,7 @@ class NsvfField(StudentField):
         )
 
     def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """See `Field`; outside all voxels it is 0. The geometry is what the trunk gives."""
+        """See `Field`; density is 0 outside all voxels. The geometry is the output of the trunk."""
         parts = [self._density(part) for part in positions.split(CHUNK)]
         sigma, geometry = (torch.cat(column) for column in zip(*parts, strict=True))
         return sigma, geometry
@@ -123,25 +124,25 @@ class NsvfField(StudentField):
         return FREE_ENERGY * ACROSS * torch.where(inside, density_of(raw), 0), hidden
 
     def embedding(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """Trilinear interpolants [S, 32] of the embeddings, and whether there is a voxel [S]."""
+        """Trilinearly interpolated embeddings [S, 32], and whether there is a voxel [S]."""
         size = len(self.index)
         scaled = positions * size
         cell = scaled.long().clamp(0, size - 1)
         voxel = self.index[cell[:, 0], cell[:, 1], cell[:, 2]]
         weights = trilinear(scaled - cell, backend=self.backend)
-        # Samples outside all voxels read one that is there: what it holds is not seen.
+        # Samples outside all voxels read some voxel: their density is set to 0.
         read = voxel.clamp(min=0)
         return gather(
             self.embeddings, self.corners, read, weights, backend=self.backend
         ), voxel >= 0
 
     def encode_directions(self, directions: Tensor) -> Tensor:
-        """See `Field`. Of directions, where the release takes their arc cosines."""
+        """See `Field`. Encodes the direction itself, where the release encodes its arc cosines."""
         unit = functional.normalize(directions, dim=-1)
         return positional(unit, DIRECTION_FREQUENCIES, identity=False, scale=1.0)
 
     def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
-        """See `Field`; colours are linear in [-1, 1] for black to white, as in the release."""
+        """See `Field`; the network's output is linear, -1 for black, 1 for white, as released."""
         pairs = zip(geometry.split(CHUNK), encoded.split(CHUNK), strict=True)
         shown = [self.colour(torch.cat((hidden, d.to(hidden)), dim=1)) for hidden, d in pairs]
         return (torch.cat(shown).to(encoded.dtype) + 1) / 2

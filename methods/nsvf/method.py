@@ -24,12 +24,12 @@ Start = Literal["random", "teacher"]
 
 
 class Nsvf(FieldStudent):
-    """A neural sparse voxel field whose voxels are where its teacher found something.
+    """A neural sparse voxel field whose voxels are where its teacher is occupied.
 
     Args:
         resolution: voxels along a side of the cube, a multiple of 16.
-        step: length of a ray-marching step in voxels, to train and to render.
-        start: embeddings begin "random", or as the features of the "teacher" at their corners.
+        step: length of a ray-marching step in voxels, in training and rendering.
+        start: initial embeddings: "random", or the features of the "teacher" at their corners.
         others: see `Student`.
     """
 
@@ -87,9 +87,9 @@ class Nsvf(FieldStudent):
 
 @torch.no_grad()
 def seen_at_corners(field: NsvfField, teacher: TrainedField) -> None:
-    """Give every corner the teacher's encoding of its place, in 1 / pi of the usual size of
-    embeddings: the network then begins with angles of that size, up to 32 times it, which are still
-    smooth from corner to corner."""
+    """Set every corner to the teacher's encoding at its position, in 1 / pi of the usual size of
+    embeddings. The angles of the positional encoding then begin at that size and reach 32 times it,
+    which is still smooth from corner to corner."""
     table = teacher.field
     places = field.vertices / len(field.index)
     found = encode(places, table.table, table.grid, packed=table.packed, backend=table.backend)

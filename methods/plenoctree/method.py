@@ -28,17 +28,17 @@ Stored = Literal["fp16", "fp32"]
 
 
 class PlenOctree(Student):
-    """A sparse grid of densities and spherical harmonics, taken from a trained field and refined on
-    the photos.
+    """A sparse grid of densities and spherical harmonics, extracted from a trained field and
+    fine-tuned on the photos.
 
     Args:
-        teacher: the field that it is taken from.
-        extraction: which leaves there are, and what they begin with.
-        training: how they learn.
-        stored: precision of the values in a file, which they are rendered at.
+        teacher: the field that it is extracted from.
+        extraction: which leaves there are, and their initial values.
+        training: how they are trained.
+        stored: precision of the values in a file, at which they are also rendered.
         stop: transmittance at which a ray ends, less than 1.
-        name: as it stands in result rows.
-        steps: of its own training; None: `budget.renderer_steps`.
+        name: as shown in result rows.
+        steps: steps of its own training; None: `budget.renderer_steps`.
     """
 
     kind = "plenoctree"
@@ -75,7 +75,7 @@ class PlenOctree(Student):
         self.extraction, self.stored = extraction, stored
 
     def model_settings(self) -> Mapping[str, object]:
-        """What is extracted."""
+        """See `Student`: the settings of the extraction."""
         return asdict(self.extraction)
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> OctreeTraining:
@@ -122,8 +122,8 @@ class PlenOctree(Student):
 
 
 def opaque_at_end(pixels: Pixels, stop: float) -> Pixels:
-    """With the rays opaque that ended at the transmittance `stop`, as in the release's viewer: what
-    they show is scaled to an opacity of 1."""
+    """Make the rays opaque that ended at the transmittance `stop`, as the release's viewer does:
+    their values are scaled to an opacity of 1."""
     ended = 1 - pixels.alpha <= stop
     scale = torch.where(ended, 1 / pixels.alpha, 1)
     return Pixels(

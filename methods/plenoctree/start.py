@@ -1,5 +1,5 @@
-"""An octree from a trained field (Yu et al. 2021, Sections 3.2 and 4): which leaves are needed, how
-dense they are, and spherical harmonics for their colours."""
+"""Extraction of an octree from a trained field (Yu et al. 2021, Sections 3.2 and 4): which leaves
+are needed, how dense they are, and spherical harmonics for their colours."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from methods.rendering.field import Field, pad
 from methods.students.voxels import largest_weights
 
 QUERIES = 1 << 18
-"""Places of the field that are looked at together."""
+"""Points at which the field is evaluated together."""
 
 CLAMP = 1e-3
-"""Colours are kept so far from 0 and 1, where their logits are infinite."""
+"""Colours are clamped this far from 0 and 1, where their logits are infinite."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,12 @@ class Extraction:
 
     Attributes:
         resolution: leaves along the side of the cube, a multiple of 64, 128 to 2048.
-        degree: of the spherical harmonics, 0 to 3.
-        least_weight: leaves stay whose weight on any of the training rays is at least this.
-        rays: random training rays that are looked at, at most as many as there are.
-        points: random places of a leaf over which its density is averaged.
-        directions: from which its colour is looked at.
-        most_leaves: candidates of more are refused before there is memory for them.
+        degree: degree of the spherical harmonics, 0 to 3.
+        least_weight: a leaf is kept if its weight on any of the training rays is at least this.
+        rays: random training rays that are traced, at most as many as there are.
+        points: random points of a leaf over which its density is averaged.
+        directions: number of directions in which its colour is evaluated.
+        most_leaves: maximum number of candidates; more are refused before memory is allocated.
     """
 
     resolution: int = 512
@@ -75,7 +75,7 @@ def extract(
     options: Extraction,
     generator: torch.Generator,
 ) -> Octree:
-    """The octree of what `teacher` shows to the training rays of `batches`.
+    """Extract the octree of what `teacher` shows to the training rays of `batches`.
 
     Raises:
         SteerbenchError: there are more candidates than allowed, or nothing to be seen.
@@ -135,8 +135,8 @@ def _densities(
 
 
 def _harmonics(field: Field, voxels: Voxels, degree: int, directions: int) -> Tensor:
-    """Coefficients [V, C, 3] whose sums are nearest, in `directions` evenly spread directions, to
-    the logits of the colours at the centres of the voxels."""
+    """Coefficients [V, C, 3], fitted by least squares to the logits of the colours at the centres
+    of the voxels, in `directions` evenly spread directions."""
     device, terms = voxels.coordinates.device, (degree + 1) ** 2
     towards = fibonacci_sphere(directions).to(device)
     basis = spherical_harmonics(towards, backend=field.backend)[:, :terms].double()

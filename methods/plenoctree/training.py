@@ -1,4 +1,4 @@
-"""Leaves learn from the photos (Yu et al. 2021, Section 4.2), from random rays, with Adam."""
+"""Training of the leaves on random rays of the photos, with Adam (Yu et al. 2021, Section 4.2)."""
 
 from __future__ import annotations
 
@@ -20,13 +20,12 @@ from methods.plenoctree.octree import Octree
 
 @dataclass(frozen=True)
 class OctreeLessons(PixelOptions):
-    """How leaves learn; `rate` is that of the harmonics. There is no grid, and no step.
+    """How to train leaves; `rate` is that of the harmonics. There is no density grid, and no step.
 
     Attributes:
-        density_rate: learning rate of the density, as optical thickness of a leaf, at the
-            beginning.
-        samples: leaves that a step aims to learn from; more than those of a field, of which every
-            sample changes the whole network.
+        density_rate: initial learning rate of the density, as optical thickness of a leaf.
+        samples: leaves that a step aims to learn from; more than the samples of a field, each of
+            which changes the whole network.
     """
 
     rate: float = 1e-2
@@ -44,7 +43,7 @@ class OctreeLessons(PixelOptions):
 
 
 class OctreeTraining(PixelTraining):
-    """The leaves stay as they are; their densities and harmonics change where rays see them.
+    """Trains the densities and harmonics of the leaves that rays see; the set of leaves is fixed.
 
     Attributes:
         visited: [S] int32 leaves that the rays of the last step saw.
@@ -75,7 +74,7 @@ class OctreeTraining(PixelTraining):
         self.moments = {name: AdamState.like(table) for name, table in self.tables.items()}
 
     def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
-        # `jitter` is of samples; a voxel is crossed where it is crossed.
+        # `jitter` moves samples; where a ray crosses a voxel is fixed.
         light, backend = self.octree.light, self.backend
         crossings = walk(rays, self.octree.voxels, backend=backend)
         with torch.no_grad():
@@ -117,11 +116,11 @@ class OctreeTraining(PixelTraining):
         return self.octree.tensors()
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
-        """Put back what `result` gave."""
+        """Restore what `result` returned."""
         self._take(Octree.of(tensors, self.octree.light.density.device))
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Moments, random numbers, size of the batch."""
+        """Moments, random numbers, number of rays."""
         tensors, figures = super().state()
         for name, adam in self.moments.items():
             tensors |= adam.tensors(f"{name}.")

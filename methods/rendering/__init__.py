@@ -1,1 +1,1 @@
-"""Volume rendering of a field: to train, all samples at once; to render, a few at a time."""
+"""Volume rendering of a field: all samples at once in training, a few at a time for frames."""

@@ -1,4 +1,4 @@
-"""Volume rendering to train: all samples of a batch of rays at once, with a gradient."""
+"""Volume rendering in training: all samples of a batch of rays at once, with a gradient."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from methods.rendering.march import March
 
 @dataclass(frozen=True)
 class FirstPass:
-    """All samples of R rays, and which of them the early stop leaves.
+    """All samples of R rays, and which of them are visible before their rays end.
 
     Attributes:
-        samples: hidden or not.
+        samples: visible or not.
         sigma: [S] their density, without gradient.
-        counts: [R] visible samples of each ray, its first ones.
+        counts: [R] number of visible samples of each ray, which are its first ones.
     """
 
     samples: Samples
@@ -46,18 +46,19 @@ def render_batch(
     guide: Field | None = None,
     hidden: bool = False,
 ) -> tuple[Pixels, int]:
-    """Render `rays`, R of them, differentiably; also the number of samples that took part.
+    """Render R `rays` differentiably; also return the number of samples that were composited.
 
     Samples behind the early stop, more than half of all once surfaces have formed, have neither
     weight nor gradient. A first pass finds them, and they are left out.
 
     Args:
         how: `window` and `faint` are ignored.
-        jitter: [R] phase of the samples of each ray, in [0, 1); None: as `rays.render_rays`.
-        background: [K] or [R, K]; None: not composited on any.
-        guide: a cheaper field whose densities tell in the first pass which samples are hidden, and
-            so have neither weight nor gradient; None: `field` itself.
-        hidden: evaluate hidden samples, too: a GPU is not waited for to count the others.
+        jitter: [R] phase of the samples of each ray, in [0, 1); None: as in `rays.render_rays`.
+        background: [K] or [R, K]; None: pixels are not composited on a background.
+        guide: a cheaper field whose densities decide in the first pass which samples are hidden,
+            and so have neither weight nor gradient; None: `field` itself.
+        hidden: evaluate hidden samples as well, so that the host need not wait for a GPU to count
+            the others.
     """
     if hidden:
         samples = march(rays, occupancy, how.step, jitter=jitter, backend=field.backend)
@@ -82,7 +83,7 @@ def first_pass(
     """Evaluate the density of all samples of `rays`; see `render_batch`.
 
     Args:
-        extent: how many there are; None: a GPU is waited for.
+        extent: how many samples there are; None: the host waits for a GPU to count them.
     """
     backend = field.backend
     samples = march(rays, occupancy, how.step, jitter=jitter, extent=extent, backend=backend)
@@ -101,6 +102,6 @@ def second_pass(field: Field, rays: Rays, samples: Samples, how: March) -> Pixel
 
 
 def opacity_entropy(opacity: Tensor) -> Tensor:
-    """Mean of -o ln o of `opacity` [R]: least where every ray meets all or nothing."""
+    """Mean of -o ln o of `opacity` [R]: smallest when every ray is fully opaque or empty."""
     opacity = opacity.clamp(1e-5, 1 - 1e-5)
     return -(opacity * opacity.log()).mean()

@@ -1,7 +1,7 @@
-"""Whether work is left out by lists of what is left: on a CPU, where they cost nothing to make.
+"""Compaction of work: on a CPU, only what is needed is computed, from lists of its indices.
 
-On a GPU the host would wait for the length of such a list until all work before is done. There what
-is not needed is computed with the rest, in a way that changes nothing.
+On a GPU the host would wait for the length of such a list until all earlier work is done. There
+everything is computed, in a way that leaves the result unchanged.
 """
 
 from __future__ import annotations
@@ -13,27 +13,27 @@ from torch import Tensor
 
 
 def compacts(device: torch.device) -> bool:
-    """Whether lists are made of what is left."""
+    """Whether work on `device` is compacted."""
     return device.type == "cpu"
 
 
 def kept_indices(mask: Tensor) -> Tensor:
-    """Where `mask` [N] is true, in order; all N places where no lists are made."""
+    """Indices where `mask` [N] is true, in order; all N where work is not compacted."""
     if compacts(mask.device):
         return mask.nonzero().squeeze(1)
     return torch.arange(len(mask), device=mask.device)
 
 
 def to_host(numbers: Sequence[Tensor]) -> list[int]:
-    """All integers in `numbers`, of any shapes. The host waits for a GPU once, not for each."""
+    """Copy all integers in `numbers`, of any shapes, to the host, which waits for a GPU once."""
     return torch.cat([number.flatten() for number in numbers]).tolist()
 
 
 def indices_where(masks: Sequence[Tensor], sizes: Sequence[int] | None = None) -> list[Tensor]:
-    """Where each of `masks` is true, in order.
+    """Indices where each of `masks` is true, in order.
 
     Args:
-        sizes: how often each is true; None: a GPU is waited for, once for all.
+        sizes: number of true entries of each; None: the host waits for a GPU, once for all.
     """
     if not masks:
         return []

@@ -1,4 +1,4 @@
-"""What a radiance field is to those who render it, and how batches of its samples are evaluated."""
+"""The interface of a radiance field to its renderers, and how batches of samples are evaluated."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ BATCH_QUANTUM = 1 << 11
 """Samples are handed to a field in multiples of this."""
 
 CHUNK_SAMPLES = 1 << 18
-"""Samples that are evaluated together where no gradient needs them: bounds the memory."""
+"""Samples that are evaluated together if no gradient is needed: bounds the memory."""
 
 ROUND_SAMPLES = 6
-"""Samples of a ray that a field evaluates together where rays end early, if one costs little. With
-more, some are evaluated in vain behind the end of a ray; with fewer, there are more rounds."""
+"""Samples of a ray that a field evaluates together where rays end early, if a sample costs little.
+With more, some are evaluated in vain behind the end of a ray; with fewer, there are more rounds."""
 
 LOG_DENSITY_CLAMP = 15.0
 """The gradient of exp is taken at a log density clamped to +- this (as torch-ngp and ngp_pl do)."""
@@ -29,7 +29,7 @@ class Field(Protocol):
 
     Attributes:
         channels: K; the first three features are RGB.
-        backend: of the kernels that render it.
+        backend: backend of the kernels that render it.
         round_samples: samples of a ray that are best evaluated together where rays end early.
     """
 
@@ -39,10 +39,10 @@ class Field(Protocol):
 
     @property
     def device(self) -> torch.device:
-        """Where it lies."""
+        """The device of its parameters."""
 
     def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """Density [S] at `positions` [S, 3], and what `features` needs of them [S, G]."""
+        """Density [S] at `positions` [S, 3], and the geometry [S, G] that `features` needs."""
 
     def encode_directions(self, directions: Tensor) -> Tensor:
         """Encoding [R, D] of ray `directions` [R, 3] of any length."""
@@ -51,7 +51,7 @@ class Field(Protocol):
         """Features [S, K] of samples with `geometry` [S, G] and encoded directions [S, D]."""
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
-        """Count the work of the densities of `samples` and of the features of `shaded`."""
+        """Count the work of `samples` densities and `shaded` features."""
 
 
 def query(field: Field, positions: Tensor, ray: Tensor, encoded: Tensor) -> tuple[Tensor, Tensor]:
@@ -63,10 +63,10 @@ def query(field: Field, positions: Tensor, ray: Tensor, encoded: Tensor) -> tupl
 
 
 def pad(samples: Tensor) -> Tensor:
-    """Zeros at the end of [S, ...], up to a multiple of `BATCH_QUANTUM`.
+    """Pad [S, ...] with zeros to a multiple of `BATCH_QUANTUM`.
 
     oneDNN prepares code for every new matrix size, which takes longer than the product itself, so a
-    field sees batches of a few round sizes only.
+    field should see only a few round batch sizes.
     """
     padding = -len(samples) % BATCH_QUANTUM
     return functional.pad(samples, (0, 0) * (samples.dim() - 1) + (0, padding))

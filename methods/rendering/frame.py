@@ -17,17 +17,17 @@ from methods.rendering.march import March
 from methods.rendering.rays import render_rays
 
 Render = Callable[[Tensor, Rays], Pixels]
-"""Renders some pixels of a frame, [P] indices row by row, by their rays."""
+"""Renders some pixels of a frame, given their row-major indices [P] and their rays."""
 
 
 @dataclass(frozen=True)
 class FeatureFrame:
-    """What a field shows to a camera: F and D of SteerNeRF.
+    """A field as a camera sees it: F and D of SteerNeRF.
 
     Attributes:
-        camera: of `width` x `height` pixels, w x h below.
-        values: [h, w, K] features on the background, the first three are RGB.
-        depth: [h, w] z-depth, +inf where nothing is.
+        camera: a camera of w x h pixels.
+        values: [h, w, K] features on the background; the first three are RGB.
+        depth: [h, w] z-depth, +inf where a pixel is empty.
         alpha: [h, w] opacity.
     """
 
@@ -38,7 +38,7 @@ class FeatureFrame:
 
     @classmethod
     def of(cls, camera: Camera, pixels: Pixels, background: Tensor) -> FeatureFrame:
-        """From all pixels of `camera`, not yet composited on `background` [K]."""
+        """Make a frame of all pixels of `camera`, and composite them on `background` [K]."""
         values = pixels.over(background).values
         seen = pixels.alpha > EMPTY_ALPHA
         depth = torch.where(seen, pixels.depth_sum / pixels.alpha, torch.inf)
@@ -46,7 +46,7 @@ class FeatureFrame:
         return cls(camera, values.view(*shape, -1), depth.view(shape), pixels.alpha.view(shape))
 
     def picture(self) -> Frame:
-        """What is shown of a field without further features."""
+        """The picture of a field that has no features beyond RGB."""
         return Frame(self.values, self.depth, self.alpha)
 
 
@@ -58,10 +58,10 @@ def render_frame(
     probe: Probe,
     render: Render,
 ) -> FeatureFrame:
-    """The frame of `camera`, composited on `background` [K].
+    """Render the frame of `camera`, composited on `background` [K].
 
     Args:
-        render: renders the pixels that may see anything.
+        render: renders the pixels that may see matter.
     """
     size = camera.height * camera.width
     with probe.stage("rays"):
@@ -75,8 +75,8 @@ def render_frame(
 
 
 def everywhere(field: Field, occupancy: Occupancy, probe: Probe, how: March) -> Render:
-    """What marches rays for `render_frame`: whole rays, or within `how.window` [h * w, 2], which is
-    given for all pixels."""
+    """Make the argument `render` of `render_frame` that marches whole rays, or marches them within
+    `how.window` [h * w, 2], which is given for all pixels."""
 
     def render(seen: Tensor, rays: Rays) -> Pixels:
         window = None if how.window is None else how.window[seen]
@@ -86,17 +86,17 @@ def everywhere(field: Field, occupancy: Occupancy, probe: Probe, how: March) -> 
 
 
 def rays_at_matter(camera: Camera, occupancy: Occupancy) -> tuple[Tensor, Rays]:
-    """The pixels that may see an occupied cell, as indices [P] row by row, and their rays. The host
+    """The pixels that may see an occupied cell, as row-major indices [P], and their rays. The host
     waits for a GPU once."""
     row, column = sees_matter(camera, occupancy).nonzero().unbind(dim=1)
     return row * camera.width + column, cast(camera, torch.stack((column, row), dim=1) + 0.5)
 
 
 def sees_matter(camera: Camera, occupancy: Occupancy) -> Tensor:
-    """Whether a pixel may see an occupied cell: [h, w] bool.
+    """Which pixels may see an occupied cell: [h, w] bool.
 
-    It may see an occupied brick if it lies in the box around the projected corners of the brick;
-    every pixel may, if one of them is not in front of the camera.
+    A pixel may see an occupied brick if it lies in the bounding box of the brick's projected
+    corners; if one of the corners is not in front of the camera, every pixel may.
     """
     device = camera.c2w.device
     bricks = occupancy.bricks.to(device)
@@ -113,8 +113,8 @@ def sees_matter(camera: Camera, occupancy: Occupancy) -> Tensor:
         for ends in (low, high)
     )
 
-    # How many boxes cover a pixel: the sum, over all pixels above and to the left, of +1 and -1 at
-    # the boxes' corners.
+    # How many boxes cover a pixel: the 2D prefix sum, from the top left, of +1 and -1 at
+    # the corners of the boxes.
     edges = torch.zeros(camera.height + 1, camera.width + 1, dtype=torch.int32, device=device)
     for row, column, sign in (
         (top, left, 1),

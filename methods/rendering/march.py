@@ -1,4 +1,4 @@
-"""How far rays are marched, and in which steps."""
+"""How rays are marched: their steps, and where they end."""
 
 from __future__ import annotations
 
@@ -10,23 +10,24 @@ from methods.kernels.composite import STOP
 from methods.rendering.occupancy import RESOLUTION, STEP
 
 FAINT = 0.1
-"""A sample of less weight than `FAINT * stop` has an opacity but no features: the error is less
+"""A sample whose weight is below `FAINT * stop` has an opacity but no features: the error is less
 than a tenth of what the early stop may cause."""
 
 
 def suitable_step(steps: int) -> float:
-    """World length of a ray-marching step that suits a training of so many `steps`.
+    """World length of the ray-marching step that suits a training of `steps` steps.
 
-    With as many samples, longer steps are more rays: they pay until a field has become finer than
-    they are. 2.7 diagonals of the cube / 1024 for 1,000 steps, which fall with the cube root to the
-    release's 1 for its 20,000; never more than a cell of the density grid, which a longer one would
-    miss. Measured up to 3,000: docs/log.md, "The step that a training needs".
+    With the same number of samples, longer steps allow more rays. This pays until the detail of the
+    field is finer than the step. The length is 2.7 diagonals of the cube / 1024 for 1,000 training
+    steps and falls with their cube root: at 20,000, as many as the release trains, it is 1, as in
+    the release. It never exceeds a cell of the density grid, which a longer step would miss.
+    Measured up to 3,000: docs/log.md, "The step that a training needs".
     """
     return min(STEP * (20_000 / steps) ** (1 / 3), 1 / RESOLUTION)
 
 
 def check_step(name: str, length: float) -> None:
-    """Refuse, with a ValueError, a step that leads nowhere."""
+    """Raise ValueError unless the `length` of a step is more than 0."""
     if not length > 0:
         raise ValueError(f"{name}: expected a length of more than 0, got {length}")
 

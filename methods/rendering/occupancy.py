@@ -1,9 +1,9 @@
-"""Learning where a field is empty: a decaying maximum of its density on a grid of cells.
+"""Occupancy grid of a field in training: a decaying maximum of its density in each cell.
 
 After Instant-NGP (appendix E.2): every `EVERY` steps the density is sampled at random points of
 some cells, and a cell counts as occupied when its running maximum exceeds min(mean of the cells,
-the density that is opaque to 1 % over one step). Two things differ. A cell's value changes only
-when the cell is visited, so that a cell that was not looked at is not forgotten. And all cells
+the density that is opaque to 1 % over one step). Two things differ. A cell's value decays only
+when the cell is visited, so that cells that were not sampled are not forgotten. And all cells
 start out occupied, one visit away from being empty, so that no step ever samples the whole grid.
 """
 
@@ -28,31 +28,32 @@ EVERY = 16
 """Training steps between two updates."""
 
 DECAY = 0.8
-"""What a visit that finds nothing leaves of a cell's value."""
+"""Factor by which a visit reduces a cell's value, if it finds no higher density."""
 
 MIN_ALPHA = 0.01
 THRESHOLD = MIN_ALPHA / STEP
 """Density that is opaque to `MIN_ALPHA` over one step."""
 
 INITIAL = 1.2 * THRESHOLD
-"""Density of a cell before its first visit: one that finds nothing empties the cell."""
+"""Value of a cell before its first visit: a visit that finds nothing empties the cell."""
 
 LARGEST = math.exp(LOG_DENSITY_CLAMP)
-"""A cell that was denser is remembered as this and can be forgotten: infinity does not decay."""
+"""Higher densities are stored as this value, so that they can decay: infinity does not."""
 
 MIN_VIEWS = 2
-"""Training cameras that must see a place before anything is believed to be there."""
+"""Training cameras that must see a place before it may count as occupied."""
 
 CHUNK = 1 << 18
 """Visits whose density is evaluated together: bounds the memory of an update."""
 
 
 def learnable_cells(bounds: Tensor, cameras: Sequence[Camera]) -> Tensor:
-    """Cells [G, G, G] of which the pictures of `cameras` can tell whether they are empty.
+    """Cells [G, G, G] that the pictures of `cameras` can show to be empty or not.
 
-    They lie inside `bounds` [2, 3] and in a brick of 4^3 cells that at least `MIN_VIEWS` cameras
-    have in their picture: what a single one sees could be anywhere along its rays, and training
-    would put it right before the camera. Bricks that touch a camera are left out as well.
+    They overlap `bounds` [2, 3] and lie in a brick of 4^3 cells that at least `MIN_VIEWS` cameras
+    have in their picture: what only one camera sees could be anywhere along its rays, and training
+    would put it right in front of that camera. Bricks at most one brick away from a camera are left
+    out as well.
     """
     device = bounds.device
     edge = torch.arange(RESOLUTION, device=device) / RESOLUTION
@@ -77,7 +78,7 @@ def learnable_cells(bounds: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 
 class DensityGrid:
-    """Running density of [G, G, G] cells of the unit cube and the occupancy that follows from it.
+    """The running maximum of the density in [G, G, G] cells of the unit cube, and their occupancy.
 
     Only `cells` [G, G, G] bool may ever be occupied.
     """
@@ -88,17 +89,17 @@ class DensityGrid:
         self.occupancy = Occupancy(cells)
 
     def restore(self, density: Tensor) -> None:
-        """Take over the density of a checkpoint."""
+        """Restore the density of a checkpoint."""
         self.density.copy_(density)
         self._threshold()
 
     @torch.no_grad()
     def update(self, field: Field, generator: torch.Generator, samples: int) -> None:
-        """Visit `samples` random cells, half of them among all, half among the occupied ones."""
+        """Visit `samples` random cells: half drawn from all cells, half from the occupied ones."""
         cells = self._draw(samples, generator)
         found = torch.full_like(self.density.view(-1), -1.0)
         for part in cells.split(CHUNK):
-            # As `torch.unravel_index`, which asks for the largest: a GPU would be waited for.
+            # Not `torch.unravel_index`: it checks the largest index, and waits for a GPU.
             rows, columns = self.density.shape[1:]
             corner = torch.stack(
                 (part // (rows * columns), part // columns % rows, part % columns), dim=-1

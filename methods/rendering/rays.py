@@ -1,5 +1,5 @@
-"""Volume rendering to render: on a CPU rays take a few samples at a time and end early; on a GPU,
-which is not to be waited for, all at once."""
+"""Volume rendering of frames. On a CPU rays take a few samples at a time and end early; on a GPU
+all samples are taken at once, so that the host need not wait."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from methods.rendering.field import CHUNK_SAMPLES, Field, pad, query
 from methods.rendering.march import March
 
 CHUNK_RAYS = 1 << 16
-"""Rays rendered together: enough to keep all threads busy, few enough to stay in the cache. It
-bounds the memory of a GPU, too: it holds the samples of so many rays."""
+"""Rays rendered together: enough to keep all threads busy, few enough to stay in the cache. This
+also bounds the memory of a GPU, which holds all samples of these rays."""
 
 
 @torch.no_grad()
@@ -27,10 +27,10 @@ def render_rays(
     how: March,
     carry: Pixels | None = None,
 ) -> Pixels:
-    """Render `rays`, R of them. Values are not composited on a background.
+    """Render R `rays`. Values are not composited on a background.
 
     Args:
-        carry: what lies in front of the windows of `how`; changed in place and returned.
+        carry: pixels of what lies in front of the windows of `how`; changed in place and returned.
     """
     device = rays.origins.device
     canvas = carry or Pixels.blank(len(rays.origins), field.channels, device)
@@ -42,11 +42,11 @@ def render_rays(
 def _in_rounds(
     field: Field, rays: Rays, occupancy: Occupancy, probe: Probe, how: March, canvas: Pixels
 ) -> None:
-    """Render into `canvas` so that few samples are evaluated behind the early stop.
+    """Render into `canvas` in rounds, so that few samples are evaluated behind the early stop.
 
     A round takes the next few samples of the rays that are still open, evaluates and composites
     them, and drops the rays that have ended. When fewer than half of the rays are left, each takes
-    as many more.
+    proportionally more samples.
     """
     device = rays.origins.device
     for first in range(0, len(rays.origins), CHUNK_RAYS):
@@ -83,10 +83,11 @@ def _in_rounds(
 def _at_once(
     field: Field, rays: Rays, occupancy: Occupancy, probe: Probe, how: March, canvas: Pixels
 ) -> None:
-    """Render into `canvas` so that the host waits once, for the numbers of samples of all chunks.
+    """Render into `canvas` so that the host waits once, for the sample counts of all chunks.
 
-    Every sample is evaluated, also where it is hidden or faint: only a GPU knows which are, and it
-    evaluates them sooner than it tells. So the work is that of one round of all samples.
+    Every sample is evaluated, even if it is hidden or faint: only the GPU knows which are, and
+    evaluating them takes less time than asking. So the work is that of a single round with all
+    samples.
     """
     window, backend = how.window, field.backend
     with probe.stage("march"):
@@ -129,8 +130,8 @@ def _at_once(
 def _evaluated(
     field: Field, samples: Samples, directions: Tensor, front: Pixels, how: March, probe: Probe
 ) -> tuple[Tensor, Tensor]:
-    """Density [S] and features [S, K] of `samples` behind what is in `front` of them; features of
-    faint samples are 0."""
+    """Density [S] and features [S, K] of `samples` behind the pixels in `front`; features of faint
+    samples are 0."""
     with probe.stage("field"):
         sigma, geometry = field.density(pad(samples.positions))
         sigma = sigma[: len(samples)]

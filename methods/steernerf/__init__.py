@@ -1,1 +1,1 @@
-"""SteerNeRF (Li et al. 2022), after Section 3 of the paper; `beyond` holds what is ours."""
+"""SteerNeRF (Li et al. 2022), after Section 3 of the paper; `beyond` holds our extensions."""

@@ -27,27 +27,27 @@ from methods.steernerf.options import Reprojection
 from methods.training.checkpoint import part
 
 SPLAT_ALPHA = 0.1
-"""Least opacity of a pixel that becomes a point: the depth of a fainter one means little."""
+"""Minimum opacity of a pixel that becomes a point; the depth of a fainter pixel is unreliable."""
 
 OVERLAP_POINTS = 256
-"""Points, evenly spread, that tell how much of a frame another view shares."""
+"""At most this many evenly spaced points estimate how much of a frame another view shares."""
 
 
 CLOUD = ("source", "points", "values", "alpha")
-"""The tensors of a cloud."""
+"""The tensor attributes of a `Cloud`."""
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """The pixels of a low-resolution frame that show something, as points in the scene.
+    """The non-empty pixels of a low-resolution frame, as points in the scene.
 
-    On a GPU they are all pixels (`rendering.compaction`), and a point that shows nothing lies
-    nowhere: its coordinates are NaN, and no view sees it.
+    On a GPU all pixels are kept (`rendering.compaction`): the points of empty ones have NaN
+    coordinates, so that no view sees them. With depths "sum" (`Reprojection`) all are kept as well.
 
     Attributes:
-        camera: of the frame.
-        source: [N] index of each point's pixel, row by row.
-        points: [N, 3].
+        camera: the camera of the frame.
+        source: [N] row-major index of each point's pixel.
+        points: [N, 3] positions in scene units.
         values: [N, K] features.
         alpha: [N] opacity.
     """
@@ -60,7 +60,7 @@ class Cloud:
 
     @classmethod
     def of(cls, frame: FeatureFrame, how: Reprojection) -> Cloud:
-        """The points of `frame`."""
+        """Unproject the pixels of `frame`."""
         alpha, depth = frame.alpha.flatten(), frame.depth.flatten()
         if how.depth == "sum":
             source = torch.arange(len(alpha), device=alpha.device)
@@ -78,7 +78,7 @@ class Cloud:
         return cls(camera, source, points, values, alpha[source])
 
     def expected(self) -> Cloud:
-        """Of a cloud of sums w t: its points at the depths sum w t / sum w, without the faint."""
+        """Turn a cloud with depths sum w t into one with sum w t / sum w, without faint points."""
         clear = self.alpha > SPLAT_ALPHA
         kept, centre = kept_indices(clear), self.camera.c2w[:, 3]
         alpha = torch.where(clear, self.alpha, torch.nan)[kept]
@@ -86,24 +86,27 @@ class Cloud:
         return Cloud(self.camera, self.source[kept], points, self.values[kept], alpha)
 
     def splat(self, camera: Camera, how: Reprojection, backend: str) -> tuple[Tensor, Tensor]:
-        """Which point each pixel of `camera` shows.
+        """Find the point that each pixel of `camera` shows.
 
         Returns:
-            [H, W] int32, the index of the point, -1 for none; and [N] the z-depth of the points.
+            [H, W] int32 index of the point, -1 for none; and [N] z-depth of the points.
         """
         pixels, depth = project(camera, self.points)  # Eq. 7 at low resolution, Eq. 9 at full
         if how.centres == "paper":
-            pixels = pixels + 0.5  # pixel i is at i there, and shows what rounds to it
+            pixels = pixels + 0.5  # the paper centres pixel i at i
         size = camera.width, camera.height
         index = splat(pixels, depth, *size, rule=how.rule, backend=backend)  # Eq. 8, Eq. 10
         return index, depth
 
     def overlap(self, camera: Camera) -> Tensor:
-        """About which share of what this frame shows `camera` can see, 0 to 1: [], where it lies.
+        """Estimate the share of what this frame shows that `camera` can see, 0 to 1.
 
-        An estimate that takes all surfaces for balls: a point inside the other picture counts
-        (1 + cos t) / 2, the share of a ball's disc that a camera at an angle of t sees as well.
-        Occlusion is ignored. 0 for a frame that shows nothing.
+        Every point inside the other picture counts (1 + cos t) / 2, where t is the angle between
+        the two views of it: on a ball, the share of the visible disc that both cameras see.
+        Occlusion is ignored. A frame that shows nothing gives 0.
+
+        Returns:
+            A scalar tensor on the device of the cloud.
         """
         clear = self.alpha > SPLAT_ALPHA
         number = clear.cumsum(dim=0)  # from 1
@@ -121,8 +124,8 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Remembered:
-    """What is kept of a frame: its `cloud`, and its `picture` [H, W, 3] as `camera` saw it, None
-    where no frame to come reads it."""
+    """What the buffer keeps of a frame: its `cloud`, and the `picture` [H, W, 3] that `camera` saw,
+    None if no later frame reads it."""
 
     cloud: Cloud
     camera: Camera
@@ -130,41 +133,41 @@ class Remembered:
 
 
 class RenderingBuffer:
-    """The last `length` frames of a sequence; more are forgotten."""
+    """The last `length` frames of a sequence; older ones are dropped."""
 
     def __init__(self, length: int) -> None:
         self._frames: deque[Remembered] = deque(maxlen=length)
 
     @property
     def frames(self) -> Sequence[Remembered]:
-        """Newest first; fewer than `length` after a cold start."""
+        """The stored frames, newest first; fewer than `length` after a cold start."""
         return tuple(self._frames)
 
     def push(self, frame: Remembered) -> None:
-        """Remember `frame`, forget the oldest one if there are too many."""
+        """Store `frame`; drop the oldest one if the buffer is full."""
         self._frames.appendleft(frame)
 
     def copy(self) -> RenderingBuffer:
-        """A buffer that has seen the same frames, and goes on by itself."""
+        """An independent buffer with the same frames."""
         other = RenderingBuffer(self._frames.maxlen or 0)
         other._frames.extend(self._frames)
         return other
 
     def state(self) -> dict[str, Tensor]:
-        """All that is remembered, to be kept in a file."""
+        """All stored frames, to be kept in a file."""
         tensors: dict[str, Tensor] = {}
         for age, frame in enumerate(self._frames):
             tensors |= {f"{age}.{name}": x for name, x in _packed(frame).items()}
         return tensors
 
     def restore(self, tensors: Mapping[str, Tensor], device: torch.device) -> None:
-        """Remember on `device` what `state` gave of another buffer."""
+        """Restore on `device` what `state` of another buffer returned."""
         ages = sum(name.endswith(".camera") for name in tensors)
         frames = (_unpacked(part(tensors, f"{age}."), device) for age in range(ages))
         self._frames = deque(frames, self._frames.maxlen)
 
     def reset(self) -> None:
-        """Forget all: a new sequence starts."""
+        """Drop all frames: a new sequence starts."""
         self._frames.clear()
 
 
@@ -175,7 +178,7 @@ def _packed(frame: Remembered) -> dict[str, Tensor]:
 
 
 def _packed_picture(picture: Tensor) -> dict[str, Tensor]:
-    """Only what differs from its first pixel: most of it is background."""
+    """Keep only the pixels that differ from the first one: most are background."""
     pixels = picture.flatten(0, 1)
     places = (pixels != pixels[0]).any(dim=1).nonzero().squeeze(1)
     return {"background": pixels[0].clone(), "places": places.int(), "pixels": pixels[places]}

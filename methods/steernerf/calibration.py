@@ -1,4 +1,4 @@
-"""Inputs of a 2D renderer's network on real frames, for engines that calibrate on them."""
+"""Inputs of the 2D renderer's network on real frames, for engines that calibrate on them."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from methods.training import checkpoint
 
 @dataclass(frozen=True)
 class Calibration:
-    """Frames of a trained pipeline that an engine may see.
+    """Frames of a trained pipeline on which an engine can calibrate the network.
 
     Attributes:
-        pipeline: whose renderer has no engine yet.
-        rendering: of the frames.
-        scene: whose training views they are.
-        degrees: range of the angular speed of the motions before the views, degrees a frame.
-        seed: of the motions.
+        pipeline: the trained pipeline; its renderer has no engine yet.
+        rendering: how the frames are rendered.
+        scene: the scene whose training views are rendered.
+        degrees: range of the angular speed of the motion before each view, in degrees per frame.
+        seed: seed of these motions.
     """
 
     pipeline: Pipeline
@@ -39,10 +39,10 @@ class Calibration:
     seed: int
 
     def inputs(self, count: int, folder: Path, log: Log) -> list[Inputs]:
-        """What the network is given in `count` frames, 1 or more: recorded once, kept in `folder`.
+        """The network's inputs in `count` frames, 1 or more; recorded once and kept in `folder`.
 
         Raises:
-            SteerbenchError: the file there cannot be written or read.
+            SteerbenchError: the file in `folder` cannot be written or read.
         """
         path = folder / "inputs.safetensors"
         with missing(path, log) as to_record:
@@ -62,10 +62,10 @@ class Calibration:
         return [tuple(tensors[name].to(device) for name in names) for _, names in by_frame]
 
     def record(self, count: int, log: Log) -> list[Inputs]:
-        """What the network is given in `count` training views, evenly spread.
+        """Record the network's inputs in `count` training views, evenly spread.
 
-        L + 1 frames of a random smooth motion precede each view: with one more than the buffer
-        holds, its oldest frame was rendered after another one.
+        L + 1 frames of a random smooth motion precede each view. That is one more than the buffer
+        holds, so that even its oldest frame was rendered with a preceding frame.
         """
         generator = torch.Generator().manual_seed(self.seed)
         cameras, target = self.scene.splits["train"].cameras, viewing_target(self.scene)

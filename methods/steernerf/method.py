@@ -25,23 +25,23 @@ from methods.steernerf.training.stage2 import Stage2, TrainedPipeline, train_sta
 
 
 class SteerNerf:
-    """Low-resolution features of a field, preceding frames and a 2D renderer.
+    """SteerNeRF: low-resolution features of a field, preceding frames and a 2D renderer.
 
     Args:
         grid: shape of the hash table.
-        training: stage 1, the field alone at full resolution; shared with every other method that
-            trains it in the same way.
-        model: what stage 2 trains for.
-        rendering: what is chosen afterwards.
-        renderer: makes the 2D renderer, called with K, L and s.
-        joint: stage 2, on patches, of `budget.renderer_steps` steps.
-        after: share of these after which it is rendered; see `training.stage2.Stage2`.
+        training: how stage 1 trains the field alone, at full resolution; all methods with the same
+            options share the result.
+        model: the settings that stage 2 trains for.
+        rendering: the settings chosen after training.
+        renderer: factory of the 2D renderer, called with K, L and s.
+        joint: how stage 2 trains on patches, for `budget.renderer_steps` steps.
+        after: share of these steps whose weights are used; see `training.stage2.Stage2`.
         engine: computes the network of the 2D renderer once it is trained.
         precision: of the field, "bf16" (packed table, bfloat16 networks) or "fp32".
-        name: as it stands in result rows.
+        name: as shown in result rows.
 
     Attributes:
-        rendering: may be exchanged between frames.
+        rendering: may be replaced between frames.
     """
 
     study = STUDY
@@ -72,7 +72,7 @@ class SteerNerf:
         self.train_s = 0.0
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
-        """Train both stages, or load what the same trainings left behind."""
+        """Train both stages, or load their results if they were trained before."""
         with torch_threads(budget.threads):
             self.trained = train_field(self.setup, scene, budget, log)
             second = train_stage2(self.trained, self.setup, self.stage2, scene, budget, log)
@@ -85,7 +85,7 @@ class SteerNerf:
         self.buffer.reset()
 
     def render(self, camera: Camera, probe: Probe) -> Frame:
-        """The next frame of the sequence."""
+        """Render the next frame of the sequence."""
         return self.pipeline.render(camera, self.buffer, self.rendering, probe)
 
     def sizes(self) -> dict[str, int]:
@@ -100,10 +100,10 @@ class SteerNerf:
         }
 
     def _build_network(self, second: TrainedPipeline, scene: Scene, log: Log) -> None:
-        """Have the engine compute the network of the 2D renderer from now on.
+        """Build the network of the 2D renderer with the engine, which computes it from now on.
 
-        It is calibrated on frames rendered as in training, so that it does not depend on
-        `rendering`.
+        The engine is calibrated on frames rendered as in training, so that the result does not
+        depend on `rendering`.
         """
         renderer, engine, joint = second.pipeline.renderer, self.engine, self.stage2.joint
         rendering = Rendering.in_training(self.stage2.model, joint.refined, joint.refined_step)
@@ -124,7 +124,7 @@ class SteerNerf:
 
 
 def _check(stage2: Stage2, rendering: Rendering) -> None:
-    """Refuse, with a ValueError and before anything is trained, what does not go together."""
+    """Raise ValueError, before anything is trained, if settings contradict each other."""
     model = stage2.model
     if not model.frames and rendering.range.mode != "off":
         raise ValueError(
@@ -137,7 +137,7 @@ def _check(stage2: Stage2, rendering: Rendering) -> None:
             "rendering.range.depth: expected the depth that is kept, model.reprojection.depth="
             "expected; got sum"
         )
-    with torch.random.fork_rng(devices=()):  # asked for what it can do; another one is trained
+    with torch.random.fork_rng(devices=()):  # queried for its abilities; another one is trained
         renderer = stage2.make_renderer(model.channels, model.frames, model.scale)
     for name in ("history", "surface"):
         if getattr(model, name) and not renderer.reads_details:

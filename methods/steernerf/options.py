@@ -1,4 +1,4 @@
-"""What of a frame is trained for (`Model`), and what is chosen afterwards (`Rendering`)."""
+"""Settings that stage 2 trains for (`Model`), and settings chosen afterwards (`Rendering`)."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from methods.rendering.march import March, check_step
 from methods.rendering.occupancy import STEP
 
 SIZES = {"channels": (3, 256), "frames": (0, 64), "scale": (1, 64)}
-"""K, L and s that a model may have: from, to."""
+"""Minimum and maximum of K, L and s."""
 
 
 @dataclass(frozen=True)
 class Reprojection:
-    """How a frame is brought into another view; the release's values are marked (paper).
+    """How a frame is reprojected into another view; the release's choices are marked (paper).
 
     Attributes:
-        rule: which point a pixel shows, the "nearest", or the "last" written (paper).
-        centres: "exact", or "paper" (paper): unprojected through the corner of a pixel, a constant
-            offset of s / 2 - 1/2 pixels that the 2D renderer has to learn.
-        depth: "expected" termination, or the "sum" of w t (paper): too near where alpha < 1; empty
-            pixels become points at the camera.
+        rule: which of several points a pixel shows, the "nearest", or the "last" written (paper).
+        centres: "exact", or "paper" (paper): pixels are unprojected through their corner, a
+            constant offset of s / 2 - 1/2 pixels that the 2D renderer has to learn.
+        depth: the "expected" depth of the ray, or the "sum" of w t (paper), which is too near where
+            alpha < 1 and turns empty pixels into points at the camera.
     """
 
     rule: Literal["nearest", "last"] = "nearest"
@@ -32,21 +32,21 @@ class Reprojection:
 
 @dataclass(frozen=True)
 class Model:
-    """What a SteerNeRF is trained for: a change of any of it is another training.
+    """What a SteerNeRF is trained for: changing any of it requires training again.
 
     Attributes:
-        channels: K, features of the field; the first three are RGB.
-        frames: L, preceding frames.
-        scale: s, the field is rendered at 1/s of the resolution.
-        step: of the rays at low resolution, in diagonals of the cube / 1024; stage 2 trains the
-            field for it.
+        channels: K, number of features of the field; the first three are RGB.
+        frames: L, number of preceding frames.
+        scale: s; the field is rendered at 1/s of the resolution.
+        step: ray-marching step at low resolution, in diagonals of the cube / 1024; stage 2 trains
+            the field for it.
         stop: transmittance at which a ray ends.
-        reprojection: how preceding frames are brought into the present view.
-        feature_background: what the features beyond RGB are composited on. 1/2 is what an
-            untrained feature is everywhere.
-        history: the preceding picture is reprojected, too (not in the paper).
-        surface: the field is also evaluated once a pixel at full resolution, where the
-            low-resolution depth has the surface (not in the paper).
+        reprojection: how preceding frames are reprojected into the present view.
+        feature_background: what the features beyond RGB are composited on. 1/2 is the value of an
+            untrained feature.
+        history: whether the preceding picture is reprojected as well (not in the paper).
+        surface: whether the field is also evaluated once per pixel at full resolution, at the
+            surface that the low-resolution depth gives (not in the paper).
     """
 
     channels: int
@@ -68,16 +68,16 @@ class Model:
 
 @dataclass(frozen=True)
 class RangeReduction:
-    """Where along a ray to look for a surface, given the depth of the newest preceding frame.
+    """Where along a ray to sample, given the depth of the newest preceding frame.
 
     Attributes:
         mode: "off": everywhere. "paper": within `epsilon` of the depth reprojected onto the pixel
             (SteerNeRF, Section 3.2). "window": within `epsilon` of the depths reprojected onto its
-            3 x 3 neighbourhood. A ray ends at the opacity they had; if it does not reach it, it
-            continues behind the window. At a depth edge the whole ray is marched.
-        epsilon: scene units along z.
-        depth: which D it is that is reprojected: "sum", sum w t as the release renders it, or
-            "expected", divided by the opacity. The two differ at silhouettes.
+            3 x 3 neighbourhood. A ray ends once it has the opacity of these points; if it does not
+            reach it, it continues behind the window. At a depth edge the whole ray is marched.
+        epsilon: margin on either side of the depth, scene units along z.
+        depth: which depth D is reprojected: "sum", the sum of w t as the release renders it, or
+            "expected", the same divided by the opacity. The two differ at silhouettes.
     """
 
     mode: Literal["off", "paper", "window"] = "off"
@@ -91,12 +91,12 @@ class RangeReduction:
 
 @dataclass(frozen=True)
 class Skips:
-    """What is not computed because no picture shows it; switched off, to see what that saves.
+    """Work to skip because no picture shows it; switch one off to measure what it saves.
 
     Attributes:
-        empty: samples where the field holds nothing, and rays that meet nothing else.
+        empty: samples in empty cells, and rays that meet no other cells.
         hidden: samples behind a transmittance of `Rendering.stop`.
-        background: cells near which nothing is seen.
+        background: cells that are not near matter.
     """
 
     empty: bool = True
@@ -106,18 +106,18 @@ class Skips:
 
 @dataclass(frozen=True)
 class Rendering:
-    """What is chosen after the training: one training serves every choice.
+    """Settings chosen after training: one training serves every choice.
 
     Attributes:
-        step: of the rays at low resolution, in diagonals of the cube / 1024.
+        step: ray-marching step at low resolution, in diagonals of the cube / 1024.
         stop: transmittance at which a ray ends.
-        range: where rays look for a surface.
-        overlap: a preceding frame that shares less than this of what it shows with the present view
-            is not used; see `buffer.Cloud.overlap`.
-        refined: share of the cells whose pixels are rendered by the field after all: those with the
-            largest estimated error (not in the paper).
-        refined_step: of the rays there.
-        skip: what is not computed.
+        range: where rays are sampled.
+        overlap: a preceding frame is dropped if the present view sees less than this share of what
+            the frame shows; see `buffer.Cloud.overlap`.
+        refined: share of the cells whose pixels the field renders instead: those with the largest
+            estimated error (not in the paper).
+        refined_step: ray-marching step in these cells, in the same unit.
+        skip: which work is skipped.
     """
 
     step: float
@@ -138,8 +138,8 @@ class Rendering:
 
     @classmethod
     def in_training(cls, model: Model, refined: float, refined_step: float) -> Rendering:
-        """How `model` is rendered while it is trained: rays look everywhere, so that one training
-        serves all choices; a share `refined` of the cells is refined, in steps of
+        """How `model` is rendered during training: without range reduction, so that one training
+        serves all choices; a share `refined` of the cells is refined, with steps of
         `refined_step`."""
         return cls(
             model.step,
@@ -153,12 +153,12 @@ class Rendering:
 
     @property
     def march(self) -> March:
-        """Of the rays at low resolution."""
+        """How rays at low resolution are marched."""
         return self._march(self.step)
 
     @property
     def refined_march(self) -> March:
-        """Of the rays of refined cells."""
+        """How rays of refined cells are marched."""
         return self._march(self.refined_step)
 
     def _march(self, step: float) -> March:
@@ -166,6 +166,6 @@ class Rendering:
 
 
 def check_size(name: str, got: int, least: int, most: int) -> None:
-    """Refuse, with a ValueError, a size that is not of `least` to `most`."""
+    """Raise ValueError unless `got` lies between `least` and `most`."""
     if not least <= got <= most:
         raise ValueError(f"{name}: expected {least} to {most}, got {got}")

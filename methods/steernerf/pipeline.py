@@ -1,16 +1,16 @@
-"""One frame of SteerNeRF, top-down, beside Section 3 of the paper.
+"""One frame of SteerNeRF, from top to bottom, following Section 3 of the paper.
 
 | stage                | what it does                                            | equations |
 |----------------------|---------------------------------------------------------|-----------|
-| depth_reprojection   | the newest preceding depth limits where rays look       | 7, 8      |
+| depth_reprojection   | a reprojected depth prior limits where rays are sampled | 7, 8      |
 | field                | features F and depth D at h x w = H/s x W/s             | 2 to 5    |
 | feature_reprojection | preceding features at H x W                             | 9, 10     |
 | renderer2d           | the 2D neural renderer draws the picture                | 11        |
-| finish               | F and D are stored as points, for the frames to come    | 6         |
+| finish               | F and D are stored as points, for later frames          | 6         |
 
 Beyond the paper, and off in its method: the preceding picture is reprojected (`history`), the
-field is evaluated at the surface of each pixel (`surface`), and the cells with the largest
-estimated error are rendered by the field after all (`refinement`).
+field is evaluated at the surface of each pixel (`surface`), and the field itself renders the cells
+with the largest estimated error (`refinement`).
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ class Pipeline:
     """A field and a 2D renderer that together render frames, one after the other.
 
     Args:
-        field: with `model.channels` features.
+        field: a field with `model.channels` features.
         occupancy: where the field may hold matter.
-        background: [3] of the scene.
-        renderer: draws pictures; may be exchanged.
+        background: [3] background colour of the scene.
+        renderer: the 2D renderer; may be replaced later.
         model: what both are trained for.
     """
 
@@ -72,14 +72,14 @@ class Pipeline:
         )  # [K]
 
     def view(self, camera: Camera) -> View:
-        """The view of `camera`, where the field is."""
+        """The view of `camera`, on the device of the field."""
         return View.of(place_camera(camera, self.background.device), self.model.scale)
 
     @torch.no_grad()
     def render(
         self, camera: Camera, buffer: RenderingBuffer, rendering: Rendering, probe: Probe
     ) -> Frame:
-        """Render the frame that follows those in `buffer`, and remember it there."""
+        """Render the frame that follows those in `buffer`, and store it there."""
         model, view = self.model, self.view(camera)
         preceding = self.overlapping(buffer.frames, view, rendering, probe)
         frame = self.features(view, preceding, rendering, probe)  # F, D
@@ -102,7 +102,7 @@ class Pipeline:
 
     @torch.no_grad()
     def remember(self, camera: Camera, buffer: RenderingBuffer, rendering: Rendering) -> None:
-        """As `render`, for `buffer` alone: a picture that no frame to come reads is not drawn."""
+        """Update `buffer` as `render` does, but draw the picture only if later frames read it."""
         probe = NullProbe()
         if self.model.history:
             self.render(camera, buffer, rendering, probe)
@@ -115,7 +115,7 @@ class Pipeline:
     def overlapping(
         self, frames: Sequence[Remembered], view: View, rendering: Rendering, probe: Probe
     ) -> Sequence[Remembered]:
-        """Those of the preceding `frames` that share enough with `view`."""
+        """Select the preceding `frames` that share enough with `view`."""
         if frames and (least := rendering.overlap):
             with probe.stage("feature_reprojection"):
                 shares = torch.stack([f.cloud.overlap(view.full) for f in frames]).tolist()
@@ -126,8 +126,8 @@ class Pipeline:
     def features(
         self, view: View, preceding: Sequence[Remembered], rendering: Rendering, probe: Probe
     ) -> FeatureFrame:
-        """Features and depth at low resolution (Eq. 2 to 5); with range reduction on, rays look
-        near the depth of the newest of the `preceding` frames only."""
+        """Render features and depth at low resolution (Eq. 2 to 5). With range reduction, rays are
+        sampled only near the depth of the newest of the `preceding` frames."""
         newest = preceding[0].cloud if preceding else None
         render = self._marcher(newest, view, rendering, probe)
         with probe.stage("field"):
@@ -137,7 +137,7 @@ class Pipeline:
     def _marcher(
         self, newest: Cloud | None, view: View, rendering: Rendering, probe: Probe
     ) -> Render:
-        """What marches the rays at low resolution: the argument `render` of `render_frame`."""
+        """Make the argument `render` of `render_frame`, which marches the low-resolution rays."""
         occupancy, how, reduction = self._occupied(rendering), rendering.march, rendering.range
         if newest is None or reduction.mode == "off":
             return everywhere(self.field, occupancy, probe, how)
@@ -153,7 +153,7 @@ class Pipeline:
             return everywhere(self.field, occupancy, probe, how)
 
     def reproject(self, cloud: Cloud, view: View) -> Points:
-        """The features of a preceding frame where the present picture sees them (Eq. 9, 10)."""
+        """Reproject the features of a preceding frame into the present view (Eq. 9, 10)."""
         index, _ = cloud.splat(view.full, self.model.reprojection, self.backend)
         return Points(cloud.values, index)
 
@@ -167,11 +167,11 @@ class Pipeline:
         probe: Probe,
         cells: Tensor | None = None,
     ) -> Observation:
-        """All that the 2D renderer is given: the present `frame`, the `preceding` features and,
+        """Collect the input of the 2D renderer: the present `frame`, the `preceding` features and,
         beyond the paper, the `newest` preceding picture and the field at the surface.
 
         Args:
-            cells: those near matter; None: a GPU is waited for to find them.
+            cells: the cells near matter; None: they are found here, and the host waits for a GPU.
         """
         model = self.model
         if not self.leaves_out(rendering):
@@ -195,7 +195,7 @@ class Pipeline:
     def _history(
         self, newest: Remembered, picture: Tensor, depth: Tensor, cells: Tensor, view: View
     ) -> Detail:
-        """The preceding `picture` where the present, of `depth` [N, s^2] in `cells`, sees it."""
+        """Warp the preceding `picture` into `cells`, whose present depth is `depth` [N, s^2]."""
         values, valid = warp(
             picture,
             newest.camera,
@@ -210,7 +210,7 @@ class Pipeline:
     def refined(
         self, cells: Tensor, frame: FeatureFrame, view: View, rendering: Rendering, probe: Probe
     ) -> Tensor:
-        """Colours [n, s^2, 3] of `cells` [n], by a ray through each of their pixels."""
+        """Render the colours [n, s^2, 3] of `cells` [n] with a ray through each of their pixels."""
         rays = rays_of_cells(cells, view)
         how = refined_march(cells, frame, view.scale, rendering)
         probe.count("refined_rays", len(rays.origins), view.full.width * view.full.height)
@@ -228,7 +228,7 @@ class Pipeline:
 
 
 def _finished(camera: Camera, picture: Tensor, frame: FeatureFrame, scale: int) -> Frame:
-    """What the harness asks for: depth and opacity of the nearest low-resolution pixel."""
+    """The frame for the harness, with depth and opacity of the nearest low-resolution pixel."""
     size = slice(0, camera.height), slice(0, camera.width)
     depth, alpha = (
         image.repeat_interleave(scale, 0).repeat_interleave(scale, 1)[size]

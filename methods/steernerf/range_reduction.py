@@ -1,4 +1,4 @@
-"""Range reduction: a preceding depth limits where rays look (SteerNeRF, Section 3.2)."""
+"""Range reduction: rays are sampled only near a reprojected depth (SteerNeRF, Section 3.2)."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from methods.steernerf.options import Reprojection
 def depth_interval(
     cloud: Cloud, camera: Camera, epsilon: float, how: Reprojection, backend: str
 ) -> Tensor:
-    """[h, w, 2]: the interval [D - epsilon, D + epsilon] of z-depth in which each pixel of
-    `camera`, a low-resolution one, looks; [0, inf) where no point of `cloud` falls."""
+    """The z-depths [h, w, 2] between which each pixel of the low-resolution `camera` is sampled:
+    D - epsilon and D + epsilon, or 0 and inf where no point of `cloud` lands."""
     index, depth = cloud.splat(camera, how, backend)  # Eq. 7, 8; Eq. 6 made the cloud
     reprojected = at_pixels(depth, index, torch.inf)  # D, t' -> t
     known = index >= 0
@@ -29,5 +29,5 @@ def depth_interval(
 
 
 def at_pixels(values: Tensor, index: Tensor, otherwise: float) -> Tensor:
-    """`values` [N] at `index` [h, w], `otherwise` where that is -1."""
-    return functional.pad(values, (0, 1), value=otherwise)[index.long()]  # -1 is the last one
+    """Look up `values` [N] at `index` [h, w]; `otherwise` where the index is -1."""
+    return functional.pad(values, (0, 1), value=otherwise)[index.long()]  # -1 reads the padding

@@ -16,8 +16,8 @@ from methods.steernerf.beyond.cells import cells_near, largest_in_cell
 
 @dataclass(frozen=True)
 class Points:
-    """Features `values` [P, C] of points, and for each pixel the row of `values` that it shows:
-    `index` [...], int32, -1 for none."""
+    """Features of points, `values` [P, C], and the row of `values` that each pixel shows: `index`
+    [...], int32, -1 for none."""
 
     values: Tensor
     index: Tensor
@@ -25,7 +25,7 @@ class Points:
 
 @dataclass(frozen=True)
 class Detail:
-    """What is known, pixel by pixel, of N cells: `values` [N, s^2, C], `valid` [N, s^2]."""
+    """The pixels of N cells, `values` [N, s^2, C], and where they are known, `valid` [N, s^2]."""
 
     values: Tensor
     valid: Tensor
@@ -33,20 +33,20 @@ class Detail:
 
 @dataclass(frozen=True)
 class Observation:
-    """All that is known of a picture before it is drawn.
+    """Everything that a 2D renderer is given to draw a picture.
 
     Attributes:
         frame: the present features, [h, w, K].
-        background: [K] that they are composited on.
-        preceding: newest first, with an index for every pixel [H, W]; fewer than L after a cold
-            start.
-        cells: [N] int64, the cells in which there may be anything; see `beyond.cells`.
-        history: the newest preceding picture in `cells`; None after a cold start, or where it is
-            not used.
-        surface: features of the field where the low-resolution depth has the surface of a pixel,
-            and their opacity as the last of K + 1, with an index for every pixel of `cells`
-            [N, s^2]; None where they are not used.
-        backend: of the kernels that a renderer calls.
+        background: [K] background that they are composited on.
+        preceding: features of the preceding frames, newest first, with an index for every pixel
+            [H, W]; fewer than L after a cold start.
+        cells: [N] int64, the cells that may show matter; see `beyond.cells`.
+        history: the newest preceding picture, warped into `cells`; None after a cold start, or if
+            it is not used.
+        surface: features of the field at the surface of each pixel, which the low-resolution depth
+            gives, with the opacity as the last of K + 1 channels; an index for every pixel of
+            `cells` [N, s^2]. None if they are not used.
+        backend: backend of the kernels that a renderer calls.
     """
 
     frame: FeatureFrame
@@ -59,15 +59,15 @@ class Observation:
 
 
 def cells_at_matter(alpha: Tensor, preceding: Sequence[Points]) -> Tensor:
-    """The cells [N] near anything seen: in the present frame, of opacity `alpha` [h, w], or in a
+    """Find the cells [N] near matter in the present frame, of opacity `alpha` [h, w], or in a
     preceding one. The host waits for a GPU."""
     near = near_matter(alpha > 0, [points.index for points in preceding])
     return near.flatten().nonzero().squeeze(1)
 
 
 def near_matter(seen: Tensor, indices: Sequence[Tensor]) -> Tensor:
-    """Which cells are near anything, [h, w] bool: where the present frame has `seen` it, [h, w], or
-    preceding ones show it, of whose points the `indices` [H, W] tell."""
+    """Which cells [h, w] bool are near matter: `seen` [h, w] in the present frame, or shown by the
+    points of a preceding frame, given by its `indices` [H, W]."""
     for index in indices:
         scale = index.shape[0] // len(seen)
         seen = seen | (largest_in_cell(index, scale) >= 0)
@@ -76,12 +76,12 @@ def near_matter(seen: Tensor, indices: Sequence[Tensor]) -> Tensor:
 
 @dataclass(frozen=True)
 class Drawing:
-    """What a 2D renderer makes of observations.
+    """The output of a 2D renderer.
 
     Attributes:
         pictures: [B, H, W, 3].
-        error: [N] estimated error of all cells, one observation after the other: the log of the
-            mean squared error of their pixels. None: the renderer does not estimate it.
+        error: [N] estimated error of all cells, observation by observation: the log of the mean
+            squared error of their pixels. None: the renderer does not estimate it.
     """
 
     pictures: Tensor
@@ -92,15 +92,15 @@ UNWATCHED = NullProbe()
 
 
 class Renderer2d(nn.Module, ABC):
-    """Turns observations into pictures, with the help of a network.
+    """Turns observations into pictures with a network.
 
     Attributes:
         scale: s.
-        draws_cells: it draws the cells of an observation alone; otherwise the whole picture.
-        estimates_error: it says which cells of its pictures may be wrong.
-        reads_details: it reads the preceding picture and the field at the surface.
-        network: what is learned.
-        engine: computes what the network does, in its place; see `methods.engines`.
+        draws_cells: whether it draws only the cells of an observation, not the whole picture.
+        estimates_error: whether it estimates the error of each cell.
+        reads_details: whether it reads the preceding picture and the field at the surface.
+        network: the trainable network.
+        engine: computes the output of `network` in its place, if set; see `methods.engines`.
     """
 
     scale: int
@@ -111,14 +111,14 @@ class Renderer2d(nn.Module, ABC):
     engine: Callable[..., tuple[Tensor, ...]] | None = None
 
     def run(self, probe: Probe, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """What the network makes of its inputs."""
+        """Compute the network's output, with the engine if there is one."""
         probe.count("products", self.network.products(*inputs))
         with probe.stage("network"):
             return (self.engine or self.network)(*inputs)
 
     @abstractmethod
     def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Drawing:
-        """Draw all of them."""
+        """Draw all observations."""
 
     @abstractmethod
     def base(self, observations: Sequence[Observation]) -> Tensor:

@@ -1,4 +1,4 @@
-"""What can be varied of SteerNeRF, and what its stages are; see `bench.study`."""
+"""What studies vary in SteerNeRF, and the stages of its frames; see `bench.study`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from bench.study import Axis, Study, Variant, turned
 
 
 def ranges(mode: str, epsilons: Iterable[float]) -> list[Variant]:
-    """Range reduction in `mode` with each of several intervals."""
+    """Variants with range reduction in `mode`, one for each epsilon."""
     return turned(
         f"range {mode}",
         "method.rendering.range.epsilon",
@@ -35,7 +35,7 @@ SKIPS = {
 
 
 def not_skipped(skips: Mapping[str, str]) -> list[Variant]:
-    """Each of `skips` switched off alone."""
+    """Variants that each switch off one of `skips`."""
     return [
         Variant(f"{name} not skipped", (f"{setting}=false",)) for name, setting in skips.items()
     ]

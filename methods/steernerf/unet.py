@@ -18,18 +18,18 @@ from methods.steernerf.renderer import UNWATCHED, Drawing, Observation, Renderer
 class UNet(Renderer2d):
     """The U-Net of the released code (`ReconstructionNet_v4`), at full resolution.
 
-    Its input are the features of all frames, zero where nothing is: those of the present one at
-    every s-th pixel, those of the preceding ones where they land. Its output is added to the
-    bilinearly enlarged RGB of the present frame. 2,115,587 parameters at L = 2, K = 6
-    and a width of 64; its outputs are those of the release (tests/data/steernerf_release.npz).
+    Its inputs are the features of all frames: those of the present frame at every s-th pixel, those
+    of the preceding frames at the pixels where their points land, zero elsewhere. Its output is
+    added to the bilinearly enlarged RGB of the present frame. It has 2,115,587 parameters at L = 2,
+    K = 6 and width 64, and gives the outputs of the release (tests/data/steernerf_release.npz).
 
     Args:
         channels: K.
         frames: L.
         scale: s.
-        width: channels at full resolution; 64 as the release.
-        aligned: False, as the release, enlarges the base with align_corners=True, which moves all
-            pixels but the middle one; True keeps every pixel in its place.
+        width: channels at full resolution; 64 in the release.
+        aligned: whether enlarging the base keeps every pixel in its place. False, as in the
+            release, uses align_corners=True, which moves all pixels but the middle one.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class UNet(Renderer2d):
 
 
 class _Network(Network):
-    """The layers of `ReconstructionNet_v4`, of `width` channels at full resolution."""
+    """The layers of `ReconstructionNet_v4`, with `width` channels at full resolution."""
 
     varying = ((),)
 
@@ -90,7 +90,7 @@ class _Network(Network):
     def forward(self, inputs: Tensor) -> tuple[Tensor]:
         """[B, C, H, W] to [B, 3, H, W]."""
         height, width = inputs.shape[-2:]
-        # Two halvings: sizes that are no multiple of 4 are padded, and the padding cut off.
+        # The size is halved twice: pad to a multiple of 4, and crop the result.
         padded = functional.pad(inputs, (0, -width % 4, 0, -height % 4))
         full = self.enter(self.first(padded)).relu()
         half = self.at_half(functional.max_pool2d(full, 2)).relu()
@@ -105,7 +105,7 @@ class _Network(Network):
         return (self.last(self.leave(merged).relu())[..., :height, :width],)
 
     def products(self, *inputs: Tensor) -> int:
-        """See `Network`: every kernel once a pixel of the size at which it is used."""
+        """See `Network`: every kernel counts once per pixel at its resolution."""
         batch, _, height, width = inputs[0].shape
         full = batch * (-(-height // 4) * 4) * (-(-width // 4) * 4)
         used = {
@@ -140,7 +140,7 @@ def _conv(inputs: int, outputs: int) -> nn.Conv2d:
 
 
 def _kaiming(layer: nn.Conv2d, scale: float) -> None:
-    """Start from `scale` times the weights of He et al. 2015 for ReLU, and from no bias."""
+    """Initialise to `scale` times the weights of He et al. 2015 for ReLU, and zero bias."""
     nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
     assert layer.bias is not None
     nn.init.zeros_(layer.bias)

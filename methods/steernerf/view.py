@@ -13,7 +13,7 @@ class View:
     """A camera at both resolutions.
 
     Attributes:
-        full: the camera, its picture enlarged to the right and below to multiples of s.
+        full: the camera, its picture padded at the right and bottom to multiples of s.
         low: the same view at 1/s of the resolution; its intrinsics are K_l of Eq. 7, those of
             `full` K_h of Eq. 9.
         scale: s.
@@ -25,13 +25,13 @@ class View:
 
     @classmethod
     def of(cls, camera: Camera, scale: int) -> View:
-        """The view of a camera at 1/`scale` of its resolution, rounded up."""
+        """Make the view of `camera`; low resolution is 1/`scale` of its own, rounded up."""
         width, height = -(-camera.width // scale), -(-camera.height // scale)
         full = replace(camera, width=width * scale, height=height * scale)
         return cls(full, scale_camera(full, width, height), scale)
 
     def crop(self, left: int, top: int, width: int, height: int) -> View:
-        """The part of `width` x `height` low-resolution pixels whose first is `left`, `top`."""
+        """Crop to `width` x `height` low-resolution pixels, the first of them at `left`, `top`."""
         s = self.scale
         full = crop_camera(self.full, left * s, top * s, width * s, height * s)
         return View(full, crop_camera(self.low, left, top, width, height), s)

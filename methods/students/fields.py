@@ -25,17 +25,18 @@ from methods.training import checkpoint, loop
 from methods.training.optimiser import step_at
 
 REACH = 5 * STEP
-"""Length over which densities are compared as opacities: about KiloNeRF's 0.0211 of its scenes."""
+"""Length over which densities become the opacities that are compared: about the 0.0211 of KiloNeRF,
+in the units of its scenes."""
 
 
 @dataclass(frozen=True)
 class FieldLessons(MarchOptions):
-    """How a student that is a field learns: from rays as Instant-NGP does, after some points.
+    """How to train a student that is a field: first on points, then on rays as Instant-NGP is.
 
     Attributes:
         points: share of the steps, at the beginning, that compare densities and colours at random
             points of occupied cells with the teacher's.
-        share: samples of a step, as a share of those of the budget.
+        share: samples per step, as a share of the budget's.
     """
 
     points: float = 0.5
@@ -52,10 +53,10 @@ class FieldLessons(MarchOptions):
 
 
 class StudentField(nn.Module, ABC):
-    """A `methods.rendering.field.Field` of colours that is trained and knows its size.
+    """A trainable `methods.rendering.field.Field` whose features are colours.
 
     Args:
-        backend: of the kernels that render it.
+        backend: backend of the kernels that render it.
     """
 
     channels = 3
@@ -67,7 +68,7 @@ class StudentField(nn.Module, ABC):
 
     @property
     def device(self) -> torch.device:
-        """Where its parameters lie."""
+        """The device of its parameters."""
         return next(self.parameters()).device
 
     @abstractmethod
@@ -92,13 +93,13 @@ class StudentField(nn.Module, ABC):
 
 
 class StudentTraining(PixelTraining):
-    """Points of the teacher, then rays of the photos, among what the teacher's grid has.
+    """Trains on points of the teacher, then on rays of the photos, within occupied cells.
 
-    Rays learn at the samples that the teacher does not hide: its density costs less than that of a
-    large network.
+    On rays, samples that the teacher's density hides are left out: it costs less than the density
+    of a large network.
 
     Args:
-        occupancy: where the field is trained and rendered, elsewhere is nothing; None: the
+        occupancy: where the field is trained and rendered; it is empty elsewhere. None: the
             teacher's.
     """
 
@@ -124,7 +125,7 @@ class StudentTraining(PixelTraining):
         )
 
     def advance(self) -> dict[str, float]:
-        """One step; its mean squared error, of opacities and colours or of pixels."""
+        """Take one step; return its mean squared error, of opacities and colours or of pixels."""
         if self.step >= self.points_until:
             return super().advance()
         positions, directions = self._places()
@@ -136,7 +137,7 @@ class StudentTraining(PixelTraining):
         return errors
 
     def _places(self) -> tuple[Tensor, Tensor]:
-        """Random points [S, 3] of occupied cells, and directions [S, 3] to see them in."""
+        """Random points [S, 3] in occupied cells, and random view directions [S, 3]."""
         count, device, generator = self.samples, self.cells.device, self.generator
         chosen = torch.randint(len(self.cells), (count,), generator=generator, device=device)
         jitter = torch.rand(count, 3, generator=generator, device=device)
@@ -145,8 +146,8 @@ class StudentTraining(PixelTraining):
         return positions, functional.normalize(directions, dim=1)
 
     def _difference(self, positions: Tensor, directions: Tensor) -> Tensor:
-        """Mean square of the differences in opacity over `REACH` and, where there is any, in red,
-        green and blue, which count as much each."""
+        """Mean squared difference in opacity over `REACH`, plus those in red, green and blue,
+        weighted by the teacher's opacity."""
         with torch.no_grad():
             wanted, shown = _seen(self.teacher, positions, directions)
         opacity, colour = self._learned(positions, directions)
@@ -156,7 +157,7 @@ class StudentTraining(PixelTraining):
         )
 
     def _learned(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """What is compared with the teacher's: opacity [S] over `REACH` and colour [S, 3]."""
+        """The opacity [S] over `REACH` and colour [S, 3] that are compared with the teacher's."""
         return _seen(self.field, positions, directions)
 
     def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
@@ -183,7 +184,7 @@ class StudentTraining(PixelTraining):
         return tensors | {"cells": self.occupancy.cells}
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
-        """Put back what `result` gave."""
+        """Restore what `result` returned."""
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
@@ -205,17 +206,17 @@ def _seen(field: Field, positions: Tensor, directions: Tensor) -> tuple[Tensor, 
 
 
 class FieldStudent(Student):
-    """Base of the methods that are another field, rendered as Instant-NGP is."""
+    """Base of the methods that train another field and render it as Instant-NGP is rendered."""
 
     training: FieldLessons
 
     @abstractmethod
     def new_field(self) -> StudentField:
-        """The untrained field on the teacher's device, with weights by the seed; `occupancy` is
-        known already."""
+        """Make the untrained field on the teacher's device, with weights drawn from the seed; the
+        occupied cells are known already."""
 
     def occupied(self, teacher: TrainedField) -> Occupancy:
-        """The cells in which the field may be other than empty: those of the teacher."""
+        """The cells in which the field may hold matter: those of the teacher."""
         return teacher.occupancy
 
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> StudentTraining:

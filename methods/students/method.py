@@ -27,19 +27,20 @@ from methods.training import checkpoint, loop
 class Student(ABC):
     """Base of the methods that start from the Instant-NGP field that all methods share.
 
-    `train_s` counts the training of the field, the start of the model and its own training.
+    `train_s` counts the training of the field, the initialisation of the model and its own
+    training.
 
     Args:
         teacher: the field that it starts from, and where it runs.
-        training: how the model learns.
+        training: how the model is trained.
         stop: transmittance at which a ray ends when rendering, less than 1.
-        name: as it stands in result rows.
-        steps: of its own training; None: `budget.renderer_steps`.
+        name: as shown in result rows.
+        steps: steps of its own training; None: `budget.renderer_steps`.
     """
 
     memory = 0
     kind: ClassVar[str]
-    """Of its trained stage: "nerf"."""
+    """Name of its trained stage, for example "nerf"."""
 
     study = Study(
         knobs={"stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3"))},
@@ -62,25 +63,25 @@ class Student(ABC):
 
     @abstractmethod
     def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> loop.Training:
-        """The training of the model before its first step."""
+        """Make the training of the model, as it is before its first step."""
 
     @abstractmethod
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take over what a training had as its `result`, to be rendered."""
+        """Load the `result` of a training, to render it."""
 
     @abstractmethod
     def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
-        """Where anything may be seen, and what renders the pixels that may see it."""
+        """The cells that may show anything, and what renders the pixels that may see them."""
 
     @torch.no_grad()
     def render(self, camera: Camera, probe: Probe) -> Frame:
-        """One frame at the camera's full resolution."""
+        """Render one frame at the camera's full resolution."""
         camera = place_camera(camera, self.teacher.device)
         occupancy, render = self.renderer(probe)
         return render_frame(camera, occupancy, self.background, probe, render).picture()
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
-        """Train the field and the model, or load what the same trainings left behind."""
+        """Train the field and the model, or load their results if they were trained before."""
         budget = replace(budget, renderer_steps=self.steps or budget.renderer_steps)
         with torch_threads(budget.threads):
             teacher = train_field(self.teacher, scene, budget, log)

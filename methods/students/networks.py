@@ -1,4 +1,4 @@
-"""Dense layers of students that are networks, and the encoding of what goes into them."""
+"""Dense layers for students that are networks, and the encoding of their inputs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from methods.students.fields import FieldLessons
 
 @dataclass(frozen=True)
 class NetworkLessons(FieldLessons):
-    """How one large network learns: from many small steps, at a lower rate than a hash grid."""
+    """How to train one large network: in many small steps, at a lower rate than a hash grid."""
 
     rate: float = 1e-3
     final_rate: float = 0.1
@@ -26,7 +26,7 @@ class NetworkLessons(FieldLessons):
 def positional(
     values: Tensor, frequencies: int, *, identity: bool = True, scale: float = math.pi
 ) -> Tensor:
-    """Sines and cosines of `values` [S, C], of frequencies 2^0 to 2^(F - 1) times `scale`.
+    """Sines and cosines of `values` [S, C], at frequencies 2^0 to 2^(F - 1) times `scale`.
 
     Mildenhall et al. (2020), Eq. 4; the release has no pi (`scale` 1) and puts the values
     themselves in front (`identity`).
@@ -40,22 +40,22 @@ def positional(
     parts = [values] if identity else []
     for _ in range(frequencies):
         parts += [sine, cosine]
-        # Those of twice the angle cost less than functions of it. Errors double as the angle does;
+        # Double-angle formulas cost less than sin and cos. Errors double as the angle does;
         # with 1 - 2 sin^2 for the cosine they would grow faster.
         sine, cosine = 2 * sine * cosine, (cosine - sine) * (cosine + sine)
     return torch.cat(parts, dim=-1)
 
 
 def positional_channels(channels: int, frequencies: int, *, identity: bool = True) -> int:
-    """Channels of `positional` of as many values."""
+    """Channels that `positional` makes of `channels` values."""
     return channels * (2 * frequencies + identity)
 
 
 class Dense(nn.Linear):
-    """A layer of a network: `inputs` [S, I] times weights, plus biases, [S, O].
+    """A dense layer: `inputs` [S, I] times weights, plus biases, [S, O].
 
-    With precision "bf16" the products are those of bfloat16 with float32 accumulation, and results
-    are bfloat16, where the device has such products; elsewhere all is float32. Parameters stay
+    With precision "bf16" products are of bfloat16 with float32 accumulation, and results are
+    bfloat16, if the device has such products; otherwise everything is float32. Parameters stay
     float32.
     """
 
@@ -70,21 +70,21 @@ class Dense(nn.Linear):
             self.bias.zero_()
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Of [S, I]: [S, O]."""
+        """Map [S, I] to [S, O]."""
         return self.forward_with(inputs, self.weight, self.bias)
 
     def forward_with(self, inputs: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        """The same with `weight` [O, I] and `bias` [O] in place of its own."""
+        """Do the same with `weight` [O, I] and `bias` [O] in place of its own."""
         half = self.precision == "bf16" and multiplies_bf16(self.weight.device.type)
         dtype = torch.bfloat16 if half else self.weight.dtype
         return functional.linear(inputs.to(dtype), weight.to(dtype), bias.to(dtype))
 
 
 def density_of(raw: Tensor) -> Tensor:
-    """ReLU of the last output of a density network; where it gives 0, a loss can still raise it.
+    """ReLU of a density network's output; where the result is 0, a loss can still raise it.
 
-    Without that gradient a network that once gives 0 everywhere, as after its first steps among
-    mostly empty samples, shows nothing for ever.
+    With the gradient of plain ReLU, a network that once gives 0 everywhere, as it may after its
+    first steps among mostly empty samples, stays at 0 forever.
     """
     return _RisingRelu.apply(raw)
 
@@ -102,7 +102,7 @@ class _RisingRelu(torch.autograd.Function):
 
 
 def products(*layers: nn.Module) -> int:
-    """Multiplications that one sample costs in the dense layers in `layers`."""
+    """Multiplications per sample in all dense layers inside `layers`."""
     dense = (part for layer in layers for part in layer.modules() if isinstance(part, Dense))
     return sum(part.weight.numel() for part in dense)
 

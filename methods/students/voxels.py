@@ -1,4 +1,4 @@
-"""Sparse voxels of the unit cube: which there are, and the corners that they share."""
+"""Sparse voxels of the unit cube: which ones exist, and the corners that they share."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from methods.kernels.march import Occupancy
 from methods.kernels.voxel_walk import Crossings, Voxels, walk
 
 CHUNK_RAYS = 1 << 15
-"""Rays that are looked along together: bounds the memory."""
+"""Rays that are traced together: bounds the memory."""
 
 OFFSETS = tuple((c & 1, c >> 1 & 1, c >> 2 & 1) for c in range(8))
-"""Of a voxel's corners and of its eighths: bit 0 is +x, bit 1 +y, bit 2 +z."""
+"""Offsets of a voxel's corners; in the index of a corner, bit 0 is +x, bit 1 +y, bit 2 +z."""
 
 
 def corners_of(coordinates: Tensor) -> tuple[Tensor, Tensor]:
-    """The corners of V voxels, each of them once.
+    """Find the corners of V voxels, each corner once.
 
     Args:
         coordinates: [V, 3] int, from 0 to 2^20.
@@ -39,7 +39,7 @@ def corners_of(coordinates: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def occupied_voxels(occupancy: Occupancy, resolution: int) -> Tensor:
-    """The voxels [V, 3] int32 of a grid of another resolution that reach into occupied cells.
+    """The voxels [V, 3] int32 of a grid of another resolution that overlap occupied cells.
 
     They are ordered by x, then y, then z.
 
@@ -52,7 +52,7 @@ def occupied_voxels(occupancy: Occupancy, resolution: int) -> Tensor:
     voxel = torch.arange(resolution, device=device)
     first, last = voxel * size // resolution, -(-(voxel + 1) * size // resolution)
     counts = occupancy.cells.int()
-    for axis in range(3):  # how many occupied cells a voxel reaches into, an axis after the other
+    for axis in range(3):  # how many occupied cells a voxel overlaps, axis by axis
         sums = torch.cat((torch.zeros_like(counts.narrow(axis, 0, 1)), counts.cumsum(axis)), axis)
         counts = (sums.index_select(axis, last) - sums.index_select(axis, first)).int()
     return counts.nonzero().int()
@@ -70,8 +70,8 @@ def largest_weights(
     """The largest weight [V] that each voxel has in a pixel, over random training rays.
 
     Args:
-        weigh: the weights [S] of what rays cross.
-        rays: how many are looked along, at most as many as there are.
+        weigh: returns the weights [S] of the voxels that rays cross.
+        rays: how many rays are traced, at most as many as there are.
     """
     largest = torch.zeros(len(voxels), device=voxels.coordinates.device)
     most = min(rays, len(batches))

@@ -1,1 +1,1 @@
-"""What every training needs: its loop, its checkpoints, steps of an optimiser."""
+"""What every training needs: the loop, checkpoints, optimiser steps."""

@@ -1,4 +1,4 @@
-"""Files of trained and half-trained stages: tensors and figures, whole or not there at all."""
+"""Files of trained and half-trained stages: tensors and numbers, written whole or not at all."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from bench.types import SteerbenchError
 
 
 def write(path: Path, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-    """Write a file whole or not at all, also when another process writes the same.
+    """Write a file whole or not at all, even if another process writes the same file.
 
     Raises:
-        SteerbenchError: the disk refuses.
+        SteerbenchError: the file cannot be written.
     """
     packed = {name: tensor.contiguous() for name, tensor in tensors.items()}
     try:
@@ -34,10 +34,10 @@ def write(path: Path, tensors: Mapping[str, Tensor], figures: Mapping[str, float
 
 
 def read(path: Path) -> tuple[dict[str, Tensor], dict[str, float]]:
-    """Tensors and figures of a file written by `write`.
+    """Read the tensors and figures of a file written by `write`.
 
     Raises:
-        SteerbenchError: the file is damaged, or something else.
+        SteerbenchError: the file is damaged, or was not written by `write`.
     """
     try:
         with safe_open(path, "pt") as file:
@@ -52,10 +52,10 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, float]]:
 
 @contextmanager
 def restoring(path: Path) -> Iterator[None]:
-    """Whatever is put back in here comes from `path`.
+    """Context in which state that was read from `path` is restored.
 
     Raises:
-        SteerbenchError: it does not fit, and so is of another training.
+        SteerbenchError: the state does not fit: it belongs to another training.
     """
     try:
         yield
@@ -84,14 +84,14 @@ def optimiser_tensors(optimiser: torch.optim.Optimizer, prefix: str) -> dict[str
 def restore_optimiser(
     optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor], prefix: str
 ) -> None:
-    """Put back what `optimiser_tensors` gave."""
+    """Restore what `optimiser_tensors` returned."""
     state = optimiser.state_dict()
     parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
     for name, value in part(tensors, prefix).items():
         number, slot = name.split(".")
         parameter = parameters[int(number)]
         if value.shape == parameter.shape:
-            # In its memory order, which files do not keep: a fused step takes both as they lie.
+            # In the parameter's memory order, which files do not keep but a fused step expects.
             value = torch.empty_like(parameter).copy_(value)
         state["state"].setdefault(int(number), {})[slot] = value
     optimiser.load_state_dict(state)

@@ -1,4 +1,4 @@
-"""The loop of every training: progress, checkpoints, going on after a kill, guards."""
+"""The loop of every training: progress, checkpoints, resuming after a kill, finiteness checks."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from bench.types import Log, SteerbenchError
 from methods.training import checkpoint
 
 LOOK_EVERY = 10
-"""Steps of which a GPU tells the errors of one: to ask it takes time, too."""
+"""On a GPU, errors are read back only every so many steps, because reading takes time."""
 
 CHECKPOINT_S = 20.0
-"""Seconds between checkpoints: what a killed training loses at most."""
+"""Seconds between checkpoints: the most that a killed training loses."""
 
 
 class Asked:
-    """Errors of a step, by label, on their way to the host, which goes on meanwhile."""
+    """Errors of a step, by label, on their way to the host, which does not wait for them."""
 
     def __init__(self, errors: Mapping[str, Tensor]) -> None:
         together = torch.stack([error.detach() for error in errors.values()])
@@ -33,7 +33,7 @@ class Asked:
             self._arrived = torch.cuda.current_stream(together.device).record_event()
 
     def tell(self) -> dict[str, float]:
-        """Them as numbers; if they have not arrived yet, the host waits."""
+        """Return the errors as numbers; the host waits if they have not arrived yet."""
         if self._arrived is not None:
             self._arrived.synchronize()
         return dict(zip(self._labels, self._values.tolist(), strict=True))
@@ -43,11 +43,11 @@ class Training(Protocol):
     """What the loop drives.
 
     Attributes:
-        steps: how many there are to be.
-        step: how many there were.
-        seconds: that they took, over all the processes the training was continued in.
-        advice: what to try where the training breaks down.
-        asked: the errors that `look` asked for last; None at first.
+        steps: how many steps there are in all.
+        step: how many are done.
+        seconds: the time they took, over all the processes the training was continued in.
+        advice: what to try if the training breaks down.
+        asked: the errors that `look` requested last; None at first.
     """
 
     steps: int
@@ -57,22 +57,25 @@ class Training(Protocol):
     asked: Asked | None
 
     def advance(self) -> Mapping[str, float]:
-        """One step; the mean squared errors to show, by label ("" for the main one); see `look`."""
+        """Take one step; return the mean squared errors to show, by label ("" for the main one).
+
+        See `look`.
+        """
 
     def watched(self) -> Mapping[str, Tensor]:
-        """What must be finite in a good state."""
+        """The tensors that must be finite in a good state, by name."""
 
     def result(self) -> dict[str, Tensor]:
-        """What the training is for."""
+        """The tensors that the training is for."""
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
-        """Put back what `result` gave."""
+        """Restore what `result` returned."""
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """What, beside the result, a checkpoint must hold to go on as if never stopped."""
+        """What a checkpoint must hold, besides the result, to go on as if never stopped."""
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        """Put back results and state."""
+        """Restore result and state."""
 
 
 def train(
@@ -82,11 +85,11 @@ def train(
     log: Log,
     marks: Mapping[Path, int] | None = None,
 ) -> None:
-    """Drive `training` to its end and write its result to `finished`, or load what is there.
+    """Drive `training` to its end and write its result to `finished`, or load the result there.
 
-    On the way the results after the numbers of steps in `marks` are written, too.
-    Another process that does the same is waited for. A training that was killed goes on from the
-    checkpoint beside it.
+    On the way, the results after the numbers of steps in `marks` are written as well. If another
+    process runs the same training, this one waits for it. A killed training resumes from the
+    checkpoint beside `finished`.
 
     Raises:
         SteerbenchError: something is not finite; the last good checkpoint is kept.
@@ -100,10 +103,10 @@ def train(
 
 
 def load(training: Training, path: Path) -> None:
-    """Put a result that `train` wrote to `path` into `training`.
+    """Load into `training` a result that `train` wrote to `path`.
 
     Raises:
-        SteerbenchError: the file is damaged, or of another training.
+        SteerbenchError: the file is damaged, or belongs to another training.
     """
     tensors, figures = checkpoint.read(path)
     with checkpoint.restoring(path):
@@ -138,7 +141,10 @@ def _drive(
 
 
 def save(training: Training, path: Path, done: bool = False) -> None:
-    """Write a good state; a bad one raises and leaves the last good file alone."""
+    """Write the result and, unless `done`, the state.
+
+    Something that is not finite raises `SteerbenchError` and leaves the last good file alone.
+    """
     check_finite(training)
     more, figures = training.state()
     figures |= {"step": training.step, "seconds": training.seconds}
@@ -146,10 +152,10 @@ def save(training: Training, path: Path, done: bool = False) -> None:
 
 
 def resume(training: Training, path: Path) -> None:
-    """Put `training` back into the state of a checkpoint.
+    """Restore `training` to the state of a checkpoint.
 
     Raises:
-        SteerbenchError: the file is damaged, or of another training.
+        SteerbenchError: the file is damaged, or belongs to another training.
     """
     tensors, figures = checkpoint.read(path)
     with checkpoint.restoring(path):
@@ -160,8 +166,10 @@ def resume(training: Training, path: Path) -> None:
 def look(
     training: Training, errors: Mapping[str, Tensor], tensors: Mapping[str, Tensor]
 ) -> dict[str, float]:
-    """The `errors` of a step as numbers; on a GPU every `LOOK_EVERY` steps, and those that were
-    asked for then: they have arrived meanwhile.
+    """Return the `errors` of a step as numbers.
+
+    On a GPU this happens every `LOOK_EVERY` steps, with the errors that were requested the time
+    before, which have arrived meanwhile; in all other steps there are none.
 
     Raises:
         SteerbenchError: an error is not finite; it names which of `tensors` are not.

@@ -1,4 +1,4 @@
-"""Steps of an optimiser at a given learning rate."""
+"""Optimiser steps at a given learning rate, and the schedule of that rate."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 
 
 def cosine(done: float, final: float, half_waves: int = 1) -> float:
-    """Share of the learning rate after a share `done` of the steps: from 1 to `final`.
+    """Share of the learning rate left after a share `done` of the steps: from 1 to `final`.
 
     One half wave falls all the way; three fall, rise to 1 again, and fall.
     """
@@ -16,7 +16,7 @@ def cosine(done: float, final: float, half_waves: int = 1) -> float:
 
 
 def step_at(optimiser: torch.optim.Optimizer, rate: float) -> None:
-    """A step at learning rate `rate`; the gradients are used up."""
+    """Take a step at learning rate `rate` and clear the gradients."""
     for group in optimiser.param_groups:
         group["lr"] = rate
     optimiser.step()

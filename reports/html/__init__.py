@@ -1,7 +1,7 @@
-"""A page for a browser, in one file that loads nothing from elsewhere.
+"""The HTML page, a single file that loads nothing from elsewhere.
 
-Texts and tables are the Markdown of the other page, rendered; plots are drawn by the same code, as
-SVG. The files beside this module are the frame of the page, its style and what it does on a click.
+Texts and tables are rendered from the same Markdown as report.md; plots are drawn by the same code,
+as SVG. The files beside this module are the page's template, its style and its script.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ TEMPLATES = Environment(
 )
 
 LOSSLESS_PIXELS = 800 * 800
-"""Pictures up to this size lose nothing; larger ones would make a page too large to send."""
+"""Pictures up to this size are stored losslessly; larger ones would make the page too large."""
 
 LOSSY_QUALITY = 90
 
 PARSER = MarkdownIt("commonmark", {"html": False}).enable("table").disable("image")
-"""Pictures are parts of their own, so none in a text is loaded."""
+"""Images in texts are disabled, because pictures are parts of their own."""
 
 
 def html_page(parts: Sequence[Part], runs: Sequence[Run]) -> str:
@@ -49,7 +49,7 @@ def html_page(parts: Sequence[Part], runs: Sequence[Run]) -> str:
 
     Args:
         parts: from top to bottom; the first begins with the title as a heading.
-        runs: those whose keys tables and marks name.
+        runs: the runs whose keys occur in tables and marks.
     """
     origins = {run.key: _origin(run) for run in runs}
     headings: dict[str, str] = {}
@@ -65,7 +65,7 @@ def html_page(parts: Sequence[Part], runs: Sequence[Run]) -> str:
 
 
 def _origin(run: Run) -> dict[str, str]:
-    """Figures of a run, and where they come from, by name."""
+    """Figures and provenance of a run, by name."""
     formats = {metric: metric_format(metric) for metric in (*QUALITY, *COST)}
     figures = [
         f"{label.rstrip(' ↑↓')} {write(run.values[metric])}"
@@ -83,7 +83,7 @@ def _origin(run: Run) -> dict[str, str]:
 
 
 def _html(part: Part, origins: dict[str, dict[str, str]], headings: dict[str, str]) -> str:
-    """A part of the page; second headings are entered into `headings` by their ids."""
+    """A part of the page as HTML; adds its second-level headings to `headings`, by id."""
     match part:
         case Table():
             return _table(part, origins)
@@ -104,8 +104,10 @@ def _rendered(tokens: Sequence[Token]) -> str:
 
 
 def _table(table: Table, origins: dict[str, dict[str, str]]) -> str:
-    """The Markdown of `table`, rendered; a line names the runs behind it, its first cell links to
-    the first of them."""
+    """Render the Markdown of `table`.
+
+    A line's tooltip names the runs behind it, and its first cell links to the first of them.
+    """
     tokens = PARSER.parse(table.markdown())
     _, *lines = (n for n, token in enumerate(tokens) if token.type == "tr_open")
     for line, sources in zip(lines, table.sources, strict=False):
@@ -113,14 +115,14 @@ def _table(table: Table, origins: dict[str, dict[str, str]]) -> str:
         if known:
             tokens[line].attrSet("data-runs", " ".join(known))
             tokens[line].attrSet("title", _in_short(known, origins))
-            label = tokens[line + 2]  # after those that open the line and its first cell
+            label = tokens[line + 2]  # after the tokens that open line and cell
             link = Token("link_open", "a", 1, attrs={"href": f"#run-{known[0]}", "class": "origin"})
             label.children = [link, *(label.children or ()), Token("link_close", "a", -1)]
     return f'<div class="table scrolls">{_rendered(tokens)}</div>'
 
 
 def _in_short(keys: Sequence[str], origins: dict[str, dict[str, str]]) -> str:
-    """Where the figures of a line come from, in a few lines."""
+    """Short provenance of a line's figures, for a tooltip."""
     shown = [
         "run {run}, commit {commit}, {machine}: {command}".format(**origins[key])
         for key in keys[:3]
@@ -130,7 +132,7 @@ def _in_short(keys: Sequence[str], origins: dict[str, dict[str, str]]) -> str:
 
 
 def _svg(plot: Plot) -> str:
-    """`plot` as SVG; its marks can be focused and say what they are."""
+    """`plot` as SVG; its marks can be focused and have descriptions."""
     with (
         tempfile.TemporaryDirectory() as place,
         matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": plot.stem}),
@@ -140,12 +142,12 @@ def _svg(plot: Plot) -> str:
     root = ElementTree.fromstring(content)
     used = set(re.findall(r"#([\w-]+)", content))
     for element in root.iter():
-        element.tag = element.tag.rpartition("}")[2]  # HTML knows what lies in an <svg>
+        element.tag = element.tag.rpartition("}")[2]  # HTML needs no namespaces in <svg>
         element.attrib = {name.rpartition("}")[2]: of for name, of in element.attrib.items()}
         name = element.get("id", "")
         if name in plot.marks:
             _name_mark(element, plot.marks[name])
-        if name not in used:  # another plot of the page may have the same
+        if name not in used:  # another plot on the page may use the same id
             element.attrib.pop("id", None)
     root.remove(next(child for child in root if child.tag == "metadata"))
     root.attrib["style"] = f"--width: {root.attrib.pop('width')}"
@@ -163,7 +165,7 @@ def _name_mark(element: ElementTree.Element, mark: Mark) -> None:
 
 
 def _frame(frame: Frame) -> dict[str, Any]:
-    """What the template shows of `frame`."""
+    """The values of `frame` for the template."""
     height, width = frame.truth.shape[:2]
     left, top, right, bottom = frame.detail.box
     views = [{"titles": ("ground truth",), "rendering": _uri(frame.truth)}]

@@ -1,1 +1,1 @@
-"""Studies of one method: from what it declares in its `bench.study.Study`, not from its name."""
+"""Studies of one method, driven by its declared `bench.study.Study`, not by its name."""

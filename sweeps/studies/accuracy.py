@@ -1,4 +1,4 @@
-"""`steerbench accuracy`: run time against error of every knob that trades them."""
+"""`steerbench accuracy`: run time against error, for every knob that trades one for the other."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ Knobs = Mapping[str, Sequence[Variant]]
 SETTINGS = (METHOD, "scene=totem", "budget=demo", "trajectory=orbit")
 
 AS_IT_IS = Variant("as it is")
-"""The settings as they were typed, with which every knob is compared."""
+"""The settings as typed, with which every knob is compared."""
 
 
 def main(options: argparse.Namespace) -> int:
-    """Print both tables and the setting that was asked for; as the last line, all rows as JSON."""
+    """Print both tables and the recommended setting, then all rows as JSON in the last line."""
     limit = None if options.within is None else decibels(options.within)
     words = _last_words([*SETTINGS, *options.overrides])
     config = composed(words)
@@ -72,7 +72,7 @@ def main(options: argparse.Namespace) -> int:
 
 
 def decibels(text: str) -> float:
-    """The number in "0.1dB", "0.1 dB" or "0.1"; SteerbenchError where it is none or negative."""
+    """The number in "0.1dB", "0.1 dB" or "0.1"; SteerbenchError if invalid or negative."""
     number = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)\s*(dB)?", text, re.IGNORECASE)
     if not number:
         raise SteerbenchError(f"--within: expected decibels, 0.1dB for example, got {text!r}")
@@ -80,16 +80,16 @@ def decibels(text: str) -> float:
 
 
 def _last_words(words: Sequence[str]) -> list[str]:
-    """`words` without those that a later word for the same setting replaces; all options stay."""
+    """`words` without those replaced by a later word for the same setting; options are kept."""
     key = {word: word if word.startswith("--") else word.partition("=")[0] for word in words}
     return list({key[word]: word for word in words}.values())
 
 
 def _knobs(config: DictConfig, words: Sequence[str], trained: bool) -> Knobs:
-    """By the name of a knob its settings, with everything else as it is.
+    """The variants of each knob, by the knob's name, with everything else unchanged.
 
-    What the knobs are compared with comes first: everything off, if the method says what that is,
-    and nothing changed. All are rendered from one training, except for those that `trained` adds.
+    First come the two that the knobs are compared with: everything off, if the method declares what
+    that is, and nothing changed. All use the same training, except those that `trained` adds.
     """
     study = declared(config)
     standard, *others = engines(words) if computes_with_engine(config) else [AS_IT_IS]
@@ -104,8 +104,10 @@ def _knobs(config: DictConfig, words: Sequence[str], trained: bool) -> Knobs:
 
 
 def _chosen(knobs: Knobs, parts: Sequence[str] | None) -> list[tuple[str, Variant]]:
-    """The settings of the knobs whose names have any of `parts` in them, each with its knob, after
-    those that all knobs are compared with."""
+    """The variants of knobs whose names contain any of `parts`, each with its knob.
+
+    Those that all knobs are compared with come first.
+    """
     chosen = set(list(knobs)[: list(knobs).index(AS_IT_IS.name) + 1])
     turned = [knob for knob in knobs if knob not in chosen]
     for part in parts or [""]:
@@ -122,8 +124,11 @@ def _chosen(knobs: Knobs, parts: Sequence[str] | None) -> list[tuple[str, Varian
 def _setting_rows(
     words: Sequence[str], chosen: Sequence[tuple[str, Variant]], options: argparse.Namespace
 ) -> list[Row]:
-    """Of every setting its knob, overrides, costs and errors, what it loses against the first, and
-    `instead`, the setting on the frontier that beats it; see `bench.accuracy.render_in_turns`."""
+    """One row per setting: its knob, overrides, costs and errors, `lost` and `instead`.
+
+    `lost` is its loss in dB against the first setting, `instead` the setting on the frontier that
+    dominates it. For the rest see `bench.accuracy.render_in_turns`.
+    """
     lines = {variant.name: _last_words([*words, *variant.settings]) for _, variant in chosen}
     found = render_variants(lines, options.frames, options.repeats)
     scene, path, rendered = found[0].scene, found[0].path, [one.values for one in found]
@@ -145,7 +150,7 @@ def _setting_rows(
 
 
 def _recommended(rows: Sequence[Row], limit: float) -> str:
-    """The fastest setting that loses at most `limit` dB, as a command; the first loses 0."""
+    """The fastest setting that loses at most `limit` dB, as a command; the first always does."""
     index = cheapest_within([row["ms"] for row in rows], [row["lost"] for row in rows], limit)
     assert index is not None
     row = rows[index]

@@ -1,4 +1,4 @@
-"""`steerbench breakdown`: the time of a frame by its parts, precision by precision."""
+"""`steerbench breakdown`: the time of a frame by its parts, for each precision."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ from sweeps.terminal import show
 SETTINGS = (METHOD, "trajectory=smooth")
 
 DENSE = ", nothing skipped"
-"""How the name of a line ends whose method skips nothing."""
+"""Suffix of a line whose method skips nothing."""
 
 
 def main(options: argparse.Namespace) -> int:
-    """Print two tables, or one of waits, and, as the last line, the rows of the first as JSON."""
+    """Print two tables, then the rows of the first as JSON in the last line; or one of waits."""
     words = with_engine([*SETTINGS, *options.overrides])
     if options.device_waits:
         return _print_waits(words, options.frames)
@@ -75,12 +75,12 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _print_waits(words: Sequence[str], frames: int) -> int:
-    """Print how often the host waits for the GPU in a steady frame, by the line that makes it wait.
+    """Print how often the host waits for the GPU in a steady frame, by the line that causes it.
 
-    The path is rendered once before: what is made once is not counted.
+    The path is rendered once before, so that one-time set-up is not counted.
     """
     with device_waits():
-        pass  # says that it needs a GPU before anything is trained
+        pass  # raises without a GPU before anything is trained
     config = composed(words)
     settings = checked_settings(config)
     log = OnceLog(Path(settings.outputs))
@@ -115,13 +115,13 @@ def _waits(method: Method, path: Trajectory) -> list[Counter[Line]]:
 
 
 def with_engine(words: Sequence[str]) -> list[str]:
-    """`words`, and before them the fastest engine that computes on the device they name."""
+    """`words`, preceded by the fastest engine for the device that they name."""
     device = str(composed(words).get("device"))
     return ["engine=torch" if on_gpu(device) else "engine=openvino", *words]
 
 
 def _precisions(words: Sequence[str]) -> list[Variant]:
-    """The chosen engine at each of its precisions; nothing for a method that uses none."""
+    """The chosen engine at each of its precisions; empty if the method uses no engine."""
     config = composed(words, return_hydra_config=True)
     if not computes_with_engine(config):
         return []
@@ -134,8 +134,10 @@ def _ending(variants: Iterable[Variant], ending: str) -> list[Variant]:
 
 
 def _shared(words: Sequence[str], study: Study) -> list[str]:
-    """The `words` that hold for all methods compared with, too: of the settings of the method those
-    that all of them have, and all other words."""
+    """The `words` that also apply to all methods compared with.
+
+    These are all words except `method=` and settings of the method that one of the others lacks.
+    """
     folders = [word for word in words if word.startswith("--config-dir=")]
     others = [composed([*folders, *settings]) for settings in study.beside.values()]
     return [word for word in words if _holds(word, others)]
@@ -151,7 +153,7 @@ def _holds(word: str, configs: Iterable[DictConfig]) -> bool:
 
 
 def _row(one: Rendered, trained_alike: bool) -> Row:
-    """One line; its PSNR is left out where the budget is another than that of the first line."""
+    """One line; its PSNR is left out if it has another budget than the first line."""
     parts: dict[str, float] = {}
     for metric, value in one.values.items():
         if metric.startswith("stage_ms."):
@@ -168,7 +170,7 @@ def _row(one: Rendered, trained_alike: bool) -> Row:
 
 
 def _parts(study: Study, rows: Iterable[Row]) -> list[str]:
-    """The parts that any line has: those that the method declares first, `other` last."""
+    """The parts that occur in any line: first those that the method declares, `other` last."""
     there = dict.fromkeys(part for row in rows for part in row["parts"])
     named = [part for part in dict.fromkeys(study.parts.values()) if part in there]
     return [*named, *(part for part in there if part not in (*named, OTHER)), OTHER]
@@ -187,8 +189,10 @@ def _line(row: Row, parts: Iterable[str]) -> tuple[str, ...]:
 
 
 def _compared(rows: Mapping[str, Row], names: Sequence[str], study: Study) -> Table | None:
-    """How the lines `names` compare with other methods, the first precision, and no skips; None
-    where there is nothing to compare with."""
+    """How the lines `names` compare with other methods, with the first precision and with no skips.
+
+    None if there is nothing to compare with.
+    """
     lines = {name: _ratios(rows, name, names[0], study) for name in names if name in rows}
     columns = tuple(next(iter(lines.values())))
     cells = ((name, *ratios.values()) for name, ratios in lines.items())

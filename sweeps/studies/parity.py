@@ -1,4 +1,4 @@
-"""`steerbench parity`: the error and the time of every engine and precision of the network."""
+"""`steerbench parity`: error and time of the network for every engine and precision."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ COLUMNS = (
 
 
 def main(options: argparse.Namespace) -> int:
-    """Print a table and, as the last line, the same rows as JSON."""
+    """Print a table, then its rows as JSON in the last line."""
     words = [METHOD, "trajectory=smooth", *options.overrides]
     if not computes_with_engine(composed(words)):
         raise SteerbenchError(

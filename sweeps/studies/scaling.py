@@ -1,4 +1,4 @@
-"""`steerbench scaling`: how time, work and memory of a frame grow with what a method declares."""
+"""`steerbench scaling`: how time, work and memory of a frame grow along a method's axes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from sweeps.studies.variants import (
 from sweeps.terminal import show
 
 SETTINGS = (METHOD, "trajectory=smooth", "++budget.renderer_steps=8")
-"""What a 2D renderer has learned does not change what it costs."""
+"""Few `renderer_steps`, because a 2D renderer costs the same however long it was trained."""
 
 SIZES = ((200, 200), (400, 400), (800, 800), (1920, 1080), (3840, 2160))
 
@@ -49,10 +49,10 @@ class Point:
 
     Attributes:
         axis: what is varied.
-        value: what the value amounts to, for the fit.
+        value: the size that the power is fitted to; see `bench.study.Axis.size`.
         label: the value as it is shown.
-        settings: the words that make it, as of `steerbench run`.
-        size: width and height of the frames; None: as the trajectory has them.
+        settings: the words for `steerbench run` that set it.
+        size: width and height of the frames; None: those of the trajectory.
     """
 
     axis: str
@@ -74,7 +74,7 @@ def _points(study: Study) -> Iterator[Point]:
 
 
 def main(options: argparse.Namespace) -> int:
-    """Print a table with the fitted exponents and, as the last line, the rows as JSON."""
+    """Print a table with the fitted exponents, then its rows as JSON in the last line."""
     if options.plot is not None and options.plot.suffix != ".png":
         raise SteerbenchError(f"--plot: expected a name that ends in .png, got {options.plot}")
     words = [*SETTINGS, *options.overrides]
@@ -101,7 +101,7 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _chosen(config: DictConfig, names: Sequence[str] | None) -> list[Point]:
-    """The points of the axes `names`, of all by default.
+    """The points of the axes `names`; by default, of all axes.
 
     Raises:
         SteerbenchError: the method has no such axis, or the engine has a fixed number of threads.
@@ -160,7 +160,7 @@ def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) 
 def _render(
     method: Method, cameras: Sequence[Camera], log: Log
 ) -> tuple[Sequence[FrameRecord], int]:
-    """The steady frames of the second of two rounds through `cameras`, and the peak of memory."""
+    """Records of the steady frames in the second of two rounds through `cameras`; peak memory."""
     device = method.settings()["device"]
     clock, meter = StageClock(device), MemoryMeter(device)
     with log.progress("rendering", 2 * len(cameras)) as progress:
@@ -174,7 +174,7 @@ def _render(
 
 
 def _table(title: str, axes: Mapping[str, Sequence[Row]]) -> Table:
-    """All rows, and below those of each axis the power with which each figure grows."""
+    """All rows, and below those of each axis the exponent with which each figure grows."""
     counters = dict.fromkeys(
         name for rows in axes.values() for row in rows for name in row if name.startswith("work.")
     )
@@ -208,8 +208,10 @@ def _plot(axes: Mapping[str, Sequence[Row]], path: Path) -> None:
 
 
 def growth(rows: Sequence[Row], figure: str) -> float:
-    """The exponent p of `figure` ~ value^p, by least squares of the logarithms; nan if there are
-    fewer than two values above 0."""
+    """The exponent p of `figure` ~ value^p, by least squares on the logarithms.
+
+    nan if fewer than two values are above 0.
+    """
     points = [
         (row["value"], row[figure]) for row in rows if row["value"] > 0 and row.get(figure, 0) > 0
     ]

@@ -1,4 +1,4 @@
-"""`steerbench skips`: what is not computed, the time that saves, and the error it adds."""
+"""`steerbench skips`: what a method skips, the time that this saves, and the error that it adds."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from sweeps.terminal import show
 
 
 def main(options: argparse.Namespace) -> int:
-    """Print a table and, as the last line, the same rows as JSON."""
+    """Print a table, then its rows as JSON in the last line."""
     words = [METHOD, "trajectory=smooth", *options.overrides]
     config = composed(words)
     study = declared(config)
@@ -34,7 +34,7 @@ def main(options: argparse.Namespace) -> int:
             f"steerbench skips: {config.method._target_} declares nothing in `study.skips` "
             "(bench/study.py); expected a method that does, for example method=steernerf_lean"
         )
-    # What was typed comes last, so that it counts.
+    # The user's words come last, so that they take precedence.
     words = [*words[:2], *study.skips_with, *options.overrides]
     found = render_variants(settings_of(words, _variants(study)), options.frames, options.repeats)
     work = found[0].work()
@@ -54,7 +54,7 @@ def nothing_skipped(study: Study) -> tuple[str, ...]:
 
 
 def _variants(study: Study) -> Iterator[Variant]:
-    """Nothing skipped, each skip alone, all of them, and further savings on top."""
+    """Variants: nothing skipped, each skip alone, all skips, and further savings on top."""
     off = dict(zip(study.skips, nothing_skipped(study), strict=True))
     yield Variant("nothing", tuple(off.values()))
     for name in off:

@@ -1,4 +1,4 @@
-"""Variants of a method on the same frames, each compared with the first of them."""
+"""Renders variants of a method on the same frames, and compares each with the first."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from sweeps.overrides import composed
 Row = dict[str, Any]
 
 METHOD = "method=steernerf_lean"
-"""What is studied by default."""
+"""The method that is studied by default."""
 
 
 @dataclass(frozen=True)
 class Rendered:
-    """What a variant rendered.
+    """The result of rendering a variant.
 
     Attributes:
         study: what its method declares.
-        method: as it was used.
+        method: the fitted method.
         scene, path: what all variants rendered.
-        values: see `bench.accuracy.render_in_turns`.
+        values: its row, see `bench.accuracy.render_in_turns`.
     """
 
     name: str
@@ -51,16 +51,16 @@ class Rendered:
 
     @property
     def frames(self) -> int:
-        """Frames of the path."""
+        """Number of frames of the path."""
         return len(self.path.steps)
 
     @property
     def network_ms(self) -> float | None:
-        """The time of the stage that the engine computes; None where the method declares none."""
+        """The time of the stage that the engine computes; None if the method declares none."""
         return self.values.get(f"stage_ms.{self.study.network_stage}")
 
     def work(self) -> dict[str, float]:
-        """The counters of a frame, without what skipping nothing would have taken."""
+        """The work counters of a frame, without the `dense` ones."""
         return {
             name.removeprefix("work."): value
             for name, value in self.values.items()
@@ -69,28 +69,29 @@ class Rendered:
 
 
 def declared(config: DictConfig) -> Study:
-    """What the method of `config` declares to be varied."""
+    """The study that the method of `config` declares."""
     return study_of(target_of(config.method))
 
 
 def computes_with_engine(config: DictConfig) -> bool:
-    """Whether the method of `config` has a network that an engine computes."""
+    """Whether the method of `config` has a network that an engine runs."""
     return "engine" in config.method
 
 
 def render_variants(
     variants: Mapping[str, Sequence[str]], frames: int, repeats: int
 ) -> list[Rendered]:
-    """Render the first `frames` of the trajectory with all variants that can be used here, in turn;
-    see `bench.accuracy.render_in_turns`. Trained stages are made, or found.
+    """Render the first `frames` of the trajectory with all usable variants in turn.
+
+    See `bench.accuracy.render_in_turns`. Stages are trained unless they are stored already.
 
     Args:
-        variants: by name the words for each, as of `steerbench run`. Scene, trajectory and
-            protocol are those of the first.
+        variants: by name, the words of each variant, as for `steerbench run`. Scene, trajectory and
+            protocol are those of the first one.
 
     Raises:
-        SteerbenchError: a setting is wrong, the first variant cannot be used here, or there is no
-            steady frame with ground truth among the first ones.
+        SteerbenchError: a setting is wrong, the first variant cannot be used here, or none of the
+            frames is steady and has a ground truth.
     """
     configs = {name: composed(words) for name, words in variants.items()}
     first = next(iter(configs.values()))
@@ -108,7 +109,7 @@ def render_variants(
 
 
 def settings_of(words: Sequence[str], variants: Iterable[Variant]) -> dict[str, list[str]]:
-    """By the name of each variant its settings after those of all."""
+    """The words of each variant, by its name: the common `words`, then its own settings."""
     return {variant.name: [*words, *variant.settings] for variant in variants}
 
 
@@ -116,7 +117,7 @@ def usable(configs: Mapping[str, DictConfig], log: Log) -> dict[str, Method]:
     """The methods that can be used here; the log says why others cannot.
 
     Raises:
-        Unavailable: the first of them cannot be used.
+        Unavailable: the first method cannot be used.
     """
     methods: dict[str, Method] = {}
     for name, config in configs.items():
@@ -140,7 +141,7 @@ def fit_each(
     """Fit all `methods`, each with the budget of its config.
 
     Raises, before anything is trained:
-        SteerbenchError: no frame of `path` is good for all.
+        SteerbenchError: no frame of `path` with a ground truth is steady for all methods.
     """
     steady_frames(methods.values(), path)
     with log.progress("variants", len(methods)) as progress:
@@ -151,7 +152,7 @@ def fit_each(
 
 
 class OnceLog(ConsoleLog):
-    """A log that says nothing twice: most variants find the same training."""
+    """A log that omits repeated messages, because most variants load the same training."""
 
     def __init__(self, root: Path) -> None:
         super().__init__(root)
@@ -164,11 +165,10 @@ class OnceLog(ConsoleLog):
 
 
 def common_ground(config: DictConfig, frames: int) -> tuple[Scene, Trajectory, EvaluationProtocol]:
-    """What all variants render and are scored by: the first `frames` of the trajectory, and the
-    protocol without LPIPS.
+    """What all variants share: scene, first `frames` of the trajectory, protocol without LPIPS.
 
     Raises:
-        SteerbenchError: a setting is wrong, or the scene does not suit the protocol.
+        SteerbenchError: a setting is wrong, or the scene does not fit the protocol.
     """
     scene = scene_of(config)
     path = build(config, "trajectory", scene)
@@ -195,7 +195,7 @@ def engines(words: Sequence[str] = ()) -> list[Variant]:
 
 
 def print_rows(rows: Iterable[Mapping[str, Any]]) -> None:
-    """Print `rows` as one line of JSON, which has null for figures that are not finite."""
+    """Print `rows` as one line of JSON, with null for figures that are not finite."""
     print(json.dumps([finite(row) for row in rows]))
 
 
@@ -218,7 +218,7 @@ COMPARED = (
 
 
 def compared(one: Rendered, first: Rendered) -> Row:
-    """The error and the time of a variant beside the first."""
+    """Error and time of a variant compared with the first one."""
     values = one.values
     return {
         "apart": values["psnr_to_first"],
@@ -230,7 +230,7 @@ def compared(one: Rendered, first: Rendered) -> Row:
 
 
 def compared_cells(row: Row) -> tuple[str, ...]:
-    """The same for a table."""
+    """The cells of a `compared` row, as text; see `COMPARED`."""
     apart = row["apart"]
     return (
         decimal(apart, 1) if math.isfinite(apart) else "the same",
@@ -242,12 +242,12 @@ def compared_cells(row: Row) -> tuple[str, ...]:
 
 
 def range_text(values: Mapping[str, Any]) -> str:
-    """The mean times of a frame of the fastest and of the slowest round, for a table."""
+    """Mean frame times of the fastest and the slowest round, as text."""
     return f"{decimal(values['ms_lo'], 1)} – {decimal(values['ms_hi'], 1)}"
 
 
 def amount(value: float) -> str:
-    """A count in few digits: 12,345 or 1.23 M."""
+    """Format a count: 12,345 or 1.23 M."""
     for size, letter in ((1e9, "G"), (1e6, "M")):
         if value >= size:
             return f"{decimal(value / size, 2)} {letter}"

@@ -1,7 +1,7 @@
 """Adam that skips entries without gradient (Kingma & Ba 2015; sparse as in tiny-cuda-nn).
 
-A table entry none of whose features got a gradient keeps its value and moments: dense Adam would
-go on moving it by momentum, and would read and write the whole table every step.
+If no feature of a table entry has a gradient, the entry keeps its value and moments. Dense Adam
+would keep moving it by momentum, and would read and write the whole table every step.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class AdamState:
 
     @classmethod
     def of(cls, tensors: Mapping[str, Tensor], prefix: str, device: torch.device) -> AdamState:
-        """What `tensors` of the same prefix gave, on `device`."""
+        """Restore the state from the result of `tensors` with the same prefix, on `device`."""
         first, second, steps = (tensors[f"{prefix}{name}"].to(device) for name in _NAMES)
         return cls(first, second, steps)
 
@@ -53,8 +53,10 @@ class AdamState:
 
 @cache
 def corrections() -> Tensor:
-    """The bias corrections 1 / (1 - beta^n) of both `BETAS`, for n = 0, which is not used, 1, ...
-    until float32 cannot tell them from 1: [2, N]."""
+    """The bias corrections 1 / (1 - beta^n) of both `BETAS` for n = 0 (unused), 1, ...: [2, N].
+
+    The table ends where float32 rounds both to 1.
+    """
     last = math.ceil(math.log(2.0**-25) / math.log(max(BETAS)))
     powers = torch.tensor(BETAS, dtype=torch.float64)[:, None] ** torch.arange(last + 1)
     return (1 / (1 - powers)).float()
@@ -69,10 +71,10 @@ def sparse_adam_(
     packed: Tensor | None = None,
     backend: str = "auto",
 ) -> None:
-    """Update, in place, the entries of `table` [entries, F] whose `grad` is not zero; clear `grad`.
+    """Update in place the entries of `table` [entries, F] with a non-zero `grad`; clear `grad`.
 
-    The bias correction goes by the entry's own number of steps. `packed`, the bfloat16 copy of
-    the table (`encode.pack`), is brought up to date when given.
+    The bias correction uses the entry's own step count. `packed`, the bfloat16 copy of the table
+    (`encode.pack`), is updated, too, if given.
     """
     entries, features = table.shape
     for name, tensor in (("grad", grad), ("first", state.first), ("second", state.second)):

@@ -20,7 +20,7 @@ LARGE = 1 << 20
 
 
 def cases() -> list[Case]:
-    """Tables none, some and all of whose entries got a gradient; tiny and huge gradients."""
+    """Tables in which none, some or all entries have a gradient; tiny and huge gradients."""
     kernel = Agreement(
         "adam",
         served("adam"),
@@ -51,7 +51,7 @@ def cases() -> list[Case]:
 def _prepare(
     count: int, share: float, features: int, device: str
 ) -> Callable[[str], tuple[Tensor, ...]]:
-    """Two features are packed, too."""
+    """With two features, the packed copy is checked, too."""
     generator = torch.Generator().manual_seed(count)
     table = torch.rand(count, features, generator=generator) * 2 - 1
     grads = [
@@ -75,7 +75,7 @@ def _prepare(
 def _first_step_error(gradient: float, backend: str, device: str, precision: str) -> float:
     table = torch.zeros(3, 2, device=device)
     grad = torch.full_like(table, gradient)
-    exact = grad[0, 0].item()  # as float32 has it
+    exact = grad[0, 0].item()  # rounded to float32
     sparse_adam_(table, grad, AdamState.like(table), 1.0, backend=backend)
     want = -exact / (abs(exact) + 1e-15)
     error = (table.double() - want).abs().max().item()

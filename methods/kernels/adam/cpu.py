@@ -1,4 +1,4 @@
-"""Sparse Adam with numba: one pass over the gradient, one over what it touched."""
+"""Sparse Adam with numba: one pass over the gradient, one over the entries that have one."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Sparse Adam with Triton: one pass, in which a program takes a block of entries.
+"""Sparse Adam with Triton: one pass, each program handles a block of entries.
 
-It reads the gradient of every entry, 4 F bytes. Of an entry that got one it also reads, and writes,
-the table, both moments and the number of steps, 12 F + 4 bytes each way, and writes a gradient of 0
-and the packed copy, 4 F + 4.
+It reads the gradient of every entry, 4 F bytes. For entries with a non-zero gradient it also reads
+and writes the table, both moments and the step count, 12 F + 4 bytes each way, and writes a
+gradient of 0 and the packed copy, 4 F + 4 bytes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from methods.kernels.adam import AdamState, corrections
 from methods.kernels.gpu import check_types, launch
 
 BLOCK = 1024
-"""Features of a program, 8 a lane: so many loads at a time hide how long one takes."""
+"""Features per program, 8 per lane: that many concurrent loads hide their latency."""
 
 BETA1, BETA2 = tl.constexpr(adam.BETAS[0]), tl.constexpr(adam.BETAS[1])
 EPS = tl.constexpr(adam.EPS)
@@ -29,7 +29,7 @@ EPS = tl.constexpr(adam.EPS)
 def sparse_adam_(
     table: Tensor, grad: Tensor, state: AdamState, rate: float, packed: Tensor | None
 ) -> None:
-    """See `methods.kernels.adam.sparse_adam_`. Changes contiguous tensors only."""
+    """See `methods.kernels.adam.sparse_adam_`. All tensors must be contiguous."""
     given = {"table": table, "grad": grad, "first": state.first, "second": state.second}
     check_types(torch.float32, **given)
     for name, tensor in given.items():
@@ -56,7 +56,7 @@ def sparse_adam_(
 
 @cache
 def _corrections(device: torch.device) -> Tensor:
-    """To copy them to the device again would wait for it."""
+    """Cached per device, because each copy to the device would synchronise."""
     return corrections().to(device)
 
 
@@ -78,7 +78,7 @@ def _update(
 ):
     """`last` is the largest number of steps in `corrections`; `packed` is of bfloat16.
 
-    The compiler knows `FEATURES`, so that a lane loads two or four at once.
+    `FEATURES` is known at compile time, so that a lane can load two or four at once.
     """
     entry = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     feature = tl.arange(0, WIDTH)
@@ -96,7 +96,7 @@ def _update(
     scale = tl.sqrt(v * correction2) + EPS
     old = tl.load(table + place, mask=changed, other=0.0)
     new = old - rate * m * correction1 / scale
-    tl.debug_barrier()  # each warp may have read the steps of its rows: all have, before one writes
+    tl.debug_barrier()  # all warps must have read `steps` before any writes
     tl.store(steps + entry, step, mask=touched)
     tl.store(first + place, m, mask=changed)
     tl.store(second + place, v, mask=changed)

@@ -14,7 +14,7 @@ def sparse_adam_(
     table: Tensor, grad: Tensor, state: AdamState, rate: float, packed: Tensor | None
 ) -> None:
     """See `methods.kernels.adam.sparse_adam_`."""
-    touched = (grad != 0).any(dim=-1, keepdim=True)  # not a list: a GPU would be waited for
+    touched = (grad != 0).any(dim=-1, keepdim=True)  # a mask, as indices would wait for a GPU
     state.steps += touched.squeeze(-1)
     steps = state.steps[:, None].to(table.dtype)
     first = BETAS[0] * state.first + (1 - BETAS[0]) * grad

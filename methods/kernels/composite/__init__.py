@@ -16,22 +16,22 @@ from bench.types import check_shape
 from methods.kernels.dispatch import implementation
 
 STOP = 1e-4
-"""Transmittance below which a ray ends: what lies behind changes a pixel by less than this."""
+"""Transmittance at which a ray ends: what lies behind changes a pixel by less than this."""
 
 
 def check_stop(stop: float) -> None:
-    """Raise ValueError for a `stop` at which every ray would end before it begins."""
+    """Raise ValueError unless 0 <= `stop` < 1; from 1 on, rays would end before they begin."""
     if not 0 <= stop < 1:
         raise ValueError(f"stop: expected a transmittance of 0 or more and less than 1, got {stop}")
 
 
 @dataclass(frozen=True)
 class Extent:
-    """How many samples some rays have, as the host knows it.
+    """Sample counts of some rays, known to the host.
 
     Attributes:
-        total: of all rays.
-        longest: of the ray that has the most.
+        total: samples of all rays together.
+        longest: samples of the ray that has the most.
     """
 
     total: int
@@ -39,25 +39,25 @@ class Extent:
 
     @classmethod
     def of_each(cls, counts: Tensor) -> list[Extent]:
-        """Of rays with `counts` [G, R] samples, group by group. The host waits for a GPU, once."""
+        """The extent of each group of rays with `counts` [G, R] samples. Waits for a GPU, once."""
         return [cls(*size) for size in cls.figures(counts).tolist()]
 
     @staticmethod
     def figures(counts: Tensor) -> Tensor:
-        """`total` and `longest` of each group of `counts` [G, R], where they are: [G, 2]."""
+        """`total` and `longest` of each group of `counts` [G, R], on the same device: [G, 2]."""
         counts = functional.pad(counts, (0, 1))  # for a group without rays
         return torch.stack((counts.sum(dim=1), counts.amax(dim=1)), dim=1)
 
 
 @dataclass(frozen=True)
 class Intervals:
-    """Where samples lie on R rays, ray by ray, front to back.
+    """The positions of samples on R rays, ray by ray, front to back.
 
     Attributes:
         t: [S] position along the ray (z-depth for rays of `bench.cameras.cast`).
         delta: [S] length of the interval a sample represents, scene units.
         offsets: [R + 1] int64, ray r owns samples offsets[r] to offsets[r + 1].
-        longest: samples of the ray that has the most; None: only `offsets` knows.
+        longest: samples of the ray that has the most; None: unknown, it follows from `offsets`.
     """
 
     t: Tensor
@@ -68,8 +68,10 @@ class Intervals:
     def first_of_each(
         self, counts: Tensor, extent: Extent | None = None
     ) -> tuple[Tensor, Tensor, int]:
-        """The first `counts` [R] samples of each ray, as indices, and their own `offsets` and
-        `longest`; `extent` is that of `counts`, None: a GPU is waited for."""
+        """Indices of the first `counts` [R] samples of each ray, and their `offsets` and `longest`.
+
+        `extent` is that of `counts`; if None, the host waits for a GPU.
+        """
         if extent is None:
             (extent,) = Extent.of_each(counts[None])
         offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
@@ -87,7 +89,7 @@ class Pixels:
 
     @classmethod
     def blank(cls, rays: int, channels: int, device: torch.device | str = "cpu") -> Pixels:
-        """Rays that no sample was composited on yet."""
+        """Rays before any sample is composited: all zeros."""
         return cls(
             torch.zeros(rays, channels, device=device),
             torch.zeros(rays, device=device),
@@ -105,7 +107,7 @@ class Pixels:
         self.alpha[index] = pixels.alpha
 
     def over(self, background: Tensor) -> Pixels:
-        """The same rays on a `background` [K] or [R, K], which shines through with 1 - alpha."""
+        """Composite the rays onto a `background` [K] or [R, K], whose weight is 1 - alpha."""
         shine = (1 - self.alpha)[:, None] * background
         return Pixels(self.values + shine, self.depth_sum, self.alpha)
 
@@ -126,9 +128,9 @@ def composite(
     Args:
         sigma: [S] density, not negative.
         values: [S, K] colour or features.
-        intervals: where the samples lie; `march.Samples` for example.
+        intervals: positions of the samples, for example `march.Samples`.
         stop: samples behind a transmittance of at most `stop` have no weight; 0 uses all.
-        carry: pixels of the samples in front of these. Constant: no gradient flows into it.
+        carry: pixels of the samples in front of these, as a constant without gradient.
     """
     _check_samples(sigma, intervals)
     check_shape("values", values, len(sigma), None)
@@ -151,7 +153,7 @@ def weights(
     front: Tensor | None = None,
     backend: str = "auto",
 ) -> Tensor:
-    """The weights [S] that `composite` gives to samples, without their values. No gradient.
+    """The weights [S] that `composite` gives to samples, computed without values. No gradient.
 
     Args:
         front: [R] transmittance in front of each ray's first sample; None: 1.
@@ -169,9 +171,9 @@ def weights(
 def visible_counts(
     sigma: Tensor, intervals: Intervals, *, stop: float = STOP, backend: str = "auto"
 ) -> Tensor:
-    """How many samples of each ray `composite` would give a weight: [R] int64. No gradient.
+    """How many samples of each ray get a weight from `composite`: [R] int64. No gradient.
 
-    They are the first ones of the ray; those behind have neither weight nor gradient.
+    They are the first samples of the ray; those behind have neither weight nor gradient.
     """
     _check_samples(sigma, intervals)
     return implementation("composite", backend, sigma.device).visible_counts(
@@ -184,6 +186,6 @@ def _check_samples(sigma: Tensor, intervals: Intervals) -> None:
     check_shape("sigma", sigma, None)
     check_shape("delta", intervals.delta, len(sigma))
     check_shape("offsets", offsets, None)
-    # Of a GPU the host would have to wait for the number.
+    # Not checked on a GPU, for which the host would have to wait.
     if len(offsets) < 1 or (offsets.device.type == "cpu" and int(offsets[-1]) != len(sigma)):
         raise ValueError(f"offsets: expected to end at the {len(sigma)} samples, got {offsets}")

@@ -18,7 +18,7 @@ from methods.kernels.dispatch import served
 INF = math.inf
 
 DEPTH = 2.0
-"""Largest t of the samples: the size of what is summed, values being at most 1."""
+"""Largest t of the samples, which bounds the summands, since values are at most 1."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ KINDS = {
     "opaque at once": Kind(9, 12, density=1e30),
     "continued": Kind(33, 20, carry=True),
     "a background a ray": Kind(33, 20, background=True),
-    # Only a transmittance within rounding of `stop` could end a ray one sample earlier.
+    # A ray could end a sample earlier only if its transmittance is within rounding of `stop`.
     "stopped after many samples": Kind(20, 200, stop=0.3),
 }
 
@@ -60,7 +60,7 @@ WEIGHTS = (
 
 @dataclass(frozen=True)
 class Bundle:
-    """Samples of some rays, `counts` [R] of each."""
+    """Samples of R rays, of which each has `counts` [R]."""
 
     sigma: Tensor
     values: Tensor
@@ -95,7 +95,7 @@ class Bundle:
 
 @dataclass(frozen=True)
 class Inputs:
-    """Inputs of an agreement: samples, what lies in front of and behind them, a gradient."""
+    """Inputs of an agreement: samples, the pixels in front, the background, a gradient."""
 
     samples: Bundle
     carry: Pixels | None
@@ -104,7 +104,7 @@ class Inputs:
 
 
 Outputs = Callable[[Inputs, float, str], tuple[Tensor, ...]]
-"""Inputs, stop and backend to results."""
+"""Computes results from inputs, stop and backend."""
 
 
 PER_SAMPLE = ("sigma", "values", "t", "delta")
@@ -137,7 +137,7 @@ SAME = "a sum in another order: twice (8 + log2 n) u; the compiled one has no or
 
 
 def cases() -> list[Case]:
-    """One extreme sample among ordinary ones; light kept over long rays; what changes nothing."""
+    """One extreme sample among ordinary ones; sums of weights on long rays; invariances."""
     pixels = Property(
         "composite",
         "pixels are those of the closed form",
@@ -176,7 +176,7 @@ def _agreements() -> list[Case]:
     for subject, (outputs, derivation, factor) in OUTPUTS.items():
         kernel = Agreement(subject, served("composite"), derivation)
         for name, kind in KINDS.items():
-            # Rounded 4 (n + 8) times at the size of t.
+            # 4 (n + 8) roundings, each relative to the size of t.
             tolerance = factor(kind) * 4 * (kind.most + 8) * U32 * DEPTH
             found.append(kernel.case(name, partial(_prepare, outputs, kind), tolerance))
         if outputs in (_pixels, _gradients):
@@ -192,7 +192,7 @@ def _prepare(outputs: Outputs, kind: Kind, device: str) -> Callable[[str], tuple
     draw = partial(torch.rand, generator=generator)
     counts = torch.randint(0, kind.most + 1, (rays,), generator=generator)
     if kind == Kind(rays, kind.most):
-        counts[: rays // 2] = kind.most  # the longest rays are there
+        counts[: rays // 2] = kind.most  # make sure that longest rays occur
     total = int(counts.sum())
     samples = Bundle(
         (kind.density * draw(total)).to(device).requires_grad_(),
@@ -244,7 +244,7 @@ OUTPUTS: dict[str, tuple[Outputs, str, Callable[[Kind], int]]] = {
         lambda kind: 0,
     ),
 }
-"""What is computed, the derivation of its tolerance, and the factor in it."""
+"""What is computed, the derivation of its tolerance, and the factor of the tolerance."""
 
 
 def _samples(extreme: tuple[float, float]) -> Bundle:
@@ -258,7 +258,7 @@ def _samples(extreme: tuple[float, float]) -> Bundle:
 
 
 def _exact_weights(sigma: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
-    """Closed form, in float64: weights of one ray, transmittance in front of and behind samples."""
+    """Weights of one ray and transmittance before and after its samples, closed form, float64."""
     tau = torch.where(delta > 0, sigma * delta, 0)
     behind = torch.exp(-tau.cumsum(0))
     front = torch.cat((behind.new_ones(1), behind[:-1]))
@@ -277,7 +277,7 @@ def _pixel_error(extreme: tuple[float, float], backend: str, device: str, precis
 def _gradient_error(
     extreme: tuple[float, float], backend: str, device: str, precision: str
 ) -> float:
-    """Of the sum of all outputs, by sigma, over the length of the sample."""
+    """Error of the gradient of the sum of all outputs by sigma, over the sample's length."""
     samples = _samples(extreme).apply(lambda x: x.to(DTYPES[precision])).to(device)
     sigma, values = samples.sigma.requires_grad_(), samples.values.requires_grad_()
     pixels = samples.composite(backend)
@@ -310,7 +310,7 @@ def _light_error(count: int, kind: str, backend: str, device: str, precision: st
 
 
 def random_rays(seed: int, rays: int, most: int) -> Bundle:
-    """Up to `most` samples on each of `rays` rays, between empty and opaque."""
+    """`rays` rays with up to `most` samples each, from empty to opaque."""
     generator = torch.Generator().manual_seed(seed)
     counts = torch.randint(0, most + 1, (rays,), generator=generator)
     total = int(counts.sum())
@@ -338,7 +338,7 @@ def _joined(parts: Sequence[Pixels]) -> Pixels:
 
 
 def split_interval(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
-    """Half of the samples of each ray first, the other half behind them."""
+    """Composite the front half of each ray first, then the rest behind it as `carry`."""
     half = samples.counts // 2
     first = _rank(samples) < half.repeat_interleave(samples.counts)
     front = replace(samples.apply(lambda x: x[first]), counts=half)
@@ -347,13 +347,13 @@ def split_interval(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
 
 
 def permute_rays(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
-    """The rays in reverse order."""
+    """Composite the rays in reverse order."""
     order = torch.arange(len(samples.counts)).flip(0)
     return samples.composite(backend).take(order), samples.rays(order).composite(backend)
 
 
 def split_batch(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
-    """Every third ray in a batch of its own."""
+    """Composite every third ray in a batch of its own."""
     order = torch.arange(len(samples.counts))
     parts = [order[order % 3 == 0], order[order % 3 != 0]]
     apart = _joined([samples.rays(part).composite(backend) for part in parts if len(part)])
@@ -361,14 +361,14 @@ def split_batch(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
 
 
 def separate_channels(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
-    """One channel after the other."""
+    """Composite one channel after the other."""
     apart = [replace(samples, values=samples.values[:, [i]]).composite(backend) for i in range(3)]
     values = torch.cat([part.values for part in apart], dim=1)
     return samples.composite(backend), Pixels(values, apart[0].depth_sum, apart[0].alpha)
 
 
 def add_empty_sample(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
-    """A sample without density in front of every ray."""
+    """Put a sample without density in front of every ray."""
     counts = samples.counts
     first = samples.intervals.offsets[:-1] + torch.arange(len(counts), device=counts.device)
     kept = first.repeat_interleave(counts) + 1 + _rank(samples)
@@ -387,7 +387,7 @@ def add_empty_sample(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
 
 
 def add_backgrounds(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
-    """Behind the sum of two backgrounds, or of one and the other less none."""
+    """Composite onto the sum of two backgrounds; compare with the sum of the separate results."""
     one, other = samples.values.new_tensor(((0.2, 0.5, 1.0), (0.7, 0.1, 0.4)))
     none = samples.composite(backend)
     first, second = (none.over(background) for background in (one, other))
@@ -396,7 +396,7 @@ def add_backgrounds(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
 
 
 def _rank(samples: Bundle) -> Tensor:
-    """The place [S] of each sample on its ray."""
+    """The index [S] of each sample on its ray."""
     counts = samples.counts
     return torch.cat([torch.arange(n, device=counts.device) for n in counts.tolist()])
 
@@ -422,7 +422,7 @@ CHANGES = (
         on_backends(16),
     ),
 )
-"""What may be done to rays, and what must hold then."""
+"""Changes that may be made to rays, and what must hold for each."""
 
 
 def _cpu(pixels: Pixels) -> tuple[Tensor, ...]:

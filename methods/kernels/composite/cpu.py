@@ -1,7 +1,7 @@
-"""Compositing with numba: a ray at a time, front to back, stopping where nothing shines through.
+"""Compositing with numba: one ray at a time, front to back, until it is opaque.
 
-What a sample takes from the light, the pixel gets: T_{i+1} = T_i - w_i. Light and sums are float64:
-a product of many factors next to 1 in float32 drifts, all of its roundings being the same.
+The transmittance is updated by T_{i+1} = T_i - w_i. Transmittance and sums are float64, because in
+float32 a product of many equal factors near 1 drifts: all are rounded the same way.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class _Composite(torch.autograd.Function):
 
 @njit(cache=True)
 def _opacity(sigma, delta):
-    # A sample without length is without matter, however dense: 0, not inf * 0.
+    # A sample of length 0 has opacity 0 even at infinite density (avoids inf * 0).
     return -math.expm1(-f64(sigma * delta)) if delta > 0 else 0.0
 
 
@@ -161,7 +161,7 @@ def _backward(
     """
     channels = values.shape[1]
     for ray in prange(len(offsets) - 1):
-        behind = 0.0  # sum of w_j g_j of samples behind i; first of all samples
+        behind = 0.0  # sum of w_j g_j over samples behind i; at first over all
         transmittance = f64(front[ray])
         end = offsets[ray]
         while end < offsets[ray + 1] and transmittance > stop:
@@ -170,7 +170,7 @@ def _backward(
             for channel in range(channels):
                 gain += grad_out[ray, channel] * values[end, channel]
                 grad_values[end, channel] = weight * grad_out[ray, channel]
-            # Kept until the second pass, which needs every sample's gain and weight again.
+            # Stored here until the second pass, which needs gain and weight again.
             grad_sigma[end] = gain
             behind += weight * gain
             transmittance -= weight

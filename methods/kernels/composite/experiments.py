@@ -1,7 +1,7 @@
 """Experiments on the quadrature of volume rendering: march and compositing in analytic media.
 
-Rays run along x through the unit cube, from its face x = 0; y says how dense the medium is on a
-ray. With the optical thickness tau(x) = int_0^x sigma, opacity and depth are
+Rays run along x through the unit cube, starting at its face x = 0; the density of the medium on a
+ray depends on y. With the optical thickness tau(x) = int_0^x sigma, opacity and depth are
 
 alpha = 1 - exp(-tau(1)),  depth_sum = int_0^1 x sigma exp(-tau) = int_0^1 exp(-tau) - exp(-tau(1)).
 """
@@ -27,22 +27,22 @@ Quantity = Literal["alpha", "depth_sum"]
 
 RAYS = 256
 NODES = 256
-"""Of the Gauss-Legendre rule for the depth: enough for rounding alone to be left."""
+"""Nodes of the Gauss-Legendre rule for the depth; enough that only rounding errors remain."""
 
 STEPS = [2.0**-power for power in range(2, 11)]
-"""Of the march, in sides of the cube: with the last one a ray has the most samples it may have."""
+"""Step lengths of the march, in cube sides; the smallest gives the maximum number of samples."""
 
 THIN = 1 / 32
-"""Optical thickness of a sample where rays are ended early."""
+"""Optical thickness of a sample in the experiment on early stopping."""
 
 
 @dataclass(frozen=True)
 class Medium:
-    """A density in the unit cube, and what lies in front of a point on rays along x.
+    """A density in the unit cube, and the optical thickness in front of a point on rays along x.
 
     Attributes:
-        sigma: of x and y [N], density [N].
-        thickness: of x and y [N], optical thickness [N] from 0 to x.
+        sigma: function of x and y [N]: density [N].
+        thickness: function of x and y [N]: optical thickness [N] from 0 to x.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Medium:
     thickness: Callable[[Tensor, Tensor], Tensor]
 
     def exact(self, quantity: Quantity, y: Tensor) -> Tensor:
-        """Of the rays at `y` [R] float64; the depth where `thickness` is smooth in x."""
+        """Exact quantity [R] of the rays at `y` [R] float64; depth needs a smooth `thickness`."""
         behind = torch.exp(-self.thickness(torch.ones_like(y), y))
         if quantity == "alpha":
             return 1 - behind
@@ -60,8 +60,7 @@ class Medium:
 
 
 def _strength(y: Tensor) -> Tensor:
-    """Density on the ray at y: the cube is opaque to two thirds at one end, to nearly all at the
-    other."""
+    """Density on the ray at y: the cube's opacity goes from two thirds at one end to almost 1."""
     return 1 + 7 * y
 
 
@@ -78,7 +77,7 @@ def _gaussian(name: str, centre: float, width: float = 0.1) -> Medium:
 
 
 def _first_face(y: Tensor) -> Tensor:
-    """Where the slab begins: between the samples, at another place on every ray."""
+    """x at which the slab begins: between samples, at a different place on every ray."""
     return 0.3 + 0.1 * y
 
 
@@ -93,7 +92,7 @@ INSIDE = _gaussian("Gaussian density", 0.5)
 CUT = _gaussian("Gaussian density, cut off by a face", 0.1)
 
 FINE = (2.0**-7, 2.0**-4)
-"""Steps that resolve the media below and leave errors that are far above rounding."""
+"""Range of steps that resolve the media below and leave errors far above rounding."""
 
 MEDIA: tuple[tuple[Medium, Quantity, tuple[float, float] | None], ...] = (
     (HOMOGENEOUS, "alpha", None),
@@ -105,13 +104,13 @@ MEDIA: tuple[tuple[Medium, Quantity, tuple[float, float] | None], ...] = (
     (CUT, "alpha", FINE),
     (SLAB, "alpha", (STEPS[-1], STEPS[0])),
 )
-"""What is integrated, and over which steps its order is fitted; None: no power law."""
+"""What is integrated, and the range of steps its order is fitted on; None: no power law."""
 
 NAMES: dict[Quantity, str] = {"alpha": "opacity", "depth_sum": "depth"}
 
 
 def experiments() -> list[Experiment]:
-    """Step length, position of the sample, early stop, and what adds the samples up."""
+    """Experiments on step length, sample position, early stop, and the precision of the sums."""
     return [
         *(_steps(medium, quantity, smooth) for medium, quantity, smooth in MEDIA),
         _steps(RAMP, "depth_sum", FINE, phase=0.0),
@@ -139,7 +138,7 @@ def _ray_heights() -> Tensor:
 
 
 def render(medium: Medium, quantity: Quantity, y: Tensor, step: float, phase: float) -> Tensor:
-    """Opacity or depth [R] of the rays at `y` [R], by march and compositing, without a stop."""
+    """Opacity or depth [R] of the rays at `y` [R], by march and compositing, without early stop."""
     origins = torch.stack((torch.zeros_like(y), y, torch.full_like(y, 0.5)), dim=1)
     rays = Rays(origins, torch.eye(3)[:1].expand(len(y), 3))
     occupancy = Occupancy(torch.ones(16, 16, 16))
@@ -152,7 +151,7 @@ def render(medium: Medium, quantity: Quantity, y: Tensor, step: float, phase: fl
 
 
 def _stops() -> Experiment:
-    """Rays of samples of thickness `THIN`, ended at a transmittance."""
+    """Rays with samples of thickness `THIN` that end at a given transmittance."""
     inputs, exact = _even_rays(RAYS, 1024, 1024 * THIN)
     stops = [0.0, *(10.0**-power for power in range(7, 0, -1))]
     trials = [Trial(stop, partial(_opacity, *inputs, stop), exact) for stop in stops]
@@ -167,9 +166,9 @@ ACCUMULATORS: tuple[tuple[str, torch.dtype], ...] = (
 
 
 def _accumulation(backend: str, dtype: torch.dtype) -> Experiment:
-    """Opacity of rays that are divided into more and more samples, 2^18 of all rays together.
+    """Opacity of rays divided into more and more samples; 2^18 samples over all rays.
 
-    All samples are alike, so that they are all rounded the same way.
+    All samples are equal, so that all are rounded the same way.
     """
     trials = []
     for count in (64, 1024, 65536):
@@ -183,8 +182,10 @@ def _accumulation(backend: str, dtype: torch.dtype) -> Experiment:
 def _even_rays(
     rays: int, count: int, thickness: float
 ) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
-    """Density, interval and offsets of `rays` that are divided evenly into `count` samples each, a
-    power of 2, and their exact opacity."""
+    """Density, interval and offsets of `rays` with `count` equal samples each; the exact opacity.
+
+    `count` is a power of 2.
+    """
     delta = torch.full((rays * count,), 1 / count)
     offsets = torch.arange(rays + 1) * count
     exact = torch.full((rays,), -math.expm1(-thickness), dtype=torch.float64)

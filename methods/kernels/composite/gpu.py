@@ -1,7 +1,7 @@
-"""Compositing with Triton: a program takes a ray, a block of its samples at a time.
+"""Compositing with Triton: one program per ray, which processes its samples block by block.
 
-Within a block transmittance is the exponential of a cumulative sum; a ray ends with the first block
-behind which nothing shines through.
+Within a block, transmittance is the exponential of a cumulative sum. A ray ends after the first
+block behind which it is opaque.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from methods.kernels.gpu import check_types, launch, opacity
 
 BLOCK = 64  # samples
 OPAQUE = tl.constexpr(128.0)
-"""Optical thickness behind which float32 has no light: thicker is the same, and stays finite."""
+"""Optical thickness at which the transmittance is 0 in float32; clamping to it avoids inf."""
 
 
 def composite(
@@ -101,9 +101,9 @@ class _Composite(torch.autograd.Function):
 
 @triton.jit
 def _thickness(sigma, delta, i, there):
-    """Optical thickness of samples, at most `OPAQUE`; a NaN stays one.
+    """Optical thickness of samples, at most `OPAQUE`; NaN stays NaN.
 
-    A sample without length is without matter, however dense: 0, not inf * 0.
+    A sample of length 0 has thickness 0 even at infinite density (avoids inf * 0).
     """
     length = tl.load(delta + i, mask=there, other=0.0)
     tau = tl.load(sigma + i, mask=there, other=0.0) * length
@@ -113,8 +113,11 @@ def _thickness(sigma, delta, i, there):
 
 @triton.jit
 def _block(sigma, delta, first, i, inside, light, stop):
-    """Weights of the samples `i`, which begin with `first`; which of them still get light, how much
-    of it goes on behind each, and behind all. Where one is NaN, nothing goes on."""
+    """Weights of the samples `i`, the first of which is `first`.
+
+    Also which of them still get light, the transmittance behind each, and that behind all. No
+    sample behind a NaN gets light.
+    """
     in_front = _thickness(sigma, delta, i - 1, inside & (i > first))
     tau = _thickness(sigma, delta, i, inside)
     before = light * tl.exp(-tl.cumsum(in_front, 0))
@@ -188,7 +191,7 @@ def _visible(sigma, delta, offsets, stop, counts, BLOCK: tl.constexpr):
 
 @triton.jit
 def _gain(values, t, i, lit, shine, of_depth, of_alpha, channel, there, channels):
-    """g_i = dL/dw_i of samples that get light, 0 of others."""
+    """g_i = dL/dw_i of samples that get light; 0 for others."""
     rows = values + i[:, None] * channels + channel[None, :]
     shown = tl.load(rows, mask=lit[:, None] & there[None, :], other=0.0)
     where = tl.load(t + i, mask=lit, other=0.0)
@@ -235,7 +238,7 @@ def _backward(
         tl.store(rows, weight[:, None] * shine[None, :], mask=lit[:, None] & there[None, :])
         first += BLOCK
 
-    # `rest` is now the sum over all samples; less what was passed, it is what lies behind.
+    # `rest` is now the sum over all samples; minus those passed, it is the sum behind.
     first, light = begin, tl.load(front + ray)
     while (first < end) & (light > stop):
         i = first + tl.arange(0, BLOCK)

@@ -47,7 +47,7 @@ def visible_counts(sigma: Tensor, intervals: Intervals, stop: float) -> Tensor:
 
 
 def _padded_rays(intervals: Intervals) -> tuple[Tensor, Tensor]:
-    """Which of [R, N] slots hold a sample, N of the longest ray, and which sample (0 elsewhere)."""
+    """Mask of the [R, N] slots that hold a sample (N: longest ray), and its index, 0 elsewhere."""
     offsets, longest = intervals.offsets, intervals.longest
     counts = offsets.diff()
     if longest is None:
@@ -58,7 +58,7 @@ def _padded_rays(intervals: Intervals) -> tuple[Tensor, Tensor]:
 
 
 def _padded(samples: Tensor, slots: tuple[Tensor, Tensor]) -> Tensor:
-    """[R, N, ...] of [S, ...], 0 where a slot holds none."""
+    """Samples [S, ...] as [R, N, ...], 0 in empty slots."""
     present, index = slots
     mask = present.reshape(*present.shape, *(1,) * (samples.dim() - 1))
     return torch.where(mask, samples[index], 0) if len(samples) else samples[index]
@@ -73,11 +73,11 @@ def _padded_weights(
 
 
 def _thickness(sigma: Tensor, delta: Tensor) -> Tensor:
-    # A sample without length is without matter, however dense: 0, not inf * 0.
+    # A sample of length 0 has thickness 0 even at infinite density (avoids inf * 0).
     return torch.where(delta > 0, sigma * delta, 0)
 
 
 def _transmittance(tau: Tensor) -> Tensor:
-    """In front of each sample, of optical thicknesses [R, N]."""
-    # Shifted rather than subtracted: behind an infinite thickness, inf - inf would be no number.
+    """Transmittance in front of each sample, from optical thicknesses [R, N]."""
+    # Shifted rather than subtracted: behind an infinite thickness, inf - inf would be NaN.
     return torch.exp(-torch.nn.functional.pad(tau, (1, 0)).cumsum(dim=1)[:, :-1])

@@ -1,8 +1,8 @@
 """Features of a voxel grid, gathered from the eight corners of a voxel with given weights.
 
-A voxel's corner c lies at +x where bit 0 of c is set, at +y with bit 1, at +z with bit 2. Local
-coordinates go from 0 to 1 along each axis of a voxel. With the weights of `trilinear` the result is
-the trilinear interpolant at a point, with those of `integral` its mean over a segment.
+Corner c of a voxel is at +x if bit 0 of c is set, at +y for bit 1, at +z for bit 2. Local
+coordinates go from 0 to 1 along each axis of a voxel. With the weights of `trilinear`, the result
+is the trilinear interpolant at a point; with those of `integral`, its mean over a segment.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ def gather(
     Differentiable in a float32 `table`; in `weights` only with backend="reference".
 
     Args:
-        table: [C, F] features of the corners; bfloat16 ones are read as they are, without gradient.
-        corners: [V, 8] int32 rows of `table`, of each voxel's corners. They are not checked.
+        table: [C, F] features of the corners; bfloat16 is read directly, but has no gradient.
+        corners: [V, 8] int32 rows of `table` for each voxel's corners. Not checked.
         voxel: [S] int32 rows of `corners`.
-        weights: [S, 8] of the corners; a NaN among them spoils the features of that sample alone.
-        grad_buffer: [C, F]; when given, the gradient of `table` is added to it in place, and
-            autograd sees none: a training step then neither allocates nor clears a second table.
+        weights: [S, 8] weights of the corners; a NaN only affects the features of its sample.
+        grad_buffer: [C, F]; if given, the gradient of `table` is added to it in place and hidden
+            from autograd, so that a training step neither allocates nor clears a second table.
 
     Raises:
-        ValueError: a shape other than these; on a CPU, a voxel that is no row of `corners`;
-            backends "cpu", "gpu": other types.
+        ValueError: wrong shapes; on a CPU, a voxel that is not a row of `corners`; backends "cpu",
+            "gpu": other types.
     """
     check_shape("table", table, None, None)
     check_shape("corners", corners, None, CORNERS)
@@ -49,8 +49,8 @@ def gather(
     if grad_buffer is not None:
         check_shape("grad_buffer", grad_buffer, *table.shape)
         if not table.requires_grad:
-            table = table.detach().requires_grad_()  # else there is no backward pass
-    if len(voxel) and voxel.device.type == "cpu":  # a GPU would have to be waited for
+            table = table.detach().requires_grad_()  # otherwise there is no backward pass
+    if len(voxel) and voxel.device.type == "cpu":  # on a GPU the check would wait
         low, high = (int(end) for end in torch.aminmax(voxel))
         if not 0 <= low <= high < len(corners):
             raise ValueError(
@@ -62,7 +62,7 @@ def gather(
 
 
 def trilinear(local: Tensor, *, backend: str = "auto") -> Tensor:
-    """Weights [S, 8] of the corners at points of local coordinates `local` [S, 3].
+    """Weights [S, 8] of the corners at points with local coordinates `local` [S, 3].
 
     Differentiable with backend="reference" only.
 
@@ -76,13 +76,13 @@ def trilinear(local: Tensor, *, backend: str = "auto") -> Tensor:
 def integral(entry: Tensor, leave: Tensor, *, backend: str = "auto") -> Tensor:
     """Weights [S, 8] of the mean of the trilinear interpolant between two points of a voxel.
 
-    They are its integral along the segment, divided by the length of the segment (Wu et al. 2022,
-    Section 3.2). Of a segment without length they are those of the point. Differentiable with
+    They give its integral along the segment, divided by the length of the segment (Wu et al. 2022,
+    Section 3.2). For a segment of length 0 they are those of the point. Differentiable with
     backend="reference" only.
 
     Args:
         entry: [S, 3] local coordinates of one end.
-        leave: [S, 3] of the other.
+        leave: [S, 3] local coordinates of the other end.
 
     Raises:
         ValueError: a shape other than these; backends "cpu", "gpu": not float32.
@@ -100,7 +100,7 @@ def integral_along(
     Not differentiable.
 
     Raises:
-        ValueError: rays or voxels that are not those of the crossings; backends "cpu", "gpu": not
+        ValueError: rays or voxels do not belong to the crossings; backends "cpu", "gpu": not
             float32.
     """
     count = len(rays.origins)

@@ -1,4 +1,4 @@
-"""Cases of the corner features: agreement of the backends, integrals in closed form, NaN."""
+"""Cases of the corner features: agreement of backends, integrals in closed form, NaN."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from methods.kernels.dispatch import served
 from methods.kernels.voxel_walk import Crossings, Voxels, walk
 
 VIEW = 1 << 17
-"""Samples of one view, for which the throughput is stated."""
+"""Samples of one view, for which the throughput is measured."""
 
 SIDE = 48
 """Voxels along the grid of the cases."""
@@ -115,7 +115,7 @@ def _corners() -> Tensor:
 
 
 def _voxels(count: int) -> Tensor:
-    """Of samples of neighbouring rays, ray by ray, half a voxel apart."""
+    """Voxels of samples on neighbouring rays, ray by ray, half a voxel apart."""
     steps = min(count, 2 * SIDE)
     rays = math.ceil(math.sqrt(count / max(steps, 1)))
     across = torch.linspace(0.1, 0.7, rays) * SIDE
@@ -221,7 +221,7 @@ def _segments(count: int) -> tuple[Tensor, Tensor]:
 
 
 def _moments(entry: Tensor, leave: Tensor) -> Tensor:
-    """Weights [S, 8] by the means of the monomials 1, x, y, xy, ... of a segment, in float64."""
+    """Weights [S, 8] from the means of the monomials 1, x, y, xy, ... over a segment, float64."""
     a, b = entry.double(), leave.double()
     means = {0: torch.ones(len(a), dtype=torch.float64)}
     for d in range(3):
@@ -259,7 +259,7 @@ def _cut_error(entry: Tensor, leave: Tensor, backend: str, device: str, precisio
 
 
 def _through(device: str) -> tuple[Rays, Crossings, Voxels]:
-    """Rays through a full grid, and what they cross of it."""
+    """Rays through a full grid, and their crossings."""
     generator = torch.Generator().manual_seed(5)
     ends = torch.rand(2, 100, 3, generator=generator).to(device)
     origins = ends[0] - 1 * (ends[1] - ends[0])
@@ -274,7 +274,7 @@ def _along(device: str) -> Callable[[str], tuple[Tensor, ...]]:
 
 
 def _way_error(backend: str, device: str, precision: str) -> float:
-    """How far off the mean place that the weights give is from the middle of each crossing."""
+    """Distance of the mean position given by the weights from the middle of each crossing."""
     rays, crossings, voxels = _through(device)
     weights = integral_along(rays, crossings, voxels, backend=backend).double()
     bits = torch.arange(CORNERS, device=device)[:, None] >> torch.arange(3, device=device) & 1
@@ -292,7 +292,7 @@ def _corner_error(backend: str, device: str, precision: str) -> float:
 
 
 def _spread_of_nan(backend: str, device: str, precision: str) -> float:
-    """Difference that NaN in every 7th sample makes to others; infinite where it is lost."""
+    """Change of other samples by NaN in every 7th sample; infinite where the NaN is lost."""
     table, corners, voxel, weights = _given(700, 5, device)
     bad = torch.arange(700, device=device) % 7 == 0
     spoiled = weights.clone()

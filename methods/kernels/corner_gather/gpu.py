@@ -1,8 +1,8 @@
-"""Corner features with Triton: a program takes a block of samples, all their channels.
+"""Corner features with Triton: each program handles a block of samples, with all channels.
 
-A sample reads 8 rows of the table, which neighbours on a ray share in the cache, and writes one.
-The scatter of the backward pass adds with atomics, in no order that repeats; where torch is told to
-use deterministic algorithms, torch's sorted scatter does it, a corner at a time.
+A sample reads 8 rows of the table, which neighbours on a ray share through the cache, and writes
+one. The backward pass scatters with atomics, whose order is not repeatable. If torch is set to use
+deterministic algorithms, torch's sorted scatter is used instead, one corner at a time.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from methods.kernels.gpu import check_types, gradient, launch, vector
 from methods.kernels.voxel_walk import Crossings, Voxels
 
 BLOCK = 1024
-"""Numbers of a program at a time, 8 a lane."""
+"""Numbers per program at a time, 8 per lane."""
 
 LANES = 128
-"""Samples of a program whose weights are computed, one a lane."""
+"""Samples per program in the kernels that compute weights, one per lane."""
 
 CORNERS = tl.constexpr(interface.CORNERS)
 GAUSS = tl.constexpr(0.5 / sqrt(3))
@@ -105,7 +105,7 @@ def _weights(kernel: triton.JITFunction, *places: Tensor) -> Tensor:
 def _filled(
     kernel: triton.JITFunction, count: int, first: Tensor, *given: Tensor, **sizes: int
 ) -> Tensor:
-    """The weights of `count` samples, which `kernel` writes."""
+    """The weights of `count` samples, written by `kernel`."""
     out = first.new_empty(count, interface.CORNERS)
     places = (x.contiguous() for x in (first, *given))
     launch(kernel, (triton.cdiv(count, LANES),), *places, out, count, **sizes, LANES=LANES)
@@ -120,7 +120,7 @@ def _move(
     weights: Tensor,
     features: Tensor,
 ) -> None:
-    """Between `table` and the `features` of samples."""
+    """Run `kernel`, which moves numbers between `table` and the `features` of samples."""
     count, channels = features.shape
     width = triton.next_power_of_2(max(channels, 1))
     rows = max(BLOCK // width, 1)
@@ -130,7 +130,7 @@ def _move(
 
 @triton.jit
 def _corner(corners, voxel, weights, i, inside, corner, channels):
-    """Where the rows of one corner of samples begin, and its weights."""
+    """Offsets of the table rows for one corner of samples, and the corner's weights."""
     v = tl.load(voxel + i, mask=inside, other=0).to(tl.int64)
     row = tl.load(corners + v * CORNERS + corner, mask=inside, other=0).to(tl.int64)
     return row * channels, tl.load(weights + i * CORNERS + corner, mask=inside, other=0.0)
@@ -228,7 +228,7 @@ def _integral(entry, leave, out, count, LANES: tl.constexpr):
 
 @triton.jit
 def _local(origin, direction, t, size: tl.constexpr, corner):
-    """Local coordinate, along an axis, in the voxel that begins at `corner`; rounding leads out."""
+    """Local coordinate along an axis in the voxel that begins at `corner`, clamped to [0, 1]."""
     place = (origin + t * direction) * size - corner.to(tl.float32)
     return tl.minimum(tl.maximum(place, 0.0), 1.0)
 

@@ -49,7 +49,7 @@ def integral_along(rays: Rays, crossings: Crossings, voxels: Voxels) -> Tensor:
     origins, directions = rays.origins[ray], rays.directions[ray]
     corner = voxels.coordinates[crossings.voxel.long()]
     ends = (
-        # Rounding leads out of the voxel.
+        # Clamped, because rounding may lead out of the voxel.
         ((origins + t[:, None] * directions) * voxels.resolution - corner).clamp(0, 1)
         for t in (crossings.near, crossings.far)
     )

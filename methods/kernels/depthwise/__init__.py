@@ -1,7 +1,7 @@
-"""Depthwise 3 x 3 convolution of cells, of which most of a picture has none.
+"""Sparse depthwise 3 x 3 convolution: computed only for cells, which cover little of a picture.
 
-y[n, c] = sum_k weight[k, c] x[neighbours[n, k], c], a neighbour of -1 counting as 0: what a dense
-convolution gives on a picture that is 0 where there is no cell, for the cells alone.
+y[n, c] = sum_k weight[k, c] x[neighbours[n, k], c], where a neighbour of -1 counts as 0. For the
+cells this equals a dense convolution on a picture that is 0 elsewhere.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from bench.types import check_shape
 from methods.kernels.dispatch import implementation
 
 TAPS = 9
-"""Neighbours of a cell, itself in the middle, row by row."""
+"""Number of neighbours of a cell, row by row, including the cell itself in the middle."""
 
 
 def neighbours_of(cells: Tensor, count: int | None = None) -> Tensor:
-    """Which cells lie around each: [N, 9] int32, -1 for none.
+    """Indices of the cells around each cell: [N, 9] int32, -1 for none.
 
     Args:
-        cells: [B, h, w] bool; cells count from 0, row by row, picture by picture.
-        count: N, how many of them are True; None: a GPU is asked, and waited for.
+        cells: [B, h, w] bool mask; cells are numbered from 0, row by row, picture by picture.
+        count: N, the number of cells; None: it is counted, which waits for a GPU.
     """
     check_shape("cells", cells, None, None, None)
     batch, height, width = cells.shape
@@ -41,7 +41,7 @@ def depthwise(x: Tensor, neighbours: Tensor, weight: Tensor, *, backend: str = "
     """Convolve the cells `x` [N, C]; differentiable in `x` and `weight`.
 
     Args:
-        neighbours: [N, 9] int32 of `neighbours_of`: what lies around what is mutual.
+        neighbours: [N, 9] int32 of `neighbours_of`; the relation must be symmetric.
         weight: [9, C].
     """
     check_shape("x", x, None, None)

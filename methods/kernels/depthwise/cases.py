@@ -1,7 +1,7 @@
 """Cases of the depthwise convolution of cells.
 
-Forward, inputs are any numbers. Backward, they are few digits long: nothing is rounded, in whatever
-order the gradient of the weights is added up.
+Forward inputs are arbitrary. Backward inputs have few digits, so that nothing is rounded, whatever
+the order in which the gradient of the weights is summed.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ LOW = 200
 """Side of the frame that is timed, in cells."""
 
 SHARE = 0.25
-"""Of the cells of the frame that contain something."""
+"""Share of the frame's cells that contain something."""
 
 WIDTH = 64
 """Channels of the trunk of the lean renderer."""
 
 STEPS = 16
-"""Backward, inputs are multiples of 1/16 from -1 to 1, products multiples of 1/256: a sum of up to
-2^15 of them has 23 bits or less."""
+"""Backward inputs are multiples of 1/16 from -1 to 1, products multiples of 1/256; a sum of up to
+2^15 products then has at most 23 bits."""
 
 
 def cases() -> list[Case]:
-    """No, one and all cells; lines; scattered ones; several pictures; a frame, timed."""
+    """No, one and all cells; lines; scattered cells; several pictures; a frame, timed."""
     frame = f"a quarter of {LOW} x {LOW}, {WIDTH} channels"
     kinds: list[tuple[str, Tensor, int]] = [
         ("no cell", torch.zeros(1, 4, 5, dtype=torch.bool), 8),

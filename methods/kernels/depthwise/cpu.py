@@ -1,4 +1,4 @@
-"""Depthwise convolution of cells with numba: a cell at a time, all its channels at once."""
+"""Depthwise convolution of cells with numba: one cell at a time, all its channels at once."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from methods.kernels.cpu import f32
 from methods.kernels.depthwise import TAPS
 
 CHUNKS = 16
-"""Parts in which the gradient of the weights is added up, always the same ones: it repeats."""
+"""Number of partial sums for the gradient of the weights; fixed, so that results are repeatable."""
 
 
 def depthwise(x: Tensor, neighbours: Tensor, weight: Tensor) -> Tensor:
@@ -37,8 +37,8 @@ class _Depthwise(torch.autograd.Function):
     def backward(ctx, grad):
         x, neighbours, weight = (part.detach() for part in ctx.saved_tensors)
         grad = grad.contiguous()
-        # n is the k-th neighbour of m where m is the (8 - k)-th of n: the gradient is the same
-        # convolution with the weights turned round.
+        # n is the k-th neighbour of m exactly if m is the (8 - k)-th of n: so the gradient is the
+        # same convolution with reversed weights.
         grad_x = torch.empty_like(x)
         _convolve(grad.numpy(), neighbours.numpy(), weight.flip(0).numpy(), grad_x.numpy())
         parts = torch.zeros(CHUNKS, *weight.shape)

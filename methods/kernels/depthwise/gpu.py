@@ -1,9 +1,9 @@
-"""Depthwise convolution of cells with Triton: a program takes a block of cells, all their channels.
+"""Depthwise convolution of cells with Triton: a program handles a block of cells, all channels.
 
-A cell reads 36 bytes of neighbours and 9 rows of 4 C bytes, of which memory gives about one: those
-around share the rest in the cache. It writes 4 C bytes. For the gradient of the weights, a program
-takes some cells and one tap: rows of the input and of the gradient are read 9 times each, once from
-memory and then mostly from the second-level cache.
+A cell reads 36 bytes of neighbour indices and 9 rows of 4 C bytes; about one row comes from memory,
+the others from the cache, shared with nearby cells. It writes 4 C bytes. For the gradient of the
+weights, a program handles some cells and one tap: rows of input and gradient are read 9 times each,
+once from memory and then mostly from the L2 cache.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from methods.kernels import depthwise as interface
 from methods.kernels.gpu import check_types, launch
 
 BLOCK = 1024
-"""Numbers of a program at a time, 8 a lane: so many loads hide how long one takes."""
+"""Numbers per program at a time, 8 per lane: that many loads hide their latency."""
 
 BLOCKS = 16
-"""Of a part of the gradient of the weights: as few parts are written and added up as keep all of a
-GPU busy with the cells of a frame."""
+"""Blocks per partial sum of the gradient of the weights: few partial sums, but enough to keep a GPU
+busy with the cells of a frame."""
 
 TAPS = tl.constexpr(interface.TAPS)
 
@@ -43,12 +43,12 @@ class _Depthwise(torch.autograd.Function):
     def backward(ctx, grad):
         x, neighbours, weight = ctx.saved_tensors
         grad = grad.contiguous()
-        # n is the k-th neighbour of m where m is the (8 - k)-th of n: the gradient is the same
-        # convolution with the weights turned round.
+        # n is the k-th neighbour of m exactly if m is the (8 - k)-th of n: so the gradient is the
+        # same convolution with reversed weights.
         grad_x = _convolved(grad, neighbours, weight.flip(0))
         rows, width = _block(x)
         count = triton.cdiv(len(x), BLOCKS * rows)
-        # Parts that are added up afterwards, always the same ones: it repeats.
+        # Partial sums, always the same ones, so that results are repeatable.
         parts = x.new_empty(count, *weight.shape)
         given = x, neighbours, grad, parts, *x.shape
         grid = count, interface.TAPS
@@ -57,7 +57,7 @@ class _Depthwise(torch.autograd.Function):
 
 
 def _block(x: Tensor) -> tuple[int, int]:
-    """Cells and channels of a block."""
+    """Number of cells and channels in a block."""
     width = triton.next_power_of_2(max(x.shape[1], 1))
     return max(BLOCK // width, 1), width
 
@@ -111,7 +111,7 @@ def _correlate(
 
 @triton.jit
 def _neighbour(x, neighbours, n, k, inside, c, there, channels):
-    """Rows of `x` of the k-th neighbours of cells; 0 where there is none."""
+    """Rows of `x` for the k-th neighbours of cells; 0 where there is none."""
     m = tl.load(neighbours + n * TAPS + k, mask=inside, other=-1).to(tl.int64)
     place = x + m[:, None] * channels + c[None, :]
     return tl.load(place, mask=(m >= 0)[:, None] & there[None, :], other=0.0)

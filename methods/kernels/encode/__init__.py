@@ -4,8 +4,8 @@ Level l has scale_l = N_min b^l - 1 and res_l = ceil(scale_l) + 1 vertices along
 x in [0, 1]^3 lies at p = scale_l x + 1/2, its cell is floor(p), its trilinear weights frac(p)
 (the conventions of tiny-cuda-nn, `common_device.h` and `grid.h`). A level whose res^3 vertices fit
 into 2^log2_table entries is dense, x + y res + z res^2; the others are hashed,
-(x ^ y * 2654435761 ^ z * 805459861) mod 2^log2_table in 32-bit arithmetic. The half-cell stagger
-makes a dense level's last vertex spill one entry over; its index wraps around.
+(x ^ y * 2654435761 ^ z * 805459861) mod 2^log2_table in 32-bit arithmetic. Because of the half-cell
+offset, the last vertex of a dense level exceeds the table by one entry; its index wraps around.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class HashGrid:
 
     Attributes:
         levels: number of resolutions.
-        features: F, channels an entry holds.
-        log2_table: log2 of T, the largest number of entries of a level.
+        features: F, channels per entry.
+        log2_table: log2 of T, the maximum number of entries of a level.
         n_min: vertices along an axis at the coarsest level.
         n_max: vertices along an axis at the finest level.
     """
@@ -49,19 +49,19 @@ class HashGrid:
 
     @cached_property
     def scales(self) -> tuple[float, ...]:
-        """Grid cells along the unit cube, of each level."""
+        """Grid cells along a side of the unit cube, for each level."""
         growth = math.log(self.n_max / self.n_min) / max(self.levels - 1, 1)
         return tuple(self.n_min * math.exp(level * growth) - 1 for level in range(self.levels))
 
     @cached_property
     def resolutions(self) -> tuple[int, ...]:
-        """Vertices along an axis, of each level."""
-        # Rounding first keeps n_max, a product of logs and exps, from becoming n_max + 1.
+        """Vertices along an axis, for each level."""
+        # Rounded first, because n_max comes out of log and exp and could become n_max + 1.
         return tuple(math.ceil(round(scale, 6)) + 1 for scale in self.scales)
 
     @cached_property
     def sizes(self) -> tuple[int, ...]:
-        """Table entries of each level, a multiple of 8."""
+        """Table entries of each level, multiples of 8."""
         return tuple(min(-(-(res**3) // 8) * 8, 1 << self.log2_table) for res in self.resolutions)
 
     @cached_property
@@ -71,7 +71,7 @@ class HashGrid:
 
     @cached_property
     def offsets(self) -> tuple[int, ...]:
-        """First table entry of each level, and the number of all entries at the end."""
+        """First table entry of each level, then the total number of entries."""
         starts = [0]
         for size in self.sizes:
             starts.append(starts[-1] + size)
@@ -79,7 +79,7 @@ class HashGrid:
 
     @property
     def entries(self) -> int:
-        """Entries of the whole table."""
+        """Number of entries of the whole table."""
         return self.offsets[-1]
 
     @property
@@ -99,15 +99,15 @@ def encode(
 ) -> Tensor:
     """Encode `positions` [N, 3] with `table` [entries, F]: [N, levels * F], level by level.
 
-    Positions are clamped to [0, 1]. The features of a position with a NaN are all NaN; it changes
+    Positions are clamped to [0, 1]. A position with a NaN gets NaN for all its features; it affects
     no other features and no gradient. Differentiable in `table`; in `positions` only with
     backend="reference".
 
     Args:
-        packed: `pack(table)`, read instead of `table` when given (half the memory traffic;
+        packed: `pack(table)`; if given, it is read instead of `table` (half the memory traffic;
             F = 2 only). The output is then bfloat16; its gradient goes to `table`.
-        grad_buffer: [entries, F]; when given, the gradient of `table` is added to it in place,
-            and autograd sees none: a training step then neither allocates nor clears a second
+        grad_buffer: [entries, F]; if given, the gradient of `table` is added to it in place and
+            hidden from autograd, so that a training step neither allocates nor clears a second
             table.
     """
     check_shape("positions", positions, None, 3)
@@ -119,17 +119,17 @@ def encode(
     if grad_buffer is not None:
         check_shape("grad_buffer", grad_buffer, grid.entries, grid.features)
         if not table.requires_grad:
-            table = table.detach().requires_grad_()  # else there is no backward pass
+            table = table.detach().requires_grad_()  # otherwise there is no backward pass
     features = implementation("encode", backend, positions.device).encode(
         positions, table, grid, packed=packed, grad_buffer=grad_buffer
     )
-    # Hardly ever: one sum is cheap to test, but on a GPU dearer to wait for.
+    # NaN is rare. On a CPU one sum tests for it cheaply; on a GPU, waiting for it would cost more.
     if positions.device.type != "cpu" or positions.sum().isnan():
         features = torch.where(positions.isnan().any(dim=1, keepdim=True), torch.nan, features)
     return features
 
 
 def pack(table: Tensor) -> Tensor:
-    """Two bfloat16 features in an int32 word, the first low: [entries, 2] -> [entries]."""
+    """Pack two features as bfloat16 into an int32, the first one low: [entries, 2] -> [entries]."""
     check_shape("table", table, None, 2)
     return table.detach().to(torch.bfloat16).contiguous().view(torch.int32).squeeze(-1)

@@ -30,11 +30,11 @@ SMALL = HashGrid(levels=4, log2_table=10, n_min=4, n_max=40)
 ODD = HashGrid(levels=3, features=3, log2_table=8, n_min=3, n_max=17)
 LARGE = HashGrid(log2_table=19, n_max=2048)
 VIEW = 1 << 17
-"""Samples of one view, for which the throughput is stated."""
+"""Samples of one view, for which the throughput is measured."""
 
 GRID = HashGrid(levels=8, log2_table=12, n_min=4, n_max=512)
 LARGEST = HashGrid(levels=17, features=8, log2_table=24, n_min=512, n_max=4096)
-"""More than 2^31 numbers, all levels hashed."""
+"""A table with more than 2^31 numbers, all levels hashed."""
 
 BELOW_1 = 1 - 2.0**-24
 """The float32 before 1."""
@@ -51,7 +51,7 @@ SUMS = (
 
 
 def cases() -> list[Case]:
-    """Shapes that hurt; one view; positions at ends, on grid lines and outside; a huge table."""
+    """Awkward shapes; one view; positions at borders, on grid lines and outside; a huge table."""
     return [*_agreements(), *_extremes()]
 
 
@@ -110,20 +110,19 @@ def _view(count: int) -> Tensor:
 
 
 def _units(grid: HashGrid) -> float:
-    """u by which a feature may be off; see `FEATURES`."""
+    """Tolerance of a feature in units of u; see `FEATURES`."""
     return 12 * grid.n_max + 11
 
 
 def _sum_error(positions: Tensor, grid: HashGrid) -> float:
-    """By how much a gradient may be off; see `SUMS`. Most samples share an entry of the coarsest
-    level."""
+    """Tolerance of a gradient; see `SUMS`. Sums are longest at the coarsest level."""
     entries, _ = corners(positions, grid, 0)
     touched = int(entries.flatten().bincount().max()) if len(positions) else 0
     return 6 * math.sqrt(touched) * (3 * 2 * U32 * grid.n_max + touched * U32)
 
 
 def _random_table(count: int, grid: HashGrid, device: str) -> Tensor:
-    """Values of at most 1."""
+    """A table of values of magnitude at most 1."""
     generator = torch.Generator().manual_seed(count)
     return (torch.rand(grid.entries, grid.features, generator=generator) * 2 - 1).to(device)
 
@@ -186,7 +185,7 @@ def _extremes() -> list[Case]:
     return [
         *(closed_form.case(name, partial(_feature_error, at)) for name, at in kinds.items()),
         not_a_number.case("NaN", _spread_of_nan),
-        # Reserves, though it does not fill, 9 GB.
+        # Reserves 9 GB, but does not fill them.
         huge.case("2^31 numbers in the table", _largest_table_error, slow=True),
     ]
 
@@ -196,18 +195,18 @@ def _product(*edges: float) -> Tensor:
 
 
 def _grid_lines() -> Tensor:
-    """Where scale x + 1/2 is whole along some axes, of every level."""
+    """Positions where scale x + 1/2 is an integer along some axes, for every level."""
     lines = [(k + 0.5) / scale for scale in GRID.scales for k in (0, 1, int(scale) // 2)]
     return torch.tensor([(x, y, 0.3) for x in lines for y in lines], dtype=torch.float64)
 
 
 def _value(entry: int, feature: int) -> float:
-    """What stands in a table, a multiple of 1/64 from -1 to 1."""
+    """The value of a feature in the table, a multiple of 1/64 from -1 to 1."""
     return (entry * 31 + feature * 17) % 129 / 64 - 1
 
 
 def _corners(position: list[float], grid: HashGrid, level: int) -> list[tuple[int, float]]:
-    """Entries around a place in the cube and their weights, in Python's own numbers."""
+    """Entries around a position and their weights, computed with Python's own numbers."""
     places = [x * grid.scales[level] + 0.5 for x in position]
     found = []
     for bits in itertools.product((0, 1), repeat=3):
@@ -257,8 +256,10 @@ def _feature_error(positions: Tensor, backend: str, device: str, precision: str)
 
 
 def _spread_of_nan(backend: str, device: str, precision: str) -> float:
-    """Difference that NaN in every 7th place makes to others, and to a gradient that it has no
-    part in; infinite where it is not reported."""
+    """Change by NaN in every 7th position: of other features, and of gradients of other positions.
+
+    Infinite where the NaN does not appear in the features.
+    """
     generator = torch.Generator().manual_seed(0)
     positions = torch.rand(700, 3, generator=generator).to(device)
     bad = torch.arange(700, device=device) % 7 == 0
@@ -280,7 +281,7 @@ def _spread_of_nan(backend: str, device: str, precision: str) -> float:
 def _largest_table_error(backend: str, device: str, precision: str) -> float:
     generator = torch.Generator().manual_seed(0)
     positions = torch.rand(16, 3, generator=generator)
-    # Pages that nobody writes to take no memory.
+    # Pages that are never written take no memory.
     table = torch.from_numpy(np.zeros((LARGEST.entries, LARGEST.features), np.float32))
     for position in positions.tolist():
         for level in range(LARGEST.levels):

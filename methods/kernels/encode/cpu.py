@@ -1,12 +1,13 @@
-"""Hash-grid encoding with numba: 16 samples to an AVX-512 register, table reads as gathers.
+"""Hash-grid encoding with numba: 16 samples per AVX-512 register, table reads as gathers.
 
-A level of a chunk of samples is done in three short passes over buffers that stay in the
-first-level cache: indices and weights of the eight corners, gather, blend. Each pass is a loop that
-LLVM can vectorise: the buffers are flat, with corner k at the constant distance k * CHUNK, because
-only then can it prove that they do not overlap.
+One level of a chunk of samples is done in three short passes over buffers that stay in the L1
+cache: indices and weights of the eight corners, gather, blend. Each pass is a loop that LLVM can
+vectorise: the buffers are flat, with corner k at the constant offset k * CHUNK, because only then
+can LLVM prove that they do not overlap.
 
-Forward: a thread takes a chunk and walks the levels. Backward: a thread takes a level and walks the
-chunks, so that no two threads ever add to the same entry: no atomics, and the same sums every run.
+Forward: a thread takes a chunk and goes through the levels. Backward: a thread takes a level and
+goes through the chunks, so that no two threads add to the same entry: this needs no atomics, and
+the sums are the same in every run.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ CHUNK = 256  # samples; 256 * (8 indices + 8 weights + 8 values) * 4 bytes = 24 
 
 PRIME_Y, PRIME_Z = u32(PRIMES[1]), u32(PRIMES[2])
 
-# Reordering and fused multiply-adds are allowed; assuming that no NaN comes is not: `_load`
-# turns one into 0 before it can become an address.
+# Reordering and fused multiply-adds are allowed; assuming that there is no NaN is not, because
+# `_load` must turn NaN into 0 before it can become an address.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
@@ -68,7 +69,7 @@ class _Encode(torch.autograd.Function):
         target = torch.zeros(grid.entries, grid.features) if buffer is None else buffer
         _scatter(
             positions.numpy(),
-            grad.T.contiguous().float().numpy(),  # a level then reads only its own channels
+            grad.T.contiguous().float().numpy(),  # so that a level reads only its own channels
             *_level_arrays(grid),
             target.numpy(),
             get_num_threads(),
@@ -81,8 +82,10 @@ def _unsigned(words: Tensor) -> np.ndarray:
 
 
 def _level_arrays(grid: HashGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Scale, vertices along an axis (0: hashed) and first entry of each level, and the number of
-    all entries."""
+    """Scale, vertices along an axis (0: hashed) and first entry of each level.
+
+    The first entries are followed by the total number of entries.
+    """
     strides = [res if dense else 0 for res, dense in zip(grid.resolutions, grid.dense, strict=True)]
     return (
         np.array(grid.scales, np.float32),
@@ -93,7 +96,7 @@ def _level_arrays(grid: HashGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @njit(cache=True, fastmath=FAST)
 def _load(positions, first, count, xyz):
-    """Positions [first, first + count) clamped to [0, 1], NaN as 0, axis by axis."""
+    """Copy positions [first, first + count) axis by axis, clamped to [0, 1], NaN as 0."""
     for axis in range(3):
         for i in range(count):
             value = positions[first + i, axis]
@@ -103,7 +106,7 @@ def _load(positions, first, count, xyz):
 
 @njit(cache=True, fastmath=FAST)
 def _weights(x, y, z, scale):
-    """Cell and trilinear weights of a position: weights along y and z come multiplied."""
+    """Cell and trilinear weights of a position; those along y and z are already multiplied."""
     px, py, pz = x * scale + f32(0.5), y * scale + f32(0.5), z * scale + f32(0.5)
     ix, iy, iz = i32(px), i32(py), i32(pz)
     fx, fy, fz = px - f32(ix), py - f32(iy), pz - f32(iz)

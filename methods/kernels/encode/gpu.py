@@ -1,9 +1,8 @@
 """Hash-grid encoding with Triton: a program encodes a block of samples at one level.
 
-Programs of one level are numbered one after the other: those that run at a time mostly read one
-level, which stays in the second-level cache. The scatter of the backward pass adds with atomics, in
-no order that repeats; where torch is told to use deterministic algorithms, torch's sorted scatter
-does it.
+Programs of one level are numbered consecutively, so that those running at the same time mostly read
+one level, which stays in the L2 cache. The backward pass scatters with atomics, whose order is not
+repeatable. If torch is set to use deterministic algorithms, torch's sorted scatter is used instead.
 """
 
 from __future__ import annotations
@@ -31,8 +30,10 @@ def encode(
     packed: Tensor | None = None,
     grad_buffer: Tensor | None = None,
 ) -> Tensor:
-    """See `methods.kernels.encode.encode`. Not differentiable in `positions`; a table of float16 or
-    bfloat16 gives features of its type, its products and sums are float32."""
+    """See `methods.kernels.encode.encode`. Not differentiable in `positions`.
+
+    A float16 or bfloat16 table gives features of its type; products and sums are float32.
+    """
     if positions.requires_grad:
         raise ValueError("backend 'gpu' gives no gradient for positions: use backend='reference'")
     check_types(torch.float32, positions=positions)
@@ -66,7 +67,7 @@ class _Encode(torch.autograd.Function):
 def _launch(
     kernel: triton.JITFunction, positions: Tensor, table: Tensor, grid: HashGrid, features: Tensor
 ) -> None:
-    """Run `kernel`, which reads or adds to one of `table` and `features`, for the other."""
+    """Run `kernel`, which reads one of `table` and `features` and writes to the other."""
     launch(
         kernel,
         (triton.cdiv(len(positions), BLOCK), grid.levels),
@@ -83,8 +84,10 @@ def _launch(
 
 @cache
 def _level_arrays(grid: HashGrid, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Scale [levels] of each level; its vertices along an axis (0: hashed), first entry and number
-    of entries [levels, 3]. To copy them to the device again would wait for it."""
+    """Scales [levels]; vertices along an axis (0: hashed), first entry, entries: [levels, 3].
+
+    Cached, because each copy to the device would synchronise.
+    """
     strides = [res if dense else 0 for res, dense in zip(grid.resolutions, grid.dense, strict=True)]
     shapes = list(zip(strides, grid.offsets, grid.sizes, strict=False))
     return (
@@ -94,7 +97,7 @@ def _level_arrays(grid: HashGrid, device: torch.device) -> tuple[Tensor, Tensor]
 
 
 def _scatter_sorted(positions: Tensor, grad: Tensor, grid: HashGrid, target: Tensor) -> None:
-    """Add to `target` in the same order every time."""
+    """Add the gradient to `target` in a repeatable order."""
     inside = torch.where(positions > 0, positions, 0).clamp(max=1)
     for level in range(grid.levels):
         entries, weights = corners(inside, grid, level)
@@ -105,7 +108,7 @@ def _scatter_sorted(positions: Tensor, grad: Tensor, grid: HashGrid, target: Ten
 
 @triton.jit
 def _axis(positions, i, inside, axis, scale):
-    """Cell and fraction along an axis; a NaN is at 0."""
+    """Cell and fraction along an axis; NaN counts as 0."""
     x = tl.load(positions + 3 * i + axis, mask=inside, other=0.0)
     x = tl.minimum(tl.where(x > 0, x, 0.0), 1.0)
     p = x * scale + 0.5
@@ -115,7 +118,7 @@ def _axis(positions, i, inside, axis, scale):
 
 @triton.jit
 def _entry(x, y, z, stride, size):
-    """Table entry, within its level, of a vertex; `stride` is 0 where they are hashed."""
+    """Table entry, within its level, of a vertex; `stride` is 0 for a hashed level."""
     stored = x + stride * (y + stride * z)
     stored = tl.where(stored >= size, stored - size, stored)
     hashed = (x ^ (y * PRIME_Y) ^ (z * PRIME_Z)) & (size - 1)
@@ -133,8 +136,7 @@ def _corner(ix, iy, iz, fx, fy, fz, stride, size, corner: tl.constexpr):
 
 @triton.jit
 def _locate(positions, scales, shapes, level, i, inside):
-    """Cell and fraction of samples along each axis of a level; the level's vertices along an axis
-    (0: hashed), first entry and number of entries."""
+    """Cells and fractions of samples at a level, and the level's row of `_level_arrays`."""
     scale = tl.load(scales + level)
     ix, fx = _axis(positions, i, inside, 0, scale)
     iy, fy = _axis(positions, i, inside, 1, scale)

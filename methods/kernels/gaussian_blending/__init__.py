@@ -1,9 +1,9 @@
-"""Blending ellipses of 3D Gaussians into a picture, front to back (Kerbl et al. 2023, Eq. 2 and 3).
+"""Blends ellipses of 3D Gaussians into a picture, front to back (Kerbl et al. 2023, Eq. 2 and 3).
 
 alpha_i = min(LARGEST_ALPHA, o_i exp(-(A x^2 + 2 B x y + C y^2) / 2)), 0 below LEAST_ALPHA,
 T_i = prod_{j<i} (1 - alpha_j),  w_i = T_i alpha_i,
 values = sum w_i c_i,  depth_sum = sum w_i z_i,  alpha = sum w_i
-at the centre of every pixel, (x, y) from the centre of the ellipse, in the order of the depths.
+at the centre of every pixel, with (x, y) relative to the centre of the ellipse, in depth order.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ def blend(
     stop: float = STOP,
     backend: str = "auto",
 ) -> Pixels:
-    """The pixels of a width x height picture, row by row, not composited on a background.
+    """Render the pixels of a width x height picture, row by row, without a background.
 
     Values and alpha are differentiable in centres, conics, opacities and colours; depth has no
     gradient. Gaussians of equal depth are blended in the order in which they are given.
 
     Args:
-        ellipses: N Gaussians in the picture.
+        ellipses: N Gaussians projected to the picture.
         opacities: [N] at their centres.
         colours: [N, 3].
-        stop: what lies behind a transmittance of at most `stop` has no weight.
+        stop: Gaussians behind a transmittance of at most `stop` have no weight.
 
     Raises:
-        ValueError: a shape other than these, no pixel; backends "cpu" and "gpu": not float32.
+        ValueError: wrong shapes, no pixel; backends "cpu" and "gpu": not float32.
     """
     count = len(opacities)
     check_shape("opacities", opacities, None)

@@ -1,4 +1,4 @@
-"""Cases of the blending of Gaussians: agreement of the backends, and what is known otherwise."""
+"""Cases of the blending of Gaussians: agreement of the backends, and results known in advance."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from methods.kernels.gaussian_blending import LARGEST_ALPHA, blend
 from methods.kernels.gaussian_projection import LEAST_ALPHA, Ellipses
 
 CLEAR = 1e-4
-"""Relative distance of every opacity, at every pixel, from where a comparison turns."""
+"""Minimum relative distance of every opacity, at every pixel, from a threshold of a comparison."""
 
 SIZES = (
     ("one pixel", 30, 1, 1, 1),
@@ -28,14 +28,14 @@ SIZES = (
     ("crowded", 600, 21, 19, 1),
     ("160 x 160", 2000, 160, 160, 1),
 )
-"""Number of Gaussians, width and height of the picture, and how much larger than usual they are."""
+"""Number of Gaussians, width and height of the picture, factor on the size of the Gaussians."""
 
 Given = tuple[Ellipses, Tensor, Tensor]
 """Ellipses, opacities, colours."""
 
 
 def cases() -> list[Case]:
-    """No, some and crowded Gaussians; one alone; two in one place; a loop; the order; the stop."""
+    """No, some and crowded Gaussians; one alone; two in one place; a plain loop; order; stop."""
     backends = served("gaussian_blending")
     forward = Agreement(
         "gaussian blending",
@@ -95,8 +95,8 @@ def cases() -> list[Case]:
 def draw(count: int, width: int, height: int, size: int = 1) -> Given:
     """Gaussians in and around a picture, one to six pixels wide, or `size` times as wide.
 
-    Without those whose opacity comes, at a pixel, close to where it is cut off: there a rounding
-    decides.
+    Gaussians whose opacity at some pixel is close to a cut-off are left out, because there rounding
+    would decide.
     """
     generator = torch.Generator().manual_seed(count + width)
 
@@ -137,7 +137,7 @@ def _to(given: Given, device: str, dtype: torch.dtype) -> Given:
 
 
 def _alphas(ellipses: Ellipses, opacities: Tensor, width: int, height: int) -> Tensor:
-    """Opacity [P, N] of each Gaussian at each pixel, in float64, cut off nowhere."""
+    """Opacity [P, N] of each Gaussian at each pixel, in float64, without cut-offs."""
     offset = pixel_grid(width, height).double()[:, None] - ellipses.centres.double()
     a, b, c = ellipses.conics.double().unbind(dim=1)
     x, y = offset.unbind(dim=2)
@@ -249,7 +249,7 @@ def _two_error(flipped: bool, backend: str, device: str, precision: str) -> floa
 
 
 def _hidden_gradient(backend: str, device: str, precision: str) -> float:
-    """Three opaque Gaussians in front of a fourth let 1e-6 of the light through, less than STOP."""
+    """Gradient of a Gaussian behind three opaque ones, which let through 1e-6 < STOP."""
     dtype = DTYPES[precision]
     one, _, _ = _alone(1.0, device, dtype)
     wide = torch.full((4, 2), 40.0).to(device, dtype)

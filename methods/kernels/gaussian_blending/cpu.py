@@ -1,8 +1,8 @@
-"""Blending with numba: tiles of 16 x 16 pixels, a row of a tile at a time.
+"""Blending with numba: tiles of 16 x 16 pixels, processed row by row.
 
-Gaussians are sorted by depth once. Each tile gets the list of those whose boxes it touches, in this
-order, and works through the list until nothing shines through. The 16 pixels of a row are the lanes
-of a vector: no branch, exp as a polynomial.
+Gaussians are sorted by depth once. Each tile gets the list of Gaussians whose boxes touch it, in
+this order, and processes the list until it is opaque. The 16 pixels of a row are the lanes of a
+vector: the code has no branches, and exp is a polynomial.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from methods.kernels.gaussian_projection import LEAST_ALPHA, Ellipses
 TILE = 16  # pixels, along both axes
 PIXELS = TILE * TILE
 PATIENCE = 8
-"""Gaussians between two looks at whether anything still shines through a tile."""
+"""Gaussians between two checks whether a tile is opaque."""
 
 FIELDS = 10  # of a packed Gaussian: u, v, A, B, C, opacity, r, g, b, z
 SUMS = 9  # of a Gaussian in a tile: see `_tile_backward`
-IN_LANES = 6 * PIXELS  # where these sums begin in the state of a tile, one for each lane
+IN_LANES = 6 * PIXELS  # offset of these sums in the state of a tile, one per lane
 LANES = {"contract", "nsz", "arcp"}
-"""Freedoms of the compiler where one result is all it can choose; see `methods.kernels.cpu`."""
+"""Fast-math flags that leave the compiler only one possible result; see `methods.kernels.cpu`."""
 
 LARGEST, LEAST = f32(LARGEST_ALPHA), f32(LEAST_ALPHA)
 ZERO, ONE, HALF = f32(0), f32(1), f32(0.5)
 LOG2_E = f32(math.log2(math.e))
-# 2^x on [0, 1], least squares of the relative error: below 2e-9 before rounding.
+# 2^x on [0, 1], least-squares fit of the relative error: below 2e-9 before rounding.
 P0, P1, P2, P3 = (
     f32(1.000000001815494),
     f32(0.693146987057476),
@@ -124,10 +124,10 @@ class _Blend(torch.autograd.Function):
 
 
 def _by_depth(depth: np.ndarray, extents: np.ndarray) -> np.ndarray:
-    """The Gaussians that are shown, nearest first; [n] int64.
+    """Indices of the visible Gaussians, nearest first; [n] int64.
 
-    Their depths are positive: as integers, their bits have the same order. With the index in the
-    lower half, a fast sort of int64 keeps equal depths as they are given.
+    Depths are positive, so their bits as integers have the same order. With the index in the lower
+    half, a fast sort of int64 is stable for equal depths.
     """
     shown = (extents[:, 0] > 0).nonzero()[0]
     keys = depth[shown].view(np.int32).astype(np.int64) << 32 | shown
@@ -140,9 +140,9 @@ class _Lists:
 
     Attributes:
         offsets: [tiles + 1], tile t owns entries offsets[t] to offsets[t + 1].
-        ranks: [entries] places of Gaussians in the order of the depths, ascending in a tile.
+        ranks: [entries] ranks of Gaussians by depth, ascending in a tile.
         first: [N + 1], the Gaussian of rank r owns first[r] to first[r + 1] of `slots`.
-        slots: [entries] the entries of a Gaussian, tile by tile.
+        slots: [entries] indices of the entries of each Gaussian, tile by tile.
     """
 
     def __init__(self, boxes: Tensor, width: int, height: int) -> None:
@@ -162,8 +162,7 @@ class _Lists:
 
 @njit(cache=True, parallel=True)
 def _pack(order, centres, conics, opacities, colours, depth, extents, width, height, packed, boxes):
-    """Gaussians in the order of their depths, and the box of pixels of each: [left, right) and
-    [top, bottom)."""
+    """Pack Gaussians in depth order, and the pixel box of each: [left, right), [top, bottom)."""
     for rank in prange(len(order)):
         i = order[rank]
         u, v = centres[i, 0], centres[i, 1]
@@ -175,7 +174,7 @@ def _pack(order, centres, conics, opacities, colours, depth, extents, width, hei
         row[9] = depth[i]
         box = boxes[rank]
         box[0], box[1], box[2], box[3] = 0, 0, 0, 0
-        # A little more, so that no rounding leaves out a pixel.
+        # A little larger, so that rounding never leaves out a pixel.
         half, tall = extents[i, 0] * f32(1.0001), extents[i, 1] * f32(1.0001)
         left, right = max(u - half - HALF, ZERO), min(u + half + HALF, f32(width))
         top, bottom = max(v - tall - HALF, ZERO), min(v + tall + HALF, f32(height))
@@ -195,7 +194,10 @@ def _tiles(box):
 
 @njit(cache=True, parallel=True)
 def _count(boxes, across, threads, counts, entries):
-    """Entries of each tile and, one place late, of each Gaussian. A thread has every n-th row."""
+    """Count the entries of each tile and of each Gaussian (shifted by one), in n threads.
+
+    Each thread handles every n-th row of tiles.
+    """
     for thread in prange(threads):
         for rank in range(len(boxes)):
             left, right, top, bottom = _tiles(boxes[rank])
@@ -257,7 +259,7 @@ def _forward(packed, boxes, offsets, ranks, stop, threads, values, depth, alpha)
 
 @njit(cache=True, fastmath=LANES)
 def _tile_forward(packed, boxes, ranks, stop, top, left, state):
-    """`state`: transmittance, r, g, b and the sum of depths of each pixel of the tile."""
+    """`state`: transmittance, r, g, b and depth sum of each pixel of the tile."""
     state[:PIXELS] = ONE
     state[PIXELS:] = ZERO
     for n in range(len(ranks)):
@@ -325,12 +327,12 @@ def _backward(packed, boxes, offsets, ranks, stop, threads, grad, gain, sums):
             )
 
 
-@njit(cache=True, error_model="numpy")  # a branch less at the division
+@njit(cache=True, error_model="numpy")  # saves a branch at the division
 def _tile_backward(packed, boxes, ranks, stop, top, left, state, sums):
     """With g_i = dL/dw_i: dL/dalpha_i = T_i g_i - (sum_{j > i} w_j g_j) / (1 - alpha_i).
 
     `state`: transmittance, the sum behind, dL/dr, dL/dg, dL/db and dL/dalpha of each pixel; then
-    the sums of a Gaussian in each lane.
+    the sums of one Gaussian, per lane.
     `sums` of each Gaussian, with p = alpha_i dL/dalpha_i = dL/d(exponent):
     p, p x, p y, p x^2, p x y, p y^2, dL/dr, dL/dg, dL/db.
     """
@@ -384,7 +386,7 @@ def _tile_backward(packed, boxes, ranks, stop, top, left, state, sums):
 
 @njit(cache=True, parallel=True)
 def _collect(order, packed, first, slots, sums, centres, conics, opacities, colours):
-    """The gradients of each Gaussian from its sums in all tiles."""
+    """Compute the gradients of each Gaussian from its sums in all tiles."""
     for rank in prange(len(order)):
         total = np.zeros(SUMS, np.float32)
         for slot in range(first[rank], first[rank + 1]):

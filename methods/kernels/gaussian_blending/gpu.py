@@ -1,12 +1,12 @@
-"""Blending with Triton: a program takes a tile of 16 x 16 pixels.
+"""Blending with Triton: one program per tile of 16 x 16 pixels.
 
 A Gaussian has an entry for every tile that its box touches. Sorted by tile and depth (Kerbl et al.
-2023, Section 6), they are the list of each tile; how many there are in all is what the host waits
-for, once. A program works through its list, some Gaussians at a time, until nothing shines through.
+2023, Section 6), the entries form the list of each tile. The host waits once, for their total
+number. A program processes its list, a few Gaussians at a time, until its tile is opaque.
 
-Nothing is added up with atomics. The backward pass leaves sums over the pixels of a tile in the
-place of the entry before the sorting, where those of a Gaussian are neighbours, and adds these up
-from there: gradients are the same every time.
+There are no atomics. The backward pass writes sums over the pixels of a tile to the position that
+the entry had before sorting, where the entries of a Gaussian are adjacent, and adds these up. So
+gradients are repeatable.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from methods.kernels.gaussian_projection import Ellipses
 from methods.kernels.gpu import check_types, launch, vector
 
 TILE = 16  # pixels, along both axes
-BLOCK = 128  # Gaussians or entries of a program that makes the lists
+BLOCK = 128  # Gaussians or entries per program that makes the lists
 GAUSSIANS = 64 if interpreted() else 8
-"""Gaussians that a tile blends at a time. Those of a pixel are in the registers of one lane. The
-interpreter takes as long for many as for few."""
+"""Gaussians that a tile blends at a time, kept in registers, one pixel per lane. The interpreter
+takes as long for many as for few."""
 
 SUMS = tl.constexpr(9)  # of an entry: see `_backward`
 ROWS, SLOTS = 64 if interpreted() else 4, 8
-"""Gaussians of a program that adds up their sums, and how many sums of each at a time."""
+"""Gaussians per program in `_collect`, and the entries of each that are summed at a time."""
 
 LARGEST = tl.constexpr(interface.LARGEST_ALPHA)
 LEAST = tl.constexpr(gaussian_projection.LEAST_ALPHA)
@@ -60,8 +60,8 @@ class _Lists(NamedTuple):
     Attributes:
         offsets: [tiles + 1], tile t owns entries offsets[t] to offsets[t + 1].
         owners: [E] the Gaussian of each entry, nearest first in a tile.
-        slots: [E] the place of each entry before the sorting: Gaussian by Gaussian.
-        ends: [N] where the places of a Gaussian end, and those of the next begin.
+        slots: [E] the position of each entry before sorting: Gaussian by Gaussian.
+        ends: [N] end of the positions of each Gaussian, where those of the next begin.
     """
 
     offsets: Tensor
@@ -71,7 +71,7 @@ class _Lists(NamedTuple):
 
     @classmethod
     def of(cls, centres: Tensor, depth: Tensor, extents: Tensor, size: tuple[int, int]) -> _Lists:
-        """Of the tiles of a picture of `size` (tiles across, tiles down)."""
+        """The lists for a picture of `size` (tiles across, tiles down)."""
         count, device = len(centres), centres.device
         counts = torch.zeros(count, dtype=torch.int64, device=device)
         launch(
@@ -92,7 +92,7 @@ class _Lists(NamedTuple):
             TILE=TILE,
             BLOCK=BLOCK,
         )
-        keys, slots = keys.sort(stable=True)  # of equal depths the first stays in front
+        keys, slots = keys.sort(stable=True)  # stable: keeps the order of equal depths
         tiles = torch.arange(size[0] * size[1] + 1, device=device)
         return cls(torch.searchsorted(keys, tiles << 32), owners[slots], slots, ends)
 
@@ -149,11 +149,11 @@ class _Blend(torch.autograd.Function):
 
 @triton.jit
 def _range(centres, extents, axis, i, inside, tiles, TILE: tl.constexpr):
-    """The tiles, from the first to before the last, that boxes of Gaussians touch along an axis."""
+    """The range of tiles [first, last) that boxes of Gaussians touch along an axis."""
     centre = tl.load(centres + 2 * i + axis, mask=inside, other=0.0)
     half = tl.load(extents + 2 * i + axis, mask=inside, other=0.0)
-    reach = half * 1.0001 + 0.5  # a little more, so that no rounding leaves out a pixel
-    # Cut off as floats: as integers, what is huge has no defined value.
+    reach = half * 1.0001 + 0.5  # a little larger: rounding leaves out no pixel
+    # Clamped as floats, because converting huge values to integers is undefined.
     first = tl.minimum(tl.maximum((centre - reach) / TILE, 0.0), tiles)
     last = tl.minimum(tl.maximum((centre + reach) / TILE, 0.0), tiles)
     shown = half > 0
@@ -185,8 +185,10 @@ def _name(
     TILE: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """The key of each entry: its tile, and, in the lower half, the bits of its depth, which as
-    integers have the order of positive floats."""
+    """Write the sort key of each entry: its tile, and in the lower half the bits of its depth.
+
+    As integers, the bits of positive floats have the same order.
+    """
     entry = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = entry < total
     i = tl.load(owners + entry, mask=inside, other=0)
@@ -201,8 +203,7 @@ def _name(
 
 @triton.jit
 def _pixels(width, height, TILE: tl.constexpr):
-    """The pixels of a tile: where they are stored, whether they are in the picture, and the
-    coordinates of their centres."""
+    """The pixels of a tile: offsets in memory, whether in the picture, coordinates of centres."""
     at = tl.arange(0, TILE * TILE)
     column, row = tl.program_id(0) * TILE + at % TILE, tl.program_id(1) * TILE + at // TILE
     inside = (column < width) & (row < height)
@@ -211,8 +212,10 @@ def _pixels(width, height, TILE: tl.constexpr):
 
 @triton.jit
 def _shares(centres, conics, opacities, i, there, x, y):
-    """Of Gaussians `i` [G, 1] at pixels [1, P]: the way from centre to pixel, and the opacity
-    there, before and after it is cut off, [G, P]."""
+    """Gaussians `i` [G, 1] at pixels [1, P]: offset from centre to pixel, and opacity [G, P].
+
+    The opacity is given before and after its cut-offs.
+    """
     u = x - tl.load(centres + 2 * i, mask=there, other=0.0)
     v = y - tl.load(centres + 2 * i + 1, mask=there, other=0.0)
     a, b, c = vector(conics, i, there)
@@ -223,7 +226,7 @@ def _shares(centres, conics, opacities, i, there, x, y):
 
 @triton.jit
 def _weights(share, light, stop):
-    """How much light gets to each of some Gaussians, its weight, and what goes on behind all."""
+    """Transmittance in front of each Gaussian, its weight, and the transmittance behind all."""
     behind = light[None, :] * tl.cumprod(1 - share, 0)
     before = behind / (1 - share)
     return before, tl.where(before > stop, before * share, 0.0), tl.min(behind, 0)
@@ -335,13 +338,13 @@ def _backward(
 
 @triton.jit
 def _keep(sums, slot, k: tl.constexpr, terms, there):
-    """Sum `terms` [G, P] over the pixels, as the k-th sums of the entries at `slot` [G, 1]."""
+    """Sum `terms` [G, P] over pixels and store them as the k-th sums of entries `slot` [G, 1]."""
     tl.store(sums + slot * SUMS + k, tl.sum(terms, 1, keep_dims=True), mask=there)
 
 
 @triton.jit
 def _total(sums, first, end, k: tl.constexpr, ROWS: tl.constexpr, SLOTS: tl.constexpr):
-    """The k-th sums of Gaussians, in all their tiles."""
+    """The k-th sums of Gaussians over all their tiles."""
     total = tl.zeros([ROWS, SLOTS], tl.float32)
     slot = first[:, None] + tl.arange(0, SLOTS)[None, :]
     longest = tl.max(end - first, 0)
@@ -366,7 +369,7 @@ def _collect(
     ROWS: tl.constexpr,
     SLOTS: tl.constexpr,
 ):
-    """The gradients of each Gaussian from its sums."""
+    """Compute the gradients of each Gaussian from its sums."""
     i = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     inside = i < count
     first = tl.load(ends + i - 1, mask=inside & (i > 0), other=0)

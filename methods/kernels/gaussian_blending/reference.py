@@ -1,4 +1,4 @@
-"""Blending in plain torch: all Gaussians that reach a band of rows, at all of its pixels."""
+"""Blending in plain torch: band by band, all Gaussians that reach it at all of its pixels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from methods.kernels.gaussian_blending import LARGEST_ALPHA
 from methods.kernels.gaussian_projection import LEAST_ALPHA, Ellipses
 
 BAND = 16
-"""Rows that are blended together: bounds the memory of a picture."""
+"""Rows that are blended together, which bounds the memory."""
 
 
 def blend(

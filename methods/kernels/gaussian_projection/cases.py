@@ -1,4 +1,4 @@
-"""Cases of the projection of Gaussians: agreement of the backends, ellipses known otherwise."""
+"""Cases of the projection of Gaussians: agreement of the backends, ellipses known in advance."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from methods.kernels.gaussian_projection import (
 
 CAMERA = CAMERAS["looking at the cube"]
 FAR = 3.0
-"""Largest variance of an ellipse here, over the smallest, `BLUR`: scales and depths see to it."""
+"""Bound on the variance of an ellipse over the least, `BLUR`; scales and depths ensure it."""
 
 Gaussians = tuple[Tensor, Tensor, Tensor, Tensor]
 """Means, scales, rotations, opacities."""
@@ -142,7 +142,7 @@ def _circle_error(scale: float, depth: float, backend: str, device: str, precisi
     turn = torch.randn(1, 4, generator=torch.Generator().manual_seed(0))
     given = place[None], torch.full((1, 3), scale), turn, torch.tensor([1.0])
     found = _projected([x.to(device, dtype) for x in given], camera, backend)
-    # As the inputs have it: the place is rounded to float32.
+    # The actual depth, because the position was rounded to float32.
     z = float((place - camera.c2w[:, 3]).double() @ camera.c2w[:, 2].double())
     size = float(given[1][0, 0].to(dtype)) / z
     across, down = (camera.fx * size) ** 2 + BLUR, (camera.fy * size) ** 2 + BLUR

@@ -61,7 +61,7 @@ class _Project(torch.autograd.Function):
 
 
 def _view(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """W [3, 3] and centre [3] of a camera, and its fx, fy, cx, cy and limits of x / z and y / z."""
+    """W [3, 3] and centre [3] of a camera; fx, fy, cx, cy and limits of x / z and y / z in J."""
     pose = camera.c2w.numpy().astype(np.float32)
     limits = FRUSTUM * 0.5 * camera.width / camera.fx, FRUSTUM * 0.5 * camera.height / camera.fy
     intrinsics = np.array((camera.fx, camera.fy, camera.cx, camera.cy, *limits), np.float32)
@@ -173,7 +173,7 @@ def _backward(
         ty = min(max(v, -limit_y), limit_y)
         ax, ay = fx * inverse, fy * inverse
 
-        # dL/dV', symmetric: its entry off the diagonal stands for half of dL/dB.
+        # dL/dV' is symmetric: each off-diagonal entry is half of dL/dB.
         a, b, c = conics[i, 0], conics[i, 1], conics[i, 2]
         ga, gb, gc = grad_conics[i, 0], grad_conics[i, 1] / TWO, grad_conics[i, 2]
         p00, p01 = a * ga + b * gb, a * gb + b * gc
@@ -182,7 +182,7 @@ def _backward(
         gxy = -(p00 * b + p01 * c)
         gyy = -(p10 * b + p11 * c)
 
-        # Of H, and from there of the scales, of W R (rows m0, m1, m2), of x / z, y / z and 1 / z.
+        # Gradients of H, then of the scales, of W R (rows m0, m1, m2), of x / z, y / z and 1 / z.
         gtx, gty, gax, gay = ZERO, ZERO, ZERO, ZERO
         m0, m1, m2 = (ZERO, ZERO, ZERO), (ZERO, ZERO, ZERO), (ZERO, ZERO, ZERO)
         for k in range(3):

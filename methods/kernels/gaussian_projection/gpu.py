@@ -1,7 +1,7 @@
-"""Projection of Gaussians with Triton: a lane takes a Gaussian, in registers.
+"""Projection of Gaussians with Triton: one lane per Gaussian, in registers.
 
-It reads the 44 bytes of a Gaussian and writes the 32 of its ellipse. The backward pass computes the
-way to the ellipse again, which costs less than to read it.
+It reads the 44 bytes of a Gaussian and writes the 32 bytes of its ellipse. The backward pass
+recomputes intermediate results, which is cheaper than reading them.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def _finite(x, y, z):
 
 @triton.jit
 def _local(means, pose, i, inside):
-    """Centres as the camera has them; of those that are not finite, z is not a number."""
+    """Centres in camera coordinates; z is NaN for centres that are not finite."""
     x, y, z = vector(means, i, inside)
     finite = _finite(x, y, z)
     x = tl.where(finite, x, 0.0) - tl.load(pose + 3)
@@ -129,7 +129,7 @@ def _rotation(rotations, i, inside):
     x = tl.load(rotations + 4 * i + 1, mask=inside, other=0.0)
     y = tl.load(rotations + 4 * i + 2, mask=inside, other=0.0)
     z = tl.load(rotations + 4 * i + 3, mask=inside, other=0.0)
-    # An error of the length enters a conic four times: not the approximations of a GPU.
+    # Correctly rounded, because an error of the length enters a conic four times.
     shrink = tl.div_rn(1.0, tl.sqrt_rn(w * w + x * x + y * y + z * z))
     return w * shrink, x * shrink, y * shrink, z * shrink, shrink
 
@@ -147,8 +147,10 @@ def _column(w, x, y, z, k: tl.constexpr):
 
 @triton.jit
 def _slopes(pose, w, x, y, z, tx, ty, k: tl.constexpr):
-    """How an axis of the Gaussian is seen: its column of J W R, but for f / z, along both axes of
-    the picture; and its part along the axis of the camera."""
+    """The k-th column of J W R without the factors f / z, for both axes of the picture.
+
+    Also the component of that axis of the Gaussian along the camera's axis.
+    """
     a, b, c = _column(w, x, y, z, k)
     deep = _along(pose, 2, a, b, c)
     return _along(pose, 0, a, b, c) - tx * deep, _along(pose, 1, a, b, c) - ty * deep, deep
@@ -205,7 +207,7 @@ def _forward(
     tl.store(centres + 2 * i + 1, tl.where(shown, fy * v + cy, 0.0), mask=inside)
     a, b, c = tl.where(shown, a, 0.0), tl.where(shown, b, 0.0), tl.where(shown, c, 0.0)
     _put(conics, i, a, b, c, inside)
-    # A quotient of a GPU may be a little below 1 where both are equal.
+    # On a GPU, the quotient of equal numbers may be slightly below 1.
     reach = 2 * tl.log(tl.where(shown, tl.maximum(opacity / LEAST, 1.0), 1.0))
     wide, tall = tl.sqrt(reach * xx), tl.sqrt(reach * yy)
     tl.store(extents + 2 * i, tl.where(shown, wide, 0.0), mask=inside)
@@ -248,7 +250,7 @@ def _backward(
     qw, qx, qy, qz, shrink = _rotation(rotations, i, shown)
     s0, s1, s2 = vector(scales, i, shown)
 
-    # dL/dV', symmetric: its entry off the diagonal stands for half of dL/dB.
+    # dL/dV' is symmetric: each off-diagonal entry is half of dL/dB.
     a, b, c = vector(conics, i, shown)
     ga, gb, gc = vector(grad_conics, i, shown)
     gb = gb / 2
@@ -256,7 +258,7 @@ def _backward(
     p10, p11 = b * ga + c * gb, b * gb + c * gc
     gxx, gxy, gyy = -(p00 * a + p01 * b), -(p00 * b + p01 * c), -(p10 * b + p11 * c)
 
-    # Of H, and from there of the scales, of W R diag s (its columns) and of J.
+    # Gradients of H, then of the scales, of W R diag s (by columns) and of J.
     across, down, deep = _slopes(pose, qw, qx, qy, qz, tx, ty, 0)
     gs0, gh0, gk0, gax, gay, gtx, gty = _of_axis(across, down, deep, s0, ax, ay, gxx, gxy, gyy)
     across, down, deep = _slopes(pose, qw, qx, qy, qz, tx, ty, 1)
@@ -292,8 +294,11 @@ def _backward(
 
 @triton.jit
 def _of_axis(across, down, deep, scale, ax, ay, gxx, gxy, gyy):
-    """Gradients by way of a column (h, k) of H: of the scale; of the column of W R, along both axes
-    of the picture; of fx / z and fy / z; of tx and ty."""
+    """Gradients through a column (h, k) of H.
+
+    They are of the scale; of the column of W R, along both axes of the picture; of fx / z and
+    fy / z; of tx and ty.
+    """
     h, k = ax * across * scale, ay * down * scale
     gh, gk = 2 * (gxx * h + gxy * k), 2 * (gxy * h + gyy * k)
     of_scale = gh * ax * across + gk * ay * down
@@ -304,7 +309,7 @@ def _of_axis(across, down, deep, scale, ax, ay, gxx, gxy, gyy):
 
 @triton.jit
 def _to_world(pose, x, y, z):
-    """W^T of a vector of the camera."""
+    """W^T times a vector in camera coordinates."""
     a, b, c = _axis(pose, 0)
     d, e, f = _axis(pose, 1)
     g, h, k = _axis(pose, 2)

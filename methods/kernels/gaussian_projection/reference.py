@@ -1,4 +1,4 @@
-"""Projection of Gaussians in plain torch; autograd has its gradient."""
+"""Projection of Gaussians in plain torch, differentiated by autograd."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def project_gaussians(
         centres, conics, depth, _ = _ellipses(means, scales, rotations, opacities, camera)
         shown = (depth > NEAR) & (opacities >= LEAST_ALPHA)
         shown &= conics.isfinite().all(dim=1) & centres.isfinite().all(dim=1)
-    # What is not shown stands for something harmless, so that no gradient is NaN.
+    # Invisible Gaussians are replaced by harmless values, so that no gradient is NaN.
     axis = camera.c2w.to(means)
     given = (
         torch.where(shown[:, None], means, axis[:, 3] + axis[:, 2]),
@@ -40,7 +40,7 @@ def project_gaussians(
 def _ellipses(
     means: Tensor, scales: Tensor, rotations: Tensor, opacities: Tensor, camera: Camera
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Centres, conics, depth and extents, whatever the Gaussians."""
+    """Centres, conics, depth and extents, without checks of visibility."""
     pose = camera.c2w.to(means)
     local = (means - pose[:, 3]) @ pose[:, :3]  # W (mean - c), row vectors
     x, y, z = local.unbind(dim=1)

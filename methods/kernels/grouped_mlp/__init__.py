@@ -1,12 +1,12 @@
 """Many small networks, each for the samples of its own cell (Reiser et al. 2021, Section 3).
 
-Samples are put in the order of their networks, so that the weights of one network stay in the cache
-while its samples are computed. All networks have the same layers, those of KiloNeRF (Figure 2):
+Samples are sorted by network, so that the weights of one network stay in the cache while its
+samples are computed. All networks have the layers of KiloNeRF (Figure 2):
 
 hidden = relu(mid(relu(in(encoding of the position)))), density = density(hidden),
 colour = sigmoid(colour(relu(direction(feature(hidden), encoding of the direction))))
 
-`feature` is followed by no ReLU. The density has no activation yet.
+`feature` is not followed by a ReLU. The density has no activation here.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from bench.types import check_shape
 from methods.kernels.dispatch import implementation
 
 HIDDEN = 32
-"""Outputs of a layer, but of the density and the colour."""
+"""Outputs of every layer except density and colour."""
 
 LAYERS = ("in", "mid", "density", "feature", "direction", "colour")
 
 
 @dataclass(frozen=True)
 class Groups:
-    """Samples in the order of their networks.
+    """Samples sorted by network.
 
     Attributes:
-        permutation: [M] int64, the samples that have a network, network by network, each network's
-            in the order in which they were given.
+        permutation: [M] int64, the samples that have a network, network by network; within a
+            network in the given order.
         offsets: [N + 1] int64, network n owns offsets[n] to offsets[n + 1] of the permutation.
     """
 
@@ -42,11 +42,11 @@ class Groups:
 
 @dataclass(frozen=True)
 class Networks:
-    """N networks, by `LAYERS`.
+    """N networks with the layers `LAYERS`.
 
     Attributes:
-        weights: [N, I, O] of each layer, from I inputs to O outputs.
-        biases: [N, O] of each layer.
+        weights: [N, I, O] for each layer, from I inputs to O outputs.
+        biases: [N, O] for each layer.
     """
 
     weights: Mapping[str, Tensor]
@@ -58,17 +58,17 @@ class Networks:
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """N, the number of networks."""
         return len(self.biases["in"])
 
     @property
     def frequencies(self) -> int:
-        """Of the encoding of a position: the first layer has 3 + 6 of them as inputs."""
+        """F, frequencies in the encoding of a position: the first layer has 3 + 6 F inputs."""
         return (self.weights["in"].shape[1] - 3) // 6
 
     @property
     def learning(self) -> bool:
-        """Whether a gradient is wanted."""
+        """Whether gradients are needed."""
         tensors = (*self.weights.values(), *self.biases.values())
         return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
 
@@ -76,17 +76,18 @@ class Networks:
 def locate(
     positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor, *, backend: str = "auto"
 ) -> tuple[Tensor, Tensor]:
-    """The network of each position, [S] int16, -1 for none; and where in its cube the position is,
-    [S, 3], -1 to 1 along each axis. No gradient.
+    """Find the network of each position, and the local position in its cube. No gradient.
+
+    Returns networks [S] int16, -1 for none, and local positions [S, 3], -1 to 1 along each axis.
 
     Args:
         positions: [S, 3].
         cubes: [X, Y, Z] int16, the network of each cube of a grid, -1 for none.
-        corner: [3] where the first cube begins.
-        side: [] length of a cube.
+        corner: [3] lower corner of the first cube.
+        side: [] side of a cube.
 
     Raises:
-        ValueError: a shape other than these; backends "cpu", "gpu": not float32.
+        ValueError: wrong shapes; backends "cpu", "gpu": not float32.
     """
     check_shape("positions", positions, None, 3)
     check_shape("cubes", cubes, None, None, None)
@@ -101,15 +102,15 @@ def order(networks: Tensor, count: int, *, backend: str = "auto") -> Groups:
 
     Args:
         networks: [S] int16, int32 or int64, the number of each sample's network; negative: none.
-        count: N, how many networks there are.
+        count: N, the number of networks.
 
     Raises:
-        ValueError: a shape or a type other than these; on a CPU, a network of N or more.
+        ValueError: wrong shape or type; on a CPU, a network number of N or more.
     """
     check_shape("networks", networks, None)
     if networks.is_floating_point():
         raise ValueError(f"networks: expected whole numbers, got {networks.dtype}")
-    on_cpu = networks.device.type == "cpu"  # a GPU would have to be waited for
+    on_cpu = networks.device.type == "cpu"  # on a GPU the check would wait
     if len(networks) and on_cpu and int(networks.max()) >= count:
         raise ValueError(
             f"networks: expected numbers below {count}, got {int(networks.max())}: "
@@ -121,12 +122,12 @@ def order(networks: Tensor, count: int, *, backend: str = "auto") -> Groups:
 def encode_frequencies(inputs: Tensor, frequencies: int, *, backend: str = "auto") -> Tensor:
     """Positional encoding [S, 3 + 6 F] of `inputs` [S, 3]: x, sin x, cos x, sin 2x, cos 2x, ...
 
-    Angles are 2^k x for k = 0 to F - 1, without the factor pi of Mildenhall et al. 2020, Eq. 4: so
-    had their release and that of KiloNeRF. Differentiable with backend="reference" only; with
+    Angles are 2^k x for k = 0 to F - 1, without the factor pi of Mildenhall et al. 2020, Eq. 4, as
+    in their release and that of KiloNeRF. Differentiable with backend="reference" only; with
     backend="cpu" an input beyond +-16 loses digits.
 
     Raises:
-        ValueError: a shape other than this, F < 1; backends "cpu", "gpu": not float32.
+        ValueError: wrong shape, F < 1; backends "cpu", "gpu": not float32.
     """
     check_shape("inputs", inputs, None, 3)
     if frequencies < 1:
@@ -145,18 +146,18 @@ def grouped_linear(
     relu: bool = False,
     backend: str = "auto",
 ) -> Tensor:
-    """A linear layer [S, O] of samples that are sorted by network; differentiable in all of them.
+    """A linear layer [S, O] on samples sorted by network; differentiable in all three tensors.
 
     Args:
-        inputs: [S, I], network n has rows offsets[n] to offsets[n + 1].
+        inputs: [S, I]; network n has rows offsets[n] to offsets[n + 1].
         weights: [N, I, O].
         biases: [N, O].
         offsets: [N + 1] int64 of `Groups`, from 0 to S.
-        relu: whether outputs below 0 become 0.
+        relu: whether to apply a ReLU to the outputs.
 
     Raises:
-        ValueError: a shape other than these; on a CPU, offsets that do not end at S; backends
-            "cpu", "gpu": not float32.
+        ValueError: wrong shapes; on a CPU, offsets that do not end at S; backends "cpu", "gpu":
+            not float32.
     """
     check_shape("weights", weights, None, None, None)
     networks, channels, outputs = weights.shape
@@ -175,18 +176,18 @@ def grouped_linear(
 def densities(
     positions: Tensor, numbers: Tensor, networks: Networks, *, backend: str = "auto"
 ) -> tuple[Tensor, Tensor]:
-    """Densities [S] before their activation, and what `colours` needs of samples, [S, 33]: hidden
-    channels, then the number of the network, which float32 has exactly.
+    """Densities [S] before their activation, and the input [S, 33] of `colours`.
 
+    The latter holds the hidden channels, then the number of the network, which is exact in float32.
     Densities and hidden channels are 0 where a sample has no network. Differentiable in the
     networks.
 
     Args:
-        positions: [S, 3] in the sample's own cube, -1 to 1 along each axis.
-        numbers: [S] the network of each, as `order` takes them.
+        positions: [S, 3] local to the sample's cube, -1 to 1 along each axis.
+        numbers: [S] the network of each sample, as for `order`.
 
     Raises:
-        ValueError: a shape other than these; backends "cpu", "gpu": not float32.
+        ValueError: wrong shapes; backends "cpu", "gpu": not float32.
     """
     check_shape("positions", positions, None, 3)
     check_shape("numbers", numbers, len(positions))
@@ -205,11 +206,11 @@ def colours(
     Differentiable in the hidden channels and the networks.
 
     Args:
-        geometry: [S, 33] of `densities`.
+        geometry: [S, 33] from `densities`.
         encoded: [S, D] encoded directions.
 
     Raises:
-        ValueError: a shape other than these; backends "cpu", "gpu": not float32.
+        ValueError: wrong shapes; backends "cpu", "gpu": not float32.
     """
     check_shape("geometry", geometry, None, HIDDEN + 1)
     check_shape("encoded", encoded, len(geometry), networks.weights["direction"].shape[1] - HIDDEN)
@@ -248,5 +249,5 @@ def composed_colours(geometry: Tensor, encoded: Tensor, networks: Networks, back
 
 
 def _back(values: Tensor, place: Tensor, count: int) -> Tensor:
-    """Rows put back where they came from, among `count`; zeros elsewhere."""
+    """Scatter rows back to their original places among `count` rows; zeros elsewhere."""
     return values.new_zeros(count, values.shape[1]).index_copy(0, place, values)

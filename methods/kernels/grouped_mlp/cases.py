@@ -27,7 +27,7 @@ SIZES = {"in": (63, 32), "mid": (32, 32), "density": (32, 1)} | {
     "colour": (32, 3),
 }
 BOUND = 1 / 8
-"""Largest weight and bias of the cases: no sum grows from layer to layer beyond 8."""
+"""Largest weight and bias in the cases, so that no sum exceeds 8 in any layer."""
 
 KINDS = {
     "some samples without a network": (1000, 7),
@@ -36,7 +36,7 @@ KINDS = {
     "fewer samples than go together": (5, 1),
     "most networks empty": (40, 300),
 }
-"""Samples and networks."""
+"""Numbers of samples and networks."""
 
 MANY = 1_200_000, 2000
 
@@ -47,7 +47,7 @@ def cases() -> list[Case]:
 
 
 def _numbers(count: int, networks: int) -> Tensor:
-    """A network or none, -1, for each sample."""
+    """A network, or -1 for none, for each sample."""
     generator = torch.Generator().manual_seed(count)
     return torch.randint(-1, networks, (count,), generator=generator)
 
@@ -172,7 +172,7 @@ def _backward(
     count: int, networks: int, inputs: int, outputs: int, relu: bool, device: str
 ) -> Callable[[str], tuple[Tensor, ...]]:
     *tensors, offsets = _given(count, networks, inputs, outputs, device)
-    if relu:  # no sum is so close to 0 that rounding decides whether it passes
+    if relu:  # keeps sums away from 0, where rounding would decide
         tensors[2] = tensors[2].sign() * 16
     tensors = [tensor.requires_grad_() for tensor in tensors]
     grad = _uniform(4, len(tensors[0]), outputs).to(device)

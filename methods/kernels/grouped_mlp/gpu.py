@@ -1,12 +1,12 @@
 """Small networks with Triton: a program multiplies a tile of samples of one network.
 
-Samples are sorted by network, and a network's tiles begin with its first sample: a tile is only
-full where the network has as many samples. How many tiles there are the host does not know, but at
-most how many: it does not wait, and the idle ones return at once. A whole network is one kernel,
-whose hidden channels stay in registers.
+Samples are sorted by network, and a network's tiles start at its first sample, so its last tile may
+be partly empty. The host knows only an upper bound on the number of tiles; so it need not wait, and
+surplus programs return at once. A whole network is one kernel that keeps hidden channels in
+registers.
 
-Products are those of float32, not of TF32. For the gradient of weights a program takes a network
-and adds up its samples one tile after the other: nothing is added by atomics, and it repeats.
+Products are in float32, not TF32. For the gradient of the weights, a program takes one network and
+sums over its samples tile by tile, without atomics, so that results are repeatable.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from methods.kernels.grouped_mlp.reference import order
 __all__ = ["colours", "densities", "encode_frequencies", "grouped_linear", "locate", "order"]
 
 ROWS = 64
-"""Samples of a tile."""
+"""Samples per tile."""
 
 BLOCK = 512
-"""Numbers of a program that multiplies nothing, 4 a lane."""
+"""Numbers per program in kernels without products, 4 per lane."""
 
 LEAST, MOST = 16, 64
-"""Inputs or outputs that are multiplied together: as few as Triton's product takes; of any layer,
-as many as fit into registers."""
+"""Inputs or outputs that are multiplied together: the least that Triton's product accepts, and the
+most that fit into registers."""
 
 
 def locate(positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
@@ -100,7 +100,7 @@ def _layers(networks: Networks, *names: str) -> list[Tensor]:
 
 
 def _padded(size: int) -> int:
-    """How many inputs or outputs are multiplied together, to have `size`."""
+    """How many inputs or outputs are multiplied together for a layer with `size` of them."""
     return max(triton.next_power_of_2(size), LEAST)
 
 
@@ -112,7 +112,7 @@ def _sorted(numbers: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 def _tiles(offsets: Tensor, samples: int) -> Tensor:
-    """Network, first sample and end of each tile, [T, 3] int64; idle ones end where they begin.
+    """Network, first sample and end of each tile, [T, 3] int64; surplus tiles are empty.
 
     A network has at most one tile that is not full.
     """
@@ -213,7 +213,7 @@ def _doubled(x, times):
 
 @triton.jit
 def _relu(x):
-    """Of a NaN it is one."""
+    """ReLU that keeps NaN."""
     return tl.where(x < 0, 0.0, x)
 
 
@@ -224,15 +224,14 @@ def _product(x, weights, total):
 
 @triton.jit
 def _rows(table, row, column, there, known, width):
-    """The numbers of `table`, of `width` columns, in rows that are `there` and columns that are
-    `known`; 0 elsewhere."""
+    """Load numbers of `table` with `width` columns; 0 unless row is `there` and column `known`."""
     place = table + row[:, None] * width + column[None, :]
     return tl.load(place, mask=there[:, None] & known[None, :], other=0.0)
 
 
 @triton.jit
 def _tile(tiles, ROWS: tl.constexpr):
-    """Network and samples of a tile, and which of these there are; whether there are any."""
+    """Network and samples of a tile, the mask of valid samples, and whether there are any."""
     tile = tiles + 3 * tl.program_id(0)
     first, end = tl.load(tile + 1), tl.load(tile + 2)
     row = first + tl.arange(0, ROWS)

@@ -1,4 +1,4 @@
-"""Small networks in plain torch, one after the other, any dtype and device."""
+"""Small networks in plain torch, one network after the other, for any dtype and device."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def locate(positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor) -> tu
     """See `methods.kernels.grouped_mlp.locate`."""
     scaled = (positions.detach() - corner) / side
     cell = scaled.floor()
-    sizes = [cell.new_full((), size) for size in cubes.shape]  # filled in: no GPU is waited for
+    sizes = [cell.new_full((), size) for size in cubes.shape]  # filled: no wait for a GPU
     inside = ((cell >= 0) & (cell < torch.stack(sizes))).all(dim=1)
     x, y, z = torch.where(inside[:, None], cell, 0).long().unbind(dim=1)
     return torch.where(inside, cubes[x, y, z], -1), 2 * (scaled - cell) - 1

@@ -1,10 +1,10 @@
-"""Ray marching through an occupancy grid: samples where something may be, nothing elsewhere.
+"""Ray marching through an occupancy grid: samples only in cells that may hold matter.
 
-A ray enters the unit cube at t_0 and is divided into steps of one world length:
-t_k = t_0 + (k + phase) step / norm(d), phase 1/2 (midpoint rule) or a jitter in [0, 1). Sample k
-exists where the cell at o + t_k d is occupied and t_k lies in the ray's window. The set of samples
-does not depend on how empty space is skipped, so every backend returns the same ones, and a window
-leaves samples out but moves none.
+A ray enters the unit cube at t_0 and is divided into steps of equal world length:
+t_k = t_0 + (k + phase) step / norm(d), with phase 1/2 (midpoint rule) or a jitter in [0, 1).
+Sample k exists if the cell at o + t_k d is occupied and t_k is in the ray's window. The set of
+samples does not depend on how empty space is skipped, so that all backends return the same samples;
+a window removes samples but moves none.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from methods.kernels.composite import Extent, Intervals
 from methods.kernels.dispatch import implementation
 
 MAX_SAMPLES = 1024
-"""Samples with which a ray crosses the unit cube at the usual step, sqrt(3) / 1024."""
+"""Most samples of a ray through the unit cube at the usual step, sqrt(3) / 1024."""
 
 PARALLEL = 2.0**-127
-"""A component of a direction below this counts as 0: its reciprocal overflows float32."""
+"""A smaller component of a direction counts as 0, because its reciprocal overflows float32."""
 
 BRICK = 4
-"""Cells along the side of a brick, the 64 cells of one word of `Occupancy.words`."""
+"""Cells along the side of a brick; its 64 cells are one word of `Occupancy.words`."""
 
 
 class Occupancy:
     """Which cells of the unit cube may hold matter.
 
-    `cells` [G, G, G] bool is indexed (x, y, z); G is a multiple of 16. What is derived from them
-    lets a ray cross all that is known to be empty around it in one step.
+    `cells` [G, G, G] bool is indexed (x, y, z); G is a multiple of 16. The derived properties let a
+    ray cross all space known to be empty around it in one step.
     """
 
     def __init__(self, cells: Tensor) -> None:
@@ -47,7 +47,7 @@ class Occupancy:
 
     @classmethod
     def at(cls, coordinates: Tensor, resolution: int) -> Occupancy:
-        """With the cells at integer `coordinates` [V, 3] occupied, of `resolution`^3."""
+        """A grid of `resolution`^3 cells in which those at `coordinates` [V, 3] are occupied."""
         cells = torch.zeros([resolution] * 3, dtype=torch.bool, device=coordinates.device)
         cells[coordinates.long().unbind(dim=1)] = True
         return cls(cells)
@@ -58,25 +58,29 @@ class Occupancy:
         return self.cells.shape[0]
 
     def holds(self, positions: Tensor) -> Tensor:
-        """Whether the cells of `positions` [..., 3] are occupied, [...] bool; what is outside the
-        unit cube belongs to the nearest cell."""
+        """Whether the cells of `positions` [..., 3] are occupied: [...] bool.
+
+        Positions outside the unit cube belong to the nearest cell.
+        """
         size = self.resolution
         return self.cells[(positions * size).long().clamp(0, size - 1).unbind(dim=-1)]
 
     @cached_property
     def words(self) -> Tensor:
-        """One bit a cell, one int64 word a brick: [G/4, G/4, G/4]."""
+        """One bit per cell, one int64 word per brick: [G/4, G/4, G/4]."""
         return _pack_bricks(self.cells)
 
     @cached_property
     def bricks(self) -> Tensor:
-        """Where the bricks with anything in them are, in bricks: [B, 3]."""
+        """Coordinates of the non-empty bricks, in bricks: [B, 3]."""
         return self.words.nonzero()
 
     @cached_property
     def clearance(self) -> Tensor:
-        """How far off the nearest brick with anything in it is, in bricks along the farthest axis,
-        0 in such a brick, at most G/4: [G/4, G/4, G/4] uint8."""
+        """Chebyshev distance in bricks to the nearest non-empty brick: [G/4, G/4, G/4] uint8.
+
+        0 in a non-empty brick, at most G/4.
+        """
         near = (self.words != 0)[None, None].float()
         clearance = torch.zeros_like(near)
         for _ in range(self.resolution // BRICK):
@@ -98,7 +102,7 @@ class Occupancy:
 
 
 def _pack_bricks(bits: Tensor) -> Tensor:
-    """64 bits a word: bit x + 4 y + 16 z of a word is the cell (x, y, z) of its 4^3 brick."""
+    """Pack cells into 64-bit words: bit x + 4 y + 16 z is the cell (x, y, z) of a 4^3 brick."""
     side = bits.shape[0] // BRICK
     cells = bits.view(side, BRICK, side, BRICK, side, BRICK).permute(0, 2, 4, 5, 3, 1)
     weight = torch.ones(64, dtype=torch.int64, device=bits.device).bitwise_left_shift(
@@ -112,9 +116,9 @@ class Samples(Intervals):
     """Samples of R rays, ray by ray, front to back.
 
     Attributes:
-        ray: [S] int32, the ray a sample belongs to.
+        ray: [S] int32, the ray that a sample belongs to.
         positions: [S, 3] in the unit cube.
-        resume: [R] int32, the step to go on from; -1 where the ray has no more samples.
+        resume: [R] int32, the step to resume from; -1 if the ray has no more samples.
     """
 
     ray: Tensor
@@ -125,8 +129,10 @@ class Samples(Intervals):
         return len(self.t)
 
     def front(self, counts: Tensor, extent: Extent | None = None) -> Samples:
-        """Only the first `counts` [R] samples of each ray, which then has no more; see
-        `first_of_each`."""
+        """Only the first `counts` [R] samples of each ray, with no more to follow.
+
+        `extent` is as for `first_of_each`.
+        """
         kept, offsets, longest = self.first_of_each(counts, extent)
         return Samples(
             self.t[kept],
@@ -141,13 +147,13 @@ class Samples(Intervals):
 
 @dataclass(frozen=True)
 class Segments:
-    """The parts of R rays that are sampled; see `march`.
+    """The parts of R rays to sample; see `march`.
 
     Attributes:
-        rays: R of them.
+        rays: the R rays.
         window: [R, 2] nearest and farthest t, the latter excluded.
         jitter: [R] phase of the samples.
-        start: [R] int32 step to begin with; negative: none.
+        start: [R] int32 first step; negative: no samples.
     """
 
     rays: Rays
@@ -170,18 +176,18 @@ def march(
 ) -> Samples:
     """Sample R `rays` inside the unit cube. Not differentiable.
 
-    A ray has no samples if it misses the cube, is not finite, has no direction or one so short that
-    t overflows.
+    A ray has no samples if it misses the cube, is not finite, or has a direction that is zero or so
+    short that t overflows.
 
     Args:
         step: world length of a step, scene units.
         window: [R, 2] nearest and farthest t, the latter excluded; None: [0, inf).
         jitter: [R] phase of a ray's samples in [0, 1); None: 1/2.
-        start: [R] int32 step to begin with, `Samples.resume` of an earlier call with the same rays;
-            a negative one ends the ray; None: 0.
-        limit: at most so many samples a ray; None: all.
-        extent: how many samples there are, of `extents` or `sample_counts`: a GPU is not waited
-            for then.
+        start: [R] int32 first step, from `Samples.resume` of an earlier call with the same rays;
+            negative: no samples; None: 0.
+        limit: maximum number of samples per ray; None: all.
+        extent: how many samples there are, from `extents` or `sample_counts`; with it, the host
+            does not wait for a GPU.
     """
     segments = _segments(rays, step, window, jitter, start)
     if limit is None:
@@ -201,8 +207,10 @@ def extents(
     window: Tensor | None = None,
     backend: str = "auto",
 ) -> list[Extent]:
-    """How many samples `march` finds for the first `size` of R `rays`, for the next, and so on. The
-    host waits for a GPU, once."""
+    """How many samples `march` finds in each batch of `size` rays, in order.
+
+    The host waits for a GPU, once.
+    """
     counts = sample_counts(rays, occupancy, step, window=window, backend=backend)
     return Extent.of_each(functional.pad(counts, (0, -len(counts) % size)).view(-1, size))
 
@@ -225,14 +233,14 @@ def sample_counts(
 
 
 def longest_ray(step: float) -> int:
-    """No ray has more samples: those of the cube's diagonal, and what rounding adds."""
+    """Upper bound on the samples of a ray: those on the cube's diagonal, plus some for rounding."""
     return math.ceil(math.sqrt(3) / step) + 1
 
 
 def _segments(
     rays: Rays, step: float, window: Tensor | None, jitter: Tensor | None, start: Tensor | None
 ) -> Segments:
-    """What `march` is given, checked, and its defaults."""
+    """Check the arguments of `march` and fill in defaults."""
     origins, count = rays.origins, len(rays.origins)
     check_shape("origins", origins, None, 3)
     check_shape("directions", rays.directions, count, 3)

@@ -1,5 +1,5 @@
-"""Cases of the ray march: the same samples by all backends, to the last bit; rays that meet faces,
-edges and corners, or come from very far."""
+"""Cases of the ray march: bit-identical samples by all backends; rays that hit faces, edges and
+corners, or come from very far."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from methods.kernels.dispatch import served
 from methods.kernels.march import MAX_SAMPLES, Occupancy, march
 
 STEP = math.sqrt(3) / MAX_SAMPLES
-LONG = 4 * STEP  # of the rays that agree: the interpreter of Triton takes milliseconds for a step
+LONG = 4 * STEP  # for agreement: Triton's interpreter takes milliseconds per step
 AXES = torch.cat((torch.eye(3), -torch.eye(3)))
 ALL = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * 3)  # [27, 3], one is 0
 
 SIZE = 16
 CELL = (3, 12, 8)
-"""The one cell of a grid that is empty elsewhere."""
+"""The only occupied cell of a grid."""
 
 FINE = 1e-4
-"""A step at which a ray takes more than `MAX_SAMPLES` samples."""
+"""A step at which a ray has more than `MAX_SAMPLES` samples."""
 
 
 def cases() -> list[Case]:
@@ -152,10 +152,10 @@ def _ways() -> list[Case]:
     ):
         for kind, rays in kinds.items():
             if "1e6" in kind and grid == "one cell":
-                continue  # t is rounded there by as much as the cell measures
+                continue  # there, rounding of t is as large as the cell
             size = rays[0].abs().max().item() + 1
-            # An end of the way is rounded to a sample: half a step in the cube, where the first
-            # sample lies half a step behind it, a step in the cell, at both ends.
+            # Sampling rounds the ends of the path: by half a step in the cube, where the first
+            # sample lies half a step behind the entry; by one step in the cell, over both ends.
             steps = {"full grid": 0.5, "one cell": 1.0, "empty grid": 0.0}[grid]
             rounding = 0.0 if grid == "empty grid" else 4 * math.sqrt(3) * size * U32
             way = Property(
@@ -184,7 +184,7 @@ def _one_or_all(kind: str, device: str) -> Occupancy:
 
 
 def _way(kind: str, rays: Rays) -> Tensor:
-    """World length of rays in occupied cells, by the slab test in float64; 0 where t overflows."""
+    """World length of rays inside occupied cells (slab test, float64); 0 where t overflows."""
     origins, directions = rays.origins.cpu(), rays.directions.cpu()
     if kind == "empty grid":
         return torch.zeros(len(origins), dtype=torch.float64)
@@ -205,8 +205,7 @@ def _way(kind: str, rays: Rays) -> Tensor:
 def _way_error(
     grid: str, rays: Rays, step: float, backend: str, device: str, precision: str
 ) -> float:
-    """Difference between the way that the samples cover, taken in as many calls as needed, and the
-    exact one."""
+    """Error of the path length covered by the samples, found in as many calls as needed."""
     dtype = DTYPES[precision]
     rays = Rays(rays.origins.to(device, dtype), rays.directions.to(device, dtype))
     occupancy, count = _one_or_all(grid, device), len(rays.origins)

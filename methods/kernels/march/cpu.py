@@ -1,8 +1,8 @@
-"""Ray marching with numba: a ray crosses all that is empty around a cell or brick in one step.
+"""Ray marching with numba: a ray crosses all empty space around a cell or brick in one step.
 
-Samples are found once. A chunk of rays writes the t of its samples into its own part of a scratch
-array, whose pages cost nothing until they are written; when all counts are known, the samples are
-moved to their place.
+Rays are marched only once. A chunk of rays writes the t of its samples into its own part of a
+scratch array, whose pages cost nothing until written. Once all counts are known, the samples are
+moved to their final place.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def march(
 
 @njit(cache=True)
 def _cross(origin, direction, box):
-    """Where a ray enters and leaves a box; enter > leave where it misses (slab test)."""
+    """Where a ray enters and leaves a box (slab test); enter > leave if it misses."""
     enter, leave = f32(-np.inf), f32(np.inf)
     for axis in range(3):
         along = slope(direction[axis])
@@ -108,13 +108,13 @@ def _cell(coordinate, size):
 
 @njit(cache=True)
 def _leave_slab(origin, slope, first, end, width):
-    """t at which a ray leaves, along one axis, the cells `first` to `end`, excluded."""
+    """t at which a ray leaves the cells [first, end) of one axis."""
     return (f32(end if slope > 0 else first) * width - origin) * slope if slope != 0 else INF
 
 
 @njit(cache=True)
 def _empty_cells(cell, free):
-    """Along one axis, the cells that are empty with `cell`, if `free` bricks are."""
+    """The cells of one axis that are known to be empty around `cell`, at a clearance of `free`."""
     if free == 0:
         return cell, cell + 1
     brick = cell >> 2
@@ -123,7 +123,7 @@ def _empty_cells(cell, free):
 
 @njit(cache=True)
 def _march_ray(origin, direction, words, clearance, bounds, step, window, phase, k, limit, out):
-    """Write the t of a ray's samples to `out`; return their number and the step to resume from."""
+    """Write the t of a ray's samples to `out`; return their count and the step to resume from."""
     ox, oy, oz = origin
     dx, dy, dz = direction
     length = f32(math.sqrt(f64(dx) ** 2 + f64(dy) ** 2 + f64(dz) ** 2))
@@ -137,7 +137,7 @@ def _march_ray(origin, direction, words, clearance, bounds, step, window, phase,
     width = f32(1) / f32(size)
     sx, sy, sz = slope(dx), slope(dy), slope(dz)
 
-    # Skip what lies before the window and the box of occupied cells, with a step to spare for
+    # Skip steps before the window and the box of occupied cells, with one step to spare for
     # rounding.
     enter, leave = _cross(origin, direction, bounds)
     if not enter <= leave:
@@ -170,7 +170,7 @@ def _march_ray(origin, direction, words, clearance, bounds, step, window, phase,
                 _leave_slab(oy, sy, y0, y1, width),
                 _leave_slab(oz, sz, z0, z1, width),
             )
-            # Rounded down, so that the first step outside the cube is never passed over.
+            # Rounded down, so that the first step beyond the empty space is never skipped.
             k = max(k + 1, int((leave - near) * steps_per_t - phase))
 
 

@@ -1,7 +1,6 @@
-"""Ray marching with Triton: a lane a ray, which crosses all that is empty around it in one step.
+"""Ray marching with Triton: one lane per ray, which crosses all empty space around it in one step.
 
-The rays are marched twice: once to count their samples, once, when it is known where these go, to
-write them.
+Rays are marched twice: first to count samples, then to write them, once their places are known.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ from methods.kernels.march import (
 from methods.kernels.march.reference import clip
 
 BLOCK = 128 if interpreted() else 32
-"""Rays of a program: those of a warp, which waits for the longest of them. The interpreter takes as
-long for many as for few."""
+"""Rays per program: one warp, which waits for its longest ray. The interpreter takes as long for
+many as for few."""
 
 
 def count(segments: Segments, occupancy: Occupancy, step: float) -> Tensor:
@@ -59,14 +58,14 @@ def march(
 
 
 def _arguments(segments: Segments, occupancy: Occupancy, step: float, limit: int) -> list[Any]:
-    """What `_march` is given of rays and grid; the last is R."""
+    """The arguments of `_march` for rays and grid; the last one is R."""
     origins, directions = segments.rays.origins, segments.rays.directions
     window, jitter, start = segments.window, segments.jitter, segments.start
     check_types(torch.float32, origins=origins, directions=directions, window=window, jitter=jitter)
     near, far, step_t, alive = clip(segments.rays, step, window[:, 1])
     parallel = directions.abs() < PARALLEL
     slopes = torch.where(parallel, 0, 1 / torch.where(parallel, 1, directions))
-    # Where a ray is not in the cube a window changes nothing, and may be far beyond any integer.
+    # Clamped to the cube: a window may lie outside it, beyond the range of integers.
     lowest = torch.minimum(torch.maximum(window[:, 0], near), far)
     given = (origins, directions, slopes, near, far, step_t, lowest, jitter)
     return [
@@ -81,7 +80,7 @@ def _arguments(segments: Segments, occupancy: Occupancy, step: float, limit: int
 
 
 def _counted(arguments: list[Any]) -> tuple[Tensor, Tensor]:
-    """How many samples a ray has, and where it resumes, [R] each."""
+    """How many samples each ray has, and where it resumes, [R] each."""
     origins, rays = arguments[0], arguments[-1]
     counts = torch.zeros(rays, dtype=torch.int64, device=origins.device)
     resume = torch.full((rays,), -1, dtype=torch.int32, device=origins.device)
@@ -96,8 +95,10 @@ def _launch(arguments: list[Any], *outputs: Tensor | None) -> None:
 
 @triton.jit
 def _leave_slab(origin, slope, cell, free, width):
-    """t at which a ray leaves, along one axis, the cells that are empty with `cell`: itself, or, if
-    `free` is not 0, those of as many bricks around."""
+    """t at which a ray leaves, along one axis, the cells known to be empty around `cell`.
+
+    These are the cell itself or, if `free` is not 0, the cells within that clearance in bricks.
+    """
     brick = cell >> 2
     first = tl.where(free == 0, cell, (brick - free + 1) << 2)
     end = tl.where(free == 0, cell + 1, (brick + free) << 2)
@@ -135,7 +136,7 @@ def _march(
     out_positions,
     BLOCK: tl.constexpr,
 ):
-    """Count the samples and find where to resume; with `offsets`, write the samples there."""
+    """Count samples and find where to resume; with `offsets`, write the samples there."""
     ray = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = ray < rays
     k = tl.load(starts + ray, mask=inside, other=-1)
@@ -153,7 +154,7 @@ def _march(
     count = tl.zeros([BLOCK], tl.int64)
     begin = count if offsets is None else tl.load(offsets + ray, mask=inside, other=0)
     again = tl.full([BLOCK], -1, tl.int32)
-    # Less one, for what rounding may take from the step before.
+    # One step less, because rounding may affect the step before.
     k = tl.where(going, tl.maximum(k, ((low - near) / step - phase).to(tl.int32) - 1), k)
     while tl.max(going.to(tl.int32), 0) > 0:
         t = near + (k.to(tl.float32) + phase) * step
@@ -182,7 +183,7 @@ def _march(
             leave = _leave_slab(ox, sx, x, free, width)
             leave = tl.minimum(leave, _leave_slab(oy, sy, y, free, width))
             leave = tl.minimum(leave, _leave_slab(oz, sz, z, free, width))
-            # Rounded down, so that the first step outside what is empty is never passed over.
+            # Rounded down, so that the first step beyond the empty space is never skipped.
             ahead = tl.where(skips, (leave - near) / step, 0.0) - phase
             k = tl.maximum(k, ahead.to(tl.int32))
         going = going & (full == 0)

@@ -14,7 +14,7 @@ from methods.kernels.composite import Extent
 from methods.kernels.march import PARALLEL, Occupancy, Samples, Segments, longest_ray
 
 BLOCK = 1 << 12
-"""Rays whose steps are tested at once: [BLOCK, 1024, 3] positions are 50 MB."""
+"""Rays that are tested at a time: [BLOCK, 1024, 3] positions are 50 MB."""
 
 
 def count(segments: Segments, occupancy: Occupancy, step: float) -> Tensor:
@@ -48,7 +48,7 @@ def march(
 
 @dataclass(frozen=True)
 class _Steps:
-    """The steps of R rays; see `clip`. No ray has more than `most`."""
+    """The steps of R rays, at most `most` for each; see `clip`."""
 
     segments: Segments
     near: Tensor
@@ -62,7 +62,7 @@ class _Steps:
         near, far, length, alive = clip(segments.rays, step, segments.window[:, 1])
         alive &= segments.start >= 0
         most = longest_ray(step)
-        if alive.device.type == "cpu":  # a GPU would have to be waited for
+        if alive.device.type == "cpu":  # a GPU would make the host wait
             count = torch.where(alive, (far - near) / length, 0).ceil()
             most = int(functional.pad(count, (0, 1)).max())
         return cls(segments, near, far, length, alive, most)
@@ -74,8 +74,7 @@ class _Steps:
         return t, rays.origins[ray] + t[..., None] * rays.directions[ray]
 
     def taken(self, occupancy: Occupancy, limit: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Of the next rays: which of their steps are samples [R, most] bool, how many a ray has
-        [R], where to resume [R]."""
+        """For each batch of rays: which steps are samples [R, most], counts [R], resume [R]."""
         rays = torch.arange(len(self.near), device=self.near.device)
         k = torch.arange(self.most, device=self.near.device)
         for ray in rays.split(BLOCK):
@@ -98,19 +97,21 @@ class _Steps:
 
 
 def clip(rays: Rays, step: float, farthest: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The t between which rays are inside the cube and nearer than `farthest`, their step in t, and
-    whether there is anything to march, each [R]."""
+    """The range of t inside the cube and nearer than `farthest`, the step in t, whether to march.
+
+    near, far, step and mask are [R] each.
+    """
     entry, leave = _cross_unit_cube(rays.origins, rays.directions)
     near, far = entry.clamp(min=0), torch.minimum(leave, farthest)
-    # In float64, where every backend rounds to the same float32.
+    # In float64, so that every backend rounds to the same float32.
     length = rays.directions.double().norm(dim=-1).to(rays.directions.dtype)
-    # A true division: `step / length` would multiply by the reciprocal, an ulp away.
+    # A true division: `step / length` would multiply by the reciprocal, which is an ulp off.
     step_t = torch.full_like(length, step) / length
     return near, far, step_t, (near < far) & far.isfinite() & step_t.isfinite()
 
 
 def _cross_unit_cube(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Where rays enter and leave [0, 1]^3; enter > leave where they miss it (slab test)."""
+    """Where rays enter and leave [0, 1]^3 (slab test); enter > leave if they miss it."""
     parallel = directions.abs() < PARALLEL
     slope = 1 / torch.where(parallel, 1, directions)
     first, second = -origins * slope, (1 - origins) * slope

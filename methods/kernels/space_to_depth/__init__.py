@@ -1,8 +1,8 @@
-"""All that is known of a cell of s x s pixels in one row, and a network's rows made into pixels.
+"""Gathers the inputs of a cell of s x s pixels into one row, and turns network output into pixels.
 
-`space_to_depth` brings what is known of a cell into one row: the present low-resolution sample, the
-features of preceding frames, the preceding picture, the surface. `depth_to_space` makes pixels of
-the network's output. Colours are relative to the background, so that empty space is 0.
+`space_to_depth` collects a cell's inputs in one row: the current low-resolution sample, features of
+preceding frames, the preceding picture, the surface. `depth_to_space` converts the network's output
+to pixels. Colours are relative to the background, so that empty space is 0.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from bench.types import check_shape
 from methods.kernels.dispatch import implementation
 
 TAPS = 9
-"""Low-resolution samples that a pixel's base is made of."""
+"""Low-resolution samples that are interpolated to a pixel's base colour."""
 
 Pair = tuple[Tensor, Tensor]
 
@@ -31,8 +31,8 @@ class Layout:
         channels: K.
         frames: L.
         scale: s.
-        history: the preceding picture has columns.
-        surface: the surface of each pixel has columns.
+        history: whether there are columns for the preceding picture.
+        surface: whether there are columns for the surface of each pixel.
     """
 
     channels: int
@@ -43,7 +43,7 @@ class Layout:
 
     @cached_property
     def groups(self) -> list[tuple[str, int, int]]:
-        """Name, slots, features a slot: colour, opacity or validity, the rest."""
+        """(name, slots, features per slot); features are colour, opacity or validity, the rest."""
         cell, features = self.scale**2, self.channels + 1
         return [
             ("present", 1, features),
@@ -69,20 +69,20 @@ class Layout:
 
 @dataclass(frozen=True)
 class CellInputs:
-    """All that is known of some cells.
+    """The inputs of N cells.
 
     Attributes:
-        values: [h, w, K] features of the present low-resolution frame.
+        values: [h, w, K] features of the current low-resolution frame.
         alpha: [h, w] opacity.
-        background: [K] that features are composited on.
-        cells: [N] int64 low-resolution pixels, counted row by row, 0 to h w - 1.
-        preceding: newest first, no more than `Layout.frames`: features [P, K] of points and the
-            index [h s, w s] int32 of the one that each pixel shows, -1 for none; columns of missing
-            frames are 0.
-        history: preceding picture [N, s^2, 3] in the cells, and where it is valid, [N, s^2] in
-            {0, 1}; None: columns of 0.
-        surface: features and, last, opacity [P, K + 1], and the index [N, s^2] int32 of the one
-            that each pixel shows, -1 for none; None: columns of 0.
+        background: [K] on which features are composited.
+        cells: [N] int64 low-resolution pixels, numbered row by row, 0 to h w - 1.
+        preceding: newest first, at most `Layout.frames`: features [P, K] of points, and for each
+            pixel the index [h s, w s] int32 of the point that it shows, -1 for none. Columns of
+            missing frames are 0.
+        history: preceding picture [N, s^2, 3] in the cells, and its validity [N, s^2] in {0, 1};
+            None: columns of 0.
+        surface: features and, last, opacity [P, K + 1] of points, and for each pixel the index
+            [N, s^2] int32 of the point that it shows, -1 for none; None: columns of 0.
     """
 
     values: Tensor
@@ -94,7 +94,7 @@ class CellInputs:
     surface: Pair | None = None
 
     def check(self, layout: Layout) -> None:
-        """Raise `ValueError` unless all shapes are those of `layout`."""
+        """Raise `ValueError` unless all shapes match `layout`."""
         height, width, count, pixels = *self.values.shape[:2], len(self.cells), layout.scale**2
         history, surface = self.history, self.surface
         check_shape("values", self.values, None, None, layout.channels)
@@ -121,23 +121,23 @@ class CellInputs:
 def space_to_depth(
     inputs: CellInputs, layout: Layout, *, multiple: int = 1, backend: str = "auto"
 ) -> Pair:
-    """The base of some cells, which a network corrects, and their rows.
+    """The base colours of cells, which a network corrects, and the rows of the cells.
 
-    The base is the present RGB enlarged bilinearly, the border repeated. Colours of history and
+    The base is the current RGB upsampled bilinearly with a repeated border. Colours of history and
     surface are relative to the base.
 
     Differentiable in `values`, `alpha` and the features of `preceding` and `surface`, not in
     `history`.
 
     Args:
-        layout: of the rows.
-        multiple: rows of 0 follow up to a multiple, 1 or more, of this.
+        layout: the columns of the rows.
+        multiple: rows of 0 are appended up to a positive multiple of this.
 
     Returns:
         base [N, s^2, 3] and rows [N or more, layout.width].
 
     Raises:
-        ValueError: a shape is wrong, or an index names no point.
+        ValueError: a shape is wrong, or an index is out of range.
     """
     inputs.check(layout)
     values, count = inputs.values, len(inputs.cells)
@@ -161,14 +161,14 @@ def depth_to_space(
 ) -> Tensor:
     """Pixels [N, s^2, 3], relative to the background, of cells with `base` and `rows`.
 
-    base + correction + share * (preceding picture - base) + matrix [surface less base, opacity,
-    rest], the colours of the surface weighted by its opacity. Differentiable in all.
+    A pixel is base + correction + share * (preceding picture - base) + matrix [surface - base,
+    opacity, rest], with the colours of the surface weighted by its opacity. Differentiable in all.
 
     Args:
-        base: [N, s^2, 3] of `space_to_depth`.
-        rows: [R, layout.width] of `space_to_depth`, R at least N; the others are ignored.
-        output: [R, s^2 (3 + layout.history)] of each pixel, correction and logit of the share.
-        matrix: [R, 3 (K + 1)] that the pixels of a cell share; None without surface.
+        base: [N, s^2, 3] from `space_to_depth`.
+        rows: [R, layout.width] from `space_to_depth`, R >= N; surplus rows are ignored.
+        output: [R, s^2 (3 + layout.history)]: for each pixel, correction and logit of the share.
+        matrix: [R, 3 (K + 1)], shared by the pixels of a cell; None without surface.
 
     Raises:
         ValueError: a shape is wrong.

@@ -1,8 +1,7 @@
 """Cases of the rows and pixels of cells.
 
-Inputs of `space_to_depth` are few digits long, and so are the weights of its base where s is a
-power of 2: nothing is rounded there, in whatever order the gradients of shared samples are added
-up.
+Inputs of `space_to_depth` have few digits, and so have the weights of its base if s is a power of
+2. Then nothing is rounded, whatever the order in which gradients of shared samples are summed.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from methods.kernels.dispatch import served
 from methods.kernels.space_to_depth import CellInputs, Layout, Pair, depth_to_space, space_to_depth
 
 STEPS = 16
-"""Numbers are multiples of 1/16 from -1 to 1. With weights in multiples of 1/64 a product has 11
-bits, and a sum of 2^13 of them is exact."""
+"""Inputs are multiples of 1/16 from -1 to 1. With weights in multiples of 1/64, a product has 11
+bits, and a sum of 2^13 products is exact."""
 
 BASE = (
     "s a power of 2: short numbers, 0; else nine products, of weights that add up to 1 and numbers "
@@ -34,7 +33,7 @@ BASE_GRADIENT = (
 
 @dataclass(frozen=True)
 class Size:
-    """A picture of height x width cells, `share` of them drawn."""
+    """A picture of height x width cells, of which the share `share` is rendered."""
 
     height: int
     width: int
@@ -45,14 +44,14 @@ class Size:
 
     @property
     def cells(self) -> Tensor:
-        """Those that are drawn."""
+        """The rendered cells."""
         generator = torch.Generator().manual_seed(1)
         shown = torch.rand(self.height * self.width, generator=generator) < self.share
         return shown.nonzero().squeeze(1)
 
     @property
     def rows(self) -> int:
-        """Rows of cells, and of what fills up their number."""
+        """Number of rows, including the padding."""
         return self.multiple * -(-len(self.cells) // self.multiple)
 
 
@@ -112,7 +111,7 @@ def _short(generator: torch.Generator, *shape: int) -> Tensor:
 
 
 def _inputs(size: Size, device: str) -> tuple[CellInputs, list[Tensor]]:
-    """Inputs of `space_to_depth`, and those of them that it is differentiable in."""
+    """Inputs of `space_to_depth`, and the list of those in which it is differentiable."""
     layout, generator = size.layout, torch.Generator().manual_seed(2)
     cells, pixels = size.cells, layout.scale**2
 

@@ -1,7 +1,7 @@
-"""Rows and pixels of cells with numba: a cell at a time, one pass over its inputs.
+"""Rows and pixels of cells with numba: one cell at a time, one pass over its inputs.
 
-Gradients of what several cells share (samples, points) are added up by a single thread: the same
-sums every time. It takes as long to read what is added as to add it.
+Gradients of data shared by cells (samples, points) are summed by a single thread, which makes them
+repeatable. More threads would gain little: reading the summands takes as long as adding them.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ class _DepthToSpace(torch.autograd.Function):
 
 
 def _columns(layout: Layout) -> tuple[int, int, int]:
-    """K, and where history and surface begin; -1: nowhere."""
+    """K, and the first columns of history and surface, -1 if absent."""
     begins = layout.begins
     return layout.channels, begins.get("history", -1), begins.get("surface", -1)
 
@@ -157,7 +157,7 @@ def _check(wrong: int, values: Tensor) -> None:
 
 @njit(cache=True)
 def _put(row, column, values, background, opacity):
-    """Features less their background from `column` on, `opacity` behind the colours."""
+    """Write features minus background from `column` on, with `opacity` after the colours."""
     for c in range(3):
         row[column + c] = values[c] - background[c]
     row[column + 3] = opacity
@@ -167,7 +167,7 @@ def _put(row, column, values, background, opacity):
 
 @njit(cache=True)
 def _nearest(row, column, tap, height, width):
-    """Which of all samples is tap 0 to 8 of the 3 x 3 around (row, column), the border repeated."""
+    """Index of the sample at tap 0 to 8 of the 3 x 3 around (row, column), border repeated."""
     y = min(max(row + tap // 3 - 1, 0), height - 1)
     x = min(max(column + tap % 3 - 1, 0), width - 1)
     return y * width + x

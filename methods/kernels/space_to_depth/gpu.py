@@ -1,13 +1,13 @@
-"""Rows and pixels of cells with Triton: a lane takes a number that is written.
+"""Rows and pixels of cells with Triton: one lane per number that is written.
 
-Every number is written once, in the order of memory; what it is made of is read by the lanes beside
-it, too, and comes from the cache. Of memory, rows are 4 bytes a column to write, and what is seen
-to read; pixels are 12 bytes to write, and rows, output, matrix and base to read.
+Every number is written once, in memory order; its inputs are also read by neighbouring lanes and
+come from the cache. Memory traffic: rows write 4 bytes per column and read the visible inputs;
+pixels write 12 bytes and read rows, output, matrix and base.
 
-What several cells share, samples and points, gets its gradient by atomics, in no order that
-repeats; where torch is told to use deterministic algorithms, it differentiates the reference. All
-other gradients are written once, too. Whether an index names no point is asked once, after all is
-launched: here the host waits for that alone.
+Samples and points that several cells share get their gradients by atomics, whose order is not
+repeatable. If torch is set to use deterministic algorithms, the reference is differentiated
+instead. All other gradients are written once. Out-of-range indices are checked once, after all
+launches; this is the only wait of the host.
 """
 
 from __future__ import annotations
@@ -25,8 +25,7 @@ from methods.kernels.gpu import check_types, launch
 from methods.kernels.space_to_depth import CellInputs, Layout, Pair, reference
 
 BLOCK = 512
-"""Numbers of a program, 4 a lane: a number is made of several loads, which hide how long one
-takes."""
+"""Numbers per program, 4 per lane; each takes several loads, which hide their latency."""
 
 TAPS = tl.constexpr(interface.TAPS)
 
@@ -48,13 +47,13 @@ def depth_to_space(
 
 
 def _learned(inputs: CellInputs) -> list[Tensor]:
-    """What the rows are differentiable in."""
+    """The inputs in which the rows are differentiable."""
     pairs = [*inputs.preceding, *([inputs.surface] if inputs.surface else [])]
     return [inputs.values, inputs.alpha, *(points for points, _ in pairs)]
 
 
 def _with(inputs: CellInputs, values: Tensor, alpha: Tensor, *points: Tensor) -> CellInputs:
-    """`inputs` with others in place of `_learned(inputs)`."""
+    """`inputs` with the given tensors in place of `_learned(inputs)`."""
     pairs = list(zip(points, (index for _, index in inputs.preceding), strict=False))
     surface = (points[-1], inputs.surface[1]) if inputs.surface else None
     return replace(inputs, values=values, alpha=alpha, preceding=pairs, surface=surface)
@@ -147,7 +146,7 @@ def _add(
     grad_rows: Tensor,
     grads: Sequence[Tensor | None],
 ) -> None:
-    """Add to `grads` of `_learned(inputs)`, or leave out those that are None."""
+    """Add to the `grads` of `_learned(inputs)`, skipping those that are None."""
     height, width, channels = inputs.values.shape
     cells, pixels, begins = inputs.cells.contiguous(), layout.scale**2, layout.begins
     number, each = len(cells), pixels * (channels + 1)
@@ -185,7 +184,7 @@ def _drawn(
 def _undrawn(
     layout: Layout, grad: Tensor, rows: Tensor, output: Tensor, matrix: Tensor | None = None
 ) -> list[Tensor]:
-    """Gradients of all that `_drawn` is given but the base, whose is `grad` itself."""
+    """Gradients of all inputs of `_drawn` except the base, whose gradient is `grad` itself."""
     grads = [torch.zeros_like(x) for x in (rows, output, matrix) if x is not None]
     at = {name.upper(): begin for name, begin in _places(layout).items()}
     number, pixels = grad.shape[:2]
@@ -201,7 +200,7 @@ def _undrawn(
 
 
 def _places(layout: Layout) -> dict[str, int]:
-    """Where history and surface begin, -1 for nowhere."""
+    """First columns of history and surface, -1 if absent."""
     return {name: layout.begins.get(name, -1) for name in ("history", "surface")}
 
 
@@ -219,14 +218,14 @@ def _launch(
 
 @triton.jit
 def _block(total, BLOCK: tl.constexpr):
-    """The numbers that a program writes, and which of them there are."""
+    """The numbers that a program writes, and the mask of those that exist."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     return i, i < total
 
 
 @triton.jit
 def _near(cell, tap, height, width):
-    """Which of all samples is tap 0 to 8 of the 3 x 3 around a cell, the border repeated."""
+    """Index of the sample at tap 0 to 8 of the 3 x 3 around a cell, border repeated."""
     y = tl.minimum(tl.maximum(cell // width + (tap // 3 - 1), 0), height - 1)
     x = tl.minimum(tl.maximum(cell % width + (tap % 3 - 1), 0), width - 1)
     return (y * width + x).to(tl.int64)
@@ -260,13 +259,13 @@ def _base(
 
 @triton.jit
 def _source(f, FEATURES: tl.constexpr):
-    """The feature of a column: colours, opacity, which is last in memory, the rest."""
+    """Memory index of a column's feature; columns are colours, opacity (last in memory), rest."""
     return tl.where(f < 3, f, tl.where(f == 3, FEATURES - 1, f - 1))
 
 
 @triton.jit
 def _less_background(features, background, source, seen, FEATURES: tl.constexpr):
-    """Numbers of `features`, pointers to rows, less their background; 0 for an opacity."""
+    """Load features minus background; `features` are pointers to rows, opacity has background 0."""
     feature = seen & (source < FEATURES - 1)
     shown = tl.load(features + source, mask=feature, other=0.0)
     return shown - tl.load(background + source, mask=feature, other=0.0)
@@ -274,7 +273,7 @@ def _less_background(features, background, source, seen, FEATURES: tl.constexpr)
 
 @triton.jit
 def _seen(point, points, f, wrong):
-    """Where there is a point; counts the pixels that name none of the `points`."""
+    """Whether a pixel shows a point; counts indices that are out of range of `points`."""
     unknown = (f == 0) & ((point < -1) | (point >= points))
     found = tl.sum(unknown.to(tl.int32), 0)
     if found > 0:
@@ -306,7 +305,7 @@ def _present(
 
 @triton.jit
 def _in_cell(index, cells, width, n, sub, inside, SCALE: tl.constexpr):
-    """The points that the pixels `sub` of cells show."""
+    """The points shown by the pixels `sub` of cells."""
     cell = tl.load(cells + n, mask=inside, other=0).to(tl.int32)
     row, column = cell // width * SCALE + sub // SCALE, cell % width * SCALE + sub % SCALE
     shown = index + row * (width * SCALE) + column
@@ -410,7 +409,7 @@ def _pixels(
     FEATURES: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """`HISTORY` and `SURFACE` are where their columns begin, -1 for nowhere."""
+    """`HISTORY` and `SURFACE` are first columns, -1 if absent."""
     i, inside = _block(total, BLOCK)
     pixel, c = i // 3, i % 3
     n, sub = pixel // (SCALE * SCALE), pixel % (SCALE * SCALE)
@@ -450,7 +449,7 @@ def _base_back(
     FEATURES: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """`whole`: also what reaches the base through the columns that are relative to it."""
+    """`whole`: also includes gradients through the columns that are relative to the base."""
     i, inside = _block(total, BLOCK)
     pixel, c = i // 3, i % 3
     n, sub = pixel // (SCALE * SCALE), pixel % (SCALE * SCALE)
@@ -573,7 +572,7 @@ def _output_back(
     FEATURES: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Of the output and, of as many columns, of the history."""
+    """Gradients of the output and of the history's columns, which are equally many."""
     i, inside = _block(total, BLOCK)
     OUTPUTS: tl.constexpr = 3 + (HISTORY >= 0)
     pixel, o = i // OUTPUTS, i % OUTPUTS
@@ -609,7 +608,7 @@ def _read_back(
     FEATURES: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Of the columns of the surface; that of an opacity goes through the colours, too."""
+    """Gradients of the surface's columns; that of the opacity includes its weight on colours."""
     i, inside = _block(total, BLOCK)
     pixel, f = i // FEATURES, i % FEATURES
     n, sub = pixel // (SCALE * SCALE), pixel % (SCALE * SCALE)

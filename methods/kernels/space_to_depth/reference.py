@@ -62,8 +62,10 @@ def depth_to_space(
 
 
 def _enlarged(colours: Tensor, cells: Tensor, taps: Tensor) -> Tensor:
-    """`colours` [h, w, 3] at the pixels of `cells`, each the mean, with weights `taps` [s^2, 9], of
-    the 3 x 3 samples around its cell: [N, s^2, 3]."""
+    """Upsample `colours` [h, w, 3] to the pixels of `cells`: [N, s^2, 3].
+
+    A pixel is the mean of the 3 x 3 samples around its cell with weights `taps` [s^2, 9].
+    """
     height, width, _ = colours.shape
     around = torch.arange(-1, 2, device=cells.device)
     row = (cells // width)[:, None] + around.repeat_interleave(3)
@@ -74,7 +76,7 @@ def _enlarged(colours: Tensor, cells: Tensor, taps: Tensor) -> Tensor:
 
 
 def _in_cells(image: Tensor, cells: Tensor, scale: int) -> Tensor:
-    """Of `image` [h s, w s] the pixels of `cells`, [N, s^2]."""
+    """The pixels of `image` [h s, w s] in `cells`, [N, s^2]."""
     height, width = (side // scale for side in image.shape)
     blocks = image.view(height, scale, width, scale).transpose(1, 2)
     return blocks[cells // width, cells % width].flatten(1)
@@ -82,7 +84,7 @@ def _in_cells(image: Tensor, cells: Tensor, scale: int) -> Tensor:
 
 def _shown(values: Tensor, index: Tensor) -> Tensor:
     """Rows of `values` at `index`, zeros where it is -1."""
-    # Of a GPU the host would have to wait for the number.
+    # Checked only on a CPU; for a GPU the host would have to wait.
     wrong = (index < -1) | (index >= len(values))
     if index.device.type == "cpu" and wrong.any():
         raise ValueError(
@@ -92,5 +94,5 @@ def _shown(values: Tensor, index: Tensor) -> Tensor:
 
 
 def _with_opacity(values: Tensor, opacity: Tensor) -> Tensor:
-    """`opacity` [N, 1] put behind the colours of `values` [N, K]."""
+    """Insert `opacity` [N, 1] after the colours of `values` [N, K]."""
     return torch.cat((values[:, :3], opacity, values[:, 3:]), dim=1)

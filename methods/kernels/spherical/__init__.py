@@ -1,4 +1,4 @@
-"""Real spherical harmonics of view directions, degrees 0 to 3, and colours made of them."""
+"""Real spherical harmonics of view directions, degrees 0 to 3, and colours made from them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from methods.kernels.dispatch import implementation
 
 CHANNELS = 16
 SIZES = (1, 4, 9, 16)
-"""Numbers of harmonics up to a degree."""
+"""Number of harmonics up to degree 0, 1, 2 and 3."""
 
 
 def spherical_harmonics(directions: Tensor, *, backend: str = "auto") -> Tensor:
@@ -23,17 +23,17 @@ def spherical_harmonics(directions: Tensor, *, backend: str = "auto") -> Tensor:
 
 
 def shade(coefficients: Tensor, directions: Tensor, *, backend: str = "auto") -> Tensor:
-    """Sums of harmonics [N, 3]: of each direction, weighted with its own coefficients.
+    """Sums of harmonics [N, 3], for each direction weighted with its own coefficients.
 
     Differentiable in the coefficients; in the directions with backend="reference" only.
 
     Args:
-        coefficients: [N, C, 3], of the first C harmonics in the order of `spherical_harmonics`;
+        coefficients: [N, C, 3] for the first C harmonics in the order of `spherical_harmonics`;
             C is 1, 4, 9 or 16, for degrees up to 0, 1, 2 or 3.
-        directions: [N, 3], unit vectors.
+        directions: [N, 3] unit vectors.
 
     Raises:
-        ValueError: a shape other than these; backends "cpu", "gpu": not float32.
+        ValueError: wrong shapes; backends "cpu", "gpu": not float32.
     """
     check_shape("coefficients", coefficients, len(directions), None, 3)
     check_shape("directions", directions, None, 3)

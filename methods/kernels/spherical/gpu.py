@@ -1,10 +1,10 @@
 """Spherical harmonics with Triton.
 
-Harmonics of a direction, 12 bytes, are 64 bytes; the gradients of the coefficients of a colour are
-12 C bytes, from 24. They are written as rows, in the order of memory: a lane computes all harmonics
-of its direction and keeps those of its columns, which costs less than to write in pieces. To shade,
-a lane takes a colour and reads its coefficients, 12 C bytes, one after the other: they come from
-the first-level cache, to which they were brought as a whole.
+The harmonics of a direction (12 bytes) take 64 bytes; the gradients of a colour's coefficients take
+12 C bytes, from 24. They are written as rows, in memory order: each lane computes all harmonics of
+its direction and keeps those of its columns, which is cheaper than scattered writes. To shade, a
+lane takes a colour and reads its 12 C bytes of coefficients one by one; they come from the L1
+cache, into which they were loaded as a whole.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from methods.kernels.gpu import check_types, launch, vector
 from methods.kernels.spherical import CHANNELS
 
 BLOCK = 1024
-"""Numbers that a program writes, 8 a lane."""
+"""Numbers that a program writes, 8 per lane."""
 
 LANES = 128
-"""Colours of a program, one a lane."""
+"""Colours per program, one per lane."""
 
 C00 = tl.constexpr(sqrt(1 / (4 * pi)))
 C1 = tl.constexpr(sqrt(3 / (4 * pi)))
@@ -122,7 +122,7 @@ def _harmonic(x, y, z, k: tl.constexpr):
 
 @triton.jit
 def _rows(x, y, z, column, SIZE: tl.constexpr):
-    """For each direction the harmonics that the columns want, of the first `SIZE`; else 0."""
+    """For each direction, the harmonic of each `column`; 0 from `SIZE` on."""
     rows = tl.zeros([x.shape[0], column.shape[0]], tl.float32)
     for k in tl.static_range(SIZE):
         rows = tl.where(column[None, :] == k, _harmonic(x, y, z, k)[:, None], rows)

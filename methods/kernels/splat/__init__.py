@@ -1,7 +1,7 @@
-"""Points into pixels, and what the points carry with them: the reprojection of earlier frames.
+"""Splats points into pixels and gathers their features: the reprojection of earlier frames.
 
-`splat` says which point each pixel shows, `gather` brings the features of those points. Pixel
-(i, j) covers [i, i+1) x [j, j+1), so a point at (u, v) lands in (floor u, floor v) alone.
+`splat` finds which point each pixel shows; `gather` fetches the features of these points. Pixel
+(i, j) covers [i, i+1) x [j, j+1), so a point at (u, v) lands only in (floor u, floor v).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from bench.types import check_shape
 from methods.kernels.dispatch import implementation
 
 Rule = Literal["nearest", "last"]
-"""Which of the points in a pixel is shown."""
+"""Which of several points in a pixel is shown."""
 
 
 def splat(
@@ -27,23 +27,23 @@ def splat(
     rule: Rule = "nearest",
     backend: str = "auto",
 ) -> Tensor:
-    """Which of N points each pixel of a width x height picture shows: [height, width] int32.
+    """Find which of N points each pixel of a width x height picture shows: [height, width] int32.
 
-    An entry is the index of a point, -1 where none lands. A point takes part if it lies inside the
-    picture and its depth is finite and positive; one that is not finite takes no part. Not
-    differentiable: what the points carry is brought by `gather`.
+    An entry is the index of a point, -1 where none lands. Only points inside the picture with a
+    finite positive depth count; points that are not finite are ignored. Not differentiable; for
+    features use `gather`.
 
     Args:
         pixels: [N, 2] continuous coordinates (u, v), in pixels.
         depth: [N] z-depth.
         width, height: pixels of the picture, 1 or more.
-        rule: "nearest": the point of smallest depth, among equals that of smaller u, then of
-            smaller v, so that the order of the points decides only between exact duplicates (the
-            first). "last": the point of highest index, whatever its depth; SteerNeRF's release
-            lets points overwrite each other.
+        rule: "nearest": the point with the smallest depth, then the smallest u, then the smallest
+            v, so that the order of points matters only for exact duplicates (the first wins).
+            "last": the point with the highest index, whatever its depth, as in SteerNeRF's
+            release, where points overwrite each other.
 
     Raises:
-        ValueError: a shape, size or rule other than these; backend "cpu": not float32.
+        ValueError: wrong shape, size or rule; backend "cpu": not float32.
     """
     check_shape("pixels", pixels, None, 2)
     check_shape("depth", depth, len(pixels))
@@ -59,15 +59,15 @@ def splat(
 def gather(values: Tensor, index: Tensor, *, backend: str = "auto") -> Tensor:
     """Rows of `values` [N, C] at `index` [...] int32, zeros where it is -1: [..., C].
 
-    Differentiable in `values`; the gradient of a row is the sum over all places that show it.
+    Differentiable in `values`; the gradient of a row is the sum over all pixels that show it.
 
     Raises:
-        ValueError: `index` is not int32 or names no row; backend "cpu": `values` is not float32.
+        ValueError: `index` is not int32 or out of range; backend "cpu": `values` is not float32.
     """
     check_shape("values", values, None, None)
     if index.dtype != torch.int32:
         raise ValueError(f"index: expected int32, got {index.dtype}")
-    # Of a GPU the host would have to wait for the bounds.
+    # Checked only on a CPU; for a GPU the host would have to wait.
     if index.numel() and index.device.type == "cpu":
         least, most = (int(bound) for bound in index.aminmax())
         if least < -1 or most >= len(values):

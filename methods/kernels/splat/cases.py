@@ -1,6 +1,6 @@
 """Cases of the splatting: agreement of the backends, frames into themselves, borders, ties.
 
-Which point is shown is decided by comparisons alone: tolerance 0.
+Only comparisons decide which point is shown, so the tolerance is 0.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from methods.kernels.dispatch import served
 from methods.kernels.splat import Rule, gather, splat
 
 LOW, HIGH = 200, 800
-"""Side of the frame that is splatted and of the picture it is splatted to, in pixels."""
+"""Sides in pixels of the splatted frame and of the target picture."""
 
 FRAME = f"{LOW} x {LOW} into {HIGH} x {HIGH}"
 
 CHANNELS = 6
-"""Features of a point in SteerNeRF: a colour and three more."""
+"""Features of a point in SteerNeRF: a colour and three others."""
 
 WRONG = (math.nan, math.inf, -math.inf, 1e20, -1e20, 0.0, -0.0, 1e-20, -1e-20)
-"""Coordinates and depths outside every picture, or only just inside."""
+"""Coordinates and depths that are outside every picture, or barely inside."""
 
 WIDTH, HEIGHT = 7, 5
 
@@ -72,7 +72,7 @@ def _splats() -> list[Case]:
 
 
 def _gathers() -> list[Case]:
-    """No pixel, no channel, points at no, one and many pixels; a frame, timed."""
+    """No pixel; no channel; points shown by no, one and many pixels; a frame, timed."""
     kinds = [
         ("no point", _index(0, 20), 0, CHANNELS),
         ("no pixel", _index(10, 0), 10, CHANNELS),
@@ -104,8 +104,11 @@ def _gathers() -> list[Case]:
 
 
 def _known_pixels() -> list[Case]:
-    """Frames seen by their own camera, a turned and a rolled one, after a rigid motion; points at
-    borders, in ties, with extreme depths and coordinates."""
+    """Frames with known pixels, and points with extreme positions.
+
+    Frames are seen by their own camera, by a turned and a rolled one, and after a rigid motion.
+    Points lie at borders, in ties, or have extreme depths and coordinates.
+    """
     here = CAMERAS["looking at the cube"]
     turned, rolled = rotated(here, TURNED), rotated(here, ROLLED)
     derivation = "decided by comparisons, half a pixel from where they turn: 0 wrong"
@@ -159,7 +162,7 @@ def _points(
 
 
 def _seen_aside() -> tuple[Tensor, Tensor]:
-    """A frame seen from a little aside: its pixels scattered by half a pixel of the picture."""
+    """A frame seen from slightly beside: its pixels scatter by half a pixel of the picture."""
     generator = torch.Generator().manual_seed(0)
     pixels = HIGH / LOW * pixel_grid(LOW, LOW) + torch.tensor([5.0, -3.0])
     pixels += 0.5 * torch.randn(LOW**2, 2, generator=generator)
@@ -210,7 +213,7 @@ def rotated(camera: Camera, rotation: Tensor) -> Camera:
 
 
 def _frame(camera: Camera, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """The pixels of a frame of random depth, as points; their indices as a picture."""
+    """The pixels of a frame with random depth, as points, and their indices as a picture."""
     pixels = pixel_grid(camera.width, camera.height).to(dtype)
     depth = 10 ** torch.empty(len(pixels)).uniform_(
         -1, 3, generator=torch.Generator().manual_seed(0)
@@ -233,7 +236,7 @@ def _frame_error(
     device: str,
     precision: str,
 ) -> float:
-    """How many pixels show something else."""
+    """How many pixels show another point than expected."""
     points, own = _frame(source, DTYPES[precision])
     return _wrong(points, camera, expected(own), backend, device)
 
@@ -247,7 +250,7 @@ def _moved_frame_error(seed: int, backend: str, device: str, precision: str) -> 
 
 
 def _borders() -> tuple[Tensor, Tensor]:
-    """Around each border of the picture, the number before it, it, and the number after it."""
+    """Points on each border of the picture, and at the floats just before and after it."""
     edges = []
     for edge in (0.0, 1.0, WIDTH - 1.0, WIDTH, HEIGHT - 1.0, HEIGHT):
         at = torch.tensor(edge)
@@ -267,7 +270,7 @@ def _places() -> tuple[Tensor, Tensor]:
 
 
 def _ties() -> tuple[Tensor, Tensor]:
-    """All of them in one pixel or the next."""
+    """Tied points, all in one pixel or the next."""
     u, v = torch.tensor([2.25, 2.5, 3.0]), torch.tensor([1.0, 1.5])
     corners = torch.cartesian_prod(u, v, torch.tensor([1.0, 1.0 + 2**-23]))
     points = torch.cat((corners, corners.flip(0), corners))
@@ -275,7 +278,7 @@ def _ties() -> tuple[Tensor, Tensor]:
 
 
 def _points_error(make: Points, rule: str, backend: str, device: str, precision: str) -> float:
-    """How many pixels show another point than in a loop over all points."""
+    """How many pixels show another point than a plain loop over all points."""
     pixels, depth = (x.to(DTYPES[precision]) for x in make())
     shown: dict[tuple[int, int], int] = {}
     for point, ((u, v), z) in enumerate(zip(pixels.tolist(), depth.tolist(), strict=True)):

@@ -1,6 +1,6 @@
-"""Splatting with numba: a thread owns a band of rows and walks all points in order.
+"""Splatting with numba: each thread owns a band of rows and goes through all points in order.
 
-No two threads write to the same pixel, and the picture is the same with any number of them.
+No two threads write to the same pixel, and the result does not depend on their number.
 """
 
 from __future__ import annotations
@@ -77,19 +77,19 @@ def _splat(pixels, depth, last, index, bands):
         index[top:bottom] = -1
         for point in range(len(depth)):
             u, v, z = pixels[point, 0], pixels[point, 1], depth[point]
-            # Compared as floats, where every comparison with nan is false: as integers, what is
-            # huge or not finite has no defined value.
+            # Compared as floats, where comparisons with NaN are false; converting huge or
+            # non-finite values to integers is undefined.
             if top <= v < bottom and 0 <= u < width and 0 < z < np.inf:
-                row, column = int(v), int(u)  # not negative: cut off is floor
+                row, column = int(v), int(u)  # not negative: truncation is floor
                 shown = index[row, column]
-                # The index is the z-buffer too: the depth of what a pixel shows is looked up.
+                # The index serves as z-buffer: the depth of the shown point is looked up.
                 if shown < 0 or last or _nearer(pixels, depth, point, shown):
                     index[row, column] = i32(point)
 
 
 @njit(cache=True, parallel=True)
 def _gather(values, index, rows):
-    """Fill in the rows that show a point; the others are zero already, most of them."""
+    """Fill in the rows of pixels that show a point; the others (most) are zero already."""
     for i in prange(len(index)):
         if index[i] >= 0:
             for channel in range(values.shape[1]):
@@ -98,7 +98,7 @@ def _gather(values, index, rows):
 
 @njit(cache=True)
 def _scatter(grad, index, grad_values):
-    """Adjoint of `_gather`. One thread: it takes as long to read the index as to add."""
+    """Adjoint of `_gather`. Single-threaded: reading the index takes as long as adding."""
     for i in range(len(index)):
         if index[i] >= 0:
             for channel in range(grad.shape[1]):

@@ -1,7 +1,7 @@
-"""Experiments on bringing a preceding frame into the present view.
+"""Experiments on reprojecting a preceding frame into the current view.
 
-The cameras look along z at a wall that stands across, so that what a pixel of one sees of the other
-is known in closed form.
+The cameras look along z at a perpendicular wall, so that the mapping between their pixels is known
+in closed form.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from methods.kernels.splat import gather, splat
 from methods.kernels.warp import warp
 
 WALL = 1.0
-"""z-depth of the wall, scene units; the preceding camera's where the two differ."""
+"""z-depth of the wall in scene units, for the preceding camera if the two differ."""
 
 BESIDE = 0.02
-"""How far beside the present camera the preceding one stands."""
+"""Sideways offset of the preceding camera from the current one, scene units."""
 
 NEARER = 1 / 16
-"""How much nearer to the wall the present camera stands: a point moves by up to 1/30 of the
-picture, and so comes to lie anywhere in a pixel."""
+"""How much nearer to the wall the current camera is, scene units. Points move by up to 1/30 of the
+picture, so that they may land anywhere in a pixel."""
 
 
 Brought = tuple[Callable[[], Tensor], Tensor]
-"""What computes the colours of some pixels of the present view, and which these are."""
+"""A function that computes colours of some pixels of the current view, and which pixels."""
 
 
 def experiments() -> list[Experiment]:
-    """Error of the depth; size of the pixels that points are rounded to."""
+    """Experiments on the error of the depth, and on the pixel size that points are rounded to."""
     return [
         _depth_error(),
         _pixel_size("the nearest point of each pixel (splat)", _splatted),
@@ -44,7 +44,7 @@ def experiments() -> list[Experiment]:
 
 
 def _depth_error() -> Experiment:
-    """A picture whose colours are its own coordinates, looked up with a wrong depth."""
+    """Look up a picture whose colours are its own coordinates, with a wrong depth."""
     side = 256
     present, preceding = _camera(side), _camera(side, x=BESIDE)
     coordinates = pixel_grid(side, side)
@@ -65,7 +65,7 @@ def _depth_error() -> Experiment:
 
 
 def _pixel_size(name: str, bring: Callable[[Tensor, Camera, Camera], Brought]) -> Experiment:
-    """A smooth picture, brought into a view from nearer by."""
+    """Reproject a smooth picture into a view from nearer."""
     trials = []
     for side in (32, 64, 128, 256, 512):
         preceding, present = _camera(side), _camera(side, z=NEARER)
@@ -77,7 +77,7 @@ def _pixel_size(name: str, bring: Callable[[Tensor, Camera, Camera], Brought]) -
 
 
 def _splatted(picture: Tensor, preceding: Camera, present: Camera) -> Brought:
-    """The pixels that a point lands in."""
+    """Splat; yields the pixels in which a point lands."""
     side = preceding.width
     points = unproject(preceding, pixel_grid(side, side), torch.full((side**2,), WALL))
     pixels, depth = project(present, points)
@@ -90,7 +90,7 @@ def _splatted(picture: Tensor, preceding: Camera, present: Camera) -> Brought:
 
 
 def _warped(picture: Tensor, preceding: Camera, present: Camera) -> Brought:
-    """All pixels but those of the rim."""
+    """Warp backward; yields all pixels except those at the rim."""
     side = preceding.width
     rim = torch.zeros(side, side, dtype=torch.bool)
     rim[1:-1, 1:-1] = True
@@ -106,7 +106,7 @@ def _camera(side: int, x: float = 0.0, z: float = 0.0) -> Camera:
 
 
 def _on_wall(camera: Camera, depth: float) -> Tensor:
-    """x and y [H * W, 2] float64 of what the pixel centres see at `depth`."""
+    """x and y [H * W, 2] float64 of the points that pixel centres see at `depth`."""
     pixels = pixel_grid(camera.width, camera.height).double()
     middle = pixels.new_tensor((camera.cx, camera.cy))
     return (pixels - middle) / camera.fx * depth + camera.c2w[:2, 3].double()

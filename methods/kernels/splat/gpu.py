@@ -1,8 +1,8 @@
-"""Splatting with Triton: a lane a point, which competes for its pixel with atomics.
+"""Splatting with Triton: one lane per point; points compete for their pixel with atomics.
 
-One key after the other: the least depth of every pixel, among the points that have it the least u,
-then v, then the first. What is the least does not depend on the order of the atomics, so the
-picture is the same every time.
+Keys are processed one by one: the smallest depth of every pixel, then among points with that depth
+the smallest u, then v, then index. A minimum does not depend on the order of the atomics, so that
+the result is repeatable.
 """
 
 from __future__ import annotations
@@ -63,17 +63,17 @@ class _Gather(torch.autograd.Function):
 
 
 def _move(kernel: triton.JITFunction, values: Tensor, index: Tensor, rows: Tensor) -> None:
-    """Between `values` [N, C] and the `rows` [P, C] that show those at `index` [P]."""
+    """Run `kernel`, which moves data between `values` [N, C] and `rows` [P, C] = values[index]."""
     grid = (triton.cdiv(rows.numel(), BLOCK),)
     launch(kernel, grid, values, index, rows, rows.numel(), rows.shape[1], BLOCK=BLOCK)
 
 
 @triton.jit
 def _pixel(pixels, depth, points, width, height, i):
-    """u, v and depth of points, the pixel they lie in, and whether they take part.
+    """u, v and depth of points, their pixel, and whether they count.
 
-    Compared as floats, where every comparison with nan is false: as integers, what is huge or not
-    finite has no defined value. A zero without sign is added: -0 and 0 are the same place.
+    Compared as floats, where comparisons with NaN are false; converting huge or non-finite values
+    to integers is undefined. Adding 0 turns -0 into 0, so that both are the same position.
     """
     inside = i < points
     u = tl.load(pixels + 2 * i, mask=inside, other=-1.0) + 0.0
@@ -89,10 +89,10 @@ def _pixel(pixels, depth, points, width, height, i):
 def _compete(
     pixels, depth, points, width, height, size, least, KEY: tl.constexpr, BLOCK: tl.constexpr
 ):
-    """Lower `least` [4, H, W], of depth, u, v or index, by `KEY`, for points that are the least by
-    all keys before; `size` is H W.
+    """Update the minimum of `KEY` (depth, u, v or index) in `least` [4, H, W]; `size` is H W.
 
-    Floats that are not negative are in the order of their bits as integers.
+    Only points that have the minimum of all previous keys take part. Bits of non-negative floats
+    are ordered like integers.
     """
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     u, v, z, pixel, shown = _pixel(pixels, depth, points, width, height, i)

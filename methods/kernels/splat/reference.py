@@ -1,4 +1,4 @@
-"""Splatting in plain torch: among the points of a pixel, the least of one key after another."""
+"""Splatting in plain torch: among the points of a pixel, the minimum of one key after another."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from methods.kernels.splat import Rule
 def splat(pixels: Tensor, depth: Tensor, width: int, height: int, rule: Rule) -> Tensor:
     """See `methods.kernels.splat.splat`."""
     u, v = pixels.unbind(dim=1)
-    # Compared as floats, where every comparison with nan is false: as integers, what is huge or
-    # not finite has no defined value.
+    # Compared as floats, where comparisons with NaN are false; converting huge or non-finite
+    # values to integers is undefined.
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     taken = inside & (depth > 0) & (depth < torch.inf)  # [N]
-    # No list of them, for which a GPU would be waited for: the others fall into a bin at the end.
+    # No indices of valid points, which would wait for a GPU: other points go to an extra bin.
     bin_ = height * width
     row, column = (torch.where(taken, x, 0).long() for x in (v, u))  # not negative: this is floor
     pixel = torch.where(taken, row * width + column, bin_)
@@ -35,5 +35,5 @@ def splat(pixels: Tensor, depth: Tensor, width: int, height: int, rule: Rule) ->
 
 def gather(values: Tensor, index: Tensor) -> Tensor:
     """See `methods.kernels.splat.gather`."""
-    # -1 is the last row.
+    # Index -1 is the appended row of zeros.
     return torch.cat((values, values.new_zeros(1, values.shape[1])))[index]

@@ -16,7 +16,7 @@ SIZES = ((40, 33), (1, 1), (3, 20), (400, 400))
 
 
 def cases() -> list[Case]:
-    """A pixel, pictures smaller and larger than the window; noise, a patch of it, equal, black."""
+    """Sizes from one pixel to larger than the window; noise, a noisy patch, equal, black."""
     forward = Agreement(
         "ssim",
         served("ssim"),

@@ -1,7 +1,7 @@
-"""SSIM with numba: row by row, the window first down and then across, derivatives on the way.
+"""SSIM with numba: row by row, window first vertical then horizontal, with derivatives.
 
-A row of pixels is a row of 3 W numbers: the neighbours of a channel are three numbers apart, and
-every loop runs over consecutive ones. Windows that see no difference are left out.
+A row of pixels is a row of 3 W numbers: neighbours in a channel are three numbers apart, and every
+loop runs over consecutive numbers. Windows in which the pictures are equal are skipped.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def _add_product(out, weight, x, y):
 
 @njit(cache=True)
 def _across(out, padded):
-    """The window along a row that has `MARGIN` zeros on both sides."""
+    """Apply the window along a row with `MARGIN` zeros on both sides."""
     out[:] = f32(0)
     for k in range(len(WEIGHTS)):
         _add(out, WEIGHTS[k], padded[3 * k : 3 * k + len(out)])
@@ -73,7 +73,7 @@ def _across(out, padded):
 
 @njit(cache=True, parallel=True)
 def _different(picture, target, spans):
-    """The numbers [low, high) of each row between which the pictures differ; 0, 0 if nowhere."""
+    """The range [low, high) of each row in which the pictures differ; 0, 0 if nowhere."""
     height, size = picture.shape
     for row in prange(height):
         low, high = 0, size
@@ -86,7 +86,7 @@ def _different(picture, target, spans):
 
 @njit(cache=True)
 def _reached(spans, row, size):
-    """What a window on `row` can see of `spans`, a window's reach further out: [low, high)."""
+    """The range [low, high) of window centres on `row` whose window may see any of `spans`."""
     low, high = size, 0
     for other in range(max(row - REACH, 0), min(row + REACH + 1, len(spans))):
         if spans[other, 0] < spans[other, 1]:
@@ -96,10 +96,10 @@ def _reached(spans, row, size):
 
 @njit(cache=True, parallel=True)
 def _compare(picture, target, spans, slopes, sums, seen):
-    """Sums of the similarity of each row; its slopes by the mean of x, of x x and of x y.
+    """Sums of the similarity of each row; its derivatives by the mean of x, of x x and of x y.
 
-    Only what a difference can be `seen` from is computed. A window in which both pictures are equal
-    has a similarity of 1, and no gradient: it cannot grow.
+    Only windows from which a difference can be `seen` are computed. A window in which both pictures
+    are equal has the similarity 1 and no gradient, because that is the maximum.
     """
     height, size = picture.shape
     for row in prange(height):
@@ -108,7 +108,7 @@ def _compare(picture, target, spans, slopes, sums, seen):
         sums[row] = size - (high - low)
         if low == high:
             continue
-        left, right = max(low - MARGIN, 0), min(high + MARGIN, size)  # what its windows cover
+        left, right = max(low - MARGIN, 0), min(high + MARGIN, size)  # covered by the windows
         padded = np.zeros((5, high - low + 2 * MARGIN), np.float32)
         start = left - (low - MARGIN)
         down = padded[:, start : start + right - left]
@@ -147,7 +147,7 @@ def _slopes(means, by_mean, by_square, by_product):
 
 @njit(cache=True, parallel=True)
 def _spread(picture, target, slopes, seen, grads):
-    """The gradient of the sum: each slope reaches all pixels under its window."""
+    """The gradient of the sum: each derivative is spread over all pixels under its window."""
     height, size = picture.shape
     for row in prange(height):
         low, high = _reached(seen, row, size)

@@ -1,7 +1,7 @@
-"""SSIM with Triton: a lane a number, the window first down and then across.
+"""SSIM with Triton: one lane per number, window first vertical then horizontal.
 
-Five maps are written and read between the two, 20 bytes a number; neighbours read the same rows
-from the cache. Sums of the similarity are added up in parts, always the same ones: it repeats.
+Between the two passes, five maps are written and read, 20 bytes per number; neighbours share rows
+through the cache. The similarity is summed in fixed parts, so that results are repeatable.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from methods.kernels.dispatch import interpreted
 from methods.kernels.gpu import check_types, launch
 
 BLOCK = 1 << 16 if interpreted() else 512
-"""Numbers of a program, 4 a lane. The interpreter takes as long for many as for few."""
+"""Numbers per program, 4 per lane. The interpreter takes as long for many as for few."""
 
 WINDOW = tl.constexpr(interface.WINDOW)
 REACH, TAPS = tl.constexpr(interface.REACH), tl.constexpr(len(interface.WINDOW))
@@ -52,8 +52,10 @@ class _Ssim(torch.autograd.Function):
 
 
 def _launch(kernel: triton.JITFunction, *given: Tensor) -> None:
-    """Run `kernel`, a lane for each number of a picture, one of which is the first map in `given`;
-    a row is 3 W numbers."""
+    """Run `kernel` with one lane per number of a picture; a row is 3 W numbers.
+
+    The size is that of a map of the first tensor in `given`.
+    """
     height, width = given[0].shape[-3:-1]
     total = 3 * height * width
     launch(kernel, (triton.cdiv(total, BLOCK),), *given, total, 3 * width, BLOCK=BLOCK)
@@ -61,21 +63,21 @@ def _launch(kernel: triton.JITFunction, *given: Tensor) -> None:
 
 @triton.jit
 def _place(total, columns, BLOCK: tl.constexpr):
-    """Numbers of a program, the columns that they are in, and which of them there are."""
+    """The numbers of a program, their columns, and the mask of those that exist."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     return i, i % columns, i < total
 
 
 @triton.jit
 def _tap(numbers, i, step, first, end, inside):
-    """The numbers `step` further than `i`, 0 before the `first` and from the `end` on."""
+    """The numbers at `i` + `step`; 0 before `first` and from `end` on."""
     there = inside & (i + step >= first) & (i + step < end)
     return tl.load(numbers + i + step, mask=there, other=0.0)
 
 
 @triton.jit
 def _across(numbers, i, column, columns, inside):
-    """The window along a row."""
+    """Apply the window along a row."""
     blurred, first = tl.zeros(i.shape, tl.float32), i - column
     for tap in tl.static_range(TAPS):
         near = _tap(numbers, i, 3 * (tap - REACH), first, first + columns, inside)
@@ -85,7 +87,7 @@ def _across(numbers, i, column, columns, inside):
 
 @triton.jit
 def _pair_down(picture, target, maps, total, columns, BLOCK: tl.constexpr):
-    """The window along columns: x, y, x x, y y, x y."""
+    """Apply the window along columns to x, y, x x, y y and x y."""
     i, _, inside = _place(total, columns, BLOCK)
     mean_x = tl.zeros([BLOCK], tl.float32)
     mean_y, xx, yy, xy = mean_x, mean_x, mean_x, mean_x
@@ -108,8 +110,10 @@ def _pair_down(picture, target, maps, total, columns, BLOCK: tl.constexpr):
 
 @triton.jit
 def _compare(maps, slopes, sums, total, columns, BLOCK: tl.constexpr):
-    """The window along rows; the similarity, added up, and its slopes by the mean of x, of x x and
-    of x y."""
+    """Apply the window along rows; sum the similarity, and write its derivatives.
+
+    These are by the mean of x, of x x and of x y.
+    """
     i, column, inside = _place(total, columns, BLOCK)
     x = _across(maps, i, column, columns, inside)
     y = _across(maps + total, i, column, columns, inside)
@@ -129,7 +133,7 @@ def _compare(maps, slopes, sums, total, columns, BLOCK: tl.constexpr):
 
 @triton.jit
 def _slopes_down(slopes, maps, total, columns, BLOCK: tl.constexpr):
-    """The window along columns, of each slope."""
+    """Apply the window along columns to each derivative."""
     i, _, inside = _place(total, columns, BLOCK)
     for k in tl.static_range(3):
         blurred = tl.zeros([BLOCK], tl.float32)
@@ -141,7 +145,7 @@ def _slopes_down(slopes, maps, total, columns, BLOCK: tl.constexpr):
 
 @triton.jit
 def _spread(picture, target, maps, grads, total, columns, BLOCK: tl.constexpr):
-    """The gradient of the sum: each slope reaches all pixels under its window."""
+    """The gradient of the sum: each derivative is spread over all pixels under its window."""
     i, column, inside = _place(total, columns, BLOCK)
     by_mean = _across(maps, i, column, columns, inside)
     by_square = _across(maps + total, i, column, columns, inside)

@@ -22,7 +22,7 @@ def ssim(picture: Tensor, target: Tensor) -> Tensor:
 
 
 def _blur(maps: Tensor) -> Tensor:
-    """Each of [C, H, W] under the window, rows and columns in turn."""
+    """Apply the window to each of [C, H, W], along rows and then along columns."""
     window = torch.tensor(WINDOW, dtype=maps.dtype).to(maps.device, non_blocking=True)
     blurred = functional.conv2d(maps[:, None], window.view(1, 1, 1, -1), padding=(0, REACH))
     return functional.conv2d(blurred, window.view(1, 1, -1, 1), padding=(REACH, 0))[:, 0]

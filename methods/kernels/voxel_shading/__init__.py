@@ -1,4 +1,4 @@
-"""Colours of voxels of one set of spherical harmonics each, to learn from.
+"""Differentiable colours of voxels, each with one set of spherical harmonics, for training.
 
 A voxel shows sigmoid(sum_k c_k Y_k(d)) in direction d (Yu et al. 2021, Eq. 3).
 """
@@ -28,11 +28,11 @@ def shade_voxels(
     Args:
         harmonics: [V, C, 3] coefficients of the first C harmonics in the order of `spherical`;
             C is 1, 4, 9 or 16.
-        voxel: [S] int32 rows of `harmonics`; any number of times the same.
+        voxel: [S] int32 rows of `harmonics`; rows may repeat.
         ray: [S] int32 rows of `directions`.
         directions: [R, 3] unit vectors.
-        grad_buffer: [V, C, 3]; when given, the gradient of `harmonics` is added to it in place, and
-            autograd sees none.
+        grad_buffer: [V, C, 3]; if given, the gradient of `harmonics` is added to it in place and
+            hidden from autograd.
 
     Raises:
         ValueError: wrong shapes; backends "cpu", "gpu": not float32.
@@ -48,7 +48,7 @@ def shade_voxels(
     if grad_buffer is not None:
         check_shape("grad_buffer", grad_buffer, *harmonics.shape)
         if not harmonics.requires_grad:
-            harmonics = harmonics.detach().requires_grad_()  # else there is no backward pass
+            harmonics = harmonics.detach().requires_grad_()  # otherwise there is no backward pass
     kernel = implementation("voxel_shading", backend, harmonics.device)
     colours: Tensor = kernel.shade_voxels(harmonics, voxel, ray, directions, grad_buffer)
     return colours

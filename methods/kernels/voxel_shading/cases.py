@@ -14,7 +14,7 @@ from methods.kernels.dispatch import served
 from methods.kernels.voxel_shading import shade_voxels
 
 SUMS = 16 * 50 * 6 + 16 * 16 * 6
-"""Roundings of a sum of 16 products of harmonics below 2, off by 48 u, with numbers below 6."""
+"""Error bound in u: sum of 16 products of harmonics (below 2, error 48 u) and numbers below 6."""
 
 
 def cases() -> list[Case]:

@@ -1,7 +1,7 @@
-"""Colours of voxels with numba: read where they lie, without a copy of their coefficients.
+"""Colours of voxels with numba: coefficients are read in place, without a copy.
 
-Backward, a thread adds up the gradients of its own voxels only: there are no atomics, and the sums
-are the same every time.
+In the backward pass each thread sums the gradients of its own voxels only, so that there are no
+atomics and results are repeatable.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Colours of voxels with Triton: a lane takes a colour, and reads the coefficients where they lie.
+"""Colours of voxels with Triton: one lane per colour, coefficients are read in place.
 
-Backward, a program takes a block of voxels, all their coefficients, and adds with atomics, in no
-order that repeats; where torch is told to use deterministic algorithms, torch's sorted scatter does
-it.
+In the backward pass a program handles a block of voxels with all their coefficients and adds with
+atomics, whose order is not repeatable. If torch is set to use deterministic algorithms, torch's
+sorted scatter is used instead.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from methods.kernels.gpu import check_types, gradient, launch, vector
 from methods.kernels.spherical import CHANNELS, spherical_harmonics
 
 BLOCK = 1024
-"""Gradients of a program, 8 a lane."""
+"""Gradients per program, 8 per lane."""
 
 LANES = 128
-"""Colours of a program, one a lane."""
+"""Colours per program, one per lane."""
 
 BASIS = tl.constexpr(CHANNELS)
 

@@ -1,11 +1,9 @@
-"""Which voxels of a sparse grid a ray crosses, front to back, where it enters and leaves them, and
-what it sees of them.
+"""Walks rays through the voxels of a sparse grid, front to back, and renders them.
 
 The unit cube is divided into G^3 cells, some of which are voxels that hold something. A ray o + t d
-crosses the plane k of an axis at t = (k / G - o) / d, computed from the integer k alone: two
-neighbouring voxels have the very same t where one is left and the other entered. A ray is in the
-cell that follows from the planes that it has crossed, so that every backend finds the same
-segments.
+crosses the plane k of an axis at t = (k / G - o) / d, computed from the integer k alone, so that
+the exit from a voxel and the entry into its neighbour have exactly the same t. The cell of a ray is
+determined by the planes that it has crossed, so that every backend finds the same segments.
 """
 
 from __future__ import annotations
@@ -26,26 +24,25 @@ BRICK = 8
 """Cells along the side of a brick."""
 
 MAX_RESOLUTION = 2048
-"""Most cells along a side: a map of its bricks has 64 MiB."""
+"""Maximum number of cells along a side; the map of its bricks takes 64 MiB."""
 
 MAX_CLEARANCE = 32
-"""Bricks beyond which a clearance is not told apart: a ray then takes another step."""
+"""Upper limit of a clearance in bricks; beyond it a ray takes another step."""
 
 
 class Voxels:
-    """Cells of a grid of G^3 over the unit cube that hold something, and where each stands in a
-    list.
+    """The non-empty cells (voxels) of a grid of G^3 over the unit cube, with their numbers.
 
-    Two levels of an octree of branching 8^3: a map of bricks of 8^3 cells, and the cells of those
-    bricks that have any voxel. Both give int32 numbers, -1 where nothing is.
+    A two-level tree with branching 8^3: a map of bricks of 8^3 cells, and the cells of the bricks
+    that contain any voxel. Both hold int32 numbers, -1 for empty.
 
     Args:
-        coordinates: [V, 3] integers from 0 to G - 1, (x, y, z) of each voxel, none twice. The order
-            stays: row v is voxel v.
+        coordinates: [V, 3] integers from 0 to G - 1, distinct (x, y, z) of the voxels; row v is
+            voxel v.
         resolution: G, a multiple of 8, at most `MAX_RESOLUTION`.
 
     Raises:
-        ValueError: a resolution or coordinates other than these.
+        ValueError: invalid resolution or coordinates.
     """
 
     def __init__(self, coordinates: Tensor, resolution: int) -> None:
@@ -84,13 +81,15 @@ class Voxels:
 
     @cached_property
     def clearance(self) -> Tensor:
-        """How far off the nearest brick with a voxel is, in bricks along the farthest axis, 0 in
-        such a brick, at most `MAX_CLEARANCE`: [G/8, G/8, G/8] uint8."""
+        """Chebyshev distance in bricks to the nearest non-empty brick: [G/8, G/8, G/8] uint8.
+
+        0 in a non-empty brick, at most `MAX_CLEARANCE`.
+        """
         near = (self.bricks >= 0)[None, None].float()
         clearance = torch.zeros_like(near)
         for _ in range(min(self.resolution // BRICK, MAX_CLEARANCE)):
             clearance += near == 0
-            for axis in range(3):  # the maximum over a cube, an axis at a time
+            for axis in range(3):  # maximum over a cube, one axis at a time
                 kernel, padding = [1, 1, 1], [0, 0, 0]
                 kernel[axis], padding[axis] = 3, 1
                 near = functional.max_pool3d(near, kernel, stride=1, padding=padding)
@@ -98,8 +97,10 @@ class Voxels:
 
     @cached_property
     def masks(self) -> Tensor:
-        """Which cells of a brick are voxels: [B, 8] int64, one word for each x, bit y * 8 + z. A
-        brick's are in one line of the cache, where its `leaves` are in 32."""
+        """Which cells of a brick are voxels: [B, 8] int64, one word per x, bit y * 8 + z.
+
+        The masks of a brick are in one cache line, whereas its `leaves` are in 32.
+        """
         bits = torch.arange(BRICK**2, device=self.leaves.device)
         used = (self.leaves.view(-1, BRICK, BRICK**2) >= 0).long()
         return used.bitwise_left_shift(bits).sum(dim=2)
@@ -113,10 +114,10 @@ class Crossings(Intervals):
 
     Attributes:
         near: [S] t where the ray enters the voxel.
-        far: [S] t where it leaves; of touching voxels it is the `near` of the next.
-        ray: [S] int32.
+        far: [S] t where it leaves; for touching voxels it equals `near` of the next one.
+        ray: [S] int32, the ray that a crossing belongs to.
         voxel: [S] int32 row of `Voxels.coordinates`.
-        resume: [R] t to go on from; +inf where the ray has no more.
+        resume: [R] t to resume from; +inf if the ray has no more crossings.
     """
 
     near: Tensor
@@ -129,7 +130,7 @@ class Crossings(Intervals):
         return len(self.t)
 
     def front(self, counts: Tensor) -> Crossings:
-        """Only the first `counts` [R] of each ray, which then has no more."""
+        """Only the first `counts` [R] crossings of each ray, without resuming."""
         kept, offsets, longest = self.first_of_each(counts)
         return Crossings(
             self.t[kept],
@@ -146,7 +147,7 @@ class Crossings(Intervals):
 
 @dataclass(frozen=True)
 class Light:
-    """What V voxels hold.
+    """The contents of V voxels.
 
     Attributes:
         density: [V] 1 / scene unit, not negative.
@@ -165,15 +166,15 @@ def walk(
     limit: int | None = None,
     backend: str = "auto",
 ) -> Crossings:
-    """Every voxel that each of R `rays` crosses with a positive length, once. Not differentiable.
+    """Find every voxel that each of R `rays` crosses with positive length. Not differentiable.
 
-    A ray that lies in a plane between cells is in those above it. A ray has no crossings if it
-    misses the cube, is not finite, has no direction or one so short that t overflows.
+    A ray in a plane between cells belongs to the cells above it. A ray has no crossings if it
+    misses the cube, is not finite, or has a direction that is zero or so short that t overflows.
 
     Args:
-        start: [R] t to begin with, `Crossings.resume` of an earlier call with the same rays; in a
-            voxel, its rest counts. +inf or NaN: none. None: 0.
-        limit: at most so many crossings a ray; None: all.
+        start: [R] first t, from `Crossings.resume` of an earlier call with the same rays; inside a
+            voxel, the rest of the voxel counts. +inf or NaN: no crossings. None: 0.
+        limit: maximum number of crossings per ray; None: all.
 
     Raises:
         ValueError: wrong shapes, a limit below 1; backends "cpu", "gpu": not float32.
@@ -203,16 +204,16 @@ def render_voxels(
     faint: float = 0.0,
     backend: str = "auto",
 ) -> tuple[Pixels, Tensor, Tensor]:
-    """The pixels of R `rays`, not composited on a background. Not differentiable.
+    """Render R `rays` without a background. Not differentiable.
 
     A voxel has the opacity 1 - exp(-sigma delta) over a length delta, and shows
     sigmoid(sum_k c_k Y_k(d)) in direction d (Yu et al. 2021, Eq. 1 to 3).
 
-    Also, for each ray, how many voxels it crossed and how many of them it shaded: [R] int32.
+    Returns the pixels and, for each ray, the numbers of crossed and of shaded voxels: [R] int32.
 
     Args:
         stop: transmittance at which a ray ends, less than 1.
-        faint: weight up to which a voxel has an opacity but no colour.
+        faint: voxels with at most this weight count for opacity but are not shaded.
 
     Raises:
         ValueError: wrong shapes, a stop outside [0, 1); backends "cpu", "gpu": not float32.

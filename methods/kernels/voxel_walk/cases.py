@@ -1,6 +1,5 @@
-"""Cases of the voxel walk: the same crossings by all backends, to the last bit; against the slab
-test of each voxel alone; rays that meet faces, edges and corners, or come from very far; pixels,
-and those of a cube in closed form."""
+"""Cases of the voxel walk: bit-identical crossings by all backends; lengths against a slab test per
+voxel; rays that hit faces, edges and corners, or come from far; pixels, also in closed form."""
 
 from __future__ import annotations
 
@@ -20,14 +19,14 @@ from methods.kernels.march.cases import ALL, AXES
 from methods.kernels.voxel_walk import Light, Voxels, render_voxels, walk
 
 SIZE = 24
-"""Of the grids of most cases: no power of two, so that planes are rounded."""
+"""Resolution of the grids in most cases; not a power of two, so that planes are rounded."""
 
 LONGEST = 3 * SIZE
-"""Most voxels of a ray in them."""
+"""Maximum number of voxels on a ray in these grids."""
 
 COLOUR = (16 * 50 * 6 + 16 * 16 * 6) / 4 + 8
-"""Roundings of a colour: of a sum of 16 products of harmonics below 2, off by 48 u, with numbers
-below 6, of which the sigmoid passes on a quarter, and its own."""
+"""Error bound in u of a colour: a quarter (slope of the sigmoid) of the error of a sum of 16
+products of harmonics (below 2, error 48 u) and numbers below 6, plus the sigmoid's own error."""
 
 
 def cases() -> list[Case]:
@@ -133,8 +132,7 @@ def _prepare(count: int, kind: dict[str, Any], device: str) -> Callable[[str], t
 
 
 def _lengths() -> list[Case]:
-    """Every kind of ray through grids full, scattered, empty and of one voxel, at once and in
-    rounds."""
+    """Every kind of ray through full, scattered, empty and one-voxel grids; also in rounds."""
     some = ALL[ALL.any(dim=1)]
     middle, corner = torch.full((3,), 0.5), torch.zeros(3)
     kinds: dict[str, tuple[Tensor, Tensor]] = {
@@ -184,8 +182,10 @@ def _lengths() -> list[Case]:
 def _length_error(
     grid: str, given: Rays, limit: int | None, backend: str, device: str, precision: str
 ) -> float:
-    """Largest difference of a ray's length in a voxel from the exact one, walked in rounds of
-    `limit`; infinite where crossings are not in order."""
+    """Largest error of a ray's length in a voxel, walked in rounds of `limit`.
+
+    Infinite if crossings are not in order.
+    """
     dtype = DTYPES[precision]
     rays = Rays(given.origins.to(device, dtype), given.directions.to(device, dtype))
     voxels, count = _grid(grid, device), len(given.origins)
@@ -208,7 +208,7 @@ def _length_error(
 
 
 def _exact_lengths(rays: Rays, voxels: Voxels) -> Tensor:
-    """World length [R, V] of rays in voxels, by the slab test in float64; 0 where t overflows."""
+    """World length [R, V] of rays in voxels (slab test, float64); 0 where t overflows."""
     lower = voxels.coordinates.cpu().double() / voxels.resolution
     upper = lower + 1 / voxels.resolution
     o, d = rays.origins.cpu().double()[:, None], rays.directions.cpu().double()[:, None]
@@ -285,7 +285,7 @@ def _pixels() -> list[Case]:
                 rounding + 3 * (stop + LONGEST * faint),
             )
         )
-    # Of 128^3: 384 voxels at most.
+    # 128^3 voxels: at most 384 on a ray.
     large = (COLOUR + 3 * 4 * 384) * U32 + 3 * (1e-4 + 384 * 1e-5)
     timed = partial(_rendered, 128, 1 << 13, "cloud", 1e-4, 1e-5)
     return [*found, kernel.case("a frame of 128^3", timed, large, items=1 << 13)]
@@ -305,7 +305,7 @@ def _rendered(
 
 
 def _cubes() -> list[Case]:
-    """A cube of voxels all alike, whose pixels are known."""
+    """A cube of equal voxels, whose pixels are known."""
     known = Property(
         "render_voxels",
         "opacity is 1 - exp(-sigma chord), and colour is that opacity times that of the direction",

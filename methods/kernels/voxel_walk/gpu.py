@@ -1,9 +1,8 @@
-"""Crossed voxels with Triton: a lane a ray, which goes from cell to cell and crosses all that is
-empty around it in one step.
+"""The voxel walk with Triton: one lane per ray, which goes from cell to cell and crosses all empty
+space around it in one step.
 
-As in the ray march, rays are walked twice: once to count what they cross, once, when it is known
-where that goes, to write it. A frame is one pass: a lane walks, shades and composites, and writes
-its pixel alone.
+As in the ray march, rays are walked twice: first to count crossings, then to write them, once their
+places are known. Rendering is a single pass: a lane walks, shades, composites and writes its pixel.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ from methods.kernels.voxel_walk import Crossings, Light, Voxels
 from methods.kernels.voxel_walk.reference import clip, length, slopes
 
 BLOCK = 1024 if interpreted() else 32
-"""Rays of a program: those of a warp, which waits for the longest of them. The interpreter takes as
-long for many as for few."""
+"""Rays per program: one warp, which waits for its longest ray. The interpreter takes as long for
+many as for few."""
 
 BASIS = tl.constexpr(CHANNELS)
 
@@ -63,7 +62,7 @@ def render_voxels(
 
 
 def _arguments(rays: Rays, voxels: Voxels, start: Tensor) -> list[Any]:
-    """What the kernels are given of R rays and of the grid; the first is the number of rays."""
+    """The arguments of the kernels for R rays and the grid; the first is the number of rays."""
     check_types(torch.float32, origins=rays.origins, directions=rays.directions)
     near, far, _ = clip(rays, voxels.resolution, start)
     lengths = length(rays.directions)
@@ -112,8 +111,10 @@ def _cell(t, origin, direction, slope, size, width, going):
 
 @triton.jit
 def _leave(cell, free, origin, slope, size, width):
-    """t at which rays leave, along an axis, the cells that are empty with theirs: that alone, or,
-    if `free` is not 0, those of as many bricks around."""
+    """t at which rays leave, along one axis, the cells known to be empty around `cell`.
+
+    These are the cell itself or, if `free` is not 0, the cells within that clearance in bricks.
+    """
     brick = cell >> 3
     first = tl.where(free == 0, cell, tl.maximum(brick - free + 1, 0) << 3)
     end = tl.where(free == 0, cell + 1, tl.minimum((brick + free) << 3, size))
@@ -123,8 +124,11 @@ def _leave(cell, free, origin, slope, size, width):
 
 @triton.jit
 def _next(cell, leave, t, far_off, origin, direction, slope, size, width):
-    """The cell of an axis that is entered at `t`: a neighbour where the plane at `leave` is crossed
-    there, else the same one; any where rays went `far_off`."""
+    """The cell of an axis that is entered at `t`.
+
+    It is a neighbour if the plane at `leave` is crossed there, otherwise the same cell; it is found
+    from `t` if rays went `far_off`.
+    """
     step = tl.where(slope > 0, 1, -1)
     following = tl.where(leave <= t, cell + step, cell)
     if tl.max(far_off.to(tl.int32), 0) > 0:
@@ -135,7 +139,7 @@ def _next(cell, leave, t, far_off, origin, direction, slope, size, width):
 
 @triton.jit
 def _rays(origins, directions, slopes, nearest, farthest, lengths, ray, count):
-    """Rays, the t between which they go, whether they do, and their lengths."""
+    """Rays, their range of t, whether it is not empty, and the lengths of directions."""
     inside = ray < count
     t = tl.load(nearest + ray, mask=inside, other=0.0)
     far = tl.load(farthest + ray, mask=inside, other=0.0)
@@ -160,8 +164,11 @@ def _cells(o, d, s, t, size, width, going):
 
 @triton.jit
 def _step(o, d, s, bricks, masks, clearance, x, y, z, t, far, going, size, width):
-    """The t at which rays leave the cell, or what is empty around it; whether that was a voxel that
-    they cross with a positive length; its place in the leaves; the next cell."""
+    """One step: the t at which rays leave the cell or the empty space around it.
+
+    Also whether the cell was a voxel crossed with positive length, its place in the leaves, and the
+    next cell.
+    """
     side = size // 8
     brick = ((x >> 3) * side + (y >> 3)) * side + (z >> 3)
     free = tl.load(clearance + brick, mask=going, other=0).to(tl.int32)
@@ -209,7 +216,7 @@ def _walk(
     rays,
     BLOCK: tl.constexpr,
 ):
-    """Count what is crossed and find where to resume; with `offsets`, write what is crossed."""
+    """Count crossings and find where to resume; with `offsets`, write the crossings."""
     ray = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     given = origins, directions, slopes, nearest, farthest, lengths
     o, d, s, t, far, reach, going = _rays(*given, ray, rays)

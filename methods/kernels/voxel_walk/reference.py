@@ -1,6 +1,6 @@
-"""Crossed voxels in plain torch: all planes that a ray crosses, sorted, and the cell behind each.
+"""The voxel walk in plain torch: sorts the planes that a ray crosses, finds the cell behind each.
 
-For small grids: a ray takes memory for 3 G planes.
+For small grids, since a ray takes memory for 3 G planes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from methods.kernels.spherical import shade
 from methods.kernels.voxel_walk import BRICK, Crossings, Light, Voxels
 
 BLOCK = 1 << 11
-"""Rays whose planes are sorted at once."""
+"""Rays that are processed at a time."""
 
 
 def walk(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> Crossings:
@@ -32,7 +32,7 @@ def walk(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> Crossings:
     offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
     delta = (far - near) * length(rays.directions)[ray]
     middle = (near + far) * 0.5
-    longest = int(counts.max()) if count else 0  # asked once, not by all that composite them
+    longest = int(counts.max()) if count else 0  # read once here, not in each composite
     return Crossings(middle, delta, offsets, near, far, ray.int(), voxel, resume, longest=longest)
 
 
@@ -58,19 +58,21 @@ def render_voxels(
 
 
 def length(directions: Tensor) -> Tensor:
-    """Of directions [R, 3], [R]: in float64, where every backend rounds to the same float32."""
+    """Lengths [R] of directions [R, 3]; in float64, so all backends round to the same float32."""
     return directions.double().norm(dim=-1).to(directions.dtype)
 
 
 def slopes(directions: Tensor) -> Tensor:
-    """t by length along each axis, [R, 3]; 0 for a ray that does not move along it."""
+    """Change of t per length along each axis, [R, 3]; 0 for a ray that does not move along it."""
     parallel = directions.abs() < PARALLEL
     return torch.where(parallel, 0, 1 / torch.where(parallel, 1, directions))
 
 
 def clip(rays: Rays, resolution: int, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The t between which rays are inside the cube, from `start` on, and whether there is anything
-    to walk, each [R]; without that, the t are 0."""
+    """The range of t inside the cube from `start` on, and whether to walk at all, [R] each.
+
+    If there is nothing to walk, both t are 0.
+    """
     origins, directions = rays.origins, rays.directions
     parallel, slope = directions.abs() < PARALLEL, slopes(directions)
     width = 1 / origins.new_full((), resolution)
@@ -88,7 +90,7 @@ def clip(rays: Rays, resolution: int, start: Tensor) -> tuple[Tensor, Tensor, Te
 
 
 def _walk_block(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> tuple[Tensor, ...]:
-    """Near, far and voxel [S] of crossings, how many a ray has [R], where to resume [R]."""
+    """near, far and voxel [S] of crossings, counts [R], resume [R]."""
     origins, directions = rays.origins, rays.directions
     size, rows = voxels.resolution, len(origins)
     parallel, slope = directions.abs() < PARALLEL, slopes(directions)
@@ -117,7 +119,7 @@ def _walk_block(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> tuple[
     ended = torch.where(kept, leave, -torch.inf).amax(dim=1) if rows else near[:, 0]
     more = (counts == limit) & (ended < far[:, 0])
     resume = torch.where(more, ended, torch.inf)
-    place = kept.flatten().nonzero().squeeze(1)  # a GPU is waited for once, not for each
+    place = kept.flatten().nonzero().squeeze(1)  # waits for a GPU once, not three times
     enter, leave, voxel = (x.flatten()[place] for x in (enter, leave, voxel))
     return enter, leave, voxel, counts, resume
 

@@ -1,13 +1,13 @@
-"""Backward warping: the preceding picture, looked up where the present surface was in it.
+"""Backward warping: looks up the preceding picture at the points that the current picture shows.
 
-A pixel of the present picture takes its depth from the low-resolution depth around it, becomes a
-point, and shows what the preceding picture shows at that point, interpolated bilinearly. Depths are
-averaged bilinearly over those of the four nearest low-resolution pixels that have one and lie no
-deeper than `TOLERANCE` behind the nearest of the four: what moves with the front surface hides what
-is behind it.
+A pixel of the current picture takes its depth from the low-resolution depths around it, is
+unprojected to a point, and shows the colour of the preceding picture at that point, interpolated
+bilinearly. Its depth is the bilinear mean over those of the four nearest low-resolution pixels that
+have a depth at most `TOLERANCE` behind the nearest of the four, because the front surface hides
+what is behind it.
 
-The s x s pixels of a low-resolution pixel, its cell, stand beside each other. Only the given cells
-are warped.
+The s x s pixels of a low-resolution pixel, its cell, are stored together. Only the given cells are
+warped.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from bench.types import Camera, check_shape
 from methods.kernels.dispatch import implementation
 
 TOLERANCE = 0.02
-"""Scene units along z by which a depth may lie behind the nearest one and still be averaged."""
+"""A depth is averaged only if it is at most this far behind the nearest one, in scene units."""
 
 
 def enlarge(depth: Tensor, cells: Tensor, scale: int, *, backend: str = "auto") -> Tensor:
-    """Depth of the s x s pixels of some cells, row by row: [N, s^2], inf for none.
+    """Upsample depth to the s x s pixels of some cells, row by row: [N, s^2], inf for none.
 
     Args:
         depth: [h, w] z-depth at low resolution, not finite where there is none.
-        cells: [N] int64 low-resolution pixels, counted row by row.
+        cells: [N] int64 low-resolution pixels, numbered row by row.
         scale: s.
     """
     check_shape("depth", depth, None, None)
@@ -45,18 +45,19 @@ def warp(
     *,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
-    """Warp `picture` [H, W, C] of `source` into some cells of the view of `camera`. Not
-    differentiable.
+    """Warp `picture` [H, W, C], seen by `source`, into some cells of the view of `camera`.
+
+    Not differentiable.
 
     Args:
-        depth: [N, s^2] z-depth of the pixels of `cells`, as of `enlarge`; a pixel is valid only
-            where it is positive and finite.
-        cells: [N] int64 cells of s x s pixels, counted row by row.
-        camera: the view, of whole cells.
+        depth: [N, s^2] z-depth of the pixels of `cells`, as from `enlarge`; a pixel is valid only
+            if its depth is positive and finite.
+        cells: [N] int64 cells of s x s pixels, numbered row by row.
+        camera: the current view; its size is a multiple of s.
         scale: s.
 
     Returns:
-        values [N, s^2, C], zero where not valid, and valid [N, s^2] in {0, 1}.
+        values [N, s^2, C], zero where invalid, and validity [N, s^2] in {0, 1}.
 
     Raises:
         ValueError: a size is wrong.
@@ -75,8 +76,10 @@ def warp(
 
 
 def source_from_camera(source: Camera, camera: Camera) -> tuple[Tensor, Tensor]:
-    """M [3, 3], m [3]: homogeneous source pixel = z M (u, v, 1) + m; in float64, where the cameras
-    are."""
+    """M [3, 3], m [3]: homogeneous source pixel = z M (u, v, 1) + m.
+
+    In float64, on the device of the cameras.
+    """
     to, of = source.c2w.double(), camera.c2w.double()
     rotation = to[:, :3].T @ of[:, :3]
     offset = to[:, :3].T @ (of[:, 3] - to[:, 3])
@@ -86,7 +89,7 @@ def source_from_camera(source: Camera, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def _intrinsics(camera: Camera) -> Tensor:
-    """[3, 3] on the CPU, from which a GPU takes it without being waited for."""
+    """The intrinsic matrix [3, 3] on the CPU, from which it is copied to a GPU without waiting."""
     return torch.tensor(
         [(camera.fx, 0, camera.cx), (0, camera.fy, camera.cy), (0, 0, 1)], dtype=torch.float64
     )

@@ -1,9 +1,9 @@
 """Cases of the backward warping: agreement of the backends, same and opposite views, a long walk.
 
-Whether a pixel is valid depends on which side of the source picture's border it falls, which
-rounding may decide: an agreement compares only the pixels that rounding cannot move over the
-border. Depths differ by much less or much more than `TOLERANCE`, so that rounding decides nothing
-else.
+Whether a pixel is valid depends on the side of the source picture's border on which it falls, and
+rounding may decide that. So an agreement compares only pixels that rounding cannot move across the
+border. Depths differ by much less or much more than `TOLERANCE`, so that rounding affects no other
+decision.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from methods.kernels.splat.cases import ROLLED, TURNED, rotated
 from methods.kernels.warp import enlarge, source_from_camera, warp
 
 LOW, HIGH = 200, 800
-"""Side of the depth and of the picture, in pixels."""
+"""Sides of the depth map and of the picture, in pixels."""
 
 MIDDLE = 2.0
 """Depth of the wall that most cases look at."""
 
 MEAN_ROUNDINGS = 8
-"""Most operations, of relative error u each, from the depths to their mean: a weight and its
-product, three sums, those of the weights and the quotient, as far as they do not cancel."""
+"""Maximum number of operations, of relative error u each, from the depths to their mean: a weight
+and its product, three sums, those of the weights, and the quotient, unless they cancel."""
 
 ROUNDINGS = 8 + MEAN_ROUNDINGS
-"""The same from the inputs to a coordinate's numerator and denominator: two for a matrix entry, six
-for the sum of products, and those of the mean depth."""
+"""The same number from the inputs to numerator and denominator of a coordinate: two for a matrix
+entry, six for the sum of products, and those of the mean depth."""
 
 Vector = tuple[float, float, float]
 
@@ -46,15 +46,15 @@ class Kind:
     """Inputs of an agreement.
 
     Attributes:
-        width, height: of the depth.
+        width, height: size of the depth map.
         scale: s.
         turn: rotation vector of the source, in radians.
         move: offset of the source along the axes of the camera.
-        zoom: focal length of the source over the camera's.
-        holes: some pixels have no depth.
-        edge: how much farther the right half of the depth and a row lie.
-        channels: of the picture.
-        every: only every so many-th cell is warped; 0: none.
+        zoom: focal length of the source over that of the camera.
+        holes: whether some pixels have no depth.
+        edge: how much farther away the right half of the depth map and one row are.
+        channels: channels of the picture.
+        every: warp only every n-th cell; 0: none.
     """
 
     width: int
@@ -86,7 +86,7 @@ class Kind:
 
     @property
     def depth(self) -> Tensor:
-        """A wavy wall with its edge and holes."""
+        """The depth of a wavy wall with an edge and holes."""
         row, column = torch.arange(self.height)[:, None], torch.arange(self.width)
         depth = MIDDLE + 0.005 * torch.sin(0.9 * row + 0.7 * column)
         if self.edge:
@@ -145,7 +145,7 @@ def cases() -> list[Case]:
     found = _agreements()
     for name, camera in CAMERAS.items():
         reach = max(abs(camera.cx), abs(camera.cy), camera.width, camera.height)
-        exact = () if camera.c2w[:, 3].any() else ("fp64",)  # where the pose is
+        exact = () if camera.c2w[:, 3].any() else ("fp64",)  # where the pose is exact
         tolerances = on_backends(24 * reach + 8, *exact)
         same = Property("warp", "the picture is unchanged", BACK, tolerances)
         for depth in (1e-20, 1.0, 1e20):
@@ -199,7 +199,7 @@ def cases() -> list[Case]:
 
 
 def _agreements() -> list[Case]:
-    """Cameras that rest, move, turn and roll; holes, edges; what cannot be seen; a frame."""
+    """Cameras that rest, move, turn and roll; holes, edges; invisible points; a frame."""
     warped = Agreement(
         "warp",
         served("warp"),
@@ -250,7 +250,7 @@ def _enlarging(kind: Kind) -> tuple[Prepare, float]:
         depth, cells = kind.depth.to(device), kind.cells.to(device)
 
         def call(backend: str) -> tuple[Tensor, ...]:
-            # No depth is 0: a finite number instead of inf can be compared.
+            # Missing depth becomes 0, which no depth is, because inf cannot be compared.
             z = enlarge(depth, cells, kind.scale, backend=backend)
             return (z.nan_to_num(nan=-1.0, posinf=0.0),)
 
@@ -260,12 +260,12 @@ def _enlarging(kind: Kind) -> tuple[Prepare, float]:
 
 
 def _position_error(kind: Kind) -> float:
-    """How far apart, in pixels, two backends may look up the same pixel.
+    """Bound in pixels on the distance between the positions that two backends look up for a pixel.
 
-    A coordinate is x = n / w. Each of the two is a sum of products, off by `ROUNDINGS` u of the sum
-    of their sizes n' and w', so x is off by (n' + |x| w') / w of that. All are at most as large as
-    in the last corner of the picture at the largest depth, but for w, which is as small as at any
-    pixel.
+    A coordinate is x = n / w. Both are sums of products, with an error of `ROUNDINGS` u times the
+    sums of magnitudes n' and w'. So the error of x is `ROUNDINGS` u (n' + |x| w') / w. Bounds are
+    taken at the last corner of the picture and the largest depth, except for w, whose minimum over
+    all pixels is used.
     """
     source, camera, depth, scale = kind.source, kind.camera, kind.depth, kind.scale
     low = scale_camera(camera, depth.shape[1], depth.shape[0])
@@ -286,7 +286,7 @@ def _position_error(kind: Kind) -> float:
 
 
 def _sure(kind: Kind, margin: float) -> Tensor:
-    """[N, s^2] pixels whose validity does not change when the source picture shifts by `margin`."""
+    """Mask [N, s^2] of pixels whose validity stays if the source picture shifts by `margin`."""
     source, cells, scale = kind.source, kind.cells, kind.scale
     picture = torch.ones(source.height, source.width, 1, dtype=torch.float64)
     fine = enlarge(kind.depth.double(), cells, scale, backend="reference")
@@ -299,7 +299,7 @@ def _sure(kind: Kind, margin: float) -> Tensor:
 
 
 def _ahead(camera: Camera) -> Camera:
-    """The camera, 3 units nearer to what it looks at."""
+    """The camera moved 3 units along its viewing direction."""
     centre = camera.c2w[:, 3:] + 3 * camera.c2w[:, 2:3]
     return replace(camera, c2w=torch.cat((camera.c2w[:, :3], centre), dim=1))
 
@@ -324,8 +324,7 @@ def _warped(
 def _at_depth(
     cameras: tuple[Camera, Camera], depth: float, cell: tuple[str, str], device: str
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The picture of the first camera, and `_warped` to the second, all of whose pixels have the
-    same depth."""
+    """The picture of the first camera, and `_warped` to the second, at constant depth."""
     (source, camera), (backend, precision) = cameras, cell
     picture = _picture(source, DTYPES[precision])
     z = torch.full((camera.height * camera.width,), depth, dtype=picture.dtype)
@@ -353,7 +352,7 @@ def _seen(camera: Camera, depth: float, backend: str, device: str, precision: st
 
 
 def _inside_error(backend: str, device: str, precision: str) -> float:
-    """A step of 0.1 to the side, surfaces as near as that, a picture that is linear in u and v."""
+    """A sideways step of 0.1, surfaces equally near, and a picture that is linear in u and v."""
     camera = CAMERAS["at the origin"]
     c2w = camera.c2w.clone()
     c2w[0, 3] = 0.1
@@ -365,7 +364,7 @@ def _inside_error(backend: str, device: str, precision: str) -> float:
     if not valid.any():
         return math.inf
     u = pixels[:, 0] - source.fx * source.c2w[0, 3].double() / z.double()
-    u = u.clamp(0.5, camera.width - 0.5)  # the border is repeated
+    u = u.clamp(0.5, camera.width - 0.5)  # repeated border
     want = torch.stack((u, pixels[:, 1]), dim=1).view(camera.height, camera.width, 2) / 32
     apart = (values - want).abs().amax(dim=2) * (valid > 0)
     return apart.max().item()
@@ -384,7 +383,7 @@ def _enlarged_error(backend: str, device: str, precision: str) -> float:
 
 
 def _walk_error(frames: int, backend: str, device: str, precision: str) -> float:
-    """Around a quarter of the scene and back, 50 frames each way, each frame from the last."""
+    """A quarter turn around the scene and back, 50 frames each way, each warped from the last."""
     start = Camera(torch.eye(4)[:3], 8.0, 8.0, 4.0, 4.0, 8, 8)
     up, middle = torch.tensor([0.0, 0.0, 1.0]), torch.full((3,), 0.5)
     first = torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(0)).to(DTYPES[precision])

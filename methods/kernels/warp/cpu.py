@@ -1,4 +1,4 @@
-"""Backward warping with numba, a cell at a time."""
+"""Backward warping with numba, one cell at a time."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def _clamp(value, size):
 
 @njit(cache=True)
 def _depth_at(depth, y, x, tolerance):
-    """Depth at a continuous place, counted from the centre of pixel (0, 0); inf if none."""
+    """Depth at a continuous position relative to the centre of pixel (0, 0); inf if none."""
     row, column = math.floor(y), math.floor(x)
     down, right = f32(y - row), f32(x - column)
     top, bottom = _clamp(int(row), depth.shape[0]), _clamp(int(row) + 1, depth.shape[0])
@@ -125,7 +125,7 @@ def _depth_at(depth, y, x, tolerance):
 
 @njit(cache=True)
 def _known(z, weight):
-    """The depth; inf where it is not finite or has no weight."""
+    """The depth `z`; inf if it is not finite or has no weight."""
     return z if weight > 0 and -math.inf < z < math.inf else f32(math.inf)
 
 

@@ -1,8 +1,9 @@
-"""Backward warping with Triton: a lane takes a pixel, or a channel of one.
+"""Backward warping with Triton: one lane per pixel, or per channel of a pixel.
 
-A pixel writes 4 bytes of depth and shares what is read with its cell and those around it; warped,
-it reads its 4 bytes of depth and writes C values and its validity, 4 C + 4. Of the preceding
-picture, 4 C bytes a pixel, neighbouring pixels look up the same four, which come from the cache.
+`enlarge` writes 4 bytes of depth per pixel; reads are shared within a cell and with its neighbours.
+`warp` reads 4 bytes of depth per pixel and writes C values and the validity, 4 C + 4 bytes. In the
+preceding picture (4 C bytes per pixel) neighbouring pixels look up the same four pixels, which come
+from the cache.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from methods.kernels import warp as interface
 from methods.kernels.gpu import check_types, launch
 
 BLOCK = 1024
-"""Values of a program, 8 a lane: so many loads at a time hide how long one takes."""
+"""Values per program, 8 per lane: that many concurrent loads hide their latency."""
 
 TOLERANCE = tl.constexpr(interface.TOLERANCE)
 
@@ -50,7 +51,7 @@ def warp(
     """See `methods.kernels.warp.warp`."""
     check_types(torch.float32, picture=picture, depth=depth)
     matrix, offset = projection
-    # Twelve numbers, for which the host does not wait.
+    # Twelve numbers, copied without a wait of the host.
     to_source = torch.cat((matrix, offset[:, None]), dim=1).float()
     values, valid = depth.new_empty(*depth.shape, picture.shape[2]), torch.empty_like(depth)
     channels = triton.next_power_of_2(max(picture.shape[2], 1))
@@ -81,9 +82,9 @@ def _clamp(value, size):
 
 @triton.jit
 def _place(cells, width, i, inside, SCALE: tl.constexpr):
-    """Of the i-th pixels of the cells: row and column of the cell, and of the pixel in it.
+    """For the i-th pixels of the cells: row and column of the cell, and of the pixel in it.
 
-    Divisions are of 32 bits or by constants: others cost more than all the rest.
+    Divisions are 32-bit or by constants, because others would cost more than all the rest.
     """
     cell = tl.load(cells + i // (SCALE * SCALE), mask=inside, other=0).to(tl.int32)
     sub = (i % (SCALE * SCALE)).to(tl.int32)
@@ -92,18 +93,18 @@ def _place(cells, width, i, inside, SCALE: tl.constexpr):
 
 @triton.jit
 def _between(cell, sub, SCALE: tl.constexpr):
-    """Along one axis, the cell whose centre is before that of a pixel, the `sub`-th of `cell`, and
-    how far that is, as a part of the way to the next.
+    """Along one axis, the cell whose centre precedes the `sub`-th pixel of `cell`; a fraction.
 
-    Counted in halves of a pixel, in whole numbers: a weight of 0 is one, however numbers round.
+    The fraction is the pixel's position on the way to the next centre. Computed in integers, in
+    half pixels, so that a weight of 0 is exactly 0.
     """
-    halves = 2 * sub + 1 + SCALE  # from the centre of the cell before
+    halves = 2 * sub + 1 + SCALE  # from the previous cell's centre
     return cell - 1 + halves // (2 * SCALE), (halves % (2 * SCALE)).to(tl.float32) / (2 * SCALE)
 
 
 @triton.jit
 def _known(depth, row, column, height, width, weight, inside):
-    """Depth of a low-resolution pixel; inf where it is not finite or has no weight."""
+    """Depth of a low-resolution pixel; inf if it is not finite or has no weight."""
     place = depth + _clamp(row, height) * width + _clamp(column, width)
     z = tl.load(place, mask=inside, other=float("inf"))
     return tl.where((weight > 0) & (z > float("-inf")) & (z < float("inf")), z, float("inf"))
@@ -134,14 +135,14 @@ def _enlarge(depth, cells, height, width, out, total, SCALE: tl.constexpr, BLOCK
 
 @triton.jit
 def _kept(z, weight, limit):
-    """Product of depth and weight, and weight, of what lies before `limit`; else 0."""
+    """(depth * weight, weight) for depths up to `limit`; 0 beyond."""
     kept = (z <= limit) & (z < float("inf"))
     return weight * tl.where(kept, z, 0.0), tl.where(kept, weight, 0.0)
 
 
 @triton.jit
 def _coordinate(to_source, k, u, v, z):
-    """The k-th homogeneous coordinate in the source."""
+    """The k-th homogeneous coordinate in the source picture."""
     of = to_source + 4 * k
     return z * (tl.load(of) * u + tl.load(of + 1) * v + tl.load(of + 2)) + tl.load(of + 3)
 
@@ -173,7 +174,7 @@ def _warp(
     z = tl.where(seen, z, 1.0)
     w = _coordinate(to_source, 2, u, v, z)
     seen = seen & (w > 0)
-    # Rounded as on the CPU: a camera that rests sees each pixel where it was.
+    # Correctly rounded, as on the CPU, so that a still camera sees each pixel where it was.
     x = tl.div_rn(_coordinate(to_source, 0, u, v, z), tl.where(seen, w, 1.0))
     y = tl.div_rn(_coordinate(to_source, 1, u, v, z), tl.where(seen, w, 1.0))
     seen = seen & (x >= 0) & (x < width) & (y >= 0) & (y < height)
@@ -196,6 +197,6 @@ def _warp(
 
 @triton.jit
 def _look_up(picture, row, column, height, width, channels, channel, shown):
-    """Values of pixels of the source, the border repeated; 0 where none is shown."""
+    """Values of source pixels, with a repeated border; 0 where `shown` is false."""
     pixel = _clamp(row, height).to(tl.int64) * width + _clamp(column, width)
     return tl.load(picture + pixel[:, None] * channels + channel[None, :], mask=shown, other=0.0)

@@ -52,14 +52,14 @@ def warp(
 
 
 def _pixels(cells: Tensor, width: int, scale: int) -> tuple[Tensor, Tensor]:
-    """Centres (v, u), [N, s^2] each, of the pixels of `cells`, of which a row has `width`."""
+    """Centres (v, u), [N, s^2] each, of the pixels of `cells`; a row has `width` cells."""
     sub = torch.arange(scale**2, device=cells.device)
     row, column = (cells // width)[:, None], (cells % width)[:, None]
     return row * scale + sub // scale + 0.5, column * scale + sub % scale + 0.5
 
 
 def _look_up(picture: Tensor, position: Tensor) -> Tensor:
-    """Bilinear values at continuous `position` [..., 2], the border repeated."""
+    """Bilinear values at continuous `position` [..., 2], with a repeated border."""
     x, y = (position - 0.5).unbind(dim=-1)
     total = torch.zeros(())
     for down in (0, 1):

@@ -1,1 +1,1 @@
-"""What the paper does not have: a lean 2D renderer, the field at the surface, refinement."""
+"""Extensions beyond the paper: a lean 2D renderer, the field at the surface, refinement."""

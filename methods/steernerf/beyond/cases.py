@@ -1,4 +1,4 @@
-"""Cases of the engines: constants, numbers outside the calibration, NaN."""
+"""Test cases of the engines: constant inputs, values outside the calibration range, NaN."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ SHARE = (
 )
 
 SIDE, BLOCKS = 16, 6
-"""Cells along a side of the view; blocks of the network, each of which reaches a cell further."""
+"""Cells along a side of the view; blocks of the network, each of which reaches one cell farther."""
 
 
 def cases() -> list[Case]:
-    """Constants, numbers far outside the calibration, a cell of NaN."""
+    """Constant inputs, values far outside the calibration range, a cell of NaN."""
     shares = {cell: TOLERANCE[cell[1]] for cell in CELLS}
     rounded = {cell: share for cell, share in shares.items() if cell[1] != "int8"}
     counted = {cell: 0.0 for cell in CELLS if cell[1] == "int8"}
     same = "the output is that of the network"
     cases = [
         Property("engine", same, SHARE, shares).case("all inputs 0", partial(_error, 0.0)),
-        # In int8 it saturates, layer by layer: no random view is as bright inside.
+        # Not in int8: layers saturate, as no view of the calibration has such large activations.
         Property("engine", same, SHARE, rounded).case("all inputs 1/2", partial(_error, 0.5)),
         Property(
             "engine", "the output is finite", "it is, or is not: 0", dict.fromkeys(CELLS, 0.0)
@@ -69,7 +69,7 @@ def cases() -> list[Case]:
 
 @cache
 def _renderer() -> LeanRenderer:
-    """With the weights that come with the package."""
+    """The lean renderer with the weights that come with the package."""
     return LeanRenderer(3, 2, 4).requires_grad_(False)
 
 
@@ -109,7 +109,7 @@ def _outputs(engine: str, device: str, precision: str, rows: Tensor) -> list[Ten
 
 
 def _apart(got: list[Tensor], want: list[Tensor]) -> float:
-    """Root mean square of the difference over that of `want`, of the worst output."""
+    """Root mean square of the difference relative to that of `want`, of the worst output."""
     shares = [
         ((g - w).square().mean() / w.square().mean()).sqrt().item()
         for g, w in zip(got, want, strict=True)
@@ -125,13 +125,13 @@ def _error(value: float, engine: str, device: str, precision: str) -> float:
 
 
 def _not_finite(engine: str, device: str, precision: str) -> float:
-    """How many numbers of the output are not finite."""
+    """How many values of the output are not finite."""
     outputs = _outputs(engine, device, precision, 2e4 * _random_rows(0))
     return float(sum((~x.isfinite()).sum() for x in outputs))
 
 
 def _not_saturated(engine: str, device: str, precision: str) -> float:
-    """How many numbers of the output change when inputs out of range double."""
+    """How many values of the output change when inputs out of range double."""
     rows = _random_rows(0).sign() * 4
     once, twice = (_outputs(engine, device, precision, factor * rows) for factor in (1, 2))
     return float(sum((a != b).sum() for a, b in zip(once, twice, strict=True)))

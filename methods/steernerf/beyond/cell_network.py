@@ -19,7 +19,7 @@ class CellNetwork(Network):
     """A trunk of depthwise 3 x 3 convolutions and matrix products, with one head for each output.
 
     Args:
-        layout: of its input rows.
+        layout: layout of the input rows.
         width: channels of the trunk.
         blocks: residual blocks of the trunk.
     """
@@ -40,12 +40,13 @@ class CellNetwork(Network):
             nn.init.zeros_(layer.bias)
 
     def forward(self, rows: Tensor, neighbours: Tensor) -> tuple[Tensor, ...]:
-        """What `depth_to_space` makes pixels of, from the `rows` [R, layout.width] of cells with
+        """Compute what `depth_to_space` needs from the `rows` [R, layout.width] of cells with
         `neighbours` [R, 9].
 
         Returns:
-            answer [R, s^2 (3 + layout.history)]; estimated error [R, 1], the log of the mean
-            squared error; with `layout.surface`, matrix [R, 3 (K + 1)].
+            correction and blending share of each pixel [R, s^2 (3 + layout.history)]; estimated
+            error [R, 1], the log of the mean squared error; with `layout.surface`, matrix
+            [R, 3 (K + 1)].
         """
         hidden = self.enter(rows).to(rows)
         for block in self.trunk:
@@ -55,7 +56,7 @@ class CellNetwork(Network):
         return tuple(head(hidden) for head in heads if head is not None)
 
     def products(self, *inputs: Tensor) -> int:
-        """See `Network`: every matrix, and the taps of every channel, once a cell."""
+        """See `Network`: every matrix, and the taps of every channel, count once per cell."""
         return len(inputs[0]) * sum(x.numel() for x in self.parameters() if x.dim() > 1)
 
 
@@ -67,8 +68,8 @@ class _Linear(nn.Linear):
 def _product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """x W^T + b of `x` [N, C] and `weight` [D, C].
 
-    Without gradient, a convolution of 1 x 1: torch hands products of float32 to MKL and
-    convolutions to oneDNN, which is twice as fast on processors that are not Intel's.
+    Without gradient it is computed as a 1 x 1 convolution: torch hands products of float32 to MKL,
+    but convolutions to oneDNN, which is twice as fast on non-Intel processors.
     """
     if torch.is_grad_enabled() or torch.jit.is_tracing() or not len(x):
         return functional.linear(x, weight, bias)

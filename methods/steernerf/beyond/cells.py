@@ -1,7 +1,7 @@
-"""Cells: the s x s pixels of a picture that a low-resolution pixel stands for.
+"""Cells: the s x s pixels of a picture that one low-resolution pixel covers.
 
-Only those near matter are drawn. N cells are given by their number, counted row by row; their
-pixels stand beside each other, [N, s^2, ...], row by row, too.
+Only cells near matter are drawn. Cells are given by their row-major indices [N], their pixels as
+[N, s^2, ...], also row by row.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 REACH = 1
-"""Cells around matter that are still drawn: what is further from all that was seen is empty."""
+"""Distance from matter, in cells, within which cells are drawn; everything farther is empty."""
 
 
 def cells_near(seen: Tensor) -> Tensor:
-    """Which cells lie within `REACH` of those that are `seen`, [h, w] bool."""
+    """Which cells lie within `REACH` of one that is `seen`: both [h, w] bool."""
     near = seen.clone()
     for axis in (0, 1):
         line = near.clone()
@@ -28,14 +28,14 @@ def cells_near(seen: Tensor) -> Tensor:
 
 
 def largest_in_cell(image: Tensor, scale: int) -> Tensor:
-    """[h, w]: of `image` [h s, w s] the largest pixel of each cell."""
+    """The largest pixel of each cell of `image` [h s, w s]: [h, w]."""
     height, width = image.shape
     cells = image.view(height // scale, scale, width // scale, scale)
     return cells.amax(dim=1).amax(dim=2)  # four times as fast as both at once
 
 
 def centres(cells: Tensor, width: int, scale: int) -> Tensor:
-    """(u, v) of all pixels of `cells`, [N, s^2, 2], where a row has `width` cells."""
+    """Centres (u, v) of all pixels of `cells`, [N, s^2, 2]; a row has `width` cells."""
     sub = torch.arange(scale**2, device=cells.device)
     u = (cells % width)[:, None] * scale + sub % scale
     v = (cells // width)[:, None] * scale + sub // scale
@@ -43,14 +43,13 @@ def centres(cells: Tensor, width: int, scale: int) -> Tensor:
 
 
 def pixels_of(image: Tensor, cells: Tensor, scale: int) -> Tensor:
-    """Of `image` [h s, w s, ...] the pixels of `cells`: [N, s^2, ...]."""
+    """The pixels of `cells` in `image` [h s, w s, ...]: [N, s^2, ...]."""
     width = image.shape[1] // scale
     return _blocks(image, scale)[cells // width, cells % width].flatten(1, 2)
 
 
 def put_pixels(image: Tensor, cells: Tensor, scale: int, pixels: Tensor) -> None:
-    """Replace, in place, the pixels of `cells` in `image` [h s, w s, ...] by `pixels`
-    [N, s^2, ...]."""
+    """Write `pixels` [N, s^2, ...] to the `cells` of `image` [h s, w s, ...], in place."""
     width = image.shape[1] // scale
     _blocks(image, scale)[cells // width, cells % width] = pixels.unflatten(1, (scale, scale))
 
@@ -64,20 +63,20 @@ def _blocks(image: Tensor, scale: int) -> Tensor:
 def paint(
     cells: Sequence[Tensor], size: torch.Size, scale: int, pixels: Tensor, background: Tensor
 ) -> Tensor:
-    """Pictures [B, h s, w s, C], `background` [C] outside of the `cells` of each, whose `pixels`
-    [N, s^2, C] follow each other.
+    """Draw pictures [B, h s, w s, C] of `pixels` [N, s^2, C], which belong to the `cells` of one
+    picture after the other, on `background` [C].
 
     Args:
         size: h, w.
     """
     height, width = size
     canvas = background.repeat(len(cells) * height * scale, width * scale, 1)
-    # One below the other, they are a single picture.
+    # Stacked vertically, they are a single picture.
     put_pixels(canvas, number(cells, size), scale, pixels)
     return canvas.view(len(cells), height * scale, width * scale, -1)
 
 
 def number(cells: Sequence[Tensor], size: torch.Size) -> Tensor:
-    """The `cells` of pictures of `size` h, w that lie one below the other, counted as of one."""
+    """Indices of the `cells` of several pictures of `size` h, w, stacked vertically into one."""
     height, width = size
     return torch.cat([some + picture * height * width for picture, some in enumerate(cells)])

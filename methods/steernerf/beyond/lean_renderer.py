@@ -1,4 +1,4 @@
-"""A lean 2D renderer that works at low resolution, where something is, and nowhere else."""
+"""A lean 2D renderer that works at low resolution, and only on cells near matter."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PRETRAINED_GROUPS = (
     ("history", 16, 4),
     ("surface", 16, 4),
 )
-"""What those weights expect: K = 3, L = 2, s = 4."""
+"""The inputs that those weights expect, as in `Layout.groups`: K = 3, L = 2, s = 4."""
 
 PRETRAINED_SCALE = 4
 
@@ -40,14 +40,15 @@ Groups = Sequence[tuple[str, int, int]]
 class LeanRenderer(Renderer2d):
     """A network on cells: the s x s pixels of a low-resolution pixel are channels of its cell.
 
-    A picture is the aligned bilinear enlargement of the present RGB (the base), blended pixel by
-    pixel with the preceding picture where that is known, plus a correction, plus what the features
-    at the surface of each pixel say, read by a matrix that all pixels of a cell share. Shares,
-    corrections and matrices come from a network on cells; so does the error to be expected there.
+    A picture starts from the base: the present RGB, bilinearly enlarged with every pixel in its
+    place. Each of its pixels is blended with the preceding picture where that is known. Then a
+    correction is added, and the features at the surface of the pixel times a matrix that all pixels
+    of a cell share. The network gives the blending shares, corrections and matrices, and also the
+    error to expect in each cell.
 
     Only the cells of an observation are drawn; all others are background, and 0 to their
     neighbours. So nothing is computed for them, and a part of a frame is drawn exactly as in the
-    whole. All features enter less their background, so that nothing is 0.
+    whole. The background is subtracted from all features, so that empty space is 0.
 
     Args:
         channels: K.
@@ -57,8 +58,8 @@ class LeanRenderer(Renderer2d):
         blocks: residual blocks of the trunk.
         init: "pretrained": start from the weights that come with the package, trained on other
             scenes; "scratch": from random ones.
-        history: use the preceding picture.
-        surface: use the features at the surface, pixel by pixel.
+        history: whether to use the preceding picture.
+        surface: whether to use the features at the surface of each pixel.
     """
 
     draws_cells = True
@@ -114,10 +115,10 @@ class LeanRenderer(Renderer2d):
         return self._paint(observations, torch.cat(parts))
 
     def _rows(self, observations: Sequence[Observation]) -> tuple[Tensor, Tensor]:
-        """The base and the rows of all their cells, rows of 0 behind them; see `space_to_depth`.
+        """The base and the rows of all their cells, followed by rows of 0; see `space_to_depth`.
 
-        The library behind the products prepares code for every new size, which takes longer than
-        the product itself: it sees few sizes.
+        The matrix library prepares code for every new size, which takes longer than the product
+        itself. Rows of 0 round the size up, so that it sees few different ones.
         """
         alone = len(observations) == 1
         quantum = self.network.quantum
@@ -146,7 +147,7 @@ class LeanRenderer(Renderer2d):
         return space_to_depth(inputs, layout, multiple=multiple, backend=o.backend)
 
     def _neighbours(self, observations: Sequence[Observation], rows: int) -> Tensor:
-        """Of all cells, and of as many more as make `rows`, which have none: [R, 9]."""
+        """The neighbours [R, 9] of all cells; rows without any follow, up to `rows`."""
         size, device = observations[0].frame.alpha.shape, observations[0].cells.device
         active = torch.zeros(len(observations), *size, dtype=torch.bool, device=device)
         cells = number([o.cells for o in observations], size)
@@ -155,19 +156,20 @@ class LeanRenderer(Renderer2d):
         return functional.pad(neighbours, (0, 0, 0, rows - len(neighbours)), value=-1)
 
     def _paint(self, observations: Sequence[Observation], less: Tensor) -> Tensor:
-        """Pictures [B, H, W, 3] of all cells, of which `less` [N, s^2, 3] has no background."""
+        """Pictures [B, H, W, 3] from the pixels `less` [N, s^2, 3] of all cells, relative to the
+        background."""
         size, background = observations[0].frame.alpha.shape, observations[0].background[:3]
         shown = [o.cells for o in observations]
         return paint(shown, size, self.scale, less + background, background)
 
     @torch.no_grad()
     def _start_from(self, pretrained: Mapping[str, Tensor]) -> None:
-        """Take over the weights of a renderer of the same trunk that was trained at K = 3, L = 2.
+        """Copy the weights of a renderer with the same trunk that was trained at K = 3, L = 2.
 
-        Weights of features beyond RGB, and of frames it did not have, stay as they are.
+        Weights for features beyond RGB, and for frames that it did not have, stay as they are.
 
         Raises:
-            ValueError: this renderer is of another shape.
+            ValueError: this renderer has another shape.
         """
         weights = dict(self.network.named_parameters())
         unused = {
@@ -196,7 +198,7 @@ class LeanRenderer(Renderer2d):
 
 
 def _same_columns(ours: Groups, theirs: Groups) -> tuple[list[int], list[int]]:
-    """Columns of colours and validity that two layouts of the inputs have in common."""
+    """The input columns of colours and validity that both layouts have, as indices into each."""
     columns: tuple[dict[tuple[str, int, int], int], ...] = ({}, {})
     for groups, place in zip((ours, theirs), columns, strict=True):
         begin = 0

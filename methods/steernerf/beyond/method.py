@@ -1,4 +1,4 @@
-"""The lean SteerNeRF: ours, as a `bench.types.Method`."""
+"""The lean SteerNeRF, our variant, as a `bench.types.Method`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _refined_steps(lengths: Sequence[float]) -> list[Variant]:
 
 
 def _together() -> list[Variant]:
-    """Two knobs at a time."""
+    """Variants that turn two knobs at a time."""
     low = [*turned("step", "method.rendering.step", (1,)), *ranges("window", (0.03,))]
     return [
         *(_both(share, other) for share in _refined(SHARES) for other in low),
@@ -66,7 +66,7 @@ class SteerNerfLean(SteerNerf):
         skips_with=("method.rendering.refined=0",),  # refinement takes a share of the cells drawn
         beside={
             **STUDY.beside,
-            # The release's network; what it has learned does not change what it costs.
+            # The release's network; its cost does not depend on how well it is trained.
             "the paper's": (
                 "method=steernerf",
                 "method.renderer.width=64",
@@ -78,6 +78,6 @@ class SteerNerfLean(SteerNerf):
     def pretrain_renderer(
         self, scenes: Sequence[Scene], budget: Budget, output: Path, log: Log
     ) -> None:
-        """Train a 2D renderer on many scenes, for others to start from; see
+        """Train a 2D renderer on many scenes, as a start for others; see
         `beyond.pretraining.pretrain_renderer`."""
         pretrain_renderer(self.setup, self.stage2, scenes, budget, output, log)

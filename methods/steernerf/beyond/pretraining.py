@@ -1,4 +1,4 @@
-"""The weights that a lean 2D renderer starts from: trained once, on the fields of many scenes."""
+"""Pre-training of the lean 2D renderer: initial weights, learned on the fields of many scenes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from methods.training import checkpoint, loop
 
 @dataclass(frozen=True)
 class AnyOf:
-    """The patches of a batch come from one of `sources`, drawn by `generator`."""
+    """Draws each batch of patches from one of `sources`, which `generator` chooses."""
 
     sources: Sequence[Patches]
     generator: torch.Generator
@@ -50,11 +50,11 @@ def pretrain_renderer(
 ) -> None:
     """Fit a field to each of `scenes`, train one renderer on all of them, write it to `output`.
 
-    What was trained is kept, and found again. The fields are frozen: what a renderer learns from
-    them must hold for fields it never saw.
+    Trained stages are cached. The fields are frozen: what a renderer learns from them must hold for
+    fields it has never seen.
 
     Raises:
-        SteerbenchError: K is not 3. Other features mean something else in every scene.
+        SteerbenchError: K is not 3. Further features mean something different in every scene.
     """
     model, joint = stage2.model, stage2.joint
     if model.channels != 3:

@@ -1,4 +1,4 @@
-"""Refinement: the cells with the largest estimated error are rendered by the field after all."""
+"""Refinement: the field itself renders the cells with the largest estimated error."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from methods.steernerf.view import View
 
 
 def worst_cells(error: Tensor, share: float) -> Tensor:
-    """Which of N cells, `share` of them, have the largest estimated `error` [N]."""
+    """Indices of the `share` of N cells with the largest estimated `error` [N]."""
     return error.topk(math.ceil(share * len(error)), sorted=False).indices
 
 
 def rays_of_cells(cells: Tensor, view: View) -> Rays:
-    """A ray through each pixel of `cells` [n], cell by cell: n s^2."""
+    """Rays through all pixels of `cells` [n], cell by cell: n s^2 of them."""
     return cast(view.full, centres(cells, view.low.width, view.scale).flatten(0, 1))
 
 
 def refined_march(cells: Tensor, frame: FeatureFrame, scale: int, rendering: Rendering) -> March:
     """How the rays of `cells` [n] are marched.
 
-    With range reduction in mode "window" they look where the low-resolution `frame` has something
-    around their cell.
+    With range reduction in mode "window" they are sampled only near the depths of the
+    low-resolution `frame` around their cell.
     """
     how = rendering.refined_march
     if rendering.range.mode != "window":
         return how
-    # Between the samples of the frame a surface may lie farther off.
+    # Twice epsilon: between low-resolution pixels the surface may lie farther off.
     window = depths_around(frame.depth, 2 * rendering.range.epsilon).view(-1, 2)[cells]
     return how.within(window.repeat_interleave(scale**2, dim=0))

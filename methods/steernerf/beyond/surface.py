@@ -1,4 +1,4 @@
-"""The field evaluated once a pixel, where the low-resolution depth has the surface."""
+"""The field evaluated once per pixel, at the surface that the low-resolution depth gives."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from methods.steernerf.renderer import Points
 from methods.steernerf.view import View
 
 LAYER = 4 * STEP
-"""Thickness, in scene units, of what a single sample of the surface stands for."""
+"""Thickness, in scene units, of the layer that a single sample of the surface stands for."""
 
 PIECE = 1 << 16
 """Pixels that a CPU evaluates together: few enough to stay in the cache."""
@@ -24,8 +24,8 @@ PIECE = 1 << 16
 def surface_points(
     field: Field, depth: Tensor, cells: Tensor, view: View, scale: int, probe: Probe
 ) -> Points:
-    """Features and opacity, [P, K + 1], of a sample at every pixel of `cells` [N] whose `depth`
-    [N, s^2] is finite; differentiable in the field, not in the depth."""
+    """Sample features and opacity, [P, K + 1], at every pixel of `cells` [N] whose `depth` [N, s^2]
+    is finite; differentiable in the field, not in the depth."""
     there = depth.isfinite().flatten()
     known = kept_indices(there)
     probe.count("surface_samples", len(known), view.full.width * view.full.height)

@@ -1,6 +1,6 @@
-"""Range reduction by a window of depths, with a way out where the window misses the surface.
+"""Range reduction by a window of depths, with a fallback where the window misses the surface.
 
-Not in the paper: its interval leaves holes where the reprojected depth is that of another surface.
+Not in the paper, whose interval leaves holes where the reprojected depth is of another surface.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from methods.steernerf.options import Reprojection
 from methods.steernerf.range_reduction import at_pixels
 
 KEPT_ALPHA = 0.95
-"""Share of the expected opacity at which a ray has found what was expected."""
+"""Share of the expected opacity at which a ray counts as having found the surface."""
 
 EDGE = 2.0
-"""Depths of a neighbourhood that differ by more than this many epsilons are those of an edge."""
+"""A neighbourhood whose depths differ by more than this many epsilons is a depth edge."""
 
 
 @dataclass(frozen=True)
 class DepthPrior:
-    """What a preceding frame says of a view of h x w pixels.
+    """The depth prior that a preceding frame gives for a view of h x w pixels.
 
     Attributes:
-        window: [h, w, 2] nearest and farthest z-depth worth looking at; [0, inf) if unknown.
-        alpha: [h, w] the opacity to expect; 0 if unknown.
+        window: [h, w, 2] nearest and farthest z-depth worth sampling; [0, inf) if unknown.
+        alpha: [h, w] expected opacity; 0 where no point is near.
     """
 
     window: Tensor
@@ -46,8 +46,8 @@ class DepthPrior:
 def depth_prior(
     cloud: Cloud, camera: Camera, epsilon: float, how: Reprojection, backend: str
 ) -> DepthPrior:
-    """The depths of `cloud` around each pixel of `camera`, a low-resolution one; unknown where no
-    point is near, or a depth edge is."""
+    """The depth prior of `camera`, a low-resolution one, from the points of `cloud` around each
+    pixel; unknown where no point is near, or at a depth edge."""
     index, depth = cloud.splat(camera, how, backend)
     near = -_highest(-at_pixels(depth, index, torch.inf))
     far = _highest(at_pixels(depth, index, -torch.inf))
@@ -61,8 +61,8 @@ def depth_prior(
 
 
 def depths_around(depth: Tensor, epsilon: float) -> Tensor:
-    """[h, w, 2] nearest and farthest z-depth within `epsilon` of those of the 3 x 3 neighbourhood
-    in `depth` [h, w]; [0, inf) where none of them is finite."""
+    """Nearest and farthest z-depth [h, w, 2] in the 3 x 3 neighbourhoods of `depth` [h, w], widened
+    by `epsilon`; [0, inf) where no depth is finite."""
     near = -_highest(-depth)
     far = _highest(torch.where(depth.isfinite(), depth, -torch.inf))
     known = near.isfinite()
@@ -78,19 +78,19 @@ def _highest(image: Tensor) -> Tensor:
 def within(
     field: Field, occupancy: Occupancy, probe: Probe, how: March, prior: DepthPrior
 ) -> Render:
-    """For `rendering.frame.render_frame`: a ray looks in its window of `prior`, and behind it where
-    it does not reach the expected opacity."""
+    """Make the argument `render` of `rendering.frame.render_frame` that samples each ray in its
+    window of `prior`, and behind it if the ray does not reach the expected opacity."""
 
     def render(seen: Tensor, rays: Rays) -> Pixels:
         window, expected = prior.window.view(-1, 2)[seen], prior.alpha.flatten()[seen]
         narrow = window[:, 1].isfinite()
         inside = kept_indices(narrow)
         expected, near = expected[inside], torch.where(narrow[:, None], window, 0)[inside]
-        # A stricter limit of what is faint: rays that go on would lack faint samples in front.
+        # A stricter faint limit: rays that go on would lack the faint samples in front.
         loose = March(how.step, max(how.stop, 1 - KEPT_ALPHA), near, faint=FAINT * how.stop)
         first = render_rays(field, rays.take(inside), occupancy, probe, loose)
         enough = narrow[inside] & (first.alpha >= KEPT_ALPHA * expected)
-        # Scaled to the expected opacity: the rest looks like what was found.
+        # Scale to the expected opacity, as if the rest looked like what was found.
         more = torch.where(enough & (first.alpha < expected), expected / first.alpha, 1)
         canvas = Pixels.blank(len(seen), first.values.shape[1], field.device)
         canvas.put(

@@ -1,4 +1,4 @@
-"""Distilled views: what the field of stage 1 shows to random cameras, to learn from as well."""
+"""Distilled views: pictures of the stage 1 field at random cameras, as further training views."""
 
 from __future__ import annotations
 
@@ -21,10 +21,12 @@ from methods.training import checkpoint
 def distilled_views(
     setup: Setup, trained: TrainedField, scene: Scene, budget: Budget, count: int, log: Log
 ) -> tuple[list[TrueView], float]:
-    """`count` views among the training cameras as `trained` shows them at full resolution, and the
-    seconds that it took to render them.
+    """Render `count` random views among the training cameras with `trained`, at full resolution.
 
-    They are kept, and found again by the same `setup`, `scene` and `budget`.
+    They are cached, by `setup`, `scene`, `budget` and `count`.
+
+    Returns:
+        the views, and the seconds that it took to render them.
     """
     if not count:
         return [], 0.0
@@ -54,7 +56,7 @@ def distilled_views(
 
 
 def _picture(trained: TrainedField, camera: Camera, background: Tensor) -> Tensor:
-    """uint8 [H, W, 3]."""
+    """Render one view: uint8 [H, W, 3]."""
     field, probe = trained.field, NullProbe()
     camera, background = place_camera(camera, field.device), background.to(field.device)
     render = everywhere(field, trained.occupancy, probe, trained.march)

@@ -1,4 +1,4 @@
-"""Stage 2: the 2D renderer, and with it the field, trained on patches of pictures (Section 3.4)."""
+"""Stage 2: the 2D renderer and the field, trained together on patches (Section 3.4)."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ from methods.training import checkpoint, loop
 from methods.training.optimiser import cosine, step_at
 
 LEAST_ERROR = 1e-6
-"""Mean squared error of a cell below which one is as good as another."""
+"""Added to the mean squared error of a cell: below this, one error is as good as another."""
 
 Tensors = tuple[Tensor, ...] | list[Tensor]
 
 
 class RendererTraining:
-    """Stage 2 of the 2D renderer alone, as a `loop.Training`: the field stays as it is.
+    """Stage 2 of the 2D renderer alone, as a `loop.Training`; the field is frozen.
 
     Args:
         renderer: trained in place.
-        patches: what it learns from.
-        steps: optimiser steps.
-        generator: of all random numbers, also those of `patches`.
+        patches: source of the patches it learns from.
+        steps: number of optimiser steps.
+        generator: source of all random numbers, including those of `patches`.
 
     Attributes:
-        mean: the running mean of the renderer's weights, which is what is used in the end.
+        mean: the running mean of the renderer's weights, which is the result.
     """
 
     advice = "Try smaller learning rates (method.joint.rate, method.joint.field_rate)."
@@ -64,13 +64,13 @@ class RendererTraining:
 
     @cached_property
     def optimiser(self) -> torch.optim.Adam:
-        """Of the renderer; made when it is needed, as that of the field."""
+        """Adam for the renderer; created when first needed, like that of the field."""
         parameters = self.renderer.parameters()
         return torch.optim.Adam(parameters, lr=self.options.rate, fused=True)
 
     def advance(self) -> dict[str, float]:
-        """One step; mean squared error of the picture and of the base that it corrects; see
-        `loop.look`.
+        """Take one step; return the mean squared errors of the picture and of the base that the
+        network corrects; see `loop.look`.
 
         Raises:
             SteerbenchError: the loss is not finite.
@@ -92,7 +92,7 @@ class RendererTraining:
         return errors
 
     def _error_loss(self, batch: Batch, drawing: Drawing) -> Tensor | float:
-        """How far the estimated errors of the renderer are from the errors it made."""
+        """How far the renderer's estimated errors are from its actual errors."""
         if drawing.error is None:
             return 0.0
         errors = (drawing.pictures.detach() - batch.truth).square().mean(dim=-1)
@@ -104,22 +104,22 @@ class RendererTraining:
         return self.options.error_weight * functional.mse_loss(drawing.error, wanted)
 
     def _field_loss(self, batch: Batch, drawing: Drawing) -> Tensor | float:
-        """What the field learns from, beside the pictures that are drawn."""
+        """Further loss terms for the field, besides the error of the pictures."""
         return 0.0
 
     def _update(self) -> None:
-        """Change the weights."""
+        """Update the weights."""
         step_at(self.optimiser, self.rate_now(self.options.rate))
         self._averaged.update_parameters(self.renderer)
 
     def rate_now(self, first: float) -> float:
-        """The learning rate of the next step, of one that is `first` at the beginning."""
+        """The learning rate of the next step, for one that starts at `first`."""
         final, waves = self.options.final_rate / first, self.options.half_waves
         return first * cosine(self.step / self.steps, final, waves)
 
     @torch.no_grad()
     def _average(self, mean: Tensors, new: Tensors, count: Tensor | int) -> None:
-        # In the beginning, over fewer steps: the first weights are not worth remembering.
+        # At first over fewer steps: the earliest weights are not worth keeping.
         keep = min(self.options.average, (1 + int(count)) / (10 + int(count)))
         torch._foreach_lerp_(mean, new, 1 - keep)
 
@@ -132,11 +132,11 @@ class RendererTraining:
         return {f"mean.{name}": x for name, x in self.mean.state_dict().items()}
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
-        """Put back what `result` gave."""
+        """Restore what `result` returned."""
         self.mean.load_state_dict(checkpoint.part(tensors, "mean."))
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Renderer, optimiser, random numbers, and what the next patches are cut out of."""
+        """Renderer, optimiser, random numbers, and the sequences that patches are cut from."""
         tensors = {f"renderer.{name}": x for name, x in self.renderer.state_dict().items()}
         tensors |= checkpoint.optimiser_tensors(self.optimiser, "renderer_adam.")
         tensors |= {f"patches.{name}": x for name, x in self.patches.state().items()}
@@ -156,7 +156,7 @@ class RendererTraining:
 
 
 class JointTraining(RendererTraining):
-    """Stage 2 end to end: the field of `patches` learns through the 2D renderer, in place."""
+    """Stage 2 end to end: the field of `patches` is trained as well, in place."""
 
     patches: PatchSource
 
@@ -175,7 +175,7 @@ class JointTraining(RendererTraining):
         self._visits = torch.Generator(self.field.device).manual_seed(generator.initial_seed())
 
     def advance(self) -> dict[str, float]:
-        """As `RendererTraining`; the density grid follows the field."""
+        """Step as `RendererTraining` does; the density grid follows the field."""
         if self.options.grid_samples and self.step % EVERY == 0:
             self.grid.update(self.field, self._visits, self.options.grid_samples)
             self.patches.pipeline.occupancy = self.grid.occupancy
@@ -231,13 +231,13 @@ class JointTraining(RendererTraining):
         return field | {"grid.density": self.grid.density} | super().result()
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
-        """Put back what `result` gave."""
+        """Restore what `result` returned."""
         super().restore_result(tensors)
         restore_field(self.field, self.grid, tensors)
         self.patches.pipeline.occupancy = self.grid.occupancy
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """The optimisers of the field, too, and the random numbers of its grid."""
+        """Also the optimisers of the field and the random numbers of its grid."""
         tensors, figures = super().state()
         visits = {"visits": self._visits.get_state()}
         return tensors | self.field_optimiser.tensors() | visits, figures

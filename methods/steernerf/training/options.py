@@ -17,30 +17,34 @@ class JointOptions:
     Attributes:
         field: "joint", or "frozen" as stage 1 left it (the ablation of the paper's Table 5).
         through: frames that the field learns from: "all", or only the "present" one.
-        features: what the features beyond RGB are at first: "random", of random weights, or
-            "constant", 1/2 everywhere.
-        rate: learning rate of the 2D renderer at the beginning.
-        field_rate: of the field.
-        final_rate: of both at the end of the cosine schedule.
-        half_waves: of that schedule, an odd number; see `methods.training.optimiser.cosine`.
-        patch: side of a patch, low-resolution pixels, at most.
-        patch_share: of the shorter side of the low-resolution frame that a patch has, at most.
+        features: how the features beyond RGB start: "random", with random weights, or "constant",
+            1/2 everywhere.
+        rate: initial learning rate of the 2D renderer.
+        field_rate: initial learning rate of the field.
+        final_rate: learning rate of both at the end of the cosine schedule.
+        half_waves: half waves of that schedule, an odd number; see
+            `methods.training.optimiser.cosine`.
+        patch: maximum side of a patch, in low-resolution pixels.
+        patch_share: maximum side of a patch, as a share of the shorter side of the low-resolution
+            frame.
         place: where a patch lies: "anywhere", or around "content", a pixel that is not background.
-        batch: patches of a step.
-        jitter: whether each ray has a random phase of its samples.
-        opacity_entropy: weight of -o ln o of the rays.
-        error_weight: of the squared difference between the estimated log error and the true one.
-        refined: share of the cells that are refined while it is trained.
-        refined_step: of their rays, in diagonals of the cube / 1024.
-        refined_rays: pixels of those that the field learns from in a step.
-        clip: largest norm of the 2D renderer's gradient; None: as it is.
+        batch: patches per step.
+        jitter: whether the samples of each ray have a random phase.
+        opacity_entropy: weight of -o ln o of the rays' opacity o.
+        error_weight: weight of the squared difference between the estimated log error and the
+            true one.
+        refined: share of the cells that are refined during training.
+        refined_step: ray-marching step in these cells, in diagonals of the cube / 1024.
+        refined_rays: pixels of these cells that the field learns from in a step.
+        clip: maximum norm of the 2D renderer's gradient; None: no clipping.
         average: decay of the running mean of the 2D renderer's weights, which is the result; 0: the
             weights themselves.
-        grid_samples: visits of an update of the density grid while the field learns; 0: it stays as
-            stage 1 left it.
-        distilled_views: most pictures of the stage 1 field, at random views, to learn from, too.
-        distilled_share: share of the patches that come from those.
-        motion: what precedes a training view.
+        grid_samples: cells visited in an update of the density grid while the field learns; 0: it
+            stays as stage 1 left it.
+        distilled_views: maximum number of pictures of the stage 1 field, at random views, that are
+            also learned from.
+        distilled_share: share of the patches that come from these pictures.
+        motion: the motion that precedes a training view.
     """
 
     field: Literal["joint", "frozen"] = "joint"
@@ -85,9 +89,9 @@ class JointOptions:
                     raise ValueError(f"joint.{name}: expected {wanted}, got {got}")
 
     def distilled(self, steps: int, frames: int) -> int:
-        """Distilled views that a training of so many `steps` can use.
+        """How many distilled views a training of `steps` steps can use.
 
-        With L = 0 `frames`, sequences are never continued.
+        With no preceding `frames` (L = 0), sequences are never continued.
         """
         longer = self.motion.longer if frames else 0.0
         sequences = self.motion.pool + (1 - longer) * steps * self.batch / self.motion.uses

@@ -1,4 +1,4 @@
-"""Patches of training views, seen through the pipeline as far as a 2D renderer needs it."""
+"""Patches of training views, rendered as far as the input of the 2D renderer."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ Through = Literal["all", "present", "none"]
 
 @dataclass(frozen=True)
 class Patch:
-    """A patch of a training view, and which rays of the field it is drawn from.
+    """A patch of a training view, and the rays of the field that it needs.
 
     Attributes:
-        sequence: what it was cut from.
+        sequence: the sequence it was cut from.
         view: its cameras.
-        truth: [H, W, 3].
-        indices: what each preceding frame shows at its pixels, [H, W].
+        truth: [H, W, 3] the true picture.
+        indices: for each preceding frame, the point that each pixel shows, [H, W].
         masks: which rays are rendered: of the pixels of `view.low` [h w], then, if the field learns
             from them, of the points [N] of each preceding frame.
     """
@@ -46,7 +46,7 @@ class Patch:
     masks: list[Tensor]
 
     def rays(self, chosen: list[Tensor]) -> list[Rays]:
-        """The rays of the `chosen` pixels and points, those where `masks` are true."""
+        """The rays of the `chosen` pixels and points, given as indices for each of `masks`."""
         clouds = [frame.cloud for frame in self.sequence.buffer.frames]
         pixels, *points = chosen
         shown = zip(clouds, points, strict=False)  # no points if the field learns from none
@@ -61,10 +61,10 @@ class Batch:
     """Patches to learn from.
 
     Attributes:
-        observations: what is known of each, with a gradient if the field is to learn.
+        observations: the renderer's input for each, with a gradient if the field learns.
         views: the cameras of each.
         truth: their true pictures, [B, H, W, 3].
-        opacity: of the rays that were rendered.
+        opacity: opacity of all rendered rays.
     """
 
     observations: list[Observation]
@@ -74,23 +74,23 @@ class Batch:
 
 
 class Patches(Protocol):
-    """Where a training gets its patches from."""
+    """A source of patches for a training."""
 
     def draw(self, count: int) -> Batch:
-        """`count` patches."""
+        """Draw `count` patches."""
 
     def state(self) -> dict[str, Tensor]:
-        """What the next patches depend on, beside the pipeline and the random numbers."""
+        """What the next patches depend on, besides the pipeline and the random numbers."""
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Put back what `state` gave."""
+        """Restore what `state` returned."""
 
 
 class PatchSource:
-    """Batches of random patches of the sequences of a pool.
+    """Draws batches of random patches from the sequences of a pool.
 
     Args:
-        options: how large a patch is, where it lies, and whether its rays are jittered.
+        options: size and place of a patch, and whether its rays are jittered.
         through: frames that the field learns from: "all", only the "present" one, or "none".
     """
 
@@ -121,7 +121,7 @@ class PatchSource:
         self.pool.restore(tensors)
 
     def cut(self, sequence: Sequence) -> Patch:
-        """A random patch of `sequence`."""
+        """Cut a random patch from `sequence`."""
         view, options = sequence.view, self.options
         size = view.low.height, view.low.width
         largest = min(options.patch, max(1, int(options.patch_share * min(size))))
@@ -144,7 +144,7 @@ class PatchSource:
     def _around_content(
         self, sequence: Sequence, extents: tuple[int, int], size: tuple[int, int]
     ) -> list[int]:
-        """The first row and column of a patch in which there is more than background."""
+        """Choose the first row and column of a patch that shows more than background."""
         place = sequence.cells[self._random(len(sequence.cells))].tolist()
         return [
             min(max(centre - self._random(extent), 0), side - extent)
@@ -152,7 +152,7 @@ class PatchSource:
         ]
 
     def _truth(self, sequence: Sequence, top: int, left: int, full: Camera) -> Tensor:
-        """The true picture [H, W, 3] of the patch; the background where it ends."""
+        """The true picture [H, W, 3] of the patch, with background beyond the picture's border."""
         scale = self.pipeline.model.scale
         background = self.pipeline.background[:3]
         rows = slice(top * scale, top * scale + full.height)
@@ -164,7 +164,8 @@ class PatchSource:
         return truth
 
     def observe(self, patches: list[Patch]) -> tuple[list[Observation], Tensor]:
-        """What the renderer is given of `patches`, with the gradient it is to have; opacities."""
+        """Compute the renderer's input for `patches`, with a gradient as `through` says, and the
+        opacities of the rays."""
         found, rays, extent = self._rays(patches)
         chosen = _of_each(patches, found)
         field, occupancy = self.pipeline.field, self.pipeline.occupancy
@@ -178,9 +179,9 @@ class PatchSource:
         return observations, pixels.alpha
 
     def _rays(self, patches: list[Patch]) -> tuple[list[Tensor], Rays, Extent | None]:
-        """The chosen pixels and points of all patches, where their masks are true, and their rays.
+        """The indices where the masks of all patches are true, and the rays of these entries.
 
-        A GPU is asked at once how many there are and how many samples they have.
+        On a GPU the number of rays and the extent of their samples are read back together.
         """
         masks = [mask for patch in patches for mask in patch.masks]
         if compacts(masks[0].device):
@@ -189,7 +190,7 @@ class PatchSource:
         which = torch.cat(masks)
         every = [torch.arange(len(mask), device=mask.device) for mask in masks]
         rays = _joined(patches, every)
-        # The chosen rays draw theirs again, the same.
+        # From a clone: `observe` draws the same phases again, for the chosen rays alone.
         jitter = self._jitter(len(which), self.generator.clone_state())
         if jitter is not None:
             jitter = jitter[(which.cumsum(0) - 1).clamp(min=0)]
@@ -206,7 +207,7 @@ class PatchSource:
         return indices_where(masks, sizes), rays.take(together), extent
 
     def _jitter(self, rays: int, generator: torch.Generator) -> Tensor | None:
-        """Phases of the samples of each ray, if they are random."""
+        """Random phases of the samples of each ray; None if they are not random."""
         if not self.options.jitter:
             return None
         device = self.pipeline.field.device
@@ -215,8 +216,8 @@ class PatchSource:
     def _visible(
         self, first: FirstPass, patches: list[Patch], chosen: list[list[Tensor]]
     ) -> tuple[Samples, list[Tensor] | list[None]]:
-        """The samples that are not hidden, and the cells near matter of each patch: a GPU is asked
-        at once for the numbers of both."""
+        """The samples that are not hidden, and the cells near matter of each patch. On a GPU the
+        numbers of both are read back together."""
         counts = first.counts
         if compacts(counts.device) or not self.pipeline.leaves_out(self.rendering):
             return first.samples.front(counts), [None] * len(patches)
@@ -233,7 +234,7 @@ class PatchSource:
     def _observation(
         self, patch: Patch, chosen: list[Tensor], rendered: list[Pixels], cells: Tensor | None
     ) -> Observation:
-        """Of the pixels and points that were `chosen` and `rendered`."""
+        """The observation of `patch`, from the `chosen` pixels and points as `rendered`."""
         (pixels, present), *preceding = zip(chosen, rendered, strict=True)
         frame = self._frame(patch, pixels, present)
         frames = patch.sequence.buffer.frames
@@ -247,7 +248,7 @@ class PatchSource:
         return self.pipeline.observe(frame, points, newest, patch.view, rendering, probe, cells)
 
     def _frame(self, patch: Patch, seen: Tensor, pixels: Pixels) -> FeatureFrame:
-        """All pixels of the patch, from those `seen`, which were rendered."""
+        """The frame of the whole patch, from its rendered pixels, those at indices `seen`."""
         parts = (pixels.values, pixels.depth_sum, pixels.alpha)
         canvas = Pixels(*(_spread(patch, seen, part).flatten(0, 1) for part in parts))
         frame = FeatureFrame.of(patch.view.low, canvas, self.pipeline.background)
@@ -258,27 +259,27 @@ class PatchSource:
 
 
 def _spread(patch: Patch, seen: Tensor, part: Tensor) -> Tensor:
-    """`part` [P, ...] at the pixels of the patch that are `seen` [P], 0 elsewhere: [h, w, ...]."""
+    """Scatter `part` [P, ...] to the pixels `seen` [P] of the patch, 0 elsewhere: [h, w, ...]."""
     low = patch.view.low
     blank = part.new_zeros(low.height * low.width, *part.shape[1:])
     return blank.index_copy(0, seen, part).unflatten(0, (low.height, low.width))
 
 
 def _of_each(patches: list[Patch], parts: Iterable[T]) -> list[list[T]]:
-    """`parts` of the masks of all patches, patch by patch."""
+    """Group `parts`, one for each mask of all patches, by patch."""
     following = iter(parts)
     return [[next(following) for _ in patch.masks] for patch in patches]
 
 
 def _joined(patches: list[Patch], chosen: list[Tensor]) -> Rays:
-    """The rays of what is `chosen` by each mask of all patches, in one."""
+    """Join the rays of what is `chosen` for each mask of all patches."""
     parts = zip(patches, _of_each(patches, chosen), strict=True)
     return Rays.joined([rays for patch, some in parts for rays in patch.rays(some)])
 
 
 def _asked(masks: list[Tensor], counts: Tensor) -> tuple[list[int], Extent]:
-    """In how many places each mask is true, and the extent of samples with `counts` [R]: a GPU is
-    asked once."""
+    """How many entries of each mask are true, and the extent of samples with `counts` [R]. The host
+    waits for a GPU once."""
     *sizes, total, longest = to_host(
         [*(mask.sum() for mask in masks), Extent.figures(counts[None])]
     )
@@ -286,7 +287,7 @@ def _asked(masks: list[Tensor], counts: Tensor) -> tuple[list[int], Extent]:
 
 
 def _shown(index: Tensor, count: int) -> Tensor:
-    """Which of `count` points stand in `index`, -1 for none: [count] bool."""
+    """Which of `count` points occur in `index`, which is -1 for none: [count] bool."""
     shown = torch.zeros(count + 1, dtype=torch.bool, device=index.device)
     return shown.index_fill_(0, index.flatten().long() % (count + 1), True)[:count]
 

@@ -1,8 +1,8 @@
 """Training sequences: a true picture, and the frames that came before it.
 
-Training views are scattered, so the cameras before each are made up: a random smooth motion that
-ends there. The pipeline renders these frames with its present weights, as it will when it is used.
-After some patches they are rendered again, along another motion.
+Training views are scattered, so the preceding cameras are synthetic: a random smooth motion that
+ends at the view. The pipeline renders these frames with its present weights, as it does when it is
+used. After a number of patches they are rendered again, along another motion.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class TrainingViews:
 
     Attributes:
         real: the training pictures.
-        target: [3] the point that the cameras look at, more or less.
+        target: [3] the point that the cameras look at, roughly.
         distilled: views whose pictures a trained field has rendered.
-        share: of the sequences that end in a distilled view.
+        share: share of the sequences that end in a distilled view.
     """
 
     real: Seq[TrueView]
@@ -49,7 +49,7 @@ class TrainingViews:
 
     @classmethod
     def of(cls, scene: Scene, distilled: Seq[TrueView] = (), share: float = 0.0) -> TrainingViews:
-        """The training pictures of `scene`, and a `share` of the `distilled` views."""
+        """The training views of `scene`, and `distilled` ones for a `share` of the sequences."""
         split = scene.splits["train"]
         real = [TrueView(c, p) for c, p in zip(split.cameras, split.images, strict=True)]
         return cls(real, viewing_target(scene), distilled, share)
@@ -62,17 +62,17 @@ class TrainingViews:
 
 @dataclass
 class Sequence:
-    """A view to be drawn and what precedes it.
+    """A training view and the frames that precede it.
 
     Attributes:
-        number: of the view, among those of its pool.
+        number: index of the view among those of its pool.
         truth: the view and its picture.
         view: the view as the pipeline sees it.
         buffer: the preceding frames.
-        cells: [N, 2] row and column of the low-resolution pixels in which the picture is not just
-            background, or of all if it is.
-        uses: patches that may still be cut out of it.
-        lasting: after these it is continued, not replaced.
+        cells: [N, 2] row and column of the low-resolution pixels that show more than background;
+            of all pixels if none does.
+        uses: how many patches may still be cut from it.
+        lasting: whether it is then continued instead of replaced.
     """
 
     number: int
@@ -86,15 +86,15 @@ class Sequence:
 
 @dataclass(frozen=True)
 class MotionOptions:
-    """The made-up motions before a training view.
+    """The synthetic motions before a training view.
 
     Attributes:
-        degrees: range of the angular speed, degrees a frame.
-        length: most frames that precede a view,
-        least: and fewest: fewer than L, and none at times, teach the cold start; the release trains
-            with L, always.
-        pool: sequences kept at a time.
-        uses: patches cut out of a sequence before it is replaced.
+        degrees: range of the angular speed, in degrees per frame.
+        length: maximum number of frames that precede a view.
+        least: minimum number; fewer than L, and sometimes none, teach the cold start. The release
+            always trains with L.
+        pool: number of sequences kept at a time.
+        uses: patches cut from a sequence before it is replaced.
         longer: probability that it is continued instead, there and back to its view, so that what
             is drawn becomes its own history.
     """
@@ -122,9 +122,9 @@ class SequencePool:
     """Sequences that end in randomly chosen views and are replaced as `MotionOptions` says.
 
     Args:
-        pipeline: renders the frames that precede a view,
-        rendering: in this way.
-        views: that sequences end in.
+        pipeline: renders the frames that precede a view.
+        rendering: how it renders them.
+        views: the views that sequences end in.
     """
 
     def __init__(
@@ -138,11 +138,11 @@ class SequencePool:
         self.pipeline, self.rendering = pipeline, rendering
         self._views, self._options, self._generator = views, options, generator
         self._pool: list[Sequence] = []
-        background = pipeline.background[:3].cpu()  # asked for once: a GPU is waited for
+        background = pipeline.background[:3].cpu()  # read back once: the host waits for a GPU
         self._background = (background * 255).round().to(torch.uint8)
 
     def draw(self) -> Sequence:
-        """A sequence of the pool; counts as one use."""
+        """Draw a sequence from the pool; counts as one use."""
         place = self._random(self._options.pool)
         if place >= len(self._pool):
             self._pool.append(self._make())
@@ -155,7 +155,7 @@ class SequencePool:
         return sequence
 
     def state(self) -> dict[str, Tensor]:
-        """All sequences as they stand, to be kept in a file."""
+        """The state of all sequences, to be kept in a file."""
         tensors = {}
         for place, sequence in enumerate(self._pool):
             figures = (sequence.number, sequence.uses, sequence.lasting)
@@ -164,7 +164,7 @@ class SequencePool:
         return tensors
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Go on with the sequences that `state` gave, of a pool of the same views and options."""
+        """Restore the sequences that `state` of a pool with the same views and options returned."""
         count = sum(name.endswith(".figures") for name in tensors)
         self._pool = [self._restored(part(tensors, f"{place}.")) for place in range(count)]
 
@@ -186,7 +186,7 @@ class SequencePool:
         return self._ended(number, self._motion(view), buffer, cells)
 
     def _go_on(self, old: Sequence) -> Sequence:
-        """Go on from the view that `old` ends in, there and back."""
+        """Continue from the view that `old` ends in, there and back."""
         back = self._motion(old.truth)
         back = back[len(back) // 2 :]
         path = [old.truth.camera, *reversed(back), *back[1:]]
@@ -200,11 +200,11 @@ class SequencePool:
     def _ended(
         self, number: int, motion: Seq[Camera], buffer: RenderingBuffer, cells: Tensor
     ) -> Sequence:
-        """The sequence of a view whose `buffer` has seen the frames of a `motion` besides."""
+        """Make a sequence after rendering the frames of a `motion` into its `buffer`."""
         if self.pipeline.model.frames:
             for camera in motion:
                 self.pipeline.remember(camera, buffer, self.rendering)
-        # Without frames before it, a view that goes on would be the same once more.
+        # Without preceding frames, continuing would only repeat the view.
         lasting = self._chance() < self._options.longer and self.pipeline.model.frames > 0
         return self._sequence(number, buffer, cells, self._options.uses, lasting)
 

@@ -1,4 +1,4 @@
-"""Stage 2: a 2D renderer, and with it the field, trained for one model; found again if it was."""
+"""Stage 2: train a 2D renderer and the field for one model, or load the result if it exists."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from methods.steernerf.training.sequences import SequencePool, TrainingViews
 from methods.training import loop
 
 MARKS = (0.125, 0.25, 0.5)
-"""Shares of the steps after which the weights are kept besides, so that an ablation can be shown as
-a curve over the steps."""
+"""Shares of the steps after which the weights are saved as well, so that an ablation can be shown
+as a curve over the steps."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,10 @@ class Stage2:
     """What is trained in stage 2, and how.
 
     Attributes:
-        model: what it is trained for.
-        make_renderer: makes the 2D renderer, called with K, L and s.
+        model: the settings it is trained for.
+        make_renderer: factory of the 2D renderer, called with K, L and s.
         joint: how it is trained.
-        after: share of its steps after which it is used, 1 or one of `MARKS`: one training serves
+        after: share of the steps whose weights are used, 1 or one of `MARKS`; one training serves
             all of them.
     """
 
@@ -53,14 +53,14 @@ class Stage2:
             raise ValueError(f"after: expected {choices} or 1, got {self.after}")
 
     def new_renderer(self, seed: int, device: torch.device) -> Renderer2d:
-        """A 2D renderer that has learned nothing."""
+        """Make an untrained 2D renderer."""
         torch.manual_seed(seed)
         model = self.model
         renderer = self.make_renderer(model.channels, model.frames, model.scale).to(device)
         return renderer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def key(self, budget: Budget) -> dict[str, object]:
-        """Everything that the training depends on, beside the field of stage 1."""
+        """Everything that the training depends on, besides the field of stage 1."""
         make: Any = self.make_renderer
         kind, settings = (make.func, make.keywords) if isinstance(make, partial) else (make, {})
         return {
@@ -75,7 +75,7 @@ class Stage2:
 
 @dataclass(frozen=True)
 class TrainedPipeline:
-    """A trained `pipeline`, the `key` of its weights, and the seconds of stage 2 behind them."""
+    """A trained `pipeline`, the `key` of its weights, and the seconds of stage 2 spent on them."""
 
     pipeline: Pipeline
     key: dict[str, object]
@@ -85,8 +85,8 @@ class TrainedPipeline:
 def train_stage2(
     trained: TrainedField, setup: Setup, stage2: Stage2, scene: Scene, budget: Budget, log: Log
 ) -> TrainedPipeline:
-    """Train `stage2` on the field that `setup` made for `scene`, or load what the same training
-    left behind; the field is widened to K features and changed in place."""
+    """Train `stage2` on the field that `setup` made for `scene`, or load the result of the same
+    training. The field is widened to K features and changed in place."""
     model, joint = stage2.model, stage2.joint
     count = joint.distilled(budget.renderer_steps, model.frames)
     distilled, distilled_s = distilled_views(setup, trained, scene, budget, count, log)
@@ -111,7 +111,7 @@ def train_stage2(
 
 
 def _at(folder: Path, share: float) -> Path:
-    """Where the weights after a `share` of the steps are kept."""
+    """The file of the weights after a `share` of the steps."""
     return folder / f"after-{share}.safetensors"
 
 
