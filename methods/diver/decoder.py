@@ -8,10 +8,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from methods.kernels.corner_rendering import Layers
 from methods.students.networks import positional
 
 CHANNELS = 32
-"""Features of a corner, and of every layer between input and output."""
+"""Features of a corner, and width of every layer between input and output."""
 
 FREQUENCIES = 4
 DIRECTION_CHANNELS = 3 + 2 * 3 * FREQUENCIES
@@ -24,8 +25,8 @@ def encode_directions(directions: Tensor) -> Tensor:
 
 
 class Decoder(nn.Module):
-    """A network 32-32-32-33 of integrated features, and one (32 + 27)-32-3 of the last 32 outputs
-    and the direction. ReLU between the layers of either; none where the second begins."""
+    """A 32-32-32-33 network of integrated features, and a (32 + 27)-32-3 network of its last 32
+    outputs and the direction. ReLU between the layers of each, but not between the two."""
 
     def __init__(self, generator: torch.Generator | None = None) -> None:
         super().__init__()
@@ -36,7 +37,7 @@ class Decoder(nn.Module):
         self.colour = _linear(3, CHANNELS, generator)
 
     def density(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Density [S], integrated over the segment, before its ReLU; what `colours` needs
+        """Density [S], integrated over the segment, before its ReLU; and what `colours` needs
         [S, 32]."""
         hidden = self.second(self.first(features).relu()).relu()
         sigma, geometry = self.third(hidden).split((1, CHANNELS), dim=1)
@@ -45,7 +46,7 @@ class Decoder(nn.Module):
     def colours(self, geometry: Tensor, encoded: Tensor, ray: Tensor) -> Tensor:
         """RGB [S, 3] in [0, 1] on rays `ray` [S] of encoded directions [R, 27]."""
         along, across = self.view.weight.split((CHANNELS, DIRECTION_CHANNELS), dim=1)
-        # Directions enter after the last product of positions: theirs is due once a ray.
+        # This layer is linear: the product of the directions is computed only once per ray.
         towards = functional.linear(encoded, across, self.view.bias)
         hidden = functional.linear(geometry, along) + towards.index_select(0, ray)
         return self.colour(hidden.relu()).sigmoid()
@@ -61,27 +62,19 @@ def _linear(outputs: int, inputs: int, generator: torch.Generator | None) -> nn.
 
 @dataclass(frozen=True)
 class Merged:
-    """The same decoder for features that the first layer was applied to at the corners.
+    """The same decoder, for features to which the first layer was already applied at the corners.
 
     Integration is linear and its weights add up to 1, so the first layer may come before it. No
-    ReLU stands between the 32 outputs and the layer of the directions: their product is one.
+    ReLU separates the 32 outputs from the layer of the directions: the two are merged.
 
     Attributes:
-        second, second_bias: [32, 32], [32].
-        sigma, sigma_bias: [1, 32], [1].
-        along, across, view_bias: [32, 32], [32, 27], [32].
-        colour, colour_bias: [3, 32], [3].
+        layers: from integrated features to density and colour.
+        across, view_bias: [32, 27], [32] of the encoded direction.
     """
 
-    second: Tensor
-    second_bias: Tensor
-    sigma: Tensor
-    sigma_bias: Tensor
-    along: Tensor
+    layers: Layers
     across: Tensor
     view_bias: Tensor
-    colour: Tensor
-    colour_bias: Tensor
 
     @classmethod
     @torch.no_grad()
@@ -89,18 +82,22 @@ class Merged:
         """From a trained decoder."""
         along, across = decoder.view.weight.split((CHANNELS, DIRECTION_CHANNELS), dim=1)
         third, bias = decoder.third.weight, decoder.third.bias
-        return cls(
-            decoder.second.weight.clone(),
-            decoder.second.bias.clone(),
-            third[:1].clone(),
-            bias[:1].clone(),
-            along @ third[1:],
-            across.clone(),
-            decoder.view.bias + along @ bias[1:],
-            decoder.colour.weight.clone(),
-            decoder.colour.bias.clone(),
+        layers = Layers(
+            hidden=decoder.second.weight.clone(),
+            hidden_bias=decoder.second.bias.clone(),
+            density=third[:1].clone(),
+            density_bias=bias[:1].clone(),
+            geometry=along @ third[1:],
+            colour=decoder.colour.weight.clone(),
+            colour_bias=decoder.colour.bias.clone(),
         )
+        return cls(layers, across.clone(), decoder.view.bias + along @ bias[1:])
+
+    def towards(self, directions: Tensor) -> Tensor:
+        """What ray `directions` [R, 3] add to the layer of the colour: [R, 32]."""
+        return functional.linear(encode_directions(directions), self.across, self.view_bias)
 
     def numel(self) -> int:
-        """Numbers in it."""
-        return sum(tensor.numel() for tensor in vars(self).values())
+        """Number of parameters."""
+        parts = (*vars(self.layers).values(), self.across, self.view_bias)
+        return sum(tensor.numel() for tensor in parts)

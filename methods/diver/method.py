@@ -26,17 +26,17 @@ FINEST = 512
 
 
 class Diver(Student):
-    """Corner features of sparse voxels whose integrals along ray segments a small network decodes.
+    """Corner features of sparse voxels, integrated along rays and decoded by a small network.
 
     Args:
         teacher: the field that it starts from, and where it runs.
-        training: how corners and decoder learn.
+        training: how corners and decoder are trained.
         resolution: voxels along the unit cube, a multiple of 16, at most 512.
-        stored: "bf16" or "fp32", the features of the corners when rendering.
+        stored: "bf16" or "fp32", the precision of the corners' features when rendering.
         faint: weight below which a segment has an opacity but no colour.
         stop: transmittance at which a ray ends when rendering, less than 1.
-        name: as it stands in result rows.
-        steps: of its own training; None: `budget.renderer_steps`.
+        name: as shown in result rows.
+        steps: steps of its own training; None: `budget.renderer_steps`.
     """
 
     kind = "diver"
@@ -48,7 +48,7 @@ class Diver(Student):
             "stored": [Variant("stored fp32", ("method.stored=fp32",))],
         },
         exact=("method.stop=1e-4", "method.faint=0", "method.stored=fp32"),
-        parts=dict.fromkeys(("rays", "walk", "gather", "decode", "composite"), "field"),
+        parts=dict.fromkeys(("rays", "segments"), "field"),
         axes={"G": Axis("{} voxels a side", "method.resolution", (128, 192, 256))},
     )
 

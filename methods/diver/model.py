@@ -22,10 +22,10 @@ class CornerModel(nn.Module):
     """V voxels of a grid over the unit cube with features [C, 32] of their corners, and a decoder.
 
     Args:
-        coordinates: [V, 3] int32 of the voxels.
+        coordinates: [V, 3] int32, which voxels there are.
         resolution: voxels along the cube.
-        decoder: of the integrals.
-        backend: of the kernels.
+        decoder: decodes the integrals.
+        backend: backend of the kernels.
     """
 
     table: nn.Parameter
@@ -43,8 +43,10 @@ class CornerModel(nn.Module):
     def taught(
         cls, teacher: TrainedField, resolution: int, generator: torch.Generator
     ) -> CornerModel:
-        """Where the teacher has anything: a corner has the teacher's hash encoding as its features,
-        16 levels of 2, divided by their standard deviation; the decoder is random.
+        """Make a model with voxels where the teacher is occupied.
+
+        The features of a corner are the teacher's hash encoding, 16 levels of 2, divided by their
+        standard deviation; the decoder is random.
 
         Raises:
             ValueError: the encoding has more than 32 channels.
@@ -69,8 +71,8 @@ class CornerModel(nn.Module):
         self.corners, self.vertices = corners_of(coordinates)
 
     def keep(self, voxels: Tensor) -> Tensor:
-        """Forget all voxels but some ([V] bool); the rows [C'] of the corners that are left."""
-        rows = self.corners[voxels].unique()  # in the order in which `_place` will have them
+        """Keep only some voxels ([V] bool); return the rows [C'] of the corners that are left."""
+        rows = self.corners[voxels].unique()  # in the order that `_place` gives them
         self._place(self.voxels.coordinates[voxels])
         self.table = nn.Parameter(self.table.detach()[rows.long()])
         return rows
@@ -91,7 +93,7 @@ class CornerModel(nn.Module):
         return decoder | {"coordinates": self.voxels.coordinates, "table": self.table.detach()}
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Put back what `tensors` gave, of as many voxels as there were."""
+        """Restore what `tensors` returned, with as many voxels as there were."""
         self.decoder.load_state_dict(checkpoint.part(tensors, "decoder."))
         device = self.table.device
         self._place(tensors["coordinates"].to(device))
@@ -99,5 +101,5 @@ class CornerModel(nn.Module):
 
 
 def as_intervals(crossings: Crossings) -> Intervals:
-    """For `composite`: densities are integrated already, so that every length is 1."""
+    """Intervals for `composite`: densities are integrated already, so every length is 1."""
     return Intervals(crossings.t, torch.ones_like(crossings.t), crossings.offsets)

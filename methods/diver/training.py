@@ -1,4 +1,4 @@
-"""Corners and decoder learn from random pixels of the training pictures."""
+"""Training of corners and decoder on random pixels of the training pictures."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from methods.training.optimiser import step_at
 
 @dataclass(frozen=True)
 class DiverLessons(PixelOptions):
-    """How the model learns; `rate` is that of the decoder.
+    """How to train the model; `rate` is that of the decoder.
 
     Attributes:
-        corner_rate: learning rate at the beginning, of the features of the corners.
+        corner_rate: initial learning rate of the corners' features.
         sparsity: weight of the mean of log(1 + 2 sigma^2) over the segments that are not hidden,
-            sigma before its ReLU: what is negative is drawn back to 0.
-        prune_at: share of the steps after which voxels go that hardly show.
-        prune_below: largest weight, in all rays that were looked along, of a voxel that goes.
-        prune_rays: random training rays that are looked along, at most as many as there are.
+            with sigma before its ReLU: negative values are drawn back to 0.
+        prune_at: share of the steps after which voxels that hardly show are pruned.
+        prune_below: a voxel is pruned if its weight on all traced rays is below this.
+        prune_rays: random training rays that are traced for this, at most as many as there are.
     """
 
     rate: float = 5e-3
@@ -51,7 +51,7 @@ class DiverLessons(PixelOptions):
 
 
 class DiverTraining(PixelTraining):
-    """The training as a `methods.training.loop.Training`: some thousand rays a step."""
+    """Trains corners and decoder on some thousand rays a step, as a `loop.Training`."""
 
     options: DiverLessons
 
@@ -66,7 +66,7 @@ class DiverTraining(PixelTraining):
         self.grad = torch.zeros_like(model.table)
 
     def advance(self) -> dict[str, float]:
-        """One step; its mean squared error."""
+        """Take one step; return its mean squared error."""
         if self.step == int(self.options.prune_at * self.steps):
             self._prune()
         return super().advance()
@@ -91,8 +91,8 @@ class DiverTraining(PixelTraining):
         return pixels.over(background), count
 
     def _push_to_sparsity(self, raw: Tensor, count: int) -> None:
-        """Add, to the gradient of the first `count` of the densities `raw`, that of the mean of
-        log(1 + 2 sigma^2)."""
+        """Add the gradient of the sparsity term, the mean of log(1 + 2 sigma^2), to that of the
+        first `count` densities `raw`."""
         if self.options.sparsity and raw.requires_grad:
             slope = 4 * raw.detach() / (1 + 2 * raw.detach().square())
             slope[count:] = 0
@@ -109,7 +109,7 @@ class DiverTraining(PixelTraining):
 
     @torch.no_grad()
     def _prune(self) -> None:
-        """Forget the voxels that no ray of many shows with more than a certain weight (their
+        """Prune the voxels that have less than a certain weight on all of many rays (their
         Section 4.1)."""
         model, options = self.model, self.options
 
@@ -142,11 +142,11 @@ class DiverTraining(PixelTraining):
         return self.model.tensors()
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
-        """Put back what `result` gave."""
+        """Restore what `result` returned."""
         self.model.load(tensors)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Optimisers, random numbers, size of the batch."""
+        """Optimisers, random numbers, number of rays."""
         tensors, figures = super().state()
         tensors |= self.moments.tensors("moments.")
         return tensors | checkpoint.optimiser_tensors(self.networks, "adam."), figures

@@ -139,6 +139,7 @@ def test_every_kernel_has_cases_for_all_its_backends(kernel: str) -> None:
 NAMES = {
     "adam": "sparse_adam_",
     "corner_gather": "gather",
+    "corner_rendering": "render_segments",
     "gaussian_blending": "blend",
     "gaussian_projection": "project_gaussians",
     "grouped_mlp": "grouped_linear",

@@ -1,8 +1,8 @@
-"""Corner features with numba: a row of the table is read as a whole, a few vectors of channels.
+"""Corner features with numba: each table row is read whole, a few vectors of channels.
 
-Forward: a thread takes a chunk of samples. Backward: a thread takes some rows and walks all
-samples, so that no two threads ever add to the same number: no atomics, and the same sums however
-many threads there are.
+Forward: each thread handles a chunk of samples. Backward: each thread owns some table rows and goes
+through all samples, so that no two threads add to the same number. This needs no atomics, and the
+sums do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ CHUNK = 256  # samples
 GAUSS = f32(0.5 / sqrt(3))
 """Distance of the two nodes of the Gauss-Legendre rule from the middle of a segment of length 1."""
 
-# Reordering and fused multiply-adds are allowed; assuming that no NaN comes is not.
+# Reordering and fused multiply-adds are allowed; assuming that there is no NaN is not.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
@@ -126,8 +126,8 @@ def _weights(fill, *places: Tensor) -> Tensor:
 
 
 @njit(cache=True)
-def _all(values, i):
-    """The eight numbers in a row: in names of their own they stay in registers."""
+def eight_of(values, i):
+    """The eight numbers of a row; as separate variables they stay in registers."""
     return (
         values[i, 0],
         values[i, 1],
@@ -145,8 +145,8 @@ def _gather(table, corners, voxel, weights, out):
     total, channels = out.shape
     for chunk in prange((total + CHUNK - 1) // CHUNK):
         for i in range(chunk * CHUNK, min(total, (chunk + 1) * CHUNK)):
-            r0, r1, r2, r3, r4, r5, r6, r7 = _all(corners, voxel[i])
-            w0, w1, w2, w3, w4, w5, w6, w7 = _all(weights, i)
+            r0, r1, r2, r3, r4, r5, r6, r7 = eight_of(corners, voxel[i])
+            w0, w1, w2, w3, w4, w5, w6, w7 = eight_of(weights, i)
             for k in range(channels):
                 out[i, k] = (
                     w0 * table[r0, k]
@@ -161,7 +161,7 @@ def _gather(table, corners, voxel, weights, out):
 
 
 @njit(cache=True)
-def _wide(half):
+def wide(half):
     """A bfloat16, given as its bits, as float32."""
     return u32(u32(half) << u32(16)).view(np.float32)
 
@@ -171,18 +171,18 @@ def _gather_bf16(table, corners, voxel, weights, out):
     total, channels = out.shape
     for chunk in prange((total + CHUNK - 1) // CHUNK):
         for i in range(chunk * CHUNK, min(total, (chunk + 1) * CHUNK)):
-            r0, r1, r2, r3, r4, r5, r6, r7 = _all(corners, voxel[i])
-            w0, w1, w2, w3, w4, w5, w6, w7 = _all(weights, i)
+            r0, r1, r2, r3, r4, r5, r6, r7 = eight_of(corners, voxel[i])
+            w0, w1, w2, w3, w4, w5, w6, w7 = eight_of(weights, i)
             for k in range(channels):
                 out[i, k] = (
-                    w0 * _wide(table[r0, k])
-                    + w1 * _wide(table[r1, k])
-                    + w2 * _wide(table[r2, k])
-                    + w3 * _wide(table[r3, k])
-                    + w4 * _wide(table[r4, k])
-                    + w5 * _wide(table[r5, k])
-                    + w6 * _wide(table[r6, k])
-                    + w7 * _wide(table[r7, k])
+                    w0 * wide(table[r0, k])
+                    + w1 * wide(table[r1, k])
+                    + w2 * wide(table[r2, k])
+                    + w3 * wide(table[r3, k])
+                    + w4 * wide(table[r4, k])
+                    + w5 * wide(table[r5, k])
+                    + w6 * wide(table[r6, k])
+                    + w7 * wide(table[r7, k])
                 )
 
 
@@ -225,7 +225,7 @@ def _trilinear(local, weights):
 
 
 @njit(cache=True, fastmath=FAST)
-def _mean_weights(ax, ay, az, bx, by, bz):
+def mean_weights(ax, ay, az, bx, by, bz):
     """A weight is a cubic along the segment, for which two Gauss-Legendre nodes are exact."""
     half = f32(0.5)
     mx, my, mz = (ax + bx) * half, (ay + by) * half, (az + bz) * half
@@ -251,11 +251,11 @@ def _integral(entry, leave, weights):
         for i in range(chunk * CHUNK, min(total, (chunk + 1) * CHUNK)):
             ax, ay, az = entry[i, 0], entry[i, 1], entry[i, 2]
             bx, by, bz = leave[i, 0], leave[i, 1], leave[i, 2]
-            _put(weights, i, _mean_weights(ax, ay, az, bx, by, bz))
+            _put(weights, i, mean_weights(ax, ay, az, bx, by, bz))
 
 
 @njit(cache=True)
-def _local(origin, direction, t, resolution, corner):
+def local_coordinate(origin, direction, t, resolution, corner):
     """Local coordinate, along an axis, in the voxel that begins at `corner`."""
     place = (origin + t * direction) * resolution - f32(corner)
     return min(max(place, f32(0)), f32(1))
@@ -270,12 +270,12 @@ def _integral_along(origins, directions, ray, near, far, coordinates, voxel, res
             ox, oy, oz = origins[r, 0], origins[r, 1], origins[r, 2]
             dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
             x, y, z = coordinates[v, 0], coordinates[v, 1], coordinates[v, 2]
-            found = _mean_weights(
-                _local(ox, dx, near[i], resolution, x),
-                _local(oy, dy, near[i], resolution, y),
-                _local(oz, dz, near[i], resolution, z),
-                _local(ox, dx, far[i], resolution, x),
-                _local(oy, dy, far[i], resolution, y),
-                _local(oz, dz, far[i], resolution, z),
+            found = mean_weights(
+                local_coordinate(ox, dx, near[i], resolution, x),
+                local_coordinate(oy, dy, near[i], resolution, y),
+                local_coordinate(oz, dz, near[i], resolution, z),
+                local_coordinate(ox, dx, far[i], resolution, x),
+                local_coordinate(oy, dy, far[i], resolution, y),
+                local_coordinate(oz, dz, far[i], resolution, z),
             )
             _put(weights, i, found)

@@ -1,8 +1,7 @@
 """Small networks with numba: six samples and 16 outputs at a time, kept in registers.
 
-`_product` is what all is made of. LLVM does not keep the sums of a loop nest in registers by itself
-(13 instead of 40 GFLOP/s a core), so its loop is written in LLVM's own terms. Work is divided among
-threads by samples, at the borders of networks.
+All of it is made of `methods.kernels.cpu.six`. Work is divided among threads by samples, at the
+borders of networks.
 """
 
 from __future__ import annotations
@@ -11,36 +10,28 @@ import math
 
 import numpy as np
 import torch
-from llvmlite import ir
-from numba import njit, prange, types
-from numba.core import cgutils
-from numba.extending import intrinsic
-from numba.np.arrayobj import make_array
+from numba import njit, prange
 from torch import Tensor
 from torch.nn import functional
 
-from methods.kernels.cpu import f32
+from methods.kernels.cpu import LANES, ROWS, f32, multiply, six, six_relu
 from methods.kernels.grouped_mlp import HIDDEN, Groups, Networks
 
-ROWS = 6
-"""Samples that are computed together: 6 x 16 sums fill 12 of the 16 vector registers of AVX2."""
-
 SLOT = 8  # numbers a row of `_encode`: ROWS and two idle ones, a whole vector
-LANES = 16  # outputs that are computed together
 CHUNKS = 64
-"""Parts into which samples are divided, always the same ones."""
+"""Parts into which samples are divided; fixed, so that results are repeatable."""
 
 RESTART = 5
-"""Doublings of an angle, each of which doubles its error, before it is computed anew."""
+"""Doublings of an angle before sine and cosine are computed afresh, as each doubles the error."""
 
 ZERO, ONE, TWO = f32(0), f32(1), f32(2)
 PER_TURN = f32(2 / math.pi)
-# pi / 2 in three parts, the first two short enough that multiples up to 2^11 are exact.
+# pi / 2 in three parts; the first two have few enough bits that multiples up to 2^11 are exact.
 QUARTER0 = f32(1.5703125)
 QUARTER1 = f32(0.000483989715576171875)
 QUARTER2 = f32(math.pi / 2 - 1.5703125 - 0.000483989715576171875)
 # sin r = r + r z (S0 + z (S1 + z S2)), cos r = 1 - z / 2 + z^2 (C0 + z (C1 + z C2)), z = r^2,
-# |r| <= pi/4: least squares, below 3e-9 before rounding.
+# |r| <= pi/4: least-squares fits, errors below 3e-9 before rounding.
 S0, S1, S2 = f32(-0.16666655242443085), f32(0.008332165889441967), f32(-0.00019515953317750245)
 C0, C1, C2 = f32(0.04166664555668831), f32(-0.0013887342065572739), f32(2.4435852537862957e-05)
 
@@ -126,7 +117,7 @@ def _arrays(*tensors: Tensor) -> list[np.ndarray]:
 
 
 class _Linear(torch.autograd.Function):
-    """Outputs are computed, and gradients of inputs, in whole vectors; what is too much is cut."""
+    """Computes outputs and input gradients in whole vectors, and cuts off the excess."""
 
     @staticmethod
     def forward(ctx, inputs, weights, biases, offsets, relu):
@@ -156,112 +147,6 @@ class _Linear(torch.autograd.Function):
         return grad_inputs[:, :channels] if wanted else None, *cut, None, None
 
 
-def _product(rows: int, relu: bool):
-    """out[r, o] = bias[o] + sum_k a[r, k] w[k, o] for `rows` r and `LANES` o, of flat arrays.
-
-    Its arguments: a, the place of a[0, 0], steps to the next r and the next k; w, the place of
-    w[0, 0], the step to the next k; bias, its place; out, its place, the step to the next r; how
-    many k there are, 1 or more.
-    """
-
-    @intrinsic
-    def product(
-        typing, a, a_at, a_row, a_step, w, w_at, w_step, bias, bias_at, out, out_at, out_row, count
-    ):
-        def generate(context, builder, signature, values):
-            index = ir.IntType(64)
-            vector = ir.VectorType(ir.FloatType(), LANES)
-            zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-            fma = cgutils.get_or_insert_function(
-                builder.module,
-                ir.FunctionType(vector, [vector] * 3),
-                f"llvm.fma.v{LANES}f32",
-            )
-
-            def pointer(array: int) -> ir.Value:
-                data = make_array(signature.args[array])(context, builder, values[array]).data
-                return builder.gep(data, [values[array + 1]])
-
-            def lanes(base: ir.Value, at: ir.Value) -> ir.Value:
-                return builder.bitcast(builder.gep(base, [at]), vector.as_pointer())
-
-            def splat(number: ir.Value) -> ir.Value:
-                nothing = ir.Constant(vector, ir.Undefined)
-                one = builder.insert_element(nothing, number, ir.Constant(ir.IntType(32), 0))
-                return builder.shuffle_vector(one, nothing, zeros)
-
-            def row(step: ir.Value, r: int) -> ir.Value:
-                return builder.mul(step, ir.Constant(index, r))
-
-            a_data, w_data, bias_data, out_data = (pointer(n) for n in (0, 4, 7, 9))
-            first = builder.load(lanes(bias_data, ir.Constant(index, 0)), align=4)
-            before, loop = builder.block, builder.append_basic_block("k")
-            after = builder.append_basic_block("summed")
-            builder.branch(loop)
-
-            builder.position_at_end(loop)
-            k = builder.phi(index)
-            sums = [builder.phi(vector) for _ in range(rows)]
-            weight = builder.load(lanes(w_data, builder.mul(k, values[6])), align=4)
-            along = builder.gep(a_data, [builder.mul(k, values[3])])
-            next_k = builder.add(k, ir.Constant(index, 1))
-            k.add_incoming(ir.Constant(index, 0), before)
-            k.add_incoming(next_k, loop)
-            results = []
-            for r, total in enumerate(sums):
-                number = splat(builder.load(builder.gep(along, [row(values[2], r)])))
-                results.append(builder.call(fma, [number, weight, total]))
-                total.add_incoming(first, before)
-                total.add_incoming(results[-1], loop)
-            builder.cbranch(builder.icmp_signed("<", next_k, values[12]), loop, after)
-
-            builder.position_at_end(after)
-            nothing = ir.Constant(vector, [0.0] * LANES)
-            for r, result in enumerate(results):
-                if relu:  # NaN is not below 0 and stays
-                    below = builder.fcmp_ordered("<", result, nothing)
-                    result = builder.select(below, nothing, result)
-                builder.store(result, lanes(out_data, row(values[11], r)), align=4)
-            return context.get_dummy_value()
-
-        n = types.int64
-        return types.void(a, n, n, n, w, n, n, bias, n, out, n, n, n), generate
-
-    return product
-
-
-_six, _six_relu = _product(ROWS, relu=False), _product(ROWS, relu=True)
-_one, _one_relu = _product(1, relu=False), _product(1, relu=True)
-
-
-@njit(cache=True)
-def _multiply(rows, a, a_at, a_row, a_step, w, width, bias, out, out_at, count, relu):
-    """`rows` rows of a matrix, any number, times w [count, width], plus bias [width], which are
-    flat: out [rows, width]."""
-    for left in range(0, width, LANES):
-        r = 0
-        while r < rows:
-            if rows >= ROWS:
-                r = min(r, rows - ROWS)  # the last ones overlap: some are computed twice
-            at, to = a_at + r * a_row, out_at + r * width + left
-            if rows < ROWS:
-                if relu:
-                    _one_relu(
-                        a, at, a_row, a_step, w, left, width, bias, left, out, to, width, count
-                    )
-                else:
-                    _one(a, at, a_row, a_step, w, left, width, bias, left, out, to, width, count)
-                r += 1
-            else:
-                if relu:
-                    _six_relu(
-                        a, at, a_row, a_step, w, left, width, bias, left, out, to, width, count
-                    )
-                else:
-                    _six(a, at, a_row, a_step, w, left, width, bias, left, out, to, width, count)
-                r += ROWS
-
-
 @njit(cache=True, parallel=True, error_model="numpy")
 def _locate(positions, cubes, corner, side, networks, local):
     for s in prange(len(positions)):
@@ -281,7 +166,7 @@ def _locate(positions, cubes, corner, side, networks, local):
 
 @njit(cache=True)
 def _sort(networks, offsets, places):
-    """A counting sort: each network's samples keep their order."""
+    """Counting sort; samples of the same network keep their order."""
     for s in range(len(networks)):
         if networks[s] >= 0:
             offsets[networks[s] + 1] += 1
@@ -307,7 +192,7 @@ def _borders(offsets):
 
 @njit(cache=True)
 def _largest(offsets):
-    """Samples of the largest group."""
+    """Number of samples in the largest group."""
     largest = 0
     for n in range(len(offsets) - 1):
         largest = max(largest, offsets[n + 1] - offsets[n])
@@ -321,7 +206,7 @@ def _linear(inputs, weights, biases, offsets, relu, out):
     flat, flat_out = inputs.reshape(-1), out.reshape(-1)
     for chunk in prange(CHUNKS):
         for n in range(borders[chunk], borders[chunk + 1]):
-            _multiply(
+            multiply(
                 offsets[n + 1] - offsets[n],
                 flat,
                 offsets[n] * channels,
@@ -344,7 +229,7 @@ def _backward(inputs, weights, offsets, out, grad, relu, grad_inputs, grad_weigh
     borders, largest = _borders(offsets), _largest(offsets)
     flat, flat_inputs = inputs.reshape(-1), grad_inputs.reshape(-1)
     for chunk in prange(CHUNKS):
-        through = np.empty(largest * outputs, np.float32)  # what the ReLU lets through of `grad`
+        through = np.empty(largest * outputs, np.float32)  # the part of `grad` that passes the ReLU
         turned = np.zeros(outputs * width, np.float32)  # the weights, transposed
         nothing = np.zeros(max(width, outputs), np.float32)
         for n in range(borders[chunk], borders[chunk + 1]):
@@ -360,9 +245,9 @@ def _backward(inputs, weights, offsets, out, grad, relu, grad_inputs, grad_weigh
                     shut = relu and out[first + s, o] <= ZERO
                     kept[o] = ZERO if shut else grad[first + s, o]
                     grad_biases[n, o] += kept[o]
-            # Of the weights: inputs^T through.
+            # Gradient of the weights: inputs^T through.
             at, to = first * channels, grad_weights[n].reshape(-1)
-            _multiply(
+            multiply(
                 channels, flat, at, 1, channels, through, outputs, nothing, to, 0, count, False
             )
             if len(grad_inputs):  # through weights^T
@@ -370,14 +255,14 @@ def _backward(inputs, weights, offsets, out, grad, relu, grad_inputs, grad_weigh
                     for o in range(outputs):
                         turned[o * width + i] = weights[n, i, o]
                 to, at = flat_inputs, first * width
-                _multiply(
+                multiply(
                     count, through, 0, outputs, 1, turned, width, nothing, to, at, outputs, False
                 )
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _sine_and_cosine(angle):
-    """Of an angle of up to some thousand quarter turns."""
+    """Sine and cosine of an angle of up to some thousand quarter turns."""
     whole = np.floor(angle * PER_TURN + f32(0.5))
     r = ((angle - whole * QUARTER0) - whole * QUARTER1) - whole * QUARTER2
     z = r * r
@@ -396,7 +281,7 @@ def _sine_and_cosine(angle):
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
 def _encode(encoded, frequencies):
-    """Fill in sines and cosines: number c of sample r is encoded[c * SLOT + r], 0 to 2 given."""
+    """Fill in sines and cosines: channel c of sample r is encoded[c * SLOT + r], 0 to 2 given."""
     block = 3 * SLOT
     for k in range(frequencies):
         sines, cosines = (1 + 2 * k) * block, (2 + 2 * k) * block
@@ -437,9 +322,9 @@ def _block(a, a_row, a_step, w, bias, out, out_row, count, relu):
     """`ROWS` rows times w [count, 32], plus bias [32]: out [ROWS, 32 of `out_row`]."""
     for left in range(0, HIDDEN, LANES):
         if relu:
-            _six_relu(a, 0, a_row, a_step, w, left, HIDDEN, bias, left, out, left, out_row, count)
+            six_relu(a, 0, a_row, a_step, w, left, HIDDEN, bias, left, out, left, out_row, count)
         else:
-            _six(a, 0, a_row, a_step, w, left, HIDDEN, bias, left, out, left, out_row, count)
+            six(a, 0, a_row, a_step, w, left, HIDDEN, bias, left, out, left, out_row, count)
 
 
 @njit(cache=True, parallel=True, fastmath={"contract", "reassoc"})
@@ -527,7 +412,7 @@ def _colours(
                 _block(given, HIDDEN, 1, feature, of, joined, channels, HIDDEN, False)
                 of = direction_biases[n]
                 _block(joined, channels, 1, direction, of, inner, HIDDEN, channels, True)
-                _six(inner, 0, HIDDEN, 1, last, 0, LANES, bias, 0, result, 0, LANES, HIDDEN)
+                six(inner, 0, HIDDEN, 1, last, 0, LANES, bias, 0, result, 0, LANES, HIDDEN)
                 for r in range(rows):
                     for c in range(3):
                         raw[permutation[first + r], c] = result[r * LANES + c]

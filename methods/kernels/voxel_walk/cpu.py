@@ -1,9 +1,9 @@
-"""Crossed voxels with numba: from cell to cell in integers (Amanatides & Woo 1987), and over all
-bricks that are known to be empty in one step.
+"""The voxel walk with numba: from cell to cell in integers (Amanatides & Woo 1987), and over all
+bricks known to be empty in one step.
 
-As in the ray march, a chunk of rays writes what it finds into its own part of a scratch array; when
-all counts are known, it is moved to its place. A frame does not keep what it finds: each ray walks,
-shades and composites a few voxels at a time, which never leave the first-level cache.
+As in the ray march, a chunk of rays writes its crossings into its own part of a scratch array; once
+all counts are known, they are moved to their final place. Rendering does not store crossings: each
+ray walks, shades and composites a few voxels at a time, which never leave the L1 cache.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from methods.kernels.voxel_walk import Crossings, Light, Voxels
 
 CHUNK = 64  # rays
 ROUND = 16
-"""Voxels that a ray of a frame finds at a time: few are walked in vain behind its end."""
+"""Voxels that a ray finds at a time when rendering; few, so that few behind its end are wasted."""
 
 f64 = np.float64
 INF = f32(np.inf)
 
 BLOCK = 1 << 12
-"""Rays walked together: the next ones write to memory that these have made warm."""
+"""Rays walked at a time; the next ones reuse memory that is then already in the cache."""
 
 
 def walk(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> Crossings:
@@ -100,7 +100,7 @@ def render_voxels(
 
 @njit(cache=True)
 def _length(dx, dy, dz):
-    """Of a direction."""
+    """Length of a direction."""
     return f32(math.sqrt(f64(dx) ** 2 + f64(dy) ** 2 + f64(dz) ** 2))
 
 
@@ -112,7 +112,7 @@ def _plane(k, width, origin, slope):
 
 @njit(cache=True)
 def _slab(origin, slope, size, width):
-    """Between which t a ray is inside the cube, along one axis."""
+    """The range of t in which a ray is inside the cube, along one axis."""
     if slope == 0:
         return (-INF, INF) if f32(0) <= origin <= f32(1) else (INF, -INF)
     a, b = _plane(0, width, origin, slope), _plane(size, width, origin, slope)
@@ -121,7 +121,7 @@ def _slab(origin, slope, size, width):
 
 @njit(cache=True)
 def _cell(t, origin, direction, slope, size, width):
-    """The cell of an axis in which a ray is at `t`: that behind the last plane it has crossed."""
+    """The cell of an axis in which a ray is at `t`: the one behind the last crossed plane."""
     cell = min(max(int((origin + t * direction) * f32(size)), 0), size - 1)
     if slope > 0:
         while cell + 1 < size and _plane(cell + 1, width, origin, slope) <= t:
@@ -138,7 +138,7 @@ def _cell(t, origin, direction, slope, size, width):
 
 @njit(cache=True)
 def _leave(first, end, width, origin, slope):
-    """t at which a ray leaves, along one axis, the cells `first` to `end`, excluded."""
+    """t at which a ray leaves the cells [first, end) of one axis."""
     if slope == 0:
         return INF
     return _plane(end if slope > 0 else first, width, origin, slope)
@@ -146,17 +146,15 @@ def _leave(first, end, width, origin, slope):
 
 @njit(cache=True)
 def _empty_cells(cell, free, size):
-    """Along one axis, the cells that are empty with `cell`, if `free` bricks are."""
+    """The cells of one axis that are known to be empty around `cell`, at a clearance of `free`."""
     brick = cell >> 3
     return max(brick - free + 1, 0) << 3, min((brick + free) << 3, size)
 
 
 @njit(cache=True, error_model="numpy")
-def _walk_ray(
-    origin, direction, bricks, masks, leaves, clearance, start, limit, nears, fars, found
-):
-    """Write entry, exit and voxel of at most `limit` crossings; return how many there are and the t
-    to go on from."""
+def walk_ray(origin, direction, bricks, masks, leaves, clearance, start, limit, nears, fars, found):
+    """Write entry, exit and voxel of at most `limit` crossings; return their count, and the t to
+    resume from."""
     size = bricks.shape[0] << 3
     width = f32(1) / f32(size)
     ox, oy, oz = origin[0], origin[1], origin[2]
@@ -171,7 +169,7 @@ def _walk_ray(
     if not (finite and t < far < INF and start < far):
         return 0, INF
     t = max(t, start)
-    # A step to the next cell, and the plane that it crosses.
+    # Direction of the next cell, and offset of the plane that is crossed.
     step_x, step_y, step_z = i32(sx > 0), i32(sy > 0), i32(sz > 0)
     count = 0
     x = _cell(t, ox, dx, sx, size, width)
@@ -242,7 +240,7 @@ def _find(
     for chunk in prange((rays + CHUNK - 1) // CHUNK):
         used = chunk * CHUNK * limit
         for ray in range(chunk * CHUNK, min(rays, (chunk + 1) * CHUNK)):
-            counts[ray], resume[ray] = _walk_ray(
+            counts[ray], resume[ray] = walk_ray(
                 origins[ray],
                 directions[ray],
                 bricks,
@@ -329,7 +327,7 @@ def _render(
             red, green, blue, depth, transmittance = 0.0, 0.0, 0.0, 0.0, 1.0
             start, steps, colours = f32(0), 0, 0
             while start < np.inf and transmittance > stop:
-                count, start = _walk_ray(
+                count, start = walk_ray(
                     origin,
                     direction,
                     bricks,

@@ -1,0 +1,322 @@
+"""Pixels of corner features with numba: a ray at a time, a few segments of it together, and nothing
+of them ever leaves the first-level cache.
+
+The hidden layer is computed for `ROWS` segments at once, because that is what the registers hold:
+some lie behind the end of the ray, in vain. Segments that show wait until `BATCH` of them are
+there, of any rays of a chunk, before their colours are computed together.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numba import njit, prange, types
+from numba.extending import overload
+from torch import Tensor
+from torch.nn import functional
+
+from bench.types import Rays
+from methods.kernels.composite import Pixels
+from methods.kernels.corner_gather.cpu import (
+    eight_of,
+    local_coordinate,
+    mean_weights,
+    wide,
+)
+from methods.kernels.corner_rendering import Corners, Layers
+from methods.kernels.cpu import LANES, ROWS, f32, multiply, sigmoid
+from methods.kernels.voxel_walk import Voxels
+from methods.kernels.voxel_walk.cpu import walk_ray
+
+CHUNK = 64  # rays
+BATCH = 8 * ROWS
+"""Segments whose colours are computed together."""
+
+f64 = np.float64
+
+
+def render_segments(
+    rays: Rays,
+    voxels: Voxels,
+    corners: Corners,
+    layers: Layers,
+    towards: Tensor,
+    stop: float,
+    faint: float,
+) -> tuple[Pixels, Tensor, Tensor]:
+    """See `methods.kernels.corner_rendering.render_segments`."""
+    parts = [
+        layers.hidden.T,
+        layers.hidden_bias,
+        *_whole_lanes(layers.density, layers.density_bias),
+        layers.geometry.T,
+        *_whole_lanes(layers.colour, layers.colour_bias),
+    ]
+    dtypes = {x.dtype for x in (rays.origins, rays.directions, towards, *parts)}
+    table = corners.table.detach().contiguous()
+    if dtypes != {torch.float32} or table.dtype not in (torch.float32, torch.bfloat16):
+        raise ValueError(
+            "backend 'cpu' renders float32 with a table of float32 or bfloat16, got "
+            f"{dtypes} with {table.dtype}: use backend='reference'"
+        )
+    if any(size % LANES for size in layers.hidden.shape):
+        raise ValueError(
+            f"backend 'cpu' has layers of multiples of {LANES}, got {list(layers.hidden.shape)}: "
+            "use backend='reference'"
+        )
+    if table.dtype == torch.bfloat16:
+        features = table.view(torch.int16).numpy().view(np.uint16)
+    else:
+        features = table.numpy()
+    count = len(rays.origins)
+    pixels = Pixels.blank(count, 3)
+    crossed, shaded = (torch.zeros(count, dtype=torch.int32) for _ in range(2))
+    _render(
+        rays.origins.detach().contiguous().numpy(),
+        rays.directions.detach().contiguous().numpy(),
+        towards.detach().contiguous().numpy(),
+        *(x.numpy() for x in (voxels.bricks, voxels.masks, voxels.leaves, voxels.clearance)),
+        voxels.coordinates.contiguous().numpy(),
+        f32(voxels.resolution),
+        corners.rows.contiguous().numpy(),
+        features,
+        *(x.detach().contiguous().numpy() for x in parts),
+        f64(f32(stop)),
+        f64(f32(faint)),
+        pixels.values.numpy(),
+        pixels.depth_sum.numpy(),
+        pixels.alpha.numpy(),
+        crossed.numpy(),
+        shaded.numpy(),
+    )
+    return pixels, crossed, shaded
+
+
+def _whole_lanes(weights: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
+    """A layer of fewer than `LANES` outputs with zeros for the others: [H, LANES], [LANES]."""
+    idle = LANES - len(bias)
+    return functional.pad(weights.T, (0, idle)), functional.pad(bias, (0, idle))
+
+
+def _as_float(number):
+    """An entry of the table as float32."""
+    raise NotImplementedError
+
+
+@overload(_as_float, inline="always")
+def _as_float_of(number):
+    if number == types.uint16:
+        return lambda number: wide(number)
+    return lambda number: number
+
+
+@njit(cache=True, fastmath={"contract"})
+def _blend(table, rows, weights, out, at):
+    """The ReLU of the sum of eight rows of `table` with `weights`, into the flat `out`."""
+    r0, r1, r2, r3, r4, r5, r6, r7 = rows
+    w0, w1, w2, w3, w4, w5, w6, w7 = weights
+    for k in range(table.shape[1]):
+        total = (
+            w0 * _as_float(table[r0, k])
+            + w1 * _as_float(table[r1, k])
+            + w2 * _as_float(table[r2, k])
+            + w3 * _as_float(table[r3, k])
+            + w4 * _as_float(table[r4, k])
+            + w5 * _as_float(table[r5, k])
+            + w6 * _as_float(table[r6, k])
+            + w7 * _as_float(table[r7, k])
+        )
+        out[at + k] = f32(0) if total < f32(0) else total
+
+
+@njit(cache=True)
+def _shade(
+    waiting,
+    count,
+    rays,
+    weights,
+    towards,
+    geometry,
+    none,
+    colour,
+    colour_bias,
+    shown,
+    raw,
+    sums,
+    first,
+):
+    """Add the colours of `count` `waiting` segments to the `sums` of their `rays`."""
+    size = len(none)
+    rows = ROWS * ((count + ROWS - 1) // ROWS)  # the last ones of them are of no use
+    multiply(rows, waiting, 0, size, 1, geometry, size, none, shown, 0, size, False)
+    for i in range(count):
+        ray, at = rays[i], i * size
+        for k in range(size):
+            total = shown[at + k] + towards[ray, k]
+            shown[at + k] = f32(0) if total < f32(0) else total
+    multiply(rows, shown, 0, size, 1, colour, LANES, colour_bias, raw, 0, size, False)
+    for i in range(count):
+        for channel in range(3):
+            seen = f64(sigmoid(raw[i * LANES + channel]))
+            sums[rays[i] - first, channel] += weights[i] * seen
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _render(
+    origins,
+    directions,
+    towards,
+    bricks,
+    masks,
+    leaves,
+    clearance,
+    coordinates,
+    resolution,
+    corners,
+    table,
+    hidden_weights,
+    hidden_bias,
+    density,
+    density_bias,
+    geometry,
+    colour,
+    colour_bias,
+    stop,
+    faint,
+    values,
+    depth_sum,
+    alpha,
+    crossed,
+    shaded,
+):
+    rays = len(origins)
+    inputs, size = hidden_weights.shape
+    none = np.zeros(size, np.float32)
+    hidden_flat, density_flat = hidden_weights.reshape(-1), density.reshape(-1)
+    geometry_flat, colour_flat = geometry.reshape(-1), colour.reshape(-1)
+    for chunk in prange((rays + CHUNK - 1) // CHUNK):
+        first, end = chunk * CHUNK, min(rays, (chunk + 1) * CHUNK)
+        near, far = np.empty(ROWS, np.float32), np.empty(ROWS, np.float32)
+        voxel = np.empty(ROWS, np.int32)
+        features, hidden = np.zeros(ROWS * inputs, np.float32), np.empty(ROWS * size, np.float32)
+        waiting, shown = np.zeros(BATCH * size, np.float32), np.empty(BATCH * size, np.float32)
+        owners, shares, filled = np.empty(BATCH, np.int64), np.empty(BATCH), 0
+        sums, raw = np.zeros((CHUNK, 3)), np.empty(BATCH * LANES, np.float32)
+        densities = np.empty(ROWS * LANES, np.float32)
+        for ray in range(first, end):
+            ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
+            dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+            depth, transmittance = 0.0, 1.0
+            start, steps, colours = f32(0), 0, 0
+            while start < np.inf and not transmittance <= stop:
+                count, start = walk_ray(
+                    origins[ray],
+                    directions[ray],
+                    bricks,
+                    masks,
+                    leaves,
+                    clearance,
+                    start,
+                    ROWS,
+                    near,
+                    far,
+                    voxel,
+                )
+                if not count:
+                    break
+                for i in range(count):
+                    v, near_t, far_t = voxel[i], near[i], far[i]
+                    x, y, z = coordinates[v, 0], coordinates[v, 1], coordinates[v, 2]
+                    weights = mean_weights(
+                        local_coordinate(ox, dx, near_t, resolution, x),
+                        local_coordinate(oy, dy, near_t, resolution, y),
+                        local_coordinate(oz, dz, near_t, resolution, z),
+                        local_coordinate(ox, dx, far_t, resolution, x),
+                        local_coordinate(oy, dy, far_t, resolution, y),
+                        local_coordinate(oz, dz, far_t, resolution, z),
+                    )
+                    rows = eight_of(corners, v)
+                    _blend(table, rows, weights, features, i * inputs)
+                multiply(
+                    ROWS,
+                    features,
+                    0,
+                    inputs,
+                    1,
+                    hidden_flat,
+                    size,
+                    hidden_bias,
+                    hidden,
+                    0,
+                    inputs,
+                    True,
+                )
+                multiply(
+                    ROWS,
+                    hidden,
+                    0,
+                    size,
+                    1,
+                    density_flat,
+                    LANES,
+                    density_bias,
+                    densities,
+                    0,
+                    size,
+                    False,
+                )
+                for i in range(count):
+                    if transmittance <= stop:
+                        break
+                    steps += 1
+                    sigma = densities[i * LANES]
+                    if sigma <= 0:
+                        continue
+                    weight = transmittance * -math.expm1(-f64(sigma))
+                    transmittance -= weight
+                    depth += weight * f64((near[i] + far[i]) * f32(0.5))
+                    if not weight <= faint:  # a NaN shows, too
+                        colours += 1
+                        for k in range(size):
+                            waiting[filled * size + k] = hidden[i * size + k]
+                        owners[filled], shares[filled] = ray, weight
+                        filled += 1
+                        if filled == BATCH:
+                            _shade(
+                                waiting,
+                                filled,
+                                owners,
+                                shares,
+                                towards,
+                                geometry_flat,
+                                none,
+                                colour_flat,
+                                colour_bias,
+                                shown,
+                                raw,
+                                sums,
+                                first,
+                            )
+                            filled = 0
+            depth_sum[ray], alpha[ray] = depth, 1 - transmittance
+            crossed[ray], shaded[ray] = steps, colours
+        _shade(
+            waiting,
+            filled,
+            owners,
+            shares,
+            towards,
+            geometry_flat,
+            none,
+            colour_flat,
+            colour_bias,
+            shown,
+            raw,
+            sums,
+            first,
+        )
+        for ray in range(first, end):
+            for channel in range(3):
+                values[ray, channel] = sums[ray - first, channel]
