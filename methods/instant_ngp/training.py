@@ -29,7 +29,7 @@ GRID_YOUTH_STEPS = 256
 
 @dataclass(frozen=True)
 class PixelOptions:
-    """How to train on random pixels; the defaults follow ngp_pl where facts are known.
+    """How to train on random pixels; the defaults follow ngp_pl, except for the random background.
 
     Attributes:
         rate: initial learning rate.
@@ -84,14 +84,18 @@ class TrainingOptions(MarchOptions):
 
     Attributes:
         grid_samples: cells visited in an update of the density grid.
+        rays: number of rays in every step; None: as many as give the samples of the budget.
     """
 
     grid_samples: int = 1 << 17
+    rays: int | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.grid_samples < 2:
             raise ValueError(f"expected grid_samples >= 2: {self}")
+        if self.rays is not None and self.rays < MIN_RAYS:
+            raise ValueError(f"expected rays >= {MIN_RAYS}: {self}")
 
 
 class PixelBatches:
@@ -254,6 +258,8 @@ class FieldTraining(PixelTraining):
         super().__init__(scene, field.device, budget.steps, budget.samples, options, seed)
         self.field, self.grid = field, new_grid(scene, field.device)
         self.grid_samples, self.march = options.grid_samples, options.march(budget)
+        self.rays = options.rays or self.rays
+        self.always_as_many = options.rays is not None
         self.optimiser = FieldOptimiser(field)
 
     def advance(self) -> dict[str, float]:
@@ -276,6 +282,10 @@ class FieldTraining(PixelTraining):
 
     def _update(self) -> None:
         self.optimiser.step(self.learning_rate())
+
+    def _fit_batch(self, samples: int) -> None:
+        if not self.always_as_many:
+            super()._fit_batch(samples)
 
     def watched(self) -> dict[str, Tensor]:
         """Table and its moments, networks."""

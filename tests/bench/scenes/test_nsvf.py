@@ -61,6 +61,12 @@ def test_the_box_with_its_margin_fills_the_unit_cube(folder, log) -> None:
     torch.testing.assert_close(scene.bounds, expected)
 
 
+@pytest.mark.parametrize(("name", "further"), [("Mic", 1.2), ("Lego", 1.1), ("Chair", 1.0)])
+def test_boxes_that_are_too_small_are_enlarged_further(folder, log, name, further) -> None:
+    scene = nsvf.load(folder.rename(folder.with_name(name)), log=log)
+    assert scene.unit_length == pytest.approx(4 * 1.05 * further)
+
+
 def test_poses_are_taken_as_opencv(folder, log) -> None:
     scene = nsvf.load(folder, log=log)
     camera = move_camera(scene.splits["val"].cameras[0], scene.unit_length, scene.origin)

@@ -204,6 +204,17 @@ def test_no_step_has_more_rays_than_it_may(ball_scene: Scene) -> None:
     assert max(rays) <= MIN_RAYS
 
 
+def test_every_step_has_the_rays_that_were_asked_for(ball_scene: Scene) -> None:
+    """Though 64 rays bring far fewer samples than the budget."""
+    options = replace(QUICK, rays=MIN_RAYS)
+    training = FieldTraining(new_field(), ball_scene, BUDGET, options, seed=0)
+    rays = []
+    for _ in range(3):
+        rays.append(training.rays)
+        training.advance()
+    assert rays == [MIN_RAYS] * 3
+
+
 def test_an_opaque_picture_among_transparent_ones_is_opaque(ball_scene: Scene) -> None:
     split = ball_scene.splits["train"]
     images = [split.images[0][..., :3], split.images[1]]
@@ -222,7 +233,9 @@ def test_pictures_that_do_not_overlap_are_refused(ball_scene: Scene) -> None:
         FieldTraining(new_field(), replace(ball_scene, splits={"train": alone}), BUDGET, QUICK, 0)
 
 
-@pytest.mark.parametrize("setting", [{"rate": 0.0}, {"final_rate": 2.0}, {"max_rays": 1}])
+@pytest.mark.parametrize(
+    "setting", [{"rate": 0.0}, {"final_rate": 2.0}, {"max_rays": 1}, {"rays": 1}]
+)
 def test_options_that_make_no_sense_are_refused(setting: dict) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(setting))}"):
         TrainingOptions(**setting)
