@@ -132,31 +132,32 @@ def _blend(table, rows, weights, out, at):
 
 
 @njit(cache=True)
-def _shade(
-    waiting,
-    count,
-    rays,
-    weights,
-    towards,
-    geometry,
-    none,
-    colour,
-    colour_bias,
-    shown,
-    raw,
-    sums,
-    first,
-):
-    """Add the colours of `count` `waiting` segments to the `sums` of their `rays`."""
+def _layer(rows, inputs, count, weights, bias, outputs, relu):
+    """`rows` rows of `count` numbers times `weights`, plus `bias`; all are flat."""
+    multiply(rows, inputs, 0, count, 1, weights, len(bias), bias, outputs, 0, count, relu)
+
+
+@njit(cache=True)
+def _shade(count, waiting, buffers, layers, sums, first):
+    """Add the colours of `count` segments to the `sums` of their rays, which begin at ray `first`.
+
+    Args:
+        waiting: what the hidden layer made of each segment, its ray and its weight.
+        buffers: for the outputs of both layers.
+        layers: what the directions add, geometry and its missing bias, colour and its bias.
+    """
+    hidden, rays, weights = waiting
+    shown, raw = buffers
+    towards, geometry, none, colour, colour_bias = layers
     size = len(none)
     rows = ROWS * ((count + ROWS - 1) // ROWS)  # the last ones of them are of no use
-    multiply(rows, waiting, 0, size, 1, geometry, size, none, shown, 0, size, False)
+    _layer(rows, hidden, size, geometry, none, shown, False)
     for i in range(count):
         ray, at = rays[i], i * size
         for k in range(size):
             total = shown[at + k] + towards[ray, k]
             shown[at + k] = f32(0) if total < f32(0) else total
-    multiply(rows, shown, 0, size, 1, colour, LANES, colour_bias, raw, 0, size, False)
+    _layer(rows, shown, size, colour, colour_bias, raw, False)
     for i in range(count):
         for channel in range(3):
             seen = f64(sigmoid(raw[i * LANES + channel]))
@@ -195,16 +196,18 @@ def _render(
     inputs, size = hidden_weights.shape
     none = np.zeros(size, np.float32)
     hidden_flat, density_flat = hidden_weights.reshape(-1), density.reshape(-1)
-    geometry_flat, colour_flat = geometry.reshape(-1), colour.reshape(-1)
+    layers = (towards, geometry.reshape(-1), none, colour.reshape(-1), colour_bias)
     for chunk in prange((rays + CHUNK - 1) // CHUNK):
         first, end = chunk * CHUNK, min(rays, (chunk + 1) * CHUNK)
         near, far = np.empty(ROWS, np.float32), np.empty(ROWS, np.float32)
         voxel = np.empty(ROWS, np.int32)
         features, hidden = np.zeros(ROWS * inputs, np.float32), np.empty(ROWS * size, np.float32)
-        waiting, shown = np.zeros(BATCH * size, np.float32), np.empty(BATCH * size, np.float32)
-        owners, shares, filled = np.empty(BATCH, np.int64), np.empty(BATCH), 0
-        sums, raw = np.zeros((CHUNK, 3)), np.empty(BATCH * LANES, np.float32)
         densities = np.empty(ROWS * LANES, np.float32)
+        kept, filled = np.zeros(BATCH * size, np.float32), 0
+        owners, shares = np.empty(BATCH, np.int64), np.empty(BATCH)
+        waiting = kept, owners, shares
+        buffers = np.empty(BATCH * size, np.float32), np.empty(BATCH * LANES, np.float32)
+        sums = np.zeros((CHUNK, 3))
         for ray in range(first, end):
             ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
             dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
@@ -239,34 +242,8 @@ def _render(
                     )
                     rows = eight_of(corners, v)
                     _blend(table, rows, weights, features, i * inputs)
-                multiply(
-                    ROWS,
-                    features,
-                    0,
-                    inputs,
-                    1,
-                    hidden_flat,
-                    size,
-                    hidden_bias,
-                    hidden,
-                    0,
-                    inputs,
-                    True,
-                )
-                multiply(
-                    ROWS,
-                    hidden,
-                    0,
-                    size,
-                    1,
-                    density_flat,
-                    LANES,
-                    density_bias,
-                    densities,
-                    0,
-                    size,
-                    False,
-                )
+                _layer(ROWS, features, inputs, hidden_flat, hidden_bias, hidden, True)
+                _layer(ROWS, hidden, size, density_flat, density_bias, densities, False)
                 for i in range(count):
                     if transmittance <= stop:
                         break
@@ -280,43 +257,15 @@ def _render(
                     if not weight <= faint:  # a NaN shows, too
                         colours += 1
                         for k in range(size):
-                            waiting[filled * size + k] = hidden[i * size + k]
+                            kept[filled * size + k] = hidden[i * size + k]
                         owners[filled], shares[filled] = ray, weight
                         filled += 1
                         if filled == BATCH:
-                            _shade(
-                                waiting,
-                                filled,
-                                owners,
-                                shares,
-                                towards,
-                                geometry_flat,
-                                none,
-                                colour_flat,
-                                colour_bias,
-                                shown,
-                                raw,
-                                sums,
-                                first,
-                            )
+                            _shade(filled, waiting, buffers, layers, sums, first)
                             filled = 0
             depth_sum[ray], alpha[ray] = depth, 1 - transmittance
             crossed[ray], shaded[ray] = steps, colours
-        _shade(
-            waiting,
-            filled,
-            owners,
-            shares,
-            towards,
-            geometry_flat,
-            none,
-            colour_flat,
-            colour_bias,
-            shown,
-            raw,
-            sums,
-            first,
-        )
+        _shade(filled, waiting, buffers, layers, sums, first)
         for ray in range(first, end):
             for channel in range(3):
                 values[ray, channel] = sums[ray - first, channel]
