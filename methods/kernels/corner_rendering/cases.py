@@ -60,7 +60,7 @@ def _tolerance(longest: int, stop: float, faint: float) -> float:
     return 3 * ((light + 540 / 4) * U32 + stop + longest * faint)
 
 
-def _scene(side: int, dtype: torch.dtype, device: str) -> tuple[Voxels, Corners, Layers]:
+def some_scene(side: int, dtype: torch.dtype, device: str) -> tuple[Voxels, Corners, Layers]:
     """Every third voxel of a grid, with features from -1 to 1."""
     generator = torch.Generator().manual_seed(side)
 
@@ -86,14 +86,16 @@ def _scene(side: int, dtype: torch.dtype, device: str) -> tuple[Voxels, Corners,
     return Voxels(cells.to(device), side), corners, Layers(*(x.to(device) for x in layers))
 
 
-def _views(count: int, device: str) -> Rays:
+def some_rays(count: int, device: str) -> Rays:
+    """From all around into the cube."""
     generator = torch.Generator().manual_seed(count)
     origins = normalize(torch.randn(count, 3, generator=generator), dim=1) * 1.5 + 0.5
     targets = torch.rand(count, 3, generator=generator)
     return Rays(origins.to(device), (targets - origins).to(device))
 
 
-def _towards(count: int, device: str) -> Tensor:
+def some_towards(count: int, device: str) -> Tensor:
+    """What the directions of so many rays add."""
     generator = torch.Generator().manual_seed(count)
     return (torch.rand(count, HIDDEN, generator=generator) - 0.5).to(device)
 
@@ -101,8 +103,8 @@ def _towards(count: int, device: str) -> Tensor:
 def _rendered(
     side: int, count: int, dtype: torch.dtype, stop: float, faint: float, device: str
 ) -> Callable[[str], tuple[Tensor, ...]]:
-    voxels, corners, layers = _scene(side, dtype, device)
-    rays, towards = _views(count, device), _towards(count, device)
+    voxels, corners, layers = some_scene(side, dtype, device)
+    rays, towards = some_rays(count, device), some_towards(count, device)
 
     def call(backend: str) -> tuple[Tensor, ...]:
         pixels, _, _ = render_segments(
@@ -129,10 +131,10 @@ def _even_media() -> list[Case]:
 
 def _even_error(backend: str, device: str, precision: str) -> float:
     dtype = DTYPES[precision]
-    voxels, corners, layers = _scene(SIDE, dtype, device)
+    voxels, corners, layers = some_scene(SIDE, dtype, device)
     features = corners.table[:1]
     corners = Corners(corners.rows, features.repeat(len(corners.table), 1))
-    rays, towards = _views(129, device), _towards(129, device)
+    rays, towards = some_rays(129, device), some_towards(129, device)
     pixels, crossed, _ = render_segments(
         rays, voxels, corners, layers, towards, stop=0.0, backend=backend
     )
@@ -162,8 +164,8 @@ def _spoilt() -> list[Case]:
 
 def _spoilt_error(backend: str, device: str, precision: str) -> float:
     """0 if it holds, else infinity."""
-    voxels, corners, layers = _scene(SIDE, DTYPES[precision], device)
-    rays, towards = _views(129, device), _towards(129, device)
+    voxels, corners, layers = some_scene(SIDE, DTYPES[precision], device)
+    rays, towards = some_rays(129, device), some_towards(129, device)
     spoilt = Corners(corners.rows, corners.table.clone())
     row = corners.rows[len(voxels) // 2, 0]
     spoilt.table[row] = math.nan

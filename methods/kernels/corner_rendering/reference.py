@@ -14,6 +14,9 @@ from methods.kernels.corner_gather import gather, integral_along
 from methods.kernels.corner_rendering import Corners, Layers
 from methods.kernels.voxel_walk import Voxels, walk
 
+CHUNK_RAYS = 1 << 15
+"""Rays rendered together: bounds the memory, as all their segments are evaluated at once."""
+
 
 @torch.no_grad()
 def by_steps(
@@ -30,6 +33,27 @@ def by_steps(
 
     It evaluates all segments, also those behind the end of a ray, whose weight is 0.
     """
+    count = len(rays.origins)
+    chunks = [slice(first, first + CHUNK_RAYS) for first in range(0, max(count, 1), CHUNK_RAYS)]
+    parts = [
+        _together(backend, rays.take(some), voxels, corners, layers, towards[some], stop, faint)
+        for some in chunks
+    ]
+    *pixels, crossed, shaded = map(torch.cat, zip(*parts, strict=True))
+    return Pixels(*pixels), crossed, shaded
+
+
+def _together(
+    backend: str,
+    rays: Rays,
+    voxels: Voxels,
+    corners: Corners,
+    layers: Layers,
+    towards: Tensor,
+    stop: float,
+    faint: float,
+) -> tuple[Tensor, ...]:
+    """Values, depth sums and opacities of `rays`; numbers of segments crossed and shaded."""
     crossings = walk(rays, voxels, backend=backend)
     ray = crossings.ray.long()
     mean = integral_along(rays, crossings, voxels, backend=backend)
@@ -47,7 +71,7 @@ def by_steps(
     shaded = torch.zeros(len(towards), dtype=torch.int32, device=towards.device)
     shaded.index_add_(0, ray, seen.int())
     crossed = visible_counts(density, intervals, stop=stop, backend=backend)
-    return pixels, crossed.int(), shaded
+    return pixels.values, pixels.depth_sum, pixels.alpha, crossed.int(), shaded
 
 
 render_segments = partial(by_steps, "reference")
