@@ -11,7 +11,8 @@ from math import sqrt
 
 import numpy as np
 import torch
-from numba import get_num_threads, njit, prange
+from numba import get_num_threads, njit, prange, types
+from numba.extending import overload
 from torch import Tensor
 
 from bench.types import Rays
@@ -50,7 +51,7 @@ def gather(
     if table.dtype == torch.bfloat16:
         features = torch.empty(len(voxel), table.shape[1])
         words = table.detach().contiguous().view(torch.int16).numpy().view(np.uint16)
-        _gather_bf16(words, *(x.numpy() for x in index), features.numpy())
+        _gather(words, *(x.numpy() for x in index), features.numpy())
         return features
     return _Gather.apply(table, *index, grad_buffer)
 
@@ -140,50 +141,43 @@ def eight_of(values, i):
     )
 
 
+def _as_float(number):
+    """An entry of a table, float32 or the bits of a bfloat16, as float32."""
+    raise TypeError("compiled code alone calls this")
+
+
+@overload(_as_float, inline="always")
+def _as_float_of(number):
+    if number == types.uint16:
+        return lambda number: u32(u32(number) << u32(16)).view(np.float32)
+    return lambda number: number
+
+
+@njit(cache=True, fastmath=FAST)
+def blended(table, rows, weights, k):
+    """Channel `k` of the sum of eight `rows` of `table` with `weights`."""
+    r0, r1, r2, r3, r4, r5, r6, r7 = rows
+    w0, w1, w2, w3, w4, w5, w6, w7 = weights
+    return (
+        w0 * _as_float(table[r0, k])
+        + w1 * _as_float(table[r1, k])
+        + w2 * _as_float(table[r2, k])
+        + w3 * _as_float(table[r3, k])
+        + w4 * _as_float(table[r4, k])
+        + w5 * _as_float(table[r5, k])
+        + w6 * _as_float(table[r6, k])
+        + w7 * _as_float(table[r7, k])
+    )
+
+
 @njit(cache=True, fastmath=FAST, parallel=True)
 def _gather(table, corners, voxel, weights, out):
     total, channels = out.shape
     for chunk in prange((total + CHUNK - 1) // CHUNK):
         for i in range(chunk * CHUNK, min(total, (chunk + 1) * CHUNK)):
-            r0, r1, r2, r3, r4, r5, r6, r7 = eight_of(corners, voxel[i])
-            w0, w1, w2, w3, w4, w5, w6, w7 = eight_of(weights, i)
+            rows, shares = eight_of(corners, voxel[i]), eight_of(weights, i)
             for k in range(channels):
-                out[i, k] = (
-                    w0 * table[r0, k]
-                    + w1 * table[r1, k]
-                    + w2 * table[r2, k]
-                    + w3 * table[r3, k]
-                    + w4 * table[r4, k]
-                    + w5 * table[r5, k]
-                    + w6 * table[r6, k]
-                    + w7 * table[r7, k]
-                )
-
-
-@njit(cache=True)
-def wide(half):
-    """A bfloat16, given as its bits, as float32."""
-    return u32(u32(half) << u32(16)).view(np.float32)
-
-
-@njit(cache=True, fastmath=FAST, parallel=True)
-def _gather_bf16(table, corners, voxel, weights, out):
-    total, channels = out.shape
-    for chunk in prange((total + CHUNK - 1) // CHUNK):
-        for i in range(chunk * CHUNK, min(total, (chunk + 1) * CHUNK)):
-            r0, r1, r2, r3, r4, r5, r6, r7 = eight_of(corners, voxel[i])
-            w0, w1, w2, w3, w4, w5, w6, w7 = eight_of(weights, i)
-            for k in range(channels):
-                out[i, k] = (
-                    w0 * wide(table[r0, k])
-                    + w1 * wide(table[r1, k])
-                    + w2 * wide(table[r2, k])
-                    + w3 * wide(table[r3, k])
-                    + w4 * wide(table[r4, k])
-                    + w5 * wide(table[r5, k])
-                    + w6 * wide(table[r6, k])
-                    + w7 * wide(table[r7, k])
-                )
+                out[i, k] = blended(table, rows, shares, k)
 
 
 @njit(cache=True, fastmath=FAST, parallel=True)

@@ -12,19 +12,13 @@ import math
 
 import numpy as np
 import torch
-from numba import njit, prange, types
-from numba.extending import overload
+from numba import njit, prange
 from torch import Tensor
 from torch.nn import functional
 
 from bench.types import Rays
 from methods.kernels.composite import Pixels
-from methods.kernels.corner_gather.cpu import (
-    eight_of,
-    local_coordinate,
-    mean_weights,
-    wide,
-)
+from methods.kernels.corner_gather.cpu import blended, eight_of, local_coordinate, mean_weights
 from methods.kernels.corner_rendering import Corners, Layers
 from methods.kernels.cpu import LANES, ROWS, f32, multiply, sigmoid
 from methods.kernels.voxel_walk import Voxels
@@ -98,37 +92,6 @@ def _whole_lanes(weights: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
     """A layer of fewer than `LANES` outputs with zeros for the others: [H, LANES], [LANES]."""
     idle = LANES - len(bias)
     return functional.pad(weights.T, (0, idle)), functional.pad(bias, (0, idle))
-
-
-def _as_float(number):
-    """An entry of the table as float32."""
-    raise NotImplementedError
-
-
-@overload(_as_float, inline="always")
-def _as_float_of(number):
-    if number == types.uint16:
-        return lambda number: wide(number)
-    return lambda number: number
-
-
-@njit(cache=True, fastmath={"contract"})
-def _blend(table, rows, weights, out, at):
-    """The ReLU of the sum of eight rows of `table` with `weights`, into the flat `out`."""
-    r0, r1, r2, r3, r4, r5, r6, r7 = rows
-    w0, w1, w2, w3, w4, w5, w6, w7 = weights
-    for k in range(table.shape[1]):
-        total = (
-            w0 * _as_float(table[r0, k])
-            + w1 * _as_float(table[r1, k])
-            + w2 * _as_float(table[r2, k])
-            + w3 * _as_float(table[r3, k])
-            + w4 * _as_float(table[r4, k])
-            + w5 * _as_float(table[r5, k])
-            + w6 * _as_float(table[r6, k])
-            + w7 * _as_float(table[r7, k])
-        )
-        out[at + k] = f32(0) if total < f32(0) else total
 
 
 @njit(cache=True)
@@ -241,7 +204,9 @@ def _render(
                         local_coordinate(oz, dz, far_t, resolution, z),
                     )
                     rows = eight_of(corners, v)
-                    _blend(table, rows, weights, features, i * inputs)
+                    for k in range(inputs):
+                        mean = blended(table, rows, weights, k)
+                        features[i * inputs + k] = f32(0) if mean < f32(0) else mean
                 _layer(ROWS, features, inputs, hidden_flat, hidden_bias, hidden, True)
                 _layer(ROWS, hidden, size, density_flat, density_bias, densities, False)
                 for i in range(count):
