@@ -252,6 +252,8 @@ class PixelTraining(ABC):
 class FieldTraining(PixelTraining):
     """Stage 1: trains a hash-grid field and its density grid."""
 
+    options: TrainingOptions
+
     def __init__(
         self, field: HashField, scene: Scene, budget: Budget, options: TrainingOptions, seed: int
     ) -> None:
@@ -259,7 +261,6 @@ class FieldTraining(PixelTraining):
         self.field, self.grid = field, new_grid(scene, field.device)
         self.grid_samples, self.march = options.grid_samples, options.march(budget)
         self.rays = options.rays or self.rays
-        self.always_as_many = options.rays is not None
         self.optimiser = FieldOptimiser(field)
 
     def advance(self) -> dict[str, float]:
@@ -284,7 +285,7 @@ class FieldTraining(PixelTraining):
         self.optimiser.step(self.learning_rate())
 
     def _fit_batch(self, samples: int) -> None:
-        if not self.always_as_many:
+        if self.options.rays is None:
             super()._fit_batch(samples)
 
     def watched(self) -> dict[str, Tensor]:
