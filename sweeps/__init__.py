@@ -12,4 +12,6 @@ from bench.allocator import keep_freed
 # that the other needs; one that sleeps at once must be woken a thousand times per step. So let it
 # spin for some ten microseconds.
 os.environ.setdefault("GOMP_SPINCOUNT", "20000")
+# Large tensors on pages of 2 MB: fewer pages to map, and fewer addresses to look up.
+os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
 keep_freed()

@@ -17,6 +17,7 @@ from bench.types import Camera
 from methods.kernels.dispatch import served
 from methods.kernels.gaussian_projection import (
     BLUR,
+    FRUSTUM,
     LEAST_ALPHA,
     Ellipses,
     covariances,
@@ -80,9 +81,17 @@ def cases() -> list[Case]:
 
 
 def draw(count: int, device: str = "cpu") -> Gaussians:
-    """Gaussians in and around the unit cube, one to four pixels wide seen by `CAMERA`."""
+    """Gaussians seen by `CAMERA`, one to four pixels wide, in and around its picture; an eighth of
+    them are behind it."""
     generator = torch.Generator().manual_seed(count)
-    means = 3 * torch.rand(count, 3, generator=generator) - 1
+    depth = 0.5 + 2.5 * torch.rand(count, generator=generator)
+    across = 3 * torch.rand(count, 2, generator=generator) - 1.5  # of half the picture
+    edge = (across.abs() - FRUSTUM).abs() < 0.01  # on which side of it, rounding would decide
+    across[edge] *= 0.9
+    half = torch.tensor((0.5 * CAMERA.width / CAMERA.fx, 0.5 * CAMERA.height / CAMERA.fy))
+    depth[: count // 8] *= -1
+    local = torch.cat((depth[:, None] * half * across, depth[:, None]), dim=1)
+    means = local @ CAMERA.c2w[:, :3].T + CAMERA.c2w[:, 3]
     scales = torch.rand(count, 3, generator=generator) * 0.5 / CAMERA.fx + 1e-3
     rotations = torch.randn(count, 4, generator=generator)
     opacities = torch.rand(count, generator=generator)
@@ -105,15 +114,8 @@ def _ellipses(count: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
     given, camera = draw(count, device), _on(device)
 
     def call(backend: str) -> tuple[Tensor, ...]:
-        found = _projected(given, camera, backend)
-        seen = found.centres.abs().amax(dim=1, keepdim=True) < 4 * camera.width
-        size = camera.width
-        return (
-            torch.where(seen, found.centres, 0) / size,
-            torch.where(seen, found.conics, 0),
-            found.depth,
-            torch.where(seen, found.extents, 0) / size,
-        )
+        found, size = _projected(given, camera, backend), camera.width
+        return found.centres / size, found.conics, found.depth, found.extents / size
 
     return call
 
@@ -123,17 +125,15 @@ def _gradients(count: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
     camera, generator = _on(device), torch.Generator().manual_seed(1)
     towards = [torch.randn(count, n, generator=generator).to(device) for n in (2, 3)]
 
-    def call(backend: str) -> tuple[Tensor, ...]:
-        given = [x.clone().requires_grad_() for x in (means, scales, rotations)]
+    def gradients(backend: str) -> tuple[Tensor, ...]:
+        given = [x.detach().requires_grad_() for x in (means, scales, rotations)]
         found = _projected([*given, opacities], camera, backend)
-        seen = (found.centres.abs().amax(dim=1, keepdim=True) < 4 * CAMERA.width).detach()
-        grads = torch.autograd.grad(
-            (found.centres, found.conics), given, [seen * g for g in towards]
-        )
-        largest = [grad.abs().max().clamp(min=1e-30) if count else 1.0 for grad in grads]
-        return tuple(grad / size for grad, size in zip(grads, largest, strict=True))
+        return torch.autograd.grad((found.centres, found.conics), given, towards)
 
-    return call
+    largest = [float(x.abs().max()) if count else 1.0 for x in gradients("reference")]
+    return lambda backend: tuple(
+        grad.div_(size) for grad, size in zip(gradients(backend), largest, strict=True)
+    )
 
 
 def _circle_error(scale: float, depth: float, backend: str, device: str, precision: str) -> float:

@@ -1,7 +1,7 @@
-"""Small networks with numba: six samples and 16 outputs at a time, kept in registers.
+"""Small networks with numba: some samples and 16 outputs at a time, kept in registers.
 
-All of it is made of `methods.kernels.cpu.six`. Work is divided among threads by samples, at the
-borders of networks.
+All of it is made of `methods.kernels.cpu.tall`. Work is divided among threads by samples, at the
+borders of networks. Samples sorted by network lie anywhere in memory, so their rows are prefetched.
 """
 
 from __future__ import annotations
@@ -14,10 +14,19 @@ from numba import njit, prange
 from torch import Tensor
 from torch.nn import functional
 
-from methods.kernels.cpu import LANES, ROWS, f32, multiply, six, six_relu
+from methods.kernels.cpu import LANES, TALL, f32, multiply, prefetch, tall, tall_relu
 from methods.kernels.grouped_mlp import HIDDEN, Groups, Networks
 
-SLOT = 8  # numbers a row of `_encode`: ROWS and two idle ones, a whole vector
+SLOT = TALL + -TALL % 8
+"""Numbers in a row of `_encode`: `TALL` and a few idle ones, whole vectors."""
+
+LINE = 16  # float32 in a cache line
+AHEAD = 24
+"""Samples from the one that is computed to the one that is prefetched."""
+
+DEEP = 96
+"""Samples whose inputs and gradients, with 64 channels, stay in the first-level cache."""
+
 CHUNKS = 64
 """Parts into which samples are divided; fixed, so that results are repeatable."""
 
@@ -116,15 +125,20 @@ def _arrays(*tensors: Tensor) -> list[np.ndarray]:
     return [tensor.detach().contiguous().numpy() for tensor in tensors]
 
 
+def _whole_vectors(tensor: Tensor) -> Tensor:
+    """The last dimension filled up with zeros to a multiple of `LANES`."""
+    idle = -tensor.shape[-1] % LANES
+    return functional.pad(tensor, (0, idle)) if idle else tensor
+
+
 class _Linear(torch.autograd.Function):
     """Computes outputs and input gradients in whole vectors, and cuts off the excess."""
 
     @staticmethod
     def forward(ctx, inputs, weights, biases, offsets, relu):
         outputs = weights.shape[2]
-        idle = -outputs % LANES
-        weights, biases = functional.pad(weights, (0, idle)), functional.pad(biases, (0, idle))
-        out = torch.empty(len(inputs), outputs + idle)
+        weights, biases = _whole_vectors(weights), _whole_vectors(biases)
+        out = torch.empty(len(inputs), weights.shape[2])
         _linear(*_arrays(inputs, weights, biases, offsets), relu, out.numpy())
         ctx.save_for_backward(inputs, weights, offsets, out)
         ctx.relu = relu
@@ -134,7 +148,7 @@ class _Linear(torch.autograd.Function):
     def backward(ctx, grad):
         inputs, weights, offsets, out = ctx.saved_tensors
         outputs, wanted = grad.shape[1], ctx.needs_input_grad[0]
-        grad = functional.pad(grad, (0, out.shape[1] - outputs))
+        grad = _whole_vectors(grad)
         grads = torch.empty_like(weights), torch.empty(len(weights), out.shape[1])
         channels = inputs.shape[1]
         grad_inputs = torch.empty(len(inputs) if wanted else 0, channels + -channels % LANES)
@@ -190,15 +204,6 @@ def _borders(offsets):
     return ends
 
 
-@njit(cache=True)
-def _largest(offsets):
-    """Number of samples in the largest group."""
-    largest = 0
-    for n in range(len(offsets) - 1):
-        largest = max(largest, offsets[n + 1] - offsets[n])
-    return largest
-
-
 @njit(cache=True, parallel=True)
 def _linear(inputs, weights, biases, offsets, relu, out):
     channels, outputs = weights.shape[1:]
@@ -226,38 +231,65 @@ def _linear(inputs, weights, biases, offsets, relu, out):
 def _backward(inputs, weights, offsets, out, grad, relu, grad_inputs, grad_weights, grad_biases):
     channels, outputs = weights.shape[1:]
     width = grad_inputs.shape[1]
-    borders, largest = _borders(offsets), _largest(offsets)
+    borders = _borders(offsets)
     flat, flat_inputs = inputs.reshape(-1), grad_inputs.reshape(-1)
+    flat_out, flat_grad = out.reshape(-1), grad.reshape(-1)
     for chunk in prange(CHUNKS):
-        through = np.empty(largest * outputs, np.float32)  # the part of `grad` that passes the ReLU
+        through = np.empty(DEEP * outputs, np.float32)  # the part of `grad` that passes the ReLU
         turned = np.zeros(outputs * width, np.float32)  # the weights, transposed
+        part = np.empty(channels * outputs, np.float32)
         nothing = np.zeros(max(width, outputs), np.float32)
         for n in range(borders[chunk], borders[chunk + 1]):
-            first, count = offsets[n], offsets[n + 1] - offsets[n]
-            if count == 0:
-                grad_weights[n] = ZERO
-                grad_biases[n] = ZERO
-                continue
-            grad_biases[n] = ZERO
-            for s in range(count):
-                kept = through[s * outputs : (s + 1) * outputs]
-                for o in range(outputs):
-                    shut = relu and out[first + s, o] <= ZERO
-                    kept[o] = ZERO if shut else grad[first + s, o]
-                    grad_biases[n, o] += kept[o]
-            # Gradient of the weights: inputs^T through.
-            at, to = first * channels, grad_weights[n].reshape(-1)
-            multiply(
-                channels, flat, at, 1, channels, through, outputs, nothing, to, 0, count, False
-            )
-            if len(grad_inputs):  # through weights^T
+            of_weights, of_biases = grad_weights[n].reshape(-1), grad_biases[n]
+            of_weights[:] = ZERO
+            of_biases[:] = ZERO
+            if len(grad_inputs) and offsets[n] < offsets[n + 1]:
                 for i in range(channels):
                     for o in range(outputs):
                         turned[o * width + i] = weights[n, i, o]
-                to, at = flat_inputs, first * width
+            for first in range(offsets[n], offsets[n + 1], DEEP):
+                count = min(DEEP, offsets[n + 1] - first)
+                here = slice(first * outputs, (first + count) * outputs)
+                shown, given = flat_out[here], flat_grad[here]
+                for j in range(count * outputs):
+                    through[j] = ZERO if relu and shown[j] <= ZERO else given[j]
+                for s in range(count):
+                    row = through[s * outputs : (s + 1) * outputs]
+                    for o in range(outputs):
+                        of_biases[o] += row[o]
+                at = first * channels  # inputs^T through
                 multiply(
-                    count, through, 0, outputs, 1, turned, width, nothing, to, at, outputs, False
+                    channels,
+                    flat,
+                    at,
+                    1,
+                    channels,
+                    through,
+                    outputs,
+                    nothing,
+                    part,
+                    0,
+                    count,
+                    False,
                 )
+                for j in range(len(part)):
+                    of_weights[j] += part[j]
+                if len(grad_inputs):  # through weights^T
+                    to, at = flat_inputs, first * width
+                    multiply(
+                        count,
+                        through,
+                        0,
+                        outputs,
+                        1,
+                        turned,
+                        width,
+                        nothing,
+                        to,
+                        at,
+                        outputs,
+                        False,
+                    )
 
 
 @njit(cache=True, fastmath={"contract"}, error_model="numpy")
@@ -303,28 +335,28 @@ def _encode(encoded, frequencies):
 @njit(cache=True, parallel=True)
 def _encode_all(inputs, frequencies, out):
     count, channels = out.shape
-    blocks = (count + ROWS - 1) // ROWS
+    blocks = (count + TALL - 1) // TALL
     for chunk in prange(CHUNKS):
         encoded = np.zeros(channels * SLOT, np.float32)
         for block in range(chunk * blocks // CHUNKS, (chunk + 1) * blocks // CHUNKS):
-            rows = min(ROWS, count - block * ROWS)
+            rows = min(TALL, count - block * TALL)
             for r in range(rows):
                 for d in range(3):
-                    encoded[d * SLOT + r] = inputs[block * ROWS + r, d]
+                    encoded[d * SLOT + r] = inputs[block * TALL + r, d]
             _encode(encoded, frequencies)
             for r in range(rows):
                 for c in range(channels):
-                    out[block * ROWS + r, c] = encoded[c * SLOT + r]
+                    out[block * TALL + r, c] = encoded[c * SLOT + r]
 
 
 @njit(cache=True)
 def _block(a, a_row, a_step, w, bias, out, out_row, count, relu):
-    """`ROWS` rows times w [count, 32], plus bias [32]: out [ROWS, 32 of `out_row`]."""
+    """`TALL` rows times w [count, 32], plus bias [32]: out [TALL, 32 of `out_row`]."""
     for left in range(0, HIDDEN, LANES):
         if relu:
-            six_relu(a, 0, a_row, a_step, w, left, HIDDEN, bias, left, out, left, out_row, count)
+            tall_relu(a, 0, a_row, a_step, w, left, HIDDEN, bias, left, out, left, out_row, count)
         else:
-            six(a, 0, a_row, a_step, w, left, HIDDEN, bias, left, out, left, out_row, count)
+            tall(a, 0, a_row, a_step, w, left, HIDDEN, bias, left, out, left, out_row, count)
 
 
 @njit(cache=True, parallel=True, fastmath={"contract", "reassoc"})
@@ -342,19 +374,26 @@ def _densities(
     raw,
     geometry,
 ):
-    channels = in_weights.shape[1]
+    channels, end = in_weights.shape[1], len(permutation)
     borders = _borders(offsets)
+    places, found = positions.reshape(-1), geometry.reshape(-1)
     for chunk in prange(CHUNKS):
         encoded = np.zeros(channels * SLOT, np.float32)
-        one, two = np.empty(ROWS * HIDDEN, np.float32), np.empty(ROWS * HIDDEN, np.float32)
+        one, two = np.empty(TALL * HIDDEN, np.float32), np.empty(TALL * HIDDEN, np.float32)
         for n in range(borders[chunk], borders[chunk + 1]):
             into, mid = in_weights[n].reshape(-1), mid_weights[n].reshape(-1)
             weights = density_weights[n].reshape(-1)
-            for first in range(offsets[n], offsets[n + 1], ROWS):
-                rows = min(ROWS, offsets[n + 1] - first)  # idle ones repeat what was there
+            for first in range(offsets[n], offsets[n + 1], TALL):
+                rows = min(TALL, offsets[n + 1] - first)  # idle ones repeat what was there
                 for r in range(rows):
                     for d in range(3):
                         encoded[d * SLOT + r] = positions[permutation[first + r], d]
+                for r in range(first + AHEAD, min(first + AHEAD + TALL, end)):
+                    s = permutation[r]
+                    prefetch(places, 3 * s)
+                    prefetch(raw, s)
+                    for i in range(0, HIDDEN + 1, LINE):
+                        prefetch(found, s * (HIDDEN + 1) + i)
                 _encode(encoded, frequencies)
                 _block(encoded, 1, SLOT, into, in_biases[n], one, HIDDEN, channels, True)
                 _block(one, HIDDEN, 1, mid, mid_biases[n], two, HIDDEN, HIDDEN, True)
@@ -384,14 +423,15 @@ def _colours(
 ):
     """Colours before the sigmoid."""
     seen = directions.shape[1]
-    channels = HIDDEN + seen
+    channels, end = HIDDEN + seen, len(permutation)
     borders = _borders(offsets)
+    hidden, towards, shown = geometry.reshape(-1), directions.reshape(-1), raw.reshape(-1)
     for chunk in prange(CHUNKS):
-        given = np.zeros(ROWS * HIDDEN, np.float32)
-        joined = np.zeros(ROWS * channels, np.float32)
-        inner = np.empty(ROWS * HIDDEN, np.float32)
+        given = np.zeros(TALL * HIDDEN, np.float32)
+        joined = np.zeros(TALL * channels, np.float32)
+        inner = np.empty(TALL * HIDDEN, np.float32)
         last, bias = np.zeros(HIDDEN * LANES, np.float32), np.zeros(LANES, np.float32)
-        result = np.empty(ROWS * LANES, np.float32)
+        result = np.empty(TALL * LANES, np.float32)
         for n in range(borders[chunk], borders[chunk + 1]):
             if offsets[n] == offsets[n + 1]:
                 continue
@@ -400,19 +440,27 @@ def _colours(
                 bias[c] = colour_biases[n, c]
                 for i in range(HIDDEN):
                     last[i * LANES + c] = colour_weights[n, i, c]
-            for first in range(offsets[n], offsets[n + 1], ROWS):
-                rows = min(ROWS, offsets[n + 1] - first)  # idle ones repeat what was there
+            for first in range(offsets[n], offsets[n + 1], TALL):
+                rows = min(TALL, offsets[n + 1] - first)  # idle ones repeat what was there
                 for r in range(rows):
                     s = permutation[first + r]
                     for i in range(HIDDEN):
                         given[r * HIDDEN + i] = geometry[s, i]
                     for i in range(seen):
                         joined[r * channels + HIDDEN + i] = directions[s, i]
+                for r in range(first + AHEAD, min(first + AHEAD + TALL, end)):
+                    s = permutation[r]
+                    for i in range(0, HIDDEN + 1, LINE):
+                        prefetch(hidden, s * (HIDDEN + 1) + i)
+                    for i in range(0, seen, LINE):
+                        prefetch(towards, s * seen + i)
+                    prefetch(towards, s * seen + seen - 1)
+                    prefetch(shown, 3 * s)
                 of = feature_biases[n]
                 _block(given, HIDDEN, 1, feature, of, joined, channels, HIDDEN, False)
                 of = direction_biases[n]
                 _block(joined, channels, 1, direction, of, inner, HIDDEN, channels, True)
-                six(inner, 0, HIDDEN, 1, last, 0, LANES, bias, 0, result, 0, LANES, HIDDEN)
+                tall(inner, 0, HIDDEN, 1, last, 0, LANES, bias, 0, result, 0, LANES, HIDDEN)
                 for r in range(rows):
                     for c in range(3):
                         raw[permutation[first + r], c] = result[r * LANES + c]

@@ -78,7 +78,7 @@ def _gradients(count: int, size: int, device: str) -> Callable[[str], tuple[Tens
     coefficients, directions, grad = _given(count, size, device)
 
     def call(backend: str) -> tuple[Tensor, ...]:
-        given = coefficients.clone().requires_grad_()
+        given = coefficients.detach().requires_grad_()
         return torch.autograd.grad(shade(given, directions, backend=backend), given, grad)
 
     return call

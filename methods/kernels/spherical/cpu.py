@@ -9,9 +9,16 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from methods.kernels.cpu import f32
+from methods.kernels.cpu import f32, u64
 
-CHUNK = 256  # directions
+BLOCK = 256
+"""Directions at a time; their 16 harmonics stay in the first-level cache."""
+
+ROWS = 19
+"""Rows of a block: the harmonics, and x, y, z."""
+
+ZERO = f32(0)
+ONE, TWO, THREE, NEXT = u64(1), u64(2), u64(3), u64(BLOCK)
 C00 = f32(sqrt(1 / (4 * pi)))
 C1 = f32(sqrt(3 / (4 * pi)))
 C2 = f32(sqrt(15 / (4 * pi)))
@@ -49,7 +56,8 @@ class _Shade(torch.autograd.Function):
     def forward(ctx, coefficients, directions):
         colours = torch.empty(len(directions), 3)
         coefficients = coefficients.detach().contiguous()
-        _shade(coefficients.numpy(), directions.numpy(), colours.numpy())
+        terms = coefficients.shape[1]
+        _shade(coefficients.view(-1).numpy(), directions.numpy(), terms, colours.numpy())
         ctx.save_for_backward(directions)
         ctx.shape = coefficients.shape
         return colours
@@ -58,56 +66,91 @@ class _Shade(torch.autograd.Function):
     def backward(ctx, grad):
         (directions,) = ctx.saved_tensors
         grads = torch.empty(ctx.shape)
-        _unshade(grad.contiguous().numpy(), directions.numpy(), grads.numpy())
+        given = grad.contiguous().numpy(), directions.numpy()
+        _unshade(*given, ctx.shape[1], grads.view(-1).numpy())
         return grads, None
 
 
 @njit(cache=True, parallel=True)
 def _evaluate(directions, out):
-    for i in prange(len(directions)):
-        _harmonics(directions[i], out[i])
+    count = len(directions)
+    for chunk in prange((count + BLOCK - 1) // BLOCK):
+        first, size = chunk * BLOCK, min(BLOCK, count - chunk * BLOCK)
+        basis = np.empty(ROWS * BLOCK, np.float32)
+        _harmonics(directions, first, size, basis)
+        for i in range(size):
+            for k in range(16):
+                out[first + i, k] = basis[k * BLOCK + i]
 
 
 @njit(cache=True, parallel=True)
-def _shade(coefficients, directions, colours):
-    count, size, _ = coefficients.shape
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        basis = np.empty(16, np.float32)
-        for i in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-            _harmonics(directions[i], basis)
-            red, green, blue = f32(0), f32(0), f32(0)
-            for k in range(size):
-                red += basis[k] * coefficients[i, k, 0]
-                green += basis[k] * coefficients[i, k, 1]
-                blue += basis[k] * coefficients[i, k, 2]
-            colours[i, 0], colours[i, 1], colours[i, 2] = red, green, blue
+def _shade(coefficients, directions, terms, colours):
+    """`coefficients` are flat."""
+    count = len(directions)
+    for chunk in prange((count + BLOCK - 1) // BLOCK):
+        first, size = chunk * BLOCK, min(BLOCK, count - chunk * BLOCK)
+        basis = np.empty(ROWS * BLOCK, np.float32)
+        _harmonics(directions, first, size, basis)
+        for i in range(size):
+            at, of = u64((first + i) * terms * 3), u64(i)
+            red, green, blue = ZERO, ZERO, ZERO
+            for _ in range(terms):
+                value = basis[of]
+                red += value * coefficients[at]
+                green += value * coefficients[at + ONE]
+                blue += value * coefficients[at + TWO]
+                at, of = at + THREE, of + NEXT
+            colours[first + i, 0], colours[first + i, 1], colours[first + i, 2] = red, green, blue
 
 
 @njit(cache=True, parallel=True)
-def _unshade(grad, directions, grads):
-    count, size, _ = grads.shape
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        basis = np.empty(16, np.float32)
-        for i in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-            _harmonics(directions[i], basis)
-            for k in range(size):
-                for channel in range(3):
-                    grads[i, k, channel] = basis[k] * grad[i, channel]
+def _unshade(grad, directions, terms, grads):
+    """`grads` are flat."""
+    count = len(directions)
+    for chunk in prange((count + BLOCK - 1) // BLOCK):
+        first, size = chunk * BLOCK, min(BLOCK, count - chunk * BLOCK)
+        basis = np.empty(ROWS * BLOCK, np.float32)
+        _harmonics(directions, first, size, basis)
+        for i in range(size):
+            at, of = u64((first + i) * terms * 3), u64(i)
+            red, green, blue = grad[first + i, 0], grad[first + i, 1], grad[first + i, 2]
+            for _ in range(terms):
+                value = basis[of]
+                grads[at], grads[at + ONE], grads[at + TWO] = (
+                    value * red,
+                    value * green,
+                    value * blue,
+                )
+                at, of = at + THREE, of + NEXT
 
 
 @njit(cache=True)
-def _harmonics(direction, out):
-    x, y, z = direction[0], direction[1], direction[2]
-    xx, yy, zz = x * x, y * y, z * z
-    out[0] = C00
-    out[1], out[2], out[3] = C1 * y, C1 * z, C1 * x
-    out[4], out[5], out[7] = C2 * x * y, C2 * y * z, C2 * x * z
-    out[6] = C20 * (f32(2) * zz - xx - yy)
-    out[8] = C22 * (xx - yy)
-    out[9] = C33 * y * (f32(3) * xx - yy)
-    out[10] = C3XYZ * x * y * z
-    out[11] = C31 * y * (f32(4) * zz - xx - yy)
-    out[12] = C30 * z * (f32(2) * zz - f32(3) * xx - f32(3) * yy)
-    out[13] = C31 * x * (f32(4) * zz - xx - yy)
-    out[14] = C32 * z * (xx - yy)
-    out[15] = C33 * x * (xx - f32(3) * yy)
+def _harmonics(directions, first, size, block):
+    """Fill `block` with the harmonics of `size` directions, number k of direction i at
+    block[k * BLOCK + i].
+
+    The directions are copied into it first: in a loop over one array LLVM sees what it may
+    vectorise.
+    """
+    for d in range(3):
+        for i in range(size):
+            block[(16 + d) * BLOCK + i] = directions[first + i, d]
+    for i in range(size):
+        x, y, z = block[16 * BLOCK + i], block[17 * BLOCK + i], block[18 * BLOCK + i]
+        xx, yy, zz = x * x, y * y, z * z
+        block[i] = C00
+        block[BLOCK + i] = C1 * y
+        block[2 * BLOCK + i] = C1 * z
+        block[3 * BLOCK + i] = C1 * x
+        block[4 * BLOCK + i] = C2 * x * y
+        block[5 * BLOCK + i] = C2 * y * z
+        block[7 * BLOCK + i] = C2 * x * z
+        block[6 * BLOCK + i] = C20 * (f32(2) * zz - xx - yy)
+        block[8 * BLOCK + i] = C22 * (xx - yy)
+        block[9 * BLOCK + i] = C33 * y * (f32(3) * xx - yy)
+        block[10 * BLOCK + i] = C3XYZ * x * y * z
+        block[11 * BLOCK + i] = C31 * y * (f32(4) * zz - xx - yy)
+        block[12 * BLOCK + i] = C30 * z * (f32(2) * zz - f32(3) * xx - f32(3) * yy)
+        block[13 * BLOCK + i] = C31 * x * (f32(4) * zz - xx - yy)
+        block[14 * BLOCK + i] = C32 * z * (xx - yy)
+        block[15 * BLOCK + i] = C33 * x * (xx - f32(3) * yy)

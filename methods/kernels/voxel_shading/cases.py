@@ -78,7 +78,7 @@ def _gradients(
     harmonics, *given, grad = _given(count, size, device)
 
     def call(backend: str) -> tuple[Tensor, ...]:
-        learned = harmonics.clone().requires_grad_()
+        learned = harmonics.detach().requires_grad_()
         buffer = torch.ones_like(harmonics) if buffered else None
         colours = shade_voxels(learned, *given, grad_buffer=buffer, backend=backend)
         colours.backward(grad)

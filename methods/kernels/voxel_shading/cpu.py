@@ -10,10 +10,16 @@ import torch
 from numba import get_num_threads, njit, prange
 from torch import Tensor
 
-from methods.kernels.cpu import f32, sigmoid
-from methods.kernels.spherical import spherical_harmonics
+from methods.kernels.cpu import f32, sigmoid, u64
+from methods.kernels.spherical import CHANNELS, spherical_harmonics
 
-CHUNK = 1 << 12  # voxels
+CHUNK = 1 << 10
+"""Voxels at a time, whose colours stay in the first-level cache."""
+
+NEAR = 64
+"""Voxels in a row that one thread owns: two threads would take a cache line from each other."""
+
+ONE, TWO, THREE = u64(1), u64(2), u64(3)
 
 
 def shade_voxels(
@@ -32,11 +38,10 @@ def shade_voxels(
 class _Shade(torch.autograd.Function):
     @staticmethod
     def forward(ctx, harmonics, voxel, ray, basis, grad_buffer):
-        given = [x.detach().contiguous() for x in (voxel, ray, basis)]
+        given = [x.detach().contiguous() for x in (voxel, ray, basis.view(-1))]
         colours = torch.empty(len(voxel), 3)
-        _shade(
-            harmonics.detach().contiguous().numpy(), *(x.numpy() for x in given), colours.numpy()
-        )
+        flat = harmonics.detach().reshape(-1)
+        _shade(flat.numpy(), *(x.numpy() for x in given), harmonics.shape[1], colours.numpy())
         ctx.save_for_backward(*given, colours)
         ctx.shape, ctx.grad_buffer = harmonics.shape, grad_buffer
         return colours
@@ -46,37 +51,48 @@ class _Shade(torch.autograd.Function):
         *given, colours = ctx.saved_tensors
         buffer = ctx.grad_buffer
         target = torch.zeros(ctx.shape) if buffer is None else buffer
-        slope = grad * colours * (1 - colours)  # of the sigmoid
-        parts = 4 * get_num_threads()
-        _scatter(*(x.numpy() for x in (*given, slope.contiguous(), target)), parts)
+        parts = 1 << (get_num_threads() - 1).bit_length()
+        given += [colours, grad.contiguous(), target.view(-1)]
+        _scatter(*(x.numpy() for x in given), ctx.shape[1], parts)
         return target if buffer is None else None, None, None, None, None
 
 
-@njit(cache=True, parallel=True)
-def _shade(harmonics, voxel, ray, basis, colours):
-    total, size = len(voxel), harmonics.shape[1]
+@njit(cache=True, parallel=True, error_model="numpy")
+def _shade(harmonics, voxel, ray, basis, terms, colours):
+    """`harmonics` and `basis` are flat."""
+    total = len(voxel)
     for chunk in prange((total + CHUNK - 1) // CHUNK):
-        for i in range(chunk * CHUNK, min(total, (chunk + 1) * CHUNK)):
-            coefficients, values = harmonics[voxel[i]], basis[ray[i]]
+        first, end = chunk * CHUNK, min(total, (chunk + 1) * CHUNK)
+        for i in range(first, end):
+            at, of = u64(voxel[i] * terms * 3), u64(ray[i] * CHANNELS)
             red, green, blue = f32(0), f32(0), f32(0)
-            for k in range(size):
-                red += values[k] * coefficients[k, 0]
-                green += values[k] * coefficients[k, 1]
-                blue += values[k] * coefficients[k, 2]
-            colours[i, 0], colours[i, 1], colours[i, 2] = (
-                sigmoid(red),
-                sigmoid(green),
-                sigmoid(blue),
-            )
+            for _ in range(terms):
+                red += basis[of] * harmonics[at]
+                green += basis[of] * harmonics[at + ONE]
+                blue += basis[of] * harmonics[at + TWO]
+                at, of = at + THREE, of + ONE
+            colours[i, 0], colours[i, 1], colours[i, 2] = red, green, blue
+        shown = colours[first:end].reshape(-1)
+        for j in range(len(shown)):  # by themselves, in whole vectors
+            shown[j] = sigmoid(shown[j])
 
 
 @njit(cache=True, parallel=True)
-def _scatter(voxel, ray, basis, slope, target, parts):
-    """Adjoint of the sums of `_shade`: target[voxel] += Y(d) slope."""
-    size = target.shape[1]
+def _scatter(voxel, ray, basis, colours, grad, target, terms, parts):
+    """Adjoint of `_shade`: target[voxel] += Y(d) times the gradient before the sigmoid.
+
+    `basis` and `target` are flat, `parts` a power of two.
+    """
     for part in prange(parts):
         for i in range(len(voxel)):
-            if voxel[i] % parts == part:
-                for k in range(size):
-                    for channel in range(3):
-                        target[voxel[i], k, channel] += basis[ray[i], k] * slope[i, channel]
+            if (voxel[i] // NEAR) & (parts - 1) == part:
+                red = grad[i, 0] * colours[i, 0] * (f32(1) - colours[i, 0])
+                green = grad[i, 1] * colours[i, 1] * (f32(1) - colours[i, 1])
+                blue = grad[i, 2] * colours[i, 2] * (f32(1) - colours[i, 2])
+                at, of = u64(voxel[i] * terms * 3), u64(ray[i] * CHANNELS)
+                for _ in range(terms):
+                    value = basis[of]
+                    target[at] += value * red
+                    target[at + ONE] += value * green
+                    target[at + TWO] += value * blue
+                    at, of = at + THREE, of + ONE
