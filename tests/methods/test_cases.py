@@ -143,6 +143,7 @@ NAMES = {
     "gaussian_blending": "blend",
     "gaussian_projection": "project_gaussians",
     "grouped_mlp": "grouped_linear",
+    "relu": "relu_",
     "spherical": "spherical_harmonics",
     "voxel_shading": "shade_voxels",
     "voxel_walk": "walk",
