@@ -8,6 +8,7 @@ from torch.nn import functional
 
 from bench.types import Probe
 from methods.instant_ngp.field import Precision
+from methods.kernels.relu import relu_
 from methods.students.fields import REACH, StudentField
 from methods.students.networks import (
     Dense,
@@ -79,7 +80,7 @@ class NerfField(StudentField):
         for number, layer in enumerate(self.trunk):
             if number == SKIP:
                 hidden = torch.cat((encoded.to(hidden.dtype), hidden), dim=1)
-            hidden = layer(hidden).relu_()
+            hidden = relu_(layer(hidden), backend=self.backend)
         raw = self.opacity(hidden)[:, 0].to(positions.dtype)
         return DENSITY * density_of(raw), hidden
 
@@ -93,7 +94,7 @@ class NerfField(StudentField):
         return torch.cat([self._colours(*pair) for pair in pairs])
 
     def _colours(self, geometry: Tensor, encoded: Tensor) -> Tensor:
-        hidden = self._view(geometry, encoded).relu_()
+        hidden = relu_(self._view(geometry, encoded), backend=self.backend)
         return self.colour(hidden).to(encoded.dtype).sigmoid()
 
     def _view(self, geometry: Tensor, encoded: Tensor) -> Tensor:
