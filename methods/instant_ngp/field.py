@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -163,8 +162,8 @@ class HashField(nn.Module):
         return functional.linear(inputs, weights.to(self._compute_dtype))
 
 
-def _joined(parts: Sequence[Tensor]) -> Tensor:
-    return parts[0] if len(parts) == 1 else torch.cat(list(parts))
+def _joined(parts: tuple[Tensor, ...] | list[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(parts)
 
 
 def _xavier_uniform(outputs: int, inputs: int, generator: torch.Generator | None) -> nn.Parameter:

@@ -91,6 +91,14 @@ def _load(block, place, source, first, size):
 
 
 @njit(cache=True)
+def _load_gaussians(block, means, scales, rotations, first, size):
+    """Rows 0 to 9 of a block."""
+    _load(block, 0, means, first, size)
+    _load(block, 3, scales, first, size)
+    _load(block, 6, rotations, first, size)
+
+
+@njit(cache=True)
 def _store(block, place, target, first, size):
     """The way back of `_load`."""
     for column in range(target.shape[1]):
@@ -102,6 +110,19 @@ def _store(block, place, target, first, size):
 def _three(block, row, i):
     """Three rows of the block, from `row` on, of Gaussian `i`."""
     return block[row * BLOCK + i], block[(row + 1) * BLOCK + i], block[(row + 2) * BLOCK + i]
+
+
+@njit(cache=True, error_model="numpy")
+def _place(block, i, w0, w1, w2, origin, limit_x, limit_y):
+    """Depth z of Gaussian `i`, 1 / z, x / z and y / z, and the last two within the limits of J."""
+    x, y, z = _three(block, 0, i)
+    mean = x - origin[0], y - origin[1], z - origin[2]
+    depth = _dot(w2, mean)
+    inverse = ONE / depth
+    u, v = _dot(w0, mean) * inverse, _dot(w1, mean) * inverse
+    tx = min(max(u, -limit_x), limit_x)
+    ty = min(max(v, -limit_y), limit_y)
+    return depth, inverse, u, v, tx, ty
 
 
 @njit(cache=True, error_model="numpy")
@@ -123,9 +144,7 @@ def _forward(means, scales, rotations, reach, world, origin, view, centres, coni
     for chunk in prange((count + BLOCK - 1) // BLOCK):
         first, size = chunk * BLOCK, min(BLOCK, count - chunk * BLOCK)
         block = np.empty(19 * BLOCK, np.float32)
-        _load(block, 0, means, first, size)
-        _load(block, 3, scales, first, size)
-        _load(block, 6, rotations, first, size)
+        _load_gaussians(block, means, scales, rotations, first, size)
         _load(block, 10, reach, first, size)
         _project(block, size, world, origin, view)
         _store(block, 11, centres, first, size)
@@ -139,19 +158,13 @@ def _project(block, size, world, origin, view):
     """Rows of the block: means, scales, quaternions and reach; centres, conics, depth, extents."""
     fx, fy, cx, cy, limit_x, limit_y = view
     w0, w1, w2 = _row(world, 0), _row(world, 1), _row(world, 2)
-    ox, oy, oz = origin[0], origin[1], origin[2]
+    centre = origin[0], origin[1], origin[2]
     for i in range(size):  # one array and no branch: LLVM makes vectors of it
-        x, y, z = _three(block, 0, i)
-        mean = x - ox, y - oy, z - oz
+        z, inverse, u, v, tx, ty = _place(block, i, w0, w1, w2, centre, limit_x, limit_y)
         s0, s1, s2 = _three(block, 3, i)
         qx, qy, qz = _three(block, 7, i)
         r0, r1, r2, _ = _rotation(block[6 * BLOCK + i], qx, qy, qz)
         rise = block[10 * BLOCK + i]
-        z = _dot(w2, mean)
-        inverse = ONE / z
-        u, v = _dot(w0, mean) * inverse, _dot(w1, mean) * inverse
-        tx = min(max(u, -limit_x), limit_x)
-        ty = min(max(v, -limit_y), limit_y)
         # Rows of J W R diag s.
         ax, ay = fx * inverse, fy * inverse
         v20, v21, v22 = _dot(w2, r0), _dot(w2, r1), _dot(w2, r2)
@@ -195,9 +208,7 @@ def _backward(
     for chunk in prange((count + BLOCK - 1) // BLOCK):
         first, size = chunk * BLOCK, min(BLOCK, count - chunk * BLOCK)
         block = np.empty(30 * BLOCK, np.float32)
-        _load(block, 0, means, first, size)
-        _load(block, 3, scales, first, size)
-        _load(block, 6, rotations, first, size)
+        _load_gaussians(block, means, scales, rotations, first, size)
         _load(block, 10, conics, first, size)
         _load(block, 13, extents, first, size)
         _load(block, 15, grad_centres, first, size)
@@ -219,21 +230,15 @@ def _differentiate(block, size, world, origin, view):
     fx, fy, _, _, limit_x, limit_y = view
     w0, w1, w2 = _row(world, 0), _row(world, 1), _row(world, 2)
     c0, c1, c2 = _row(world.T, 0), _row(world.T, 1), _row(world.T, 2)
-    ox, oy, oz = origin[0], origin[1], origin[2]
+    centre = origin[0], origin[1], origin[2]
     for i in range(size):  # one array and no branch: LLVM makes vectors of it
-        x, y, z = _three(block, 0, i)
-        mean = x - ox, y - oy, z - oz
+        _, inverse, u, v, tx, ty = _place(block, i, w0, w1, w2, centre, limit_x, limit_y)
         s0, s1, s2 = _three(block, 3, i)
         qw = block[6 * BLOCK + i]
         qx, qy, qz = _three(block, 7, i)
         a, b, c = _three(block, 10, i)
         shown = block[13 * BLOCK + i] > ZERO
         r0, r1, r2, shrink = _rotation(qw, qx, qy, qz)
-        z = _dot(w2, mean)
-        inverse = ONE / z
-        u, v = _dot(w0, mean) * inverse, _dot(w1, mean) * inverse
-        tx = min(max(u, -limit_x), limit_x)
-        ty = min(max(v, -limit_y), limit_y)
         ax, ay = fx * inverse, fy * inverse
 
         # dL/dV' is symmetric: each off-diagonal entry is half of dL/dB.

@@ -35,9 +35,9 @@ def cases() -> list[Case]:
         found.append(
             forward.case(name, partial(_forward, x), 0.0, precision=precision, items=items)
         )
-        finite = torch.where(x.isnan(), 1, x)  # torch passes the gradient of a NaN, or not
+        numbers = torch.where(x.isnan(), 1, x)  # whether the gradient of a NaN passes is left open
         found.append(
-            backward.case(name, partial(_backward, finite), 0.0, precision=precision, items=items)
+            backward.case(name, partial(_backward, numbers), 0.0, precision=precision, items=items)
         )
     return found
 

@@ -76,8 +76,7 @@ def _evaluate(directions, out):
     count = len(directions)
     for chunk in prange((count + BLOCK - 1) // BLOCK):
         first, size = chunk * BLOCK, min(BLOCK, count - chunk * BLOCK)
-        basis = np.empty(ROWS * BLOCK, np.float32)
-        _harmonics(directions, first, size, basis)
+        basis = _harmonics(directions, first, size)
         for i in range(size):
             for k in range(16):
                 out[first + i, k] = basis[k * BLOCK + i]
@@ -89,8 +88,7 @@ def _shade(coefficients, directions, terms, colours):
     count = len(directions)
     for chunk in prange((count + BLOCK - 1) // BLOCK):
         first, size = chunk * BLOCK, min(BLOCK, count - chunk * BLOCK)
-        basis = np.empty(ROWS * BLOCK, np.float32)
-        _harmonics(directions, first, size, basis)
+        basis = _harmonics(directions, first, size)
         for i in range(size):
             at, of = u64((first + i) * terms * 3), u64(i)
             red, green, blue = ZERO, ZERO, ZERO
@@ -109,8 +107,7 @@ def _unshade(grad, directions, terms, grads):
     count = len(directions)
     for chunk in prange((count + BLOCK - 1) // BLOCK):
         first, size = chunk * BLOCK, min(BLOCK, count - chunk * BLOCK)
-        basis = np.empty(ROWS * BLOCK, np.float32)
-        _harmonics(directions, first, size, basis)
+        basis = _harmonics(directions, first, size)
         for i in range(size):
             at, of = u64((first + i) * terms * 3), u64(i)
             red, green, blue = grad[first + i, 0], grad[first + i, 1], grad[first + i, 2]
@@ -125,13 +122,13 @@ def _unshade(grad, directions, terms, grads):
 
 
 @njit(cache=True)
-def _harmonics(directions, first, size, block):
-    """Fill `block` with the harmonics of `size` directions, number k of direction i at
-    block[k * BLOCK + i].
+def _harmonics(directions, first, size):
+    """A block with the harmonics of `size` directions, number k of direction i at k * `BLOCK` + i.
 
     The directions are copied into it first: in a loop over one array LLVM sees what it may
     vectorise.
     """
+    block = np.empty(ROWS * BLOCK, np.float32)
     for d in range(3):
         for i in range(size):
             block[(16 + d) * BLOCK + i] = directions[first + i, d]
@@ -154,3 +151,4 @@ def _harmonics(directions, first, size, block):
         block[13 * BLOCK + i] = C31 * x * (f32(4) * zz - xx - yy)
         block[14 * BLOCK + i] = C32 * z * (xx - yy)
         block[15 * BLOCK + i] = C33 * x * (xx - f32(3) * yy)
+    return block
