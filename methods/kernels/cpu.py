@@ -87,10 +87,11 @@ def sigmoid(x):
     return f32(1) / (f32(1) + exp(-x))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def slope(direction):
     """Change of t per length along an axis; 0 for a ray that does not move along it."""
-    return f32(1) / direction if abs(direction) >= PARALLEL else f32(0)
+    inverse = f32(1) / direction
+    return inverse if abs(direction) >= PARALLEL else f32(0)
 
 
 @njit(cache=True)

@@ -10,16 +10,20 @@ from torch import Tensor
 from bench.types import Rays
 from methods.kernels.composite import Extent, Pixels, composite, visible_counts
 from methods.kernels.march import Occupancy, Samples, march
+from methods.rendering.compaction import compacts
 from methods.rendering.field import CHUNK_SAMPLES, Field, pad, query
 from methods.rendering.march import March
+
+FRONT_SAMPLES = 8
+"""Samples of a ray whose densities a CPU evaluates before it knows whether the ray goes on."""
 
 
 @dataclass(frozen=True)
 class FirstPass:
-    """All samples of R rays, and which of them are visible before their rays end.
+    """Samples of R rays, and which of them are visible before their rays end.
 
     Attributes:
-        samples: visible or not.
+        samples: visible or not; some that are not may be missing.
         sigma: [S] their density, without gradient.
         counts: [R] number of visible samples of each ray, which are its first ones.
     """
@@ -80,18 +84,52 @@ def first_pass(
     extent: Extent | None = None,
     guide: Field | None = None,
 ) -> FirstPass:
-    """Evaluate the density of all samples of `rays`; see `render_batch`.
+    """Evaluate the density of the samples of `rays`; see `render_batch`.
 
     Args:
         extent: how many samples there are; None: the host waits for a GPU to count them.
     """
-    backend = field.backend
-    samples = march(rays, occupancy, how.step, jitter=jitter, extent=extent, backend=backend)
     teller = field if guide is None else guide
-    parts = pad(samples.positions).split(CHUNK_SAMPLES)
-    sigma = torch.cat([teller.density(part)[0] for part in parts])[: len(samples)]
-    counts = visible_counts(sigma, samples, stop=how.stop, backend=backend)
+    if compacts(rays.origins.device):
+        samples, sigma = _front_then_rest(teller, rays, occupancy, how, jitter, field.backend)
+    else:
+        samples = march(
+            rays, occupancy, how.step, jitter=jitter, extent=extent, backend=field.backend
+        )
+        sigma = _densities(teller, samples)
+    counts = visible_counts(sigma, samples, stop=how.stop, backend=field.backend)
     return FirstPass(samples, sigma, counts)
+
+
+def _front_then_rest(
+    teller: Field,
+    rays: Rays,
+    occupancy: Occupancy,
+    how: March,
+    jitter: Tensor | None,
+    backend: str,
+) -> tuple[Samples, Tensor]:
+    """Samples and densities of `rays`; of rays that end within `FRONT_SAMPLES`, only so many."""
+    front = march(rays, occupancy, how.step, jitter=jitter, limit=FRONT_SAMPLES, backend=backend)
+    sigma = _densities(teller, front)
+    seen = visible_counts(sigma, front, stop=how.stop, backend=backend)
+    open_ = ((front.resume >= 0) & (seen == FRONT_SAMPLES)).nonzero().squeeze(1)
+    rest = march(
+        rays.take(open_),
+        occupancy,
+        how.step,
+        jitter=None if jitter is None else jitter[open_],
+        start=front.resume[open_],
+        backend=backend,
+    )
+    samples, order = front.followed_by(rest, open_)
+    return samples, torch.cat((sigma, _densities(teller, rest)))[order]
+
+
+def _densities(field: Field, samples: Samples) -> Tensor:
+    """Density of `samples`, [S]."""
+    parts = pad(samples.positions).split(CHUNK_SAMPLES)
+    return torch.cat([field.density(part)[0] for part in parts])[: len(samples)]
 
 
 def second_pass(field: Field, rays: Rays, samples: Samples, how: March) -> Pixels:

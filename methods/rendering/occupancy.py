@@ -99,20 +99,21 @@ class DensityGrid:
     def update(self, field: Field, generator: torch.Generator, samples: int) -> None:
         """Visit `samples` random cells: half drawn from all cells, half from the occupied ones."""
         cells = self._draw(samples, generator)
-        found = torch.full_like(self.density.view(-1), -1.0)
-        for part in cells.split(CHUNK):
-            # Not `torch.unravel_index`: it checks the largest index, and waits for a GPU.
-            rows, columns = self.density.shape[1:]
-            corner = torch.stack(
-                (part // (rows * columns), part // columns % rows, part % columns), dim=-1
-            )
-            jitter = torch.rand(len(part), 3, generator=generator, device=part.device)
-            sigma, _ = field.density((corner + jitter) / RESOLUTION)
-            found.scatter_reduce_(0, part, sigma.clamp(max=LARGEST), "amax")
-        found = found.view_as(self.density)
-        visited = torch.maximum(DECAY * self.density, found)
-        self.density = torch.where(found >= 0, visited, self.density)
+        sigma = torch.cat([self._visit(field, part, generator) for part in cells.split(CHUNK)])
+        density = self.density.view(-1)
+        found = torch.fmax(DECAY * density[cells], sigma.clamp(max=LARGEST))  # not NaN
+        density.scatter_reduce_(0, cells, found, "amax", include_self=False)
         self._threshold()
+
+    def _visit(self, field: Field, cells: Tensor, generator: torch.Generator) -> Tensor:
+        """Density at a random point of each of `cells` [N]."""
+        # Not `torch.unravel_index`: it checks the largest index, and waits for a GPU.
+        rows, columns = self.density.shape[1:]
+        corner = torch.stack(
+            (cells // (rows * columns), cells // columns % rows, cells % columns), dim=-1
+        )
+        jitter = torch.rand(len(cells), 3, generator=generator, device=cells.device)
+        return field.density((corner + jitter) / RESOLUTION)[0]
 
     def _draw(self, samples: int, generator: torch.Generator) -> Tensor:
         device = self.density.device
@@ -126,5 +127,5 @@ class DensityGrid:
         )
 
     def _threshold(self) -> None:
-        mean = self.density.view(-1)[self._candidates].mean()
+        mean = self.density.sum() / len(self._candidates)  # others have a density of 0
         self.occupancy = Occupancy(self.density > mean.clamp(max=THRESHOLD))

@@ -81,12 +81,15 @@ class Occupancy:
 
         0 in a non-empty brick, at most G/4.
         """
-        near = (self.words != 0)[None, None].float()
-        clearance = torch.zeros_like(near)
-        for _ in range(self.resolution // BRICK):
-            clearance += near == 0
-            near = functional.max_pool3d(near, 3, stride=1, padding=1)
-        return clearance[0, 0].to(torch.uint8)
+        side = self.resolution // BRICK
+        index = torch.arange(side, dtype=torch.uint8, device=self.cells.device)
+        apart = torch.where(index > index[:, None], index - index[:, None], index[:, None] - index)
+        distance = torch.where(self.words != 0, 0, side).to(torch.uint8)
+        # The largest of three distances along axes: find the smallest of it axis by axis.
+        for _ in range(3):
+            distance = torch.maximum(distance[:, None], apart[:, :, None, None]).amin(dim=0)
+            distance = distance.permute(1, 2, 0)
+        return distance.contiguous()
 
     @cached_property
     def bounds(self) -> Tensor:
@@ -104,11 +107,10 @@ class Occupancy:
 def _pack_bricks(bits: Tensor) -> Tensor:
     """Pack cells into 64-bit words: bit x + 4 y + 16 z is the cell (x, y, z) of a 4^3 brick."""
     side = bits.shape[0] // BRICK
-    cells = bits.view(side, BRICK, side, BRICK, side, BRICK).permute(0, 2, 4, 5, 3, 1)
-    weight = torch.ones(64, dtype=torch.int64, device=bits.device).bitwise_left_shift(
-        torch.arange(64, device=bits.device)
-    )
-    return (cells.reshape(side, side, side, 64).long() * weight).sum(dim=-1)
+    cells = bits.view(torch.uint8).view(side, BRICK, side, BRICK, side, BRICK)
+    cells = cells.permute(0, 2, 4, 5, 3, 1).reshape(side, side, side, 8, 8)  # 8 bytes of 8 bits
+    weight = 1 << torch.arange(8, dtype=torch.uint8, device=bits.device)
+    return (cells * weight).sum(dim=-1, dtype=torch.uint8).view(torch.int64).squeeze(-1)
 
 
 @dataclass(frozen=True)
@@ -143,6 +145,31 @@ class Samples(Intervals):
             torch.full_like(self.resume, -1),
             longest=longest,
         )
+
+    def followed_by(self, more: Samples, rays: Tensor) -> tuple[Samples, Tensor]:
+        """These samples and `more`, which lie behind them on the rays `rays` [Q], in increasing
+        order. Also returns the order [S + M] in which both, one after the other, were taken."""
+        counts, added = self.offsets.diff(), more.offsets.diff()
+        together = counts.index_add(0, rays, added)
+        offsets = torch.cat((counts.new_zeros(1), together.cumsum(dim=0)))
+        shifts = (
+            (offsets - self.offsets)[:-1].repeat_interleave(counts, output_size=len(self)),
+            (offsets[rays] + counts[rays] - more.offsets[:-1]).repeat_interleave(
+                added, output_size=len(more)
+            ),
+        )
+        places = torch.cat([torch.arange(len(x), device=x.device) + x for x in shifts])
+        order = torch.empty_like(places)
+        order[places] = torch.arange(len(places), device=places.device)
+        merged = Samples(
+            torch.cat((self.t, more.t))[order],
+            torch.cat((self.delta, more.delta))[order],
+            offsets,
+            torch.cat((self.ray, rays.int()[more.ray]))[order],
+            torch.cat((self.positions, more.positions))[order],
+            self.resume.index_copy(0, rays, more.resume),
+        )
+        return merged, order
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
-"""Ray marching with numba: a ray crosses all empty space around a cell or brick in one step.
+"""Ray marching with numba: the rays of a chunk take their steps together, in vectors, and cross all
+empty space around a cell or brick in one step.
 
-Rays are marched only once. A chunk of rays writes the t of its samples into its own part of a
-scratch array, whose pages cost nothing until written. Once all counts are known, the samples are
-moved to their final place.
+Rays are marched only once. A chunk writes the t of its samples, in the order found, into its own
+part of a scratch array, whose pages cost nothing until written. Once all counts are known, the
+samples are moved to their final place, ray by ray.
 """
 
 from __future__ import annotations
@@ -15,13 +16,29 @@ from numba import njit, prange
 from torch import Tensor
 
 from methods.kernels.composite import Extent
-from methods.kernels.cpu import f32, slope
+from methods.kernels.cpu import f32, i32, slope, u64
 from methods.kernels.march import Occupancy, Samples, Segments, longest_ray
 
-CHUNK = 64  # rays
+CHUNK = 128
+"""Rays that are marched together; their numbers stay in the first-level cache."""
+
+VECTOR = 32
+"""Loops run over a multiple of so many columns, so that vectors leave none over. What they find in
+columns without a ray is not read."""
+
 f64 = np.float64
 INF = f32(np.inf)
-UNIT_CUBE = np.array([[0, 0, 0], [1, 1, 1]], np.float32)
+ZEROS, ONES = (f32(0),) * 3, (f32(1),) * 3
+FAR_AWAY = f32(2**30)
+"""A step that no ray reaches; the numbers of steps are int32."""
+
+# Rows of a chunk: what is known of each ray, in float32 ...
+ORIGIN, DIRECTION, SLOPE = 0, 3, 6  # three rows each
+NEAR, FAR, STEP, RATE, PHASE, FIRST, T = 9, 10, 11, 12, 13, 14, 15
+FLOATS = 16
+# ... and in int32. FREE is the clearance, or -1 in an occupied cell.
+K, RAY, COUNT, CELL, FREE = 0, 1, 2, 3, 6
+INTEGERS = 7
 
 
 def count(segments: Segments, occupancy: Occupancy, step: float) -> Tensor:
@@ -44,14 +61,16 @@ def march(
         raise ValueError(f"backend 'cpu' marches float32, got {origins.dtype}")
     rays = len(origins)
     most = min(limit, longest_ray(step))
-    scratch = torch.empty(-(-rays // CHUNK) * CHUNK * most)
+    size = -(-rays // CHUNK) * CHUNK * most
+    scratch, owners = torch.empty(size), torch.empty(size, dtype=torch.uint8)
     counts = torch.empty(rays, dtype=torch.int64)
     resume = torch.empty(rays, dtype=torch.int32)
     _find(
         origins.numpy(),
         directions.numpy(),
-        occupancy.words.numpy(),
-        occupancy.clearance.numpy(),
+        occupancy.words.numpy().reshape(-1),
+        occupancy.clearance.numpy().reshape(-1),
+        occupancy.resolution,
         occupancy.bounds.numpy(),
         f32(step),
         segments.window.contiguous().numpy(),
@@ -59,6 +78,7 @@ def march(
         segments.start.contiguous().numpy(),
         most,
         scratch.numpy(),
+        owners.numpy(),
         counts.numpy(),
         resume.numpy(),
     )
@@ -71,6 +91,7 @@ def march(
         origins.numpy(),
         directions.numpy(),
         scratch.numpy(),
+        owners.numpy(),
         most,
         offsets.numpy(),
         t.numpy(),
@@ -81,97 +102,186 @@ def march(
 
 
 @njit(cache=True)
-def _cross(origin, direction, box):
-    """Where a ray enters and leaves a box (slab test); enter > leave if it misses."""
-    enter, leave = f32(-np.inf), f32(np.inf)
-    for axis in range(3):
-        along = slope(direction[axis])
-        if along == 0:
-            if origin[axis] < box[0, axis] or origin[axis] > box[1, axis]:
-                return f32(np.inf), f32(-np.inf)
-        else:
-            a = (box[0, axis] - origin[axis]) * along
-            b = (box[1, axis] - origin[axis]) * along
-            enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
-    return enter, leave
+def _at(row, column):
+    """Place of a number of a ray, which has a column of its own in a chunk."""
+    return u64(row) * u64(CHUNK) + u64(column)
 
 
 @njit(cache=True)
-def _occupied(word, x, y, z):
-    return (word >> ((x & 3) + ((y & 3) << 2) + ((z & 3) << 4))) & 1
+def _three(numbers, row, column):
+    """Three numbers of a ray, from `row` on."""
+    return numbers[_at(row, column)], numbers[_at(row + 1, column)], numbers[_at(row + 2, column)]
+
+
+@njit(cache=True)
+def _padded(columns):
+    """Columns that a loop runs over; see `VECTOR`."""
+    return (columns + VECTOR - 1) // VECTOR * VECTOR
+
+
+@njit(cache=True)
+def _load(floats, integers, origins, directions, window, jitter, start, first, rays):
+    """Fill the first columns of a chunk with the rays from `first` on."""
+    for i in range(rays):
+        for axis in range(3):
+            floats[_at(ORIGIN + axis, i)] = origins[first + i, axis]
+            floats[_at(DIRECTION + axis, i)] = directions[first + i, axis]
+        floats[_at(FIRST, i)], floats[_at(FAR, i)] = window[first + i]
+        floats[_at(PHASE, i)] = jitter[first + i]
+        integers[_at(K, i)], integers[_at(RAY, i)] = start[first + i], i
+
+
+@njit(cache=True, error_model="numpy")
+def _cross_slab(floats, i, axis, low, high):
+    """Where a ray enters and leaves a slab between two planes; enter > leave if it misses."""
+    origin, along = floats[_at(ORIGIN + axis, i)], floats[_at(SLOPE + axis, i)]
+    a, b = (low - origin) * along, (high - origin) * along
+    enter, leave = a if a < b else b, b if a < b else a
+    outside = INF if (origin < low) | (origin > high) else -INF
+    return enter if along != f32(0) else outside, leave if along != f32(0) else -outside
+
+
+@njit(cache=True, error_model="numpy")
+def _cross(floats, i, low, high):
+    """Where a ray enters and leaves a box (slab test); enter > leave if it misses."""
+    x, x_end = _cross_slab(floats, i, 0, low[0], high[0])
+    y, y_end = _cross_slab(floats, i, 1, low[1], high[1])
+    z, z_end = _cross_slab(floats, i, 2, low[2], high[2])
+    return max(x, max(y, z)), min(x_end, min(y_end, z_end))
+
+
+@njit(cache=True)
+def _whole(number):
+    """A number of steps, rounded down; 0 of NaN."""
+    number = number if number > f32(0) else f32(0)
+    return i32(number if number < FAR_AWAY else FAR_AWAY)
+
+
+@njit(cache=True, error_model="numpy")
+def _begin(floats, integers, rays, low, high, step):
+    """Clip rays to the cube and their windows, and skip the steps in front of the box of occupied
+    cells, from `low` to `high`. FREE is 1 if there is something to march."""
+    for i in range(_padded(rays)):
+        x, y, z = _three(floats, DIRECTION, i)
+        length = f32(math.sqrt(f64(x) * f64(x) + f64(y) * f64(y) + f64(z) * f64(z)))
+        step_t, rate = step / length, length / step
+        floats[_at(SLOPE, i)] = slope(x)
+        floats[_at(SLOPE + 1, i)] = slope(y)
+        floats[_at(SLOPE + 2, i)] = slope(z)
+        first = floats[_at(FIRST, i)]
+        enter, leave = _cross(floats, i, ZEROS, ONES)
+        near, far = max(enter, f32(0)), min(leave, floats[_at(FAR, i)])
+        x, y, z = _three(floats, ORIGIN, i)
+        finite = (abs(x) + abs(y) + abs(z) < INF) & (f32(0) < length) & (length < INF)
+        alive = finite & (near < far) & (far < INF) & (integers[_at(K, i)] >= 0)
+        enter, leave = _cross(floats, i, low, high)
+        integers[_at(FREE, i)] = i32(alive & (enter <= leave))
+        # With a step to spare for rounding.
+        skipped = _whole((min(max(enter, first), far) - near) * rate) - 1
+        integers[_at(K, i)] = max(integers[_at(K, i)], skipped)
+        floats[_at(NEAR, i)] = near
+        floats[_at(FAR, i)] = min(far, leave + step_t)
+        floats[_at(STEP, i)] = step_t
+        floats[_at(RATE, i)] = rate
+
+
+@njit(cache=True)
+def _move(floats, integers, source, target):
+    """Move a ray to another column."""
+    for row in range(FLOATS):
+        floats[_at(row, target)] = floats[_at(row, source)]
+    for row in range(INTEGERS):
+        integers[_at(row, target)] = integers[_at(row, source)]
 
 
 @njit(cache=True)
 def _cell(coordinate, size):
-    return min(max(int(coordinate * f32(size)), 0), size - 1)
+    """Cell of one axis; truncating a number above -1 rounds down or to 0."""
+    at = coordinate * size
+    at = at if at > f32(0) else f32(0)
+    last = size - f32(1)
+    return i32(at if at < last else last)
+
+
+@njit(cache=True, error_model="numpy")
+def _locate(floats, integers, rays, size):
+    """t of the next step of each ray, +inf if it has left, and the cell there."""
+    for i in range(_padded(rays)):
+        near = floats[_at(NEAR, i)]
+        k = f32(integers[_at(K, i)])
+        t = near + (k + floats[_at(PHASE, i)]) * floats[_at(STEP, i)]
+        inside = t < floats[_at(FAR, i)]
+        at = t if inside else near
+        x, y, z = _three(floats, ORIGIN, i)
+        dx, dy, dz = _three(floats, DIRECTION, i)
+        integers[_at(CELL, i)] = _cell(x + at * dx, size)
+        integers[_at(CELL + 1, i)] = _cell(y + at * dy, size)
+        integers[_at(CELL + 2, i)] = _cell(z + at * dz, size)
+        floats[_at(T, i)] = t if inside else INF
 
 
 @njit(cache=True)
-def _leave_slab(origin, slope, first, end, width):
-    """t at which a ray leaves the cells [first, end) of one axis."""
-    return (f32(end if slope > 0 else first) * width - origin) * slope if slope != 0 else INF
+def _leave_axis(floats, integers, i, axis, free, width):
+    """t at which a ray leaves, along one axis, the cells around it that are known to be empty at a
+    clearance of `free` bricks; at 0 that is its own cell."""
+    along, cell = floats[_at(SLOPE + axis, i)], integers[_at(CELL + axis, i)]
+    ahead, brick = along > f32(0), i32(cell >> i32(2))
+    next_cell = i32(cell + i32(ahead))
+    next_brick = i32(brick + free) if ahead else i32(i32(brick - free) + i32(1))
+    edge = f32(i32(next_brick << i32(2)) if free > 0 else next_cell)
+    leave = (edge * width - floats[_at(ORIGIN + axis, i)]) * along
+    return leave if along != f32(0) else INF
+
+
+@njit(cache=True, error_model="numpy")
+def _advance(floats, integers, rays, width):
+    """The next step of each ray: the one after a sample, or the last in the empty space around."""
+    for i in range(_padded(rays)):
+        free = integers[_at(FREE, i)]
+        x = _leave_axis(floats, integers, i, 0, free, width)
+        y = _leave_axis(floats, integers, i, 1, free, width)
+        z = _leave_axis(floats, integers, i, 2, free, width)
+        leave = x if x < y else y
+        leave = leave if leave < z else z
+        # Rounded down, so that the first step beyond the empty space is never skipped.
+        to = (leave - floats[_at(NEAR, i)]) * floats[_at(RATE, i)]
+        beyond = _whole(to - floats[_at(PHASE, i)])
+        after = i32(integers[_at(K, i)] + i32(1))
+        beyond = beyond if free >= 0 else after
+        integers[_at(K, i)] = beyond if beyond > after else after
 
 
 @njit(cache=True)
-def _empty_cells(cell, free):
-    """The cells of one axis that are known to be empty around `cell`, at a clearance of `free`."""
-    if free == 0:
-        return cell, cell + 1
-    brick = cell >> 2
-    return (brick - free + 1) << 2, (brick + free) << 2
-
-
-@njit(cache=True)
-def _march_ray(origin, direction, words, clearance, bounds, step, window, phase, k, limit, out):
-    """Write the t of a ray's samples to `out`; return their count and the step to resume from."""
-    ox, oy, oz = origin
-    dx, dy, dz = direction
-    length = f32(math.sqrt(f64(dx) ** 2 + f64(dy) ** 2 + f64(dz) ** 2))
-    enter, leave = _cross(origin, direction, UNIT_CUBE)
-    near, far = max(enter, f32(0)), min(leave, window[1])
-    finite = abs(ox) + abs(oy) + abs(oz) < np.inf and 0 < length < np.inf
-    if not (finite and near < far < np.inf):
-        return 0, -1
-    step_t, steps_per_t = step / length, length / step
-    size = words.shape[0] * 4
-    width = f32(1) / f32(size)
-    sx, sy, sz = slope(dx), slope(dy), slope(dz)
-
-    # Skip steps before the window and the box of occupied cells, with one step to spare for
-    # rounding.
-    enter, leave = _cross(origin, direction, bounds)
-    if not enter <= leave:
-        return 0, -1
-    k = max(k, int((min(max(enter, window[0]), far) - near) * steps_per_t) - 1)
-    far = min(far, leave + step_t)
-
-    count = 0
-    while True:
-        t = near + (f32(k) + phase) * step_t
-        if not t < far:
-            return count, -1
-        x, y, z = _cell(ox + t * dx, size), _cell(oy + t * dy, size), _cell(oz + t * dz, size)
-        bx, by, bz = x >> 2, y >> 2, z >> 2
-        free = np.int64(clearance[bx, by, bz])
-        if t < window[0]:
-            k += 1
-        elif free == 0 and _occupied(words[bx, by, bz], x, y, z):
-            out[count] = t
-            count += 1
-            k += 1
-            if count == limit:
-                return count, k
-        else:
-            x0, x1 = _empty_cells(x, free)
-            y0, y1 = _empty_cells(y, free)
-            z0, z1 = _empty_cells(z, free)
-            leave = min(
-                _leave_slab(ox, sx, x0, x1, width),
-                _leave_slab(oy, sy, y0, y1, width),
-                _leave_slab(oz, sz, z0, z1, width),
-            )
-            # Rounded down, so that the first step beyond the empty space is never skipped.
-            k = max(k + 1, int((leave - near) * steps_per_t - phase))
+def _march_chunk(
+    floats, integers, active, words, clearance, resolution, limit, scratch, owners, counts, resume
+):
+    """March the rays in the first `active` columns to their ends."""
+    used = u64(0)
+    side = resolution // 4
+    size, width = f32(resolution), f32(1) / f32(resolution)
+    while active > 0:
+        _locate(floats, integers, active, size)
+        for i in range(active - 1, -1, -1):  # a ray that ends makes room for one seen before
+            t = floats[_at(T, i)]
+            ray, found = u64(integers[_at(RAY, i)]), integers[_at(COUNT, i)]
+            again = -1
+            if t < INF:
+                x, y, z = _three(integers, CELL, i)
+                brick = u64(((x >> 2) * side + (y >> 2)) * side + (z >> 2))
+                bit = (words[brick] >> ((x & 3) + ((y & 3) << 2) + ((z & 3) << 4))) & 1
+                integers[_at(FREE, i)] = np.int64(clearance[brick]) - bit
+                scratch[used], owners[used] = t, ray
+                sample = bit & (t >= floats[_at(FIRST, i)])
+                used += u64(sample)
+                found += sample
+                integers[_at(COUNT, i)] = found
+                if found < limit:
+                    continue
+                again = integers[_at(K, i)] + 1
+            counts[ray], resume[ray] = found, again
+            active -= 1
+            _move(floats, integers, active, i)
+        _advance(floats, integers, active, width)
 
 
 @njit(cache=True, parallel=True)
@@ -180,6 +290,7 @@ def _find(
     directions,
     words,
     clearance,
+    resolution,
     bounds,
     step,
     window,
@@ -187,40 +298,54 @@ def _find(
     start,
     most,
     scratch,
+    owners,
     counts,
     resume,
 ):
     rays = len(origins)
     for chunk in prange((rays + CHUNK - 1) // CHUNK):
-        used = chunk * CHUNK * most
-        for ray in range(chunk * CHUNK, min(rays, (chunk + 1) * CHUNK)):
-            count, again = 0, -1
-            if start[ray] >= 0:
-                count, again = _march_ray(
-                    origins[ray],
-                    directions[ray],
-                    words,
-                    clearance,
-                    bounds,
-                    step,
-                    window[ray],
-                    jitter[ray],
-                    np.int64(start[ray]),
-                    most,
-                    scratch[used:],
-                )
-            counts[ray], resume[ray] = count, again
-            used += count
+        floats = np.zeros(FLOATS * CHUNK, np.float32)
+        integers = np.zeros(INTEGERS * CHUNK, np.int32)
+        low = bounds[0, 0], bounds[0, 1], bounds[0, 2]
+        high = bounds[1, 0], bounds[1, 1], bounds[1, 2]
+        first = chunk * CHUNK
+        active = min(CHUNK, rays - first)
+        counts[first : first + active], resume[first : first + active] = 0, -1
+        _load(floats, integers, origins, directions, window, jitter, start, first, active)
+        _begin(floats, integers, active, low, high, step)
+        for i in range(active - 1, -1, -1):
+            if not integers[_at(FREE, i)]:
+                active -= 1
+                _move(floats, integers, active, i)
+        _march_chunk(
+            floats,
+            integers,
+            active,
+            words,
+            clearance,
+            resolution,
+            most,
+            scratch[first * most :],
+            owners[first * most :],
+            counts[first:],
+            resume[first:],
+        )
 
 
 @njit(cache=True, parallel=True)
-def _place(origins, directions, scratch, most, offsets, t, positions, ray_of):
+def _place(origins, directions, scratch, owners, most, offsets, t, positions, ray_of):
     rays = len(origins)
     for chunk in prange((rays + CHUNK - 1) // CHUNK):
-        shift = chunk * CHUNK * most - offsets[chunk * CHUNK]
-        for ray in range(chunk * CHUNK, min(rays, (chunk + 1) * CHUNK)):
-            for sample in range(offsets[ray], offsets[ray + 1]):
-                t[sample] = scratch[sample + shift]
-                ray_of[sample] = ray
-                for axis in range(3):
-                    positions[sample, axis] = origins[ray, axis] + t[sample] * directions[ray, axis]
+        first, last = chunk * CHUNK, min(rays, (chunk + 1) * CHUNK)
+        next_ = offsets[first:last].copy()
+        for n in range(offsets[last] - offsets[first]):
+            ray = owners[first * most + n]
+            sample = next_[ray]
+            next_[ray] = sample + 1
+            along = scratch[first * most + n]
+            t[sample] = along
+            ray_of[sample] = first + ray
+            for axis in range(3):
+                positions[sample, axis] = (
+                    origins[first + ray, axis] + along * directions[first + ray, axis]
+                )

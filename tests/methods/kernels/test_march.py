@@ -214,6 +214,18 @@ def test_the_front_of_a_ray_is_its_first_samples() -> None:
             assert torch.equal(getattr(front, name)[kept], getattr(samples, name)[whole])
 
 
+def test_the_first_samples_and_those_that_follow_are_the_samples_of_one_go() -> None:
+    rays, grid = rays_through_the_cube(60), dust(2)
+    whole, front = march(rays, grid, STEP), march(rays, grid, STEP, limit=3)
+    open_ = (front.resume >= 0).nonzero().squeeze(1)
+    assert 0 < len(open_) < 60
+    rest = march(rays.take(open_), grid, STEP, start=front.resume[open_])
+    together, order = front.followed_by(rest, open_)
+    for name in ("t", "delta", "offsets", "ray", "positions", "resume"):
+        assert torch.equal(getattr(together, name), getattr(whole, name)), name
+    assert torch.equal(torch.cat((front.t, rest.t))[order], whole.t)
+
+
 def test_words_and_bounds_describe_the_cells() -> None:
     cells = torch.zeros(32, 32, 32, dtype=torch.bool)
     cells[3, 17, 30] = cells[5, 20, 31] = True

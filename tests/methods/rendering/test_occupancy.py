@@ -101,6 +101,13 @@ def test_a_cell_is_occupied_until_it_was_visited_and_keeps_its_value_in_between(
     assert torch.equal(grid.occupancy.cells, ~visited)
 
 
+def test_a_density_that_is_not_a_number_is_as_good_as_none() -> None:
+    grid, other = DensityGrid(WHOLE), DensityGrid(WHOLE)
+    for one, sigma in ((grid, math.nan), (other, 0.0)):
+        one.update(Slab(sigma), torch.Generator().manual_seed(1), samples=4096)
+    assert torch.equal(grid.density, other.density)
+
+
 @pytest.mark.slow
 def test_matter_that_is_thin_everywhere_is_kept_where_it_is_denser_than_the_mean() -> None:
     thin = Slab(0.1 * THRESHOLD)
