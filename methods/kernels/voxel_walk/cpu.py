@@ -18,15 +18,19 @@ from torch.nn.functional import normalize
 
 from bench.types import Rays
 from methods.kernels.composite import Pixels
-from methods.kernels.cpu import f32, i32, sigmoid, slope
-from methods.kernels.spherical import spherical_harmonics
+from methods.kernels.cpu import f32, i32, prefetch, sigmoid, slope, u64
+from methods.kernels.spherical import CHANNELS, spherical_harmonics
 from methods.kernels.voxel_walk import Crossings, Light, Voxels
 
 CHUNK = 64  # rays
 ROUND = 16
 """Voxels that a ray finds at a time when rendering; few, so that few behind its end are wasted."""
 
+WORDS = 16
+"""Numbers in a cache line."""
+
 f64 = np.float64
+ONE, TWO, THREE = u64(1), u64(2), u64(3)
 INF = f32(np.inf)
 
 BLOCK = 1 << 12
@@ -83,9 +87,11 @@ def render_voxels(
     pixels = Pixels.blank(count, 3)
     crossed, shaded = (torch.zeros(count, dtype=torch.int32) for _ in range(2))
     basis = spherical_harmonics(normalize(rays.directions, dim=1), backend="cpu")
-    given = (rays.origins, rays.directions, basis, light.density, light.harmonics)
+    terms = light.harmonics.shape[1]
+    given = (rays.origins, rays.directions, basis.view(-1), light.density, light.harmonics.view(-1))
     _render(
         *(x.detach().contiguous().numpy() for x in given),
+        terms,
         *(x.numpy() for x in (voxels.bricks, voxels.masks, voxels.leaves, voxels.clearance)),
         f64(f32(stop)),
         f64(f32(faint)),
@@ -288,13 +294,15 @@ def _place(
 
 
 @njit(cache=True)
-def _colour(coefficients, basis):
-    size = coefficients.shape[0]
+def _colour(harmonics, voxel, basis, ray, terms):
+    """Colour of a voxel as a ray sees it; `harmonics` and `basis` are flat."""
+    at, of = u64(voxel * terms * 3), u64(ray * CHANNELS)
     red, green, blue = f32(0), f32(0), f32(0)
-    for k in range(size):
-        red += basis[k] * coefficients[k, 0]
-        green += basis[k] * coefficients[k, 1]
-        blue += basis[k] * coefficients[k, 2]
+    for _ in range(terms):
+        red += basis[of] * harmonics[at]
+        green += basis[of] * harmonics[at + ONE]
+        blue += basis[of] * harmonics[at + TWO]
+        at, of = at + THREE, of + ONE
     return sigmoid(red), sigmoid(green), sigmoid(blue)
 
 
@@ -305,6 +313,7 @@ def _render(
     basis,
     density,
     harmonics,
+    terms,
     bricks,
     masks,
     leaves,
@@ -340,6 +349,12 @@ def _render(
                     far,
                     voxel,
                 )
+                # All that may be read is asked for before anything is waited for.
+                for i in range(count):
+                    prefetch(density, np.int64(voxel[i]))
+                    for k in range(0, terms * 3, WORDS):
+                        prefetch(harmonics, voxel[i] * terms * 3 + k)
+                    prefetch(harmonics, (voxel[i] + 1) * terms * 3 - 1)
                 for i in range(count):
                     if transmittance <= stop:
                         break
@@ -353,7 +368,7 @@ def _render(
                     depth += weight * f64((near[i] + far[i]) * f32(0.5))
                     if weight > faint:
                         colours += 1
-                        r, g, b = _colour(harmonics[voxel[i]], basis[ray])
+                        r, g, b = _colour(harmonics, voxel[i], basis, ray, terms)
                         red += weight * f64(r)
                         green += weight * f64(g)
                         blue += weight * f64(b)
