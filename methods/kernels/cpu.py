@@ -41,6 +41,9 @@ TALL = 12 if get_host_cpu_features().get("avx512f") else ROWS
 LANES = 16
 """Outputs that both compute together."""
 
+WORDS = 16
+"""Numbers of 32 bits in a cache line."""
+
 # e^x = 2^n e^r with n the whole number nearest to x / ln 2. ln 2 in two parts: n times the first is
 # exact. e^r = 1 + r + r^2 (E0 + r (E1 + r (E2 + r (E3 + r E4)))), |r| <= ln 2 / 2: a minimax fit,
 # off by less than 4e-9 before rounding.
@@ -126,6 +129,14 @@ def prefetch(typing, array, at):
         return context.get_dummy_value()
 
     return types.void(array, types.int64), generate
+
+
+@njit(cache=True)
+def prefetch_row(array, at, count):
+    """Ask for `count` numbers of a flat array of float32, from place `at` on."""
+    for k in range(0, count, WORDS):
+        prefetch(array, at + k)
+    prefetch(array, at + count - 1)
 
 
 def _product(rows: int, relu: bool):

@@ -20,7 +20,7 @@ from bench.types import Rays
 from methods.kernels.composite import Pixels
 from methods.kernels.corner_gather.cpu import blended, eight_of, local_coordinate, mean_weights
 from methods.kernels.corner_rendering import Corners, Layers
-from methods.kernels.cpu import LANES, ROWS, f32, multiply, sigmoid
+from methods.kernels.cpu import LANES, ROWS, f32, multiply, prefetch, sigmoid
 from methods.kernels.voxel_walk import Voxels
 from methods.kernels.voxel_walk.cpu import walk_ray
 
@@ -192,6 +192,12 @@ def _render(
                 )
                 if not count:
                     break
+                # Corners and their features are asked for before any of them is waited for.
+                for i in range(count):
+                    prefetch(corners, voxel[i] * 8)
+                for i in range(count):
+                    for row in eight_of(corners, voxel[i]):
+                        prefetch(table, row * inputs)
                 for i in range(count):
                     v, near_t, far_t = voxel[i], near[i], far[i]
                     x, y, z = coordinates[v, 0], coordinates[v, 1], coordinates[v, 2]

@@ -10,7 +10,7 @@ import torch
 from numba import get_num_threads, njit, prange
 from torch import Tensor
 
-from methods.kernels.cpu import f32, sigmoid, u64
+from methods.kernels.cpu import f32, prefetch_row, sigmoid, u64
 from methods.kernels.spherical import CHANNELS, spherical_harmonics
 
 CHUNK = 1 << 10
@@ -18,6 +18,9 @@ CHUNK = 1 << 10
 
 NEAR = 64
 """Voxels in a row that one thread owns: two threads would take a cache line from each other."""
+
+AHEAD = 16
+"""Voxels between the one that is asked for and the one that is read."""
 
 ONE, TWO, THREE = u64(1), u64(2), u64(3)
 
@@ -64,6 +67,7 @@ def _shade(harmonics, voxel, ray, basis, terms, colours):
     for chunk in prange((total + CHUNK - 1) // CHUNK):
         first, end = chunk * CHUNK, min(total, (chunk + 1) * CHUNK)
         for i in range(first, end):
+            prefetch_row(harmonics, voxel[min(i + AHEAD, end - 1)] * terms * 3, terms * 3)
             at, of = u64(voxel[i] * terms * 3), u64(ray[i] * CHANNELS)
             red, green, blue = f32(0), f32(0), f32(0)
             for _ in range(terms):

@@ -18,16 +18,13 @@ from torch.nn.functional import normalize
 
 from bench.types import Rays
 from methods.kernels.composite import Pixels
-from methods.kernels.cpu import f32, i32, prefetch, sigmoid, slope, u64
+from methods.kernels.cpu import f32, i32, prefetch, prefetch_row, sigmoid, slope, u64
 from methods.kernels.spherical import CHANNELS, spherical_harmonics
 from methods.kernels.voxel_walk import Crossings, Light, Voxels
 
 CHUNK = 64  # rays
 ROUND = 16
 """Voxels that a ray finds at a time when rendering; few, so that few behind its end are wasted."""
-
-WORDS = 16
-"""Numbers in a cache line."""
 
 f64 = np.float64
 ONE, TWO, THREE = u64(1), u64(2), u64(3)
@@ -352,9 +349,7 @@ def _render(
                 # All that may be read is asked for before anything is waited for.
                 for i in range(count):
                     prefetch(density, np.int64(voxel[i]))
-                    for k in range(0, terms * 3, WORDS):
-                        prefetch(harmonics, voxel[i] * terms * 3 + k)
-                    prefetch(harmonics, (voxel[i] + 1) * terms * 3 - 1)
+                    prefetch_row(harmonics, voxel[i] * terms * 3, terms * 3)
                 for i in range(count):
                     if transmittance <= stop:
                         break
