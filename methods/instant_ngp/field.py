@@ -15,7 +15,12 @@ from methods.kernels.encode import HashGrid, encode, pack
 from methods.kernels.relu import relu_
 from methods.kernels.spherical import CHANNELS as DIRECTION_CHANNELS
 from methods.kernels.spherical import spherical_harmonics
-from methods.rendering.field import CHUNK_SAMPLES, LOG_DENSITY_CLAMP, ROUND_SAMPLES
+from methods.rendering.field import (
+    CACHED_SAMPLES,
+    CHUNK_SAMPLES,
+    LOG_DENSITY_CLAMP,
+    ROUND_SAMPLES,
+)
 
 Precision = Literal["bf16", "fp32"]
 
@@ -24,10 +29,6 @@ HIDDEN_CHANNELS = 64
 
 GEOMETRY_CHANNELS = 16
 """Outputs of the density network. The first is the log density; all feed the feature network."""
-
-CACHED_SAMPLES = 1 << 15
-"""Samples that go through all layers together on a CPU: with the 128 bytes that each has between
-two layers, two cores keep them in their second-level caches."""
 
 
 class HashField(nn.Module):
@@ -42,6 +43,7 @@ class HashField(nn.Module):
     """
 
     round_samples = ROUND_SAMPLES
+    skips_faint = False
 
     def __init__(
         self,
@@ -104,11 +106,12 @@ class HashField(nn.Module):
 
     def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Density [S] float32 and geometry channels [S, 16] at `positions` [S, 3]."""
-        parts = [self._density(part) for part in positions.split(self._together)]
+        weights = self._weights("density_in", "density_out")
+        parts = [self._density(part, *weights) for part in positions.split(self._together)]
         sigma, geometry = (_joined(column) for column in zip(*parts, strict=True))
         return sigma, geometry
 
-    def _density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+    def _density(self, positions: Tensor, first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
         features = encode(
             positions,
             self.table,
@@ -117,21 +120,23 @@ class HashField(nn.Module):
             grad_buffer=self.grad_buffer,
             backend=self.backend,
         ).to(self._compute_dtype)
-        hidden = relu_(self._linear(features, self.layers["density_in"]), backend=self.backend)
-        geometry = self._linear(hidden, self.layers["density_out"])
+        hidden = relu_(functional.linear(features, first), backend=self.backend)
+        geometry = functional.linear(hidden, last)
         return _ClampedExp.apply(geometry[:, 0].to(self.table.dtype)), geometry
 
     def features(self, geometry: Tensor, directions: Tensor) -> Tensor:
         """Features [S, K] float32 of samples with encoded view `directions` [S, 16]."""
+        weights = self._weights("feature_in", "feature_mid", "feature_out")
         pairs = zip(geometry.split(self._together), directions.split(self._together), strict=True)
-        return _joined([self._features(*pair) for pair in pairs])
+        return _joined([self._features(*pair, *weights) for pair in pairs])
 
-    def _features(self, geometry: Tensor, directions: Tensor) -> Tensor:
-        layers = self.layers
-        hidden = self._linear(torch.cat((directions, geometry), dim=-1), layers["feature_in"])
+    def _features(
+        self, geometry: Tensor, directions: Tensor, first: Tensor, middle: Tensor, last: Tensor
+    ) -> Tensor:
+        hidden = functional.linear(torch.cat((directions, geometry), dim=-1), first)
         hidden = relu_(hidden, backend=self.backend)
-        hidden = relu_(self._linear(hidden, layers["feature_mid"]), backend=self.backend)
-        return self._linear(hidden, layers["feature_out"]).to(self.table.dtype).sigmoid()
+        hidden = relu_(functional.linear(hidden, middle), backend=self.backend)
+        return functional.linear(hidden, last).to(self.table.dtype).sigmoid()
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
         """Count the work of `samples` densities and `shaded` features."""
@@ -156,10 +161,12 @@ class HashField(nn.Module):
         half = self.precision == "bf16" and multiplies_bf16(self.device.type)
         return torch.bfloat16 if half else self.table.dtype
 
-    def _linear(self, inputs: Tensor, weights: Tensor) -> Tensor:
+    def _weights(self, *names: str) -> list[Tensor]:
+        """The weights of layers as they are multiplied; with "bf16" they are always rounded."""
+        layers = [self.layers[name] for name in names]
         if self.precision == "bf16":
-            weights = weights.to(torch.bfloat16)
-        return functional.linear(inputs, weights.to(self._compute_dtype))
+            layers = [layer.to(torch.bfloat16) for layer in layers]
+        return [layer.to(self._compute_dtype) for layer in layers]
 
 
 def _joined(parts: tuple[Tensor, ...] | list[Tensor]) -> Tensor:

@@ -16,6 +16,10 @@ BATCH_QUANTUM = 1 << 11
 CHUNK_SAMPLES = 1 << 18
 """Samples that are evaluated together if no gradient is needed: bounds the memory."""
 
+CACHED_SAMPLES = 1 << 15
+"""Samples that go through all layers together on a CPU: with the 128 bytes that each has between
+two layers of Instant-NGP, two cores keep them in their second-level caches."""
+
 ROUND_SAMPLES = 6
 """Samples of a ray that a field evaluates together where rays end early, if a sample costs little.
 With more, some are evaluated in vain behind the end of a ray; with fewer, there are more rounds."""
@@ -31,11 +35,14 @@ class Field(Protocol):
         channels: K; the first three features are RGB.
         backend: backend of the kernels that render it.
         round_samples: samples of a ray that are best evaluated together where rays end early.
+        skips_faint: whether a frame leaves out the features of faint samples. That pays only if
+            features cost more than finding out which samples are faint.
     """
 
     channels: int
     backend: str
     round_samples: int
+    skips_faint: bool
 
     @property
     def device(self) -> torch.device:
