@@ -43,7 +43,6 @@ class HashField(nn.Module):
     """
 
     round_samples = ROUND_SAMPLES
-    skips_faint = False
 
     def __init__(
         self,

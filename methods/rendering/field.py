@@ -35,14 +35,11 @@ class Field(Protocol):
         channels: K; the first three features are RGB.
         backend: backend of the kernels that render it.
         round_samples: samples of a ray that are best evaluated together where rays end early.
-        skips_faint: whether a frame leaves out the features of faint samples. That pays only if
-            features cost more than finding out which samples are faint.
     """
 
     channels: int
     backend: str
     round_samples: int
-    skips_faint: bool
 
     @property
     def device(self) -> torch.device:

@@ -69,16 +69,7 @@ def _in_rounds(
             if not len(samples):
                 break
             front = canvas.take(open_)
-            with probe.stage("field"):
-                if field.skips_faint:
-                    sigma, values, shaded = _without_faint(
-                        field, samples, some.directions, front, how
-                    )
-                else:
-                    sigma, values = _whole(field, samples, some.directions, CACHED_SAMPLES)
-                    shaded = len(samples)
-            probe.count("shaded_samples", shaded, len(samples))
-            field.count(probe, len(samples), shaded)
+            sigma, values = _evaluated(field, samples, some.directions, front, how, probe)
             with probe.stage("composite"):
                 pixels = composite(
                     sigma, values, samples, stop=how.stop, carry=front, backend=field.backend
@@ -120,38 +111,39 @@ def _at_once(
         field.count(probe, extent.total, extent.total)
         front = canvas.take(chunk)
         with probe.stage("field"):
-            sigma, values = _whole(field, samples, some.directions, CHUNK_SAMPLES)
-            if field.skips_faint:
-                through = 1 - front.alpha
-                weight = weights(sigma, samples, stop=how.stop, front=through, backend=backend)
-                values = torch.where((weight > how.least_weight)[:, None], values, 0)
+            encoded = field.encode_directions(some.directions)
+            pieces = zip(
+                samples.positions.split(CHUNK_SAMPLES),
+                samples.ray.split(CHUNK_SAMPLES),
+                strict=True,
+            )
+            found = [query(field, positions, ray, encoded) for positions, ray in pieces]
+            sigma, values = (torch.cat(column) for column in zip(*found, strict=True))
+            through = 1 - front.alpha
+            weight = weights(sigma, samples, stop=how.stop, front=through, backend=backend)
+            values = torch.where((weight > how.least_weight)[:, None], values, 0)
         with probe.stage("composite"):
             pixels = composite(sigma, values, samples, stop=how.stop, carry=front, backend=backend)
             canvas.put(chunk, pixels)
 
 
-def _whole(field: Field, samples: Samples, directions: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Density [S] and features [S, K] of `samples`, `size` of them at a time."""
-    encoded = field.encode_directions(directions)
-    pieces = zip(samples.positions.split(size), samples.ray.split(size), strict=True)
-    found = [query(field, positions, ray, encoded) for positions, ray in pieces]
-    sigma, values = (torch.cat(column) for column in zip(*found, strict=True))
-    return sigma, values
-
-
-def _without_faint(
-    field: Field, samples: Samples, directions: Tensor, front: Pixels, how: March
-) -> tuple[Tensor, Tensor, int]:
+def _evaluated(
+    field: Field, samples: Samples, directions: Tensor, front: Pixels, how: March, probe: Probe
+) -> tuple[Tensor, Tensor]:
     """Density [S] and features [S, K] of `samples` behind the pixels in `front`; features of faint
-    samples are 0. Also returns how many are not."""
-    sigma, geometry = field.density(pad(samples.positions))
-    sigma = sigma[: len(samples)]
-    through = 1 - front.alpha
-    weight = weights(sigma, samples, stop=how.stop, front=through, backend=field.backend)
-    seen = (weight > how.least_weight).nonzero().squeeze(1)
-    encoded = field.encode_directions(directions)
-    index = pad(seen)
-    values = sigma.new_zeros(len(samples), field.channels)
-    shown = field.features(geometry[index], encoded[samples.ray[index]])
-    values[seen] = shown[: len(seen)]
-    return sigma, values, len(seen)
+    samples are 0."""
+    with probe.stage("field"):
+        sigma, geometry = field.density(pad(samples.positions))
+        sigma = sigma[: len(samples)]
+        through = 1 - front.alpha
+        weight = weights(sigma, samples, stop=how.stop, front=through, backend=field.backend)
+        seen = (weight > how.least_weight).nonzero().squeeze(1)
+        encoded = field.encode_directions(directions)
+        values = sigma.new_zeros(len(samples), field.channels)
+        for part in seen.split(CACHED_SAMPLES):
+            index = pad(part)
+            shown = field.features(geometry[index], encoded[samples.ray[index]])
+            values[part] = shown[: len(part)]
+    probe.count("shaded_samples", len(seen), len(samples))
+    field.count(probe, len(samples), len(seen))
+    return sigma, values

@@ -61,7 +61,6 @@ class StudentField(nn.Module, ABC):
 
     channels = 3
     round_samples = ROUND_SAMPLES
-    skips_faint = True
 
     def __init__(self, backend: str) -> None:
         super().__init__()

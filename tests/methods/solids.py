@@ -21,7 +21,6 @@ class Solid:
 
     backend = "cpu"
     round_samples = ROUND_SAMPLES
-    skips_faint = True
 
     def __init__(self, *shapes: Shape, density: float = DENSITY, channels: int = 4) -> None:
         self.shapes, self.solid, self.channels = shapes, density, channels
