@@ -110,7 +110,7 @@ def test_what_was_measured_is_not_measured_again(
 def test_training_is_shared_by_methods_and_by_runs_that_differ_in_rendering_only(
     first: tuple[Path, str], lpips_weights: Path
 ) -> None:
-    done = demo(first[0], lpips_weights, "method=ngp", "method.stop=1e-2")
+    done = demo(first[0], lpips_weights, "method=ngp", "method.stop=1e-3")
     assert "trained field found" in done.stderr
     assert len(rows(first[0])["run"].unique()) == len(METHODS) + 1
     stages = [path.name.split("-")[0] for path in (first[0] / "outputs" / "stages").iterdir()]

@@ -259,7 +259,7 @@ def test_planted_a_range_on_the_cpu_is_found(
     gpu: PretendedGpu, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     background, arange = torch.ones(4, device="cuda"), torch.arange
-    monkeypatch.setattr(rays.torch, "arange", lambda *of, device=None: arange(*of))
+    monkeypatch.setattr(rays.torch, "arange", lambda *of, device=None, **kind: arange(*of, **kind))
     with pytest.raises(RuntimeError, match="same device"):
         draw(background)
 
