@@ -85,7 +85,7 @@ class Occupancy:
         index = torch.arange(side, dtype=torch.uint8, device=self.cells.device)
         apart = torch.where(index > index[:, None], index - index[:, None], index[:, None] - index)
         distance = torch.where(self.words != 0, 0, side).to(torch.uint8)
-        # The largest of three distances along axes: find the smallest of it axis by axis.
+        # The largest of the distances along the axes: its minimum is taken axis by axis.
         for _ in range(3):
             distance = torch.maximum(distance[:, None], apart[:, :, None, None]).amin(dim=0)
             distance = distance.permute(1, 2, 0)

@@ -60,6 +60,20 @@ class _Shade(torch.autograd.Function):
         return target if buffer is None else None, None, None, None, None
 
 
+@njit(cache=True, error_model="numpy")
+def weighted_sum(harmonics, voxel, basis, ray, terms):
+    """Three colours of a voxel as a ray sees it, before the sigmoid; `harmonics` and `basis` are
+    flat."""
+    at, of = u64(voxel * terms * 3), u64(ray * CHANNELS)
+    red, green, blue = f32(0), f32(0), f32(0)
+    for _ in range(terms):
+        red += basis[of] * harmonics[at]
+        green += basis[of] * harmonics[at + ONE]
+        blue += basis[of] * harmonics[at + TWO]
+        at, of = at + THREE, of + ONE
+    return red, green, blue
+
+
 @njit(cache=True, parallel=True, error_model="numpy")
 def _shade(harmonics, voxel, ray, basis, terms, colours):
     """`harmonics` and `basis` are flat."""
@@ -68,14 +82,9 @@ def _shade(harmonics, voxel, ray, basis, terms, colours):
         first, end = chunk * CHUNK, min(total, (chunk + 1) * CHUNK)
         for i in range(first, end):
             prefetch_row(harmonics, voxel[min(i + AHEAD, end - 1)] * terms * 3, terms * 3)
-            at, of = u64(voxel[i] * terms * 3), u64(ray[i] * CHANNELS)
-            red, green, blue = f32(0), f32(0), f32(0)
-            for _ in range(terms):
-                red += basis[of] * harmonics[at]
-                green += basis[of] * harmonics[at + ONE]
-                blue += basis[of] * harmonics[at + TWO]
-                at, of = at + THREE, of + ONE
-            colours[i, 0], colours[i, 1], colours[i, 2] = red, green, blue
+            colours[i, 0], colours[i, 1], colours[i, 2] = weighted_sum(
+                harmonics, voxel[i], basis, ray[i], terms
+            )
         shown = colours[first:end].reshape(-1)
         for j in range(len(shown)):  # by themselves, in whole vectors
             shown[j] = sigmoid(shown[j])

@@ -18,8 +18,9 @@ from torch.nn.functional import normalize
 
 from bench.types import Rays
 from methods.kernels.composite import Pixels
-from methods.kernels.cpu import f32, i32, prefetch, prefetch_row, sigmoid, slope, u64
-from methods.kernels.spherical import CHANNELS, spherical_harmonics
+from methods.kernels.cpu import f32, i32, prefetch, prefetch_row, sigmoid, slope
+from methods.kernels.spherical import spherical_harmonics
+from methods.kernels.voxel_shading.cpu import weighted_sum
 from methods.kernels.voxel_walk import Crossings, Light, Voxels
 
 CHUNK = 64  # rays
@@ -27,7 +28,6 @@ ROUND = 16
 """Voxels that a ray finds at a time when rendering; few, so that few behind its end are wasted."""
 
 f64 = np.float64
-ONE, TWO, THREE = u64(1), u64(2), u64(3)
 INF = f32(np.inf)
 
 BLOCK = 1 << 12
@@ -85,7 +85,13 @@ def render_voxels(
     crossed, shaded = (torch.zeros(count, dtype=torch.int32) for _ in range(2))
     basis = spherical_harmonics(normalize(rays.directions, dim=1), backend="cpu")
     terms = light.harmonics.shape[1]
-    given = (rays.origins, rays.directions, basis.view(-1), light.density, light.harmonics.view(-1))
+    given = (
+        rays.origins,
+        rays.directions,
+        basis.view(-1),
+        light.density,
+        light.harmonics.reshape(-1),
+    )
     _render(
         *(x.detach().contiguous().numpy() for x in given),
         terms,
@@ -290,19 +296,6 @@ def _place(
                 ray_of[i] = first + ray
 
 
-@njit(cache=True)
-def _colour(harmonics, voxel, basis, ray, terms):
-    """Colour of a voxel as a ray sees it; `harmonics` and `basis` are flat."""
-    at, of = u64(voxel * terms * 3), u64(ray * CHANNELS)
-    red, green, blue = f32(0), f32(0), f32(0)
-    for _ in range(terms):
-        red += basis[of] * harmonics[at]
-        green += basis[of] * harmonics[at + ONE]
-        blue += basis[of] * harmonics[at + TWO]
-        at, of = at + THREE, of + ONE
-    return sigmoid(red), sigmoid(green), sigmoid(blue)
-
-
 @njit(cache=True, parallel=True)
 def _render(
     origins,
@@ -363,10 +356,10 @@ def _render(
                     depth += weight * f64((near[i] + far[i]) * f32(0.5))
                     if weight > faint:
                         colours += 1
-                        r, g, b = _colour(harmonics, voxel[i], basis, ray, terms)
-                        red += weight * f64(r)
-                        green += weight * f64(g)
-                        blue += weight * f64(b)
+                        r, g, b = weighted_sum(harmonics, voxel[i], basis, ray, terms)
+                        red += weight * f64(sigmoid(r))
+                        green += weight * f64(sigmoid(g))
+                        blue += weight * f64(sigmoid(b))
             values[ray, 0], values[ray, 1], values[ray, 2] = red, green, blue
             depth_sum[ray], alpha[ray] = depth, 1 - transmittance
             crossed[ray], shaded[ray] = steps, colours
