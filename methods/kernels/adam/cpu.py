@@ -10,9 +10,12 @@ from numba import njit, prange
 from torch import Tensor
 
 from methods.kernels.adam import BETAS, EPS, AdamState, corrections
-from methods.kernels.cpu import f32, pack_bf16
+from methods.kernels.cpu import f32, pack_bf16, u64
 
 CHUNK = 4096  # entries
+
+BETA1, BETA2, EPSILON = f32(BETAS[0]), f32(BETAS[1]), f32(EPS)
+ONE = u64(1)
 
 
 @torch.no_grad()
@@ -24,42 +27,46 @@ def sparse_adam_(
         raise ValueError(f"backend 'cpu' updates float32, got {table.dtype}")
     words = np.empty(0, np.uint32) if packed is None else packed.numpy().view(np.uint32)
     _update(
-        table.numpy(),
-        grad.numpy(),
-        state.first.numpy(),
-        state.second.numpy(),
+        *(x.view(-1).numpy() for x in (table, grad, state.first, state.second)),
         state.steps.numpy(),
         words,
         *corrections().numpy(),
         f32(rate),
-        f32(BETAS[0]),
-        f32(BETAS[1]),
-        f32(EPS),
     )
 
 
-@njit(cache=True, parallel=True)
-def _update(
-    table, grad, first, second, steps, packed, corrections1, corrections2, rate, beta1, beta2, eps
-):
-    entries, features = table.shape
+@njit(cache=True, parallel=True, error_model="numpy")
+def _update(table, grad, first, second, steps, packed, to1, to2, rate):
+    """`table`, `grad`, `first` and `second` are flat; `to1` and `to2` are the corrections."""
+    entries = len(steps)
+    features = len(table) // max(entries, 1)
     for chunk in prange((entries + CHUNK - 1) // CHUNK):
-        for entry in range(chunk * CHUNK, min(entries, (chunk + 1) * CHUNK)):
-            touched = False
-            for feature in range(features):
-                touched |= grad[entry, feature] != 0
-            if not touched:
-                continue
-            steps[entry] += 1
-            correction1 = corrections1[min(steps[entry], len(corrections1) - 1)]
-            correction2 = corrections2[min(steps[entry], len(corrections2) - 1)]
-            for feature in range(features):
-                gradient = grad[entry, feature]
-                grad[entry, feature] = f32(0)
-                m = beta1 * first[entry, feature] + (f32(1) - beta1) * gradient
-                v = beta2 * second[entry, feature] + (f32(1) - beta2) * gradient * gradient
-                first[entry, feature], second[entry, feature] = m, v
-                scale = math.sqrt(v * correction2) + eps
-                table[entry, feature] -= rate * m * correction1 / scale
-            if len(packed):
-                packed[entry] = pack_bf16(table[entry, 0], table[entry, 1])
+        a, b = chunk * CHUNK, min(entries, (chunk + 1) * CHUNK)
+        if features == 2:  # so that the compiler knows it
+            _entries(a, b, 2, table, grad, first, second, steps, packed, to1, to2, rate)
+        else:
+            _entries(a, b, features, table, grad, first, second, steps, packed, to1, to2, rate)
+
+
+@njit(inline="always")
+def _entries(a, b, features, table, grad, first, second, steps, packed, to1, to2, rate):
+    for e in range(a, b):
+        entry, begin = u64(e), u64(e * features)
+        touched = False
+        for feature in range(features):
+            touched |= grad[begin + u64(feature)] != 0
+        if not touched:
+            continue
+        steps[entry] += 1
+        correction1 = to1[u64(min(steps[entry], len(to1) - 1))]
+        correction2 = to2[u64(min(steps[entry], len(to2) - 1))]
+        for feature in range(features):
+            i = begin + u64(feature)
+            gradient = grad[i]
+            grad[i] = f32(0)
+            m = BETA1 * first[i] + (f32(1) - BETA1) * gradient
+            v = BETA2 * second[i] + (f32(1) - BETA2) * gradient * gradient
+            first[i], second[i] = m, v
+            table[i] -= rate * m * correction1 / (math.sqrt(v * correction2) + EPSILON)
+        if len(packed):
+            packed[entry] = pack_bf16(table[begin], table[begin + ONE])
