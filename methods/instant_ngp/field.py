@@ -12,7 +12,7 @@ from torch.nn import functional
 from bench.types import Probe
 from methods.kernels import multiplies_bf16
 from methods.kernels.encode import HashGrid, encode, pack
-from methods.kernels.relu import relu_
+from methods.kernels.mlp import mlp
 from methods.kernels.spherical import CHANNELS as DIRECTION_CHANNELS
 from methods.kernels.spherical import spherical_harmonics
 from methods.rendering.field import (
@@ -106,11 +106,11 @@ class HashField(nn.Module):
     def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Density [S] float32 and geometry channels [S, 16] at `positions` [S, 3]."""
         weights = self._weights("density_in", "density_out")
-        parts = [self._density(part, *weights) for part in positions.split(self._together)]
+        parts = [self._density(part, weights) for part in positions.split(self._together)]
         sigma, geometry = (_joined(column) for column in zip(*parts, strict=True))
         return sigma, geometry
 
-    def _density(self, positions: Tensor, first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
+    def _density(self, positions: Tensor, weights: list[Tensor]) -> tuple[Tensor, Tensor]:
         features = encode(
             positions,
             self.table,
@@ -119,23 +119,18 @@ class HashField(nn.Module):
             grad_buffer=self.grad_buffer,
             backend=self.backend,
         ).to(self._compute_dtype)
-        hidden = relu_(functional.linear(features, first), backend=self.backend)
-        geometry = functional.linear(hidden, last)
+        geometry = mlp([features], weights, backend=self.backend)
         return _ClampedExp.apply(geometry[:, 0].to(self.table.dtype)), geometry
 
     def features(self, geometry: Tensor, directions: Tensor) -> Tensor:
         """Features [S, K] float32 of samples with encoded view `directions` [S, 16]."""
         weights = self._weights("feature_in", "feature_mid", "feature_out")
         pairs = zip(geometry.split(self._together), directions.split(self._together), strict=True)
-        return _joined([self._features(*pair, *weights) for pair in pairs])
+        return _joined([self._features(*pair, weights) for pair in pairs])
 
-    def _features(
-        self, geometry: Tensor, directions: Tensor, first: Tensor, middle: Tensor, last: Tensor
-    ) -> Tensor:
-        hidden = functional.linear(torch.cat((directions, geometry), dim=-1), first)
-        hidden = relu_(hidden, backend=self.backend)
-        hidden = relu_(functional.linear(hidden, middle), backend=self.backend)
-        return functional.linear(hidden, last).to(self.table.dtype).sigmoid()
+    def _features(self, geometry: Tensor, directions: Tensor, weights: list[Tensor]) -> Tensor:
+        raw = mlp([directions, geometry], weights, backend=self.backend)
+        return raw.to(self.table.dtype).sigmoid()
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
         """Count the work of `samples` densities and `shaded` features."""

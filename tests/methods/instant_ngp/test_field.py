@@ -94,7 +94,7 @@ def test_the_gradient_of_a_huge_density_is_clamped() -> None:
 
 
 def test_the_work_of_a_field_is_what_torch_counts() -> None:
-    made, work = field("fp32", channels=6), Work()
+    made, work = field("fp32", channels=6, backend="reference"), Work()
     made.count(work, 200, 200)
     with FlopCounterMode(display=False) as counter:
         evaluate(made)

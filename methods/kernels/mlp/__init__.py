@@ -1,0 +1,37 @@
+"""A small network without biases, for many samples: its activations do not leave the cache.
+
+Such networks follow the encoding in Instant-NGP (Müller et al. 2022, Section 5.4), where they are
+"fully fused" (Müller et al. 2021, Section 4.1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from bench.types import check_shape
+from methods.kernels.dispatch import implementation
+
+
+def mlp(inputs: Sequence[Tensor], weights: Sequence[Tensor], *, backend: str = "auto") -> Tensor:
+    """The outputs W_n relu(... relu(W_1 x)) [S, O_n] of a network with a ReLU between its layers.
+
+    Differentiable in inputs and weights; NaN stays NaN.
+
+    Args:
+        inputs: one or two tensors [S, I]; x is both, side by side.
+        weights: [O, I] of each layer, of the same dtype as the inputs.
+
+    Raises:
+        ValueError: wrong shapes or number of inputs; backend "cpu": neither float32 nor bfloat16.
+    """
+    if len(inputs) not in (1, 2):
+        raise ValueError(f"inputs: expected one or two, got {len(inputs)}")
+    for part in inputs:
+        check_shape("inputs", part, len(inputs[0]), None)
+    channels = sum(part.shape[1] for part in inputs)
+    for layer in weights:
+        check_shape("weights", layer, None, channels)
+        channels = len(layer)
+    return implementation("mlp", backend, inputs[0].device).mlp(inputs, weights)

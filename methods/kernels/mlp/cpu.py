@@ -1,0 +1,226 @@
+"""A small network with numba: `DEEP` samples go through all layers before the next ones do.
+
+bfloat16 goes layer by layer instead: a CPU that has products of bfloat16 computes them faster than
+any product of float32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numba import njit, prange
+from torch import Tensor
+from torch.nn import functional
+
+from methods.kernels.cpu import LANES, f32, multiply, u64
+from methods.kernels.relu import relu_
+
+DEEP = 96
+"""Samples whose activations, with 64 channels, stay in the first-level cache."""
+
+CHUNKS = 64
+"""Parts into which samples are divided; fixed, so that results are repeatable."""
+
+ZERO = f32(0)
+
+
+def mlp(inputs: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
+    """See `methods.kernels.mlp.mlp`."""
+    tensors = *inputs, *weights
+    if all(tensor.dtype == torch.bfloat16 for tensor in tensors):
+        return _layer_by_layer(inputs, weights)
+    for tensor in tensors:
+        if tensor.dtype != torch.float32:
+            raise ValueError(
+                f"backend 'cpu' multiplies float32 or bfloat16, got {tensor.dtype}: "
+                "use backend='reference'"
+            )
+    left = inputs[0]
+    right = inputs[1] if len(inputs) > 1 else left.new_empty(len(left), 0)
+    if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
+        return _outputs(left, right, weights, learning=False)[0]
+    out: Tensor = _Network.apply(left, right, *weights)
+    return out
+
+
+def _layer_by_layer(inputs: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
+    x = inputs[0] if len(inputs) == 1 else torch.cat(tuple(inputs), dim=1)
+    for layer in weights[:-1]:
+        x = relu_(functional.linear(x, layer), backend="cpu")
+    return functional.linear(x, weights[-1])
+
+
+def _outputs(
+    left: Tensor, right: Tensor, weights: Sequence[Tensor], *, learning: bool
+) -> tuple[Tensor, Tensor]:
+    """Outputs [S, O_n], and the hidden activations if they are needed to learn."""
+    widths = [left.shape[1] + right.shape[1], *map(len, weights)]
+    kept = torch.empty(len(left) * sum(map(_padded, widths[1:-1])) if learning else 0)
+    out = torch.empty(len(left), widths[-1])
+    _forward(
+        *_flat(left, right),
+        left.shape[1],
+        *_flat(_joined(weights, turned=False)),
+        np.array(widths),
+        np.array([_padded(width) for width in widths]),
+        *_flat(kept, out),
+    )
+    return out, kept
+
+
+class _Network(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, left, right, *weights):
+        out, kept = _outputs(left, right, weights, learning=True)
+        ctx.save_for_backward(left, right, kept, *weights)
+        return out
+
+    @staticmethod
+    def backward(ctx, grad):
+        left, right, kept, *weights = ctx.saved_tensors
+        widths = [left.shape[1] + right.shape[1], *map(len, weights)]
+        turned = _joined(weights, turned=True)
+        of_weights = torch.zeros(CHUNKS, len(turned))
+        wanted = any(ctx.needs_input_grad[:2])
+        of_inputs = [x.new_empty(x.shape if wanted else 0) for x in (left, right)]
+        _backward(
+            *_flat(left, right),
+            left.shape[1],
+            *_flat(turned),
+            np.array(widths),
+            np.array([_padded(width) for width in widths]),
+            *_flat(kept, grad, *of_inputs),
+            of_weights.numpy(),
+        )
+        shapes = [(_padded(i), _padded(o)) for i, o in pairwise(widths)]
+        parts = of_weights.sum(dim=0).split([i * o for i, o in shapes])
+        of_layers = [
+            part.view(shape)[: layer.shape[1], : len(layer)].T
+            for part, shape, layer in zip(parts, shapes, weights, strict=True)
+        ]
+        return *(of_inputs if wanted else (None, None)), *of_layers
+
+
+def _padded(width: int) -> int:
+    """`width` filled up to whole vectors."""
+    return width + -width % LANES
+
+
+def _joined(weights: Sequence[Tensor], *, turned: bool) -> Tensor:
+    """All layers in one flat tensor, each [I, O] or, turned, [O, I], in whole vectors."""
+    parts = []
+    for layer in weights:
+        outputs, inputs = layer.shape
+        full = functional.pad(layer.detach(), (0, -inputs % LANES, 0, -outputs % LANES))
+        parts.append((full if turned else full.T).reshape(-1))
+    return torch.cat(parts)
+
+
+def _flat(*tensors: Tensor) -> list[np.ndarray]:
+    return [tensor.detach().contiguous().view(-1).numpy() for tensor in tensors]
+
+
+@njit(cache=True, error_model="numpy")
+def _copy(rows, width, source, at, source_row, target, to, target_row):
+    """Copy `rows` rows of `width` numbers between flat arrays."""
+    for r in range(rows):
+        a, b = u64(at + r * source_row), u64(to + r * target_row)
+        for i in range(width):
+            target[b + u64(i)] = source[a + u64(i)]
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _forward(left, right, a, weights, widths, sizes, kept, out):
+    """`kept` [layers - 1, S, outputs] is filled with the hidden activations, unless it is empty.
+
+    All arrays are flat; `left` has `a` channels.
+    """
+    b, outputs, layers = widths[0] - a, widths[-1], len(widths) - 1
+    count = len(left) // a
+    blocks = (count + DEEP - 1) // DEEP
+    last = sizes[-1]
+    for chunk in prange(CHUNKS):
+        begin, end = chunk * blocks // CHUNKS, (chunk + 1) * blocks // CHUNKS
+        if begin == end:
+            continue
+        given = np.zeros(DEEP * sizes[0], np.float32)
+        inner = np.empty(0 if len(kept) else DEEP * sum(sizes[1:-1]), np.float32)
+        result = np.empty(DEEP * last, np.float32)
+        nothing = np.zeros(max(sizes), np.float32)
+        for block in range(begin, end):
+            first = block * DEEP
+            rows = min(DEEP, count - first)
+            _copy(rows, a, left, first * a, a, given, 0, sizes[0])
+            _copy(rows, b, right, first * b, b, given, a, sizes[0])
+            x, x_at, w_at, before = given, 0, 0, 0
+            for layer in range(layers):
+                i, o = sizes[layer], sizes[layer + 1]
+                w = weights[w_at : w_at + i * o]
+                w_at += i * o
+                if layer == layers - 1:
+                    multiply(rows, x, x_at, i, 1, w, o, nothing, result, 0, i, False)
+                elif len(kept):
+                    at = before * count + first * o
+                    multiply(rows, x, x_at, i, 1, w, o, nothing, kept, at, i, True)
+                    x, x_at = kept, at
+                else:
+                    at = before * DEEP
+                    multiply(rows, x, x_at, i, 1, w, o, nothing, inner, at, i, True)
+                    x, x_at = inner, at
+                before += o
+            _copy(rows, outputs, result, 0, last, out, first * outputs, outputs)
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _backward(left, right, a, turned, widths, sizes, kept, grad, of_left, of_right, of_weights):
+    """`of_weights` [CHUNKS, all weights] is added to; `of_left`, `of_right` may be empty."""
+    b, outputs, layers = widths[0] - a, widths[-1], len(widths) - 1
+    count = len(left) // a
+    blocks = (count + DEEP - 1) // DEEP
+    widest, last = max(sizes), sizes[-1]
+    for chunk in prange(CHUNKS):
+        begin, end = chunk * blocks // CHUNKS, (chunk + 1) * blocks // CHUNKS
+        if begin == end:
+            continue
+        given = np.zeros(DEEP * sizes[0], np.float32)
+        above, below = np.empty(DEEP * widest, np.float32), np.empty(DEEP * widest, np.float32)
+        part = np.empty(widest * widest, np.float32)
+        nothing = np.zeros(widest, np.float32)
+        sums = of_weights[chunk]
+        for block in range(begin, end):
+            first = block * DEEP
+            rows = min(DEEP, count - first)
+            _copy(rows, a, left, first * a, a, given, 0, sizes[0])
+            _copy(rows, b, right, first * b, b, given, a, sizes[0])
+            above[: rows * last] = ZERO
+            _copy(rows, outputs, grad, first * outputs, outputs, above, 0, last)
+            w_end, before = len(turned), sum(sizes[1:-1])
+            for layer in range(layers - 1, -1, -1):
+                i, o = sizes[layer], sizes[layer + 1]
+                w_at = w_end - i * o
+                if layer:
+                    before -= i
+                    x, x_at = kept, before * count + first * i
+                else:
+                    x, x_at = given, 0
+                multiply(i, x, x_at, 1, i, above, o, nothing, part, 0, rows, False)  # x^T above
+                total = sums[w_at:w_end]
+                for j in range(len(total)):
+                    total[j] += part[j]
+                if layer or len(of_left):
+                    w = turned[w_at:w_end]
+                    multiply(
+                        rows, above, 0, o, 1, w, i, nothing, below, 0, widths[layer + 1], False
+                    )
+                    if layer:  # the gradient passes where the ReLU's result is not 0
+                        shown = x[x_at : x_at + rows * i]
+                        for j in range(len(shown)):
+                            below[j] = ZERO if shown[j] == ZERO else below[j]
+                    above, below = below, above
+                w_end = w_at
+            if len(of_left):
+                _copy(rows, a, above, 0, sizes[0], of_left, first * a, a)
+                _copy(rows, b, above, a, sizes[0], of_right, first * b, b)

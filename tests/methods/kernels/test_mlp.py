@@ -1,0 +1,61 @@
+"""The small network: its formula, what it refuses, and that threads do not change it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from bench.threads import torch_threads
+from methods.kernels.mlp import mlp
+
+
+def network(count: int, dtype: torch.dtype = torch.float32) -> tuple[list[Tensor], list[Tensor]]:
+    """Two inputs of 5 and 3 channels, and layers of 20 and 4 outputs, which need a gradient."""
+    generator = torch.Generator().manual_seed(count)
+    inputs = [torch.randn(count, n, generator=generator).to(dtype) for n in (5, 3)]
+    layers = [torch.randn(*n, generator=generator).to(dtype) for n in ((20, 8), (4, 20))]
+    return inputs, [layer.requires_grad_() for layer in layers]
+
+
+def test_the_reference_is_the_formula() -> None:
+    inputs, layers = network(50, torch.float64)
+    first, last = (layer.detach().numpy() for layer in layers)
+    x = np.concatenate([part.numpy() for part in inputs], axis=1)
+    want = np.einsum("oh,sh->so", last, np.maximum(np.einsum("hi,si->sh", first, x), 0))
+    got = mlp(inputs, layers, backend="reference").detach().numpy()
+    np.testing.assert_allclose(got, want, rtol=0, atol=1e-12)
+
+
+def test_the_gradient_does_not_depend_on_the_number_of_threads() -> None:
+    inputs, layers = network(5000)
+
+    def gradients(threads: int) -> tuple[Tensor, ...]:
+        with torch_threads(threads):
+            return torch.autograd.grad(mlp(inputs, layers, backend="cpu").square().sum(), layers)
+
+    for alone, together in zip(gradients(1), gradients(2), strict=True):
+        assert torch.equal(alone, together)
+
+
+def test_outputs_do_not_depend_on_whether_a_gradient_is_needed() -> None:
+    inputs, layers = network(1000)
+    with torch.no_grad():
+        plain = mlp(inputs, layers, backend="cpu")
+    assert torch.equal(mlp(inputs, layers, backend="cpu"), plain)
+
+
+def test_other_types_are_refused_on_a_cpu() -> None:
+    with pytest.raises(ValueError, match="float64"):
+        mlp(*network(3, torch.float64), backend="cpu")
+
+
+def test_other_numbers_of_inputs_and_other_shapes_are_refused() -> None:
+    inputs, layers = network(3)
+    with pytest.raises(ValueError, match="inputs"):
+        mlp([*inputs, *inputs], layers)
+    with pytest.raises(ValueError, match="inputs"):
+        mlp([inputs[0], inputs[1][:2]], layers)
+    with pytest.raises(ValueError, match="weights"):
+        mlp(inputs, layers[::-1])
