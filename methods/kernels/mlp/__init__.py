@@ -21,13 +21,16 @@ def mlp(inputs: Sequence[Tensor], weights: Sequence[Tensor], *, backend: str = "
 
     Args:
         inputs: one or two tensors [S, I]; x is both, side by side.
-        weights: [O, I] of each layer, of the same dtype as the inputs.
+        weights: [O, I] of each layer, one or more, of the same dtype as the inputs.
 
     Raises:
-        ValueError: wrong shapes or number of inputs; backend "cpu": neither float32 nor bfloat16.
+        ValueError: wrong shapes or numbers of inputs or layers; backend "cpu": neither float32
+            nor bfloat16.
     """
     if len(inputs) not in (1, 2):
         raise ValueError(f"inputs: expected one or two, got {len(inputs)}")
+    if not weights:
+        raise ValueError("weights: expected one layer or more, got none")
     for part in inputs:
         check_shape("inputs", part, len(inputs[0]), None)
     channels = sum(part.shape[1] for part in inputs)

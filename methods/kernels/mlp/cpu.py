@@ -139,7 +139,7 @@ def _forward(left, right, a, weights, widths, sizes, kept, out):
     All arrays are flat; `left` has `a` channels.
     """
     b, outputs, layers = widths[0] - a, widths[-1], len(widths) - 1
-    count = len(left) // a
+    count = len(out) // outputs
     blocks = (count + DEEP - 1) // DEEP
     last = sizes[-1]
     for chunk in prange(CHUNKS):
@@ -178,7 +178,7 @@ def _forward(left, right, a, weights, widths, sizes, kept, out):
 def _backward(left, right, a, turned, widths, sizes, kept, grad, of_left, of_right, of_weights):
     """`of_weights` [CHUNKS, all weights] is added to; `of_left`, `of_right` may be empty."""
     b, outputs, layers = widths[0] - a, widths[-1], len(widths) - 1
-    count = len(left) // a
+    count = len(grad) // outputs
     blocks = (count + DEEP - 1) // DEEP
     widest, last = max(sizes), sizes[-1]
     for chunk in prange(CHUNKS):

@@ -13,5 +13,5 @@ def mlp(inputs: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
     """See `methods.kernels.mlp.mlp`."""
     x = torch.cat(tuple(inputs), dim=1)
     for layer in weights[:-1]:
-        x = functional.linear(x, layer).relu()
+        x = functional.linear(x, layer).relu_()
     return functional.linear(x, weights[-1])

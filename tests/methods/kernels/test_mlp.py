@@ -51,7 +51,7 @@ def test_other_types_are_refused_on_a_cpu() -> None:
         mlp(*network(3, torch.float64), backend="cpu")
 
 
-def test_other_numbers_of_inputs_and_other_shapes_are_refused() -> None:
+def test_other_numbers_and_shapes_are_refused() -> None:
     inputs, layers = network(3)
     with pytest.raises(ValueError, match="inputs"):
         mlp([*inputs, *inputs], layers)
@@ -59,3 +59,5 @@ def test_other_numbers_of_inputs_and_other_shapes_are_refused() -> None:
         mlp([inputs[0], inputs[1][:2]], layers)
     with pytest.raises(ValueError, match="weights"):
         mlp(inputs, layers[::-1])
+    with pytest.raises(ValueError, match="weights"):
+        mlp(inputs, [])
