@@ -22,7 +22,7 @@ from bench.scenes import blender
 from bench.scenes.files import opengl_to_opencv, unexpected, whole_number
 from bench.scenes.medley import medley
 from bench.scenes.models import MODELS
-from bench.scenes.parallel import in_processes
+from bench.scenes.parallel import in_parallel
 from bench.scenes.raytrace import Model, render
 from bench.sources import digest
 from bench.types import Camera, Log, Scene, SteerbenchError, Unavailable
@@ -150,7 +150,7 @@ def _write_pictures(folder: Path, settings: dict, log: Log) -> None:
         camera, path = job
         Image.fromarray(picture(model, camera).numpy()).save(path)
 
-    in_processes(draw, jobs, f"render {settings['name']}", log)
+    in_parallel(draw, jobs, f"render {settings['name']}", log)
 
 
 def train_poses(count: int, seed: int) -> list[Tensor]:
