@@ -7,6 +7,7 @@ any product of float32.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -16,6 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from methods.kernels.cpu import LANES, f32, multiply, u64
+from methods.kernels.mlp.reference import layer_by_layer
 from methods.kernels.relu import relu_
 
 DEEP = 96
@@ -31,7 +33,7 @@ def mlp(inputs: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
     """See `methods.kernels.mlp.mlp`."""
     tensors = *inputs, *weights
     if all(tensor.dtype == torch.bfloat16 for tensor in tensors):
-        return _layer_by_layer(inputs, weights)
+        return layer_by_layer(inputs, weights, partial(relu_, backend="cpu"))
     for tensor in tensors:
         if tensor.dtype != torch.float32:
             raise ValueError(
@@ -44,13 +46,6 @@ def mlp(inputs: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
         return _outputs(left, right, weights, learning=False)[0]
     out: Tensor = _Network.apply(left, right, *weights)
     return out
-
-
-def _layer_by_layer(inputs: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
-    x = inputs[0] if len(inputs) == 1 else torch.cat(tuple(inputs), dim=1)
-    for layer in weights[:-1]:
-        x = relu_(functional.linear(x, layer), backend="cpu")
-    return functional.linear(x, weights[-1])
 
 
 def _outputs(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -11,7 +11,14 @@ from torch.nn import functional
 
 def mlp(inputs: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
     """See `methods.kernels.mlp.mlp`."""
-    x = torch.cat(tuple(inputs), dim=1)
+    return layer_by_layer(inputs, weights, Tensor.relu_)
+
+
+def layer_by_layer(
+    inputs: Sequence[Tensor], weights: Sequence[Tensor], relu_: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """`mlp` with a ReLU of its own, which may work in place."""
+    x = inputs[0] if len(inputs) == 1 else torch.cat(tuple(inputs), dim=1)
     for layer in weights[:-1]:
-        x = functional.linear(x, layer).relu_()
+        x = relu_(functional.linear(x, layer))
     return functional.linear(x, weights[-1])
