@@ -35,10 +35,18 @@ def fetch(address: str, target: Path, sha256: str | None, log: Log) -> Path:
     try:
         pooch.retrieve(address, sha256, target.name, target.parent, downloader=continued)
     except RequestException as error:
-        raise Unavailable(f"the download of {address} failed ({error})") from error
+        raise Unavailable(f"the download of {address} failed ({_reason(error)})") from error
     except ValueError as error:  # from pooch, which has deleted the file
         raise Unavailable(f"the download of {address} is damaged: {error}") from error
     return target
+
+
+def _reason(error: Exception) -> str:
+    """Why a download failed, in a few words: requests nests the cause in four exceptions."""
+    from requests.exceptions import ConnectionError, ProxyError, SSLError
+
+    lost = isinstance(error, ConnectionError) and not isinstance(error, (ProxyError, SSLError))
+    return "no connection" if lost else str(error)
 
 
 class _Continued:

@@ -60,10 +60,8 @@ def locate(net: str, weights_dir: Path | None, log: Log) -> Path:
         return _download(backbone.published, log)
     except Unavailable as error:
         raise Unavailable(
-            f"LPIPS ({net}) has no backbone weights: neither {backbone.published} nor "
-            f"{backbone.features} lies in {', '.join(map(str, _folders(weights_dir)))}, and "
-            f"{error}. Fetch that file on a machine with a network and pass its folder as "
-            "weights_dir=DIR or in $STEERBENCH_WEIGHTS."
+            f"{backbone.published} is not on this machine, and {error}; "
+            "name a folder that has it as weights_dir=DIR or in $STEERBENCH_WEIGHTS"
         ) from error
 
 

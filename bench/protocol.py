@@ -18,6 +18,8 @@ from bench.lpips_weights import locate
 from bench.trajectories import Trajectory
 from bench.types import BACKGROUNDS, Log, Scene, SteerbenchError, Unavailable
 
+_named: set[str] = set()  # reasons why figures are missing that this process has logged
+
 
 @dataclass(frozen=True)
 class EvaluationProtocol:
@@ -112,14 +114,19 @@ class EvaluationProtocol:
     def load_lpips(
         self, weights_dir: Path | None, log: Log
     ) -> tuple[dict[str, metrics.Lpips], dict[str, str]]:
-        """LPIPS by backbone; and by metric, the reason why one is missing, which is also logged."""
+        """LPIPS by backbone; and by metric, the reason why one is missing.
+
+        Each reason is also logged, once in a process.
+        """
         loaded, missing = {}, {}
         for net in self.lpips:
             try:
                 loaded[net] = metrics.Lpips(net, weights_dir, log)
             except Unavailable as error:
-                missing[f"lpips_{net}"] = str(error)
-                log.info(f"lpips_{net}: n/a. {error}")
+                reason = missing[f"lpips_{net}"] = str(error)
+                if reason not in _named:
+                    _named.add(reason)
+                    log.info(f"lpips_{net}: n/a. {reason}")
         return loaded, missing
 
     def rounded(self, rgb: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import socket
 from pathlib import Path
 
 import pytest
@@ -59,6 +60,14 @@ def test_another_content_is_refused_and_not_kept(web, tmp_path, quiet_log):
     with pytest.raises(Unavailable, match="is damaged"):
         download(web, tmp_path, quiet_log)
     assert not list(tmp_path.iterdir())
+
+
+def test_without_a_connection_the_message_says_so_in_two_words(tmp_path, quiet_log):
+    nobody = socket.create_server(("127.0.0.1", 0))
+    address = f"http://127.0.0.1:{nobody.getsockname()[1]}/file"
+    nobody.close()
+    with pytest.raises(Unavailable, match=r"/file failed \(no connection\)$"):
+        fetch(address, tmp_path / "file", None, quiet_log)
 
 
 def test_a_file_that_is_not_there_is_named(web, tmp_path, quiet_log):

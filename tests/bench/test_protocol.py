@@ -103,6 +103,17 @@ def test_backbones_that_cannot_be_had_are_named_with_the_reason(
     assert "no network" in missing["lpips_vgg"]
 
 
+def test_a_missing_backbone_is_logged_once_in_a_process(monkeypatch, tmp_path, quiet_log):
+    monkeypatch.setattr("bench.protocol._named", set())
+    monkeypatch.setattr("bench.lpips_weights._unreachable", ["no network"])
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.delenv("STEERBENCH_WEIGHTS", raising=False)
+    said: list[str] = []
+    monkeypatch.setattr(quiet_log, "info", said.append)
+    reasons = [EvaluationProtocol().load_lpips(None, quiet_log)[1] for _ in range(2)]
+    assert [line.split(":")[0] for line in said] == ["lpips_alex", "lpips_vgg"] == list(reasons[1])
+
+
 def test_a_scene_on_another_background_is_refused(tiny_scene):
     QUICK.check(tiny_scene, from_split(tiny_scene))
     black = replace(tiny_scene, background=torch.zeros(3))
