@@ -23,7 +23,7 @@ SUITS := import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' Makefile
 
-install: $(VENV)/.installed ## make $(VENV) and install steerbench into it, versions pinned
+install: $(VENV)/.installed ## make $(VENV), install steerbench into it, compile its kernels
 
 demo: install ## build a scene, train on it, render it, write outputs/demo/report.html
 	@$(BIN)/steerbench run +experiment=demo $(DEMO_ARGS)
@@ -71,4 +71,5 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	  echo "making $(VENV) with $$($$found --version)"; \
 	  $$found -m venv --clear $(VENV); }
 	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e ".[dev,openvino,onnx,video,viewer,colmap,tensorboard]"
+	-$(BIN)/steerbench compile
 	@touch $@

@@ -9,16 +9,18 @@ from typing import Any
 ROOT = Path(__file__).parent.parent
 
 
-def found(name: str) -> list[Any]:
-    """The results of the function `name` of all modules `name` of bench and methods, in one list.
-
-    Args:
-        name: "cases" or "experiments".
-    """
+def modules(name: str) -> list[str]:
+    """The modules of bench and methods that are called `name`: "cases" or "experiments"."""
     paths = sorted(
         path for top in ("bench", "methods") for path in (ROOT / top).rglob(f"{name}.py")
     )
-    modules = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in paths]
+    return [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in paths]
+
+
+def found(name: str) -> list[Any]:
+    """The results of the function `name` of all modules of this name, in one list."""
     return [
-        check for module in modules for check in getattr(importlib.import_module(module), name)()
+        check
+        for module in modules(name)
+        for check in getattr(importlib.import_module(module), name)()
     ]

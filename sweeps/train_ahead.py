@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import sys
-import threading
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping, Sequence
+from concurrent.futures import Future, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +20,7 @@ from sweeps.device_lock import device_lock, on_gpu
 from sweeps.failures import reason
 from sweeps.jobs import time_left
 from sweeps.plan import Planned
+from sweeps.processes import processes
 
 CHOSEN_AFTERWARDS = {
     *("engine", "precision", "protocol", "pictures"),
@@ -49,7 +47,7 @@ def train_ahead(jobs: Sequence[Planned], measured: Collection[str]) -> None:
     log = ConsoleLog(Path(jobs[0].config.outputs))
     log.info(f"training {len(todo)} models, {workers} at a time")
     begun = time.monotonic()
-    with device_lock("cpu", log), _pool(workers) as pool:
+    with device_lock("cpu", log), processes(workers) as pool:
         names = {pool.submit(_train, job.config): job.name for job in todo.values()}
         for number, ended in enumerate(as_completed(names), 1):
             left = time_left(time.monotonic() - begun, number, len(todo) - number)
@@ -83,25 +81,3 @@ def _said(ended: Future[float]) -> str:
     """How a training ended, in words."""
     error = ended.exception()
     return f"trained in {ended.result():.0f} s" if error is None else f"failed: {reason(error)}"
-
-
-@contextmanager
-def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Worker processes that end with this one, however it ends."""
-    fresh = multiprocessing.get_context("spawn")  # threads do not survive a fork
-    pool = ProcessPoolExecutor(workers, mp_context=fresh, initializer=_end_with_parent)
-    try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def wait() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()

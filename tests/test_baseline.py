@@ -16,7 +16,8 @@ from reports.runs import readable
 BASELINE = Path(__file__).with_name("baseline.json")
 STEERBENCH = Path(sys.executable).with_name("steerbench")
 RUN = [
-    *("+experiment=demo", "scene=cloud", "scene.width=64", "scene.train=24", "scene.test=6"),
+    *("-m", "method=ngp,steernerf_lean,steernerf", "trajectory=orbit"),
+    *("scene=cloud", "scene.width=64", "scene.train=24", "scene.test=6"),
     *("budget=tiny", "budget.steps=200", "budget.samples=16384", "budget.renderer_steps=100"),
     *("budget.frames=0", "sizing.field_step=4", "sizing.refined_step=4", "sizing.step=4"),
     "seed=0,1,2",
