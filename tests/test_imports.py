@@ -18,6 +18,7 @@ MAY_IMPORT = {
 }
 REACHES = {
     "sweeps/studies/accuracy.py": "methods.checks.",
+    "sweeps/compile.py": "methods.checks.",
     "sweeps/kernels.py": ("methods.checks.", "methods.kernels."),
     "sweeps/catalogue.py": "methods.kernels.",
     "sweeps/stress.py": "methods.checks.",
