@@ -8,9 +8,11 @@ from types import SimpleNamespace
 import pytest
 
 from bench.case import Case, Cell
+from bench.errors import Unavailable
 from sweeps.compile import compiled
 
-CPU, REFERENCE = ("cpu", "fp32"), ("reference", "fp32")
+CPU = ("cpu", "fp32")
+TOLERANCES = {CPU: 0.1, ("reference", "fp32"): 0.1}
 
 
 def module(monkeypatch: pytest.MonkeyPatch, error: float, **options: bool) -> list[Cell]:
@@ -21,9 +23,12 @@ def module(monkeypatch: pytest.MonkeyPatch, error: float, **options: bool) -> li
         computed.append((backend, precision))
         return error
 
-    case = Case("march", "empty", "", "", {CPU: 0.1, REFERENCE: 0.1}, measure, **options)
-    monkeypatch.setitem(sys.modules, "stand_in", SimpleNamespace(cases=lambda: [case]))
+    put(monkeypatch, Case("march", "empty", "", "", TOLERANCES, measure, **options))
     return computed
+
+
+def put(monkeypatch: pytest.MonkeyPatch, case: Case) -> None:
+    monkeypatch.setitem(sys.modules, "stand_in", SimpleNamespace(cases=lambda: [case]))
 
 
 def test_only_what_is_compiled_is_computed(monkeypatch):
@@ -40,6 +45,14 @@ def test_a_case_that_takes_long_is_left_out(monkeypatch):
 def test_a_wrong_kernel_is_named(monkeypatch):
     module(monkeypatch, error=0.5)
     assert compiled("stand_in") == ["march: empty"]
+
+
+def test_a_kernel_that_this_machine_cannot_have_is_not_wrong(monkeypatch):
+    def refuse(*cell: str) -> float:
+        raise Unavailable("no such products")
+
+    put(monkeypatch, Case("march", "empty", "", "", TOLERANCES, refuse))
+    assert compiled("stand_in") == []
 
 
 @pytest.mark.slow
