@@ -70,6 +70,11 @@ class Case:
     timed: Timed | None = None
     slow: bool = False
 
+    @property
+    def quick(self) -> bool:
+        """Whether its inputs are few, so that checking it takes but a moment."""
+        return not (self.slow or self.timed)
+
     def check(self, cell: Cell, device: str) -> dict[str, Any]:
         """Check one cell and return its row.
 

@@ -40,7 +40,7 @@ def compiled(module: str) -> list[str]:
     rows = [
         case.check(cell, "cpu")
         for case in importlib.import_module(module).cases()
-        if not (case.slow or case.timed)
+        if case.quick
         for cell in case.tolerances
         if cell[0] == "cpu"
     ]

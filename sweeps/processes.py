@@ -1,4 +1,4 @@
-"""Worker processes, for work that threads would share one interpreter for."""
+"""Worker processes, for work on which threads would wait for Python's lock."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ def every_nth(views: Sequence[View], step: int, where: Path) -> dict[str, list[V
     """Split views, sorted by name: 0, step, 2 * step ... are the test split, the others train.
 
     Raises:
-        SteerbenchError: `step` is less than 2, or nothing is left to train on, named as `where`.
+        SteerbenchError, which names `where`: `step` is less than 2, or nothing is left to train on.
     """
     whole_number(step, "split_every", 2)
     views = sorted(views, key=lambda view: view.name)

@@ -16,7 +16,7 @@ from methods.checks import found
 from methods.kernels import BACKENDS, availability, dispatch
 
 CASES = found("cases")
-QUICK = [case for case in CASES if not (case.slow or case.timed)]
+QUICK = [case for case in CASES if case.quick]
 DEAR = (
     *("march", "voxel_walk", "render_voxels", "warp"),
     *("composite backward", "encode backward", "gaussian blending backward"),

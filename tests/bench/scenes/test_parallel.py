@@ -18,7 +18,7 @@ def test_the_first_fault_ends_it(log) -> None:
         if item >= 3:
             raise ValueError(f"item {item}")
 
-    with pytest.raises(ValueError, match="item 3"):
+    with pytest.raises(ValueError, match=r"^item 3$"):
         in_parallel(work, range(50), "fail", log)
     assert log.done == 3
 
