@@ -34,6 +34,9 @@ class InstantNgp:
         knobs={"stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3"))},
         trained={
             "step, trained": turned("trained step", "method.training.march_step", (1, 2, 4)),
+            "stop, trained": turned("trained stop", "method.training.stop", ("1e-2", "1e-4")),
+            "thin, trained": turned("thin", "method.training.thin", (0,)),
+            "error, trained": turned("by error", "method.training.by_error", (0,)),
         },
         exact=("method.stop=1e-4",),
         parts=dict.fromkeys(("rays", "march", "composite"), "field"),

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from bench.types import Budget, Rays, Scene, Split, SteerbenchError
+from methods.instant_ngp.error_map import ErrorMap
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.optimiser import FieldOptimiser
-from methods.kernels.composite import Pixels
+from methods.kernels.composite import STOP, Pixels, check_stop
 from methods.rendering.batch import opacity_entropy, render_batch
 from methods.rendering.march import March, check_step, suitable_step
 from methods.rendering.occupancy import EVERY, MIN_VIEWS, STEP, DensityGrid, learnable_cells
@@ -38,6 +39,8 @@ class PixelOptions:
         random_background: composite RGBA pictures on a random colour per ray instead of the scene's
             background, so that no density can pass for background.
         max_rays: maximum number of rays in a step.
+        by_error: share of the rays that are drawn where the error is, see `ErrorMap`; the others
+            go through all pixels alike.
     """
 
     rate: float = 1e-2
@@ -45,6 +48,7 @@ class PixelOptions:
     opacity_entropy: float = 1e-3
     random_background: bool = True
     max_rays: int = 1 << 15
+    by_error: float = 0.0
 
     def __post_init__(self) -> None:
         if not (self.rate > 0 and 0 < self.final_rate <= 1 and self.opacity_entropy >= 0):
@@ -53,6 +57,8 @@ class PixelOptions:
             )
         if self.max_rays < MIN_RAYS:
             raise ValueError(f"expected max_rays >= {MIN_RAYS}: {self}")
+        if not 0 <= self.by_error < 1:
+            raise ValueError(f"by_error: expected a share from 0 to less than 1, got {self}")
 
 
 @dataclass(frozen=True)
@@ -85,10 +91,14 @@ class TrainingOptions(MarchOptions):
     Attributes:
         grid_samples: cells visited in an update of the density grid.
         rays: number of rays in every step; None: as many as give the samples of the budget.
+        stop: transmittance at which a ray ends.
+        thin: optical depth of a sample below which only some are kept, see `render_batch`.
     """
 
     grid_samples: int = 1 << 17
     rays: int | None = None
+    stop: float = STOP
+    thin: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -96,6 +106,9 @@ class TrainingOptions(MarchOptions):
             raise ValueError(f"expected grid_samples >= 2: {self}")
         if self.rays is not None and self.rays < MIN_RAYS:
             raise ValueError(f"expected rays >= {MIN_RAYS}: {self}")
+        check_stop(self.stop)
+        if not self.thin >= 0:
+            raise ValueError(f"thin: expected an optical depth of 0 or more, got {self.thin}")
 
 
 class PixelBatches:
@@ -124,8 +137,15 @@ class PixelBatches:
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Rays, Tensor]:
         """Draw `count` rays through pixel centres, and their colours [count, 3 or 4] in [0, 1]."""
-        total = len(self._pixels)
-        pixel = torch.randint(total, (count,), generator=generator, device=self._device)
+        return self.at(self.choose(count, generator))
+
+    def choose(self, count: int, generator: torch.Generator) -> Tensor:
+        """Draw the numbers [count] of pixels, all alike."""
+        return torch.randint(len(self), (count,), generator=generator, device=self._device)
+
+    def at(self, pixel: Tensor) -> tuple[Rays, Tensor]:
+        """The rays through the centres of the pixels with the numbers `pixel` [R], and their
+        colours [R, 3 or 4] in [0, 1]."""
         view = torch.searchsorted(self._ends, pixel, right=True)
         within = pixel - torch.where(view > 0, self._ends[view - 1], 0)
         width = self._widths[view]
@@ -171,6 +191,7 @@ class PixelTraining(ABC):
     ) -> None:
         self.options, self.samples = options, samples
         self.batches = PixelBatches(scene.splits["train"], device)
+        self.errors = ErrorMap(len(self.batches), device) if options.by_error else None
         self.background = scene.background.to(device)
         self.step, self.steps = 0, steps
         self.rays = min(1024, options.max_rays)
@@ -208,18 +229,32 @@ class PixelTraining(ABC):
         Raises:
             SteerbenchError: the loss is not finite.
         """
-        rays, colours = self.batches.draw(self.rays, self.generator)
+        numbers, alike = self._numbers()
+        rays, colours = self.batches.at(numbers)
         target, background = self._target(colours)
         jitter = torch.rand(len(target), generator=self.generator, device=target.device)
         pixels, samples = self._render(rays, jitter, background)
-        loss = functional.mse_loss(pixels.values, target)
+        each = (pixels.values - target).square().mean(dim=1)
+        loss = each.mean()
+        shown = each[:alike].mean() + 0 * loss  # not finite if any error is not
         entropy = opacity_entropy(pixels.alpha)
         (loss + self.options.opacity_entropy * entropy).backward()
-        errors = loop.look(self, {"": loss}, {"loss": loss, "rendered pixels": pixels.values})
+        if self.errors is not None:
+            self.errors.learn(numbers, each.detach())
+        errors = loop.look(self, {"": shown}, {"loss": loss, "rendered pixels": pixels.values})
         self._update()
         self._fit_batch(samples)
         self.step += 1
         return errors
+
+    def _numbers(self) -> tuple[Tensor, int]:
+        """Draw the pixels of a step; also return how many of them, the first, were drawn from all
+        pixels alike."""
+        if self.errors is None:
+            return self.batches.choose(self.rays, self.generator), self.rays
+        wrong = int(self.options.by_error * self.rays)
+        alike = self.batches.choose(self.rays - wrong, self.generator)
+        return torch.cat((alike, self.errors.draw(wrong, self.generator))), len(alike)
 
     def _target(self, colours: Tensor) -> tuple[Tensor, Tensor]:
         """Composite colours on a background; also return that background, [3] or [R, 3]."""
@@ -239,14 +274,19 @@ class PixelTraining(ABC):
         self.rays = min(max(int(self.rays * change), MIN_RAYS), self.options.max_rays)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Random numbers and number of rays."""
-        return {"generator": self.generator.get_state()}, {"rays": self.rays}
+        """Random numbers, number of rays, error map."""
+        tensors = {"generator": self.generator.get_state()}
+        if self.errors is not None:
+            tensors["errors"] = self.errors.errors
+        return tensors, {"rays": self.rays}
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
         """See `loop.Training`."""
         self.restore_result(tensors)
         self.rays = int(figures["rays"])
         self.generator.set_state(tensors["generator"].cpu())
+        if self.errors is not None:
+            self.errors.errors.copy_(tensors["errors"])
 
 
 class FieldTraining(PixelTraining):
@@ -276,9 +316,10 @@ class FieldTraining(PixelTraining):
             self.field,
             rays,
             self.grid.occupancy,
-            self.march,
+            replace(self.march, stop=self.options.stop),
             jitter=jitter,
             background=background,
+            thin=self.options.thin,
         )
 
     def _update(self) -> None:
@@ -303,7 +344,7 @@ class FieldTraining(PixelTraining):
         restore_field(self.field, self.grid, tensors)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Optimisers, random numbers, number of rays."""
+        """Optimisers, random numbers, number of rays, error map."""
         tensors, figures = super().state()
         return self.optimiser.tensors() | tensors, figures
 

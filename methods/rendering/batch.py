@@ -18,6 +18,10 @@ FRONT_SAMPLES = 8
 """Samples of a ray whose densities a CPU evaluates before it knows whether the ray goes on."""
 
 
+KEPT_THIN = 4
+"""One of so many thin samples is kept; see `render_batch`."""
+
+
 @dataclass(frozen=True)
 class FirstPass:
     """Samples of R rays, and which of them are visible before their rays end.
@@ -38,6 +42,18 @@ class FirstPass:
         found = torch.zeros_like(self.counts, dtype=torch.int32)
         return found.scatter_reduce_(0, self.samples.ray.long(), thick.int(), "amax") > 0
 
+    def thinned(self, thin: float, jitter: Tensor) -> Samples:
+        """The visible samples, without most of the thin ones; see `render_batch`."""
+        samples = self.samples
+        place = torch.arange(len(samples), device=jitter.device)
+        visible = place < (samples.offsets[:-1] + self.counts)[samples.ray]
+        faint = self.sigma * samples.delta < thin
+        # Digits of the phase that say nothing of where in a step the samples lie.
+        turn = (jitter * 2**12).long() % KEPT_THIN
+        kept = visible & ~(faint & ((place + turn[samples.ray]) % KEPT_THIN > 0))
+        lengths = torch.where(faint, KEPT_THIN * samples.delta, samples.delta)
+        return samples.where(kept, lengths)
+
 
 def render_batch(
     field: Field,
@@ -49,11 +65,16 @@ def render_batch(
     background: Tensor | None = None,
     guide: Field | None = None,
     hidden: bool = False,
+    thin: float = 0.0,
 ) -> tuple[Pixels, int]:
     """Render R `rays` differentiably; also return the number of samples that were composited.
 
     Samples behind the early stop, more than half of all once surfaces have formed, have neither
     weight nor gradient. A first pass finds them, and they are left out.
+
+    Thin samples, which hardly show, can be left to chance: of those with an optical depth
+    sigma delta below `thin`, one of `KEPT_THIN` is kept and gets the length of all. Where it lies
+    depends on `jitter`, and the expected optical depth and its gradient stay the same.
 
     Args:
         how: `window` and `faint` are ignored.
@@ -68,7 +89,10 @@ def render_batch(
         samples = march(rays, occupancy, how.step, jitter=jitter, backend=field.backend)
     else:
         first = first_pass(field, rays, occupancy, how, jitter=jitter, guide=guide)
-        samples = first.samples.front(first.counts)
+        if thin and jitter is not None:
+            samples = first.thinned(thin, jitter)
+        else:
+            samples = first.samples.front(first.counts)
     pixels = second_pass(field, rays, samples, how)
     return pixels if background is None else pixels.over(background), len(samples)
 

@@ -146,6 +146,21 @@ class Samples(Intervals):
             longest=longest,
         )
 
+    def where(self, kept: Tensor, lengths: Tensor) -> Samples:
+        """Only the samples that are `kept` [S], with no more to follow; `lengths` [S] replace their
+        `delta`."""
+        index = kept.nonzero().squeeze(1)
+        ray = self.ray[index]
+        counts = torch.bincount(ray, minlength=len(self.resume))
+        return Samples(
+            self.t[index],
+            lengths[index],
+            torch.cat((counts.new_zeros(1), counts.cumsum(dim=0))),
+            ray,
+            self.positions[index],
+            torch.full_like(self.resume, -1),
+        )
+
     def followed_by(self, more: Samples, rays: Tensor) -> tuple[Samples, Tensor]:
         """These samples and `more`, which lie behind them on the rays `rays` [Q], in increasing
         order. Also returns the order [S + M] in which both, one after the other, were taken."""

@@ -28,8 +28,9 @@ def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log, device: str) -> No
     frame = method.render(test.cameras[1], NullProbe())
     truth = composite(test.images[1], ball_scene.background)
     assert psnr(frame.rgb.cpu(), truth) > 24
-    # Depth is that of the front of the ball, 1.6 - 0.3 from the camera, to two pixels' widths.
-    assert abs(frame.depth[16, 16].item() - 1.3) < 2 * 1.6 / 40
+    # Depth is that of the front of the ball, 1.6 - 0.3 from the camera, to two pixels' widths. The
+    # ball has one colour, which leaves the depth of a single pixel to chance.
+    assert abs(frame.depth[14:19, 14:19].median().item() - 1.3) < 2 * 1.6 / 40
     assert frame.alpha[16, 16] > 0.95
     assert frame.depth[0, 0] == torch.inf
     assert torch.equal(frame.depth.isinf(), frame.alpha <= EMPTY_ALPHA)

@@ -8,10 +8,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
 
+from bench.compositing import composite
 from bench.console import ConsoleLog
 from bench.sharing import locked
-from bench.types import Budget, Log, Scene, Split, SteerbenchError
+from bench.types import Budget, Log, Rays, Scene, Split, SteerbenchError
+from methods.instant_ngp.error_map import RUN, UNSEEN
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.stage1 import train_field
 from methods.instant_ngp.training import (
@@ -21,6 +24,7 @@ from methods.instant_ngp.training import (
     PixelTraining,
     TrainingOptions,
 )
+from methods.kernels.composite import Pixels
 from methods.training import checkpoint, loop
 from tests.methods.trainings import GRID, QUICK, TEACHER, killed
 
@@ -57,6 +61,49 @@ def test_the_loss_falls(ball_scene: Scene) -> None:
     training = FieldTraining(new_field(), ball_scene, budget, QUICK, seed=0)
     losses = [training.advance()[""] for _ in range(BUDGET.steps)]
     assert sum(losses[-10:]) < 0.5 * sum(losses[:10])
+
+
+@pytest.fixture
+def unlit(ball_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> FieldTraining:
+    """A training that renders every pixel black and learns nothing."""
+
+    def render(rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
+        black = Pixels.blank(len(jitter), 3)
+        return replace(black, values=black.values.requires_grad_()), BUDGET.samples
+
+    options = replace(QUICK, random_background=False)
+    training = FieldTraining(new_field(), ball_scene, BUDGET, options, seed=0)
+    training.step = 1  # the density grid is not visited, which would draw random numbers
+    monkeypatch.setattr(training, "_render", render)
+    monkeypatch.setattr(training, "_update", lambda: None)
+    return training
+
+
+def test_the_error_shown_is_that_of_pixels_drawn_alike(unlit: FieldTraining) -> None:
+    assert unlit.errors is not None
+    generator = unlit.generator.clone_state()
+    _, colours = unlit.batches.at(unlit.batches.choose(unlit.rays // 2, generator))
+    wrong = unlit.errors.draw(unlit.rays // 2, generator)
+    shown = unlit.advance()[""]
+    truth = composite(255 * colours, unlit.background)
+    assert shown == pytest.approx(truth.square().mean().item())
+    assert (unlit.errors.errors[wrong // RUN] != UNSEEN).all()
+
+
+def test_an_error_that_is_not_finite_stops_wherever_its_pixel_was_drawn(
+    unlit: FieldTraining,
+) -> None:
+    dark = unlit._render
+
+    def render(rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
+        pixels, samples = dark(rays, jitter, background)
+        last = torch.zeros(len(jitter), 1)
+        last[-1] = torch.nan
+        return replace(pixels, values=pixels.values + last), samples
+
+    unlit._render = render  # type: ignore[method-assign]
+    with pytest.raises(SteerbenchError, match="rendered pixels"):
+        unlit.advance()
 
 
 def test_the_batch_grows_to_the_samples_of_the_budget(ball_scene: Scene) -> None:

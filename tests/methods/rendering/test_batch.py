@@ -13,7 +13,7 @@ from bench.types import Rays
 from methods.instant_ngp.field import HashField
 from methods.kernels.composite import composite
 from methods.kernels.march import Occupancy, march
-from methods.rendering.batch import first_pass, render_batch, second_pass
+from methods.rendering.batch import KEPT_THIN, first_pass, render_batch, second_pass
 from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
 from tests.methods.conftest import look_at_the_middle
@@ -53,6 +53,34 @@ def test_leaving_out_hidden_samples_changes_no_gradient(thick: Thick, device: st
         assert want is not None
         # Sums over up to 10^5 samples, in another grouping.
         torch.testing.assert_close(got, want, rtol=1e-3, atol=1e-4 * want.abs().max().item())
+
+
+def test_thin_samples_are_kept_in_turn_and_stand_for_the_others(
+    cloud: tuple[HashField, Occupancy], device: str
+) -> None:
+    field, occupancy = cloud
+    camera = look_at_the_middle(0.1, 0.4)
+    rays = cast(replace(camera, c2w=camera.c2w.to(device)))
+    jitter = torch.full((len(rays.origins),), 0.5, device=device)
+    first = first_pass(field, rays, occupancy, March(), jitter=jitter)
+    every = first.samples.front(first.counts)
+    depth = (first.sigma * first.samples.delta).median().item()
+    thick = first.thinned(0.0, jitter)
+    assert torch.equal(thick.offsets, every.offsets)
+    assert torch.equal(thick.delta, every.delta)
+
+    # The turns of one phase take all thin samples once, each with the length of all.
+    turns = [first.thinned(depth, jitter + turn / 2**12) for turn in range(KEPT_THIN)]
+    length, number = torch.zeros(2, len(rays.origins), device=device)
+    for kept in turns:
+        assert len(kept) < 0.8 * len(every)
+        assert torch.equal(kept.offsets.diff(), torch.bincount(kept.ray, minlength=len(length)))
+        length.index_add_(0, kept.ray, kept.delta / KEPT_THIN)
+        number.index_add_(0, kept.ray, torch.where(kept.delta > every.delta.max(), 1.0, 0.25))
+    assert torch.equal(number, every.offsets.diff().float())
+    expected = torch.zeros_like(length).index_add_(0, every.ray, every.delta)
+    # Sums of at most 1,024 steps, in another order.
+    torch.testing.assert_close(length, expected, rtol=1024 * 2**-24, atol=0)
 
 
 def test_hidden_samples_may_be_evaluated_too(thick: Thick) -> None:

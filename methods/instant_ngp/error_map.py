@@ -1,0 +1,44 @@
+"""Where the training pictures are still rendered wrong, so that more rays go there."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+RUN = 128
+"""Consecutive pixels of a picture that share one estimate of their error."""
+
+UNSEEN = 0.1
+"""Estimate for a run that no ray has met yet: about that of an untrained field."""
+
+
+class ErrorMap:
+    """Running estimates of the squared error of each run of pixels.
+
+    A run is drawn in proportion to the root of its error, its root mean square error, to which the
+    gradients of its pixels are proportional. The chances are not made up for by weights: the loss
+    then counts wrong pixels more, and has less noise.
+
+    Args:
+        pixels: number of pixels of all pictures.
+
+    Attributes:
+        errors: [T] mean squared error of each run; each new pixel counts as much as the estimate.
+    """
+
+    def __init__(self, pixels: int, device: torch.device) -> None:
+        self._pixels = pixels
+        self.errors = torch.full((-(-pixels // RUN),), UNSEEN, device=device)
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """Draw the numbers [count] of pixels."""
+        device = self.errors.device
+        ends = self.errors.sqrt().cumsum(0, dtype=torch.float64)
+        place = torch.rand(count, dtype=torch.float64, generator=generator, device=device)
+        run = torch.searchsorted(ends, place * ends[-1]).clamp(max=len(ends) - 1)
+        within = torch.randint(RUN, (count,), generator=generator, device=device)
+        return (run * RUN + within).clamp(max=self._pixels - 1)
+
+    def learn(self, pixels: Tensor, errors: Tensor) -> None:
+        """Update the estimates with the squared `errors` [R] of some `pixels` [R]."""
+        self.errors.scatter_reduce_(0, pixels // RUN, errors, "mean")
