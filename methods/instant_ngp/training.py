@@ -14,7 +14,7 @@ from bench.types import Budget, Rays, Scene, Split, SteerbenchError
 from methods.instant_ngp.error_map import ErrorMap
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.optimiser import FieldOptimiser
-from methods.kernels.composite import STOP, Pixels, check_stop
+from methods.kernels.composite import Pixels, check_stop
 from methods.rendering.batch import opacity_entropy, render_batch
 from methods.rendering.march import March, check_step, suitable_step
 from methods.rendering.occupancy import EVERY, MIN_VIEWS, STEP, DensityGrid, learnable_cells
@@ -86,7 +86,8 @@ class MarchOptions(PixelOptions):
 
 @dataclass(frozen=True)
 class TrainingOptions(MarchOptions):
-    """How to train a field in stage 1; `rate` is that of table and networks.
+    """How to train a field in stage 1; `rate` is that of table and networks. `stop`, `thin` and
+    `by_error` are chosen for a short training on a CPU (docs/log.md), not as in ngp_pl.
 
     Attributes:
         grid_samples: cells visited in an update of the density grid.
@@ -97,8 +98,9 @@ class TrainingOptions(MarchOptions):
 
     grid_samples: int = 1 << 17
     rays: int | None = None
-    stop: float = STOP
-    thin: float = 0.0
+    stop: float = 3e-2
+    thin: float = 1e-2
+    by_error: float = 0.5
 
     def __post_init__(self) -> None:
         super().__post_init__()
