@@ -32,8 +32,9 @@ def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log) -> None:
     method = fitted(ball_scene, shared_log, replace(TAUGHT, renderer_steps=200))
     assert quality(method, ball_scene) > 24
     frame = method.render(ball_scene.splits["test"].cameras[1], NullProbe())
-    # The depth is that of the front of the ball, 1.6 - 0.3 from the camera, to two voxels.
-    assert abs(frame.depth[16, 16].item() - 1.3) < 2 / 32
+    # The depth is that of the front of the ball, 1.6 - 0.3 from the camera, to two voxels. The ball
+    # has one colour, which leaves the depth of a single pixel to chance.
+    assert abs(frame.depth[14:19, 14:19].median().item() - 1.3) < 2 / 32
     assert torch.equal(frame.depth.isinf(), frame.alpha <= EMPTY_ALPHA)
     assert (frame.rgb[frame.alpha == 0] == 1).all()
 
