@@ -57,7 +57,8 @@ class Intervals:
         t: [S] position along the ray (z-depth for rays of `bench.cameras.cast`).
         delta: [S] length of the interval a sample represents, scene units.
         offsets: [R + 1] int64, ray r owns samples offsets[r] to offsets[r + 1].
-        longest: samples of the ray that has the most; None: unknown, it follows from `offsets`.
+        longest: samples of the ray that has the most, or more than that; None: unknown, it follows
+            from `offsets`.
     """
 
     t: Tensor

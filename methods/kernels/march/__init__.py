@@ -151,7 +151,8 @@ class Samples(Intervals):
         `delta`."""
         index = kept.nonzero().squeeze(1)
         ray = self.ray[index]
-        counts = torch.bincount(ray, minlength=len(self.resume))
+        # Not bincount, for which the host would wait for a GPU.
+        counts = self.offsets.new_zeros(len(self.resume)).index_add_(0, ray, torch.ones_like(index))
         return Samples(
             self.t[index],
             lengths[index],
@@ -159,6 +160,7 @@ class Samples(Intervals):
             ray,
             self.positions[index],
             torch.full_like(self.resume, -1),
+            longest=self.longest,  # or fewer
         )
 
     def followed_by(self, more: Samples, rays: Tensor) -> tuple[Samples, Tensor]:
