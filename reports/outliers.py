@@ -52,7 +52,7 @@ def outliers(runs: Sequence[Run]) -> list[Outlier]:
     published = tomllib.loads(REFERENCES.read_text(encoding="utf-8"))
     return [
         *far_from_other_scenes(runs),
-        *far_from_reference(runs, published["psnr"], published["method"]),
+        *far_from_reference(runs, published["psnr"], published["method"], published["resolution"]),
         *stages_do_not_add_up(runs),
         *int8_far_from_fp32(runs),
         *faster_with_more_pixels(runs),
@@ -76,11 +76,13 @@ def far_from_other_scenes(runs: Sequence[Run]) -> Iterator[Outlier]:
 
 
 def far_from_reference(
-    runs: Sequence[Run], published: Mapping[str, float], method: str
+    runs: Sequence[Run], published: Mapping[str, float], method: str, resolution: str
 ) -> Iterator[Outlier]:
-    """PSNR of `method` after a full training far below the `published` one on the same scene."""
+    """PSNR after a whole training far below the one `published` for `method` on the same scene, at
+    the same `resolution`."""
     for run in runs:
-        if run.record["made_of"]["config"]["method"].get("after", 1) < 1:
+        share = run.record["made_of"]["config"]["method"].get("after", 1)
+        if share < 1 or run.facts["resolution"] != resolution:
             continue
         known = published.get(run.facts["scene"], math.nan)
         below = known - _psnr(run)

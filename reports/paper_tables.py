@@ -13,7 +13,7 @@ from reports.page import missing_figures
 from reports.runs import Repeated, Run
 from reports.scenes import scene_table
 from reports.tables import Table
-from reports.trends import Trend, steps, trend_table
+from reports.trends import Trend, differences, trend_table
 
 FOLDER = Path(__file__).parent / "paper"
 METHOD = "method"
@@ -205,7 +205,9 @@ def _block(
     runs = [run for label in labels if label in measured for run in measured[label].runs]
     where = f"Measured: {conditions_of(runs)}, {_origin(runs)}." if runs else ""
     figures = {line.label: line.published for line in table.lines}
-    found = [step for trend in table.trends for step in steps(trend, measured, figures)]
+    found = [
+        difference for trend in table.trends for difference in differences(trend, measured, figures)
+    ]
     trends = trend_table(found) if found else ""
     notes = dict.fromkeys((*table.notes, *missing_figures(runs)))
     listed = "\n".join(f"- {note}" for note in notes)

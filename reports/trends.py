@@ -1,4 +1,4 @@
-"""Checks the paper's trends step by step: whether a metric grows here as it does there."""
+"""Checks the paper's trends one by one: whether a metric grows here as it does there."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from reports.runs import Repeated
 from reports.tables import Table
 
 HOLDS, FAILS, OPEN = "holds", "does not hold", "cannot be told"
-SMALLER = "smaller than the paper's step"
-SEEN, REVERSED = "so, by one seed", "the reverse, by one seed"
+SMALLER = "smaller than in the paper"
+SEEN, REVERSED = "agrees, by one seed", "opposite, by one seed"
 """Verdicts from the frames of one seed; another training may reverse them."""
 
 COMPUTED = "computed, not sampled"
@@ -49,8 +49,8 @@ class Growth:
 
 
 @dataclass(frozen=True)
-class Step:
-    """The step from one line of a trend to the next.
+class Difference:
+    """The difference from one line of a trend to the next.
 
     Attributes:
         paper: growth of the metric in the paper; nan if the paper does not give both figures.
@@ -73,12 +73,12 @@ class Step:
         return SMALLER if self.here.proves and high < self.paper else OPEN
 
 
-def steps(
+def differences(
     trend: Trend,
     lines: Mapping[str, Repeated],
     published: Mapping[str, Mapping[str, float]],
-) -> Iterator[Step]:
-    """Every step of `trend` between two measured lines.
+) -> Iterator[Difference]:
+    """Every difference of `trend` between two measured lines.
 
     Args:
         lines: the measured lines, by label.
@@ -91,7 +91,7 @@ def steps(
             below, above = (
                 published.get(label, {}).get(trend.metric, math.nan) for label in (smaller, larger)
             )
-            yield Step(trend.metric, smaller, larger, above - below, here)
+            yield Difference(trend.metric, smaller, larger, above - below, here)
 
 
 def _growth(one: Repeated, other: Repeated, metric: str) -> Growth | None:
@@ -125,22 +125,22 @@ def _growth(one: Repeated, other: Repeated, metric: str) -> Growth | None:
     return Growth(by, math.nan, "one figure each", proves=False)
 
 
-def trend_table(found: Sequence[Step]) -> Table:
-    """A table of the steps `found`, one line each."""
-    columns = ("grows in the paper", "paper", "here", "over", "")
+def trend_table(found: Sequence[Difference]) -> Table:
+    """A table of the differences `found`, one line each."""
+    columns = ("difference", "paper", "here", "over", "verdict")
     return Table("Trends", columns, tuple(map(_line, found)))
 
 
-def _line(step: Step) -> tuple[str, ...]:
-    label, write = metric_format(step.metric)
-    here = step.here
+def _line(found: Difference) -> tuple[str, ...]:
+    label, write = metric_format(found.metric)
+    here = found.here
     half = f" ± {write(here.half)}" if here.half > 0 else ""
     return (
-        f"{label.rstrip(' ↑↓')}: {step.smaller} < {step.larger}",
-        "" if math.isnan(step.paper) else _signed(step.paper, write),
+        f"{label.rstrip(' ↑↓')}: {found.smaller} < {found.larger}",
+        "" if math.isnan(found.paper) else _signed(found.paper, write),
         _signed(here.by, write) + half,
         here.over,
-        step.verdict,
+        found.verdict,
     )
 
 

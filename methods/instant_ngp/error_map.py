@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 RUN = 128
-"""Consecutive pixels of a picture that share one estimate of their error."""
+"""Consecutive pixels, of all pictures one after the other, that share one estimate of an error."""
 
 UNSEEN = 0.1
 """Estimate for a run that no ray has met yet: about that of an untrained field."""

@@ -30,7 +30,7 @@ GRID_YOUTH_STEPS = 256
 
 @dataclass(frozen=True)
 class PixelOptions:
-    """How to train on random pixels; the defaults follow ngp_pl, except for the random background.
+    """How to train on random pixels; rate, schedule and entropy follow ngp_pl by default.
 
     Attributes:
         rate: initial learning rate.
@@ -86,8 +86,8 @@ class MarchOptions(PixelOptions):
 
 @dataclass(frozen=True)
 class TrainingOptions(MarchOptions):
-    """How to train a field in stage 1; `rate` is that of table and networks. `stop`, `thin` and
-    `by_error` are chosen for a short training on a CPU (docs/log.md), not as in ngp_pl.
+    """How to train a field in stage 1; `rate` is that of table and networks. The defaults are made
+    for a short training on a CPU (docs/log.md); `budget=full` sets what ngp_pl has.
 
     Attributes:
         grid_samples: cells visited in an update of the density grid.

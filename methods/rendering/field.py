@@ -18,7 +18,7 @@ CHUNK_SAMPLES = 1 << 18
 
 CACHED_SAMPLES = 1 << 15
 """Samples that go through all layers together on a CPU: with the 128 bytes that each has between
-two layers of Instant-NGP, two cores keep them in their second-level caches."""
+two layers of Instant-NGP, two cores with 2 MB of second-level cache keep them there."""
 
 ROUND_SAMPLES = 6
 """Samples of a ray that a field evaluates together where rays end early, if a sample costs little.

@@ -4,9 +4,9 @@ After Instant-NGP (appendix E.2): every `EVERY` steps the density is sampled at 
 some cells, and a cell counts as occupied when its running maximum exceeds min(mean of the cells,
 the density that is opaque to 1 % over one step). Four things differ. A cell's value decays only
 when the cell is visited, so that cells that were not sampled are not forgotten, and then faster:
-to 0.8 instead of 0.95. All cells start out occupied, one visit away from being empty, so that no
-step ever samples the whole grid. Only cells that two cameras see can be occupied, and none close to
-a camera (`learnable_cells`).
+to 0.8 instead of 0.95. All cells start out occupied, one visit away from being empty, so that the
+whole grid need not be sampled at first. Only cells within the bounds of the scene that two cameras
+see can be occupied, and none close to a camera (`learnable_cells`).
 """
 
 from __future__ import annotations

@@ -91,9 +91,10 @@ def test_a_known_scene_is_compared_with_its_published_psnr(make: Make) -> None:
     runs = [
         make("good", scene="mic", psnr=33.9),
         make("bad", scene="mic", psnr=13.0),
+        make("smaller", scene="mic", width=50, psnr=13.0),
         make("other"),
     ]
-    assert list(far_from_reference(runs, {"mic": 35.59}, "a method")) == [
+    assert list(far_from_reference(runs, {"mic": 35.59}, "a method", "100x100")) == [
         Outlier("bad", "PSNR 22.6 dB below the 35.59 dB of a method")
     ]
 
@@ -138,7 +139,7 @@ def test_frames_of_several_sizes_are_compared_with_no_others(make: Make) -> None
 
 
 def test_all_rules_are_applied_and_their_reasons_shown(make: Make) -> None:
-    runs = [make("here", psnr=13.0, scene="mic")]
+    runs = [make("here", psnr=13.0, scene="mic", width=800)]
     found = outliers(runs)
     assert {outlier.key for outlier in found} == {"here"}
     assert len(found) == 2  # the reference, the stages

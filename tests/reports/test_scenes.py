@@ -13,7 +13,7 @@ from reports.paper_tables import Line, PaperTable, section
 from reports.publish import markdown
 from reports.runs import Repeated, Run, load
 from reports.scenes import over_scenes
-from reports.trends import SEEN, Trend, steps
+from reports.trends import SEEN, Trend, differences
 
 
 @pytest.fixture
@@ -75,9 +75,9 @@ def test_one_seed_is_compared_over_the_frames_of_all_scenes(run: Run) -> None:
     one = over_scenes([of_scene(run, "a"), of_scene(run, "b")])
     other = over_scenes([of_scene(run, "a", 1.0), of_scene(run, "b", 2.0)])
     lines = {"one": Repeated("one", [one]), "two": Repeated("two", [other])}
-    (step,) = steps(Trend("psnr", ["one", "two"]), lines, {})
-    assert (step.here.over, step.verdict) == ("12 frames of one seed", SEEN)
-    assert step.here.by == pytest.approx(1.5)
+    (found,) = differences(Trend("psnr", ["one", "two"]), lines, {})
+    assert (found.here.over, found.verdict) == ("12 frames of one seed", SEEN)
+    assert found.here.by == pytest.approx(1.5)
 
 
 @pytest.mark.parametrize("scenes", ["ab", "a"])

@@ -1,4 +1,4 @@
-"""Trends: the paper's step beside ours, over what its interval is, and what may be concluded."""
+"""Trends: the difference in the paper and here, its interval, and what may be concluded."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from reports.trends import (
     REVERSED,
     SEEN,
     SMALLER,
+    Difference,
     Growth,
-    Step,
     Trend,
-    steps,
+    differences,
     trend_table,
 )
 
@@ -42,12 +42,14 @@ def changed(run: Run, by: float | list[float], seed: int = 5) -> Run:
 
 
 def only(one: list[Run], two: list[Run]):
-    (step,) = steps(TREND, {"one": Repeated("one", one), "two": Repeated("two", two)}, {})
-    return step
+    (difference,) = differences(
+        TREND, {"one": Repeated("one", one), "two": Repeated("two", two)}, {}
+    )
+    return difference
 
 
-def step_of(by: float, half: float, paper: float, proves: bool = True) -> Step:
-    return Step("psnr", "one", "two", paper, Growth(by, half, "3 seeds", proves))
+def difference_of(by: float, half: float, paper: float, proves: bool = True) -> Difference:
+    return Difference("psnr", "one", "two", paper, Growth(by, half, "3 seeds", proves))
 
 
 @pytest.mark.parametrize(
@@ -59,11 +61,11 @@ def step_of(by: float, half: float, paper: float, proves: bool = True) -> Step:
     ],
 )
 def test_one_seed_is_compared_frame_by_frame(run: Run, apart: list[float], verdict: str) -> None:
-    step = only([run], [changed(run, apart)])
-    assert step.here.over == "6 frames of one seed"
-    assert step.here.by == pytest.approx(np.mean(apart))
-    assert step.here.half == pytest.approx(path_interval(np.array(apart)))
-    assert step.verdict == verdict
+    difference = only([run], [changed(run, apart)])
+    assert difference.here.over == "6 frames of one seed"
+    assert difference.here.by == pytest.approx(np.mean(apart))
+    assert difference.here.half == pytest.approx(path_interval(np.array(apart)))
+    assert difference.verdict == verdict
 
 
 @pytest.mark.parametrize(("by", "verdict"), [(0.1, HOLDS), (-0.1, FAILS)])
@@ -72,11 +74,11 @@ def test_several_seeds_are_compared_seed_by_seed(run: Run, by: float, verdict: s
     apart = [by - 0.01, by, by + 0.01]
     one = [changed(run, seed, seed) for seed in (0, 1, 2)]
     two = [changed(run, seed + apart[seed], seed) for seed in (2, 0, 1)]
-    step = only(one, two)
-    assert step.here.over == "3 seeds"
-    assert step.here.by == pytest.approx(by)
-    assert step.here.half == pytest.approx(half_interval(np.array(apart)))
-    assert step.verdict == verdict
+    difference = only(one, two)
+    assert difference.here.over == "3 seeds"
+    assert difference.here.by == pytest.approx(by)
+    assert difference.here.half == pytest.approx(half_interval(np.array(apart)))
+    assert difference.verdict == verdict
 
 
 @pytest.mark.parametrize(
@@ -91,29 +93,29 @@ def test_several_seeds_are_compared_seed_by_seed(run: Run, by: float, verdict: s
         (0.5, math.nan, OPEN),
     ],
 )
-def test_several_seeds_against_a_step_of_one_decibel_in_the_paper(
+def test_several_seeds_against_a_difference_of_one_decibel_in_the_paper(
     by: float, half: float, verdict: str
 ) -> None:
-    assert step_of(by, half, paper=1.0).verdict == verdict
+    assert difference_of(by, half, paper=1.0).verdict == verdict
 
 
-def test_only_several_seeds_show_that_a_step_is_smaller_than_a_published_one() -> None:
-    assert step_of(-0.1, 0.2, paper=math.nan).verdict == OPEN
-    assert step_of(-0.1, 0.2, paper=1.0, proves=False).verdict == OPEN
+def test_only_several_seeds_show_that_a_difference_is_smaller_than_a_published_one() -> None:
+    assert difference_of(-0.1, 0.2, paper=math.nan).verdict == OPEN
+    assert difference_of(-0.1, 0.2, paper=1.0, proves=False).verdict == OPEN
 
 
-def test_the_papers_step_is_known_where_both_its_figures_are(run: Run) -> None:
+def test_the_papers_difference_is_known_where_both_its_figures_are(run: Run) -> None:
     lines = {name: Repeated(name, [run]) for name in ("one", "two")}
     published = {"one": {"psnr": 31.0}, "two": {"psnr": 31.5}}
-    (step,) = steps(TREND, lines, published)
-    assert step.paper == pytest.approx(0.5)
-    (step,) = steps(TREND, lines, {**published, "two": {}})
-    assert math.isnan(step.paper)
+    (difference,) = differences(TREND, lines, published)
+    assert difference.paper == pytest.approx(0.5)
+    (difference,) = differences(TREND, lines, {**published, "two": {}})
+    assert math.isnan(difference.paper)
 
 
-def test_a_line_of_the_table_has_both_steps_in_the_unit_of_the_metric() -> None:
-    size = Step("size_bytes.total", "one", "two", 21e6, Growth(2e6, 0.0, "computed", True))
-    found = [step_of(-0.481, 0.15, 0.61), step_of(0.5, math.nan, math.nan), size]
+def test_a_line_of_the_table_has_both_differences_in_the_unit_of_the_metric() -> None:
+    size = Difference("size_bytes.total", "one", "two", 21e6, Growth(2e6, 0.0, "computed", True))
+    found = [difference_of(-0.481, 0.15, 0.61), difference_of(0.5, math.nan, math.nan), size]
     assert trend_table(found).lines == (
         ("PSNR, dB: one < two", "+0.61", "-0.48 ± 0.15", "3 seeds", FAILS),
         ("PSNR, dB: one < two", "", "+0.50", "3 seeds", OPEN),
@@ -122,33 +124,33 @@ def test_a_line_of_the_table_has_both_steps_in_the_unit_of_the_metric() -> None:
 
 
 def test_seeds_that_only_one_line_has_are_left_out(run: Run) -> None:
-    step = only([changed(run, 0, 0), changed(run, 9, 1)], [changed(run, 1, 0)])
-    assert step.here.over == "6 frames of one seed"
-    assert step.here.by == pytest.approx(1)
+    difference = only([changed(run, 0, 0), changed(run, 9, 1)], [changed(run, 1, 0)])
+    assert difference.here.over == "6 frames of one seed"
+    assert difference.here.by == pytest.approx(1)
 
 
 def test_a_figure_without_frames_alone_tells_nothing(run: Run) -> None:
     trend = Trend("fps", ["one", "two"])
     lines = {name: Repeated(name, [run]) for name in ("one", "two")}
-    (step,) = steps(trend, lines, {})
-    assert step.verdict == OPEN
+    (difference,) = differences(trend, lines, {})
+    assert difference.verdict == OPEN
 
 
 def test_bytes_are_computed_and_need_no_interval(run: Run) -> None:
     larger = replace(run, rows=run.rows.assign(value=run.rows["value"] + 1))
     lines = {"one": Repeated("one", [run]), "two": Repeated("two", [larger])}
-    (step,) = steps(Trend("size_bytes.total", ["one", "two"]), lines, {})
-    assert (step.here.half, step.verdict) == (0.0, HOLDS)
+    (difference,) = differences(Trend("size_bytes.total", ["one", "two"]), lines, {})
+    assert (difference.here.half, difference.verdict) == (0.0, HOLDS)
 
 
-def test_a_line_that_was_not_measured_has_no_step(run: Run) -> None:
+def test_a_line_that_was_not_measured_has_no_difference(run: Run) -> None:
     lines = {"one": Repeated("one", [run]), "two": Repeated("two", [])}
-    assert list(steps(TREND, lines, {})) == []
+    assert list(differences(TREND, lines, {})) == []
 
 
 def test_times_of_different_machines_tell_nothing(run: Run) -> None:
     machine = {**run.record["machine"], "cpu": "another"}
     elsewhere = replace(run, record={**run.record, "machine": machine})
     lines = {"one": Repeated("one", [run]), "two": Repeated("two", [elsewhere])}
-    assert not list(steps(Trend("frame_ms", ["one", "two"]), lines, {}))
-    assert list(steps(TREND, lines, {}))
+    assert not list(differences(Trend("frame_ms", ["one", "two"]), lines, {}))
+    assert list(differences(TREND, lines, {}))

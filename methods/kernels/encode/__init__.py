@@ -5,7 +5,7 @@ x in [0, 1]^3 lies at p = scale_l x + 1/2, its cell is floor(p), its trilinear w
 (the conventions of tiny-cuda-nn, `common_device.h` and `grid.h`). A level whose res^3 vertices fit
 into 2^log2_table entries is dense, x + y res + z res^2; the others are hashed,
 (x ^ y * 2654435761 ^ z * 805459861) mod 2^log2_table in 32-bit arithmetic. Because of the half-cell
-offset, the last vertex of a dense level exceeds the table by one entry; its index wraps around.
+offset, a cell at the far side of a dense level has vertices beyond the res^3; indices wrap around.
 """
 
 from __future__ import annotations

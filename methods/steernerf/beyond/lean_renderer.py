@@ -48,7 +48,8 @@ class LeanRenderer(Renderer2d):
 
     Only the cells of an observation are drawn; all others are background, and 0 to their
     neighbours. So nothing is computed for them, and a part of a frame is drawn exactly as in the
-    whole. The background is subtracted from all features, so that empty space is 0.
+    whole, but for the cells near the cut, whose neighbours are missing. The background is
+    subtracted from all features, so that empty space is 0.
 
     Args:
         channels: K.
