@@ -113,10 +113,8 @@ def novel_view(cameras: Sequence[Camera], target: Tensor, generator: torch.Gener
     """A random camera from the region in which `cameras` view `target` [3].
 
     It lies between a camera and one of its nearest neighbours by direction, at a distance between
-    theirs, then is turned a little about the target and moved a little nearer or farther.
-
-    Raises:
-        SteerbenchError: the pictures of the two differ in size.
+    theirs, then is turned a little about the target and moved a little nearer or farther. Only
+    cameras with pictures of the same size are neighbours.
     """
     check_shape("target", target, 3)
     pick = int(torch.randint(len(cameras), (), generator=generator))
@@ -134,11 +132,14 @@ def novel_view(cameras: Sequence[Camera], target: Tensor, generator: torch.Gener
 
 
 def _nearest(cameras: Sequence[Camera], target: Tensor, index: int) -> list[int]:
-    """The cameras whose direction to `target` is nearest to that of camera `index`."""
+    """The cameras whose direction to `target` is nearest to that of camera `index`, of those with
+    pictures of its size; without any, that camera itself."""
     offsets = torch.stack([_offset(camera, target) for camera in cameras])  # [N, 3]
     directions = torch.nn.functional.normalize(offsets, dim=-1)
     order = (directions @ directions[index]).argsort(descending=True, stable=True).tolist()
-    return [other for other in order if other != index][:NEIGHBOURS] or [index]
+    size = cameras[index].width, cameras[index].height
+    alike = [other for other in order if (cameras[other].width, cameras[other].height) == size]
+    return [other for other in alike if other != index][:NEIGHBOURS] or [index]
 
 
 def _turned(camera: Camera, target: Tensor, turn: Tensor, zoom: float) -> Camera:

@@ -184,6 +184,16 @@ def test_a_novel_view_of_one_camera_is_a_jittered_one():
     assert gaze_deg(view) == pytest.approx(0.0, abs=1e-3)
 
 
+def test_a_novel_view_lies_between_cameras_whose_pictures_have_one_size():
+    """The nearest neighbours have a smaller picture, a camera farther away has not."""
+    cameras = [camera_at([2.0, 0.1 * n, 0.0]) for n in range(-3, 4)]
+    small = [scale_camera(camera, 20, 16) for camera in cameras]
+    large = [camera_at([2.0, 0.0, 0.0]), camera_at([0.0, 2.0, 0.0])]
+    views = [novel_view([*small, *large], TARGET, seeded(seed)) for seed in range(30)]
+    assert {(view.width, view.height) for view in views} == {(20, 16), (40, 32)}
+    assert max(angle_deg(offset(v), offset(large[0])) for v in views if v.width == 40) > 20
+
+
 def test_the_ends_of_the_way_between_two_cameras_are_the_cameras():
     first = camera_at([2.0, 0.0, 0.0])
     second = replace(camera_at([0.0, 2.0, 0.5]), fx=80.0, cy=15.0)

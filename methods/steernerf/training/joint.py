@@ -119,8 +119,9 @@ class RendererTraining:
 
     @torch.no_grad()
     def _average(self, mean: Tensors, new: Tensors, count: Tensor | int) -> None:
-        # At first over fewer steps: the earliest weights are not worth keeping.
-        keep = min(self.options.average, (1 + int(count)) / (10 + int(count)))
+        # At first over fewer steps: the earliest weights are not worth keeping. `count` says the
+        # same as `step`, but lies on the GPU.
+        keep = min(self.options.average, (1 + self.step) / (10 + self.step))
         torch._foreach_lerp_(mean, new, 1 - keep)
 
     def watched(self) -> dict[str, Tensor]:

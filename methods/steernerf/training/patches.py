@@ -8,6 +8,7 @@ from typing import Literal, Protocol, TypeVar
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from bench.cameras import cast, pixel_grid
 from bench.compositing import composite
@@ -152,16 +153,16 @@ class PatchSource:
         ]
 
     def _truth(self, sequence: Sequence, top: int, left: int, full: Camera) -> Tensor:
-        """The true picture [H, W, 3] of the patch, with background beyond the picture's border."""
+        """The true picture [H, W, 3] of the patch. Beyond the border of a picture whose sides are
+        no multiples of the scale, its last row and column are repeated."""
         scale = self.pipeline.model.scale
         background = self.pipeline.background[:3]
         rows = slice(top * scale, top * scale + full.height)
         columns = slice(left * scale, left * scale + full.width)
         picture = sequence.truth.picture[rows, columns]
         part = composite(picture.to(background.device, non_blocking=True), background)
-        truth = background.expand(full.height, full.width, 3).clone()
-        truth[: part.shape[0], : part.shape[1]] = part
-        return truth
+        missing = 0, full.width - part.shape[1], 0, full.height - part.shape[0]
+        return functional.pad(part.movedim(-1, 0), missing, mode="replicate").movedim(0, -1)
 
     def observe(self, patches: list[Patch]) -> tuple[list[Observation], Tensor]:
         """Compute the renderer's input for `patches`, with a gradient as `through` says, and the

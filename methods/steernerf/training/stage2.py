@@ -88,17 +88,19 @@ def train_stage2(
     """Train `stage2` on the field that `setup` made for `scene`, or load the result of the same
     training. The field is widened to K features and changed in place."""
     model, joint = stage2.model, stage2.joint
-    count = joint.distilled(budget.renderer_steps, model.frames)
+    key = {**setup.key(scene, budget), **stage2.key(budget)}
+    folder = log.stage_dir("steernerf", key)
+    finished = folder / "steernerf.safetensors"
+    count = 0 if finished.exists() else joint.distilled(budget.renderer_steps, model.frames)
     distilled, distilled_s = distilled_views(setup, trained, scene, budget, count, log)
     random = torch.Generator().manual_seed(setup.seed) if joint.features == "random" else None
     trained.field.widen(model.channels, random)
     views = TrainingViews.of(scene, distilled, joint.distilled_share)
     background = scene.background.to(setup.device)
     pipeline, training = _prepared(trained, background, stage2, views, budget, setup.seed)
-    key = {**setup.key(scene, budget), **stage2.key(budget)}
-    folder = log.stage_dir("steernerf", key)
+    training.seconds = distilled_s
     marks = {_at(folder, share): math.ceil(share * training.steps) for share in MARKS}
-    loop.train(training, folder / "steernerf.safetensors", "training the 2D renderer", log, marks)
+    loop.train(training, finished, "training the 2D renderer", log, marks)
     if stage2.after < 1:
         mark = _at(folder, stage2.after)
         if not mark.exists():
@@ -107,7 +109,7 @@ def train_stage2(
         key["after"] = stage2.after
     trained.field.requires_grad_(False).grad_buffer = None
     pipeline.renderer.requires_grad_(False)
-    return TrainedPipeline(pipeline, key, distilled_s + training.seconds)
+    return TrainedPipeline(pipeline, key, training.seconds)
 
 
 def _at(folder: Path, share: float) -> Path:

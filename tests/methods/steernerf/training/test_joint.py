@@ -25,7 +25,7 @@ from methods.steernerf.training.sequences import MotionOptions, SequencePool, Tr
 from methods.steernerf.unet import UNet
 from methods.steernerf.view import View
 from methods.training import loop
-from tests.methods.conftest import ball
+from tests.methods.conftest import SIZE, ball
 from tests.methods.models import misty_field, shell, small_model, small_renderer, trained_field
 from tests.methods.observations import shaken
 from tests.methods.trainings import killed
@@ -371,6 +371,22 @@ def test_a_patch_shows_what_the_picture_shows_there(ball_scene: Scene) -> None:
     expected = ball(cut).float() / 255
     expected = expected[..., :3] * expected[..., 3:] + 1 - expected[..., 3:]
     assert (patch.truth - expected).abs().max() <= 1 / 255  # the colour of a ray, rounded twice
+
+
+def test_beyond_the_border_of_a_picture_its_last_row_and_column_go_on(ball_scene: Scene) -> None:
+    """A picture without two columns and a row: its last cells are not all pictures."""
+    split = ball_scene.splits["train"]
+    cameras = [replace(camera, width=SIZE - 2, height=SIZE - 1) for camera in split.cameras]
+    images = [image[: SIZE - 1, : SIZE - 2] for image in split.images]
+    cropped = replace(split, cameras=cameras, images=images)
+    scene = replace(ball_scene, splits={**ball_scene.splits, "train": cropped})
+    options = replace(OPTIONS, patch=SIZE, place="anywhere")
+    truth = new_training(scene, options).patches.draw(1).truth[0]
+    assert truth.shape == (SIZE, SIZE, 3)
+    assert truth[:, -3].std() > 0  # not of background alone
+    for column in (-2, -1):
+        assert torch.equal(truth[:, column], truth[:, -3])
+    assert torch.equal(truth[-1], truth[-2])
 
 
 def test_a_killed_training_goes_on_with_the_same_state(
