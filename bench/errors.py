@@ -30,7 +30,6 @@ def explained(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise SteerbenchError(
-            f"cannot write to {error.filename or folder}: {error.strerror or error}; nothing was "
-            "kept of it. Make room, correct the permissions, or choose another folder "
-            "with outputs=DIR"
+            f"cannot write to {error.filename or folder}: {error.strerror or error}. Make room, "
+            "correct the permissions, or choose another folder; outputs=DIR moves all results"
         ) from error

@@ -30,7 +30,7 @@ def check_size(metric: str, width: int, height: int) -> None:
     if min(width, height) < side:
         raise SteerbenchError(
             f"{metric} needs pictures of at least {side} x {side} pixels, got {width} x {height}: "
-            "use a smaller scene.downscale, or a protocol without this metric"
+            "use larger ones (a smaller scene.downscale), or with LPIPS a protocol without it"
         )
 
 

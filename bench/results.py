@@ -98,7 +98,10 @@ class Store:
         Raises:
             SteerbenchError: there is none, or several.
         """
-        keys = [path.name for path in self.folder.glob(f"{beginning}*") if self.find(path.name)]
+        wanted = Path(beginning).name  # the key may be given as the path of its folder
+        folders = self.folder.iterdir() if self.folder.is_dir() else ()
+        names = sorted(path.name for path in folders if path.name.startswith(wanted))
+        keys = [name for name in names if self.find(name)]
         if len(keys) != 1:
             raise SteerbenchError(
                 f"run {beginning!r}: expected the beginning of one key, {len(keys)} runs below "
@@ -200,8 +203,11 @@ class Store:
         return record
 
     def _publish(self, partial: Path, key: str) -> None:
+        folder = self.folder / key
+        if folder.exists() and self.find(key) is None:  # half deleted, or half copied
+            shutil.rmtree(folder)
         try:
-            partial.replace(self.folder / key)
+            partial.replace(folder)
         except OSError:
             if self.find(key) is None:
                 raise

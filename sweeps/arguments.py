@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,25 @@ def positive_int(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"expected 1 or more, got {text}")
     return int(text)
+
+
+def positive(text: str) -> float:
+    """A finite number above 0."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a number above 0, got {text}")
+    return number
+
+
+def port(text: str) -> int:
+    """The number of a port."""
+    number = positive_int(text)
+    if number > 65535:
+        raise argparse.ArgumentTypeError(f"expected at most 65535, got {text}")
+    return number
 
 
 def config_dir(text: str) -> str:
@@ -119,12 +139,12 @@ ARGUMENTS = {
         ),
         *_one(
             "--output",
-            help="where the pictures go (default OUTPUTS/render/TRAJECTORY)",
+            help="where the pictures go (default OUTPUTS/render/SCENE-METHOD-TRAJECTORY)",
             type=Path,
             metavar="DIR",
         ),
         *_one("--video", help="also write a video", type=Path, metavar="FILE.mp4"),
-        *_one("--fps", help="frames a second of it (default 30)", type=float, default=30.0),
+        *_one("--fps", help="frames a second of it (default 30)", type=positive, default=30.0),
         *_words("method=ngp scene=totem trajectory=test budget=small"),
     ],
     "view": [
@@ -135,7 +155,7 @@ ARGUMENTS = {
             help="address to serve (default 127.0.0.1: this machine alone; 0.0.0.0: everyone)",
             default="127.0.0.1",
         ),
-        *_one("--port", help="(default 8080)", type=positive_int, default=8080, metavar="N"),
+        *_one("--port", help="(default 8080)", type=port, default=8080, metavar="N"),
         *_words("method=ngp scene=totem trajectory=test budget=small"),
     ],
     "pretrain": [

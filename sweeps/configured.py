@@ -104,7 +104,7 @@ def scene_digest(config: DictConfig) -> str:
 
 def scene_folder(config: DictConfig) -> str | None:
     """The folder of the scene; None for an embedded scene."""
-    return str(Path(config.scene.path).resolve()) if "path" in config.scene else None
+    return str(Path(config.scene.path).expanduser().resolve()) if "path" in config.scene else None
 
 
 def _contents(config: DictConfig) -> tuple[str, Path, bool]:

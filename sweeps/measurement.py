@@ -189,7 +189,8 @@ def _show(run: Run, explain: bool) -> None:
     """Print the tables of one run and, if `explain`, why figures are missing."""
     what = run.facts[["method", "scene", "trajectory", "resolution", "budget", "protocol"]]
     out = console()
-    out.print(f"{', '.join(what)}, seed {run.facts['seed']}: run {run.key}", style="bold")
+    heading = f"{', '.join(what)}, seed {run.facts['seed']}: run {run.key}"
+    out.print(heading, style="bold", markup=False)
     out.print(Columns([rich_table(table) for table in run_tables(run.rows)]))
     for metric, reason in run.record["missing"].items() if explain else ():
         out.print(f"{metric}: n/a. {reason}", markup=False, soft_wrap=True)

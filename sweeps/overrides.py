@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -81,7 +81,7 @@ def choices(group: str, words: Sequence[str] = ()) -> dict[str, Path]:
 
 def setting(name: str, text: str) -> str:
     """The word that sets `name` to `text`, quoted if Hydra would misread it."""
-    if re.fullmatch(r"[\w/.+-]+", text):
+    if re.fullmatch(r"[\w/.+-]+", text, re.ASCII):
         return f"{name}={text}"
     escaped = text.replace("'", r"\'")
     return f"{name}='{escaped}'"
@@ -126,7 +126,9 @@ def explain(error: Exception, words: Sequence[str]) -> SteerbenchError:
     if isinstance(error, OverrideParseException):
         return SteerbenchError(
             f"cannot read '{error.override}': settings are written key=value, "
-            f"for example seed=1 or scene=wires ({error.message.splitlines()[0]})"
+            "for example seed=1 or scene=wires; a value with other signs than letters, digits and "
+            "_/.+- stands in quotes inside quotes, as in \"scene.path='~/my data'\" "
+            f"({error.message.splitlines()[0]})"
         )
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
@@ -150,6 +152,22 @@ def _settings(words: Sequence[str]) -> list[str]:
     chosen = [word for word in words if word in there]
     config: Any = composed([*(f"{FLAGS[0]}={folder}" for folder in _typed(words)), *chosen])
     return [*groups, *leaves(OmegaConf.to_container(config, resolve=False))]
+
+
+def beside(name: str, words: Sequence[str]) -> list[str]:
+    """The words for the method `name` in place of that of `words`, without settings it lacks."""
+    other = composed([*(f"{FLAGS[0]}={folder}" for folder in _typed(words)), f"method={name}"])
+    return [*(word for word in words if holds(word, [other])), f"method={name}"]
+
+
+def holds(word: str, configs: Iterable[DictConfig]) -> bool:
+    """Whether a word chooses no method, and sets nothing of a method that is not in `configs`."""
+    name, missing = word.partition("=")[0].lstrip("+~"), object()
+    if "@method" in name or name == "method":
+        return False
+    return not name.startswith("method.") or all(
+        OmegaConf.select(config, name, default=missing) is not missing for config in configs
+    )
 
 
 def leaves(config: Any, prefix: str = "") -> Iterator[str]:

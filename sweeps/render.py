@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import shlex
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -23,13 +24,14 @@ from bench.types import Camera, Method, NullProbe
 from bench.video import recorded
 from sweeps.build import build
 from sweeps.configured import scene_of, trained
-from sweeps.overrides import composed, setting
+from sweeps.overrides import beside, composed, setting
 
 
 def main(options: argparse.Namespace) -> int:
     """Render; write `0000.png` and so on, the path and the video; print where they are."""
     words = [*words_of_run(options.run, options.overrides), *options.overrides]
     if options.path:
+        words = [word for word in words if not re.match(r"[+~]*(trajectory\b|split=)", word)]
         place = setting("trajectory.path", str(options.path.resolve()))
         words = [*words, "trajectory=path", place]
     config = composed(words)
@@ -37,12 +39,16 @@ def main(options: argparse.Namespace) -> int:
     trajectory = build(config, "trajectory", scene)
     if options.video and trajectory.resolution == MIXED:
         raise SteerbenchError("--video: expected frames of one size, the trajectory has several")
-    beside = [composed([*words, f"method={name}"]) for name in options.beside]
-    methods = [trained(each, log) for each in (config, *beside)]
+    others = [composed(beside(name, words)) for name in options.beside]
+    methods = [trained(each, log) for each in (config, *others)]
     cameras = [step.camera for step in trajectory.steps]
-    folder = options.output or Path(config.outputs) / "render" / trajectory.name
+    drawn = "-".join([scene.name, *(method.name for method in methods), trajectory.name])
+    folder = options.output or Path(config.outputs) / "render" / drawn
     with explained(folder), ExitStack() as stack:
         folder.mkdir(parents=True, exist_ok=True)
+        if not options.output:  # what an earlier call left there, of a longer path, say
+            for old in folder.glob("[0-9]*.png"):
+                old.unlink()
         if trajectory.resolution != MIXED:
             paths.write(folder / "path.json", cameras, scene, options.fps)
         film = stack.enter_context(recorded(options.video, options.fps)) if options.video else None

@@ -42,7 +42,8 @@ def main(options: argparse.Namespace) -> int:
         sequence=options.sequence,
     )
     facts, out = run.facts, console()
-    out.print(f"{run.label} on {facts['scene']}, protocol {facts['protocol']}: run {run.key}")
+    heading = f"{run.label} on {facts['scene']}, protocol {facts['protocol']}: run {run.key}"
+    out.print(heading, markup=False)
     out.print(Columns([rich_table(table) for table in run_tables(run.rows)]))
     return 0
 

@@ -33,9 +33,9 @@ def show(*tables: Table) -> None:
 
 def rich_table(table: Table) -> RichTable:
     """`table` with labels and text aligned left and figures aligned right."""
-    grid = RichTable(title=table.title, title_justify="left")
+    grid = RichTable(title=escape(table.title), title_justify="left")
     for index, column in enumerate(table.columns):
-        grid.add_column(column, justify="right" if index and table.figures else "left")
+        grid.add_column(escape(column), justify="right" if index and table.figures else "left")
     for row, line in enumerate(table.lines):
         cells = (
             f"[bold]{escape(text)}[/bold]" if (row, column) in table.bold else escape(text)

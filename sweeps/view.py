@@ -11,7 +11,7 @@ from bench.study import Variant, study_of
 from bench.viewing import Painter
 from sweeps.build import build
 from sweeps.configured import scene_of, trained
-from sweeps.overrides import composed
+from sweeps.overrides import beside, composed
 from sweeps.render import words_of_run
 from sweeps.viewer import AS_GIVEN, Viewer
 
@@ -33,13 +33,13 @@ def opened(options: argparse.Namespace) -> Viewer:
         SteerbenchError: a setting is wrong, the training failed, or viser is not installed.
     """
     words = [*words_of_run(options.run, options.overrides), *options.overrides]
-    beside = [[*words, f"method={options.beside}"]] if options.beside else []
-    wanted = [_Tuned(each) for each in (words, *beside)]
+    others = [beside(options.beside, words)] if options.beside else []
+    wanted = [_Tuned(each) for each in (words, *others)]
     config = composed(words)
     log, scene = ConsoleLog(Path(config.outputs)), scene_of(config)
     first = build(config, "trajectory", scene).steps[0].camera
-    others = [composed(one.words()) for one in wanted[1:]]
-    painter = Painter([trained(each, log) for each in (config, *others)])
+    configs = [config, *(composed(one.words()) for one in wanted[1:])]
+    painter = Painter([trained(each, log) for each in configs])
     for method, one in zip(painter.methods, wanted, strict=True):
         one.knobs = dict(study_of(method).knobs)
     names = [{name: [v.name for v in one.knobs[name]] for name in one.knobs} for one in wanted]

@@ -6,6 +6,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from io import StringIO
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -225,8 +226,8 @@ class Viewer:
         last = browser.path[-1]
         cameras = [c for c in browser.path if (c.width, c.height) == (last.width, last.height)]
         self.folder.mkdir(parents=True, exist_ok=True)
-        number = len(list(self.folder.glob("path-*.json"))) + 1
-        file = self.folder / f"path-{number}.json"
+        numbered = (self.folder / f"path-{number}.json" for number in count(1))
+        file = next(path for path in numbered if not path.exists())
         paths.write(file, cameras, self.scene)
         note = f"{len(cameras)} views: trajectory=path trajectory.path={file}"
         self.log.info(note)

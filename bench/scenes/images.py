@@ -164,6 +164,9 @@ def check_mode(image: Image.Image, path: Path) -> None:
     """Raise unless the picture has 8 bits per channel."""
     if image.mode.startswith(("I", "F")):
         raise unexpected(path, "8 bits a channel", f"mode {image.mode}")
+    # Pillow reads 16 bits of colour as 8 and says so only in the raw mode of its decoder.
+    if any(";16" in str(tile) for tile in getattr(image, "tile", ())):
+        raise unexpected(path, "8 bits a channel", "16")
 
 
 def shrink(image: Tensor, factor: int) -> Tensor:

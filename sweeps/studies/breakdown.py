@@ -9,8 +9,6 @@ from itertools import compress
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
-
 from bench.accuracy import steady_frames
 from bench.probes import OTHER
 from bench.study import Study, Variant
@@ -20,7 +18,7 @@ from bench.waits import Line, device_waits
 from reports.tables import Table, decimal, share
 from sweeps.configured import checked_settings
 from sweeps.device_lock import device_lock, on_gpu
-from sweeps.overrides import composed
+from sweeps.overrides import composed, holds
 from sweeps.studies.skips import nothing_skipped
 from sweeps.studies.variants import (
     METHOD,
@@ -140,16 +138,7 @@ def _shared(words: Sequence[str], study: Study) -> list[str]:
     """
     folders = [word for word in words if word.startswith("--config-dir=")]
     others = [composed([*folders, *settings]) for settings in study.beside.values()]
-    return [word for word in words if _holds(word, others)]
-
-
-def _holds(word: str, configs: Iterable[DictConfig]) -> bool:
-    name, missing = word.partition("=")[0].lstrip("+~"), object()
-    if "@method" in name or name == "method":
-        return False
-    return not name.startswith("method.") or all(
-        OmegaConf.select(config, name, default=missing) is not missing for config in configs
-    )
+    return [word for word in words if holds(word, others)]
 
 
 def _row(one: Rendered, trained_alike: bool) -> Row:

@@ -141,6 +141,23 @@ def test_a_run_that_is_interrupted_leaves_nothing(store, exception):
     assert list(store.folder.iterdir()) == []
 
 
+def test_what_is_left_of_a_run_that_was_half_deleted_is_replaced(store):
+    key = store.save({"seed": 0}, measurement([1.0]))
+    (store.folder / key / "record.json").unlink()
+    assert store.find(key) is None
+    assert store.save({"seed": 0}, measurement([2.0])) == key
+    assert store.rows()["value"].tolist() == [2.0]
+
+
+@pytest.mark.parametrize("wanted", ["{key}", "{start}", "{folder}/{key}"])
+def test_a_run_is_found_by_the_beginning_of_its_key_or_by_its_folder(store, wanted):
+    key = store.save({"seed": 0}, measurement([1.0]))
+    folder = store.folder.resolve()
+    assert store.whole_key(wanted.format(key=key, start=key[:5], folder=folder)) == key
+    with pytest.raises(SteerbenchError, match="0 runs"):
+        store.whole_key(f"{key}0")
+
+
 def test_of_two_processes_with_the_same_run_the_first_to_finish_stays(store):
     with store.write("abc") as late:
         (late / "record.json").write_text('{"by": "late"}')

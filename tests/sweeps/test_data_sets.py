@@ -124,7 +124,7 @@ def test_other_settings_of_the_scenes_go_through(tmp_path: Path) -> None:
     assert scale == 4
 
 
-@pytest.mark.parametrize("text", ["/data/chair", "/a b,c (d)/it's", "/x=1/${y}#2"])
+@pytest.mark.parametrize("text", ["/data/chair", "/a b,c (d)/it's", "/x=1/${y}#2", "~/Jürgen"])
 def test_any_folder_can_be_named_in_a_command(text: str) -> None:
     config = composed(["scene=blender", setting("scene.path", text)])
     assert config.scene._get_node("path")._value() == text

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 import shutil
+import struct
+import zlib
 
 import numpy as np
 import pytest
@@ -240,6 +242,24 @@ def test_picture_of_16_bits(blender_folder, log) -> None:
     Image.fromarray(deep).save(blender_folder / "train" / "r_1.png")
     with pytest.raises(SteerbenchError, match=r"r_1\.png: expected 8 bits a channel"):
         blender.load(blender_folder, log=log)
+
+
+def test_colours_of_16_bits(blender_folder, log) -> None:
+    """Pillow cannot write such a file, and reads the upper half of each number."""
+    write_deep_png(blender_folder / "train" / "r_1.png", width=8, height=6)
+    with pytest.raises(SteerbenchError, match=r"r_1\.png: expected 8 bits a channel"):
+        blender.load(blender_folder, log=log)
+
+
+def write_deep_png(path, width: int, height: int) -> None:
+    """Black RGB of 16 bits a channel."""
+    size = struct.pack(">2I5B", width, height, 16, 2, 0, 0, 0)
+    rows = zlib.compress(bytes(height * (1 + 6 * width)))
+    chunks = [
+        struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+        for name, body in ((b"IHDR", size), (b"IDAT", rows), (b"IEND", b""))
+    ]
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
 
 
 @pytest.mark.parametrize("what", ["train/r_1.png", "transforms_train.json"])
