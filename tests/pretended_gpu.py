@@ -26,7 +26,6 @@ import pytest
 import torch
 from torch import Tensor
 from torch.nn.utils import clip_grad
-from torch.optim import swa_utils
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from methods.kernels.dispatch import availability, multiplies_bf16
@@ -312,8 +311,7 @@ def pretended_gpu() -> Iterator[PretendedGpu]:
         patch.setattr(torch.__future__, "get_swap_module_params_on_conversion", lambda: True)
         patch.setattr(torch.autocast, "__init__", _autocast(torch.autocast.__init__))
         groups = "_group_tensors_by_device_and_dtype"
-        for module in (clip_grad, swa_utils):
-            patch.setattr(module, groups, _grouped(getattr(module, groups)))
+        patch.setattr(clip_grad, groups, _grouped(getattr(clip_grad, groups)))
         _patch_triton(patch)
         for cached in (availability, multiplies_bf16):
             cached.cache_clear()

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from functools import cached_property
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.optim.swa_utils import AveragedModel
 
 from bench.types import Rays
 from methods.instant_ngp.optimiser import FieldOptimiser
@@ -28,8 +28,6 @@ from methods.training.optimiser import cosine, step_at
 
 LEAST_ERROR = 1e-6
 """Added to the mean squared error of a cell: below this, one error is as good as another."""
-
-Tensors = tuple[Tensor, ...] | list[Tensor]
 
 
 class RendererTraining:
@@ -59,8 +57,7 @@ class RendererTraining:
         self.renderer, self.patches, self.options = renderer, patches, options
         self.generator = generator
         self.step, self.steps, self.seconds = 0, steps, 0.0
-        self._averaged = AveragedModel(renderer, multi_avg_fn=self._average)
-        self.mean: Renderer2d = self._averaged.module  # type: ignore[assignment]
+        self.mean = deepcopy(renderer)
 
     @cached_property
     def optimiser(self) -> torch.optim.Adam:
@@ -110,7 +107,7 @@ class RendererTraining:
     def _update(self) -> None:
         """Update the weights."""
         step_at(self.optimiser, self.rate_now(self.options.rate))
-        self._averaged.update_parameters(self.renderer)
+        self._average()
 
     def rate_now(self, first: float) -> float:
         """The learning rate of the next step, for one that starts at `first`."""
@@ -118,11 +115,13 @@ class RendererTraining:
         return first * cosine(self.step / self.steps, final, waves)
 
     @torch.no_grad()
-    def _average(self, mean: Tensors, new: Tensors, count: Tensor | int) -> None:
-        # At first over fewer steps: the earliest weights are not worth keeping. `count` says the
-        # same as `step`, but lies on the GPU.
-        keep = min(self.options.average, (1 + self.step) / (10 + self.step))
-        torch._foreach_lerp_(mean, new, 1 - keep)
+    def _average(self) -> None:
+        # At first over fewer steps: the earliest weights are not worth keeping, the first not at
+        # all. (torch's AveragedModel would make the host wait for a GPU.)
+        early = (1 + self.step) / (10 + self.step) if self.step else 0.0
+        mean: list[Tensor] = list(self.mean.parameters())
+        new: list[Tensor] = list(self.renderer.parameters())
+        torch._foreach_lerp_(mean, new, 1 - min(self.options.average, early))
 
     def watched(self) -> dict[str, Tensor]:
         """The renderer."""
@@ -141,10 +140,7 @@ class RendererTraining:
         tensors = {f"renderer.{name}": x for name, x in self.renderer.state_dict().items()}
         tensors |= checkpoint.optimiser_tensors(self.optimiser, "renderer_adam.")
         tensors |= {f"patches.{name}": x for name, x in self.patches.state().items()}
-        return tensors | {
-            "generator": self.generator.get_state(),
-            "averaged": self._averaged.n_averaged,
-        }, {}
+        return tensors | {"generator": self.generator.get_state()}, {}
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
         """See `loop.Training`."""
@@ -153,7 +149,6 @@ class RendererTraining:
         checkpoint.restore_optimiser(self.optimiser, tensors, "renderer_adam.")
         self.patches.restore(checkpoint.part(tensors, "patches."))
         self.generator.set_state(tensors["generator"].cpu())
-        self._averaged.n_averaged.copy_(tensors["averaged"])
 
 
 class JointTraining(RendererTraining):
@@ -172,7 +167,7 @@ class JointTraining(RendererTraining):
     ) -> None:
         super().__init__(renderer, patches, options, steps, generator)
         self.field, self.grid = trained.field, trained.grid
-        self.field_optimiser = FieldOptimiser(self.field, fused=True)
+        self.field_optimiser = FieldOptimiser(self.field)
         self._visits = torch.Generator(self.field.device).manual_seed(generator.initial_seed())
 
     def advance(self) -> dict[str, float]:

@@ -221,7 +221,7 @@ class PatchSource:
         numbers of both are read back together."""
         counts = first.counts
         if compacts(counts.device) or not self.pipeline.leaves_out(self.rendering):
-            return first.samples.front(counts), [None] * len(patches)
+            return first.visible(), [None] * len(patches)
         opaque = first.opaque().split([len(some) for x in chosen for some in x])
         near = [
             near_matter(_spread(patch, pixels, seen), patch.indices).flatten()
@@ -230,7 +230,7 @@ class PatchSource:
             )
         ]
         sizes, extent = _asked(near, counts)
-        return first.samples.front(counts, extent), indices_where(near, sizes)
+        return first.visible(extent), indices_where(near, sizes)
 
     def _observation(
         self, patch: Patch, chosen: list[Tensor], rendered: list[Pixels], cells: Tensor | None
