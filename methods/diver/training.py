@@ -13,7 +13,7 @@ from methods.diver.decoder import encode_directions
 from methods.diver.model import CornerModel, as_intervals
 from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.adam import AdamState, sparse_adam_
-from methods.kernels.composite import STOP, Pixels, composite, visible_counts, weights
+from methods.kernels.composite import STOP, Pixels, composite, visible, weights
 from methods.kernels.voxel_walk import Crossings, walk
 from methods.rendering.field import pad
 from methods.students.voxels import largest_weights
@@ -77,7 +77,7 @@ class DiverTraining(PixelTraining):
         crossings = walk(rays, model.voxels, backend=backend)
         sigma = self._densities(rays, crossings)
         # What lies behind an opaque surface has neither weight nor gradient.
-        counts = visible_counts(sigma, as_intervals(crossings), stop=STOP, backend=backend)
+        counts, _ = visible(sigma, as_intervals(crossings), stop=STOP, backend=backend)
         crossings = crossings.front(counts)
         count = len(crossings)
         weight = model.weights(rays, crossings)

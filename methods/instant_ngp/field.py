@@ -16,6 +16,7 @@ from methods.kernels.mlp import mlp
 from methods.kernels.spherical import CHANNELS as DIRECTION_CHANNELS
 from methods.kernels.spherical import spherical_harmonics
 from methods.rendering.field import (
+    BATCH_QUANTUM,
     CACHED_SAMPLES,
     CHUNK_SAMPLES,
     LOG_DENSITY_CLAMP,
@@ -106,7 +107,7 @@ class HashField(nn.Module):
     def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Density [S] float32 and geometry channels [S, 16] at `positions` [S, 3]."""
         weights = self._weights("density_in", "density_out")
-        parts = [self._density(part, weights) for part in positions.split(self._together)]
+        parts = [self._density(part, weights) for part in positions.split(self._part(positions))]
         sigma, geometry = (_joined(column) for column in zip(*parts, strict=True))
         return sigma, geometry
 
@@ -125,7 +126,8 @@ class HashField(nn.Module):
     def features(self, geometry: Tensor, directions: Tensor) -> Tensor:
         """Features [S, K] float32 of samples with encoded view `directions` [S, 16]."""
         weights = self._weights("feature_in", "feature_mid", "feature_out")
-        pairs = zip(geometry.split(self._together), directions.split(self._together), strict=True)
+        size = self._part(geometry)
+        pairs = zip(geometry.split(size), directions.split(size), strict=True)
         return _joined([self._features(*pair, weights) for pair in pairs])
 
     def _features(self, geometry: Tensor, directions: Tensor, weights: list[Tensor]) -> Tensor:
@@ -145,10 +147,12 @@ class HashField(nn.Module):
         networks = sum(layer.numel() for layer in self.layers.values())
         return {"hash_table": self.table.numel() * width, "field_networks": networks * width}
 
-    @property
-    def _together(self) -> int:
-        """Number of samples that go through all layers before the next ones do."""
-        return CACHED_SAMPLES if self.device.type == "cpu" else CHUNK_SAMPLES
+    def _part(self, samples: Tensor) -> int:
+        """How many of the `samples` go through all layers before the next ones do: parts of one
+        size, because a small one takes more time than its share."""
+        most = CACHED_SAMPLES if self.device.type == "cpu" else CHUNK_SAMPLES
+        parts = max(1, round(len(samples) / most))
+        return max(1, -(-len(samples) // (parts * BATCH_QUANTUM)) * BATCH_QUANTUM)
 
     @property
     def _compute_dtype(self) -> torch.dtype:

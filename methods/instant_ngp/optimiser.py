@@ -20,8 +20,8 @@ class FieldOptimiser:
     Once this exists, the field collects the gradients of its table in `grad_buffer`.
     """
 
-    def __init__(self, field: HashField, *, fused: bool = False) -> None:
-        self._field, self._fused = field, fused
+    def __init__(self, field: HashField) -> None:
+        self._field = field
         self._table = AdamState.like(field.table.detach())
         field.grad_buffer = torch.zeros_like(field.table)
 
@@ -29,7 +29,7 @@ class FieldOptimiser:
     def _networks(self) -> torch.optim.Adam:
         # Created when needed: a process's first one imports torch's compiler, which takes seconds.
         parameters = list(self._field.layers.values())
-        return torch.optim.Adam(parameters, betas=(0.9, 0.99), eps=1e-15, fused=self._fused)
+        return torch.optim.Adam(parameters, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
     def step(self, rate: float) -> None:
         """Update table and networks at learning rate `rate`."""

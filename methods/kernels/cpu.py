@@ -131,6 +131,29 @@ def prefetch(typing, array, at):
     return types.void(array, types.int64), generate
 
 
+@intrinsic
+def add_pair(typing, array, at, weight, first, second):
+    """Add weight * (first, second) to two neighbours of a flat array of float32, the first of which
+    is at place `at`: one load, sum and store instead of two, which LLVM does not see."""
+
+    def generate(context, builder, signature, values):
+        data = make_array(signature.args[0])(context, builder, values[0]).data
+        pair, word = ir.VectorType(ir.FloatType(), 2), ir.IntType(32)
+        place = builder.bitcast(builder.gep(data, [values[1]]), pair.as_pointer())
+
+        def both(one: ir.Value, other: ir.Value) -> ir.Value:
+            vector = ir.Constant(pair, ir.Undefined)
+            vector = builder.insert_element(vector, one, ir.Constant(word, 0))
+            return builder.insert_element(vector, other, ir.Constant(word, 1))
+
+        more = builder.fmul(both(values[2], values[2]), both(values[3], values[4]))
+        builder.store(builder.fadd(builder.load(place, align=4), more), place, align=4)
+        return context.get_dummy_value()
+
+    n = types.float32
+    return types.void(array, types.uint64, n, n, n), generate
+
+
 @njit(cache=True)
 def prefetch_row(array, at, count):
     """Ask for `count` numbers of a flat array of float32, from place `at` on."""

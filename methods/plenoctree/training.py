@@ -12,7 +12,7 @@ from torch.nn import functional
 from bench.types import Budget, Rays, Scene
 from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.adam import AdamState, sparse_adam_
-from methods.kernels.composite import STOP, Pixels, composite, visible_counts
+from methods.kernels.composite import STOP, Pixels, composite, visible
 from methods.kernels.voxel_shading import shade_voxels
 from methods.kernels.voxel_walk import walk
 from methods.plenoctree.octree import Octree
@@ -79,7 +79,7 @@ class OctreeTraining(PixelTraining):
         crossings = walk(rays, self.octree.voxels, backend=backend)
         with torch.no_grad():
             sigma = light.density[crossings.voxel].relu()
-            counts = visible_counts(sigma, crossings, stop=STOP, backend=backend)
+            counts, _ = visible(sigma, crossings, stop=STOP, backend=backend)
         crossings = crossings.front(counts)
         self._sigma = light.density[crossings.voxel].requires_grad_()
         self.visited = crossings.voxel

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bench.types import Rays
-from methods.kernels.composite import Extent, Pixels, composite, visible_counts
+from methods.kernels.composite import Extent, Pixels, composite, visible
 from methods.kernels.march import Occupancy, Samples, march
 from methods.rendering.compaction import compacts
 from methods.rendering.field import CHUNK_SAMPLES, Field, pad, query
@@ -16,7 +16,6 @@ from methods.rendering.march import March
 
 FRONT_SAMPLES = 8
 """Samples of a ray whose densities a CPU evaluates before it knows whether the ray goes on."""
-
 
 KEPT_THIN = 4
 """One of so many thin samples is kept; see `render_batch`."""
@@ -27,32 +26,55 @@ class FirstPass:
     """Samples of R rays, and which of them are visible before their rays end.
 
     Attributes:
-        samples: visible or not; some that are not may be missing.
+        samples: those at the front of each ray, or all of them.
         sigma: [S] their density, without gradient.
-        counts: [R] number of visible samples of each ray, which are its first ones.
+        counts: [R] number of visible ones of each ray, which are its first ones.
+        rest: the rays [Q] that go on behind these samples, and what follows on them; None: none do.
     """
 
     samples: Samples
     sigma: Tensor
     counts: Tensor
+    rest: tuple[Tensor, FirstPass] | None = None
 
     def opaque(self) -> Tensor:
         """Which rays have an opacity of more than 0, [R] bool."""
         thick = self.sigma * self.samples.delta > 0
         found = torch.zeros_like(self.counts, dtype=torch.int32)
-        return found.scatter_reduce_(0, self.samples.ray.long(), thick.int(), "amax") > 0
+        found.scatter_reduce_(0, self.samples.ray.long(), thick.int(), "amax")
+        if self.rest is not None:
+            rays, behind = self.rest
+            found.index_add_(0, rays, behind.opaque().int())
+        return found > 0
+
+    def visible(self, extent: Extent | None = None) -> Samples:
+        """The visible samples. `extent` is theirs; None: the host waits for a GPU."""
+        front = self.samples.front(self.counts, extent)
+        if self.rest is None:
+            return front
+        rays, behind = self.rest
+        return front.followed_by(behind.visible(), rays)
 
     def thinned(self, thin: float, jitter: Tensor) -> Samples:
         """The visible samples, without most of the thin ones; see `render_batch`."""
-        samples = self.samples
-        place = torch.arange(len(samples), device=jitter.device)
-        visible = place < (samples.offsets[:-1] + self.counts)[samples.ray]
-        faint = self.sigma * samples.delta < thin
         # Digits of the phase that say nothing of where in a step the samples lie.
-        turn = (jitter * 2**12).long() % KEPT_THIN
-        kept = visible & ~(faint & ((place + turn[samples.ray]) % KEPT_THIN > 0))
+        return self._in_turn(thin, (jitter * 2**12).int())
+
+    def _in_turn(self, thin: float, turn: Tensor) -> Samples:
+        """`thinned`; of the thin samples of a ray, numbered from its `turn` [R] on, every
+        `KEPT_THIN`-th is kept."""
+        samples = self.samples
+        ray = samples.ray.long()
+        place = torch.arange(len(samples), dtype=torch.int32, device=turn.device)
+        place -= samples.offsets[:-1].int()[ray]
+        faint = self.sigma * samples.delta < thin
+        kept = (place < self.counts.int()[ray]) & ~(faint & ((place + turn[ray]) % KEPT_THIN > 0))
         lengths = torch.where(faint, KEPT_THIN * samples.delta, samples.delta)
-        return samples.where(kept, lengths)
+        front = samples.where(kept, lengths)
+        if self.rest is None:
+            return front
+        rays, behind = self.rest
+        return front.followed_by(behind._in_turn(thin, (turn + self.counts.int())[rays]), rays)
 
 
 def render_batch(
@@ -74,7 +96,8 @@ def render_batch(
 
     Thin samples, which hardly show, can be left to chance: of those with an optical depth
     sigma delta below `thin`, one of `KEPT_THIN` is kept and gets the length of all. Where it lies
-    depends on `jitter`, and the expected optical depth and its gradient stay the same.
+    depends on `jitter`, and the expected optical depth and its gradient stay the same. Without
+    `jitter`, or with `hidden` samples, none are left out.
 
     Args:
         how: `window` and `faint` are ignored.
@@ -89,10 +112,8 @@ def render_batch(
         samples = march(rays, occupancy, how.step, jitter=jitter, backend=field.backend)
     else:
         first = first_pass(field, rays, occupancy, how, jitter=jitter, guide=guide)
-        if thin and jitter is not None:
-            samples = first.thinned(thin, jitter)
-        else:
-            samples = first.samples.front(first.counts)
+        kept = None if jitter is None or not thin else first.thinned(thin, jitter)
+        samples = first.visible() if kept is None else kept
     pixels = second_pass(field, rays, samples, how)
     return pixels if background is None else pixels.over(background), len(samples)
 
@@ -114,40 +135,33 @@ def first_pass(
         extent: how many samples there are; None: the host waits for a GPU to count them.
     """
     teller = field if guide is None else guide
-    if compacts(rays.origins.device):
-        samples, sigma = _front_then_rest(teller, rays, occupancy, how, jitter, field.backend)
-    else:
-        samples = march(
-            rays, occupancy, how.step, jitter=jitter, extent=extent, backend=field.backend
-        )
-        sigma = _densities(teller, samples)
-    counts = visible_counts(sigma, samples, stop=how.stop, backend=field.backend)
-    return FirstPass(samples, sigma, counts)
-
-
-def _front_then_rest(
-    teller: Field,
-    rays: Rays,
-    occupancy: Occupancy,
-    how: March,
-    jitter: Tensor | None,
-    backend: str,
-) -> tuple[Samples, Tensor]:
-    """Samples and densities of `rays`; of rays that end within `FRONT_SAMPLES`, only so many."""
-    front = march(rays, occupancy, how.step, jitter=jitter, limit=FRONT_SAMPLES, backend=backend)
-    sigma = _densities(teller, front)
-    seen = visible_counts(sigma, front, stop=how.stop, backend=backend)
-    open_ = ((front.resume >= 0) & (seen == FRONT_SAMPLES)).nonzero().squeeze(1)
-    rest = march(
+    # On a CPU most rays end soon: only those that do not are looked at further.
+    limit = FRONT_SAMPLES if compacts(rays.origins.device) else None
+    samples = march(
+        rays,
+        occupancy,
+        how.step,
+        jitter=jitter,
+        limit=limit,
+        extent=extent,
+        backend=field.backend,
+    )
+    sigma = _densities(teller, samples)
+    counts, left = visible(sigma, samples, stop=how.stop, backend=field.backend)
+    if limit is None:
+        return FirstPass(samples, sigma, counts)
+    open_ = ((samples.resume >= 0) & (left > how.stop)).nonzero().squeeze(1)
+    behind = march(
         rays.take(open_),
         occupancy,
         how.step,
         jitter=None if jitter is None else jitter[open_],
-        start=front.resume[open_],
-        backend=backend,
+        start=samples.resume[open_],
+        backend=field.backend,
     )
-    samples, order = front.followed_by(rest, open_)
-    return samples, torch.cat((sigma, _densities(teller, rest)))[order]
+    dense = _densities(teller, behind)
+    seen, _ = visible(dense, behind, stop=how.stop, front=left[open_], backend=field.backend)
+    return FirstPass(samples, sigma, counts, (open_, FirstPass(behind, dense, seen)))
 
 
 def _densities(field: Field, samples: Samples) -> Tensor:

@@ -159,27 +159,42 @@ def weights(
     Args:
         front: [R] transmittance in front of each ray's first sample; None: 1.
     """
-    _check_samples(sigma, intervals)
-    rays = len(intervals.offsets) - 1
-    if front is None:
-        front = sigma.new_ones(rays)
-    check_shape("front", front, rays)
+    front = _light(sigma, intervals, front)
     return implementation("composite", backend, sigma.device).weights(
         sigma.detach(), intervals, stop, front
     )
 
 
-def visible_counts(
-    sigma: Tensor, intervals: Intervals, *, stop: float = STOP, backend: str = "auto"
-) -> Tensor:
-    """How many samples of each ray get a weight from `composite`: [R] int64. No gradient.
+def visible(
+    sigma: Tensor,
+    intervals: Intervals,
+    *,
+    stop: float = STOP,
+    front: Tensor | None = None,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor]:
+    """How many samples of each ray get a weight from `composite`, [R] int64, and the transmittance
+    behind them, [R]. No gradient.
 
     They are the first samples of the ray; those behind have neither weight nor gradient.
+
+    Args:
+        front: [R] transmittance in front of each ray's first sample; None: 1.
     """
-    _check_samples(sigma, intervals)
-    return implementation("composite", backend, sigma.device).visible_counts(
-        sigma.detach(), intervals, stop
+    front = _light(sigma, intervals, front)
+    return implementation("composite", backend, sigma.device).visible(
+        sigma.detach(), intervals, stop, front
     )
+
+
+def _light(sigma: Tensor, intervals: Intervals, front: Tensor | None) -> Tensor:
+    """Check the samples, and the transmittance in `front` of each ray or its default."""
+    _check_samples(sigma, intervals)
+    rays = len(intervals.offsets) - 1
+    if front is None:
+        front = sigma.new_ones(rays)
+    check_shape("front", front, rays)
+    return front
 
 
 def _check_samples(sigma: Tensor, intervals: Intervals) -> None:

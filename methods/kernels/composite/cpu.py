@@ -41,12 +41,15 @@ def weights(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> 
     return weight
 
 
-def visible_counts(sigma: Tensor, intervals: Intervals, stop: float) -> Tensor:
-    """See `methods.kernels.composite.visible_counts`."""
-    delta, offsets = intervals.delta.numpy(), intervals.offsets.numpy()
-    counts = torch.empty(len(offsets) - 1, dtype=torch.int64)
-    _visible(sigma.contiguous().numpy(), delta, offsets, f32(stop), counts.numpy())
-    return counts
+def visible(
+    sigma: Tensor, intervals: Intervals, stop: float, front: Tensor
+) -> tuple[Tensor, Tensor]:
+    """See `methods.kernels.composite.visible`."""
+    counts = torch.empty(len(front), dtype=torch.int64)
+    left = torch.empty(len(front))
+    samples = (x.contiguous().numpy() for x in (sigma, intervals.delta, intervals.offsets, front))
+    _visible(*samples, f32(stop), counts.numpy(), left.numpy())
+    return counts, left
 
 
 class _Composite(torch.autograd.Function):
@@ -59,6 +62,8 @@ class _Composite(torch.autograd.Function):
             pixels = Pixels(carry.values.clone(), carry.depth_sum.clone(), carry.alpha.clone())
         front = 1 - pixels.alpha
         samples = [x.contiguous() for x in (sigma, values, t, delta, offsets)]
+        learns = any(ctx.needs_input_grad)
+        opacity = torch.empty(len(sigma) if learns else 0, dtype=torch.float64)
         _forward(
             *(x.detach().numpy() for x in samples),
             f32(stop),
@@ -66,16 +71,18 @@ class _Composite(torch.autograd.Function):
             pixels.values.numpy(),
             pixels.depth_sum.numpy(),
             pixels.alpha.numpy(),
+            opacity.numpy(),
         )
-        ctx.save_for_backward(*samples, front)
+        ctx.save_for_backward(*samples[1:], front, opacity)
         ctx.stop = stop
         return pixels.values, pixels.depth_sum, pixels.alpha
 
     @staticmethod
     def backward(ctx, grad_values, grad_depth, grad_alpha):
-        *samples, front = ctx.saved_tensors
-        grad_sigma, grad_samples = torch.zeros_like(samples[0]), torch.zeros_like(samples[1])
+        *samples, front, opacity = ctx.saved_tensors
+        grad_sigma, grad_samples = torch.zeros(len(opacity)), torch.zeros_like(samples[0])
         _backward(
+            opacity.numpy(),
             *(x.detach().numpy() for x in samples),
             f32(ctx.stop),
             front.numpy(),
@@ -95,7 +102,8 @@ def _opacity(sigma, delta):
 
 
 @njit(cache=True, parallel=True)
-def _forward(sigma, values, t, delta, offsets, stop, front, out, depth_sum, alpha):
+def _forward(sigma, values, t, delta, offsets, stop, front, out, depth_sum, alpha, opacity):
+    """`opacity` keeps the opacities of samples for `_backward`, unless it is empty."""
     rays, channels = out.shape
     for chunk in prange((rays + CHUNK - 1) // CHUNK):
         sums = np.empty(channels)
@@ -105,7 +113,10 @@ def _forward(sigma, values, t, delta, offsets, stop, front, out, depth_sum, alph
             for i in range(offsets[ray], offsets[ray + 1]):
                 if transmittance <= stop:
                     break
-                weight = transmittance * _opacity(sigma[i], delta[i])
+                own = _opacity(sigma[i], delta[i])
+                if len(opacity):
+                    opacity[i] = own
+                weight = transmittance * own
                 for channel in range(channels):
                     sums[channel] += weight * values[i, channel]
                 depth += weight * t[i]
@@ -130,19 +141,19 @@ def _weights(sigma, delta, offsets, stop, front, weight):
 
 
 @njit(cache=True, parallel=True)
-def _visible(sigma, delta, offsets, stop, counts):
+def _visible(sigma, delta, offsets, front, stop, counts, left):
     for ray in prange(len(offsets) - 1):
-        transmittance = 1.0
+        transmittance = f64(front[ray])
         i = offsets[ray]
         while i < offsets[ray + 1] and transmittance > stop:
             transmittance -= transmittance * _opacity(sigma[i], delta[i])
             i += 1
-        counts[ray] = i - offsets[ray]
+        counts[ray], left[ray] = i - offsets[ray], transmittance
 
 
 @njit(cache=True, parallel=True)
 def _backward(
-    sigma,
+    opacity,
     values,
     t,
     delta,
@@ -165,7 +176,7 @@ def _backward(
         transmittance = f64(front[ray])
         end = offsets[ray]
         while end < offsets[ray + 1] and transmittance > stop:
-            weight = transmittance * _opacity(sigma[end], delta[end])
+            weight = transmittance * opacity[end]
             gain = grad_depth[ray] * t[end] + grad_alpha[ray]
             for channel in range(channels):
                 gain += grad_out[ray, channel] * values[end, channel]
@@ -178,7 +189,7 @@ def _backward(
         transmittance = f64(front[ray])
         for i in range(offsets[ray], end):
             gain = grad_sigma[i]
-            weight = transmittance * _opacity(sigma[i], delta[i])
+            weight = transmittance * opacity[i]
             behind -= weight * gain
             transmittance -= weight
             grad_sigma[i] = delta[i] * (transmittance * gain - behind)

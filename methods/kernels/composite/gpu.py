@@ -37,13 +37,16 @@ def weights(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> 
     return weight
 
 
-def visible_counts(sigma: Tensor, intervals: Intervals, stop: float) -> Tensor:
-    """See `methods.kernels.composite.visible_counts`."""
-    check_types(torch.float32, sigma=sigma, delta=intervals.delta)
-    counts = intervals.offsets.new_zeros(len(intervals.offsets) - 1)
-    samples = (x.contiguous() for x in (sigma, intervals.delta, intervals.offsets))
-    launch(_visible, (len(counts),), *samples, stop, counts, BLOCK=BLOCK, num_warps=1)
-    return counts
+def visible(
+    sigma: Tensor, intervals: Intervals, stop: float, front: Tensor
+) -> tuple[Tensor, Tensor]:
+    """See `methods.kernels.composite.visible`."""
+    check_types(torch.float32, sigma=sigma, delta=intervals.delta, front=front)
+    counts = intervals.offsets.new_zeros(len(front))
+    left = torch.empty_like(front, memory_format=torch.contiguous_format)
+    samples = (x.contiguous() for x in (sigma, intervals.delta, intervals.offsets, front))
+    launch(_visible, (len(front),), *samples, stop, counts, left, BLOCK=BLOCK, num_warps=1)
+    return counts, left
 
 
 class _Composite(torch.autograd.Function):
@@ -177,16 +180,19 @@ def _weights(sigma, delta, offsets, front, stop, weight, BLOCK: tl.constexpr):
 
 
 @triton.jit
-def _visible(sigma, delta, offsets, stop, counts, BLOCK: tl.constexpr):
+def _visible(sigma, delta, offsets, front, stop, counts, left, BLOCK: tl.constexpr):
     ray = tl.program_id(0).to(tl.int64)
     first, end = tl.load(offsets + ray), tl.load(offsets + ray + 1)
-    light, count = 1.0, tl.zeros([], tl.int64)
+    light, count = tl.load(front + ray), tl.zeros([], tl.int64)
+    last = light
     while (first < end) & (light > stop):
         i = first + tl.arange(0, BLOCK)
-        _, lit, _, light = _block(sigma, delta, first, i, i < end, light, stop)
+        _, lit, behind, light = _block(sigma, delta, first, i, i < end, light, stop)
         count += tl.sum(lit.to(tl.int64), 0)
+        last = tl.min(tl.where(lit, behind, last), 0)
         first += BLOCK
     tl.store(counts + ray, count)
+    tl.store(left + ray, last)
 
 
 @triton.jit

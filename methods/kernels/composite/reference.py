@@ -37,13 +37,15 @@ def weights(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> 
     return weight[ray, torch.arange(len(sigma), device=sigma.device) - starts[ray]]
 
 
-def visible_counts(sigma: Tensor, intervals: Intervals, stop: float) -> Tensor:
-    """See `methods.kernels.composite.visible_counts`."""
-    present, index = _padded_rays(intervals)
-    if not len(sigma):
-        return intervals.offsets.diff()
-    tau = torch.where(present, _thickness(sigma, intervals.delta)[index], 0)
-    return ((_transmittance(tau) > stop) & present).sum(dim=1)
+def visible(
+    sigma: Tensor, intervals: Intervals, stop: float, front: Tensor
+) -> tuple[Tensor, Tensor]:
+    """See `methods.kernels.composite.visible`."""
+    slots = _padded_rays(intervals)
+    tau = _padded(_thickness(sigma, intervals.delta), slots)
+    seen = (front[:, None] * _transmittance(tau) > stop) & slots[0]
+    left = front * torch.exp(-torch.where(seen, tau, 0).sum(dim=1))
+    return seen.sum(dim=1), left
 
 
 def _padded_rays(intervals: Intervals) -> tuple[Tensor, Tensor]:

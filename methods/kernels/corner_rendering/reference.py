@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import linear
 
 from bench.types import Rays
-from methods.kernels.composite import Intervals, Pixels, composite, visible_counts, weights
+from methods.kernels.composite import Intervals, Pixels, composite, visible, weights
 from methods.kernels.corner_gather import gather, integral_along
 from methods.kernels.corner_rendering import Corners, Layers
 from methods.kernels.voxel_walk import Voxels, walk
@@ -70,7 +70,7 @@ def _together(
     pixels = composite(density, colour, intervals, stop=stop, backend=backend)
     shaded = torch.zeros(len(towards), dtype=torch.int32, device=towards.device)
     shaded.index_add_(0, ray, seen.int())
-    crossed = visible_counts(density, intervals, stop=stop, backend=backend)
+    crossed, _ = visible(density, intervals, stop=stop, backend=backend)
     return pixels.values, pixels.depth_sum, pixels.alpha, crossed.int(), shaded
 
 

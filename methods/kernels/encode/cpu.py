@@ -17,7 +17,7 @@ import torch
 from numba import get_num_threads, njit, prange
 from torch import Tensor
 
-from methods.kernels.cpu import f32, i32, pack_bf16, u32
+from methods.kernels.cpu import add_pair, f32, i32, pack_bf16, u32, u64
 from methods.kernels.encode import PRIMES, HashGrid
 
 CHUNK = 256  # samples; 256 * (8 indices + 8 weights + 8 values) * 4 bytes = 24 KiB
@@ -66,15 +66,29 @@ class _Encode(torch.autograd.Function):
     def backward(ctx, grad):
         (positions,) = ctx.saved_tensors
         grid, buffer = ctx.grid, ctx.grad_buffer
-        target = torch.zeros(grid.entries, grid.features) if buffer is None else buffer
+        added = buffer is not None and buffer.is_contiguous()
+        target = buffer if added else torch.zeros(grid.entries, grid.features)
         _scatter(
             positions.numpy(),
-            grad.T.contiguous().float().numpy(),  # so that a level reads only its own channels
+            _by_channel(grad).numpy(),
             *_level_arrays(grid),
-            target.numpy(),
+            target.view(-1).numpy(),
             get_num_threads(),
         )
-        return None, target if buffer is None else None, None, None, None
+        if buffer is None:
+            return None, target, None, None, None
+        if not added:
+            buffer += target
+        return None, None, None, None, None
+
+
+def _by_channel(grad: Tensor) -> Tensor:
+    """The gradient [N, channels] as float32 [channels, N]: so a level reads only its own."""
+    if grad.dtype != torch.bfloat16 or grad.shape[1] % 2:
+        return grad.T.contiguous().float()
+    columns = torch.empty(grad.shape[1], len(grad))
+    _widen_by_channel(_unsigned(grad.contiguous().view(torch.int32)), columns.numpy())
+    return columns
 
 
 def _unsigned(words: Tensor) -> np.ndarray:
@@ -251,31 +265,47 @@ def _encode_float(positions, table, scales, strides, offsets, out):
                 out[first + i, channel] = blended[channel, i]
 
 
-@njit(cache=True)
-def _scatter_pairs(index, weight, count, first, second, target):
-    for i in range(count):
-        for corner in range(8):
-            entry, w = index[corner * CHUNK + i], weight[corner * CHUNK + i]
-            target[entry, 0] += w * first[i]
-            target[entry, 1] += w * second[i]
+@njit(cache=True, parallel=True)
+def _widen_by_channel(words, columns):
+    """Pairs of bfloat16 [N, C / 2] as float32 [C, N]."""
+    total, pairs = words.shape
+    for chunk in prange((total + CHUNK - 1) // CHUNK):
+        for pair in range(pairs):
+            for i in range(chunk * CHUNK, min(total, (chunk + 1) * CHUNK)):
+                word = words[i, pair]
+                columns[2 * pair, i] = u32(word << u32(16)).view(np.float32)
+                columns[2 * pair + 1, i] = u32(word & u32(0xFFFF0000)).view(np.float32)
 
 
 @njit(cache=True)
-def _scatter_one(index, weight, count, grad, target):
+def _scatter_pairs(index, weight, count, first, second, target, begin):
     for i in range(count):
         for corner in range(8):
-            target[index[corner * CHUNK + i]] += weight[corner * CHUNK + i] * grad[i]
+            at = u64(corner * CHUNK) + u64(i)
+            place = u64(2) * (u64(begin) + u64(index[at]))
+            add_pair(target, place, weight[at], first[i], second[i])
+
+
+@njit(cache=True)
+def _scatter_one(index, weight, count, grad, target, begin, features):
+    for i in range(count):
+        for corner in range(8):
+            at = u64(corner * CHUNK) + u64(i)
+            place = u64(features) * u64(index[at]) + u64(begin)
+            target[place] += weight[at] * grad[i]
 
 
 @njit(cache=True, parallel=True)
 def _scatter(positions, grad, scales, strides, offsets, target, workers):
-    """Adjoint of `_encode_float`: target[corner] += weight * grad; grad is [channels, N]."""
-    total, features = len(positions), target.shape[1]
+    """Adjoint of `_encode_float`: target[corner] += weight * grad. grad is [channels, N], target
+    [entries, features] flat."""
+    total, levels = len(positions), len(scales)
+    features = len(grad) // levels
     for worker in prange(workers):
         xyz = np.empty(3 * CHUNK, np.float32)
         index, weight = np.empty(8 * CHUNK, np.uint32), np.empty(8 * CHUNK, np.float32)
         # Every workers-th level, because fine levels miss the cache and cost the most.
-        for level in range(worker, len(scales), workers):
+        for level in range(worker, levels, workers):
             begin, end = offsets[level], offsets[level + 1]
             for first in range(0, total, CHUNK):
                 count = min(CHUNK, total - first)
@@ -283,8 +313,8 @@ def _scatter(positions, grad, scales, strides, offsets, target, workers):
                 _corners(xyz, count, scales[level], strides[level], u32(end - begin), index, weight)
                 part = grad[level * features : (level + 1) * features, first : first + count]
                 if features == 2:
-                    _scatter_pairs(index, weight, count, part[0], part[1], target[begin:end])
+                    _scatter_pairs(index, weight, count, part[0], part[1], target, begin)
                 else:
                     for feature in range(features):
-                        column = target[begin:end, feature]
-                        _scatter_one(index, weight, count, part[feature], column)
+                        at = begin * features + feature
+                        _scatter_one(index, weight, count, part[feature], target, at, features)

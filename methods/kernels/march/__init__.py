@@ -163,9 +163,9 @@ class Samples(Intervals):
             longest=self.longest,  # or fewer
         )
 
-    def followed_by(self, more: Samples, rays: Tensor) -> tuple[Samples, Tensor]:
+    def followed_by(self, more: Samples, rays: Tensor) -> Samples:
         """These samples and `more`, which lie behind them on the rays `rays` [Q], in increasing
-        order. Also returns the order [S + M] in which both, one after the other, were taken."""
+        order."""
         counts, added = self.offsets.diff(), more.offsets.diff()
         together = counts.index_add(0, rays, added)
         offsets = torch.cat((counts.new_zeros(1), together.cumsum(dim=0)))
@@ -178,7 +178,7 @@ class Samples(Intervals):
         places = torch.cat([torch.arange(len(x), device=x.device) + x for x in shifts])
         order = torch.empty_like(places)
         order[places] = torch.arange(len(places), device=places.device)
-        merged = Samples(
+        return Samples(
             torch.cat((self.t, more.t))[order],
             torch.cat((self.delta, more.delta))[order],
             offsets,
@@ -186,7 +186,6 @@ class Samples(Intervals):
             torch.cat((self.positions, more.positions))[order],
             self.resume.index_copy(0, rays, more.resume),
         )
-        return merged, order
 
 
 @dataclass(frozen=True)

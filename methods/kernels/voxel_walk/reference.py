@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from bench.types import Rays
-from methods.kernels.composite import Pixels, composite, visible_counts, weights
+from methods.kernels.composite import Pixels, composite, visible, weights
 from methods.kernels.march import PARALLEL
 from methods.kernels.spherical import shade
 from methods.kernels.voxel_walk import BRICK, Crossings, Light, Voxels
@@ -43,7 +43,7 @@ def render_voxels(
     """See `methods.kernels.voxel_walk.render_voxels`."""
     crossings = walk(rays, voxels, torch.zeros_like(rays.origins[:, 0]), 3 * voxels.resolution)
     sigma = light.density[crossings.voxel.long()]
-    crossed = visible_counts(sigma, crossings, stop=stop, backend="reference")
+    crossed, _ = visible(sigma, crossings, stop=stop, backend="reference")
     weight = weights(sigma, crossings, stop=stop, backend="reference")
     shown = weight > faint
     seen = shown.nonzero().squeeze(1)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from methods.kernels.composite import Intervals, Pixels, visible_counts, weights
+from methods.kernels.composite import Intervals, Pixels, visible, weights
 from methods.kernels.composite import composite as composite_samples
 
 BACKENDS = ["reference", "cpu"]
@@ -136,7 +136,7 @@ def test_the_early_stop_changes_a_pixel_by_less_than_its_threshold(
 def test_visible_samples_are_those_with_a_gradient(backend: str) -> None:
     inputs = samples([40, 0, 1, 25])
     stop = 0.05
-    counts = visible_counts(inputs["sigma"], intervals(inputs), stop=stop, backend=backend)
+    counts, left = visible(inputs["sigma"], intervals(inputs), stop=stop, backend=backend)
     values = inputs["values"].requires_grad_()
     pixels = composite(**inputs | {"values": values}, stop=stop, backend=backend)
     (grad,) = torch.autograd.grad(pixels.values.sum(), values)
@@ -146,6 +146,32 @@ def test_visible_samples_are_those_with_a_gradient(backend: str) -> None:
         assert seen[begin : begin + count].all()
         assert not seen[begin + count : end].any()
     assert 0 < counts[0] < 40
+    torch.testing.assert_close(left, 1 - pixels.alpha, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_samples_are_visible_in_two_parts_as_in_one(backend: str) -> None:
+    """All have 20 samples; the second half lies behind what the first half lets through."""
+    whole = samples([20] * 30)
+    sigma, delta = whole["sigma"].view(30, 20) / 10, whole["delta"].view(30, 20)
+    offsets, stop = whole["offsets"] // 2, 0.45
+    count, left = visible(sigma.flatten(), intervals(whole), stop=stop, backend=backend)
+    first, between = visible(
+        sigma[:, :10].flatten(),
+        Intervals(whole["t"][:300], delta[:, :10].flatten(), offsets),
+        stop=stop,
+        backend=backend,
+    )
+    second, behind = visible(
+        sigma[:, 10:].flatten(),
+        Intervals(whole["t"][:300], delta[:, 10:].flatten(), offsets),
+        stop=stop,
+        front=between,
+        backend=backend,
+    )
+    assert 0 < (second > 0).sum() < 30
+    assert torch.equal(first + second, count)
+    torch.testing.assert_close(behind, left, rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -20,7 +20,7 @@ from bench.case import U32, largest_error
 from bench.types import Camera, Rays
 from methods.kernels import availability, corner_gather
 from methods.kernels.adam import AdamState, sparse_adam_
-from methods.kernels.composite import Intervals, composite, visible_counts, weights
+from methods.kernels.composite import Intervals, composite, visible, weights
 from methods.kernels.encode import HashGrid, encode
 from methods.kernels.gaussian_blending import blend
 from methods.kernels.gaussian_projection import Ellipses, project_gaussians
@@ -152,7 +152,7 @@ def test_behind_what_is_not_a_number_a_long_ray_has_no_weights() -> None:
     assert (found[:10] > 0).all()
     assert found[10].isnan()
     assert not found[11:].any()
-    counts = visible_counts(sigma, intervals, backend="gpu")
+    counts, _ = visible(sigma, intervals, backend="gpu")
     assert counts.tolist() == [11]
 
 

@@ -63,8 +63,8 @@ def test_thin_samples_are_kept_in_turn_and_stand_for_the_others(
     rays = cast(replace(camera, c2w=camera.c2w.to(device)))
     jitter = torch.full((len(rays.origins),), 0.5, device=device)
     first = first_pass(field, rays, occupancy, March(), jitter=jitter)
-    every = first.samples.front(first.counts)
-    depth = (first.sigma * first.samples.delta).median().item()
+    every = first.visible()
+    depth = (field.density(every.positions)[0] * every.delta).median().item()
     thick = first.thinned(0.0, jitter)
     assert torch.equal(thick.offsets, every.offsets)
     assert torch.equal(thick.delta, every.delta)
@@ -112,8 +112,9 @@ def test_rays_are_opaque_where_any_of_their_samples_is(
     camera = look_at_the_middle(0.1, 0.4)
     rays = cast(replace(camera, c2w=camera.c2w.to(device)))
     first = first_pass(field, rays, occupancy, March())
-    alpha = second_pass(field, rays, first.samples, March()).alpha
-    assert 0 < (alpha > 0).sum() < (first.samples.offsets.diff() > 0).sum()
+    samples = march(rays, occupancy, STEP)
+    alpha = second_pass(field, rays, samples, March()).alpha
+    assert 0 < (alpha > 0).sum() < (samples.offsets.diff() > 0).sum()
     assert torch.equal(first.opaque(), alpha > 0)
 
 
