@@ -85,7 +85,9 @@ class Rays:
 
     def take(self, index: Tensor | slice) -> Rays:
         """The rays at `index`."""
-        return Rays(self.origins[index], self.directions[index])
+        if isinstance(index, slice):
+            return Rays(self.origins[index], self.directions[index])
+        return Rays(self.origins.index_select(0, index), self.directions.index_select(0, index))
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,10 @@ from torch import Tensor
 RUN = 128
 """Consecutive pixels, of all pictures one after the other, that share one estimate of an error."""
 
+REFRESHED = 16
+"""Steps after which the chances of the runs follow their estimates: they change slowly, and summing
+up those of half a million runs takes longer than drawing from them."""
+
 UNSEEN = 0.1
 """Estimate for a run that no ray has met yet: about that of an untrained field."""
 
@@ -24,16 +28,21 @@ class ErrorMap:
 
     Attributes:
         errors: [T] mean squared error of each run; each new pixel counts as much as the estimate.
+        ends: [T] sum of the chances of each run and all before it, as last refreshed.
     """
 
     def __init__(self, pixels: int, device: torch.device) -> None:
         self._pixels = pixels
         self.errors = torch.full((-(-pixels // RUN),), UNSEEN, device=device)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Let the chances follow the estimates."""
+        self.ends = self.errors.sqrt().cumsum(0, dtype=torch.float64)
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Draw the numbers [count] of pixels."""
-        device = self.errors.device
-        ends = self.errors.sqrt().cumsum(0, dtype=torch.float64)
+        device, ends = self.errors.device, self.ends
         place = torch.rand(count, dtype=torch.float64, generator=generator, device=device)
         run = torch.searchsorted(ends, place * ends[-1]).clamp(max=len(ends) - 1)
         within = torch.randint(RUN, (count,), generator=generator, device=device)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench.types import Budget, Rays, Scene, Split, SteerbenchError
-from methods.instant_ngp.error_map import ErrorMap
+from methods.instant_ngp.error_map import REFRESHED, ErrorMap
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.optimiser import FieldOptimiser
 from methods.kernels.composite import Pixels, check_stop
@@ -254,6 +254,8 @@ class PixelTraining(ABC):
         pixels alike."""
         if self.errors is None:
             return self.batches.choose(self.rays, self.generator), self.rays
+        if self.step % REFRESHED == 0:
+            self.errors.refresh()
         wrong = int(self.options.by_error * self.rays)
         alike = self.batches.choose(self.rays - wrong, self.generator)
         return torch.cat((alike, self.errors.draw(wrong, self.generator))), len(alike)
@@ -279,7 +281,7 @@ class PixelTraining(ABC):
         """Random numbers, number of rays, error map."""
         tensors = {"generator": self.generator.get_state()}
         if self.errors is not None:
-            tensors["errors"] = self.errors.errors
+            tensors |= {"errors": self.errors.errors, "error_ends": self.errors.ends}
         return tensors, {"rays": self.rays}
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
@@ -289,6 +291,7 @@ class PixelTraining(ABC):
         self.generator.set_state(tensors["generator"].cpu())
         if self.errors is not None:
             self.errors.errors.copy_(tensors["errors"])
+            self.errors.ends.copy_(tensors["error_ends"])
 
 
 class FieldTraining(PixelTraining):

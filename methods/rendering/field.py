@@ -62,7 +62,7 @@ def query(field: Field, positions: Tensor, ray: Tensor, encoded: Tensor) -> tupl
     """Density [S] and features [S, K] at `positions` [S, 3] on rays `ray` [S], whose directions are
     `encoded` [R, D]; evaluated as a padded batch."""
     sigma, geometry = field.density(pad(positions))
-    values = field.features(geometry, encoded[pad(ray)])
+    values = field.features(geometry, encoded.index_select(0, pad(ray)))
     return sigma[: len(positions)], values[: len(positions)]
 
 

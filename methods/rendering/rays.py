@@ -142,7 +142,8 @@ def _evaluated(
         values = sigma.new_zeros(len(samples), field.channels)
         for part in seen.split(CACHED_SAMPLES):
             index = pad(part)
-            shown = field.features(geometry[index], encoded[samples.ray[index]])
+            ray = samples.ray.index_select(0, index)
+            shown = field.features(geometry.index_select(0, index), encoded.index_select(0, ray))
             values[part] = shown[: len(part)]
     probe.count("shaded_samples", len(seen), len(samples))
     field.count(probe, len(samples), len(seen))

@@ -135,16 +135,8 @@ class Samples(Intervals):
 
         `extent` is as for `first_of_each`.
         """
-        kept, offsets, longest = self.first_of_each(counts, extent)
-        return Samples(
-            self.t[kept],
-            self.delta[kept],
-            offsets,
-            self.ray[kept],
-            self.positions[kept],
-            torch.full_like(self.resume, -1),
-            longest=longest,
-        )
+        index, offsets, longest = self.first_of_each(counts, extent)
+        return self._chosen(index, self.delta[index], offsets, longest)
 
     def where(self, kept: Tensor, lengths: Tensor) -> Samples:
         """Only the samples that are `kept` [S], with no more to follow; `lengths` [S] replace their
@@ -153,15 +145,17 @@ class Samples(Intervals):
         ray = self.ray[index]
         # Not bincount, for which the host would wait for a GPU.
         counts = self.offsets.new_zeros(len(self.resume)).index_add_(0, ray, torch.ones_like(index))
-        return Samples(
-            self.t[index],
-            lengths[index],
-            torch.cat((counts.new_zeros(1), counts.cumsum(dim=0))),
-            ray,
-            self.positions[index],
-            torch.full_like(self.resume, -1),
-            longest=self.longest,  # or fewer
-        )
+        offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
+        return self._chosen(index, lengths[index], offsets, self.longest)  # or fewer
+
+    def _chosen(
+        self, index: Tensor, delta: Tensor, offsets: Tensor, longest: int | None
+    ) -> Samples:
+        """The samples at `index` [N], in order, with no more to follow."""
+        # A row at a time; `x[index]` goes number by number.
+        t, ray, positions = (x.index_select(0, index) for x in (self.t, self.ray, self.positions))
+        resume = torch.full_like(self.resume, -1)
+        return Samples(t, delta, offsets, ray, positions, resume, longest=longest)
 
     def followed_by(self, more: Samples, rays: Tensor) -> Samples:
         """These samples and `more`, which lie behind them on the rays `rays` [Q], in increasing
@@ -178,14 +172,15 @@ class Samples(Intervals):
         places = torch.cat([torch.arange(len(x), device=x.device) + x for x in shifts])
         order = torch.empty_like(places)
         order[places] = torch.arange(len(places), device=places.device)
-        return Samples(
-            torch.cat((self.t, more.t))[order],
-            torch.cat((self.delta, more.delta))[order],
-            offsets,
-            torch.cat((self.ray, rays.int()[more.ray]))[order],
-            torch.cat((self.positions, more.positions))[order],
-            self.resume.index_copy(0, rays, more.resume),
+        pairs = (
+            (self.t, more.t),
+            (self.delta, more.delta),
+            (self.ray, rays.int()[more.ray]),
+            (self.positions, more.positions),
         )
+        t, delta, ray, positions = (torch.cat(pair).index_select(0, order) for pair in pairs)
+        resume = self.resume.index_copy(0, rays, more.resume)
+        return Samples(t, delta, offsets, ray, positions, resume)
 
 
 @dataclass(frozen=True)

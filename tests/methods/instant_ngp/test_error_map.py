@@ -13,6 +13,7 @@ CPU = torch.device("cpu")
 def test_runs_are_drawn_in_proportion_to_the_root_of_their_error() -> None:
     chances = ErrorMap(3 * RUN, CPU)
     chances.errors.copy_(torch.tensor([0.04, 0.0, 0.36]))
+    chances.refresh()
     count = 40_000
     drawn = chances.draw(count, torch.Generator().manual_seed(0))
     shares = torch.bincount(drawn // RUN, minlength=3) / count
