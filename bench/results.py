@@ -100,8 +100,7 @@ class Store:
         """
         wanted = Path(beginning).name  # the key may be given as the path of its folder
         folders = self.folder.iterdir() if self.folder.is_dir() else ()
-        names = sorted(path.name for path in folders if path.name.startswith(wanted))
-        keys = [name for name in names if self.find(name)]
+        keys = [p.name for p in folders if p.name.startswith(wanted) and self.find(p.name)]
         if len(keys) != 1:
             raise SteerbenchError(
                 f"run {beginning!r}: expected the beginning of one key, {len(keys)} runs below "

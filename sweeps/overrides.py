@@ -150,13 +150,13 @@ def _settings(words: Sequence[str]) -> list[str]:
     groups = {path.name for folder in folders for path in folder.iterdir() if path.is_dir()}
     there = {f"{group}={name}" for group in groups for name in choices(group, words)}
     chosen = [word for word in words if word in there]
-    config: Any = composed([*(f"{FLAGS[0]}={folder}" for folder in _typed(words)), *chosen])
+    config: Any = composed([*folder_words(words), *chosen])
     return [*groups, *leaves(OmegaConf.to_container(config, resolve=False))]
 
 
 def beside(name: str, words: Sequence[str]) -> list[str]:
     """The words for the method `name` in place of that of `words`, without settings it lacks."""
-    other = composed([*(f"{FLAGS[0]}={folder}" for folder in _typed(words)), f"method={name}"])
+    other = composed([*folder_words(words), f"method={name}"])
     return [*(word for word in words if holds(word, [other])), f"method={name}"]
 
 
@@ -177,6 +177,11 @@ def leaves(config: Any, prefix: str = "") -> Iterator[str]:
             yield from leaves(value, f"{prefix}{key}.")
         elif not key.startswith("_"):
             yield f"{prefix}{key}"
+
+
+def folder_words(words: Sequence[str]) -> list[str]:
+    """The folders named in `words`, as words again."""
+    return [f"{FLAGS[0]}={folder}" for folder in _typed(words)]
 
 
 def _overrides(words: Sequence[str]) -> list[str]:

@@ -133,8 +133,8 @@ def prefetch(typing, array, at):
 
 @intrinsic
 def add_pair(typing, array, at, weight, first, second):
-    """Add weight * (first, second) to two neighbours of a flat array of float32, the first of which
-    is at place `at`: one load, sum and store instead of two, which LLVM does not see."""
+    """Add weight * (first, second) to the two numbers of a flat array of float32 from place `at`
+    on, with one load, sum and store; LLVM by itself makes two of each."""
 
     def generate(context, builder, signature, values):
         data = make_array(signature.args[0])(context, builder, values[0]).data

@@ -18,7 +18,7 @@ from bench.waits import Line, device_waits
 from reports.tables import Table, decimal, share
 from sweeps.configured import checked_settings
 from sweeps.device_lock import device_lock, on_gpu
-from sweeps.overrides import composed, holds
+from sweeps.overrides import composed, folder_words, holds
 from sweeps.studies.skips import nothing_skipped
 from sweeps.studies.variants import (
     METHOD,
@@ -136,7 +136,7 @@ def _shared(words: Sequence[str], study: Study) -> list[str]:
 
     These are all words except `method=` and settings of the method that one of the others lacks.
     """
-    folders = [word for word in words if word.startswith("--config-dir=")]
+    folders = folder_words(words)
     others = [composed([*folders, *settings]) for settings in study.beside.values()]
     return [word for word in words if holds(word, others)]
 
