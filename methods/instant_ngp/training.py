@@ -87,7 +87,7 @@ class MarchOptions(PixelOptions):
 @dataclass(frozen=True)
 class TrainingOptions(MarchOptions):
     """How to train a field in stage 1; `rate` is that of table and networks. The defaults are made
-    for a short training on a CPU (docs/log.md); `budget=full` sets what ngp_pl has.
+    for a short training on a CPU (docs/log.md); `budget=full` sets those of SteerNeRF's release.
 
     Attributes:
         grid_samples: cells visited in an update of the density grid.
