@@ -136,17 +136,18 @@ class MemoryMeter:
     Memory freed earlier, say in a training, is first returned to the system.
 
     Attributes:
-        peak_bytes: the highest peak so far.
-        last_bytes: the peak of the last region.
+        peak_bytes: the highest peak so far; 0 before the first region.
+        of_process: whether the whole process is measured, with all that other code left in it.
         source: what was read, in words. It must be reported with the figure: memory of a device, of
             a process while it renders, and of a process since its start are different things.
     """
 
     def __init__(self, device: str) -> None:
-        self.peak_bytes = self.last_bytes = 0
+        self.peak_bytes = 0
         self._device = torch.device(device)
+        self.of_process = self._device.type != "cuda"
         give_back()
-        if self._device.type == "cuda":
+        if not self.of_process:
             self.source = "peak allocated on the device while rendering"
         elif _reset_high_water_mark():
             self.source = "peak resident memory of the process while rendering"
@@ -154,17 +155,18 @@ class MemoryMeter:
             self.source = "peak resident memory of the process since it began"
 
     def __enter__(self) -> None:
-        if self._device.type == "cuda":
-            torch.cuda.reset_peak_memory_stats(self._device)
-        else:
+        if self.of_process:
             _reset_high_water_mark()
+        else:
+            torch.cuda.reset_peak_memory_stats(self._device)
 
     def __exit__(self, *exception: object) -> None:
-        if self._device.type == "cuda":
-            self.last_bytes = torch.cuda.max_memory_allocated(self._device)
-        else:
-            self.last_bytes = _process_peak_bytes()
-        self.peak_bytes = max(self.peak_bytes, self.last_bytes)
+        peak = (
+            _process_peak_bytes()
+            if self.of_process
+            else torch.cuda.max_memory_allocated(self._device)
+        )
+        self.peak_bytes = max(self.peak_bytes, peak)
 
 
 def _reset_high_water_mark() -> bool:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -104,6 +105,15 @@ class _Take:
         clock = StageClock(device, stages=task.protocol.stages)
         return cls(method, clock, MemoryMeter(device), scoring, [])
 
+    def metered(self) -> AbstractContextManager[object]:
+        """Measures the memory of a frame, if it shows there.
+
+        Scoring leaves memory in the process, which hides what later frames need: there, the frames
+        of the warm-up have been measured, or else the first frame is.
+        """
+        done = self.meter.of_process and self.meter.peak_bytes
+        return nullcontext() if done else self.meter
+
 
 def _measurement(
     take: _Take, task: Task, missing: Mapping[str, str], neighbours: Neighbours
@@ -155,7 +165,7 @@ def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
         for take in takes:
             take.method.reset()
             for index in warmup:
-                with take.clock.frame():
+                with take.meter, take.clock.frame():
                     take.method.render(steps[index].camera, take.clock)
                 progress.advance(note="warming up")
             take.method.reset()
@@ -177,12 +187,11 @@ def _draw(take: _Take, task: Task, index: int, before: int) -> None:
     if task.protocol.memory == "cold":
         method.reset()
         before = 0
-    with take.meter, take.clock.frame():
+    with take.metered(), take.clock.frame():
         frame = method.render(step.camera, take.clock)
     check_frame(frame, step.camera, method.name, index)
     phase = COLD if before < method.memory else STEADY
-    figures = {"frame": index, "phase": phase, "peak_bytes": take.meter.last_bytes}
-    figures |= _times_and_work(take.clock.frames[-1])
+    figures = {"frame": index, "phase": phase} | _times_and_work(take.clock.frames[-1])
     take.rows.append(figures | take.scoring.score(index, step, frame.rgb))
 
 
@@ -202,7 +211,7 @@ def _frame_table(table: list[dict[str, Any]], protocol: EvaluationProtocol) -> p
     touched = [name for name in map(str, frames) if name.startswith(("stage_ms.", "work."))]
     touched.sort(key=lambda name: (name.startswith("work."), name == "stage_ms.other"))
     scores = (*protocol.metric_names, "flicker")
-    columns = ["frame", "name", "phase", *scores, "frame_ms", *touched, "peak_bytes"]
+    columns = ["frame", "name", "phase", *scores, "frame_ms", *touched]
     return frames.reindex(columns=columns).fillna(dict.fromkeys(touched, 0))
 
 
@@ -221,7 +230,7 @@ def phase_rows(frames: pd.DataFrame) -> list[dict[str, Any]]:
 
     Args:
         frames: at least one, in path order. Columns: `frame`, `name` and `phase`, scores up to
-            `flicker`, times, work, memory.
+            `flicker`, times, work.
     """
     columns = list(map(str, frames))
     scores = columns[columns.index("phase") + 1 : columns.index("flicker")]

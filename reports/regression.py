@@ -47,9 +47,6 @@ LIMITS: Mapping[str, Limit] = {
 }
 """The metrics that are compared, unless a baseline has limits of its own."""
 
-LARGEST = ("peak_bytes",)
-"""Metrics whose headline is the largest figure of a frame, not the mean over frames."""
-
 
 @dataclass(frozen=True)
 class Figures:
@@ -82,7 +79,7 @@ class Figures:
         scored = steady.dropna(subset=["psnr"])
         frames = {}
         for metric in values:
-            if metric in run.frames and metric not in LARGEST:
+            if metric in run.frames:
                 averaged = scored if metric in QUALITY else steady
                 if metric == "flicker":  # the first frame of a path has none
                     averaged = averaged.dropna(subset=[metric])

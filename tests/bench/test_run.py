@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+import bench.run
 from bench.compositing import composite
 from bench.intervals import path_interval
 from bench.metrics import psnr, quantise
@@ -217,10 +218,34 @@ def test_phases_there_are_none_of_have_no_rows(run, offset_method, memory, proto
     assert set(measured.rows["phase"]) == {*phases, "all"}
 
 
-def test_every_frame_says_how_much_memory_it_needed(run, offset_method):
-    measured = run(offset_method)
-    assert measured.frames["peak_bytes"].max() == value(measured.rows, "peak_bytes")
-    assert measured.frames["peak_bytes"].min() > 0
+@pytest.mark.parametrize(
+    ("of_process", "warmup", "metered"),
+    [
+        (True, 2, ["r_0", "r_5"]),
+        (True, 0, ["r_0"]),
+        (False, 2, ["r_0", "r_5", *(f"r_{i}" for i in range(6))]),
+    ],
+)
+def test_the_memory_of_a_process_is_measured_before_scoring_leaves_any_in_it(
+    run, offset_method, monkeypatch, of_process, warmup, metered
+):
+    class Meter:
+        peak_bytes, source = 0, "memory"
+
+        def __init__(self, device):
+            self.of_process = of_process
+
+        def __enter__(self):
+            self.before = len(offset_method.calls)
+
+        def __exit__(self, *_):
+            self.peak_bytes += 1
+            regions.extend(offset_method.calls[self.before :])
+
+    regions: list[str] = []
+    monkeypatch.setattr(bench.run, "MemoryMeter", Meter)
+    run(offset_method, protocol=replace(QUICK, warmup=warmup))
+    assert regions == metered
 
 
 def test_flicker_has_a_row_in_the_phases_that_have_a_pair(run, offset_method, tiny_scene):

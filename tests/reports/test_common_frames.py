@@ -26,7 +26,6 @@ def run_of(memory: int, scene: str = "one", shift: float = 0.0) -> Run:
             "flicker": [float("nan")] + [0.1] * (len(PSNR) - 1),
             "frame_ms": [10.0 + k for k in range(len(PSNR))],
             "stage_ms.other": [10.0 + k for k in range(len(PSNR))],
-            "peak_bytes": 1.0,
         }
     )
     rows = [

@@ -181,8 +181,6 @@ def test_frames_are_those_that_the_headline_is_the_mean_of(store: Store, stored_
     figures = Figures.of(replace(run, read_frames=lambda: table))
     assert len(figures.frames["psnr"]) == 1  # the others have no truth
     assert list(figures.frames["frame_ms"].values()) == table["frame_ms"].tolist()
-    assert "peak_bytes" in figures.values
-    assert "peak_bytes" not in figures.frames  # its headline is the largest
 
 
 def test_a_metric_that_only_the_baseline_has_a_limit_for_is_kept(
