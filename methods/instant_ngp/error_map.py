@@ -16,6 +16,12 @@ UNSEEN = 0.1
 """Estimate for a run that no ray has met yet: about that of an untrained field."""
 
 
+def strata(count: int, generator: torch.Generator, device: torch.device) -> Tensor:
+    """Draw one number from each of `count` equal parts of [0, 1), in order: [count] float64."""
+    places = torch.rand(count, dtype=torch.float64, generator=generator, device=device)
+    return (places + torch.arange(count, device=device)) / count
+
+
 class ErrorMap:
     """Running estimates of the squared error of each run of pixels.
 
@@ -34,6 +40,7 @@ class ErrorMap:
     def __init__(self, pixels: int, device: torch.device) -> None:
         self._pixels = pixels
         self.errors = torch.full((-(-pixels // RUN),), UNSEEN, device=device)
+        self._met = torch.ones_like(self.errors)  # 1 for the estimate, and pixels met in this step
         self.refresh()
 
     def refresh(self) -> None:
@@ -41,13 +48,18 @@ class ErrorMap:
         self.ends = self.errors.sqrt().cumsum(0, dtype=torch.float64)
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draw the numbers [count] of pixels."""
+        """Draw the numbers [count] of pixels, in the order of their runs."""
         device, ends = self.errors.device, self.ends
-        place = torch.rand(count, dtype=torch.float64, generator=generator, device=device)
-        run = torch.searchsorted(ends, place * ends[-1]).clamp(max=len(ends) - 1)
+        places = strata(count, generator, device) * ends[-1]
+        run = torch.searchsorted(ends, places).clamp(max=len(ends) - 1)
         within = torch.randint(RUN, (count,), generator=generator, device=device)
         return (run * RUN + within).clamp(max=self._pixels - 1)
 
     def learn(self, pixels: Tensor, errors: Tensor) -> None:
         """Update the estimates with the squared `errors` [R] of some `pixels` [R]."""
-        self.errors.scatter_reduce_(0, pixels // RUN, errors, "mean")
+        run = pixels // RUN
+        self._met.index_add_(0, run, torch.ones_like(errors))
+        self.errors.index_add_(0, run, errors)
+        means = self.errors.index_select(0, run) / self._met.index_select(0, run)
+        self.errors.index_copy_(0, run, means)  # a run that appears twice has the same mean twice
+        self._met.index_fill_(0, run, 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -11,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench.types import Budget, Rays, Scene, Split, SteerbenchError
-from methods.instant_ngp.error_map import REFRESHED, ErrorMap
+from methods.instant_ngp.error_map import REFRESHED, ErrorMap, strata
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.optimiser import FieldOptimiser
 from methods.kernels.composite import Pixels, check_stop
@@ -68,20 +69,30 @@ class MarchOptions(PixelOptions):
     Attributes:
         march_step: length of a ray-marching step, in diagonals of the cube / 1024; 1 in the
             release. None: it follows from the steps of the field's training, see `suitable_step`.
+        share: samples with a gradient in a step, as a share of the budget's.
     """
 
     march_step: float | None = None
+    share: float = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.march_step is not None:
             check_step("march_step", self.march_step)
+        if not 0 < self.share <= 1:
+            raise ValueError(
+                f"share: expected more than 0, up to 1, of the samples, got {self.share}"
+            )
 
     def march(self, budget: Budget) -> March:
         """How rays are marched in a training within `budget`, and later to render its result."""
         if self.march_step is None:
             return March(step=suitable_step(budget.steps))
         return March(step=self.march_step * STEP)
+
+    def samples(self, budget: Budget) -> int:
+        """Samples with a gradient that a step within `budget` aims at."""
+        return math.ceil(self.share * budget.samples)
 
 
 @dataclass(frozen=True)
@@ -91,11 +102,12 @@ class TrainingOptions(MarchOptions):
 
     Attributes:
         grid_samples: cells visited in an update of the density grid.
-        rays: number of rays in every step; None: as many as give the samples of the budget.
+        rays: number of rays in every step; None: as many as give its `share` of the samples.
         stop: transmittance at which a ray ends.
         thin: optical depth of a sample below which only some are kept, see `render_batch`.
     """
 
+    share: float = 0.5
     grid_samples: int = 1 << 17
     rays: int | None = None
     stop: float = 3e-2
@@ -124,15 +136,20 @@ class PixelBatches:
             functional.pad(picture, (0, channels - picture.shape[-1]), value=255).flatten(0, 1)
             for picture in split.images
         ]
-        sizes = torch.tensor([len(picture) for picture in pictures])
-        self._ends = sizes.cumsum(0).to(device)  # of each picture in `_pixels`
         self._pixels = torch.cat([p.to(device) for p in pictures])  # [P, 3 or 4] uint8
+        ends = torch.tensor([len(picture) for picture in pictures]).cumsum(0)
+        self._ends = ends.to(device)  # of each picture in `_pixels`
+        self._starts = functional.pad(ends[:-1], (1, 0)).to(device)
+
         cameras = split.cameras
         self._widths = torch.tensor([c.width for c in cameras], device=device)
-        self._poses = torch.stack([c.c2w for c in cameras]).to(device)  # [N, 3, 4]
-        self._intrinsics = torch.tensor(
-            [(c.fx, c.fy, c.cx, c.cy) for c in cameras], device=device
-        )  # [N, 4]
+        poses = torch.stack([c.c2w for c in cameras])  # [N, 3, 4]
+        fx, fy, cx, cy = torch.tensor([(c.fx, c.fy, c.cx, c.cy) for c in cameras]).T[..., None]
+        # A step in the picture, to the right and down, and the ray through its upper left corner.
+        right, down = poses[:, :, 0] / fx, poses[:, :, 1] / fy
+        self._steps = right.to(device), down.to(device)  # [N, 3] each
+        self._corners = (poses[:, :, 2] - cx * right - cy * down).to(device)
+        self._centres = poses[:, :, 3].contiguous().to(device)
 
     def __len__(self) -> int:
         return len(self._pixels)
@@ -142,21 +159,24 @@ class PixelBatches:
         return self.at(self.choose(count, generator))
 
     def choose(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draw the numbers [count] of pixels, all alike."""
-        return torch.randint(len(self), (count,), generator=generator, device=self._device)
+        """Draw the numbers [count] of pixels, in order: one from each of `count` equal parts of all
+        pixels, so that neighbours are fetched together."""
+        places = strata(count, generator, self._device) * len(self)
+        return places.long().clamp(max=len(self) - 1)
 
     def at(self, pixel: Tensor) -> tuple[Rays, Tensor]:
         """The rays through the centres of the pixels with the numbers `pixel` [R], and their
         colours [R, 3 or 4] in [0, 1]."""
         view = torch.searchsorted(self._ends, pixel, right=True)
-        within = pixel - torch.where(view > 0, self._ends[view - 1], 0)
-        width = self._widths[view]
-        u, v = within % width + 0.5, within // width + 0.5
-        fx, fy, cx, cy = self._intrinsics[view].unbind(dim=-1)
-        local = torch.stack(((u - cx) / fx, (v - cy) / fy, torch.ones_like(fx)), dim=-1)
-        pose = self._poses[view]
-        directions = (pose[:, :, :3] * local[:, None]).sum(dim=-1)
-        return Rays(pose[:, :, 3].contiguous(), directions), self._pixels[pixel].float() / 255
+        width = self._widths.index_select(0, view)
+        within = pixel - self._starts.index_select(0, view)
+        row = within // width
+        column = within - row * width
+        right, down = (step.index_select(0, view) for step in self._steps)
+        directions = self._corners.index_select(0, view)
+        directions.addcmul_(column[:, None] + 0.5, right).addcmul_(row[:, None] + 0.5, down)
+        colours = self._pixels.index_select(0, pixel).float() / 255
+        return Rays(self._centres.index_select(0, view), directions), colours
 
 
 def new_grid(scene: Scene, device: torch.device) -> DensityGrid:
@@ -302,7 +322,8 @@ class FieldTraining(PixelTraining):
     def __init__(
         self, field: HashField, scene: Scene, budget: Budget, options: TrainingOptions, seed: int
     ) -> None:
-        super().__init__(scene, field.device, budget.steps, budget.samples, options, seed)
+        samples = options.samples(budget)
+        super().__init__(scene, field.device, budget.steps, samples, options, seed)
         self.field, self.grid = field, new_grid(scene, field.device)
         self.grid_samples, self.march = options.grid_samples, options.march(budget)
         self.rays = options.rays or self.rays

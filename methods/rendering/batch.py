@@ -63,18 +63,20 @@ class FirstPass:
     def _in_turn(self, thin: float, turn: Tensor) -> Samples:
         """`thinned`; of the thin samples of a ray, numbered from its `turn` [R] on, every
         `KEPT_THIN`-th is kept."""
-        samples = self.samples
-        ray = samples.ray.long()
-        place = torch.arange(len(samples), dtype=torch.int32, device=turn.device)
-        place -= samples.offsets[:-1].int()[ray]
+        samples, counts = self.samples, self.counts.int()
+        first = samples.offsets[:-1].int()
+        # Of each sample: where those of its ray that are visible end, and its turn less its number.
+        end = (first + counts).index_select(0, samples.ray)
+        shift = (turn - first).index_select(0, samples.ray)
+        number = torch.arange(len(samples), dtype=torch.int32, device=turn.device)
         faint = self.sigma * samples.delta < thin
-        kept = (place < self.counts.int()[ray]) & ~(faint & ((place + turn[ray]) % KEPT_THIN > 0))
+        kept = (number < end) & ~(faint & ((number + shift) % KEPT_THIN > 0))
         lengths = torch.where(faint, KEPT_THIN * samples.delta, samples.delta)
         front = samples.where(kept, lengths)
         if self.rest is None:
             return front
         rays, behind = self.rest
-        return front.followed_by(behind._in_turn(thin, (turn + self.counts.int())[rays]), rays)
+        return front.followed_by(behind._in_turn(thin, (turn + counts)[rays]), rays)
 
 
 def render_batch(

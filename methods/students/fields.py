@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -36,20 +35,14 @@ class FieldLessons(MarchOptions):
     Attributes:
         points: share of the steps, at the beginning, that compare densities and colours at random
             points of occupied cells with the teacher's.
-        share: samples per step, as a share of the budget's.
     """
 
     points: float = 0.5
-    share: float = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0 <= self.points <= 1:
             raise ValueError(f"points: expected a share of the steps, 0 to 1, got {self.points}")
-        if not 0 < self.share <= 1:
-            raise ValueError(
-                f"share: expected more than 0, up to 1, of the samples, got {self.share}"
-            )
 
 
 class StudentField(nn.Module, ABC):
@@ -114,7 +107,7 @@ class StudentTraining(PixelTraining):
         occupancy: Occupancy | None = None,
     ) -> None:
         device = teacher.field.device
-        samples = math.ceil(options.share * budget.samples)
+        samples = options.samples(budget)
         super().__init__(scene, device, budget.renderer_steps, samples, options, seed)
         self.field, self.teacher = field, teacher.field
         self.occupancy = occupancy or teacher.occupancy

@@ -136,24 +136,25 @@ class Samples(Intervals):
         `extent` is as for `first_of_each`.
         """
         index, offsets, longest = self.first_of_each(counts, extent)
-        return self._chosen(index, self.delta[index], offsets, longest)
+        ray = self.ray.index_select(0, index)
+        return self._chosen(index, ray, self.delta, offsets, longest)
 
     def where(self, kept: Tensor, lengths: Tensor) -> Samples:
         """Only the samples that are `kept` [S], with no more to follow; `lengths` [S] replace their
         `delta`."""
         index = kept.nonzero().squeeze(1)
-        ray = self.ray[index]
+        ray = self.ray.index_select(0, index)
         # Not bincount, for which the host would wait for a GPU.
         counts = self.offsets.new_zeros(len(self.resume)).index_add_(0, ray, torch.ones_like(index))
         offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
-        return self._chosen(index, lengths[index], offsets, self.longest)  # or fewer
+        return self._chosen(index, ray, lengths, offsets, self.longest)  # or fewer
 
     def _chosen(
-        self, index: Tensor, delta: Tensor, offsets: Tensor, longest: int | None
+        self, index: Tensor, ray: Tensor, lengths: Tensor, offsets: Tensor, longest: int | None
     ) -> Samples:
-        """The samples at `index` [N], in order, with no more to follow."""
+        """The samples at `index` [N] on the rays `ray` [N], in order, with no more to follow."""
         # A row at a time; `x[index]` goes number by number.
-        t, ray, positions = (x.index_select(0, index) for x in (self.t, self.ray, self.positions))
+        t, delta, positions = (x.index_select(0, index) for x in (self.t, lengths, self.positions))
         resume = torch.full_like(self.resume, -1)
         return Samples(t, delta, offsets, ray, positions, resume, longest=longest)
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from bench.compositing import composite
 from bench.console import ConsoleLog
 from bench.sharing import locked
+from bench.cameras import cast
 from bench.types import Budget, Log, Rays, Scene, Split, SteerbenchError
 from methods.instant_ngp.error_map import RUN, UNSEEN
 from methods.instant_ngp.field import HashField
@@ -54,6 +55,25 @@ def test_rays_go_through_the_pixels_whose_colours_they_carry(ball_scene: Scene) 
     hit = (offset - along * towards).norm(dim=-1) < 0.3
     assert torch.equal(colours[:, 3] == 1, hit)
     assert 0.1 < hit.float().mean() < 0.6
+
+
+def test_rays_of_pictures_of_several_sizes_are_those_of_their_cameras(ball_scene: Scene) -> None:
+    split = ball_scene.splits["train"]
+    whole, other = split.cameras[:2]
+    small = replace(other, width=other.width // 2, height=other.height - 3, fx=2 * other.fx)
+    images = [split.images[0], split.images[1][: small.height, : small.width]]
+    batches = PixelBatches(Split((whole, small), images, split.names[:2]), torch.device("cpu"))
+    rays, colours = batches.at(torch.arange(len(batches)))
+    expected = [cast(camera) for camera in (whole, small)]
+    torch.testing.assert_close(rays.origins, torch.cat([of.origins for of in expected]))
+    torch.testing.assert_close(rays.directions, torch.cat([of.directions for of in expected]))
+    assert torch.equal(colours, torch.cat([image.flatten(0, 1) for image in images]) / 255)
+
+
+def test_every_pixel_is_drawn_once_if_as_many_are_drawn_as_there_are(ball_scene: Scene) -> None:
+    batches = PixelBatches(ball_scene.splits["train"], torch.device("cpu"))
+    drawn = batches.choose(len(batches), torch.Generator().manual_seed(0))
+    assert torch.equal(drawn, torch.arange(len(batches)))
 
 
 def test_the_loss_falls(ball_scene: Scene) -> None:
