@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 RUN = 128
-"""Consecutive pixels, of all pictures one after the other, that share one estimate of an error."""
+"""Consecutive pixels that share one estimate of an error: with the numbers of `PixelBatches`, they
+lie in 16 rows of 8."""
 
 REFRESHED = 16
 """Steps after which the chances of the runs follow their estimates: they change slowly, and summing

@@ -22,6 +22,10 @@ from methods.rendering.occupancy import EVERY, MIN_VIEWS, STEP, DensityGrid, lea
 from methods.training import checkpoint, loop
 from methods.training.optimiser import cosine
 
+STRIP = 8
+"""Width of the strips of a picture in which its pixels are numbered, row by row: a run of
+`error_map.RUN` pixels is then about as high as it is wide, and its pixels are alike."""
+
 MIN_RAYS = 64
 """Minimum number of rays in a step."""
 
@@ -125,15 +129,23 @@ class TrainingOptions(MarchOptions):
             raise ValueError(f"thin: expected an optical depth of 0 or more, got {self.thin}")
 
 
+def _in_strips(picture: Tensor) -> Tensor:
+    """The pixels [H, W, C] of a picture as [H W, C], strip by strip, row by row."""
+    return torch.cat([strip.flatten(0, 1) for strip in picture.split(STRIP, dim=1)])
+
+
 class PixelBatches:
-    """Random pixels of the pictures of a split, with their rays."""
+    """Random pixels of the pictures of a split, with their rays.
+
+    Pixels are numbered picture by picture, strip by strip from left to right, row by row.
+    """
 
     def __init__(self, split: Split, device: torch.device) -> None:
         self._device = device
         channels = max(picture.shape[-1] for picture in split.images)
         pictures = [
             # An opaque picture among transparent ones gets an alpha of 255.
-            functional.pad(picture, (0, channels - picture.shape[-1]), value=255).flatten(0, 1)
+            functional.pad(_in_strips(picture), (0, channels - picture.shape[-1]), value=255)
             for picture in split.images
         ]
         self._pixels = torch.cat([p.to(device) for p in pictures])  # [P, 3 or 4] uint8
@@ -143,6 +155,7 @@ class PixelBatches:
 
         cameras = split.cameras
         self._widths = torch.tensor([c.width for c in cameras], device=device)
+        self._heights = torch.tensor([c.height for c in cameras], device=device)
         poses = torch.stack([c.c2w for c in cameras])  # [N, 3, 4]
         fx, fy, cx, cy = torch.tensor([(c.fx, c.fy, c.cx, c.cy) for c in cameras]).T[..., None]
         # A step in the picture, to the right and down, and the ray through its upper left corner.
@@ -168,10 +181,14 @@ class PixelBatches:
         """The rays through the centres of the pixels with the numbers `pixel` [R], and their
         colours [R, 3 or 4] in [0, 1]."""
         view = torch.searchsorted(self._ends, pixel, right=True)
-        width = self._widths.index_select(0, view)
+        width, height = (sides.index_select(0, view) for sides in (self._widths, self._heights))
         within = pixel - self._starts.index_select(0, view)
-        row = within // width
-        column = within - row * width
+        strip = within // (STRIP * height)
+        left = STRIP * strip
+        wide = (width - left).clamp(max=STRIP)  # the last strip of a picture may be narrower
+        within -= left * height
+        row = within // wide
+        column = left + within - row * wide
         right, down = (step.index_select(0, view) for step in self._steps)
         directions = self._corners.index_select(0, view)
         directions.addcmul_(column[:, None] + 0.5, right).addcmul_(row[:, None] + 0.5, down)
