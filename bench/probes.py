@@ -137,7 +137,8 @@ class MemoryMeter:
 
     Attributes:
         peak_bytes: the highest peak so far; 0 before the first region.
-        of_process: whether the whole process is measured, with all that other code left in it.
+        of_process: whether the memory of the whole process is measured, including what other code
+            keeps.
         source: what was read, in words. It must be reported with the figure: memory of a device, of
             a process while it renders, and of a process since its start are different things.
     """

@@ -105,14 +105,14 @@ class _Take:
         clock = StageClock(device, stages=task.protocol.stages)
         return cls(method, clock, MemoryMeter(device), scoring, [])
 
-    def metered(self) -> AbstractContextManager[object]:
-        """Measures the memory of a frame, if it shows there.
+    def metered(self, *, warm: bool = False) -> AbstractContextManager[object]:
+        """The meter, around a frame whose memory counts; around others, nothing.
 
-        Scoring leaves memory in the process, which hides what later frames need: there, the frames
-        of the warm-up have been measured, or else the first frame is.
+        On a GPU the frames of the path count. A process also holds what scoring has left in it: on
+        a CPU the `warm` frames before count or, without any, the first of the path.
         """
-        done = self.meter.of_process and self.meter.peak_bytes
-        return nullcontext() if done else self.meter
+        counts = warm or not self.meter.peak_bytes if self.meter.of_process else not warm
+        return self.meter if counts else nullcontext()
 
 
 def _measurement(
@@ -147,7 +147,7 @@ def _measurement(
         "scene": {"name": scene.name, "digest": scene.digest, "unit_length": scene.unit_length},
         "missing": missing,
         "neighbours": neighbours._asdict(),
-        "peak_bytes": meter.source,
+        "peak_bytes": meter.source + ", before its frames were scored" * meter.of_process,
         "error_map": f"absolute error, mean over the channels, black 0 to yellow {ERROR_RANGE}",
     }
     return Measurement(rows, frames, scoring.images, record)
@@ -162,13 +162,14 @@ def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
     warmup = spread(len(steps), task.protocol.warmup)
     frames = len(takes) * (len(warmup) + len(steps))
     with torch.no_grad(), log.progress("rendering", frames) as progress:
-        for take in takes:
-            take.method.reset()
-            for index in warmup:
-                with take.meter, take.clock.frame():
+        _reset(takes)
+        for count, index in enumerate(warmup, 1):
+            settled = count > 1 or len(warmup) == 1  # in the first, kernels may be compiled
+            for take in takes:
+                with take.metered(warm=True) if settled else nullcontext(), take.clock.frame():
                     take.method.render(steps[index].camera, take.clock)
                 progress.advance(note="warming up")
-            take.method.reset()
+        _reset(takes)
         watch = Watch()
         for index, before in enumerate(task.trajectory.preceding):
             for take in takes:
@@ -176,6 +177,11 @@ def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
                 scores = [row["psnr"] for row in take.rows if "psnr" in row]
                 progress.advance(note=f"{np.mean(scores):.2f} dB" if scores else "")
         return watch.seen()
+
+
+def _reset(takes: Sequence[_Take]) -> None:
+    for take in takes:
+        take.method.reset()
 
 
 def _draw(take: _Take, task: Task, index: int, before: int) -> None:

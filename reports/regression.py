@@ -79,7 +79,7 @@ class Figures:
         scored = steady.dropna(subset=["psnr"])
         frames = {}
         for metric in values:
-            if metric in run.frames:
+            if metric in run.frames and metric != "peak_bytes":  # older runs have that column
                 averaged = scored if metric in QUALITY else steady
                 if metric == "flicker":  # the first frame of a path has none
                     averaged = averaged.dropna(subset=[metric])

@@ -8,8 +8,8 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from bench.types import NullProbe, Scene
+from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
-from methods.instant_ngp.training import PixelBatches
 from methods.rendering.rays import render_rays
 
 SOLID = 0.5
@@ -42,7 +42,8 @@ def on_surfaces(
     found, shades = torch.cat(points), torch.cat(colours)
     if not len(found):
         return anywhere(scene, count, generator)
-    index = torch.arange(count, device=found.device) % len(found)
+    # Evenly spread, because rays are drawn picture by picture.
+    index = torch.arange(count, device=found.device) * len(found) // count
     return found[index], shades[index].clamp(0, 1)
 
 

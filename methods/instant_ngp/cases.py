@@ -24,8 +24,8 @@ from methods.kernels.march import Occupancy
 from methods.rendering.occupancy import DECAY, RESOLUTION, THRESHOLD, DensityGrid
 from methods.training import loop
 
-SAMPLES = 1 << 15
-RAYS = 3000
+SAMPLES = 1 << 14
+RAYS = 1500
 """Rays that have about `SAMPLES` samples in the hollow sphere below."""
 
 GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from methods.instant_ngp.pixels import one_from_each
+
 RUN = 128
 """Consecutive pixels that share one estimate of an error: with the numbers of `PixelBatches`, they
-lie in 16 rows of 8."""
+mostly lie in 16 rows of 8."""
 
 REFRESHED = 16
 """Steps after which the chances of the runs follow their estimates: they change slowly, and summing
@@ -15,12 +17,6 @@ up those of half a million runs takes longer than drawing from them."""
 
 UNSEEN = 0.1
 """Estimate for a run that no ray has met yet: about that of an untrained field."""
-
-
-def strata(count: int, generator: torch.Generator, device: torch.device) -> Tensor:
-    """Draw one number from each of `count` equal parts of [0, 1), in order: [count] float64."""
-    places = torch.rand(count, dtype=torch.float64, generator=generator, device=device)
-    return (places + torch.arange(count, device=device)) / count
 
 
 class ErrorMap:
@@ -41,7 +37,7 @@ class ErrorMap:
     def __init__(self, pixels: int, device: torch.device) -> None:
         self._pixels = pixels
         self.errors = torch.full((-(-pixels // RUN),), UNSEEN, device=device)
-        self._met = torch.ones_like(self.errors)  # 1 for the estimate, and pixels met in this step
+        self._met = torch.ones_like(self.errors)  # 1, plus the pixels met while `learn` runs
         self.refresh()
 
     def refresh(self) -> None:
@@ -51,7 +47,7 @@ class ErrorMap:
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Draw the numbers [count] of pixels, in the order of their runs."""
         device, ends = self.errors.device, self.ends
-        places = strata(count, generator, device) * ends[-1]
+        places = one_from_each(count, generator, device) * ends[-1]
         run = torch.searchsorted(ends, places).clamp(max=len(ends) - 1)
         within = torch.randint(RUN, (count,), generator=generator, device=device)
         return (run * RUN + within).clamp(max=self._pixels - 1)

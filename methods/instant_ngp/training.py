@@ -9,22 +9,18 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from bench.types import Budget, Rays, Scene, Split, SteerbenchError
-from methods.instant_ngp.error_map import REFRESHED, ErrorMap, strata
+from bench.types import Budget, Rays, Scene, SteerbenchError
+from methods.instant_ngp.error_map import REFRESHED, ErrorMap
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.optimiser import FieldOptimiser
+from methods.instant_ngp.pixels import PixelBatches
 from methods.kernels.composite import Pixels, check_stop
 from methods.rendering.batch import opacity_entropy, render_batch
 from methods.rendering.march import March, check_step, suitable_step
 from methods.rendering.occupancy import EVERY, MIN_VIEWS, STEP, DensityGrid, learnable_cells
 from methods.training import checkpoint, loop
 from methods.training.optimiser import cosine
-
-STRIP = 8
-"""Width of the strips of a picture in which its pixels are numbered, row by row: a run of
-`error_map.RUN` pixels is then about as high as it is wide, and its pixels are alike."""
 
 MIN_RAYS = 64
 """Minimum number of rays in a step."""
@@ -106,7 +102,7 @@ class TrainingOptions(MarchOptions):
 
     Attributes:
         grid_samples: cells visited in an update of the density grid.
-        rays: number of rays in every step; None: as many as give its `share` of the samples.
+        rays: number of rays in every step; None: as many as give `share` of the budget's samples.
         stop: transmittance at which a ray ends.
         thin: optical depth of a sample below which only some are kept, see `render_batch`.
     """
@@ -127,73 +123,6 @@ class TrainingOptions(MarchOptions):
         check_stop(self.stop)
         if not self.thin >= 0:
             raise ValueError(f"thin: expected an optical depth of 0 or more, got {self.thin}")
-
-
-def _in_strips(picture: Tensor) -> Tensor:
-    """The pixels [H, W, C] of a picture as [H W, C], strip by strip, row by row."""
-    return torch.cat([strip.flatten(0, 1) for strip in picture.split(STRIP, dim=1)])
-
-
-class PixelBatches:
-    """Random pixels of the pictures of a split, with their rays.
-
-    Pixels are numbered picture by picture, strip by strip from left to right, row by row.
-    """
-
-    def __init__(self, split: Split, device: torch.device) -> None:
-        self._device = device
-        channels = max(picture.shape[-1] for picture in split.images)
-        pictures = [
-            # An opaque picture among transparent ones gets an alpha of 255.
-            functional.pad(_in_strips(picture), (0, channels - picture.shape[-1]), value=255)
-            for picture in split.images
-        ]
-        self._pixels = torch.cat([p.to(device) for p in pictures])  # [P, 3 or 4] uint8
-        ends = torch.tensor([len(picture) for picture in pictures]).cumsum(0)
-        self._ends = ends.to(device)  # of each picture in `_pixels`
-        self._starts = functional.pad(ends[:-1], (1, 0)).to(device)
-
-        cameras = split.cameras
-        self._widths = torch.tensor([c.width for c in cameras], device=device)
-        self._heights = torch.tensor([c.height for c in cameras], device=device)
-        poses = torch.stack([c.c2w for c in cameras])  # [N, 3, 4]
-        fx, fy, cx, cy = torch.tensor([(c.fx, c.fy, c.cx, c.cy) for c in cameras]).T[..., None]
-        # A step in the picture, to the right and down, and the ray through its upper left corner.
-        right, down = poses[:, :, 0] / fx, poses[:, :, 1] / fy
-        self._steps = right.to(device), down.to(device)  # [N, 3] each
-        self._corners = (poses[:, :, 2] - cx * right - cy * down).to(device)
-        self._centres = poses[:, :, 3].contiguous().to(device)
-
-    def __len__(self) -> int:
-        return len(self._pixels)
-
-    def draw(self, count: int, generator: torch.Generator) -> tuple[Rays, Tensor]:
-        """Draw `count` rays through pixel centres, and their colours [count, 3 or 4] in [0, 1]."""
-        return self.at(self.choose(count, generator))
-
-    def choose(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draw the numbers [count] of pixels, in order: one from each of `count` equal parts of all
-        pixels, so that neighbours are fetched together."""
-        places = strata(count, generator, self._device) * len(self)
-        return places.long().clamp(max=len(self) - 1)
-
-    def at(self, pixel: Tensor) -> tuple[Rays, Tensor]:
-        """The rays through the centres of the pixels with the numbers `pixel` [R], and their
-        colours [R, 3 or 4] in [0, 1]."""
-        view = torch.searchsorted(self._ends, pixel, right=True)
-        width, height = (sides.index_select(0, view) for sides in (self._widths, self._heights))
-        within = pixel - self._starts.index_select(0, view)
-        strip = within // (STRIP * height)
-        left = STRIP * strip
-        wide = (width - left).clamp(max=STRIP)  # the last strip of a picture may be narrower
-        within -= left * height
-        row = within // wide
-        column = left + within - row * wide
-        right, down = (step.index_select(0, view) for step in self._steps)
-        directions = self._corners.index_select(0, view)
-        directions.addcmul_(column[:, None] + 0.5, right).addcmul_(row[:, None] + 0.5, down)
-        colours = self._pixels.index_select(0, pixel).float() / 255
-        return Rays(self._centres.index_select(0, view), directions), colours
 
 
 def new_grid(scene: Scene, device: torch.device) -> DensityGrid:

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from bench.study import Axis, Study, Variant, turned
 from bench.types import Budget, Probe, Rays, Scene
+from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import Setup, TrainedField
-from methods.instant_ngp.training import PixelBatches
 from methods.kernels.composite import Pixels
 from methods.kernels.march import Occupancy
 from methods.kernels.voxel_walk import render_voxels

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from bench.types import Rays, SteerbenchError
+from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
-from methods.instant_ngp.training import PixelBatches
 from methods.kernels.composite import STOP, weights
 from methods.kernels.march import Occupancy
 from methods.kernels.spherical import spherical_harmonics

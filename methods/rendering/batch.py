@@ -65,7 +65,8 @@ class FirstPass:
         `KEPT_THIN`-th is kept."""
         samples, counts = self.samples, self.counts.int()
         first = samples.offsets[:-1].int()
-        # Of each sample: where those of its ray that are visible end, and its turn less its number.
+        # For each sample: the number at which the visible samples of its ray end, and what its own
+        # number lacks to its turn.
         end = (first + counts).index_select(0, samples.ray)
         shift = (turn - first).index_select(0, samples.ray)
         number = torch.arange(len(samples), dtype=torch.int32, device=turn.device)

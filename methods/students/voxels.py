@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bench.types import Rays, check_shape
-from methods.instant_ngp.training import PixelBatches
+from methods.instant_ngp.pixels import PixelBatches
 from methods.kernels.march import Occupancy
 from methods.kernels.voxel_walk import Crossings, Voxels, walk
 

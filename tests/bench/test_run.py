@@ -221,9 +221,10 @@ def test_phases_there_are_none_of_have_no_rows(run, offset_method, memory, proto
 @pytest.mark.parametrize(
     ("of_process", "warmup", "metered"),
     [
-        (True, 2, ["r_0", "r_5"]),
         (True, 0, ["r_0"]),
-        (False, 2, ["r_0", "r_5", *(f"r_{i}" for i in range(6))]),
+        (True, 1, ["r_0"]),
+        (True, 2, ["r_5"]),  # the first frame may compile kernels
+        (False, 2, [f"r_{i}" for i in range(6)]),
     ],
 )
 def test_the_memory_of_a_process_is_measured_before_scoring_leaves_any_in_it(
@@ -357,7 +358,7 @@ def test_methods_in_turns_draw_each_frame_one_after_the_other_as_they_would_alon
 
         method.render = watched
     both = measure_in_turns([offset_method, other], task, quiet_log)
-    assert drawn == ["one"] * QUICK.warmup + ["other"] * QUICK.warmup + ["one", "other"] * 6
+    assert drawn == ["one", "other"] * (QUICK.warmup + 6)
     for method, measured in zip((offset_method, other), both, strict=True):
         assert measured.frames["psnr"].tolist() == run(method).frames["psnr"].tolist()
     assert value(both[0].rows, "psnr") > value(both[1].rows, "psnr")

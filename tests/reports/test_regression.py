@@ -177,10 +177,12 @@ def test_a_baseline_can_have_limits_of_its_own() -> None:
 
 def test_frames_are_those_that_the_headline_is_the_mean_of(store: Store, stored_run: str) -> None:
     (run,) = load(store, {stored_run: "run"})
-    table = run.frames.assign(psnr=[30.0, *[math.nan] * (len(run.frames) - 1)])
+    table = run.frames.assign(psnr=[30.0, *[math.nan] * (len(run.frames) - 1)], peak_bytes=1.0)
     figures = Figures.of(replace(run, read_frames=lambda: table))
     assert len(figures.frames["psnr"]) == 1  # the others have no truth
     assert list(figures.frames["frame_ms"].values()) == table["frame_ms"].tolist()
+    assert "peak_bytes" in figures.values
+    assert "peak_bytes" not in figures.frames  # its headline was the largest of older runs
 
 
 def test_a_metric_that_only_the_baseline_has_a_limit_for_is_kept(

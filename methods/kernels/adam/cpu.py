@@ -12,8 +12,7 @@ from torch import Tensor
 from methods.kernels.adam import BETAS, EPS, AdamState, corrections
 from methods.kernels.cpu import f32, pack_bf16, u64
 
-BLOCK = 4096  # entries that are searched for gradients before any of them is updated
-CHUNK = 16 * BLOCK
+CHUNK = 4096  # entries that are searched for gradients before any of them is updated
 
 BETA1, BETA2, EPSILON = f32(BETAS[0]), f32(BETAS[1]), f32(EPS)
 ONE = u64(1)
@@ -42,34 +41,24 @@ def _update(table, grad, first, second, steps, packed, to1, to2, rate):
     entries = len(steps)
     features = len(table) // max(entries, 1)
     for chunk in prange((entries + CHUNK - 1) // CHUNK):
-        touched = np.empty(BLOCK, np.uint32)
-        for a in range(chunk * CHUNK, min(entries, (chunk + 1) * CHUNK), BLOCK):
-            b = min(entries, a + BLOCK)
-            if features == 2:  # so that the compiler knows it
-                count = _find(a, b, 2, grad, touched)
-                _step(touched, count, 2, table, grad, first, second, steps, packed, to1, to2, rate)
-            else:
-                count = _find(a, b, features, grad, touched)
-                _step(
-                    touched,
-                    count,
-                    features,
-                    table,
-                    grad,
-                    first,
-                    second,
-                    steps,
-                    packed,
-                    to1,
-                    to2,
-                    rate,
-                )
+        a, b = chunk * CHUNK, min(entries, (chunk + 1) * CHUNK)
+        if features == 2:  # so that the compiler knows it
+            _entries(a, b, 2, table, grad, first, second, steps, packed, to1, to2, rate)
+        else:
+            _entries(a, b, features, table, grad, first, second, steps, packed, to1, to2, rate)
+
+
+@njit(inline="always")
+def _entries(a, b, features, table, grad, first, second, steps, packed, to1, to2, rate):
+    touched = np.empty(CHUNK, np.uint32)
+    count = _find(a, b, features, grad, touched)
+    _step(touched, count, features, table, grad, first, second, steps, packed, to1, to2, rate)
 
 
 @njit(inline="always")
 def _find(a, b, features, grad, touched):
     """List the entries from `a` to `b` that have a gradient; return their number. There is no
-    branch: a CPU would guess it wrong at every other entry."""
+    branch, which a CPU would mispredict at almost every other entry."""
     count = u64(0)
     for entry in range(a, b):
         found = False
@@ -85,7 +74,7 @@ def _step(touched, count, features, table, grad, first, second, steps, packed, t
     """Update the first `count` entries of `touched`."""
     last = len(to1) - 1
     for k in range(count):
-        entry = u64(touched[u64(k)])
+        entry = u64(touched[k])
         begin = entry * u64(features)
         steps[entry] += 1
         step = u64(min(steps[entry], last))

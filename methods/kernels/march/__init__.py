@@ -152,7 +152,8 @@ class Samples(Intervals):
     def _chosen(
         self, index: Tensor, ray: Tensor, lengths: Tensor, offsets: Tensor, longest: int | None
     ) -> Samples:
-        """The samples at `index` [N] on the rays `ray` [N], in order, with no more to follow."""
+        """The samples at `index` [N] on the rays `ray` [N], in order, with no more to follow;
+        `lengths` [S] are those of all samples."""
         # A row at a time; `x[index]` goes number by number.
         t, delta, positions = (x.index_select(0, index) for x in (self.t, lengths, self.positions))
         resume = torch.full_like(self.resume, -1)

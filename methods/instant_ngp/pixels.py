@@ -1,0 +1,91 @@
+"""The pixels of all training pictures, and the rays through them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from bench.types import Rays, Split
+
+STRIP = 8
+"""Width of the strips of a picture in which its pixels are numbered, row by row: a run of
+`error_map.RUN` pixels is then 8 wide and 16 high, and its pixels are alike."""
+
+
+def one_from_each(count: int, generator: torch.Generator, device: torch.device) -> Tensor:
+    """Draw one number from each of `count` equal parts of [0, 1), in order: [count] float64.
+
+    It may be rounded up to where the next part begins, be it 1.
+    """
+    places = torch.rand(count, dtype=torch.float64, generator=generator, device=device)
+    return (places + torch.arange(count, device=device)) / count
+
+
+def _in_strips(picture: Tensor) -> Tensor:
+    """The pixels [H, W, C] of a picture as [H W, C], strip by strip, row by row."""
+    return torch.cat([strip.flatten(0, 1) for strip in picture.split(STRIP, dim=1)])
+
+
+class PixelBatches:
+    """Random pixels of the pictures of a split, with their rays.
+
+    Pixels are numbered picture by picture, strip by strip from left to right, row by row.
+    """
+
+    def __init__(self, split: Split, device: torch.device) -> None:
+        self._device = device
+        channels = max(picture.shape[-1] for picture in split.images)
+        pictures = [
+            # An opaque picture among transparent ones gets an alpha of 255.
+            functional.pad(_in_strips(picture), (0, channels - picture.shape[-1]), value=255)
+            for picture in split.images
+        ]
+        self._pixels = torch.cat([p.to(device) for p in pictures])  # [P, 3 or 4] uint8
+        ends = torch.tensor([len(picture) for picture in pictures]).cumsum(0)
+        self._ends = ends.to(device)  # of each picture in `_pixels`
+        self._starts = functional.pad(ends[:-1], (1, 0)).to(device)
+
+        cameras = split.cameras
+        self._widths = torch.tensor([c.width for c in cameras], device=device)
+        self._heights = torch.tensor([c.height for c in cameras], device=device)
+        # In double precision, because corner and steps cancel for the most part.
+        poses = torch.stack([c.c2w for c in cameras]).double().cpu()  # [N, 3, 4]
+        inside = [(c.fx, c.fy, c.cx, c.cy) for c in cameras]
+        fx, fy, cx, cy = torch.tensor(inside, dtype=torch.float64).T[..., None]
+        # A step in the picture, to the right and down, and the ray through its upper left corner.
+        right, down = poses[:, :, 0] / fx, poses[:, :, 1] / fy
+        corner = poses[:, :, 2] - cx * right - cy * down
+        self._steps = [step.float().to(device) for step in (right, down)]  # [N, 3] each
+        self._corners, self._centres = (x.float().to(device) for x in (corner, poses[:, :, 3]))
+
+    def __len__(self) -> int:
+        return len(self._pixels)
+
+    def draw(self, count: int, generator: torch.Generator) -> tuple[Rays, Tensor]:
+        """Draw `count` rays through pixel centres, and their colours [count, 3 or 4] in [0, 1]."""
+        return self.at(self.choose(count, generator))
+
+    def choose(self, count: int, generator: torch.Generator) -> Tensor:
+        """Draw the numbers [count] of pixels, in order: one from each of `count` equal parts of all
+        pixels, so that neighbours are fetched together."""
+        places = one_from_each(count, generator, self._device) * len(self)
+        return places.long().clamp(max=len(self) - 1)
+
+    def at(self, pixel: Tensor) -> tuple[Rays, Tensor]:
+        """The rays through the centres of the pixels with the numbers `pixel` [R], and their
+        colours [R, 3 or 4] in [0, 1]."""
+        view = torch.searchsorted(self._ends, pixel, right=True)
+        width, height = (sides.index_select(0, view) for sides in (self._widths, self._heights))
+        within = pixel - self._starts.index_select(0, view)
+        strip = within // (STRIP * height)
+        left = STRIP * strip
+        strip_width = (width - left).clamp(max=STRIP)  # the last strip of a picture may be narrower
+        within -= left * height
+        row = within // strip_width
+        column = left + within - row * strip_width
+        right, down = (step.index_select(0, view) for step in self._steps)
+        directions = self._corners.index_select(0, view)
+        directions.addcmul_(column[:, None] + 0.5, right).addcmul_(row[:, None] + 0.5, down)
+        colours = self._pixels.index_select(0, pixel).float() / 255
+        return Rays(self._centres.index_select(0, view), directions), colours

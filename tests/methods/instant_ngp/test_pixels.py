@@ -1,0 +1,59 @@
+"""Pixels of the training pictures: which rays they have, and which are drawn."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bench.cameras import cast
+from bench.types import Scene, Split
+from methods.instant_ngp.pixels import STRIP, PixelBatches
+
+
+def test_rays_go_through_the_pixels_whose_colours_they_carry(ball_scene: Scene) -> None:
+    batches = PixelBatches(ball_scene.splits["train"], torch.device("cpu"))
+    rays, colours = batches.draw(500, torch.Generator().manual_seed(0))
+    towards = torch.nn.functional.normalize(rays.directions, dim=-1)
+    offset = 0.5 - rays.origins
+    along = (offset * towards).sum(dim=-1, keepdim=True)
+    hit = (offset - along * towards).norm(dim=-1) < 0.3
+    assert torch.equal(colours[:, 3] == 1, hit)
+    assert 0.1 < hit.float().mean() < 0.6
+
+
+def test_rays_of_pictures_of_several_sizes_are_those_of_their_cameras(ball_scene: Scene) -> None:
+    split = ball_scene.splits["train"]
+    whole, other = split.cameras[:2]
+    small = replace(other, width=other.width // 2, height=other.height - 3, fx=2 * other.fx)
+    images = [split.images[0], split.images[1][: small.height, : small.width]]
+    batches = PixelBatches(Split((whole, small), images, split.names[:2]), torch.device("cpu"))
+    rays, colours = batches.at(torch.arange(len(batches)))
+    expected = [cast(camera) for camera in (whole, small)]
+    for found, of_pixels in (
+        (rays.origins, [of.origins for of in expected]),
+        (rays.directions, [of.directions for of in expected]),
+        (colours, [image.flatten(0, 1) / 255 for image in images]),
+    ):
+        rows = zip(of_pixels, images, strict=True)
+        pictures = [pixels.reshape(*image.shape[:2], -1) for pixels, image in rows]
+        strips = [part.flatten(0, 1) for whole in pictures for part in whole.split(STRIP, dim=1)]
+        torch.testing.assert_close(found, torch.cat(strips))
+
+
+def test_every_pixel_is_drawn_once_if_as_many_are_drawn_as_there_are(ball_scene: Scene) -> None:
+    batches = PixelBatches(ball_scene.splits["train"], torch.device("cpu"))
+    drawn = batches.choose(len(batches), torch.Generator().manual_seed(0))
+    assert torch.equal(drawn, torch.arange(len(batches)))
+
+
+def test_an_opaque_picture_among_transparent_ones_is_opaque(ball_scene: Scene) -> None:
+    split = ball_scene.splits["train"]
+    images = [split.images[0][..., :3], split.images[1]]
+    mixed = Split(split.cameras[:2], images, split.names[:2])
+    _, colours = PixelBatches(mixed, torch.device("cpu")).draw(
+        4000, torch.Generator().manual_seed(0)
+    )
+    transparent = (split.images[1][..., 3] == 0).float().mean().item() / 2
+    assert (colours[:, 3] == 0).float().mean().item() == pytest.approx(transparent, abs=0.05)
