@@ -171,6 +171,15 @@ def test_the_highest_of_several_regions_is_kept():
     assert meter.peak_bytes == first
 
 
+def test_a_region_knows_nothing_of_what_was_freed_before():
+    meter, busy = MemoryMeter("cpu"), MemoryMeter("cpu")
+    with busy:
+        touch(SIZE)
+    with meter:
+        pass
+    assert meter.peak_bytes <= busy.peak_bytes - SIZE + SLACK
+
+
 def test_the_source_says_when_the_peak_includes_what_came_before(monkeypatch):
     assert "while rendering" in MemoryMeter("cpu").source
     monkeypatch.setattr(probes, "_reset_high_water_mark", lambda: False)

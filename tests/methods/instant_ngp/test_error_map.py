@@ -16,7 +16,7 @@ def test_runs_are_drawn_in_proportion_to_the_root_of_their_error() -> None:
     chances.refresh()
     drawn = chances.draw(400, torch.Generator().manual_seed(0)) // RUN
     assert torch.equal(drawn, drawn.sort().values)
-    # One from each of 400 parts, so that only the part across the border of two runs is chance.
+    # One from each of 400 equal parts, of which the first 100 belong to the first run.
     assert torch.bincount(drawn, minlength=3).tolist() == pytest.approx([100, 0, 300], abs=1)
 
 

@@ -26,11 +26,17 @@ def test_rays_go_through_the_pixels_whose_colours_they_carry(ball_scene: Scene) 
 def test_rays_of_pictures_of_several_sizes_are_those_of_their_cameras(ball_scene: Scene) -> None:
     split = ball_scene.splits["train"]
     whole, other = split.cameras[:2]
-    small = replace(other, width=other.width // 2, height=other.height - 3, fx=2 * other.fx)
-    images = [split.images[0], split.images[1][: small.height, : small.width]]
-    batches = PixelBatches(Split((whole, small), images, split.names[:2]), torch.device("cpu"))
+    # The last strip of the second picture is 3 wide; the third is narrower than a strip.
+    cameras = (
+        whole,
+        replace(other, width=2 * STRIP + 3, height=other.height - 3, fx=2 * other.fx),
+        replace(whole, width=5),
+    )
+    pairs = zip(cameras, split.images, strict=False)
+    images = [image[: camera.height, : camera.width] for camera, image in pairs]
+    batches = PixelBatches(Split(cameras, images, split.names[:3]), torch.device("cpu"))
     rays, colours = batches.at(torch.arange(len(batches)))
-    expected = [cast(camera) for camera in (whole, small)]
+    expected = [cast(camera) for camera in cameras]
     for found, of_pixels in (
         (rays.origins, [of.origins for of in expected]),
         (rays.directions, [of.directions for of in expected]),
@@ -38,7 +44,7 @@ def test_rays_of_pictures_of_several_sizes_are_those_of_their_cameras(ball_scene
     ):
         rows = zip(of_pixels, images, strict=True)
         pictures = [pixels.reshape(*image.shape[:2], -1) for pixels, image in rows]
-        strips = [part.flatten(0, 1) for whole in pictures for part in whole.split(STRIP, dim=1)]
+        strips = [strip.flatten(0, 1) for of in pictures for strip in of.split(STRIP, dim=1)]
         torch.testing.assert_close(found, torch.cat(strips))
 
 
@@ -46,6 +52,14 @@ def test_every_pixel_is_drawn_once_if_as_many_are_drawn_as_there_are(ball_scene:
     batches = PixelBatches(ball_scene.splits["train"], torch.device("cpu"))
     drawn = batches.choose(len(batches), torch.Generator().manual_seed(0))
     assert torch.equal(drawn, torch.arange(len(batches)))
+
+
+def test_any_pixel_can_be_drawn(ball_scene: Scene) -> None:
+    batches = PixelBatches(ball_scene.splits["train"], torch.device("cpu"))
+    generator = torch.Generator().manual_seed(0)
+    # Each has a chance of 1/4: one of N is missed 200 times with a probability below 1e-20 N.
+    drawn = torch.cat([batches.choose(len(batches) // 4, generator) for _ in range(200)])
+    assert len(drawn.unique()) == len(batches)
 
 
 def test_an_opaque_picture_among_transparent_ones_is_opaque(ball_scene: Scene) -> None:
