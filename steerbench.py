@@ -49,6 +49,7 @@ from reports.runs import Run, load
 from sweeps import configured, measurement
 from sweeps.catalogue import described
 from sweeps.overrides import composed
+from sweeps.publish import write
 from sweeps.score import scored
 
 __all__ = [
@@ -82,9 +83,12 @@ def run(*settings: str) -> Run:
     Raises:
         SteerbenchError: a setting is wrong, or the measurement failed.
     """
-    obtained = measurement.obtain(composed(settings), ["steerbench", "run", *settings])
+    config = composed(settings)
+    obtained = measurement.obtain(config, ["steerbench", "run", *settings])
     (found,) = load(obtained.store, {obtained.run: obtained.run})
-    return replace(found, label=str(found.facts["method"]))
+    label = str(found.facts["method"])
+    write(config, obtained.store, {obtained.run: label})
+    return replace(found, label=label)
 
 
 def fit(*settings: str) -> Method:

@@ -135,18 +135,20 @@ def score(
     log: Log,
     *,
     sequence: bool = False,
+    kept: int = PICTURES,
 ) -> Measurement:
     """Score pictures under a protocol, on whose background any alpha is composited.
 
     Args:
         facts: method, scene and so on, for the rows.
         sequence: whether the pictures are consecutive frames, so that flicker is scored, too.
+        kept: number of pictures that are kept, with their truth and error map.
 
     Raises:
         SteerbenchError: a picture cannot be read, or differs in size from its true picture.
     """
     background = torch.full((3,), BACKGROUNDS[protocol.background])
-    shown = spread(len(pairs), PICTURES)
+    shown = spread(len(pairs), kept)
     frames: list[dict[str, Any]] = []
     images: dict[str, np.ndarray] = {}
     sizes, alphas = set(), 0

@@ -20,12 +20,12 @@ from bench.run import Task, measure_in_turns
 from bench.types import Log, Method
 from reports.runs import Run, load
 from reports.tables import run_tables
-from reports.trackers import Tracker, tracker
 from sweeps import failures
 from sweeps.build import build
 from sweeps.configured import checked_settings, scene_folder, scene_of
 from sweeps.device_lock import device_lock
 from sweeps.identity import described, run_parts
+from sweeps.publish import send, write
 from sweeps.terminal import console, rich_table
 
 Asked = tuple[DictConfig, Sequence[str]]
@@ -42,19 +42,15 @@ class Obtained:
 
 
 def execute(config: DictConfig, command: Sequence[str]) -> None:
-    """Obtain the run that `config` describes, print its tables, write its page.
+    """Obtain the run that `config` describes, print its tables, write the page it asks for.
 
     Raises as `obtain` does, and if the page cannot be written.
     """
     obtained = obtain(config, command)
-    label = {obtained.run: HydraConfig.get().runtime.choices["method"]}
-    (run,) = load(obtained.store, label)
+    label = HydraConfig.get().runtime.choices["method"]
+    (run,) = load(obtained.store, {obtained.run: label})
     _show(run, explain=not obtained.measured)
-    if config.report:
-        from reports.page import write_page  # loads matplotlib, which only a page needs
-
-        page = write_page(obtained.store, label, Path(config.report))
-        ConsoleLog(Path(config.outputs)).info(f"report: {page}")
+    write(config, obtained.store, {obtained.run: label})
 
 
 def obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
@@ -95,19 +91,9 @@ def obtain_in_turns(jobs: Sequence[Asked], turns: str = "") -> list[Obtained]:
     for config, _ in jobs:
         failures.forget(Path(config.outputs), described(config))
     for one in ready:
-        if one.config.tracker:
-            _send(one, tracker(one.config.tracker), log)
+        send(one.config, one.store, one.run, one.method.name)
     measured = {one.run for one in missing}
     return [Obtained(one.store, one.run, one.run in measured) for one in ready]
-
-
-def _send(one: _Ready, to: Tracker, log: Log) -> None:
-    """Send a stored run to a tracker. Errors are only logged, because the measurement is valid."""
-    try:
-        to.send(load(one.store, {one.run: one.method.name})[0], Path(one.config.outputs))
-        log.info(f"sent to {one.config.tracker}: {one.run}")
-    except Exception as error:  # third-party library: any exception
-        log.info(f"not sent to {one.config.tracker}: {one.run}: {failures.reason(error)}")
 
 
 def stored(jobs: Sequence[Asked], turns: str = "") -> list[Obtained]:

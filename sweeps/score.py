@@ -25,6 +25,7 @@ from sweeps.build import build
 from sweeps.configured import checked_settings, scene_of
 from sweeps.names import unknown
 from sweeps.overrides import composed
+from sweeps.publish import send
 from sweeps.terminal import console, rich_table
 
 NOTHING = "-"
@@ -61,7 +62,7 @@ def scored(
 
     Args:
         truth: the folder of true pictures; None: the split of a scene.
-        words: settings as for `steerbench run`: protocol, scene, split, outputs.
+        words: settings as for `steerbench run`: protocol, scene, split, outputs, pictures, tracker.
         name: name of the method in the rows; None: the name of the folder.
         match: how pictures are matched to true ones.
         sequence: whether the pictures are consecutive frames, so that flicker is scored, too.
@@ -71,6 +72,8 @@ def scored(
     """
     config = composed(words)
     settings = checked_settings(config)
+    if config.report:
+        raise SteerbenchError("report: a page compares times, which given pictures do not have")
     log, store = ConsoleLog(Path(settings.outputs)), Store(Path(settings.outputs))
     protocol: EvaluationProtocol = build(config, "protocol")
     weights = Path(settings.weights_dir) if settings.weights_dir else None
@@ -85,7 +88,9 @@ def scored(
     facts |= dict.fromkeys(("budget", "device", "backend", "engine", "precision"), NOTHING)
     log.info(f"{len(pairs)} pictures, matched by {match}: {_example(pairs)}")
     lpips, missing = protocol.load_lpips(weights, log)
-    measurement = pictures.score(pairs, protocol, lpips, facts, log, sequence=sequence)
+    measurement = pictures.score(
+        pairs, protocol, lpips, facts, log, sequence=sequence, kept=settings.pictures
+    )
     record = measurement.record
     parts = {
         "score": digest(pictures.score),
@@ -106,7 +111,9 @@ def scored(
     key = store.key(parts)
     if store.find(key) is None:
         store.save(parts, replace(measurement, record={**record, **more}))
-    (run,) = load(store, {key: str(facts["method"])})
+    label = {key: str(facts["method"])}
+    send(config, store, key, label[key])
+    (run,) = load(store, label)
     return run
 
 

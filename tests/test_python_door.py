@@ -37,8 +37,9 @@ def test_a_run_is_measured_once_and_a_method_renders_what_it_measured(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     run = steerbench.run(*QUICK)
-    again = steerbench.run(*QUICK)
+    again = steerbench.run(*QUICK, "report=page")
     assert again.key == run.key
+    assert "ngp" in Path("page/report.md").read_text()
     assert len(steerbench.results()["run"].unique()) == 1
     assert run.label == "ngp"
     assert "| PSNR, dB" in run._repr_markdown_()

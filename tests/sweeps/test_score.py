@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from PIL import Image
 
 from bench.results import Store
+from reports.trackers import TRACKERS
 
 QUICK = ("protocol.name=quick", "protocol.lpips=[]")
 SCENE = ("scene=totem", "scene.width=24", "scene.train=2", "scene.test=3")
@@ -57,6 +59,21 @@ def test_the_same_pictures_are_the_same_run_and_others_are_another(
     assert len(set(keys)) == 3
 
 
+def test_as_many_pictures_are_kept_as_asked_for_and_the_run_is_sent_to_a_tracker(
+    steerbench, folders: tuple[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent = []
+    remembering = SimpleNamespace(package="sys", send=lambda run, outputs: sent.append(run.label))
+    monkeypatch.setitem(TRACKERS, "wandb", remembering)
+    theirs, true = folders
+    words = ("pictures=1", "tracker=wandb")
+    outcome = steerbench("score", theirs, "--truth", true, *QUICK, *words)
+    assert outcome.status == 0, outcome.err
+    kept = {path.name for path in Path("outputs/runs").glob("*/pictures/*")}
+    assert {name.split("-")[0] for name in kept} == {"0000"}
+    assert sent == ["theirs"]
+
+
 def test_pictures_of_two_programs_are_compared_where_their_truth_is_the_same(
     steerbench, folders: tuple[str, str]
 ) -> None:
@@ -89,6 +106,7 @@ def test_the_pictures_of_a_scene_are_its_own_truth(steerbench) -> None:
         (["--truth", "true", "scene=totem"], "--truth and scene=totem: expected one of them"),
         (["--truth", "nowhere"], "expected a folder"),
         (["--truth", "true", "protocol=none"], "none"),
+        (["--truth", "true", "report=page"], "report: a page compares times"),
         ([*SCENE, "split=tests"], "expected test or validation"),
     ],
 )
