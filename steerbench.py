@@ -48,8 +48,8 @@ from bench.types import (
 from reports.runs import Run, load
 from sweeps import configured, measurement
 from sweeps.catalogue import described
+from sweeps.deliver import write
 from sweeps.overrides import composed
-from sweeps.publish import write
 from sweeps.score import scored
 
 __all__ = [

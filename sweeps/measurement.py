@@ -23,9 +23,9 @@ from reports.tables import run_tables
 from sweeps import failures
 from sweeps.build import build
 from sweeps.configured import checked_settings, scene_folder, scene_of
+from sweeps.deliver import send, write
 from sweeps.device_lock import device_lock
 from sweeps.identity import described, run_parts
-from sweeps.publish import send, write
 from sweeps.terminal import console, rich_table
 
 Asked = tuple[DictConfig, Sequence[str]]

@@ -23,9 +23,9 @@ from reports.runs import Run, load
 from reports.tables import run_tables
 from sweeps.build import build
 from sweeps.configured import checked_settings, scene_of
+from sweeps.deliver import send
 from sweeps.names import unknown
 from sweeps.overrides import composed
-from sweeps.publish import send
 from sweeps.terminal import console, rich_table
 
 NOTHING = "-"
