@@ -144,7 +144,7 @@ def _evaluated(
             index = pad(part)
             ray = samples.ray.index_select(0, index)
             shown = field.features(geometry.index_select(0, index), encoded.index_select(0, ray))
-            values[part] = shown[: len(part)]
+            values.index_copy_(0, part, shown[: len(part)])
     probe.count("shaded_samples", len(seen), len(samples))
     field.count(probe, len(samples), len(seen))
     return sigma, values

@@ -99,13 +99,21 @@ class Pixels:
 
     def take(self, index: Tensor | slice) -> Pixels:
         """The rays at `index`."""
-        return Pixels(self.values[index], self.depth_sum[index], self.alpha[index])
+        if isinstance(index, slice):
+            return Pixels(*(x[index] for x in self._columns))
+        return Pixels(*(x.index_select(0, index) for x in self._columns))
 
     def put(self, index: Tensor | slice, pixels: Pixels) -> None:
         """Replace, in place, the rays at `index`."""
-        self.values[index] = pixels.values
-        self.depth_sum[index] = pixels.depth_sum
-        self.alpha[index] = pixels.alpha
+        for column, new in zip(self._columns, pixels._columns, strict=True):
+            if isinstance(index, slice):
+                column[index] = new
+            else:  # a row at a time; `x[index]` goes number by number
+                column.index_copy_(0, index, new)
+
+    @property
+    def _columns(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self.values, self.depth_sum, self.alpha
 
     def over(self, background: Tensor) -> Pixels:
         """Composite the rays onto a `background` [K] or [R, K], whose weight is 1 - alpha."""

@@ -30,8 +30,10 @@ def surface_points(
     known = kept_indices(there)
     probe.count("surface_samples", len(known), view.full.width * view.full.height)
     field.count(probe, len(known), len(known))
-    pixels = centres(cells, view.low.width, scale).flatten(0, 1)[known]
-    points = unproject(view.full, pixels, torch.where(there, depth.flatten(), 0)[known])
+    # A row at a time; `x[index]` goes number by number.
+    pixels = centres(cells, view.low.width, scale).flatten(0, 1).index_select(0, known)
+    near = torch.where(there, depth.flatten(), 0).index_select(0, known)
+    points = unproject(view.full, pixels, near)
     # The pixels of a cell share the view direction of its middle.
     middles = cast(view.low, centres(cells, view.low.width, 1)[:, 0])
     encoded = field.encode_directions(middles.directions)
@@ -43,5 +45,5 @@ def surface_points(
         found.append(torch.cat((values, alpha[:, None]), dim=1))
     index = torch.full(depth.shape, -1, dtype=torch.int32, device=depth.device)
     number = torch.arange(len(points), dtype=torch.int32, device=depth.device)
-    index.view(-1)[known] = torch.where(there[known], number, -1)
+    index.view(-1).index_copy_(0, known, torch.where(there.index_select(0, known), number, -1))
     return Points(torch.cat(found), index)
