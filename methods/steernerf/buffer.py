@@ -68,14 +68,14 @@ class Cloud:
         else:
             clear = (alpha > SPLAT_ALPHA) & depth.isfinite()
             source = kept_indices(clear)
-            depth = torch.where(clear, depth, torch.nan)[source]
+            depth = torch.where(clear, depth, torch.nan).index_select(0, source)
         camera = frame.camera
-        centres = pixel_grid(camera.width, camera.height, alpha.device)[source]
+        centres = pixel_grid(camera.width, camera.height, alpha.device).index_select(0, source)
         if how.centres == "paper":
             centres = centres - 0.5
-        values = frame.values.reshape(len(alpha), -1)[source]
+        values = frame.values.reshape(len(alpha), -1).index_select(0, source)
         points = unproject(camera, centres, depth)  # Eq. 6
-        return cls(camera, source, points, values, alpha[source])
+        return cls(camera, source, points, values, alpha.index_select(0, source))
 
     def expected(self) -> Cloud:
         """Turn a cloud with depths sum w t into one with sum w t / sum w, without faint points."""

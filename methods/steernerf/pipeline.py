@@ -231,7 +231,7 @@ def _finished(camera: Camera, picture: Tensor, frame: FeatureFrame, scale: int) 
     """The frame for the harness, with depth and opacity of the nearest low-resolution pixel."""
     size = slice(0, camera.height), slice(0, camera.width)
     depth, alpha = (
-        image.repeat_interleave(scale, 0).repeat_interleave(scale, 1)[size]
+        image.repeat_interleave(scale, 1).repeat_interleave(scale, 0)[size]
         for image in (frame.depth, frame.alpha)
     )
     return Frame(picture[size], depth, alpha)

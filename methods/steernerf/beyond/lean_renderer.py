@@ -161,7 +161,8 @@ class LeanRenderer(Renderer2d):
         background."""
         size, background = observations[0].frame.alpha.shape, observations[0].background[:3]
         shown = [o.cells for o in observations]
-        return paint(shown, size, self.scale, less + background, background)
+        pixels = less.flatten(1) + background.repeat(self.scale**2)  # a cell at a time
+        return paint(shown, size, self.scale, pixels.view_as(less), background)
 
     @torch.no_grad()
     def _start_from(self, pretrained: Mapping[str, Tensor]) -> None:

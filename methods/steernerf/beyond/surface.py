@@ -8,7 +8,7 @@ from torch import Tensor
 from bench.cameras import cast, unproject
 from bench.types import Probe
 from methods.rendering.compaction import kept_indices
-from methods.rendering.field import Field, query
+from methods.rendering.field import CACHED_SAMPLES, Field, query
 from methods.rendering.occupancy import STEP
 from methods.steernerf.beyond.cells import centres
 from methods.steernerf.renderer import Points
@@ -16,9 +16,6 @@ from methods.steernerf.view import View
 
 LAYER = 4 * STEP
 """Thickness, in scene units, of the layer that a single sample of the surface stands for."""
-
-PIECE = 1 << 16
-"""Pixels that a CPU evaluates together: few enough to stay in the cache."""
 
 
 def surface_points(
@@ -37,7 +34,7 @@ def surface_points(
     # The pixels of a cell share the view direction of its middle.
     middles = cast(view.low, centres(cells, view.low.width, 1)[:, 0])
     encoded = field.encode_directions(middles.directions)
-    size = PIECE if depth.device.type == "cpu" else max(len(points), 1)
+    size = CACHED_SAMPLES if depth.device.type == "cpu" else max(len(points), 1)
     found = []
     for some, cell in zip(points.split(size), (known // scale**2).split(size), strict=True):
         sigma, values = query(field, some, cell, encoded)
