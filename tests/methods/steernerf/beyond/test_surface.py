@@ -68,7 +68,8 @@ def test_a_pipeline_that_has_no_use_for_it_has_none() -> None:
 
 @pytest.fixture
 def small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("methods.steernerf.beyond.surface.CACHED_SAMPLES", 50)  # the last of four is shorter
+    # The last of four is shorter.
+    monkeypatch.setattr("methods.steernerf.beyond.surface.CACHED_SAMPLES", 50)
 
 
 def test_in_pieces_it_is_the_same_and_the_same_work(
