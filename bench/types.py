@@ -145,8 +145,8 @@ class Budget:
     Attributes:
         name: as shown in result rows.
         steps: optimiser steps of the (pre-)training of a field.
-        samples: target number of field samples with a gradient per step, or of which a training
-            takes a share; it sets the ray count.
+        samples: target number of field samples with a gradient per step; it sets the ray count. A
+            training may take a share of it.
         frames: at most this many test frames are rendered and scored (0: all).
         renderer_steps: optimiser steps of the second stage, for methods with a 2D renderer.
         seeds: `steerbench paper` repeats a measurement with this many seeds, 0 to seeds - 1.
