@@ -19,7 +19,7 @@ RUN = [
     *("-m", "method=ngp,steernerf_lean,steernerf", "trajectory=orbit"),
     *("scene=cloud", "scene.width=64", "scene.train=24", "scene.test=6"),
     *("budget=tiny", "budget.steps=200", "budget.samples=16384", "budget.renderer_steps=100"),
-    *("budget.frames=0", "sizing.field_step=4", "sizing.refined_step=4", "sizing.step=4"),
+    *("budget.frames=0", "sizing.field_step=4", "sizing.lean_step=4", "sizing.step=4"),
     "seed=0,1,2",
 ]
 METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "work.samples", "work.products")

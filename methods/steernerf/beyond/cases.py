@@ -70,7 +70,7 @@ def cases() -> list[Case]:
 @cache
 def _renderer() -> LeanRenderer:
     """The lean renderer with the weights that come with the package."""
-    return LeanRenderer(3, 2, 4).requires_grad_(False)
+    return LeanRenderer(3, 1, 4).requires_grad_(False)
 
 
 def _placed(rows: Tensor, device: str) -> Inputs:

@@ -25,11 +25,10 @@ PRETRAINED = Path(__file__).parent / "weights" / "lean.safetensors"
 PRETRAINED_GROUPS = (
     ("present", 1, 4),
     ("preceding 0", 16, 4),
-    ("preceding 1", 16, 4),
     ("history", 16, 4),
     ("surface", 16, 4),
 )
-"""The inputs that those weights expect, as in `Layout.groups`: K = 3, L = 2, s = 4."""
+"""The inputs that those weights expect, as in `Layout.groups`: K = 3, L = 1, s = 4."""
 
 PRETRAINED_SCALE = 4
 
@@ -166,7 +165,7 @@ class LeanRenderer(Renderer2d):
 
     @torch.no_grad()
     def _start_from(self, pretrained: Mapping[str, Tensor]) -> None:
-        """Copy the weights of a renderer with the same trunk that was trained at K = 3, L = 2.
+        """Copy the weights of a renderer with the same trunk that was trained at K = 3, L = 1.
 
         Weights for features beyond RGB, and for frames that it did not have, stay as they are.
 

@@ -102,8 +102,8 @@ class MotionOptions:
     degrees: tuple[float, float] = (0.0, 2.5)
     length: int = 4
     least: int = 0
-    pool: int = 32
-    uses: int = 32
+    pool: int = 12
+    uses: int = 16
     longer: float = 0.75
 
     def __post_init__(self) -> None:
