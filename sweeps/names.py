@@ -11,6 +11,7 @@ RENAMED = {
     "command=generic": "steerbench pretrain",
     "budget=generic": "budget=pretrain",
     "method=steernerf_paper": "method=steernerf",
+    "sizing.refined_step": "sizing.lean_step",
     "method=steernerf_frozen": "method=steernerf_lean_frozen",
     "method=steernerf_k3": "method=steernerf_lean_k3",
     "method=steernerf_untaught": "method=steernerf_lean with method.rendering.step or .stop",

@@ -56,6 +56,7 @@ class Size:
 
 
 LEAN = Layout(6, 2, 4, True, True)
+"""That of the lean renderer, but with L = 2, the harder case."""
 
 SIZES = {
     "no cell": Size(3, 4, LEAN, share=0.0),

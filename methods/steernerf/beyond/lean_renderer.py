@@ -30,6 +30,8 @@ PRETRAINED_GROUPS = (
 )
 """The inputs that those weights expect, as in `Layout.groups`: K = 3, L = 1, s = 4."""
 
+PRETRAINED_WIDTH = sum(slots * features for _, slots, features in PRETRAINED_GROUPS)
+
 PRETRAINED_SCALE = 4
 
 
@@ -183,6 +185,8 @@ class LeanRenderer(Renderer2d):
         try:
             if weights.keys() != pretrained.keys() - unused or self.scale != PRETRAINED_SCALE:
                 raise RuntimeError("other layers, or another scale")
+            if (inputs := pretrained["enter.weight"].shape[1]) != PRETRAINED_WIDTH:
+                raise RuntimeError(f"{inputs} inputs instead of {PRETRAINED_WIDTH}")
             for name, weight in weights.items():
                 new = pretrained[name].float()
                 if name == "enter.weight":

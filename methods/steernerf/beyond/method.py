@@ -33,7 +33,7 @@ def _together() -> list[Variant]:
     low = [*turned("step", "method.rendering.step", (1,)), *ranges("window", (0.03,))]
     return [
         *(_both(share, other) for share in _refined(SHARES) for other in low),
-        *(_both(share, step) for share in _refined(SHARES[1:]) for step in _refined_steps((2,))),
+        *(_both(share, step) for share in _refined(SHARES[1:]) for step in _refined_steps((1,))),
     ]
 
 
@@ -46,12 +46,13 @@ class SteerNerfLean(SteerNerf):
             **STUDY.knobs,
             "skips": not_skipped(SKIPS),
             "step length": turned("step", "method.rendering.step", (1, 1.5, 3, 4)),
-            "refined step length": _refined_steps((1.5, 2, 3)),
+            "refined step length": _refined_steps((1, 1.5, 3)),
             "refined share": _refined((0, 0.03, 0.06, 0.25, 0.5, 1)),
             "two knobs": _together(),
         },
         trained={
             **STUDY.trained,
+            "L, trained": turned("L", "method.model.frames", (0, 2, 3)),
             "s, trained": turned(
                 "s", "method.model.scale", (2, 4, 8), "method.renderer.init=scratch"
             ),

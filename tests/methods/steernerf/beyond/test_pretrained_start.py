@@ -106,3 +106,10 @@ def test_pretrained_weights_of_another_shape_are_refused(other: dict[str, int]) 
         ValueError, match=r"renderer\.init=pretrained: .* use renderer\.init=scratch"
     ):
         renderer._start_from(pretrained().network.state_dict())
+
+
+def test_weights_that_were_pretrained_with_other_inputs_are_refused() -> None:
+    """Their columns would be taken for others."""
+    more = new_renderer(3, 2, 4)
+    with pytest.raises(ValueError, match="260 inputs instead of 196"):
+        new_renderer(3, 1, 4)._start_from(more.network.state_dict())

@@ -24,7 +24,7 @@ from methods.training import checkpoint
 from tests.methods.models import small_model
 from tests.methods.trainings import TEACHER
 
-MODEL = small_model(channels=3, step=4.0)
+MODEL = small_model(channels=3, frames=1, step=4.0)
 JOINT = JointOptions(patch=4, motion=MotionOptions(pool=2, length=2))
 BUDGET = Budget("test", steps=40, samples=1024, renderer_steps=8)
 RENDERER = partial(LeanRenderer, width=8, blocks=1)
@@ -50,7 +50,7 @@ def test_the_weights_of_several_scenes_are_what_a_renderer_starts_from(
         assert written[name].isfinite().all(), name
         assert written[name].any(), name  # the last three were 0 before the training
     monkeypatch.setattr(lean_renderer, "PRETRAINED", output)
-    started = RENDERER(3, 2, 4)
+    started = RENDERER(3, 1, 4)
     assert started.network.state_dict().keys() == written.keys()
     for name, weight in started.network.state_dict().items():
         assert torch.equal(weight, written[name].float()), name
