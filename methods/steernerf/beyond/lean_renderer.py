@@ -22,20 +22,8 @@ from methods.steernerf.renderer import UNWATCHED, Drawing, Observation, Renderer
 PRETRAINED = Path(__file__).parent / "weights" / "lean.safetensors"
 """Weights trained on other scenes, by `steerbench pretrain`."""
 
-PRETRAINED_GROUPS = (
-    ("present", 1, 4),
-    ("preceding 0", 16, 4),
-    ("history", 16, 4),
-    ("surface", 16, 4),
-)
-"""The inputs that those weights expect, as in `Layout.groups`: K = 3, L = 1, s = 4."""
-
-PRETRAINED_WIDTH = sum(slots * features for _, slots, features in PRETRAINED_GROUPS)
-
-PRETRAINED_SCALE = 4
-
-
-Groups = Sequence[tuple[str, int, int]]
+PRETRAINED_LAYOUT = Layout(channels=3, frames=1, scale=4, history=True, surface=True)
+"""The inputs that those weights expect."""
 
 
 class LeanRenderer(Renderer2d):
@@ -178,15 +166,16 @@ class LeanRenderer(Renderer2d):
         unused = {
             name for name in pretrained if name.startswith("read") and not self.layout.surface
         }
-        ours, theirs = _same_columns(self.layout.groups, PRETRAINED_GROUPS)
+        ours, theirs = _same_columns(self.layout, PRETRAINED_LAYOUT)
         slots = range(self.scale**2)
         written = [4 * slot + i for slot in slots for i in range(3 + self.layout.history)]
         matrix = [(self.channels + 1) * row + column for row in range(3) for column in range(4)]
         try:
-            if weights.keys() != pretrained.keys() - unused or self.scale != PRETRAINED_SCALE:
+            same_layers = weights.keys() == pretrained.keys() - unused
+            if not same_layers or self.scale != PRETRAINED_LAYOUT.scale:
                 raise RuntimeError("other layers, or another scale")
-            if (inputs := pretrained["enter.weight"].shape[1]) != PRETRAINED_WIDTH:
-                raise RuntimeError(f"{inputs} inputs instead of {PRETRAINED_WIDTH}")
+            if (inputs := pretrained["enter.weight"].shape[1]) != PRETRAINED_LAYOUT.width:
+                raise RuntimeError(f"{inputs} inputs instead of {PRETRAINED_LAYOUT.width}")
             for name, weight in weights.items():
                 new = pretrained[name].float()
                 if name == "enter.weight":
@@ -202,15 +191,18 @@ class LeanRenderer(Renderer2d):
             ) from error
 
 
-def _same_columns(ours: Groups, theirs: Groups) -> tuple[list[int], list[int]]:
+def _same_columns(ours: Layout, theirs: Layout) -> tuple[list[int], list[int]]:
     """The input columns of colours and validity that both layouts have, as indices into each."""
-    columns: tuple[dict[tuple[str, int, int], int], ...] = ({}, {})
-    for groups, place in zip((ours, theirs), columns, strict=True):
-        begin = 0
-        for name, slots, features in groups:
-            for slot in range(slots):
-                for feature in range(min(features, 4)):
-                    place[name, slot, feature] = begin + slot * features + feature
-            begin += slots * features
-    both = [key for key in columns[0] if key in columns[1]]
-    return [columns[0][key] for key in both], [columns[1][key] for key in both]
+    mine, others = _columns(ours), _columns(theirs)
+    both = [key for key in mine if key in others]
+    return [mine[key] for key in both], [others[key] for key in both]
+
+
+def _columns(layout: Layout) -> dict[tuple[str, int, int], int]:
+    """The input columns of colours and validity, by group, slot and feature."""
+    return {
+        (name, slot, feature): layout.begins[name] + slot * features + feature
+        for name, slots, features in layout.groups
+        for slot in range(slots)
+        for feature in range(min(features, 4))
+    }
