@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from bench.types import Probe
 from methods.kernels import multiplies_bf16
-from methods.kernels.encode import HashGrid, encode, pack
+from methods.kernels.encode import HashGrid, SampleGradients, encode, pack
 from methods.kernels.mlp import mlp
 from methods.kernels.spherical import CHANNELS as DIRECTION_CHANNELS
 from methods.kernels.spherical import spherical_harmonics
@@ -71,7 +71,7 @@ class HashField(nn.Module):
         packed = pack(table) if precision == "bf16" else None
         self.packed: Tensor | None
         self.register_buffer("packed", packed, persistent=False)
-        self.grad_buffer: Tensor | None = None  # set by a training that updates the table sparsely
+        self.gradients: SampleGradients | None = None  # set by a training of the table
 
     def repack(self) -> None:
         """Update the packed copy after the table was changed from outside."""
@@ -117,7 +117,7 @@ class HashField(nn.Module):
             self.table,
             self.grid,
             packed=self.packed,
-            grad_buffer=self.grad_buffer,
+            gradients=self.gradients,
             backend=self.backend,
         ).to(self._compute_dtype)
         geometry = mlp([features], weights, backend=self.backend)

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from methods.instant_ngp.field import HashField
-from methods.kernels.adam import AdamState, sparse_adam_
+from methods.kernels.adam import AdamState, hash_adam_
+from methods.kernels.encode import SampleGradients
 from methods.training import checkpoint
 from methods.training.optimiser import step_at
 
@@ -17,13 +18,13 @@ from methods.training.optimiser import step_at
 class FieldOptimiser:
     """Adam for the networks of `field`, and for its table one that skips untouched entries.
 
-    Once this exists, the field collects the gradients of its table in `grad_buffer`.
+    Once this exists, the field collects the gradients of its samples in `gradients`.
     """
 
     def __init__(self, field: HashField) -> None:
         self._field = field
         self._table = AdamState.like(field.table.detach())
-        field.grad_buffer = torch.zeros_like(field.table)
+        field.gradients = SampleGradients()
 
     @cached_property
     def _networks(self) -> torch.optim.Adam:
@@ -35,10 +36,11 @@ class FieldOptimiser:
         """Update table and networks at learning rate `rate`."""
         step_at(self._networks, rate)
         field = self._field
-        assert field.grad_buffer is not None
-        sparse_adam_(
+        assert field.gradients is not None
+        hash_adam_(
             field.table.detach(),
-            field.grad_buffer,
+            field.gradients,
+            field.grid,
             self._table,
             rate,
             packed=field.packed,

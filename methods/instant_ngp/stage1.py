@@ -131,5 +131,5 @@ def train_field(setup: Setup, scene: Scene, budget: Budget, log: Log) -> Trained
         return TrainedField(field, grid, setup.training.march(budget), seconds)
     training = FieldTraining(field, scene, budget, setup.training, setup.seed)
     loop.train(training, finished, "training", log)
-    field.grad_buffer = None
+    field.gradients = None
     return TrainedField(field, training.grid, training.march, training.seconds)

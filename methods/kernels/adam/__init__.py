@@ -16,6 +16,7 @@ from torch import Tensor
 
 from bench.types import check_shape
 from methods.kernels.dispatch import implementation
+from methods.kernels.encode import HashGrid, SampleGradients
 
 BETAS = (0.9, 0.99)
 EPS = 1e-15
@@ -76,11 +77,37 @@ def sparse_adam_(
     The bias correction uses the entry's own step count. `packed`, the bfloat16 copy of the table
     (`encode.pack`), is updated, too, if given.
     """
+    check_shape("grad", grad, *table.shape)
+    _check(table, state, packed)
+    implementation("adam", backend, table.device).sparse_adam_(table, grad, state, rate, packed)
+
+
+def hash_adam_(
+    table: Tensor,
+    gradients: SampleGradients,
+    grid: HashGrid,
+    state: AdamState,
+    rate: float,
+    *,
+    packed: Tensor | None = None,
+    backend: str = "auto",
+) -> None:
+    """`sparse_adam_` for the hash table of `grid`, with the sum of its `gradients`; clear them."""
+    check_shape("table", table, grid.entries, grid.features)
+    _check(table, state, packed)
+    if gradients:
+        positions, grad = gradients.joined()
+        implementation("adam", backend, table.device).hash_adam_(
+            table, positions, grad, grid, state, rate, packed
+        )
+    gradients.clear()
+
+
+def _check(table: Tensor, state: AdamState, packed: Tensor | None) -> None:
     entries, features = table.shape
-    for name, tensor in (("grad", grad), ("first", state.first), ("second", state.second)):
+    for name, tensor in (("first", state.first), ("second", state.second)):
         check_shape(name, tensor, entries, features)
     check_shape("steps", state.steps, entries)
     if packed is not None:
         check_shape("packed", packed, entries)
         check_shape("table, to be packed,", table, None, 2)
-    implementation("adam", backend, table.device).sparse_adam_(table, grad, state, rate, packed)

@@ -1,4 +1,8 @@
-"""Sparse Adam with numba: one pass over the gradient, one over the entries that have one."""
+"""Sparse Adam with numba: one pass over the gradient, one over the entries that have one.
+
+For a hash table, a thread takes a level, adds up its gradient, which stays in the cache, and
+updates it, before it takes the next one.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +10,13 @@ import math
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import get_num_threads, njit, prange
 from torch import Tensor
 
 from methods.kernels.adam import BETAS, EPS, AdamState, corrections
-from methods.kernels.cpu import f32, pack_bf16, u64
+from methods.kernels.cpu import f32, pack_bf16, u32, u64
+from methods.kernels.encode import HashGrid
+from methods.kernels.encode.cpu import by_channel, level_arrays, scatter_level
 
 CHUNK = 4096  # entries that are searched for gradients before any of them is updated
 
@@ -23,36 +29,111 @@ def sparse_adam_(
     table: Tensor, grad: Tensor, state: AdamState, rate: float, packed: Tensor | None
 ) -> None:
     """See `methods.kernels.adam.sparse_adam_`."""
-    if table.dtype != torch.float32:
-        raise ValueError(f"backend 'cpu' updates float32, got {table.dtype}")
-    words = np.empty(0, np.uint32) if packed is None else packed.numpy().view(np.uint32)
-    _update(
-        *(x.view(-1).numpy() for x in (table, grad, state.first, state.second)),
-        state.steps.numpy(),
-        words,
-        *corrections().numpy(),
+    _update(grad.view(-1).numpy(), table.shape[1], *_arrays(table, state, packed), f32(rate))
+
+
+@torch.no_grad()
+def hash_adam_(
+    table: Tensor,
+    positions: Tensor,
+    grad: Tensor,
+    grid: HashGrid,
+    state: AdamState,
+    rate: float,
+    packed: Tensor | None,
+) -> None:
+    """See `methods.kernels.adam.hash_adam_`."""
+    _update_levels(
+        positions.numpy(),
+        by_channel(grad).numpy(),
+        *level_arrays(grid),
+        *_arrays(table, state, packed),
         f32(rate),
+        get_num_threads(),
     )
 
 
+def _arrays(table: Tensor, state: AdamState, packed: Tensor | None) -> tuple[np.ndarray, ...]:
+    """Table, moments, steps and packed copy, each flat, and the corrections."""
+    if table.dtype != torch.float32:
+        raise ValueError(f"backend 'cpu' updates float32, got {table.dtype}")
+    words = np.empty(0, np.uint32) if packed is None else packed.numpy().view(np.uint32)
+    tables = (x.view(-1).numpy() for x in (table, state.first, state.second))
+    return (*tables, state.steps.numpy(), words, *corrections().numpy())
+
+
 @njit(cache=True, parallel=True, error_model="numpy")
-def _update(table, grad, first, second, steps, packed, to1, to2, rate):
-    """`table`, `grad`, `first` and `second` are flat; `to1` and `to2` are the corrections."""
+def _update(grad, features, table, first, second, steps, packed, to1, to2, rate):
+    """`grad`, `table`, `first` and `second` are flat; `to1` and `to2` are the corrections."""
     entries = len(steps)
-    features = len(table) // max(entries, 1)
     for chunk in prange((entries + CHUNK - 1) // CHUNK):
         a, b = chunk * CHUNK, min(entries, (chunk + 1) * CHUNK)
-        if features == 2:  # so that the compiler knows it
-            _entries(a, b, 2, table, grad, first, second, steps, packed, to1, to2, rate)
-        else:
-            _entries(a, b, features, table, grad, first, second, steps, packed, to1, to2, rate)
+        _entries(a, b, features, grad, table, first, second, steps, packed, to1, to2, rate)
 
 
-@njit(inline="always")
-def _entries(a, b, features, table, grad, first, second, steps, packed, to1, to2, rate):
+@njit(cache=True, parallel=True, error_model="numpy")
+def _update_levels(
+    positions,
+    grad,
+    scales,
+    strides,
+    offsets,
+    table,
+    first,
+    second,
+    steps,
+    packed,
+    to1,
+    to2,
+    rate,
+    workers,
+):
+    """As `_update`, with the gradient `grad` [levels * features, N] of samples at `positions`."""
+    levels = len(scales)
+    features = len(grad) // levels
+    largest = np.max(offsets[1:] - offsets[:-1])
+    for worker in prange(workers):
+        total = np.zeros(largest * features, np.float32)
+        # Every workers-th level, because fine levels cost the most.
+        for level in range(worker, levels, workers):
+            begin, end = offsets[level], offsets[level + 1]
+            a, b = begin * features, end * features
+            scatter_level(
+                positions,
+                grad[level * features : (level + 1) * features],
+                scales[level],
+                strides[level],
+                u32(end - begin),
+                total,
+            )
+            words = packed[begin:end] if len(packed) else packed
+            for entry in range(0, end - begin, CHUNK):
+                _entries(
+                    entry,
+                    min(end - begin, entry + CHUNK),
+                    features,
+                    total,
+                    table[a:b],
+                    first[a:b],
+                    second[a:b],
+                    steps[begin:end],
+                    words,
+                    to1,
+                    to2,
+                    rate,
+                )
+
+
+@njit(cache=True, error_model="numpy")
+def _entries(a, b, features, grad, table, first, second, steps, packed, to1, to2, rate):
+    """Update the entries from `a` to `b`, at most `CHUNK`, and clear their gradient."""
     touched = np.empty(CHUNK, np.uint32)
-    count = _find(a, b, features, grad, touched)
-    _step(touched, count, features, table, grad, first, second, steps, packed, to1, to2, rate)
+    if features == 2:  # so that the compiler knows it
+        count = _find(a, b, 2, grad, touched)
+        _step(touched, count, 2, grad, table, first, second, steps, packed, to1, to2, rate)
+    else:
+        count = _find(a, b, features, grad, touched)
+        _step(touched, count, features, grad, table, first, second, steps, packed, to1, to2, rate)
 
 
 @njit(inline="always")
@@ -70,7 +151,7 @@ def _find(a, b, features, grad, touched):
 
 
 @njit(inline="always")
-def _step(touched, count, features, table, grad, first, second, steps, packed, to1, to2, rate):
+def _step(touched, count, features, grad, table, first, second, steps, packed, to1, to2, rate):
     """Update the first `count` entries of `touched`."""
     last = len(to1) - 1
     for k in range(count):

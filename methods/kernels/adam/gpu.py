@@ -16,6 +16,8 @@ from torch import Tensor
 
 from methods.kernels import adam
 from methods.kernels.adam import AdamState, corrections
+from methods.kernels.encode import HashGrid
+from methods.kernels.encode.gpu import table_gradient
 from methods.kernels.gpu import check_types, launch
 
 BLOCK = 1024
@@ -52,6 +54,20 @@ def sparse_adam_(
         FEATURES=features,
         WIDTH=width,
     )
+
+
+@torch.no_grad()
+def hash_adam_(
+    table: Tensor,
+    positions: Tensor,
+    grad: Tensor,
+    grid: HashGrid,
+    state: AdamState,
+    rate: float,
+    packed: Tensor | None,
+) -> None:
+    """See `methods.kernels.adam.hash_adam_`."""
+    sparse_adam_(table, table_gradient(positions, grad, grid), state, rate, packed)
 
 
 @cache

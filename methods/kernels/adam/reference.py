@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from methods.kernels.adam import BETAS, EPS, AdamState
-from methods.kernels.encode import pack
+from methods.kernels.encode import HashGrid, pack
+from methods.kernels.encode.reference import encode
 
 
 @torch.no_grad()
@@ -27,3 +28,20 @@ def sparse_adam_(
     grad.zero_()
     if packed is not None:
         packed.copy_(torch.where(touched.squeeze(-1), pack(table), packed))
+
+
+def hash_adam_(
+    table: Tensor,
+    positions: Tensor,
+    grad: Tensor,
+    grid: HashGrid,
+    state: AdamState,
+    rate: float,
+    packed: Tensor | None,
+) -> None:
+    """See `methods.kernels.adam.hash_adam_`."""
+    with torch.enable_grad():
+        asking = table.detach().requires_grad_()
+        encode(positions, asking, grid).backward(grad.to(table.dtype))
+    assert asking.grad is not None
+    sparse_adam_(table, asking.grad, state, rate, packed)

@@ -88,13 +88,53 @@ class HashGrid:
         return self.levels * self.features
 
 
+class SampleGradients:
+    """Positions, and the gradients of their features, as they come from the backward passes of a
+    training step: what the gradient of a table is the sum of. `adam.hash_adam_` adds them up level
+    by level and uses each sum while it is in the cache, so that it is never in memory."""
+
+    def __init__(self) -> None:
+        self._parts: list[tuple[Tensor, Tensor]] = []
+
+    def __bool__(self) -> bool:
+        return bool(self._parts)
+
+    def add(self, positions: Tensor, gradients: Tensor) -> None:
+        """Append `positions` [N, 3] and the `gradients` [N, levels * F] of their features."""
+        self._parts.append((positions, gradients))
+
+    def joined(self) -> tuple[Tensor, Tensor]:
+        """All positions and gradients, of which there must be some."""
+        positions, gradients = zip(*self._parts, strict=True)
+        return torch.cat(positions), torch.cat(gradients)
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._parts.clear()
+
+
+class _Collect(torch.autograd.Function):
+    """Features [N, C] whose gradient is not that of the `table`, but goes to `gradients`."""
+
+    @staticmethod
+    def forward(ctx, features, table, positions, gradients):
+        ctx.save_for_backward(positions)
+        ctx.gradients = gradients
+        return features.view_as(features)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        ctx.gradients.add(*ctx.saved_tensors, gradient)
+        return None, None, None, None
+
+
 def encode(
     positions: Tensor,
     table: Tensor,
     grid: HashGrid,
     *,
     packed: Tensor | None = None,
-    grad_buffer: Tensor | None = None,
+    gradients: SampleGradients | None = None,
     backend: str = "auto",
 ) -> Tensor:
     """Encode `positions` [N, 3] with `table` [entries, F]: [N, levels * F], level by level.
@@ -106,9 +146,8 @@ def encode(
     Args:
         packed: `pack(table)`; if given, it is read instead of `table` (half the memory traffic;
             F = 2 only). The output is then bfloat16; its gradient goes to `table`.
-        grad_buffer: [entries, F]; if given, the gradient of `table` is added to it in place and
-            hidden from autograd, so that a training step neither allocates nor clears a second
-            table.
+        gradients: if given, the gradients of the features are collected there and hidden from
+            autograd, whether or not `table` asks for a gradient.
     """
     check_shape("positions", positions, None, 3)
     check_shape("table", table, grid.entries, grid.features)
@@ -116,13 +155,14 @@ def encode(
         if grid.features != 2:
             raise ValueError(f"packed tables hold 2 features an entry, the grid has {grid}")
         check_shape("packed", packed, grid.entries)
-    if grad_buffer is not None:
-        check_shape("grad_buffer", grad_buffer, grid.entries, grid.features)
-        if not table.requires_grad:
-            table = table.detach().requires_grad_()  # otherwise there is no backward pass
+    read = table if gradients is None else table.detach()
     features = implementation("encode", backend, positions.device).encode(
-        positions, table, grid, packed=packed, grad_buffer=grad_buffer
+        positions, read, grid, packed=packed
     )
+    if gradients is not None:
+        # Without an input that asks for a gradient, there is no backward pass.
+        asking = table.detach().requires_grad_()
+        features = _Collect.apply(features, asking, positions, gradients)
     # NaN is rare. On a CPU one sum tests for it cheaply; on a GPU, waiting for it would cost more.
     if positions.device.type != "cpu" or positions.sum().isnan():
         features = torch.where(positions.isnan().any(dim=1, keepdim=True), torch.nan, features)

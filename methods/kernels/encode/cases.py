@@ -146,11 +146,8 @@ def _gradient(positions: Tensor, grid: HashGrid, *, packed: bool = False) -> Pre
         grad = grad.bfloat16() if packed else grad
 
         def call(backend: str) -> tuple[Tensor, ...]:
-            buffer = torch.zeros_like(table)
-            encode(placed, table, grid, packed=words, grad_buffer=buffer, backend=backend).backward(
-                grad
-            )
-            return (buffer,)
+            features = encode(placed, table, grid, packed=words, backend=backend)
+            return torch.autograd.grad(features, table, grad)
 
         return call
 

@@ -35,7 +35,6 @@ def encode(
     grid: HashGrid,
     *,
     packed: Tensor | None = None,
-    grad_buffer: Tensor | None = None,
 ) -> Tensor:
     """See `methods.kernels.encode.encode`. Not differentiable in `positions`."""
     if positions.requires_grad:
@@ -45,15 +44,15 @@ def encode(
             f"backend 'cpu' encodes float32, got positions {positions.dtype} and table "
             f"{table.dtype}: use backend='reference'"
         )
-    return _Encode.apply(positions.contiguous(), table, grid, packed, grad_buffer)
+    return _Encode.apply(positions.contiguous(), table, grid, packed)
 
 
 class _Encode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, positions, table, grid, packed, grad_buffer):
+    def forward(ctx, positions, table, grid, packed):
         ctx.save_for_backward(positions)
-        ctx.grid, ctx.grad_buffer = grid, grad_buffer
-        shapes = _level_arrays(grid)
+        ctx.grid = grid
+        shapes = level_arrays(grid)
         if packed is None:
             features = torch.empty(len(positions), grid.channels)
             _encode_float(positions.numpy(), table.detach().numpy(), *shapes, features.numpy())
@@ -65,24 +64,19 @@ class _Encode(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad):
         (positions,) = ctx.saved_tensors
-        grid, buffer = ctx.grid, ctx.grad_buffer
-        added = buffer is not None and buffer.is_contiguous()
-        target = buffer if added else torch.zeros(grid.entries, grid.features)
+        grid = ctx.grid
+        target = torch.zeros(grid.entries, grid.features)
         _scatter(
             positions.numpy(),
-            _by_channel(grad).numpy(),
-            *_level_arrays(grid),
+            by_channel(grad).numpy(),
+            *level_arrays(grid),
             target.view(-1).numpy(),
             get_num_threads(),
         )
-        if buffer is None:
-            return None, target, None, None, None
-        if not added:
-            buffer += target
-        return None, None, None, None, None
+        return None, target, None, None
 
 
-def _by_channel(grad: Tensor) -> Tensor:
+def by_channel(grad: Tensor) -> Tensor:
     """The gradient [N, channels] as float32 [channels, N]: so a level reads only its own."""
     if grad.dtype != torch.bfloat16 or grad.shape[1] % 2:
         return grad.T.contiguous().float()
@@ -95,7 +89,7 @@ def _unsigned(words: Tensor) -> np.ndarray:
     return words.numpy().view(np.uint32)
 
 
-def _level_arrays(grid: HashGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def level_arrays(grid: HashGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Scale, vertices along an axis (0: hashed) and first entry of each level.
 
     The first entries are followed by the total number of entries.
@@ -278,43 +272,56 @@ def _widen_by_channel(words, columns):
 
 
 @njit(cache=True)
-def _scatter_pairs(index, weight, count, first, second, target, begin):
+def _scatter_pairs(index, weight, count, first, second, target):
     for i in range(count):
         for corner in range(8):
             at = u64(corner * CHUNK) + u64(i)
-            place = u64(2) * (u64(begin) + u64(index[at]))
+            place = u64(2) * u64(index[at])
             add_pair(target, place, weight[at], first[i], second[i])
 
 
 @njit(cache=True)
-def _scatter_one(index, weight, count, grad, target, begin, features):
+def _scatter_one(index, weight, count, grad, target, feature, features):
     for i in range(count):
         for corner in range(8):
             at = u64(corner * CHUNK) + u64(i)
-            place = u64(features) * u64(index[at]) + u64(begin)
+            place = u64(features) * u64(index[at]) + u64(feature)
             target[place] += weight[at] * grad[i]
+
+
+@njit(cache=True)
+def scatter_level(positions, grad, scale, stride, size, target):
+    """Adjoint of `_encode_float` at one level: target[corner] += weight * grad. `grad` is
+    [features, N], `target` the level's [entries, features], flat."""
+    features, total = grad.shape
+    xyz = np.empty(3 * CHUNK, np.float32)
+    index, weight = np.empty(8 * CHUNK, np.uint32), np.empty(8 * CHUNK, np.float32)
+    for first in range(0, total, CHUNK):
+        count = min(CHUNK, total - first)
+        _load(positions, first, count, xyz)
+        _corners(xyz, count, scale, stride, size, index, weight)
+        part = grad[:, first : first + count]
+        if features == 2:
+            _scatter_pairs(index, weight, count, part[0], part[1], target)
+        else:
+            for feature in range(features):
+                _scatter_one(index, weight, count, part[feature], target, feature, features)
 
 
 @njit(cache=True, parallel=True)
 def _scatter(positions, grad, scales, strides, offsets, target, workers):
-    """Adjoint of `_encode_float`: target[corner] += weight * grad. grad is [channels, N], target
-    [entries, features] flat."""
-    total, levels = len(positions), len(scales)
+    """All levels; `grad` is [channels, N], `target` flat."""
+    levels = len(scales)
     features = len(grad) // levels
     for worker in prange(workers):
-        xyz = np.empty(3 * CHUNK, np.float32)
-        index, weight = np.empty(8 * CHUNK, np.uint32), np.empty(8 * CHUNK, np.float32)
         # Every workers-th level, because fine levels miss the cache and cost the most.
         for level in range(worker, levels, workers):
             begin, end = offsets[level], offsets[level + 1]
-            for first in range(0, total, CHUNK):
-                count = min(CHUNK, total - first)
-                _load(positions, first, count, xyz)
-                _corners(xyz, count, scales[level], strides[level], u32(end - begin), index, weight)
-                part = grad[level * features : (level + 1) * features, first : first + count]
-                if features == 2:
-                    _scatter_pairs(index, weight, count, part[0], part[1], target, begin)
-                else:
-                    for feature in range(features):
-                        at = begin * features + feature
-                        _scatter_one(index, weight, count, part[feature], target, at, features)
+            scatter_level(
+                positions,
+                grad[level * features : (level + 1) * features],
+                scales[level],
+                strides[level],
+                u32(end - begin),
+                target[begin * features : end * features],
+            )

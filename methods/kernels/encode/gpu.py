@@ -16,7 +16,7 @@ from torch import Tensor
 
 from methods.kernels.encode import PRIMES, HashGrid
 from methods.kernels.encode.reference import corners
-from methods.kernels.gpu import check_types, gradient, launch
+from methods.kernels.gpu import check_types, launch
 
 BLOCK = 256  # samples
 PRIME_Y, PRIME_Z = tl.constexpr(PRIMES[1]), tl.constexpr(PRIMES[2])
@@ -28,7 +28,6 @@ def encode(
     grid: HashGrid,
     *,
     packed: Tensor | None = None,
-    grad_buffer: Tensor | None = None,
 ) -> Tensor:
     """See `methods.kernels.encode.encode`. Not differentiable in `positions`.
 
@@ -38,14 +37,14 @@ def encode(
         raise ValueError("backend 'gpu' gives no gradient for positions: use backend='reference'")
     check_types(torch.float32, positions=positions)
     check_types(torch.float32, torch.float16, torch.bfloat16, table=table)
-    return _Encode.apply(positions.contiguous(), table, grid, packed, grad_buffer)
+    return _Encode.apply(positions.contiguous(), table, grid, packed)
 
 
 class _Encode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, positions, table, grid, packed, grad_buffer):
+    def forward(ctx, positions, table, grid, packed):
         ctx.save_for_backward(positions)
-        ctx.grid, ctx.grad_buffer, ctx.dtype = grid, grad_buffer, table.dtype
+        ctx.grid, ctx.dtype = grid, table.dtype
         read = table.detach() if packed is None else packed.view(torch.bfloat16).view(-1, 2)
         features = read.new_empty(len(positions), grid.channels)
         _launch(_forward, positions, read.contiguous(), grid, features)
@@ -54,14 +53,18 @@ class _Encode(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad):
         (positions,) = ctx.saved_tensors
-        grid, buffer = ctx.grid, ctx.grad_buffer
-        shape = torch.Size((grid.entries, grid.features))
-        with gradient(buffer, shape, grad.device) as target:
-            if torch.are_deterministic_algorithms_enabled():
-                _scatter_sorted(positions, grad.float(), grid, target)
-            else:
-                _launch(_scatter, positions, target, grid, grad.contiguous())
-        return None, target.to(ctx.dtype) if buffer is None else None, None, None, None
+        return None, table_gradient(positions, grad, ctx.grid).to(ctx.dtype), None, None
+
+
+def table_gradient(positions: Tensor, grad: Tensor, grid: HashGrid) -> Tensor:
+    """The gradient [entries, F] float32 of a table, by the gradient `grad` [N, levels * F] of the
+    features at `positions` [N, 3]."""
+    target = torch.zeros(grid.entries, grid.features, device=grad.device)
+    if torch.are_deterministic_algorithms_enabled():
+        _scatter_sorted(positions, grad.float(), grid, target)
+    else:
+        _launch(_scatter, positions, target, grid, grad.contiguous())
+    return target
 
 
 def _launch(

@@ -14,12 +14,8 @@ def encode(
     grid: HashGrid,
     *,
     packed: Tensor | None = None,
-    grad_buffer: Tensor | None = None,
 ) -> Tensor:
     """See `methods.kernels.encode.encode`."""
-    if grad_buffer is not None:
-        table = table.detach().requires_grad_()
-        table.register_hook(grad_buffer.add_)
     inside = torch.where(positions > 0, positions, 0).clamp(max=1)
     found = []
     for level in range(grid.levels):

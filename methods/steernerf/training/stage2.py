@@ -107,7 +107,7 @@ def train_stage2(
             raise SteerbenchError(f"{mark} is missing: remove {folder} to train again")
         loop.load(training, mark)
         key["after"] = stage2.after
-    trained.field.requires_grad_(False).grad_buffer = None
+    trained.field.requires_grad_(False).gradients = None
     pipeline.renderer.requires_grad_(False)
     return TrainedPipeline(pipeline, key, training.seconds)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from methods.kernels.adam import AdamState, sparse_adam_
-from methods.kernels.encode import pack
+from methods.kernels.adam import AdamState, hash_adam_, sparse_adam_
+from methods.kernels.encode import HashGrid, SampleGradients, encode, pack
 
 BACKENDS = ["reference", "cpu"]
 
@@ -54,6 +54,41 @@ def test_bias_correction_goes_by_the_steps_of_the_entry(backend: str) -> None:
     # Equal gradients make every step of Adam one of length `rate`.
     assert table[0].tolist() == pytest.approx([-0.3, -0.3], rel=1e-5)
     assert table[1].tolist() == pytest.approx([-0.1, -0.1], rel=1e-5)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("features", [1, 2, 3])
+def test_the_step_of_collected_gradients_is_that_of_their_sum(backend: str, features: int) -> None:
+    """To the bit, as both add up in the order of the samples; over parts, levels and steps."""
+    grid = HashGrid(levels=3, features=features, log2_table=12, n_min=4, n_max=64)
+    generator = torch.Generator().manual_seed(0)
+    tables = [torch.randn(grid.entries, features, generator=generator)] * 2
+    tables = [table.clone() for table in tables]
+    states = [AdamState.like(table) for table in tables]
+    words = [pack(table) if features == 2 else None for table in tables]
+    for count in (300, 0, 1000):
+        positions = torch.rand(count, 3, generator=generator)
+        grad = torch.randn(count, grid.channels, generator=generator)
+        gradients = SampleGradients()
+        for part in zip(positions.split(400), grad.split(400), strict=True):
+            gradients.add(*part)
+        hash_adam_(tables[0], gradients, grid, states[0], 0.1, packed=words[0], backend=backend)
+        assert not gradients
+        asking = tables[1].clone().requires_grad_()
+        encoded = encode(positions, asking, grid, backend=backend)
+        (total,) = torch.autograd.grad(encoded, asking, grad)
+        sparse_adam_(tables[1], total, states[1], 0.1, packed=words[1], backend=backend)
+    assert torch.equal(*tables)
+    for moments in zip(*(state.tensors("").values() for state in states), strict=True):
+        assert torch.equal(*moments)
+    assert words[0] is None or torch.equal(words[0], pack(tables[0]))
+
+
+def test_without_samples_nothing_moves() -> None:
+    grid = HashGrid(levels=1, log2_table=6, n_min=4, n_max=4)
+    table = torch.ones(grid.entries, 2)
+    hash_adam_(table, SampleGradients(), grid, AdamState.like(table), 0.1)
+    assert (table == 1).all()
 
 
 def test_wrong_arguments_are_named() -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from methods.kernels.encode import PRIMES, HashGrid, encode, pack
+from methods.kernels.encode import PRIMES, HashGrid, SampleGradients, encode, pack
 
 GRID = HashGrid(levels=4, log2_table=8, n_min=3, n_max=30)
 
@@ -122,31 +122,46 @@ def test_the_packed_table_is_the_table_in_bfloat16(backend: str) -> None:
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 @pytest.mark.parametrize("packed", [False, True])
-def test_the_gradient_goes_to_the_table_or_is_added_to_the_buffer(
+def test_the_gradient_of_the_table_has_the_weights_of_its_samples(
     backend: str, packed: bool
 ) -> None:
     table = random_table(GRID, torch.float32).requires_grad_()
     words = pack(table) if packed else None
     positions = torch.rand(100, 3, generator=torch.Generator().manual_seed(0))
-    buffer = torch.ones_like(table)
-    for target in (None, buffer):
-        encode(positions, table, GRID, packed=words, grad_buffer=target, backend=backend).sum(
-            dtype=torch.float32
-        ).backward()
+    features = encode(positions, table, GRID, packed=words, backend=backend)
+    features.sum(dtype=torch.float32).backward()
     assert table.grad is not None
-    torch.testing.assert_close(buffer - 1, table.grad, rtol=1e-6, atol=1e-6)
     # Weights of a sample add up to 1, on every level and for every feature.
     assert table.grad.sum().item() == pytest.approx(100 * GRID.channels, rel=1e-4)
 
 
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("asked", [False, True])
+def test_gradients_of_samples_are_collected_whether_or_not_the_table_asks_for_its_own(
+    backend: str, asked: bool
+) -> None:
+    table = random_table(GRID, torch.float32).requires_grad_(asked)
+    positions = torch.rand(100, 3, generator=torch.Generator().manual_seed(0))
+    gradients = SampleGradients()
+    for scale, part in zip((1, 2), positions.split(60), strict=True):
+        features = encode(part, table, GRID, gradients=gradients, backend=backend)
+        (scale * features).sum().backward()
+    with torch.no_grad():
+        encode(positions, table, GRID, gradients=gradients, backend=backend)
+    found, gradient = gradients.joined()
+    assert torch.equal(found, positions)
+    assert torch.equal(gradient[:, 0], torch.tensor([1.0] * 60 + [2.0] * 40))
+    assert table.grad is None
+
+
 def test_the_backward_pass_gives_the_same_bits_twice() -> None:
-    table = random_table(GRID, torch.float32)
+    table = random_table(GRID, torch.float32).requires_grad_()
     positions = torch.rand(5000, 3, generator=torch.Generator().manual_seed(0))
-    buffers = [torch.zeros_like(table), torch.zeros_like(table)]
-    for buffer in buffers:
-        table.requires_grad_()
-        encode(positions, table, GRID, grad_buffer=buffer, backend="cpu").square().sum().backward()
-    assert torch.equal(*buffers)
+    twice = [
+        torch.autograd.grad(encode(positions, table, GRID, backend="cpu").square().sum(), table)[0]
+        for _ in range(2)
+    ]
+    assert torch.equal(*twice)
 
 
 def test_wrong_arguments_are_named() -> None:

@@ -19,9 +19,10 @@ from bench.cameras import place_camera
 from bench.case import U32, largest_error
 from bench.types import Camera, Rays
 from methods.kernels import availability, corner_gather
-from methods.kernels.adam import AdamState, sparse_adam_
+from methods.kernels.adam import AdamState, hash_adam_, sparse_adam_
 from methods.kernels.composite import Intervals, composite, visible, weights
-from methods.kernels.encode import HashGrid, encode
+from methods.kernels.encode import HashGrid, SampleGradients, encode
+from methods.kernels.encode.reference import corners
 from methods.kernels.gaussian_blending import blend
 from methods.kernels.gaussian_projection import Ellipses, project_gaussians
 from methods.kernels.grouped_mlp import grouped_linear
@@ -166,18 +167,18 @@ def test_a_zero_is_in_its_place_whatever_its_sign(axis: int) -> None:
         assert splat(pixels[order], depth, 1, 1, backend="gpu").item() == 0
 
 
-def test_what_is_not_contiguous_is_read_and_added_to_all_the_same() -> None:
+def test_what_is_not_contiguous_is_read_all_the_same() -> None:
     generator = torch.Generator().manual_seed(0)
     grid = HashGrid(levels=2, log2_table=6, n_min=4, n_max=20)
     positions = torch.rand(3, 50, generator=generator).to(DEVICE).T
     table = torch.rand(2, grid.entries, generator=generator).to(DEVICE).T.requires_grad_()
-    buffers = []
-    for backend in ("gpu", "reference"):
-        buffers.append(torch.zeros(2, grid.entries, device=DEVICE).T)
-        encode(positions, table, grid, grad_buffer=buffers[-1], backend=backend).sum().backward()
+    gradients = [
+        torch.autograd.grad(encode(positions, table, grid, backend=backend).sum(), table)
+        for backend in ("gpu", "reference")
+    ]
     # As in the cases of `encode backward`, of at most 50 samples.
     fractions = 3 * 2 * U32 * grid.n_max
-    assert largest_error(*((buffer,) for buffer in buffers)) <= 6 * 50**0.5 * (fractions + 50 * U32)
+    assert largest_error(*gradients) <= 6 * 50**0.5 * (fractions + 50 * U32)
 
 
 def gaussian_gradients(given: list[Tensor]) -> tuple[Tensor, ...]:
@@ -339,6 +340,18 @@ def test_gaussians_of_another_type_are_refused() -> None:
     ellipses = Ellipses(means[:, :2], scales, opacities, means[:, :2])
     with pytest.raises(ValueError, match="expects centres of float32"):
         blend(ellipses, opacities, colours, 4, 4, backend="gpu")
+
+
+def test_the_first_step_moves_the_corners_of_a_sample_by_the_rate() -> None:
+    grid = HashGrid(levels=2, log2_table=10, n_min=4, n_max=20)
+    position = torch.full((1, 3), 0.3, device=DEVICE)
+    table, gradients = torch.zeros(grid.entries, 2, device=DEVICE), SampleGradients()
+    gradients.add(position, torch.ones(1, grid.channels, device=DEVICE))
+    hash_adam_(table, gradients, grid, AdamState.like(table), 0.1, backend="gpu")
+    want = torch.zeros_like(table)
+    for level in range(grid.levels):
+        want[corners(position, grid, level)[0]] = -0.1
+    torch.testing.assert_close(table, want, rtol=16 * U32, atol=0)
 
 
 def test_a_table_that_cannot_be_changed_in_place_is_refused() -> None:

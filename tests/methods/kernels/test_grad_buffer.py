@@ -9,24 +9,16 @@ import torch
 from torch import Tensor
 
 from methods.kernels.corner_gather import gather
-from methods.kernels.encode import HashGrid, encode
 from methods.kernels.voxel_shading import shade_voxels
 
-GRID = HashGrid(levels=2, features=2, log2_table=8, n_min=4, n_max=8)
 RANDOM = torch.Generator().manual_seed(0)
-POSITIONS, WEIGHTS = torch.rand(9, 3, generator=RANDOM), torch.rand(9, 8, generator=RANDOM)
+WEIGHTS = torch.rand(9, 8, generator=RANDOM)
 VOXEL, RAY = (torch.randint(4, (9,), generator=RANDOM).int() for _ in range(2))
 CORNERS = torch.randint(20, (4, 8), generator=RANDOM).int()
 DIRECTIONS = torch.nn.functional.normalize(torch.randn(4, 3, generator=RANDOM), dim=1)
 
 Reads = Callable[[Tensor, Tensor, str], Tensor]
 KERNELS: dict[str, tuple[tuple[int, ...], Reads]] = {
-    "encode": (
-        (GRID.entries, GRID.features),
-        lambda table, buffer, backend: encode(
-            POSITIONS, table, GRID, grad_buffer=buffer, backend=backend
-        ),
-    ),
     "gather": (
         (20, 4),
         lambda table, buffer, backend: gather(

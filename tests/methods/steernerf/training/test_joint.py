@@ -87,7 +87,7 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
     assert [len(patch.indices) for patch in patches] == [2, 2]
     field.double(), renderer.double()
     training.patches.pipeline.background = torch.ones(4, dtype=torch.float64)
-    field.grad_buffer = None
+    field.gradients = None
     clouds = [f.cloud for patch in patches for f in patch.sequence.buffer.frames]
     frozen = [cloud.values.double() for cloud in clouds]
     for cloud, values in zip(clouds, frozen, strict=True):
@@ -205,8 +205,9 @@ def test_the_field_learns_from_the_pixels_it_is_to_refine(ball_scene: Scene) -> 
     # The same samples, taken in rounds or at once, and a thousand squares added up.
     torch.testing.assert_close(whole.item(), error / batch.truth.numel(), rtol=1e-4, atol=0)
     whole.backward()
-    assert training.field.grad_buffer is not None
-    assert training.field.grad_buffer.any()
+    assert training.field.gradients
+    _, gradients = training.field.gradients.joined()
+    assert gradients.any()
 
     training.options = replace(OPTIONS, refined=0.25, refined_rays=64)
     some = torch.stack([refined_loss(training, batch).detach() for _ in range(80)])
