@@ -9,75 +9,115 @@ from torch import Tensor
 
 from bench.types import Rays
 from methods.kernels.composite import Extent, Pixels, composite, visible
+from methods.kernels.keep import keep
 from methods.kernels.march import Occupancy, Samples, march
 from methods.rendering.compaction import compacts
 from methods.rendering.field import CHUNK_SAMPLES, Field, pad, query
 from methods.rendering.march import March
 
-FRONT_SAMPLES = 8
-"""Samples of a ray whose densities a CPU evaluates before it knows whether the ray goes on."""
+ROUNDS = (8, 16)
+"""Samples of a ray whose densities a CPU evaluates before it knows whether the ray goes on, in the
+first rounds; the last one has all that are left."""
 
 KEPT_THIN = 4
 """One of so many thin samples is kept; see `render_batch`."""
 
 
 @dataclass(frozen=True)
-class FirstPass:
-    """Samples of R rays, and which of them are visible before their rays end.
+class Round:
+    """The next samples of some rays, and which of them are visible before their rays end.
 
     Attributes:
-        samples: those at the front of each ray, or all of them.
-        sigma: [S] their density, without gradient.
-        counts: [R] number of visible ones of each ray, which are its first ones.
-        rest: the rays [Q] that go on behind these samples, and what follows on them; None: none do.
+        rays: [Q] which rays these are; None: all.
+        samples: their samples.
+        sigma: [S] density of these, without gradient.
+        counts: [Q] number of visible ones of each ray, which are its first ones.
     """
 
+    rays: Tensor | None
     samples: Samples
     sigma: Tensor
     counts: Tensor
-    rest: tuple[Tensor, FirstPass] | None = None
+
+    @property
+    def ray(self) -> Tensor:
+        """[S] int32, the ray that a sample belongs to, among all rays."""
+        own = self.samples.ray
+        return own if self.rays is None else self.rays.int().index_select(0, own)
+
+    def place(self, of_each: Tensor, values: Tensor) -> None:
+        """Put the `values` [Q] of these rays into those `of_each` [R] of all rays."""
+        if self.rays is None:
+            of_each.copy_(values)
+        else:
+            of_each.index_copy_(0, self.rays, values)
+
+
+@dataclass(frozen=True)
+class FirstPass:
+    """The `rounds` in which the samples of R rays were looked at; on a GPU, there is one."""
+
+    rounds: list[Round]
+    backend: str
+
+    @property
+    def counts(self) -> Tensor:
+        """[R] number of visible samples of each ray."""
+        return self._pieces()[1].sum(dim=0)
 
     def opaque(self) -> Tensor:
         """Which rays have an opacity of more than 0, [R] bool."""
-        thick = self.sigma * self.samples.delta > 0
-        found = torch.zeros_like(self.counts, dtype=torch.int32)
-        found.scatter_reduce_(0, self.samples.ray.long(), thick.int(), "amax")
-        if self.rest is not None:
-            rays, behind = self.rest
-            found.index_add_(0, rays, behind.opaque().int())
+        found = torch.zeros_like(self.rounds[0].counts, dtype=torch.int32)
+        for some in self.rounds:
+            thick = some.sigma * some.samples.delta > 0
+            found.scatter_reduce_(0, some.ray.long(), thick.int(), "amax")
         return found > 0
 
     def visible(self, extent: Extent | None = None) -> Samples:
         """The visible samples. `extent` is theirs; None: the host waits for a GPU."""
-        front = self.samples.front(self.counts, extent)
-        if self.rest is None:
-            return front
-        rays, behind = self.rest
-        return front.followed_by(behind.visible(), rays)
+        front = self.rounds[0]
+        if len(self.rounds) == 1:
+            return front.samples.front(front.counts, extent)
+        return self._kept(0.0, torch.zeros_like(front.samples.resume))
 
     def thinned(self, thin: float, jitter: Tensor) -> Samples:
         """The visible samples, without most of the thin ones; see `render_batch`."""
         # Digits of the phase that say nothing of where in a step the samples lie.
-        return self._in_turn(thin, (jitter * 2**12).int())
+        return self._kept(thin, (jitter * 2**12).int())
 
-    def _in_turn(self, thin: float, turn: Tensor) -> Samples:
-        """`thinned`; of the thin samples of a ray, numbered from its `turn` [R] on, every
+    def _kept(self, thin: float, turns: Tensor) -> Samples:
+        """`thinned`; of the thin samples of a ray, numbered from its turn [R] on, every
         `KEPT_THIN`-th is kept."""
-        samples, counts = self.samples, self.counts.int()
-        first = samples.offsets[:-1].int()
-        # For each sample: the number at which the visible samples of its ray end, and what its own
-        # number lacks to its turn.
-        end = (first + counts).index_select(0, samples.ray)
-        shift = (turn - first).index_select(0, samples.ray)
-        number = torch.arange(len(samples), dtype=torch.int32, device=turn.device)
-        faint = self.sigma * samples.delta < thin
-        kept = (number < end) & ~(faint & ((number + shift) % KEPT_THIN > 0))
-        lengths = torch.where(faint, KEPT_THIN * samples.delta, samples.delta)
-        front = samples.where(kept, lengths)
-        if self.rest is None:
-            return front
-        rays, behind = self.rest
-        return front.followed_by(behind._in_turn(thin, (turn + counts)[rays]), rays)
+        every = [some.samples for some in self.rounds]
+        delta = torch.cat([samples.delta for samples in every])
+        faint = torch.cat([some.sigma for some in self.rounds]) * delta < thin
+        lengths = torch.where(faint, KEPT_THIN * delta, delta)
+        index, counts = keep(*self._pieces(), turns, faint, KEPT_THIN, backend=self.backend)
+        columns = (
+            torch.cat([samples.t for samples in every]),
+            lengths,
+            torch.cat([some.ray for some in self.rounds]),
+            torch.cat([samples.positions for samples in every]),
+        )
+        # A row at a time; `x[index]` goes number by number.
+        t, delta, ray, positions = (column.index_select(0, index) for column in columns)
+        offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
+        resume = torch.full_like(every[0].resume, -1)
+        longest = every[0].longest if len(every) == 1 else None  # or fewer
+        return Samples(t, delta, offsets, ray, positions, resume, longest=longest)
+
+    def _pieces(self) -> tuple[Tensor, Tensor]:
+        """Where the samples of each ray start in each round, and how many are visible: [K, R]."""
+        total = sum(len(some.samples) for some in self.rounds)
+        of_each = len(self.rounds), len(self.rounds[0].counts)
+        starts = self.rounds[0].counts.new_full(of_each, total)
+        counts = torch.zeros_like(starts)
+        begin = 0
+        for k, some in enumerate(self.rounds):
+            some.place(starts[k], some.samples.offsets[:-1] + begin)
+            some.place(counts[k], some.counts)
+            begin += len(some.samples)
+        return starts, counts
 
 
 def render_batch(
@@ -139,32 +179,31 @@ def first_pass(
     """
     teller = field if guide is None else guide
     # On a CPU most rays end soon: only those that do not are looked at further.
-    limit = FRONT_SAMPLES if compacts(rays.origins.device) else None
-    samples = march(
-        rays,
-        occupancy,
-        how.step,
-        jitter=jitter,
-        limit=limit,
-        extent=extent,
-        backend=field.backend,
-    )
-    sigma = _densities(teller, samples)
-    counts, left = visible(sigma, samples, stop=how.stop, backend=field.backend)
-    if limit is None:
-        return FirstPass(samples, sigma, counts)
-    open_ = ((samples.resume >= 0) & (left > how.stop)).nonzero().squeeze(1)
-    behind = march(
-        rays.take(open_),
-        occupancy,
-        how.step,
-        jitter=None if jitter is None else jitter[open_],
-        start=samples.resume[open_],
-        backend=field.backend,
-    )
-    dense = _densities(teller, behind)
-    seen, _ = visible(dense, behind, stop=how.stop, front=left[open_], backend=field.backend)
-    return FirstPass(samples, sigma, counts, (open_, FirstPass(behind, dense, seen)))
+    limits = ROUNDS if compacts(rays.origins.device) else ()
+    rounds: list[Round] = []
+    chosen, start, front = None, None, None
+    for limit in (*limits, None):
+        samples = march(
+            rays if chosen is None else rays.take(chosen),
+            occupancy,
+            how.step,
+            jitter=jitter if jitter is None or chosen is None else jitter[chosen],
+            start=start,
+            limit=limit,
+            extent=extent,
+            backend=field.backend,
+        )
+        sigma = _densities(teller, samples)
+        counts, left = visible(sigma, samples, stop=how.stop, front=front, backend=field.backend)
+        rounds.append(Round(chosen, samples, sigma, counts))
+        if limit is None:
+            break
+        going = ((samples.resume >= 0) & (left > how.stop)).nonzero().squeeze(1)
+        if not len(going):
+            break
+        chosen = going if chosen is None else chosen[going]
+        start, front = samples.resume[going], left[going]
+    return FirstPass(rounds, field.backend)
 
 
 def _densities(field: Field, samples: Samples) -> Tensor:

@@ -136,53 +136,11 @@ class Samples(Intervals):
         `extent` is as for `first_of_each`.
         """
         index, offsets, longest = self.first_of_each(counts, extent)
-        ray = self.ray.index_select(0, index)
-        return self._chosen(index, ray, self.delta, offsets, longest)
-
-    def where(self, kept: Tensor, lengths: Tensor) -> Samples:
-        """Only the samples that are `kept` [S], with no more to follow; `lengths` [S] replace their
-        `delta`."""
-        index = kept.nonzero().squeeze(1)
-        ray = self.ray.index_select(0, index)
-        # Not bincount, for which the host would wait for a GPU.
-        counts = self.offsets.new_zeros(len(self.resume)).index_add_(0, ray, torch.ones_like(index))
-        offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
-        return self._chosen(index, ray, lengths, offsets, self.longest)  # or fewer
-
-    def _chosen(
-        self, index: Tensor, ray: Tensor, lengths: Tensor, offsets: Tensor, longest: int | None
-    ) -> Samples:
-        """The samples at `index` [N] on the rays `ray` [N], in order, with no more to follow;
-        `lengths` [S] are those of all samples."""
         # A row at a time; `x[index]` goes number by number.
-        t, delta, positions = (x.index_select(0, index) for x in (self.t, lengths, self.positions))
+        columns = self.t, self.delta, self.ray, self.positions
+        t, delta, ray, positions = (column.index_select(0, index) for column in columns)
         resume = torch.full_like(self.resume, -1)
         return Samples(t, delta, offsets, ray, positions, resume, longest=longest)
-
-    def followed_by(self, more: Samples, rays: Tensor) -> Samples:
-        """These samples and `more`, which lie behind them on the rays `rays` [Q], in increasing
-        order."""
-        counts, added = self.offsets.diff(), more.offsets.diff()
-        together = counts.index_add(0, rays, added)
-        offsets = torch.cat((counts.new_zeros(1), together.cumsum(dim=0)))
-        shifts = (
-            (offsets - self.offsets)[:-1].repeat_interleave(counts, output_size=len(self)),
-            (offsets[rays] + counts[rays] - more.offsets[:-1]).repeat_interleave(
-                added, output_size=len(more)
-            ),
-        )
-        places = torch.cat([torch.arange(len(x), device=x.device) + x for x in shifts])
-        order = torch.empty_like(places)
-        order[places] = torch.arange(len(places), device=places.device)
-        pairs = (
-            (self.t, more.t),
-            (self.delta, more.delta),
-            (self.ray, rays.int()[more.ray]),
-            (self.positions, more.positions),
-        )
-        t, delta, ray, positions = (torch.cat(pair).index_select(0, order) for pair in pairs)
-        resume = self.resume.index_copy(0, rays, more.resume)
-        return Samples(t, delta, offsets, ray, positions, resume)
 
 
 @dataclass(frozen=True)

@@ -83,6 +83,24 @@ def test_thin_samples_are_kept_in_turn_and_stand_for_the_others(
     torch.testing.assert_close(length, expected, rtol=1024 * 2**-24, atol=0)
 
 
+def test_the_rounds_of_the_first_pass_change_no_sample(
+    thick: Thick, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    field, occupancy, rays = thick
+    jitter = torch.full((len(rays.origins),), 0.7, device=rays.origins.device)
+    found = []
+    for rounds in ((), (2,), (1, 3)):
+        monkeypatch.setattr("methods.rendering.batch.ROUNDS", rounds)
+        first = first_pass(field, rays, occupancy, March(), jitter=jitter)
+        found.append((first.counts, first.visible(), first.thinned(1.0, jitter)))
+    for counts, *chosen in found[1:]:
+        assert torch.equal(counts, found[0][0])
+        for samples, want in zip(chosen, found[0][1:], strict=True):
+            for name in ("t", "delta", "offsets", "ray", "positions"):
+                assert torch.equal(getattr(samples, name), getattr(want, name)), name
+    assert 0 < len(found[0][2]) < len(found[0][1])
+
+
 def test_hidden_samples_may_be_evaluated_too(thick: Thick) -> None:
     field, occupancy, rays = thick
     grads, used = [], []

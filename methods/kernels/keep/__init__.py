@@ -1,0 +1,46 @@
+"""Which samples of rays are kept, when those of a ray come in several pieces."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from bench.types import check_shape
+from methods.kernels.dispatch import implementation
+
+
+def keep(
+    starts: Tensor,
+    counts: Tensor,
+    turns: Tensor,
+    thin: Tensor,
+    every: int,
+    *,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor]:
+    """Choose samples of R rays, each of which has K pieces, one behind the other.
+
+    A piece consists of the first samples from where it starts to where the next piece of any ray
+    does. The samples of a ray are numbered through its pieces, from its turn on. Thin ones are kept
+    if `every` divides their number.
+
+    Args:
+        starts: [K, R] int64, where each piece starts among S samples; a later piece of a ray
+            starts behind an earlier one.
+        counts: [K, R] int64, how many samples it has; others may follow that belong to no piece.
+        turns: [R] int32, not negative.
+        thin: [S] bool.
+        every: at least 1.
+
+    Returns:
+        The indices [N] int64 of the samples that are kept, ray by ray, front to back; and how many
+        each ray has, [R] int64. The host waits for a GPU.
+    """
+    pieces, rays = starts.shape
+    check_shape("counts", counts, pieces, rays)
+    check_shape("turns", turns, rays)
+    check_shape("thin", thin, None)
+    if every < 1:
+        raise ValueError(f"every: expected 1 or more, got {every}")
+    kernel = implementation("keep", backend, starts.device)
+    kept: tuple[Tensor, Tensor] = kernel.keep(starts, counts, turns, thin, every)
+    return kept
