@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from bench.types import Probe
 from methods.kernels import multiplies_bf16
-from methods.kernels.encode import HashGrid, SampleGradients, encode, pack
+from methods.kernels.encode import HashGrid, SampleGradients, collect, encode, pack
 from methods.kernels.mlp import mlp
 from methods.kernels.spherical import CHANNELS as DIRECTION_CHANNELS
 from methods.kernels.spherical import spherical_harmonics
@@ -104,24 +104,44 @@ class HashField(nn.Module):
         unit = functional.normalize(directions, dim=-1)
         return spherical_harmonics(unit, backend=self.backend).to(self._compute_dtype)
 
-    def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """Density [S] float32 and geometry channels [S, 16] at `positions` [S, 3]."""
-        weights = self._weights("density_in", "density_out")
-        parts = [self._density(part, weights) for part in positions.split(self._part(positions))]
-        sigma, geometry = (_joined(column) for column in zip(*parts, strict=True))
-        return sigma, geometry
-
-    def _density(self, positions: Tensor, weights: list[Tensor]) -> tuple[Tensor, Tensor]:
-        features = encode(
+    def encode(self, positions: Tensor) -> Tensor:
+        """Features [S, channels] of the table at `positions` [S, 3]."""
+        return encode(
             positions,
             self.table,
             self.grid,
             packed=self.packed,
             gradients=self.gradients,
             backend=self.backend,
-        ).to(self._compute_dtype)
-        geometry = mlp([features], weights, backend=self.backend)
+        )
+
+    def density(self, positions: Tensor, encoded: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Density [S] float32 and geometry channels [S, 16] at `positions` [S, 3].
+
+        `encoded` is what `encode` returned for them; None: it is computed here.
+        """
+        weights = self._weights("density_in", "density_out")
+        size = self._part(positions)
+        every = positions.split(size)
+        known = [None] * len(every) if encoded is None else encoded.split(size)
+        parts = [self._density(*part, weights) for part in zip(every, known, strict=True)]
+        sigma, geometry = (_joined(column) for column in zip(*parts, strict=True))
+        return sigma, geometry
+
+    def _density(
+        self, positions: Tensor, known: Tensor | None, weights: list[Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        found = self.encode(positions) if known is None else self._learning(known, positions)
+        geometry = mlp([found.to(self._compute_dtype)], weights, backend=self.backend)
         return _ClampedExp.apply(geometry[:, 0].to(self.table.dtype)), geometry
+
+    def _learning(self, known: Tensor, positions: Tensor) -> Tensor:
+        """What `encode` returned, `known`, with a gradient if one is asked for."""
+        if known.requires_grad or not torch.is_grad_enabled():
+            return known
+        if self.gradients is None:
+            return self.encode(positions)
+        return collect(known, positions, self.table, self.gradients)
 
     def features(self, geometry: Tensor, directions: Tensor) -> Tensor:
         """Features [S, K] float32 of samples with encoded view `directions` [S, 16]."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from methods.kernels.composite import Extent, Pixels, composite, visible
 from methods.kernels.keep import keep
 from methods.kernels.march import Occupancy, Samples, march
 from methods.rendering.compaction import compacts
-from methods.rendering.field import CHUNK_SAMPLES, Field, pad, query
+from methods.rendering.field import CHUNK_SAMPLES, Encoder, Field, pad, query
 from methods.rendering.march import March
 
 ROUNDS = (8, 16)
@@ -88,23 +88,29 @@ class FirstPass:
     def _kept(self, thin: float, turns: Tensor) -> Samples:
         """`thinned`; of the thin samples of a ray, numbered from its turn [R] on, every
         `KEPT_THIN`-th is kept."""
-        every = [some.samples for some in self.rounds]
-        delta = torch.cat([samples.delta for samples in every])
+        together = self._together()
+        delta = together.delta
         faint = torch.cat([some.sigma for some in self.rounds]) * delta < thin
-        lengths = torch.where(faint, KEPT_THIN * delta, delta)
         index, counts = keep(*self._pieces(), turns, faint, KEPT_THIN, backend=self.backend)
-        columns = (
-            torch.cat([samples.t for samples in every]),
-            lengths,
-            torch.cat([some.ray for some in self.rounds]),
-            torch.cat([samples.positions for samples in every]),
-        )
-        # A row at a time; `x[index]` goes number by number.
-        t, delta, ray, positions = (column.index_select(0, index) for column in columns)
         offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
-        resume = torch.full_like(every[0].resume, -1)
-        longest = every[0].longest if len(every) == 1 else None  # or fewer
-        return Samples(t, delta, offsets, ray, positions, resume, longest=longest)
+        longest = together.longest if len(self.rounds) == 1 else None  # or fewer
+        lengths = torch.where(faint, KEPT_THIN * delta, delta)
+        return replace(together, delta=lengths).chosen(index, offsets, longest)
+
+    def _together(self) -> Samples:
+        """The samples of all rounds, one round after the other; the offsets are of the first."""
+        every = [some.samples for some in self.rounds]
+        if len(every) == 1:
+            return every[0]
+        encoded = [samples.encoded for samples in every if samples.encoded is not None]
+        return replace(
+            every[0],
+            t=torch.cat([samples.t for samples in every]),
+            delta=torch.cat([samples.delta for samples in every]),
+            ray=torch.cat([some.ray for some in self.rounds]),
+            positions=torch.cat([samples.positions for samples in every]),
+            encoded=torch.cat(encoded) if encoded else None,
+        )
 
     def _pieces(self) -> tuple[Tensor, Tensor]:
         """Where the samples of each ray start in each round, and how many are visible: [K, R]."""
@@ -193,7 +199,9 @@ def first_pass(
             extent=extent,
             backend=field.backend,
         )
-        sigma = _densities(teller, samples)
+        sigma, encoded = _densities(teller, samples)
+        if teller is field:
+            samples = replace(samples, encoded=encoded)
         counts, left = visible(sigma, samples, stop=how.stop, front=front, backend=field.backend)
         rounds.append(Round(chosen, samples, sigma, counts))
         if limit is None:
@@ -206,16 +214,20 @@ def first_pass(
     return FirstPass(rounds, field.backend)
 
 
-def _densities(field: Field, samples: Samples) -> Tensor:
-    """Density of `samples`, [S]."""
+def _densities(field: Field, samples: Samples) -> tuple[Tensor, Tensor | None]:
+    """Density of `samples` [S], and the encoding [S, E] of their positions by an `Encoder`."""
     parts = pad(samples.positions).split(CHUNK_SAMPLES)
-    return torch.cat([field.density(part)[0] for part in parts])[: len(samples)]
+    if not isinstance(field, Encoder):
+        return torch.cat([field.density(part)[0] for part in parts])[: len(samples)], None
+    encoded = [field.encode(part) for part in parts]
+    sigma = [field.density(*pair)[0] for pair in zip(parts, encoded, strict=True)]
+    return torch.cat(sigma)[: len(samples)], torch.cat(encoded)[: len(samples)]
 
 
 def second_pass(field: Field, rays: Rays, samples: Samples, how: March) -> Pixels:
     """Composite the `samples` of `rays`, with a gradient."""
     encoded = field.encode_directions(rays.directions)
-    sigma, values = query(field, samples.positions, samples.ray, encoded)
+    sigma, values = query(field, samples.positions, samples.ray, encoded, samples.encoded)
     return composite(sigma, values, samples, stop=how.stop, backend=field.backend)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -58,10 +58,30 @@ class Field(Protocol):
         """Count the work of `samples` densities and `shaded` features."""
 
 
-def query(field: Field, positions: Tensor, ray: Tensor, encoded: Tensor) -> tuple[Tensor, Tensor]:
+@runtime_checkable
+class Encoder(Field, Protocol):
+    """A field whose encoding of a position takes longer to compute than to keep and fetch."""
+
+    def encode(self, positions: Tensor) -> Tensor:
+        """Encoding [S, E] of `positions` [S, 3]."""
+
+    def density(self, positions: Tensor, encoded: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """As that of any field, from what `encode` returned, with or without a gradient."""
+
+
+def query(
+    field: Field, positions: Tensor, ray: Tensor, encoded: Tensor, known: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Density [S] and features [S, K] at `positions` [S, 3] on rays `ray` [S], whose directions are
-    `encoded` [R, D]; evaluated as a padded batch."""
-    sigma, geometry = field.density(pad(positions))
+    `encoded` [R, D]; evaluated as a padded batch.
+
+    `known` is the encoding [S, E] of the positions by `field`, an `Encoder`, if there is one.
+    """
+    if known is None:
+        sigma, geometry = field.density(pad(positions))
+    else:
+        assert isinstance(field, Encoder)
+        sigma, geometry = field.density(pad(positions), pad(known))
     values = field.features(geometry, encoded.index_select(0, pad(ray)))
     return sigma[: len(positions)], values[: len(positions)]
 

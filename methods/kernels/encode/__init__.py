@@ -128,6 +128,17 @@ class _Collect(torch.autograd.Function):
         return None, None, None, None
 
 
+def collect(
+    features: Tensor, positions: Tensor, table: Tensor, gradients: SampleGradients
+) -> Tensor:
+    """The `features` [N, levels * F] that `encode` computed at `positions` [N, 3] without a
+    gradient, with one that goes to `gradients`."""
+    # Without an input that asks for a gradient, there is no backward pass.
+    asking = table.detach().requires_grad_()
+    collected: Tensor = _Collect.apply(features, asking, positions, gradients)
+    return collected
+
+
 def encode(
     positions: Tensor,
     table: Tensor,
@@ -160,9 +171,7 @@ def encode(
         positions, read, grid, packed=packed
     )
     if gradients is not None:
-        # Without an input that asks for a gradient, there is no backward pass.
-        asking = table.detach().requires_grad_()
-        features = _Collect.apply(features, asking, positions, gradients)
+        features = collect(features, positions, table, gradients)
     # NaN is rare. On a CPU one sum tests for it cheaply; on a GPU, waiting for it would cost more.
     if positions.device.type != "cpu" or positions.sum().isnan():
         features = torch.where(positions.isnan().any(dim=1, keepdim=True), torch.nan, features)

@@ -10,7 +10,7 @@ a window removes samples but moves none.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
@@ -121,11 +121,13 @@ class Samples(Intervals):
         ray: [S] int32, the ray that a sample belongs to.
         positions: [S, 3] in the unit cube.
         resume: [R] int32, the step to resume from; -1 if the ray has no more samples.
+        encoded: [S, E] encoding of the positions by a field; None: unknown.
     """
 
     ray: Tensor
     positions: Tensor
     resume: Tensor
+    encoded: Tensor | None = field(default=None, kw_only=True)
 
     def __len__(self) -> int:
         return len(self.t)
@@ -135,12 +137,17 @@ class Samples(Intervals):
 
         `extent` is as for `first_of_each`.
         """
-        index, offsets, longest = self.first_of_each(counts, extent)
+        return self.chosen(*self.first_of_each(counts, extent))
+
+    def chosen(self, index: Tensor, offsets: Tensor, longest: int | None) -> Samples:
+        """Only the samples at `index` [N], which lie on the rays as `offsets` [R + 1] say, with no
+        more to follow. `longest` is as for `Intervals`."""
         # A row at a time; `x[index]` goes number by number.
         columns = self.t, self.delta, self.ray, self.positions
         t, delta, ray, positions = (column.index_select(0, index) for column in columns)
+        encoded = None if self.encoded is None else self.encoded.index_select(0, index)
         resume = torch.full_like(self.resume, -1)
-        return Samples(t, delta, offsets, ray, positions, resume, longest=longest)
+        return Samples(t, delta, offsets, ray, positions, resume, longest=longest, encoded=encoded)
 
 
 @dataclass(frozen=True)

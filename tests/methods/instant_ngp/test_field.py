@@ -9,7 +9,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from methods.instant_ngp.field import HashField
-from methods.kernels.encode import HashGrid, encode
+from methods.kernels.encode import HashGrid, SampleGradients, encode
 from tests.methods.conftest import Work
 
 GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=32)
@@ -40,6 +40,28 @@ def test_density_is_positive_and_features_are_in_the_unit_interval() -> None:
     assert features.shape == (200, 6)
     assert (sigma > 0).all()
     assert ((features > 0) & (features < 1)).all()
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+@pytest.mark.parametrize("collected", [False, True])
+def test_a_known_encoding_changes_neither_density_nor_gradient(
+    precision: str, collected: bool
+) -> None:
+    found = []
+    for known in (False, True):
+        made = field(precision)
+        made.gradients = SampleGradients() if collected else None
+        with torch.no_grad():
+            encoded = made.encode(POSITIONS) if known else None
+        sigma, _ = made.density(POSITIONS, encoded)
+        sigma.sum().backward()
+        grads = [made.layers["density_in"].grad, made.table.grad]
+        if made.gradients is not None:
+            grads += made.gradients.joined()
+        found.append([sigma.detach(), *(grad for grad in grads if grad is not None)])
+    for got, want in zip(*found, strict=True):
+        assert want.any()
+        assert torch.equal(got, want)
 
 
 def test_bfloat16_is_close_to_float32() -> None:

@@ -26,7 +26,12 @@ def thick(cloud: tuple[HashField, Occupancy], device: str) -> Thick:
     """The cloud a hundred times as dense, so that it hides its own samples, and rays through it."""
     field, occupancy = cloud
     thin = field.density
-    field.density = lambda x: (100 * thin(x)[0], thin(x)[1])  # type: ignore[method-assign]
+
+    def density(positions: Tensor, known: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        sigma, geometry = thin(positions, known)
+        return 100 * sigma, geometry
+
+    field.density = density  # type: ignore[method-assign]
     camera = look_at_the_middle(0.1, 0.4)
     return field, occupancy, cast(replace(camera, c2w=camera.c2w.to(device)))
 
@@ -122,8 +127,8 @@ def test_rays_are_opaque_where_any_of_their_samples_is(
     field, occupancy = cloud
     holey = field.density
 
-    def density(positions: Tensor) -> tuple[Tensor, Tensor]:
-        sigma, geometry = holey(positions)
+    def density(positions: Tensor, known: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        sigma, geometry = holey(positions, known)
         return torch.where(positions[:, 0] < 0.5, sigma, 0), geometry
 
     field.density = density  # type: ignore[method-assign]
