@@ -66,7 +66,8 @@ class Encoder(Field, Protocol):
         """Encoding [S, E] of `positions` [S, 3]."""
 
     def density(self, positions: Tensor, encoded: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """As that of any field, from what `encode` returned, with or without a gradient."""
+        """As of any field; `encoded` is what `encode` returned for `positions`, which may lack a
+        gradient; None: it is computed here."""
 
 
 def query(

@@ -49,7 +49,7 @@ def hash_adam_(
         *level_arrays(grid),
         *_arrays(table, state, packed),
         f32(rate),
-        get_num_threads(),
+        min(get_num_threads(), grid.levels),
     )
 
 

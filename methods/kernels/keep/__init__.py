@@ -25,7 +25,7 @@ def keep(
 
     Args:
         starts: [K, R] int64, where each piece starts among S samples; a later piece of a ray
-            starts behind an earlier one.
+            starts behind an earlier one, and one that a ray lacks at S.
         counts: [K, R] int64, how many samples it has; others may follow that belong to no piece.
         turns: [R] int32, not negative.
         thin: [S] bool.
