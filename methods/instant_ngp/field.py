@@ -136,12 +136,12 @@ class HashField(nn.Module):
         return _ClampedExp.apply(geometry[:, 0].to(self.table.dtype)), geometry
 
     def _learning(self, known: Tensor, positions: Tensor) -> Tensor:
-        """What `encode` returned, `known`, with a gradient if one is asked for."""
+        """The encoding that is `known`, with a gradient if one is asked for."""
         if known.requires_grad or not torch.is_grad_enabled():
             return known
-        if self.gradients is None:
+        if self.gradients is None:  # the gradient goes to the table, through the encoding itself
             return self.encode(positions)
-        return collect(known, positions, self.table, self.gradients)
+        return collect(known, positions, self.gradients)
 
     def features(self, geometry: Tensor, directions: Tensor) -> Tensor:
         """Features [S, K] float32 of samples with encoded view `directions` [S, 16]."""

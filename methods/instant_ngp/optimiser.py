@@ -18,7 +18,7 @@ from methods.training.optimiser import step_at
 class FieldOptimiser:
     """Adam for the networks of `field`, and for its table one that skips untouched entries.
 
-    Once this exists, the field collects the gradients of its samples in `gradients`.
+    Once this exists, the field collects the gradients of its samples in `gradients`, until `step`.
     """
 
     def __init__(self, field: HashField) -> None:
@@ -58,6 +58,7 @@ class FieldOptimiser:
         return self._table.tensors("adam.") | networks
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore what `tensors` returned."""
+        """Restore what `tensors` returned; gradients of a step that was not finished are lost."""
+        self._field.gradients = SampleGradients()
         self._table = AdamState.of(tensors, "adam.", self._field.table.device)
         checkpoint.restore_optimiser(self._networks, tensors, "network.")

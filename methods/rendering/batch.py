@@ -12,12 +12,12 @@ from methods.kernels.composite import Extent, Pixels, composite, visible
 from methods.kernels.keep import keep
 from methods.kernels.march import Occupancy, Samples, march
 from methods.rendering.compaction import compacts
-from methods.rendering.field import CHUNK_SAMPLES, Encoder, Field, pad, query
+from methods.rendering.field import CACHED_SAMPLES, CHUNK_SAMPLES, Encoder, Field, pad, query
 from methods.rendering.march import March
 
-ROUNDS = (8, 16)
-"""Samples of a ray whose densities a CPU evaluates before it knows whether the ray goes on, in the
-first rounds; the last one has all that are left."""
+FIRST_ROUNDS = (8, 16)
+"""How many samples of a ray a CPU evaluates in each of the first rounds, before it knows whether
+the ray goes on; a last round has all that are left."""
 
 KEPT_THIN = 4
 """One of so many thin samples is kept; see `render_batch`."""
@@ -46,7 +46,7 @@ class Round:
         return own if self.rays is None else self.rays.int().index_select(0, own)
 
     def place(self, of_each: Tensor, values: Tensor) -> None:
-        """Put the `values` [Q] of these rays into those `of_each` [R] of all rays."""
+        """Write the `values` [Q] of these rays into `of_each` [R], which has one of every ray."""
         if self.rays is None:
             of_each.copy_(values)
         else:
@@ -55,7 +55,10 @@ class Round:
 
 @dataclass(frozen=True)
 class FirstPass:
-    """The `rounds` in which the samples of R rays were looked at; on a GPU, there is one."""
+    """The `rounds` in which the samples of R rays were looked at; on a GPU, there is one.
+
+    `backend` is that of the kernels.
+    """
 
     rounds: list[Round]
     backend: str
@@ -86,19 +89,21 @@ class FirstPass:
         return self._kept(thin, (jitter * 2**12).int())
 
     def _kept(self, thin: float, turns: Tensor) -> Samples:
-        """`thinned`; of the thin samples of a ray, numbered from its turn [R] on, every
-        `KEPT_THIN`-th is kept."""
+        """The visible samples, numbered along each ray from its turn [R] on. Of those below the
+        optical depth `thin`, the ones stay whose number `KEPT_THIN` divides, with the length of
+        all."""
         together = self._together()
         delta = together.delta
         faint = torch.cat([some.sigma for some in self.rounds]) * delta < thin
         index, counts = keep(*self._pieces(), turns, faint, KEPT_THIN, backend=self.backend)
         offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
-        longest = together.longest if len(self.rounds) == 1 else None  # or fewer
+        longest = together.longest if len(self.rounds) == 1 else None  # it has no more
         lengths = torch.where(faint, KEPT_THIN * delta, delta)
         return replace(together, delta=lengths).chosen(index, offsets, longest)
 
     def _together(self) -> Samples:
-        """The samples of all rounds, one round after the other; the offsets are of the first."""
+        """The samples of all rounds, one round after the other. `offsets`, `resume` and `longest`
+        are those of the first."""
         every = [some.samples for some in self.rounds]
         if len(every) == 1:
             return every[0]
@@ -181,11 +186,10 @@ def first_pass(
     """Evaluate the density of the samples of `rays`; see `render_batch`.
 
     Args:
-        extent: how many samples there are; None: the host waits for a GPU to count them.
+        extent: how many samples there are, only on a GPU; None: the host waits to count them.
     """
-    teller = field if guide is None else guide
-    # On a CPU most rays end soon: only those that do not are looked at further.
-    limits = ROUNDS if compacts(rays.origins.device) else ()
+    # Most rays end soon; a CPU looks further only along the others.
+    limits = FIRST_ROUNDS if compacts(rays.origins.device) else ()
     rounds: list[Round] = []
     chosen, start, front = None, None, None
     for limit in (*limits, None):
@@ -199,9 +203,10 @@ def first_pass(
             extent=extent,
             backend=field.backend,
         )
-        sigma, encoded = _densities(teller, samples)
-        if teller is field:
-            samples = replace(samples, encoded=encoded)
+        if guide is None and isinstance(field, Encoder):
+            sigma, samples = _encoded_densities(field, samples)
+        else:
+            sigma = _densities(field if guide is None else guide, samples)
         counts, left = visible(sigma, samples, stop=how.stop, front=front, backend=field.backend)
         rounds.append(Round(chosen, samples, sigma, counts))
         if limit is None:
@@ -214,20 +219,28 @@ def first_pass(
     return FirstPass(rounds, field.backend)
 
 
-def _densities(field: Field, samples: Samples) -> tuple[Tensor, Tensor | None]:
-    """Density of `samples` [S], and the encoding [S, E] of their positions by an `Encoder`."""
+def _densities(field: Field, samples: Samples) -> Tensor:
+    """Density of `samples`, [S]."""
     parts = pad(samples.positions).split(CHUNK_SAMPLES)
-    if not isinstance(field, Encoder):
-        return torch.cat([field.density(part)[0] for part in parts])[: len(samples)], None
-    encoded = [field.encode(part) for part in parts]
-    sigma = [field.density(*pair)[0] for pair in zip(parts, encoded, strict=True)]
-    return torch.cat(sigma)[: len(samples)], torch.cat(encoded)[: len(samples)]
+    return torch.cat([field.density(part)[0] for part in parts])[: len(samples)]
+
+
+def _encoded_densities(field: Encoder, samples: Samples) -> tuple[Tensor, Samples]:
+    """Density of `samples`, [S], and the samples with the encoding of their positions."""
+    size = CACHED_SAMPLES if compacts(samples.t.device) else CHUNK_SAMPLES
+    parts = pad(samples.positions).split(size)
+    encoded, sigma = [], []
+    for part in parts:
+        encoded.append(field.encode(part))
+        sigma.append(field.density(part, encoded[-1])[0])
+    known = torch.cat(encoded)[: len(samples)]
+    return torch.cat(sigma)[: len(samples)], replace(samples, encoded=known)
 
 
 def second_pass(field: Field, rays: Rays, samples: Samples, how: March) -> Pixels:
     """Composite the `samples` of `rays`, with a gradient."""
-    encoded = field.encode_directions(rays.directions)
-    sigma, values = query(field, samples.positions, samples.ray, encoded, samples.encoded)
+    directions = field.encode_directions(rays.directions)
+    sigma, values = query(field, samples.positions, samples.ray, directions, samples.encoded)
     return composite(sigma, values, samples, stop=how.stop, backend=field.backend)
 
 

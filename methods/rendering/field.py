@@ -71,19 +71,19 @@ class Encoder(Field, Protocol):
 
 
 def query(
-    field: Field, positions: Tensor, ray: Tensor, encoded: Tensor, known: Tensor | None = None
+    field: Field, positions: Tensor, ray: Tensor, directions: Tensor, encoded: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Density [S] and features [S, K] at `positions` [S, 3] on rays `ray` [S], whose directions are
-    `encoded` [R, D]; evaluated as a padded batch.
+    """Density [S] and features [S, K] at `positions` [S, 3] on rays `ray` [S], whose encoded
+    directions are `directions` [R, D]; evaluated as a padded batch.
 
-    `known` is the encoding [S, E] of the positions by `field`, an `Encoder`, if there is one.
+    `encoded` is the encoding [S, E] of the positions by `field`, an `Encoder`, if it is known.
     """
-    if known is None:
+    if encoded is None:
         sigma, geometry = field.density(pad(positions))
     else:
         assert isinstance(field, Encoder)
-        sigma, geometry = field.density(pad(positions), pad(known))
-    values = field.features(geometry, encoded.index_select(0, pad(ray)))
+        sigma, geometry = field.density(pad(positions), pad(encoded))
+    values = field.features(geometry, directions.index_select(0, pad(ray)))
     return sigma[: len(positions)], values[: len(positions)]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -34,7 +35,8 @@ class SteerNerf:
         model: the settings that stage 2 trains for.
         rendering: the settings chosen after training.
         renderer: factory of the 2D renderer, called with K, L and s.
-        joint: how stage 2 trains on patches, for `budget.renderer_steps` steps.
+        joint: how stage 2 trains on patches.
+        steps: of stage 2; None: `budget.renderer_steps`.
         after: share of these steps whose weights are used; see `training.stage2.Stage2`.
         engine: computes the network of the 2D renderer once it is trained.
         precision: of the field, "bf16" (packed table, bfloat16 networks) or "fp32".
@@ -56,6 +58,7 @@ class SteerNerf:
         renderer: Callable[..., Renderer2d],
         joint: JointOptions,
         engine: Engine,
+        steps: int | None = None,
         after: float = 1.0,
         precision: Precision = "bf16",
         name: str = "steernerf",
@@ -68,11 +71,13 @@ class SteerNerf:
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         engine.check(self.setup.device)
         self.rendering, self.engine, self.name = rendering, engine, name
+        self.steps = steps
         self.memory, self.buffer = model.frames, RenderingBuffer(model.frames)
         self.train_s = 0.0
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Train both stages, or load their results if they were trained before."""
+        budget = replace(budget, renderer_steps=self.steps or budget.renderer_steps)
         with torch_threads(budget.threads):
             self.trained = train_field(self.setup, scene, budget, log)
             second = train_stage2(self.trained, self.setup, self.stage2, scene, budget, log)

@@ -97,6 +97,8 @@ def hash_adam_(
     _check(table, state, packed)
     if gradients:
         positions, grad = gradients.joined()
+        check_shape("positions", positions, None, 3)
+        check_shape("gradients", grad, len(positions), grid.channels)
         implementation("adam", backend, table.device).hash_adam_(
             table, positions, grad, grid, state, rate, packed
         )

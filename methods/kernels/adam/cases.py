@@ -1,4 +1,8 @@
-"""Cases of the sparse Adam step: agreement of the backends, the first step in closed form."""
+"""Cases of the sparse Adam step: agreement of the backends, the first step in closed form.
+
+The gradients of samples are short numbers, and so are their positions in cells, so that the sums of
+a hash table's gradient are exact in any order.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +14,16 @@ import torch
 from torch import Tensor
 
 from bench.case import U16, U32, Agreement, Case, Property
-from methods.kernels.adam import AdamState, sparse_adam_
+from methods.kernels.adam import AdamState, hash_adam_, sparse_adam_
 from methods.kernels.dispatch import served
-from methods.kernels.encode import pack
+from methods.kernels.encode import HashGrid, SampleGradients, pack
 
 STEPS = 3
 RATE = 1e-2
 LARGE = 1 << 20
+
+DYADIC = {"levels": 2, "log2_table": 8, "n_min": 5, "n_max": 9}
+"""A dense and a hashed level of 4 and 8 cells along an axis."""
 
 
 def cases() -> list[Case]:
@@ -45,6 +52,9 @@ def cases() -> list[Case]:
     for features in (1, 3, 48):
         make = partial(_prepare, 70, 0.3, features)
         found.append(kernel.case(f"30% of 70, {features} features", make, tolerance))
+    for samples, features in ((0, 2), (1, 2), (60, 2), (60, 1), (60, 3)):
+        name = f"hash table, {samples} samples, {features} features"
+        found.append(kernel.case(name, partial(_prepare_hash, samples, features), tolerance))
     return found
 
 
@@ -66,6 +76,31 @@ def _prepare(
         packed = pack(trained) if features == 2 else None
         for grad in grads:
             sparse_adam_(trained, grad.clone(), state, RATE, packed=packed, backend=backend)
+        changed = trained, state.first, state.second, state.steps
+        return changed if packed is None else (*changed, packed[:, None].view(torch.bfloat16))
+
+    return call
+
+
+def _prepare_hash(samples: int, features: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
+    """The gradient of an entry is at most 3, the sum over its samples of weight and gradient."""
+    grid = HashGrid(**DYADIC, features=features)
+    generator = torch.Generator().manual_seed(samples)
+    table = (torch.rand(grid.entries, features, generator=generator) * 2 - 1).to(device)
+    steps = []
+    for _ in range(STEPS):
+        positions = torch.randint(33, (samples, 3), generator=generator) / 32
+        grads = torch.randint(-2, 3, (samples, grid.channels), generator=generator) / 4
+        steps.append((positions.to(device), grads.to(device)))
+
+    def call(backend: str) -> tuple[Tensor, ...]:
+        trained, state = table.clone(), AdamState.like(table)
+        packed = pack(trained) if features == 2 else None
+        for positions, grads in steps:
+            gradients = SampleGradients()
+            for part in zip(positions.split(40), grads.split(40), strict=True):
+                gradients.add(*part)
+            hash_adam_(trained, gradients, grid, state, RATE, packed=packed, backend=backend)
         changed = trained, state.first, state.second, state.steps
         return changed if packed is None else (*changed, packed[:, None].view(torch.bfloat16))
 

@@ -40,8 +40,8 @@ def hash_adam_(
     packed: Tensor | None,
 ) -> None:
     """See `methods.kernels.adam.hash_adam_`."""
+    asking = table.detach().requires_grad_()
     with torch.enable_grad():
-        asking = table.detach().requires_grad_()
-        encode(positions, asking, grid).backward(grad.to(table.dtype))
-    assert asking.grad is not None
-    sparse_adam_(table, asking.grad, state, rate, packed)
+        encoded = encode(positions, asking, grid)
+    (total,) = torch.autograd.grad(encoded, asking, grad.to(table.dtype))
+    sparse_adam_(table, total, state, rate, packed)

@@ -89,9 +89,9 @@ class HashGrid:
 
 
 class SampleGradients:
-    """Positions, and the gradients of their features, as they come from the backward passes of a
-    training step: what the gradient of a table is the sum of. `adam.hash_adam_` adds them up level
-    by level and uses each sum while it is in the cache, so that it is never in memory."""
+    """Positions of samples and the gradients of their features, collected by the backward passes of
+    a training step. The gradient of the table is a sum over them. `adam.hash_adam_` computes it, on
+    a CPU level by level, and uses that of a level while it is in the cache."""
 
     def __init__(self) -> None:
         self._parts: list[tuple[Tensor, Tensor]] = []
@@ -114,10 +114,12 @@ class SampleGradients:
 
 
 class _Collect(torch.autograd.Function):
-    """Features [N, C] whose gradient is not that of the `table`, but goes to `gradients`."""
+    """Lets features through; their gradient is added to `gradients`, and goes no further.
+
+    `asking` asks for a gradient, without which there would be no backward pass."""
 
     @staticmethod
-    def forward(ctx, features, table, positions, gradients):
+    def forward(ctx, features, asking, positions, gradients):
         ctx.save_for_backward(positions)
         ctx.gradients = gradients
         return features.view_as(features)
@@ -128,13 +130,10 @@ class _Collect(torch.autograd.Function):
         return None, None, None, None
 
 
-def collect(
-    features: Tensor, positions: Tensor, table: Tensor, gradients: SampleGradients
-) -> Tensor:
+def collect(features: Tensor, positions: Tensor, gradients: SampleGradients) -> Tensor:
     """The `features` [N, levels * F] that `encode` computed at `positions` [N, 3] without a
-    gradient, with one that goes to `gradients`."""
-    # Without an input that asks for a gradient, there is no backward pass.
-    asking = table.detach().requires_grad_()
+    gradient, as part of the graph: the backward pass adds their gradient to `gradients`."""
+    asking = torch.empty(0, device=features.device, requires_grad=True)
     collected: Tensor = _Collect.apply(features, asking, positions, gradients)
     return collected
 
@@ -158,7 +157,7 @@ def encode(
         packed: `pack(table)`; if given, it is read instead of `table` (half the memory traffic;
             F = 2 only). The output is then bfloat16; its gradient goes to `table`.
         gradients: if given, the gradients of the features are collected there and hidden from
-            autograd, whether or not `table` asks for a gradient.
+            autograd, whether or not `table` asks for a gradient; `positions` get none.
     """
     check_shape("positions", positions, None, 3)
     check_shape("table", table, grid.entries, grid.features)
@@ -171,7 +170,7 @@ def encode(
         positions, read, grid, packed=packed
     )
     if gradients is not None:
-        features = collect(features, positions, table, gradients)
+        features = collect(features, positions, gradients)
     # NaN is rare. On a CPU one sum tests for it cheaply; on a GPU, waiting for it would cost more.
     if positions.device.type != "cpu" or positions.sum().isnan():
         features = torch.where(positions.isnan().any(dim=1, keepdim=True), torch.nan, features)

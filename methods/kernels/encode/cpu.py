@@ -310,7 +310,7 @@ def scatter_level(positions, grad, scale, stride, size, target):
 
 @njit(cache=True, parallel=True)
 def _scatter(positions, grad, scales, strides, offsets, target, workers):
-    """All levels; `grad` is [channels, N], `target` flat."""
+    """`scatter_level` for all levels; `grad` is [channels, N], `target` the whole table, flat."""
     levels = len(scales)
     features = len(grad) // levels
     for worker in prange(workers):

@@ -19,14 +19,14 @@ def keep(
 ) -> tuple[Tensor, Tensor]:
     """Choose samples of R rays, each of which has K pieces, one behind the other.
 
-    A piece consists of the first samples from where it starts to where the next piece of any ray
-    does. The samples of a ray are numbered through its pieces, from its turn on. Thin ones are kept
-    if `every` divides their number.
+    S samples lie in stretches, each of one ray. A piece is the first `counts` samples of a stretch;
+    the others are never kept. The samples in the pieces of a ray are numbered from its turn on, and
+    thin ones are kept if `every` divides their number.
 
     Args:
-        starts: [K, R] int64, where each piece starts among S samples; a later piece of a ray
-            starts behind an earlier one, and one that a ray lacks at S.
-        counts: [K, R] int64, how many samples it has; others may follow that belong to no piece.
+        starts: [K, R] int64, where each stretch starts, the first of all at 0; those of a ray lie
+            one behind the other, and one that it lacks starts at S.
+        counts: [K, R] int64, at most the length of the stretch.
         turns: [R] int32, not negative.
         thin: [S] bool.
         every: at least 1.

@@ -1,4 +1,5 @@
-"""Cases of choosing samples: no rays, rays without samples, one to three pieces; a batch, timed."""
+"""Cases of choosing samples: no rays, rays without samples, one to three pieces, some of which most
+rays lack; a batch, timed."""
 
 from __future__ import annotations
 
@@ -44,9 +45,13 @@ def _prepare(
     """Pieces lie in memory as in rounds of a march: all first ones, then all second ones."""
     generator = torch.Generator().manual_seed(rays)
     lengths = torch.randint(most + 1, (pieces, rays), generator=generator)
-    starts = (lengths.flatten().cumsum(0) - lengths.flatten()).view_as(lengths).to(device)
+    lacking = torch.rand(pieces, rays, generator=generator) < 0.6
+    lacking[:1] = False
+    lengths[lacking] = 0
+    starts = (lengths.flatten().cumsum(0) - lengths.flatten()).view_as(lengths)
+    starts[lacking] = lengths.sum()
     counts = (lengths - torch.randint(2, lengths.shape, generator=generator)).clamp(min=0)
-    counts = counts.to(device)
+    starts, counts = starts.to(device), counts.to(device)
     turns = torch.randint(2**12, (rays,), generator=generator).int().to(device)
     thin = (torch.rand(int(lengths.sum()), generator=generator) < 0.5).to(device)
     return lambda backend: keep(starts, counts, turns, thin, every, backend=backend)

@@ -11,8 +11,8 @@ def keep(
 ) -> tuple[Tensor, Tensor]:
     """See `methods.kernels.keep.keep`."""
     rays = starts.shape[1]
-    # Without the length of a list that the host would wait for: the piece of each sample. Of empty
-    # pieces that start where another one does, the other one is the last.
+    # The piece that a sample lies in, without a list whose length the host would wait for. Of
+    # pieces that start at one place, all but the last are empty.
     begins, order = starts.flatten().sort(stable=True)
     sample = torch.arange(len(thin), device=thin.device)
     piece = order[torch.searchsorted(begins, sample, right=True) - 1]

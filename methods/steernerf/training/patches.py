@@ -219,8 +219,7 @@ class PatchSource:
     ) -> tuple[Samples, list[Tensor] | list[None]]:
         """The samples that are not hidden, and the cells near matter of each patch. On a GPU the
         numbers of both are read back together."""
-        counts = first.counts
-        if compacts(counts.device) or not self.pipeline.leaves_out(self.rendering):
+        if compacts(self.pipeline.field.device) or not self.pipeline.leaves_out(self.rendering):
             return first.visible(), [None] * len(patches)
         opaque = first.opaque().split([len(some) for x in chosen for some in x])
         near = [
@@ -229,7 +228,7 @@ class PatchSource:
                 patches, chosen, _of_each(patches, opaque), strict=True
             )
         ]
-        sizes, extent = _asked(near, counts)
+        sizes, extent = _asked(near, first.counts)
         return first.visible(extent), indices_where(near, sizes)
 
     def _observation(

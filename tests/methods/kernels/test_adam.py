@@ -98,3 +98,10 @@ def test_wrong_arguments_are_named() -> None:
         sparse_adam_(table, table.clone(), AdamState(state.first, state.second, short), 0.1)
     with pytest.raises(ValueError, match="packed: expected shape"):
         sparse_adam_(table, table.clone(), state, 0.1, packed=short)
+    grid, gradients = HashGrid(levels=1, log2_table=6, n_min=4, n_max=4), SampleGradients()
+    gradients.add(torch.zeros(5, 3), torch.zeros(5, 3))
+    table = torch.zeros(grid.entries, 2)
+    with pytest.raises(ValueError, match=r"gradients: expected shape \[5, 2\], got \[5, 3\]"):
+        hash_adam_(table, gradients, grid, AdamState.like(table), 0.1)
+    with pytest.raises(ValueError, match="table: expected shape"):
+        hash_adam_(table[1:], gradients, grid, AdamState.like(table[1:]), 0.1)

@@ -91,11 +91,12 @@ def test_thin_samples_are_kept_in_turn_and_stand_for_the_others(
 def test_the_rounds_of_the_first_pass_change_no_sample(
     thick: Thick, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """But for a transmittance that reaches `stop` just where a round ends: it is rounded there."""
     field, occupancy, rays = thick
     jitter = torch.full((len(rays.origins),), 0.7, device=rays.origins.device)
     found = []
     for rounds in ((), (2,), (1, 3)):
-        monkeypatch.setattr("methods.rendering.batch.ROUNDS", rounds)
+        monkeypatch.setattr("methods.rendering.batch.FIRST_ROUNDS", rounds)
         first = first_pass(field, rays, occupancy, March(), jitter=jitter)
         found.append((first.counts, first.visible(), first.thinned(1.0, jitter)))
     for counts, *chosen in found[1:]:
@@ -103,6 +104,8 @@ def test_the_rounds_of_the_first_pass_change_no_sample(
         for samples, want in zip(chosen, found[0][1:], strict=True):
             for name in ("t", "delta", "offsets", "ray", "positions"):
                 assert torch.equal(getattr(samples, name), getattr(want, name)), name
+            with torch.no_grad():
+                assert torch.equal(samples.encoded, field.encode(samples.positions))
     assert 0 < len(found[0][2]) < len(found[0][1])
 
 
