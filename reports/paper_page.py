@@ -99,11 +99,16 @@ def _curves(table: PaperTable, lines: Lines) -> Iterator[figures.Curve]:
         if whole := measured.get(line.label):  # end points, of the same trainings
             runs = [run for run in whole.runs if run.facts["seed"] in seeds]
             marks |= {1.0: replace(whole, runs=runs)} if runs else {}
-        points = {
-            of.runs[0].record["budget"]["renderer_steps"] * share: of for share, of in marks.items()
-        }
+        points = {_steps(of.runs[0]) * share: of for share, of in marks.items()}
         if len(points) > 1:
             yield figures.Curve(table.number, line.label, points)
+
+
+def _steps(run: Run) -> int:
+    """Steps of stage 2 in the training of `run`."""
+    method = run.record["made_of"].get("config", {}).get("method", {})
+    steps: int = method.get("steps") or run.record["budget"]["renderer_steps"]
+    return steps
 
 
 def _images(images: Mapping[str, Any], lines: Lines) -> Iterator[Part]:

@@ -118,13 +118,20 @@ def test_a_mark_stands_where_its_line_is_in_quality_and_cost(
     assert mark.get_xydata().tolist() == [[104e-6, run.values["psnr"]]]
 
 
+@pytest.mark.parametrize(("of_method", "of_budget"), [(None, 80), (80, 7)])
 def test_a_curve_has_a_point_for_every_share_of_the_training_that_was_measured(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    of_method: int | None,
+    of_budget: int,
+    run: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     drawn: list[figures.Figure] = []
     monkeypatch.setattr(figures.Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
     (table,) = (table for table in paper_tables() if table.name == "table5")
-    trained = replace(run, record={**run.record, "budget": {"renderer_steps": 80}})
+    made_of = {"config": {"method": {"steps": of_method}}}
+    budget = {"renderer_steps": of_budget}
+    trained = replace(run, record={**run.record, "budget": budget, "made_of": made_of})
     first, second = table.lines
     halves = [table.marks[line.label, 0.5].label for line in table.lines]
     quarter = table.marks[first.label, 0.25].label
