@@ -39,6 +39,7 @@ def new_method(
     engine: Engine | None = None,
     device: str = "cpu",
     after: float = 1.0,
+    steps: int | None = None,
     **rendering: Any,
 ) -> SteerNerf:
     return SteerNerf(
@@ -55,6 +56,7 @@ def new_method(
         ),
         engine=engine or TorchEngine(),
         after=after,
+        steps=steps,
         device=device,
     )
 
@@ -95,6 +97,17 @@ def test_every_number_of_frames_shares_one_field(
 ) -> None:
     for frames in (0, 1):
         new_method(frames).fit(ball_scene, BUDGET, log)
+    assert stages(tmp_path) == ["distilled", "field", "steernerf", "steernerf"]
+
+
+def test_steps_of_its_own_replace_those_of_the_budget(
+    ball_scene: Scene, log: ConsoleLog, tmp_path: Path
+) -> None:
+    new_method().fit(ball_scene, BUDGET, log)
+    more = replace(BUDGET, renderer_steps=BUDGET.renderer_steps + 1)
+    new_method(steps=BUDGET.renderer_steps).fit(ball_scene, more, log)
+    assert stages(tmp_path) == ["distilled", "field", "steernerf"]  # the same training
+    new_method().fit(ball_scene, more, log)
     assert stages(tmp_path) == ["distilled", "field", "steernerf", "steernerf"]
 
 
