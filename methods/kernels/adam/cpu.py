@@ -14,7 +14,7 @@ from numba import get_num_threads, njit, prange
 from torch import Tensor
 
 from methods.kernels.adam import BETAS, EPS, AdamState, corrections
-from methods.kernels.cpu import f32, pack_bf16, u32, u64
+from methods.kernels.cpu import f32, pack_bf16, u64
 from methods.kernels.encode import HashGrid
 from methods.kernels.encode.cpu import by_channel, level_arrays, scatter_level
 
@@ -96,16 +96,9 @@ def _update_levels(
         total = np.zeros(largest * features, np.float32)
         # Every workers-th level, because fine levels cost the most.
         for level in range(worker, levels, workers):
+            scatter_level(level, positions, grad, scales, strides, offsets, total)
             begin, end = offsets[level], offsets[level + 1]
             a, b = begin * features, end * features
-            scatter_level(
-                positions,
-                grad[level * features : (level + 1) * features],
-                scales[level],
-                strides[level],
-                u32(end - begin),
-                total,
-            )
             words = packed[begin:end] if len(packed) else packed
             for entry in range(0, end - begin, CHUNK):
                 _entries(

@@ -104,7 +104,7 @@ class SampleGradients:
         self._parts.append((positions, gradients))
 
     def joined(self) -> tuple[Tensor, Tensor]:
-        """All positions and gradients, of which there must be some."""
+        """All positions and gradients; at least one `add` must have come before."""
         positions, gradients = zip(*self._parts, strict=True)
         return torch.cat(positions), torch.cat(gradients)
 

@@ -290,17 +290,18 @@ def _scatter_one(index, weight, count, grad, target, feature, features):
 
 
 @njit(cache=True)
-def scatter_level(positions, grad, scale, stride, size, target):
+def scatter_level(level, positions, grad, scales, strides, offsets, target):
     """Adjoint of `_encode_float` at one level: target[corner] += weight * grad. `grad` is
-    [features, N], `target` the level's [entries, features], flat."""
-    features, total = grad.shape
+    [channels, N], of all levels; `target` the level's [entries, features], flat."""
+    features, total = len(grad) // len(scales), len(positions)
+    size = u32(offsets[level + 1] - offsets[level])
     xyz = np.empty(3 * CHUNK, np.float32)
     index, weight = np.empty(8 * CHUNK, np.uint32), np.empty(8 * CHUNK, np.float32)
     for first in range(0, total, CHUNK):
         count = min(CHUNK, total - first)
         _load(positions, first, count, xyz)
-        _corners(xyz, count, scale, stride, size, index, weight)
-        part = grad[:, first : first + count]
+        _corners(xyz, count, scales[level], strides[level], size, index, weight)
+        part = grad[level * features : (level + 1) * features, first : first + count]
         if features == 2:
             _scatter_pairs(index, weight, count, part[0], part[1], target)
         else:
@@ -316,12 +317,5 @@ def _scatter(positions, grad, scales, strides, offsets, target, workers):
     for worker in prange(workers):
         # Every workers-th level, because fine levels miss the cache and cost the most.
         for level in range(worker, levels, workers):
-            begin, end = offsets[level], offsets[level + 1]
-            scatter_level(
-                positions,
-                grad[level * features : (level + 1) * features],
-                scales[level],
-                strides[level],
-                u32(end - begin),
-                target[begin * features : end * features],
-            )
+            own = target[offsets[level] * features : offsets[level + 1] * features]
+            scatter_level(level, positions, grad, scales, strides, offsets, own)

@@ -17,7 +17,7 @@ def keep(
     *,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
-    """Choose samples of R rays, each of which has K pieces, one behind the other.
+    """Choose samples of R rays. A ray has K pieces, one behind the other.
 
     S samples lie in stretches, each of one ray. A piece is the first `counts` samples of a stretch;
     the others are never kept. The samples in the pieces of a ray are numbered from its turn on, and
