@@ -39,7 +39,8 @@ STANDS_ON = {
     "kilonerf": {"kernels", "rendering", "training", "instant_ngp", "students"},
     "plenoctree": {"kernels", "rendering", "training", "instant_ngp", "students"},
     "diver": {"kernels", "rendering", "training", "instant_ngp", "students"},
-    "steernerf": {"kernels", "engines", "rendering", "training", "instant_ngp"},
+    "steernerf": {"kernels", "engines", "rendering", "training", "instant_ngp", "steernerf_lean"},
+    "steernerf_lean": {"kernels", "engines", "rendering", "training", "instant_ngp", "steernerf"},
 }
 """The folders of `methods` from which each may import, beside itself; `methods/checks.py` stands
 above them all."""
@@ -94,17 +95,19 @@ def test_no_floor_stands_on_one_above_it():
 def test_an_implementation_of_a_kernel_is_known_to_that_kernel_and_its_like_alone(path):
     """A kernel for the CPU may be made of functions of another one for the CPU."""
     for name, _ in imports(path):
-        parts = name.split(".")
-        if parts[:2] == ["methods", "kernels"] and IMPLEMENTATIONS & set(parts[3:]):
-            alike = path.parts[1] == "kernels" and path.stem in parts[3:]
-            assert alike or path.parts[:3] == (*parts[:3],), f"{path} imports {name}"
+        before, _, kernel = name.partition(".kernels.")
+        kernel, *inside = kernel.split(".")
+        if IMPLEMENTATIONS & set(inside):
+            alike = "kernels" in path.parts and path.stem in inside
+            folder = tuple(f"{before}.kernels.{kernel}".split("."))
+            assert alike or path.parts[: len(folder)] == folder, f"{path} imports {name}"
 
 
 @pytest.mark.parametrize(("library", "home"), [("numba", "cpu.py"), ("triton", "gpu.py")])
 def test_a_compiler_is_imported_only_by_the_kernels_made_for_it(library, home):
     users = {path for path in SOURCES for name, _ in imports(path) if name.split(".")[0] == library}
     assert {path.name for path in users} <= {home}
-    assert {path.parts[:2] for path in users} <= {("methods", "kernels")}
+    assert all("kernels" in path.parts[1:3] for path in users)
 
 
 def test_the_command_line_opens_without_loading_torch():

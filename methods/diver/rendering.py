@@ -9,10 +9,10 @@ from torch.nn import functional
 
 from bench.types import Probe, Rays
 from methods.diver.decoder import Merged
+from methods.diver.kernels.corner_rendering import Corners, render_segments
 from methods.diver.model import CornerModel
 from methods.kernels.composite import Pixels
 from methods.kernels.corner_gather import CORNERS
-from methods.kernels.corner_rendering import Corners, render_segments
 from methods.kernels.march import Occupancy
 from methods.rendering.compaction import to_host
 

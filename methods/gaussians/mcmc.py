@@ -12,8 +12,8 @@ import math
 import torch
 from torch import Tensor
 
+from methods.gaussians.kernels.projection import covariances
 from methods.gaussians.model import Gaussians
-from methods.kernels.gaussian_projection import covariances
 
 DEAD = 0.005
 """A Gaussian whose opacity is at most this is dead, and is relocated."""

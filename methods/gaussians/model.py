@@ -9,9 +9,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from bench.types import Camera, Probe
+from methods.gaussians.kernels.blending import blend
+from methods.gaussians.kernels.projection import project_gaussians
 from methods.kernels.composite import Pixels
-from methods.kernels.gaussian_blending import blend
-from methods.kernels.gaussian_projection import project_gaussians
 from methods.kernels.spherical import shade
 
 Y00 = 1 / math.sqrt(4 * math.pi)

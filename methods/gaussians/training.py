@@ -13,10 +13,10 @@ from torch.nn import functional
 from bench.cameras import place_camera, scale_camera
 from bench.compositing import composite
 from bench.types import Camera, NullProbe, Scene
+from methods.gaussians.kernels.ssim import ssim
 from methods.gaussians.mcmc import disturb, relocate
 from methods.gaussians.model import Gaussians
 from methods.kernels.composite import STOP
-from methods.kernels.ssim import ssim
 from methods.training import checkpoint, loop
 
 

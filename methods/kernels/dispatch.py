@@ -85,17 +85,18 @@ def multiplies_bf16(kind: str) -> bool:
 
 
 def implementation(kernel: str, backend: str, device: torch.device) -> ModuleType:
-    """The module that implements `kernel` (a folder beside this file) for tensors on `device`."""
+    """The module that implements `kernel`, a package, for tensors on `device`."""
     name = resolve(backend, device)
     if name == "cpu":
         _load("methods.kernels.cpu").follow_torch_threads()
-    return _load(f"methods.kernels.{kernel}.{name}")
+    return _load(f"{kernel}.{name}")
 
 
-def served(kernel: str) -> list[str]:
-    """The backends that implement `kernel`."""
-    folder = Path(__file__).parent / kernel
-    return [name for name in BACKENDS if (folder / f"{name}.py").exists()]
+@cache
+def served(kernel: str) -> tuple[str, ...]:
+    """The backends that implement `kernel`, a package."""
+    folder = Path(*importlib.import_module(kernel).__path__)
+    return tuple(name for name in BACKENDS if (folder / f"{name}.py").exists())
 
 
 def compiled(device: str) -> list[str]:

@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from bench.types import Probe
-from methods.kernels.grouped_mlp import (
+from methods.kilonerf.grid import Grid
+from methods.kilonerf.kernels.grouped_mlp import (
     HIDDEN,
     Networks,
     colours,
@@ -17,7 +18,6 @@ from methods.kernels.grouped_mlp import (
     encode_frequencies,
     locate,
 )
-from methods.kilonerf.grid import Grid
 from methods.students.fields import REACH, StudentField
 
 POSITION_FREQUENCIES = 10

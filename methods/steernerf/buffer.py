@@ -20,9 +20,9 @@ from bench.cameras import (
     within,
 )
 from bench.types import Camera
-from methods.kernels.splat import splat
 from methods.rendering.compaction import kept_indices
 from methods.rendering.frame import FeatureFrame
+from methods.steernerf.kernels.splat import splat
 from methods.steernerf.options import Reprojection
 from methods.training.checkpoint import part
 

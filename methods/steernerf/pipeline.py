@@ -25,14 +25,9 @@ from torch.nn import functional
 from bench.cameras import place_camera
 from bench.types import Camera, Frame, NullProbe, Probe
 from methods.kernels.march import Occupancy
-from methods.kernels.warp import enlarge, warp
 from methods.rendering.field import Field
 from methods.rendering.frame import FeatureFrame, Render, everywhere, render_frame
 from methods.rendering.rays import render_rays
-from methods.steernerf.beyond import window
-from methods.steernerf.beyond.cells import put_pixels
-from methods.steernerf.beyond.refinement import rays_of_cells, refined_march, worst_cells
-from methods.steernerf.beyond.surface import surface_points
 from methods.steernerf.buffer import Cloud, Remembered, RenderingBuffer
 from methods.steernerf.options import Model, Rendering
 from methods.steernerf.range_reduction import depth_interval
@@ -44,6 +39,11 @@ from methods.steernerf.renderer import (
     cells_at_matter,
 )
 from methods.steernerf.view import View
+from methods.steernerf_lean import window
+from methods.steernerf_lean.cells import put_pixels
+from methods.steernerf_lean.kernels.warp import enlarge, warp
+from methods.steernerf_lean.refinement import rays_of_cells, refined_march, worst_cells
+from methods.steernerf_lean.surface import surface_points
 
 
 class Pipeline:

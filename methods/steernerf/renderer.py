@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from bench.types import NullProbe, Probe
 from methods.engines.network import Network
 from methods.rendering.frame import FeatureFrame
-from methods.steernerf.beyond.cells import cells_near, largest_in_cell
+from methods.steernerf_lean.cells import cells_near, largest_in_cell
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from bench.types import Probe
 from methods.engines.network import Network
-from methods.kernels.splat import gather
+from methods.steernerf.kernels.splat import gather
 from methods.steernerf.options import check_size
 from methods.steernerf.renderer import UNWATCHED, Drawing, Observation, Renderer2d
 

@@ -14,9 +14,9 @@ from methods.kernels.encode import HashGrid
 from methods.kernels.march import Occupancy
 from methods.rendering.march import March
 from methods.rendering.occupancy import DensityGrid
-from methods.steernerf.beyond.lean_renderer import LeanRenderer
 from methods.steernerf.options import Model, Rendering, Reprojection
 from methods.steernerf.pipeline import Pipeline
+from methods.steernerf_lean.lean_renderer import LeanRenderer
 
 SMALL_GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)
 

@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from methods.rendering.frame import FeatureFrame
-from methods.steernerf.beyond.lean_renderer import LeanRenderer
 from methods.steernerf.renderer import Detail, Observation, Points, Renderer2d, cells_at_matter
+from methods.steernerf_lean.lean_renderer import LeanRenderer
 from tests.methods.conftest import look_at_the_middle
 
 CAMERA = look_at_the_middle(0.0, 0.0)  # no renderer looks at it

@@ -12,8 +12,8 @@ import torch
 
 import methods.kernels
 from bench.case import Case, Cell, Difference, largest_error
-from methods.checks import found
-from methods.kernels import BACKENDS, availability, dispatch
+from methods.checks import found, kernels
+from methods.kernels import availability, dispatch
 
 CASES = found("cases")
 QUICK = [case for case in CASES if case.quick]
@@ -41,9 +41,7 @@ CELLS = [
     for case in QUICK
     for cell in case.tolerances
 ]
-KERNELS = sorted(
-    path.parent.name for path in Path(methods.kernels.__file__).parent.glob("*/cpu.py")
-)
+KERNELS = kernels("cpu")
 
 
 @pytest.mark.parametrize(("case", "cell"), CELLS)
@@ -55,17 +53,17 @@ def test_it_holds(case: Case, cell: Cell, device: str) -> None:
 
 
 MANY_BLOCKS = {
-    "gaussian_blending": {"parts of tiles"},
-    "march": {"inside and outside"},
-    "ssim": {"noise, 33 x 40"},
-    "voxel_walk": {"inside and outside", "stop and faint"},
+    "methods.gaussians.kernels.blending": {"parts of tiles"},
+    "methods.kernels.march": {"inside and outside"},
+    "methods.gaussians.kernels.ssim": {"noise, 33 x 40"},
+    "methods.kernels.voxel_walk": {"inside and outside", "stop and faint"},
 }
 """Kernels whose blocks are larger where they are interpreted, and cases of several small blocks."""
 
 
 @pytest.fixture
 def blocks_of_a_gpu(kernel: str) -> Iterator[None]:
-    module = importlib.import_module(f"methods.kernels.{kernel}.gpu")
+    module = importlib.import_module(f"{kernel}.gpu")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dispatch, "interpreted", lambda: False)
         importlib.reload(module)
@@ -80,7 +78,7 @@ def blocks_of_a_gpu(kernel: str) -> Iterator[None]:
 def test_it_holds_in_the_blocks_of_a_gpu(kernel: str) -> None:
     if reason := availability()["gpu"]:
         pytest.skip(reason)
-    cases = importlib.import_module(f"methods.kernels.{kernel}.cases").cases()
+    cases = importlib.import_module(f"{kernel}.cases").cases()
     chosen = [case for case in cases if case.name in MANY_BLOCKS[kernel]]
     for case in chosen:
         for cell in case.tolerances:
@@ -90,9 +88,10 @@ def test_it_holds_in_the_blocks_of_a_gpu(kernel: str) -> None:
 
 
 def test_no_kernel_with_blocks_of_its_own_for_the_interpreter_is_left_out() -> None:
-    folder = Path(methods.kernels.__file__).parent
     sized = {
-        path.parent.name for path in folder.glob("*/gpu.py") if "interpreted()" in path.read_text()
+        kernel
+        for kernel in kernels("gpu")
+        if "interpreted()" in inspect.getsource(importlib.import_module(f"{kernel}.gpu"))
     }
     assert sized == set(MANY_BLOCKS)
 
@@ -128,20 +127,17 @@ def test_every_file_of_checks_has_some(name: str) -> None:
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_every_kernel_has_cases_for_all_its_backends(kernel: str) -> None:
-    module = importlib.import_module(f"methods.kernels.{kernel}.cases")
+    module = importlib.import_module(f"{kernel}.cases")
     cells = {cell for case in module.cases() for cell in case.tolerances}
-    folder = Path(methods.kernels.__file__).parent / kernel
-    assert {backend for backend, _ in cells} == {
-        name for name in BACKENDS if (folder / f"{name}.py").exists()
-    }
+    assert {backend for backend, _ in cells} == set(dispatch.served(kernel))
 
 
 NAMES = {
     "adam": "sparse_adam_ hash_adam_",
     "corner_gather": "gather",
     "corner_rendering": "render_segments",
-    "gaussian_blending": "blend",
-    "gaussian_projection": "project_gaussians",
+    "blending": "blend",
+    "projection": "project_gaussians",
     "grouped_mlp": "grouped_linear",
     "relu": "relu_",
     "spherical": "spherical_harmonics",
@@ -153,12 +149,11 @@ NAMES = {
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_backends_have_the_same_signature(kernel: str) -> None:
-    folder = Path(methods.kernels.__file__).parent / kernel
-    usable = [name for name in BACKENDS if not availability()[name]]
-    names = [path.stem for path in folder.glob("*.py") if path.stem in usable]
+    names = [name for name in dispatch.served(kernel) if not availability()[name]]
     assert {"reference", "cpu"} <= set(names)
-    modules = [importlib.import_module(f"methods.kernels.{kernel}.{name}") for name in names]
-    for public in NAMES.get(kernel, kernel).split():
+    modules = [importlib.import_module(f"{kernel}.{name}") for name in names]
+    short = kernel.rpartition(".")[2]
+    for public in NAMES.get(short, short).split():
         assert len({inspect.signature(getattr(module, public)) for module in modules}) == 1
 
 

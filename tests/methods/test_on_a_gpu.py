@@ -35,7 +35,6 @@ from methods.kernels import availability, multiplies_bf16
 from methods.kernels.composite import composite
 from methods.kernels.encode import HashGrid, encode
 from methods.kernels.march import Occupancy, longest_ray, march
-from methods.kernels.splat import splat
 from methods.kilonerf.field import KiloField
 from methods.kilonerf.method import KiloNerf
 from methods.kilonerf.training import KiloLessons
@@ -48,8 +47,7 @@ from methods.plenoctree.start import Extraction
 from methods.plenoctree.training import OctreeLessons
 from methods.rendering import field, rays
 from methods.rendering.occupancy import EVERY, STEP
-from methods.steernerf.beyond.lean_renderer import LeanRenderer
-from methods.steernerf.beyond.method import SteerNerfLean
+from methods.steernerf.kernels.splat import splat
 from methods.steernerf.method import SteerNerf
 from methods.steernerf.options import RangeReduction, Reprojection
 from methods.steernerf.pipeline import Pipeline
@@ -58,6 +56,8 @@ from methods.steernerf.training.joint import JointTraining
 from methods.steernerf.training.options import JointOptions
 from methods.steernerf.training.sequences import MotionOptions
 from methods.steernerf.unet import UNet
+from methods.steernerf_lean.lean_renderer import LeanRenderer
+from methods.steernerf_lean.method import SteerNerfLean
 from methods.students.fields import StudentField
 from methods.students.networks import NetworkLessons
 from methods.training import loop

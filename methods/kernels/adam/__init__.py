@@ -79,7 +79,7 @@ def sparse_adam_(
     """
     check_shape("grad", grad, *table.shape)
     _check(table, state, packed)
-    implementation("adam", backend, table.device).sparse_adam_(table, grad, state, rate, packed)
+    implementation(__name__, backend, table.device).sparse_adam_(table, grad, state, rate, packed)
 
 
 def hash_adam_(
@@ -99,7 +99,7 @@ def hash_adam_(
         positions, grad = gradients.joined()
         check_shape("positions", positions, None, 3)
         check_shape("gradients", grad, len(positions), grid.channels)
-        implementation("adam", backend, table.device).hash_adam_(
+        implementation(__name__, backend, table.device).hash_adam_(
             table, positions, grad, grid, state, rate, packed
         )
     gradients.clear()

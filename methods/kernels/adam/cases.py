@@ -30,7 +30,7 @@ def cases() -> list[Case]:
     """Tables in which none, some or all entries have a gradient; tiny and huge gradients."""
     kernel = Agreement(
         "adam",
-        served("adam"),
+        served(__package__),
         "moments of gradients below 6 are sums of products below 36; the table, at most 1 + 3 "
         "rates, is off by a few roundings a step, its bfloat16 copy by an ulp above 1",
     )
@@ -40,7 +40,7 @@ def cases() -> list[Case]:
         "adam",
         "the step is that of the closed form",
         "moments, corrections, root, quotient and sum: 16 u of rates of 1",
-        {(backend, "fp32"): 16 * U32 for backend in served("adam")},
+        {(backend, "fp32"): 16 * U32 for backend in served(__package__)},
     )
     found = [
         first.case(f"first gradient {gradient:g}", partial(_first_step_error, gradient))

@@ -149,7 +149,7 @@ def composite(
         check_shape("carry.values", carry.values, rays, channels)
         check_shape("carry.depth_sum", carry.depth_sum, rays)
         check_shape("carry.alpha", carry.alpha, rays)
-    return implementation("composite", backend, sigma.device).composite(
+    return implementation(__name__, backend, sigma.device).composite(
         sigma, values, intervals, stop, carry
     )
 
@@ -168,7 +168,7 @@ def weights(
         front: [R] transmittance in front of each ray's first sample; None: 1.
     """
     front = _light(sigma, intervals, front)
-    return implementation("composite", backend, sigma.device).weights(
+    return implementation(__name__, backend, sigma.device).weights(
         sigma.detach(), intervals, stop, front
     )
 
@@ -190,7 +190,7 @@ def visible(
         front: [R] transmittance in front of each ray's first sample; None: 1.
     """
     front = _light(sigma, intervals, front)
-    return implementation("composite", backend, sigma.device).visible(
+    return implementation(__name__, backend, sigma.device).visible(
         sigma.detach(), intervals, stop, front
     )
 

@@ -174,7 +174,7 @@ def cases() -> list[Case]:
 def _agreements() -> list[Case]:
     found = []
     for subject, (outputs, derivation, factor) in OUTPUTS.items():
-        kernel = Agreement(subject, served("composite"), derivation)
+        kernel = Agreement(subject, served(__package__), derivation)
         for name, kind in KINDS.items():
             # 4 (n + 8) roundings, each relative to the size of t.
             tolerance = factor(kind) * 4 * (kind.most + 8) * U32 * DEPTH

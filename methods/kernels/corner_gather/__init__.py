@@ -56,7 +56,7 @@ def gather(
             raise ValueError(
                 f"voxel: expected rows of the {len(corners)} voxels, got {low} to {high}"
             )
-    return implementation("corner_gather", backend, table.device).gather(
+    return implementation(__name__, backend, table.device).gather(
         table, corners, voxel, weights, grad_buffer=grad_buffer
     )
 
@@ -70,7 +70,7 @@ def trilinear(local: Tensor, *, backend: str = "auto") -> Tensor:
         ValueError: a shape other than this; backends "cpu", "gpu": not float32.
     """
     check_shape("local", local, None, 3)
-    return implementation("corner_gather", backend, local.device).trilinear(local)
+    return implementation(__name__, backend, local.device).trilinear(local)
 
 
 def integral(entry: Tensor, leave: Tensor, *, backend: str = "auto") -> Tensor:
@@ -89,7 +89,7 @@ def integral(entry: Tensor, leave: Tensor, *, backend: str = "auto") -> Tensor:
     """
     check_shape("entry", entry, None, 3)
     check_shape("leave", leave, len(entry), 3)
-    return implementation("corner_gather", backend, entry.device).integral(entry, leave)
+    return implementation(__name__, backend, entry.device).integral(entry, leave)
 
 
 def integral_along(
@@ -110,6 +110,6 @@ def integral_along(
         raise ValueError(
             f"crossings: expected those of the {count} rays, got of {len(crossings.offsets) - 1}"
         )
-    return implementation("corner_gather", backend, rays.origins.device).integral_along(
+    return implementation(__name__, backend, rays.origins.device).integral_along(
         rays, crossings, voxels
     )

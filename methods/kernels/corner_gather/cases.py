@@ -50,7 +50,7 @@ def cases() -> list[Case]:
 
 
 def _weights() -> list[Case]:
-    backends = served("corner_gather")
+    backends = served(__package__)
     points = Agreement("trilinear", backends, "3 factors and 2 products by both: 2 x 5 u")
     means = Agreement("integral", backends, f"{WEIGHTS} by both")
     found = []
@@ -77,7 +77,7 @@ def _calls(function: Callable[..., Tensor], *places: Tensor) -> Prepare:
 def _gathers() -> list[Case]:
     kernel = Agreement(
         "corner_gather",
-        served("corner_gather"),
+        served(__package__),
         "8 products of numbers of at most 1, and their sum, by both: 2 x 8 x 9 u",
     )
     found = []
@@ -92,7 +92,7 @@ def _gathers() -> list[Case]:
 
 
 def _gradients() -> list[Case]:
-    kernel = Agreement("corner_gather backward", served("corner_gather"), SUMS)
+    kernel = Agreement("corner_gather backward", served(__package__), SUMS)
     found = []
     for count, channels in ((0, 32), (1, 32), (257, 27), (VIEW, 32)):
         reads = torch.bincount(_corners()[_voxels(count).long()].flatten().long())
@@ -201,7 +201,7 @@ def _integrals() -> list[Case]:
     }
     same = Agreement(
         "integral_along",
-        served("corner_gather"),
+        served(__package__),
         "an end is off by 4 u of at most 3 G along each of 3 axes, along which a weight changes by "
         "at most 1; 16 u of its own; by both: 72 G + 32 u",
     )

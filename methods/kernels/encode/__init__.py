@@ -166,7 +166,7 @@ def encode(
             raise ValueError(f"packed tables hold 2 features an entry, the grid has {grid}")
         check_shape("packed", packed, grid.entries)
     read = table if gradients is None else table.detach()
-    features = implementation("encode", backend, positions.device).encode(
+    features = implementation(__name__, backend, positions.device).encode(
         positions, read, grid, packed=packed
     )
     if gradients is not None:

@@ -56,7 +56,7 @@ def cases() -> list[Case]:
 
 
 def _agreements() -> list[Case]:
-    backends = served("encode")
+    backends = served(__package__)
     forward = Agreement("encode", backends, FEATURES)
     backward = Agreement("encode backward", backends, SUMS)
     shapes: list[tuple[str, HashGrid, Tensor]] = [

@@ -41,6 +41,6 @@ def keep(
     check_shape("thin", thin, None)
     if every < 1:
         raise ValueError(f"every: expected 1 or more, got {every}")
-    kernel = implementation("keep", backend, starts.device)
+    kernel = implementation(__name__, backend, starts.device)
     kept: tuple[Tensor, Tensor] = kernel.keep(starts, counts, turns, thin, every)
     return kept

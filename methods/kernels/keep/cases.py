@@ -19,7 +19,7 @@ BATCH = 12_700
 
 def cases() -> list[Case]:
     """Rays, pieces of each, most samples of a piece, and one of how many thin ones is kept."""
-    kernel = Agreement("keep", served("keep"), "integers: 0")
+    kernel = Agreement("keep", served(__package__), "integers: 0")
     kinds = (
         (0, 1, 3, 4),
         (9, 2, 0, 4),

@@ -199,7 +199,7 @@ def march(
         limit = longest_ray(step)
     if limit < 1:
         raise ValueError(f"limit: expected 1 or more, got {limit}")
-    kernel = implementation("march", backend, rays.origins.device)
+    kernel = implementation(__name__, backend, rays.origins.device)
     return kernel.march(segments, occupancy, step, limit, extent)
 
 
@@ -232,7 +232,7 @@ def sample_counts(
 ) -> Tensor:
     """How many samples `march` finds for each of R `rays`: [R] int64."""
     segments = _segments(rays, step, window, jitter, start)
-    kernel = implementation("march", backend, rays.origins.device)
+    kernel = implementation(__name__, backend, rays.origins.device)
     counts: Tensor = kernel.count(segments, occupancy, step)
     return counts
 

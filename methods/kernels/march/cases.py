@@ -52,7 +52,7 @@ def _agreements() -> list[Case]:
         ("scattered cells", 65, {"grid": "dust"}),
         ("axes, planes and corners", 0, {"special": True}),
     ]
-    kernel = Agreement("march", served("march"), "the same operations in the same order: 0")
+    kernel = Agreement("march", served(__package__), "the same operations in the same order: 0")
     found = [kernel.case(name, partial(_prepare, rays, kind), 0.0) for name, rays, kind in kinds]
     timed = partial(_prepare, 1 << 13, {"grid": "shell", "step": STEP})
     return [*found, kernel.case("hollow sphere", timed, 0.0, items=1 << 13)]

@@ -37,4 +37,4 @@ def mlp(inputs: Sequence[Tensor], weights: Sequence[Tensor], *, backend: str = "
     for layer in weights:
         check_shape("weights", layer, None, channels)
         channels = len(layer)
-    return implementation("mlp", backend, inputs[0].device).mlp(inputs, weights)
+    return implementation(__name__, backend, inputs[0].device).mlp(inputs, weights)

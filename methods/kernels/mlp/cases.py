@@ -25,8 +25,8 @@ MANY = 1 << 17
 
 def cases() -> list[Case]:
     """No sample, one, more than go together; a sample of NaN; many, timed; bfloat16."""
-    forward = Agreement("mlp", served("mlp"), "sums of few bits: 0")
-    backward = Agreement("mlp backward", served("mlp"), "sums of few bits: 0")
+    forward = Agreement("mlp", served(__package__), "sums of few bits: 0")
+    backward = Agreement("mlp backward", served(__package__), "sums of few bits: 0")
     found = []
     for count, (inputs, widths), dtype in (
         (0, DENSITY, "fp32"),

@@ -12,5 +12,5 @@ def relu_(x: Tensor, *, backend: str = "auto") -> Tensor:
 
     Differentiable: the gradient passes where the result is not 0.
     """
-    rectified: Tensor = implementation("relu", backend, x.device).relu_(x)
+    rectified: Tensor = implementation(__name__, backend, x.device).relu_(x)
     return rectified

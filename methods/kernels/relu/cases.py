@@ -18,8 +18,8 @@ MANY = 1 << 17, 64
 
 def cases() -> list[Case]:
     """Every bfloat16, none at all, rows that do not lie one after the other; a batch, timed."""
-    forward = Agreement("relu", served("relu"), "a comparison: 0")
-    backward = Agreement("relu backward", served("relu"), "a comparison: 0")
+    forward = Agreement("relu", served(__package__), "a comparison: 0")
+    backward = Agreement("relu backward", served(__package__), "a comparison: 0")
     bits = torch.arange(-(1 << 15), 1 << 15, dtype=torch.int32).to(torch.int16)
     every = bits.view(torch.bfloat16)
     kinds: list[tuple[str, str, Tensor]] = [

@@ -19,7 +19,7 @@ def spherical_harmonics(directions: Tensor, *, backend: str = "auto") -> Tensor:
     Differentiable with backend="reference" only.
     """
     check_shape("directions", directions, None, 3)
-    return implementation("spherical", backend, directions.device).spherical_harmonics(directions)
+    return implementation(__name__, backend, directions.device).spherical_harmonics(directions)
 
 
 def shade(coefficients: Tensor, directions: Tensor, *, backend: str = "auto") -> Tensor:
@@ -41,4 +41,4 @@ def shade(coefficients: Tensor, directions: Tensor, *, backend: str = "auto") ->
         raise ValueError(
             f"coefficients: expected one of {SIZES} a colour, got {list(coefficients.shape)}"
         )
-    return implementation("spherical", backend, directions.device).shade(coefficients, directions)
+    return implementation(__name__, backend, directions.device).shade(coefficients, directions)

@@ -22,7 +22,7 @@ def cases() -> list[Case]:
 def _harmonics() -> list[Case]:
     kernel = Agreement(
         "spherical",
-        served("spherical"),
+        served(__package__),
         "coefficients below 3, polynomials of at most 4 terms of size 4 with 3 products each: 48 u",
     )
     return [
@@ -40,13 +40,13 @@ def _prepare(count: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
 def _shading() -> list[Case]:
     forward = Agreement(
         "shade",
-        served("spherical"),
+        served(__package__),
         "16 products of harmonics below 2, off by 48 u, and coefficients below 6, and their sum: "
         "16 (6 x 48 + 16 x 12) u",
     )
     backward = Agreement(
         "shade backward",
-        served("spherical"),
+        served(__package__),
         "products of harmonics, off by 48 u, and gradients below 6: 6 x 50 u",
     )
     found = []

@@ -49,6 +49,6 @@ def shade_voxels(
         check_shape("grad_buffer", grad_buffer, *harmonics.shape)
         if not harmonics.requires_grad:
             harmonics = harmonics.detach().requires_grad_()  # otherwise there is no backward pass
-    kernel = implementation("voxel_shading", backend, harmonics.device)
+    kernel = implementation(__name__, backend, harmonics.device)
     colours: Tensor = kernel.shade_voxels(harmonics, voxel, ray, directions, grad_buffer)
     return colours

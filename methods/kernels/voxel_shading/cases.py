@@ -21,12 +21,12 @@ def cases() -> list[Case]:
     """No, one and many voxels; all degrees; forward and backward."""
     forward = Agreement(
         "shade_voxels",
-        served("voxel_shading"),
+        served(__package__),
         "the sum of `shade`, of which the sigmoid passes on a quarter, and 8 u of its own",
     )
     backward = Agreement(
         "shade_voxels backward",
-        served("voxel_shading"),
+        served(__package__),
         "harmonics below 2, off by 48 u, times slopes below 6 / 4, off by as much as colours are "
         "and 4 u, summed over at most 40 visits of a voxel",
     )

@@ -190,7 +190,7 @@ def walk(
         limit = most
     if limit < 1:
         raise ValueError(f"limit: expected 1 or more, got {limit}")
-    kernel = implementation("voxel_walk", backend, origins.device)
+    kernel = implementation(__name__, backend, origins.device)
     found: Crossings = kernel.walk(rays, voxels, start, min(limit, most))
     return found
 
@@ -227,6 +227,6 @@ def render_voxels(
         raise ValueError(
             f"harmonics: expected one of {SIZES} a colour, got {list(light.harmonics.shape)}"
         )
-    kernel = implementation("voxel_walk", backend, rays.origins.device)
+    kernel = implementation(__name__, backend, rays.origins.device)
     found: tuple[Pixels, Tensor, Tensor] = kernel.render_voxels(rays, voxels, light, stop, faint)
     return found

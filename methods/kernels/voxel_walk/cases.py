@@ -51,7 +51,7 @@ def _agreements() -> list[Case]:
     ]
     kernel = Agreement(
         "voxel_walk",
-        served("voxel_walk"),
+        served(__package__),
         "t of planes by the same operations, cells by comparing them: 0",
     )
     found = [kernel.case(name, partial(_prepare, rays, kind), 0.0) for name, rays, kind in kinds]
@@ -261,7 +261,7 @@ def _views(count: int, device: str) -> Rays:
 def _pixels() -> list[Case]:
     kernel = Agreement(
         "render_voxels",
-        served("voxel_walk"),
+        served(__package__),
         "colours as `COLOUR` says; light rounded once or twice a voxel by u, at most 72 voxels, "
         "and depths up to 3; where a weight next to `stop` or `faint` counts on one side only: 3 "
         "(stop + 72 faint)",

@@ -18,11 +18,11 @@ from methods.kernels import multiplies_bf16
 from methods.rendering.batch import opacity_entropy, render_batch
 from methods.rendering.compaction import compacts
 from methods.rendering.occupancy import EVERY
-from methods.steernerf.beyond.cells import pixels_of
-from methods.steernerf.beyond.refinement import rays_of_cells, worst_cells
 from methods.steernerf.renderer import Drawing, Renderer2d
 from methods.steernerf.training.options import JointOptions
 from methods.steernerf.training.patches import Batch, Patches, PatchSource
+from methods.steernerf_lean.cells import pixels_of
+from methods.steernerf_lean.refinement import rays_of_cells, worst_cells
 from methods.training import checkpoint, loop
 from methods.training.optimiser import cosine, step_at
 

@@ -16,9 +16,9 @@ from methods.engines import SIZES, Engine, Inputs, Network, required
 from methods.engines.onnxruntime_engine import OnnxRuntime
 from methods.engines.openvino_engine import OpenVino, _capabilities
 from methods.engines.torch_engine import TorchEngine
-from methods.kernels.depthwise import neighbours_of
-from methods.steernerf.beyond.lean_renderer import LeanRenderer
 from methods.steernerf.unet import UNet
+from methods.steernerf_lean.kernels.depthwise import neighbours_of
+from methods.steernerf_lean.lean_renderer import LeanRenderer
 from tests.methods.observations import shaken
 
 NO_BF16 = "BF16" not in _capabilities(required("openvino", "openvino", "openvino"))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib
 import os
-from pathlib import Path
 from typing import Any
 
 import triton
@@ -17,7 +16,7 @@ from triton.compiler import ASTSource
 
 import methods.kernels.gpu
 from bench.case import Difference
-from methods.checks import found
+from methods.checks import found, kernels
 
 AMPERE, ADA, HOPPER = (GPUTarget("cuda", capability, 32) for capability in (80, 89, 90))
 TYPES = {
@@ -78,8 +77,8 @@ def compile_for(target: GPUTarget, source: ASTSource, options: dict[str, Any]) -
 seen: set[str] = set()
 last: dict[triton.JITFunction, tuple[ASTSource, dict[str, Any]]] = {}
 methods.kernels.gpu.launch = compile_for_hopper
-for path in Path(methods.kernels.gpu.__file__).parent.glob("*/gpu.py"):
-    importlib.import_module(f"methods.kernels.{path.parent.name}.gpu")
+for kernel in kernels("gpu"):
+    importlib.import_module(f"{kernel}.gpu")
 os.environ["TRITON_INTERPRET"] = "1"  # so that CPU tensors are taken; too late for a kernel
 for case in found("cases"):
     by_gpu = any(backend == "gpu" for backend, _ in case.tolerances)

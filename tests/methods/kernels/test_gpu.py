@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import os
 import platform
 import re
@@ -14,25 +16,25 @@ import pytest
 import torch
 from torch import Tensor
 
-import methods.kernels
 from bench.cameras import place_camera
 from bench.case import U32, largest_error
 from bench.types import Camera, Rays
+from methods.checks import kernels
+from methods.gaussians.kernels.blending import blend
+from methods.gaussians.kernels.projection import Ellipses, project_gaussians
+from methods.gaussians.kernels.ssim import ssim
 from methods.kernels import availability, corner_gather
 from methods.kernels.adam import AdamState, hash_adam_, sparse_adam_
 from methods.kernels.composite import Intervals, composite, visible, weights
 from methods.kernels.encode import HashGrid, SampleGradients, encode
 from methods.kernels.encode.reference import corners
-from methods.kernels.gaussian_blending import blend
-from methods.kernels.gaussian_projection import Ellipses, project_gaussians
-from methods.kernels.grouped_mlp import grouped_linear
 from methods.kernels.march import Occupancy, extents, march
-from methods.kernels.space_to_depth import CellInputs, Layout, space_to_depth
-from methods.kernels.space_to_depth.cases import cases
-from methods.kernels.splat import gather, splat
-from methods.kernels.ssim import ssim
 from methods.kernels.voxel_shading import shade_voxels
 from methods.kernels.voxel_walk import Voxels, walk
+from methods.kilonerf.kernels.grouped_mlp import grouped_linear
+from methods.steernerf.kernels.splat import gather, splat
+from methods.steernerf_lean.kernels.space_to_depth import CellInputs, Layout, space_to_depth
+from methods.steernerf_lean.kernels.space_to_depth.cases import cases
 
 pytestmark = pytest.mark.skipif(
     bool(availability()["gpu"]), reason="Triton has no build for this platform"
@@ -317,11 +319,13 @@ def test_every_kernel_compiles_for_a_gpu_that_is_not_here(tmp_path: Path) -> Non
     )
     assert done.returncode == 0, done.stderr
     compiled = set(done.stdout.splitlines())
-    folder = Path(methods.kernels.__file__).parent
     written = {
-        f"methods.kernels.{path.parent.name}.gpu {name}"
-        for path in folder.glob("*/gpu.py")
-        for name in re.findall(r"(?:launch|_move|_weights|_filled)\(\s*(_\w+)", path.read_text())
+        f"{kernel}.gpu {name}"
+        for kernel in kernels("gpu")
+        for name in re.findall(
+            r"(?:launch|_move|_weights|_filled)\(\s*(_\w+)",
+            inspect.getsource(importlib.import_module(f"{kernel}.gpu")),
+        )
     }
     assert written <= compiled
 

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from bench.cameras import pixel_grid, project, scale_camera, unproject
 from bench.types import EMPTY_ALPHA, Camera
-from methods.kernels.splat import gather
 from methods.rendering.frame import FeatureFrame
 from methods.steernerf.buffer import SPLAT_ALPHA, Cloud, Remembered, RenderingBuffer
+from methods.steernerf.kernels.splat import gather
 from methods.steernerf.options import Reprojection
 from tests.methods.conftest import look_at_the_middle
 

@@ -18,12 +18,12 @@ from methods.engines.openvino_engine import OpenVino
 from methods.engines.torch_engine import TorchEngine
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.encode import HashGrid
-from methods.steernerf.beyond.lean_renderer import LeanRenderer
 from methods.steernerf.method import SteerNerf
 from methods.steernerf.options import Model, RangeReduction, Rendering, Reprojection, Skips
 from methods.steernerf.training.options import JointOptions
 from methods.steernerf.training.sequences import MotionOptions
 from methods.steernerf.unet import UNet
+from methods.steernerf_lean.lean_renderer import LeanRenderer
 from tests.methods.models import small_model, small_rendering
 from tests.methods.trainings import GRID, QUICK
 

@@ -13,16 +13,16 @@ from bench.cameras import cast, project
 from bench.probes import StageClock
 from bench.types import Camera, NullProbe
 from methods.kernels.march import Occupancy
-from methods.kernels.warp import enlarge
 from methods.rendering.frame import everywhere, render_frame
 from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
-from methods.steernerf.beyond.cells import cells_near, pixels_of
-from methods.steernerf.beyond.refinement import worst_cells
 from methods.steernerf.buffer import Cloud, Remembered, RenderingBuffer
 from methods.steernerf.options import SIZES, RangeReduction, Reprojection, Skips
 from methods.steernerf.unet import UNet
 from methods.steernerf.view import View
+from methods.steernerf_lean.cells import cells_near, pixels_of
+from methods.steernerf_lean.kernels.warp import enlarge
+from methods.steernerf_lean.refinement import worst_cells
 from tests.methods.conftest import Work, look_at_the_middle
 from tests.methods.models import new_pipeline, small_model, small_rendering
 from tests.methods.observations import shaken

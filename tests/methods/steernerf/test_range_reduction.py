@@ -16,10 +16,10 @@ from methods.rendering.field import ROUND_SAMPLES
 from methods.rendering.frame import FeatureFrame, everywhere, render_frame
 from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
-from methods.steernerf.beyond.window import EDGE, KEPT_ALPHA, DepthPrior, depth_prior, within
 from methods.steernerf.buffer import Cloud
 from methods.steernerf.options import RangeReduction, Reprojection
 from methods.steernerf.range_reduction import depth_interval
+from methods.steernerf_lean.window import EDGE, KEPT_ALPHA, DepthPrior, depth_prior, within
 from tests.methods.conftest import Work, look_at_the_middle
 from tests.methods.solids import Solid, ball, slab, wall
 

@@ -13,8 +13,6 @@ from torch import Tensor
 
 from bench.types import Camera, Log, NullProbe, Scene, SteerbenchError
 from methods.instant_ngp.field import HashField
-from methods.steernerf.beyond.cells import pixels_of
-from methods.steernerf.beyond.surface import surface_points
 from methods.steernerf.options import Model, Rendering
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.renderer import Points, Renderer2d
@@ -24,6 +22,8 @@ from methods.steernerf.training.patches import Batch, PatchSource, Through
 from methods.steernerf.training.sequences import MotionOptions, SequencePool, TrainingViews
 from methods.steernerf.unet import UNet
 from methods.steernerf.view import View
+from methods.steernerf_lean.cells import pixels_of
+from methods.steernerf_lean.surface import surface_points
 from methods.training import loop
 from tests.methods.conftest import SIZE, ball
 from tests.methods.models import misty_field, shell, small_model, small_renderer, trained_field

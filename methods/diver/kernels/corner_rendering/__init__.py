@@ -1,0 +1,100 @@
+"""Pixels of sparse voxels with features at their corners, which a small network decodes segment by
+segment (DIVeR: Wu et al. 2022, Sections 3.2 to 3.4).
+
+A segment is the part of a ray inside a voxel. Its features are the mean of the trilinear
+interpolant along it, as in `corner_gather`. They pass a ReLU and a hidden layer. One output is the
+density, integrated over the segment already; the others, with the direction of the ray, give its
+colour.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from bench.types import Rays, check_shape
+from methods.kernels.composite import Pixels, check_stop
+from methods.kernels.corner_gather import CORNERS
+from methods.kernels.dispatch import implementation
+from methods.kernels.voxel_walk import Voxels
+
+
+@dataclass(frozen=True)
+class Corners:
+    """What the V voxels of a grid have at their corners.
+
+    Attributes:
+        rows: [V, 8] int32 rows of `table`, the corners of each voxel in the order of
+            `corner_gather`. They are not checked.
+        table: [C, F] features, float32 or bfloat16.
+    """
+
+    rows: Tensor
+    table: Tensor
+
+
+@dataclass(frozen=True)
+class Layers:
+    """From F features of a segment, behind a ReLU, to its density and its colour.
+
+    Attributes:
+        hidden, hidden_bias: [H, F], [H]; a ReLU follows.
+        density, density_bias: [1, H], [1]; a ReLU follows.
+        geometry: [H, H], from the hidden layer; the direction of the ray is added to its output,
+            and a ReLU follows.
+        colour, colour_bias: [3, H], [3]; a sigmoid follows.
+    """
+
+    hidden: Tensor
+    hidden_bias: Tensor
+    density: Tensor
+    density_bias: Tensor
+    geometry: Tensor
+    colour: Tensor
+    colour_bias: Tensor
+
+
+def render_segments(
+    rays: Rays,
+    voxels: Voxels,
+    corners: Corners,
+    layers: Layers,
+    towards: Tensor,
+    *,
+    stop: float,
+    faint: float = 0.0,
+    backend: str = "auto",
+) -> tuple[Pixels, Tensor, Tensor]:
+    """The pixels of R `rays`, not composited on a background. Not differentiable.
+
+    Also, for each ray, how many segments lie in front of its end and how many of them have a
+    colour: [R] int32.
+
+    Args:
+        towards: [R, H] what the direction of each ray adds to the output of `layers.geometry`.
+        stop: transmittance at which a ray ends, less than 1.
+        faint: weight up to which a segment has an opacity but no colour.
+
+    Raises:
+        ValueError: wrong shapes, a stop outside [0, 1); backend "cpu": other types, F or H that is
+            no multiple of 16.
+    """
+    check_stop(stop)
+    count, (hidden, features) = len(rays.origins), layers.hidden.shape
+    check_shape("origins", rays.origins, count, 3)
+    check_shape("directions", rays.directions, count, 3)
+    check_shape("rows", corners.rows, len(voxels), CORNERS)
+    check_shape("table", corners.table, None, features)
+    check_shape("hidden_bias", layers.hidden_bias, hidden)
+    check_shape("density", layers.density, 1, hidden)
+    check_shape("density_bias", layers.density_bias, 1)
+    check_shape("geometry", layers.geometry, hidden, hidden)
+    check_shape("colour", layers.colour, 3, hidden)
+    check_shape("colour_bias", layers.colour_bias, 3)
+    check_shape("towards", towards, count, hidden)
+    kernel = implementation(__name__, backend, rays.origins.device)
+    found: tuple[Pixels, Tensor, Tensor] = kernel.render_segments(
+        rays, voxels, corners, layers, towards, stop, faint
+    )
+    return found

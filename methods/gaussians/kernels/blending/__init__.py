@@ -1,0 +1,54 @@
+"""Blends ellipses of 3D Gaussians into a picture, front to back (Kerbl et al. 2023, Eq. 2 and 3).
+
+alpha_i = min(LARGEST_ALPHA, o_i exp(-(A x^2 + 2 B x y + C y^2) / 2)), 0 below LEAST_ALPHA,
+T_i = prod_{j<i} (1 - alpha_j),  w_i = T_i alpha_i,
+values = sum w_i c_i,  depth_sum = sum w_i z_i,  alpha = sum w_i
+at the centre of every pixel, with (x, y) relative to the centre of the ellipse, in depth order.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from bench.types import check_shape
+from methods.gaussians.kernels.projection import Ellipses
+from methods.kernels.composite import STOP, Pixels
+from methods.kernels.dispatch import implementation
+
+LARGEST_ALPHA = 0.99
+
+
+def blend(
+    ellipses: Ellipses,
+    opacities: Tensor,
+    colours: Tensor,
+    width: int,
+    height: int,
+    *,
+    stop: float = STOP,
+    backend: str = "auto",
+) -> Pixels:
+    """Render the pixels of a width x height picture, row by row, without a background.
+
+    Values and alpha are differentiable in centres, conics, opacities and colours; depth has no
+    gradient. Gaussians of equal depth are blended in the order in which they are given.
+
+    Args:
+        ellipses: N Gaussians projected to the picture.
+        opacities: [N] at their centres.
+        colours: [N, 3].
+        stop: Gaussians behind a transmittance of at most `stop` have no weight.
+
+    Raises:
+        ValueError: wrong shapes, no pixel; backends "cpu" and "gpu": not float32.
+    """
+    count = len(opacities)
+    check_shape("opacities", opacities, None)
+    check_shape("colours", colours, count, 3)
+    check_shape("centres", ellipses.centres, count, 2)
+    check_shape("conics", ellipses.conics, count, 3)
+    if width < 1 or height < 1:
+        raise ValueError(f"width, height: expected 1 or more, got {width} x {height}")
+    return implementation(__name__, backend, opacities.device).blend(
+        ellipses, opacities, colours, width, height, stop
+    )

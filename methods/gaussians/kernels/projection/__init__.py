@@ -1,0 +1,98 @@
+"""Projects 3D Gaussians to ellipses (Zwicker et al. 2001, EWA splatting; Kerbl et al. 2023).
+
+A Gaussian with rotation R and scales s has the covariance V = (R diag s) (R diag s)^T. Seen by a
+camera with rotation W, its ellipse has the covariance V' = J W V W^T J^T + BLUR I, where J is the
+derivative of the projection at its centre.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bench.types import Camera, check_shape
+from methods.kernels.dispatch import implementation
+
+BLUR = 0.3
+"""Added to the variance of every ellipse, in pixels^2: none is much narrower than a pixel."""
+
+NEAR = 0.01
+"""Minimum z-depth of a visible Gaussian, in scene units."""
+
+FRUSTUM = 1.3
+"""J is evaluated at most this many half pictures from the axis; farther out it is unbounded."""
+
+LEAST_ALPHA = 1 / 255
+"""A Gaussian is cut off where its opacity is less."""
+
+
+@dataclass(frozen=True)
+class Ellipses:
+    """N Gaussians projected to a picture.
+
+    Attributes:
+        centres: [N, 2] continuous pixel coordinates (u, v).
+        conics: [N, 3] A, B, C of the squared distance A x^2 + 2 B x y + C y^2 from the centre, the
+            inverse of V'; pixels^-2.
+        depth: [N] z-depth of the centre.
+        extents: [N, 2] half width and half height of the bounding box of all points where the
+            opacity is at least `LEAST_ALPHA`, in pixels; 0 for an invisible Gaussian.
+    """
+
+    centres: Tensor
+    conics: Tensor
+    depth: Tensor
+    extents: Tensor
+
+
+def project_gaussians(
+    means: Tensor,
+    scales: Tensor,
+    rotations: Tensor,
+    opacities: Tensor,
+    camera: Camera,
+    *,
+    backend: str = "auto",
+) -> Ellipses:
+    """Project N Gaussians to ellipses.
+
+    Centres and conics are differentiable in means, scales and rotations; for invisible Gaussians
+    they are zeros without gradient. Depth and extents have no gradient.
+
+    Args:
+        means: [N, 3] centres, scene units.
+        scales: [N, 3] standard deviations along the axes of the Gaussian, scene units.
+        rotations: [N, 4] quaternions (w, x, y, z) of any non-zero length.
+        opacities: [N] at the centre, in [0, 1].
+        camera: on the device of the Gaussians.
+
+    Raises:
+        ValueError: wrong shapes; backends "cpu" and "gpu": not float32.
+    """
+    count = len(means)
+    check_shape("means", means, None, 3)
+    check_shape("scales", scales, count, 3)
+    check_shape("rotations", rotations, count, 4)
+    check_shape("opacities", opacities, count)
+    return implementation(__name__, backend, means.device).project_gaussians(
+        means, scales, rotations, opacities.detach(), camera
+    )
+
+
+def covariances(scales: Tensor, rotations: Tensor) -> Tensor:
+    """V [N, 3, 3] of N Gaussians."""
+    factors = rotation_matrices(rotations) * scales[:, None]
+    return factors @ factors.transpose(1, 2)
+
+
+def rotation_matrices(rotations: Tensor) -> Tensor:
+    """R [N, 3, 3] of quaternions [N, 4] (w, x, y, z) of any non-zero length."""
+    w, x, y, z = torch.nn.functional.normalize(rotations, dim=1).unbind(dim=1)
+    entries = (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+    return torch.stack(entries, dim=1).view(-1, 3, 3)

@@ -1,0 +1,297 @@
+"""Projection of Gaussians with numba: one pass, in vectors of Gaussians."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numba import njit, prange
+from torch import Tensor
+
+from bench.types import Camera
+from methods.gaussians.kernels.projection import BLUR, FRUSTUM, LEAST_ALPHA, NEAR, Ellipses
+from methods.kernels.cpu import f32
+
+ZERO, ONE, TWO = f32(0), f32(1), f32(2)
+BLUR32, NEAR32, INFINITE = f32(BLUR), f32(NEAR), f32(np.inf)
+BLOCK = 256
+"""Gaussians at a time; their numbers, inputs and results, stay in the first-level cache."""
+
+
+def project_gaussians(
+    means: Tensor, scales: Tensor, rotations: Tensor, opacities: Tensor, camera: Camera
+) -> Ellipses:
+    """See `methods.gaussians.kernels.projection.project_gaussians`."""
+    if means.dtype != torch.float32:
+        raise ValueError(f"backend 'cpu' projects float32, got {means.dtype}")
+    return Ellipses(*_Project.apply(means, scales, rotations, opacities, camera))
+
+
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, means, scales, rotations, opacities, camera):
+        inputs = [x.detach().contiguous() for x in (means, scales, rotations)]
+        view = _view(camera)
+        count = len(means)
+        found = [torch.empty(count, size) for size in (2, 3, 1, 2)]
+        reach = 2 * (opacities.detach() / LEAST_ALPHA).log()  # NaN or below 0: too faint
+        _forward(
+            *(x.numpy() for x in inputs),
+            reach[:, None].numpy(),
+            *view,
+            *(x.numpy() for x in found),
+        )
+        centres, conics, depth, extents = found
+        depth = depth.squeeze(1)
+        ctx.save_for_backward(*inputs, conics, extents)
+        ctx.view = view
+        ctx.mark_non_differentiable(depth, extents)
+        return centres, conics, depth, extents
+
+    @staticmethod
+    def backward(ctx, grad_centres, grad_conics, _depth, _extents):
+        *inputs, conics, extents = ctx.saved_tensors
+        grads = [torch.empty_like(x) for x in inputs]
+        _backward(
+            *(x.numpy() for x in (*inputs, conics, extents)),
+            *ctx.view,
+            grad_centres.contiguous().numpy(),
+            grad_conics.contiguous().numpy(),
+            *(x.numpy() for x in grads),
+        )
+        return (*grads, None, None)
+
+
+def _view(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """W [3, 3] and centre [3] of a camera; fx, fy, cx, cy and limits of x / z and y / z in J."""
+    pose = camera.c2w.numpy().astype(np.float32)
+    limits = FRUSTUM * 0.5 * camera.width / camera.fx, FRUSTUM * 0.5 * camera.height / camera.fy
+    intrinsics = np.array((camera.fx, camera.fy, camera.cx, camera.cy, *limits), np.float32)
+    return np.ascontiguousarray(pose[:, :3].T), np.ascontiguousarray(pose[:, 3]), intrinsics
+
+
+@njit(cache=True)
+def _row(matrix, row):
+    return matrix[row, 0], matrix[row, 1], matrix[row, 2]
+
+
+@njit(cache=True)
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True)
+def _load(block, place, source, first, size):
+    """Copy `size` rows of `source`, from `first` on; its columns become rows of the block, from
+    `place` on."""
+    for column in range(source.shape[1]):
+        for i in range(size):
+            block[(place + column) * BLOCK + i] = source[first + i, column]
+
+
+@njit(cache=True)
+def _load_gaussians(block, means, scales, rotations, first, size):
+    """Rows 0 to 9 of a block."""
+    _load(block, 0, means, first, size)
+    _load(block, 3, scales, first, size)
+    _load(block, 6, rotations, first, size)
+
+
+@njit(cache=True)
+def _store(block, place, target, first, size):
+    """The way back of `_load`."""
+    for column in range(target.shape[1]):
+        for i in range(size):
+            target[first + i, column] = block[(place + column) * BLOCK + i]
+
+
+@njit(cache=True)
+def _three(block, row, i):
+    """Three rows of the block, from `row` on, of Gaussian `i`."""
+    return block[row * BLOCK + i], block[(row + 1) * BLOCK + i], block[(row + 2) * BLOCK + i]
+
+
+@njit(cache=True, error_model="numpy")
+def _place(block, i, w0, w1, w2, origin, limit_x, limit_y):
+    """Depth z of Gaussian `i`, 1 / z, x / z and y / z, and the last two within the limits of J."""
+    x, y, z = _three(block, 0, i)
+    mean = x - origin[0], y - origin[1], z - origin[2]
+    depth = _dot(w2, mean)
+    inverse = ONE / depth
+    u, v = _dot(w0, mean) * inverse, _dot(w1, mean) * inverse
+    tx = min(max(u, -limit_x), limit_x)
+    ty = min(max(v, -limit_y), limit_y)
+    return depth, inverse, u, v, tx, ty
+
+
+@njit(cache=True, error_model="numpy")
+def _rotation(qw, qx, qy, qz):
+    """Columns of R of a quaternion, and 1 over its length."""
+    inverse = ONE / math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
+    w, x, y, z = qw * inverse, qx * inverse, qy * inverse, qz * inverse
+    return (
+        (ONE - TWO * (y * y + z * z), TWO * (x * y + w * z), TWO * (x * z - w * y)),
+        (TWO * (x * y - w * z), ONE - TWO * (x * x + z * z), TWO * (y * z + w * x)),
+        (TWO * (x * z + w * y), TWO * (y * z - w * x), ONE - TWO * (x * x + y * y)),
+        inverse,
+    )
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _forward(means, scales, rotations, reach, world, origin, view, centres, conics, depth, extents):
+    count = len(means)
+    for chunk in prange((count + BLOCK - 1) // BLOCK):
+        first, size = chunk * BLOCK, min(BLOCK, count - chunk * BLOCK)
+        block = np.empty(19 * BLOCK, np.float32)
+        _load_gaussians(block, means, scales, rotations, first, size)
+        _load(block, 10, reach, first, size)
+        _project(block, size, world, origin, view)
+        _store(block, 11, centres, first, size)
+        _store(block, 13, conics, first, size)
+        _store(block, 16, depth, first, size)
+        _store(block, 17, extents, first, size)
+
+
+@njit(cache=True, error_model="numpy")
+def _project(block, size, world, origin, view):
+    """Rows of the block: means, scales, quaternions and reach; centres, conics, depth, extents."""
+    fx, fy, cx, cy, limit_x, limit_y = view
+    w0, w1, w2 = _row(world, 0), _row(world, 1), _row(world, 2)
+    centre = origin[0], origin[1], origin[2]
+    for i in range(size):  # one array and no branch: LLVM makes vectors of it
+        z, inverse, u, v, tx, ty = _place(block, i, w0, w1, w2, centre, limit_x, limit_y)
+        s0, s1, s2 = _three(block, 3, i)
+        qx, qy, qz = _three(block, 7, i)
+        r0, r1, r2, _ = _rotation(block[6 * BLOCK + i], qx, qy, qz)
+        rise = block[10 * BLOCK + i]
+        # Rows of J W R diag s.
+        ax, ay = fx * inverse, fy * inverse
+        v20, v21, v22 = _dot(w2, r0), _dot(w2, r1), _dot(w2, r2)
+        h0, k0 = ax * (_dot(w0, r0) - tx * v20) * s0, ay * (_dot(w1, r0) - ty * v20) * s0
+        h1, k1 = ax * (_dot(w0, r1) - tx * v21) * s1, ay * (_dot(w1, r1) - ty * v21) * s1
+        h2, k2 = ax * (_dot(w0, r2) - tx * v22) * s2, ay * (_dot(w1, r2) - ty * v22) * s2
+        xx = h0 * h0 + h1 * h1 + h2 * h2 + BLUR32
+        xy = h0 * k0 + h1 * k1 + h2 * k2
+        yy = k0 * k0 + k1 * k1 + k2 * k2 + BLUR32
+        per_area = ONE / (xx * yy - xy * xy)
+        a, b, c = yy * per_area, -xy * per_area, xx * per_area
+        finite = abs(a + b + c) + abs(u + v) < INFINITE
+        shown = (z > NEAR32) & (rise >= ZERO) & finite
+        block[11 * BLOCK + i] = fx * u + cx if shown else ZERO
+        block[12 * BLOCK + i] = fy * v + cy if shown else ZERO
+        block[13 * BLOCK + i] = a if shown else ZERO
+        block[14 * BLOCK + i] = b if shown else ZERO
+        block[15 * BLOCK + i] = c if shown else ZERO
+        block[16 * BLOCK + i] = z
+        block[17 * BLOCK + i] = math.sqrt(rise * xx) if shown else ZERO
+        block[18 * BLOCK + i] = math.sqrt(rise * yy) if shown else ZERO
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _backward(
+    means,
+    scales,
+    rotations,
+    conics,
+    extents,
+    world,
+    origin,
+    view,
+    grad_centres,
+    grad_conics,
+    grad_means,
+    grad_scales,
+    grad_rotations,
+):
+    count = len(means)
+    for chunk in prange((count + BLOCK - 1) // BLOCK):
+        first, size = chunk * BLOCK, min(BLOCK, count - chunk * BLOCK)
+        block = np.empty(30 * BLOCK, np.float32)
+        _load_gaussians(block, means, scales, rotations, first, size)
+        _load(block, 10, conics, first, size)
+        _load(block, 13, extents, first, size)
+        _load(block, 15, grad_centres, first, size)
+        _load(block, 17, grad_conics, first, size)
+        _differentiate(block, size, world, origin, view)
+        _store(block, 20, grad_means, first, size)
+        _store(block, 23, grad_scales, first, size)
+        _store(block, 26, grad_rotations, first, size)
+
+
+@njit(cache=True, error_model="numpy")
+def _differentiate(block, size, world, origin, view):
+    """With H = J W R diag s, V' = H H^T + BLUR I and Q = V'^-1: dL/dV' = -Q dL/dQ Q, and
+    dL/dH = 2 dL/dV' H.
+
+    Rows of the block: means, scales, quaternions, conics, extents and gradients of centres and
+    conics; gradients of means, scales and quaternions.
+    """
+    fx, fy, _, _, limit_x, limit_y = view
+    w0, w1, w2 = _row(world, 0), _row(world, 1), _row(world, 2)
+    c0, c1, c2 = _row(world.T, 0), _row(world.T, 1), _row(world.T, 2)
+    centre = origin[0], origin[1], origin[2]
+    for i in range(size):  # one array and no branch: LLVM makes vectors of it
+        _, inverse, u, v, tx, ty = _place(block, i, w0, w1, w2, centre, limit_x, limit_y)
+        s0, s1, s2 = _three(block, 3, i)
+        qw = block[6 * BLOCK + i]
+        qx, qy, qz = _three(block, 7, i)
+        a, b, c = _three(block, 10, i)
+        shown = block[13 * BLOCK + i] > ZERO
+        r0, r1, r2, shrink = _rotation(qw, qx, qy, qz)
+        ax, ay = fx * inverse, fy * inverse
+
+        # dL/dV' is symmetric: each off-diagonal entry is half of dL/dB.
+        ga, twice_gb, gc = _three(block, 17, i)
+        gb = twice_gb / TWO
+        p00, p01 = a * ga + b * gb, a * gb + b * gc
+        p10, p11 = b * ga + c * gb, b * gb + c * gc
+        g = -(p00 * a + p01 * b), -(p00 * b + p01 * c), -(p10 * b + p11 * c)
+
+        # Gradients of H by column, hence of scales, of W R, of x / z, y / z and of ax, ay.
+        e0, m0, gt0 = _column(g, ax, ay, tx, ty, s0, _dot(w0, r0), _dot(w1, r0), _dot(w2, r0))
+        e1, m1, gt1 = _column(g, ax, ay, tx, ty, s1, _dot(w0, r1), _dot(w1, r1), _dot(w2, r1))
+        e2, m2, gt2 = _column(g, ax, ay, tx, ty, s2, _dot(w0, r2), _dot(w1, r2), _dot(w2, r2))
+        gu, gv = fx * block[15 * BLOCK + i], fy * block[16 * BLOCK + i]
+        gu += gt0[0] + gt1[0] + gt2[0] if tx == u else ZERO
+        gv += gt0[1] + gt1[1] + gt2[1] if ty == v else ZERO
+        gax, gay = gt0[2] + gt1[2] + gt2[2], gt0[3] + gt1[3] + gt2[3]
+        gz = -(gu * u + gv * v + gax * ax + gay * ay) * inverse
+        along = gu * inverse, gv * inverse, gz
+        block[20 * BLOCK + i] = _dot(c0, along) if shown else ZERO  # W^T
+        block[21 * BLOCK + i] = _dot(c1, along) if shown else ZERO
+        block[22 * BLOCK + i] = _dot(c2, along) if shown else ZERO
+        block[23 * BLOCK + i] = e0 if shown else ZERO
+        block[24 * BLOCK + i] = e1 if shown else ZERO
+        block[25 * BLOCK + i] = e2 if shown else ZERO
+
+        # dL/dR = W^T dL/d(W R), by its entries.
+        n00, n10, n20 = _dot(c0, m0), _dot(c1, m0), _dot(c2, m0)
+        n01, n11, n21 = _dot(c0, m1), _dot(c1, m1), _dot(c2, m1)
+        n02, n12, n22 = _dot(c0, m2), _dot(c1, m2), _dot(c2, m2)
+        w, x, y, z = qw * shrink, qx * shrink, qy * shrink, qz * shrink
+        gw = TWO * (x * (n21 - n12) + y * (n02 - n20) + z * (n10 - n01))
+        gx = TWO * (w * (n21 - n12) - TWO * x * (n11 + n22) + y * (n01 + n10) + z * (n02 + n20))
+        gy = TWO * (w * (n02 - n20) + x * (n01 + n10) - TWO * y * (n00 + n22) + z * (n12 + n21))
+        gz = TWO * (w * (n10 - n01) + x * (n02 + n20) + y * (n12 + n21) - TWO * z * (n00 + n11))
+        # Normalised: no gradient along the quaternion.
+        same = gw * w + gx * x + gy * y + gz * z
+        block[26 * BLOCK + i] = (gw - same * w) * shrink if shown else ZERO
+        block[27 * BLOCK + i] = (gx - same * x) * shrink if shown else ZERO
+        block[28 * BLOCK + i] = (gy - same * y) * shrink if shown else ZERO
+        block[29 * BLOCK + i] = (gz - same * z) * shrink if shown else ZERO
+
+
+@njit(cache=True)
+def _column(g, ax, ay, tx, ty, s, across, down, depth):
+    """What one column of W R, (across, down, depth), has of the gradients: its scale, itself, and
+    tx, ty, ax, ay."""
+    h, j = ax * (across - tx * depth) * s, ay * (down - ty * depth) * s
+    gh, gj = TWO * (g[0] * h + g[1] * j), TWO * (g[1] * h + g[2] * j)
+    wide, tall = gh * (across - tx * depth), gj * (down - ty * depth)
+    d0, d1 = gh * ax * s, gj * ay * s
+    return (
+        wide * ax + tall * ay,
+        (d0, d1, -d0 * tx - d1 * ty),
+        (-d0 * depth, -d1 * depth, wide * s, tall * s),
+    )

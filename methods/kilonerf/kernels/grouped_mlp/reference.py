@@ -1,0 +1,58 @@
+"""Small networks in plain torch, one network after the other, for any dtype and device."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from methods.kilonerf.kernels.grouped_mlp import (
+    Groups,
+    Networks,
+    composed_colours,
+    composed_densities,
+)
+
+
+def locate(positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
+    """See `methods.kilonerf.kernels.grouped_mlp.locate`."""
+    scaled = (positions.detach() - corner) / side
+    cell = scaled.floor()
+    sizes = [cell.new_full((), size) for size in cubes.shape]  # filled: no wait for a GPU
+    inside = ((cell >= 0) & (cell < torch.stack(sizes))).all(dim=1)
+    x, y, z = torch.where(inside[:, None], cell, 0).long().unbind(dim=1)
+    return torch.where(inside, cubes[x, y, z], -1), 2 * (scaled - cell) - 1
+
+
+def order(networks: Tensor, count: int) -> Groups:
+    """See `methods.kilonerf.kernels.grouped_mlp.order`."""
+    sorted_, permutation = networks.long().sort(stable=True)
+    numbers = torch.arange(count + 1, device=networks.device)
+    offsets = torch.searchsorted(sorted_, numbers)
+    return Groups(permutation[int(offsets[0]) :], offsets - offsets[0])
+
+
+def encode_frequencies(inputs: Tensor, frequencies: int) -> Tensor:
+    """See `methods.kilonerf.kernels.grouped_mlp.encode_frequencies`."""
+    angles = [inputs * 2**k for k in range(frequencies)]
+    return torch.cat((inputs, *(f(angle) for angle in angles for f in (torch.sin, torch.cos))), 1)
+
+
+def grouped_linear(
+    inputs: Tensor, weights: Tensor, biases: Tensor, offsets: Tensor, relu: bool
+) -> Tensor:
+    """See `methods.kilonerf.kernels.grouped_mlp.grouped_linear`."""
+    parts = inputs.split(offsets.diff().tolist())
+    layers = zip(parts, weights, biases, strict=True)
+    out = [torch.addmm(bias, part, weight) for part, weight, bias in layers]
+    joined = torch.cat(out) if out else inputs.new_zeros(0, weights.shape[2])
+    return joined.relu() if relu else joined
+
+
+def densities(positions: Tensor, numbers: Tensor, networks: Networks) -> tuple[Tensor, Tensor]:
+    """See `methods.kilonerf.kernels.grouped_mlp.densities`."""
+    return composed_densities(positions, numbers, networks, "reference")
+
+
+def colours(geometry: Tensor, encoded: Tensor, networks: Networks) -> Tensor:
+    """See `methods.kilonerf.kernels.grouped_mlp.colours`."""
+    return composed_colours(geometry, encoded, networks, "reference")

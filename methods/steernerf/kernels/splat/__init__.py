@@ -1,0 +1,78 @@
+"""Splats points into pixels and gathers their features: the reprojection of earlier frames.
+
+`splat` finds which point each pixel shows; `gather` fetches the features of these points. Pixel
+(i, j) covers [i, i+1) x [j, j+1), so a point at (u, v) lands only in (floor u, floor v).
+"""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from bench.types import check_shape
+from methods.kernels.dispatch import implementation
+
+Rule = Literal["nearest", "last"]
+"""Which of several points in a pixel is shown."""
+
+
+def splat(
+    pixels: Tensor,
+    depth: Tensor,
+    width: int,
+    height: int,
+    *,
+    rule: Rule = "nearest",
+    backend: str = "auto",
+) -> Tensor:
+    """Find which of N points each pixel of a width x height picture shows: [height, width] int32.
+
+    An entry is the index of a point, -1 where none lands. Only points inside the picture with a
+    finite positive depth count; points that are not finite are ignored. Not differentiable; for
+    features use `gather`.
+
+    Args:
+        pixels: [N, 2] continuous coordinates (u, v), in pixels.
+        depth: [N] z-depth.
+        width, height: pixels of the picture, 1 or more.
+        rule: "nearest": the point with the smallest depth, then the smallest u, then the smallest
+            v, so that the order of points matters only for exact duplicates (the first wins).
+            "last": the point with the highest index, whatever its depth, as in SteerNeRF's
+            release, where points overwrite each other.
+
+    Raises:
+        ValueError: wrong shape, size or rule; backend "cpu": not float32.
+    """
+    check_shape("pixels", pixels, None, 2)
+    check_shape("depth", depth, len(pixels))
+    if width < 1 or height < 1:
+        raise ValueError(f"width, height: expected 1 or more, got {width} x {height}")
+    if rule not in get_args(Rule):
+        raise ValueError(f"rule: expected one of {', '.join(get_args(Rule))}, got {rule!r}")
+    return implementation(__name__, backend, pixels.device).splat(
+        pixels.detach(), depth.detach(), width, height, rule
+    )
+
+
+def gather(values: Tensor, index: Tensor, *, backend: str = "auto") -> Tensor:
+    """Rows of `values` [N, C] at `index` [...] int32, zeros where it is -1: [..., C].
+
+    Differentiable in `values`; the gradient of a row is the sum over all pixels that show it.
+
+    Raises:
+        ValueError: `index` is not int32 or out of range; backend "cpu": `values` is not float32.
+    """
+    check_shape("values", values, None, None)
+    if index.dtype != torch.int32:
+        raise ValueError(f"index: expected int32, got {index.dtype}")
+    # Checked only on a CPU; for a GPU the host would have to wait.
+    if index.numel() and index.device.type == "cpu":
+        least, most = (int(bound) for bound in index.aminmax())
+        if least < -1 or most >= len(values):
+            raise ValueError(
+                f"index: expected -1 to {len(values) - 1} for {len(values)} rows of values, "
+                f"got {least} to {most}"
+            )
+    return implementation(__name__, backend, values.device).gather(values, index)

@@ -1,0 +1,72 @@
+"""Pixels of corner features: counts, chunks, types and shapes; accuracy is in its cases."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bench.types import Rays
+from methods.diver.kernels.corner_rendering import Layers, cases, reference, render_segments
+
+RAYS = 40
+
+
+def given(**layers: torch.Tensor) -> tuple:
+    """A small scene with some rays, and `layers` in place of its own."""
+    voxels, corners, own = cases.some_scene(cases.SIDE, torch.float32, "cpu")
+    rays, towards = cases.some_rays(RAYS, "cpu"), cases.some_towards(RAYS, "cpu")
+    return rays, voxels, corners, replace(own, **layers), towards
+
+
+def test_backends_count_the_same_segments() -> None:
+    """In front of the end of a ray, and of a weight that shows; none lies at a bound by chance."""
+    counts = [
+        render_segments(*given(), stop=0.5, faint=0.1, backend=backend)[1:]
+        for backend in ("reference", "cpu")
+    ]
+    for one, other in zip(*counts, strict=True):
+        assert torch.equal(one, other)
+    whole, _ = render_segments(*given(), stop=0.0)[1:]
+    crossed, shaded = counts[0]
+    assert (shaded <= crossed).all()
+    assert (crossed <= whole).all()
+    assert shaded.sum() < crossed.sum() < whole.sum()
+
+
+@pytest.mark.parametrize("size", [1, 7, RAYS])
+def test_rays_that_are_rendered_in_chunks_have_the_same_pixels(
+    size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    together = render_segments(*given(), stop=1e-2, backend="reference")
+    monkeypatch.setattr(reference, "CHUNK_RAYS", size)
+    apart = render_segments(*given(), stop=1e-2, backend="reference")
+    # Products of other shapes are summed in another order: at most 32 roundings of numbers below 1.
+    torch.testing.assert_close(apart[0].values, together[0].values, rtol=0, atol=1e-5)
+    assert torch.equal(apart[1], together[1])
+
+
+def test_a_cpu_refuses_what_it_has_no_code_for() -> None:
+    rays, *rest = given()
+    wide = Rays(rays.origins.double(), rays.directions.double())
+    with pytest.raises(ValueError, match="renders float32 with a table of float32 or bfloat16"):
+        render_segments(wide, *rest, stop=0.0, backend="cpu")
+    narrow = Layers(
+        torch.zeros(8, 32),
+        torch.zeros(8),
+        torch.zeros(1, 8),
+        torch.zeros(1),
+        torch.zeros(8, 8),
+        torch.zeros(3, 8),
+        torch.zeros(3),
+    )
+    voxels, corners, _, towards = rest
+    with pytest.raises(ValueError, match=r"multiples of 16, got \[8, 32\]"):
+        render_segments(rays, voxels, corners, narrow, towards[:, :8], stop=0.0, backend="cpu")
+
+
+@pytest.mark.parametrize("name", ["hidden_bias", "density", "geometry", "colour"])
+def test_layers_that_do_not_fit_are_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=name):
+        render_segments(*given(**{name: torch.zeros(5, 5)}), stop=0.0)

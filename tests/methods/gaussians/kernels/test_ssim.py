@@ -1,0 +1,44 @@
+"""SSIM as a loss: that of scikit-image, and its gradient. The backends agree by its cases."""
+
+from __future__ import annotations
+
+import torch
+from skimage.metrics import structural_similarity
+from torch.nn import functional
+
+from methods.gaussians.kernels.ssim import ssim
+
+
+def pictures() -> tuple[torch.Tensor, torch.Tensor]:
+    """Two pictures of noise in a black frame wider than the window: no border is in sight."""
+    generator = torch.Generator().manual_seed(0)
+    inner = torch.rand(2, 3, 20, 24, generator=generator, dtype=torch.float64)
+    framed = functional.pad(inner, (11, 11, 11, 11)).movedim(1, -1)
+    return framed[0].contiguous(), framed[1].contiguous()
+
+
+def test_it_is_the_ssim_of_scikit_image() -> None:
+    one, other = pictures()
+    want = structural_similarity(
+        one.numpy(),
+        other.numpy(),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=-1,
+        full=True,
+    )[1].mean()
+    assert abs(ssim(one, other, backend="reference").item() - want) < 1e-12
+
+
+def test_a_picture_is_like_itself() -> None:
+    one, _ = pictures()
+    assert abs(ssim(one, one, backend="reference").item() - 1) < 1e-12
+
+
+def test_its_gradient() -> None:
+    one, other = (picture[10:24, 10:24].clone() for picture in pictures())
+    assert torch.autograd.gradcheck(
+        lambda x: ssim(x, other, backend="reference"), one.requires_grad_()
+    )

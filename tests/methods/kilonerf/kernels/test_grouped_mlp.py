@@ -1,0 +1,135 @@
+"""Small networks against torch.nn, one by one, and what must not depend on what."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from bench.case import U32
+from methods.kilonerf.kernels.grouped_mlp import (
+    Networks,
+    colours,
+    densities,
+    encode_frequencies,
+    grouped_linear,
+    order,
+)
+
+SHAPES = {"in": (63, 32), "mid": (32, 32), "density": (32, 1)} | {
+    "feature": (32, 32),
+    "direction": (59, 32),
+    "colour": (32, 3),
+}
+BACKENDS = ["reference", "cpu"]
+
+
+def networks(count: int) -> tuple[Networks, list[dict[str, nn.Linear]]]:
+    """The same ones, for the kernel and as modules of torch."""
+    torch.manual_seed(count)
+    modules = [{name: nn.Linear(*shape) for name, shape in SHAPES.items()} for _ in range(count)]
+    weights = {n: torch.stack([m[n].weight.detach().T for m in modules]) for n in SHAPES}
+    biases = {n: torch.stack([m[n].bias.detach() for m in modules]) for n in SHAPES}
+    return Networks(weights, biases), modules
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_they_are_those_of_torch_one_by_one(backend: str) -> None:
+    few, modules = networks(4)
+    numbers = torch.tensor([2, -1, 0, 2, 3, 0, 2, -1, 2, 2, 2, 2, 2])
+    positions, directions = 2 * torch.rand(13, 3) - 1, torch.rand(13, 27)
+    raw, geometry = densities(positions, numbers, few, backend=backend)
+    shown = colours(geometry, directions, few, backend=backend)
+    assert torch.equal(geometry[:, 32].long(), numbers)
+    for s, n in enumerate(numbers.tolist()):
+        if n < 0:
+            assert not raw[s]
+            assert not geometry[s, :32].any()
+            assert not shown[s].any()
+            continue
+        layers, x = modules[n], positions[s]
+        parts = [x, *(f(2**k * x) for k in range(10) for f in (torch.sin, torch.cos))]
+        with torch.no_grad():
+            trunk = layers["mid"](layers["in"](torch.cat(parts)).relu()).relu()
+            joined = torch.cat((layers["feature"](trunk), directions[s]))
+            colour = layers["colour"](layers["direction"](joined).relu()).sigmoid()
+            # Errors of the encoding, 188 u, pass three layers whose gains are below 6 each.
+            assert abs(raw[s] - layers["density"](trunk)) < 188 * 6**3 * U32
+        torch.testing.assert_close(shown[s], colour, rtol=0, atol=188 * 6**3 * U32)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_order_of_the_samples_does_not_matter(backend: str) -> None:
+    few, _ = networks(5)
+    numbers, positions = torch.randint(-1, 5, (200,)), 2 * torch.rand(200, 3) - 1
+    mixed = torch.randperm(200)
+    one = densities(positions, numbers, few, backend=backend)
+    other = densities(positions[mixed], numbers[mixed], few, backend=backend)
+    for first, second in zip(one, other, strict=True):
+        # Another size of a product may add up in another order: 64 roundings of numbers below 4.
+        torch.testing.assert_close(first[mixed], second, rtol=0, atol=256 * U32)
+
+
+def gradients(backend: str, offsets: list[int], inputs: Tensor) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.randn(3, 8, 16, generator=generator, requires_grad=True)
+    biases = torch.randn(3, 16, generator=generator, requires_grad=True)
+    out = grouped_linear(inputs, weights, biases, torch.tensor(offsets), relu=True, backend=backend)
+    return torch.autograd.grad(out.square().sum(), (weights, biases))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_gradient_does_not_depend_on_other_networks(backend: str) -> None:
+    inputs = torch.randn(30, 8, generator=torch.Generator().manual_seed(1))
+    changed = inputs.clone()
+    changed[10:] *= -3
+    before = gradients(backend, [0, 10, 20, 30], inputs)
+    after = gradients(backend, [0, 10, 20, 30], changed)
+    for one, other in zip(before, after, strict=True):
+        assert torch.equal(one[0], other[0])
+        assert not torch.equal(one[1], other[1])
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_network_without_samples_has_no_gradient(backend: str) -> None:
+    inputs = torch.randn(20, 8, generator=torch.Generator().manual_seed(1))
+    for grad in gradients(backend, [0, 10, 10, 20], inputs):
+        assert not grad[1].any()
+        assert grad[0].any()
+        assert grad[2].any()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_sines_and_cosines_are_those_of_the_angles(backend: str) -> None:
+    x = torch.linspace(-1, 1, 999)[:, None].expand(-1, 3).contiguous()
+    encoded = encode_frequencies(x, 10, backend=backend).double()
+    for k in range(10):
+        angle = x[:, 0].double() * 2**k
+        assert (encoded[:, 3 + 6 * k] - angle.sin()).abs().max() < 188 * U32
+        assert (encoded[:, 6 + 6 * k] - angle.cos()).abs().max() < 188 * U32
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_nan_stays_with_its_sample(backend: str) -> None:
+    few, _ = networks(1)
+    positions = torch.zeros(12, 3)
+    positions[5] = math.nan
+    raw, _ = densities(positions, torch.zeros(12, dtype=torch.int32), few, backend=backend)
+    assert raw.isnan().nonzero().flatten().tolist() == [5]
+
+
+def test_wrong_inputs_are_refused() -> None:
+    with pytest.raises(ValueError, match="numbers below 2, got 2"):
+        order(torch.tensor([0, 2]), 2)
+    with pytest.raises(ValueError, match="whole numbers"):
+        order(torch.tensor([0.5]), 2)
+    with pytest.raises(ValueError, match="frequencies: expected 1 or more"):
+        encode_frequencies(torch.zeros(1, 3), 0)
+    with pytest.raises(ValueError, match="expected to end at the 4 inputs"):
+        grouped_linear(
+            torch.zeros(4, 2), torch.zeros(1, 2, 3), torch.zeros(1, 3), torch.tensor([0, 3])
+        )
+    with pytest.raises(ValueError, match="use backend='reference'"):
+        encode_frequencies(torch.zeros(1, 3, dtype=torch.float64), 2, backend="cpu")

@@ -1,0 +1,184 @@
+"""The depthwise convolution of cells against that of a dense picture, and finite differences."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from methods.steernerf_lean.kernels.depthwise import TAPS, depthwise, neighbours_of
+
+BACKENDS = ["reference", "cpu"]
+SUM_ERROR = 2 * TAPS * TAPS * 2.0**-24
+"""Nine products of size 1 at most, each rounded once alone and in at most eight sums; twice."""
+
+
+def scattered(batch: int = 1, height: int = 9, width: int = 7, share: float = 0.5) -> Tensor:
+    generator = torch.Generator().manual_seed(height)
+    return torch.rand(batch, height, width, generator=generator) < share
+
+
+def draw(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return 2 * torch.rand(*shape, generator=generator, dtype=dtype) - 1
+
+
+def dense(cells: Tensor, x: Tensor, weight: Tensor) -> Tensor:
+    """What torch makes of the pictures in which `x` fills the `cells`, at those cells."""
+    picture = x.new_zeros(*cells.shape, x.shape[1])
+    picture[cells] = x
+    kernel = weight.T.reshape(-1, 1, 3, 3)
+    out = functional.conv2d(
+        picture.permute(0, 3, 1, 2), kernel, padding=1, groups=len(kernel)
+    ).permute(0, 2, 3, 1)
+    return out[cells]
+
+
+CELLS = {
+    "scattered": scattered(),
+    "three pictures": scattered(3, 5, 6),
+    "all": torch.ones(2, 4, 5, dtype=torch.bool),
+    "one": torch.ones(1, 1, 1, dtype=torch.bool),
+    "one row": torch.ones(1, 1, 6, dtype=torch.bool),
+    "one column": torch.ones(1, 6, 1, dtype=torch.bool),
+    "the second picture only": torch.stack((torch.zeros(4, 3), torch.ones(4, 3))) > 0,
+    "none": torch.zeros(2, 4, 5, dtype=torch.bool),
+}
+KINDS = pytest.mark.parametrize("kind", CELLS)
+
+
+@KINDS
+def test_neighbours_are_the_cells_around_row_by_row(kind: str) -> None:
+    cells = CELLS[kind]
+    places = [tuple(place) for place in cells.nonzero().tolist()]
+    number = {place: i for i, place in enumerate(places)}
+    want = [
+        [
+            number.get((picture, row + down, column + right), -1)
+            for down in (-1, 0, 1)
+            for right in (-1, 0, 1)
+        ]
+        for picture, row, column in places
+    ]
+    got = neighbours_of(cells)
+    assert got.dtype == torch.int32
+    assert got.shape == (len(places), TAPS)
+    assert got.tolist() == want
+
+
+@KINDS
+def test_neighbours_are_mutual(kind: str) -> None:
+    """Every backward pass rests on it."""
+    neighbours = neighbours_of(CELLS[kind])
+    for k in range(TAPS):
+        (cell,) = (neighbours[:, k] >= 0).nonzero(as_tuple=True)
+        assert torch.equal(neighbours[neighbours[cell, k].long(), TAPS - 1 - k].long(), cell)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@KINDS
+def test_cells_are_convolved_as_in_a_dense_picture(kind: str, backend: str) -> None:
+    cells = CELLS[kind]
+    x, weight = draw(int(cells.sum()), 5), draw(TAPS, 5, seed=1)
+    got = depthwise(x, neighbours_of(cells), weight, backend=backend)
+    torch.testing.assert_close(got, dense(cells, x, weight), rtol=0, atol=SUM_ERROR)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@KINDS
+def test_gradients_are_those_of_a_dense_picture(kind: str, backend: str) -> None:
+    cells = CELLS[kind]
+    count, channels = int(cells.sum()), 5
+    x, weight = draw(count, channels).requires_grad_(), draw(TAPS, channels, seed=1)
+    weight.requires_grad_()
+    grad = draw(count, channels, seed=2)
+    out = depthwise(x, neighbours_of(cells), weight, backend=backend)
+    got_x, got_weight = torch.autograd.grad(out, (x, weight), grad)
+    want_x, want_weight = torch.autograd.grad(dense(cells, x, weight), (x, weight), grad)
+    torch.testing.assert_close(got_x, want_x, rtol=0, atol=SUM_ERROR)
+    # Of as many products of size 1 at most as there are cells, each in as many roundings.
+    error = 2 * count**2 * 2.0**-24
+    torch.testing.assert_close(got_weight, want_weight, rtol=0, atol=error)
+
+
+def test_gradients_in_float64() -> None:
+    cells = scattered(2, 3, 4)
+    neighbours = neighbours_of(cells)
+    x = draw(len(neighbours), 2, dtype=torch.float64).requires_grad_()
+    weight = draw(TAPS, 2, seed=1, dtype=torch.float64).requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda x, weight: depthwise(x, neighbours, weight, backend="reference"), (x, weight)
+    )
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("only", ["x", "weight"])
+def test_one_of_the_two_may_have_no_gradient(only: str, backend: str) -> None:
+    neighbours = neighbours_of(scattered())
+    inputs = {"x": draw(len(neighbours), 3), "weight": draw(TAPS, 3, seed=1)}
+    inputs[only].requires_grad_()
+    depthwise(inputs["x"], neighbours, inputs["weight"], backend=backend).sum().backward()
+    assert inputs[only].grad is not None
+    assert inputs[only].grad.any()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_pictures_do_not_see_each_other(backend: str) -> None:
+    """The last row of one picture and the first of the next lie side by side in memory."""
+    cells = torch.ones(2, 3, 3, dtype=torch.bool)
+    x, weight = draw(18, 4), draw(TAPS, 4, seed=1)
+    together = depthwise(x, neighbours_of(cells), weight, backend=backend)
+    alone = [
+        depthwise(part, neighbours_of(cells[:1]), weight, backend=backend) for part in x.split(9)
+    ]
+    assert torch.equal(together, torch.cat(alone))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_strided_cells_are_read_as_they_stand(backend: str) -> None:
+    neighbours = neighbours_of(scattered())
+    x, weight = draw(4, len(neighbours)).T, draw(4, TAPS, seed=1).T
+    rows = neighbours.T.contiguous().T
+    got = depthwise(x, rows, weight, backend=backend)
+    want = depthwise(x.contiguous(), neighbours, weight.contiguous(), backend=backend)
+    torch.testing.assert_close(got, want, rtol=0, atol=SUM_ERROR)
+
+
+def test_the_backward_pass_gives_the_same_bits_whatever_the_number_of_threads() -> None:
+    neighbours = neighbours_of(scattered(1, 60, 50))
+    x = draw(len(neighbours), 6).requires_grad_()
+    weight = draw(TAPS, 6, seed=1).requires_grad_()
+    before, gradients = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 4):
+            torch.set_num_threads(threads)
+            out = depthwise(x, neighbours, weight, backend="cpu")
+            gradients.append(torch.autograd.grad(out.square().sum(), (x, weight)))
+    finally:
+        torch.set_num_threads(before)
+    for others in gradients[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(gradients[0], others, strict=True))
+
+
+def test_the_reference_keeps_the_digits_of_float64() -> None:
+    neighbours = neighbours_of(torch.ones(1, 1, 1, dtype=torch.bool))
+    x = torch.full((1, 1), 1 + 1e-12, dtype=torch.float64)
+    weight = torch.ones(TAPS, 1, dtype=torch.float64)
+    assert torch.equal(depthwise(x, neighbours, weight, backend="reference"), x)
+
+
+def test_wrong_arguments_are_named() -> None:
+    neighbours = neighbours_of(torch.ones(1, 2, 2, dtype=torch.bool))
+    x, weight = torch.zeros(4, 3), torch.zeros(TAPS, 3)
+    with pytest.raises(ValueError, match=r"cells: expected shape \[any, any, any\], got \[2, 2\]"):
+        neighbours_of(torch.ones(2, 2, dtype=torch.bool))
+    with pytest.raises(ValueError, match=r"x: expected shape \[any, any\], got \[12\]"):
+        depthwise(x.flatten(), neighbours, weight)
+    with pytest.raises(ValueError, match=r"neighbours: expected shape \[4, 9\], got \[3, 9\]"):
+        depthwise(x, neighbours[:3], weight)
+    with pytest.raises(ValueError, match=r"weight: expected shape \[9, 3\], got \[3, 9\]"):
+        depthwise(x, neighbours, weight.T)
+    for one, other in ((x.double(), weight), (x, weight.double())):
+        with pytest.raises(ValueError, match="convolves float32"):
+            depthwise(one, neighbours, other, backend="cpu")

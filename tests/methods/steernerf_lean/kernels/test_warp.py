@@ -1,0 +1,371 @@
+"""The backward warping against a plain loop over the pixels, and closed forms."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from bench.cameras import look_at
+from bench.types import Camera
+from methods.steernerf_lean.kernels.warp import TOLERANCE
+from methods.steernerf_lean.kernels.warp import enlarge as enlarge_cells
+from methods.steernerf_lean.kernels.warp import warp as warp_cells
+
+BACKENDS = ["reference", "cpu"]
+ERROR = 1e-4
+"""Pixels: coordinates up to 50 are rounded two dozen times in float32, 24 * 50 * 2 u = 1.4e-4 if
+all of it went the same way, and half of it is that of the coordinate alone."""
+
+
+def straight(width: int, height: int, focal: float = 32.0) -> Camera:
+    """A camera at the origin that looks along z."""
+    return Camera(torch.eye(3, 4), focal, focal, width / 2, height / 2, width, height)
+
+
+def elsewhere(camera: Camera) -> Camera:
+    """A camera beside it, turned and rolled, of another focal length and size."""
+    eye, target, up = torch.tensor([[0.3, -0.2, 0.1], [0.05, 0.1, 2.0], [0.3, -1.0, 0.0]])
+    return Camera(look_at(eye, target, up), 40.0, 38.0, 23.0, 15.5, 49, 33)
+
+
+def noise(height: int, width: int, channels: int = 3) -> Tensor:
+    return torch.rand(height, width, channels, generator=torch.Generator().manual_seed(height))
+
+
+def uneven_depth() -> Tensor:
+    """Two walls that are a little rough, with holes of every kind."""
+    depth = 2 + 0.01 * torch.rand(7, 9, generator=torch.Generator().manual_seed(1))
+    depth[:, 5:] += 1.0
+    depth[2, 2], depth[3, 6], depth[6, 0] = math.inf, math.nan, -math.inf
+    depth[4:, 7:] = math.inf
+    return depth
+
+
+def enlarge(depth: Tensor, scale: int, *, backend: str = "auto") -> Tensor:
+    """Of all cells, [h, w, s^2]."""
+    cells = torch.arange(depth.numel())
+    return enlarge_cells(depth, cells, scale, backend=backend).view(*depth.shape, -1)
+
+
+def warp(
+    picture: Tensor,
+    source: Camera,
+    depth: Tensor,
+    camera: Camera,
+    scale: int,
+    *,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor]:
+    """Into all cells, whose depth is [h, w] enlarged: [h, w, s^2, C] and [h, w, s^2]."""
+    cells = torch.arange(depth.numel())
+    fine = enlarge_cells(depth, cells, scale, backend=backend)
+    values, valid = warp_cells(picture, source, fine, cells, camera, scale, backend=backend)
+    return values.view(*depth.shape, *values.shape[1:]), valid.view(*depth.shape, -1)
+
+
+def whole(blocks: Tensor, scale: int) -> Tensor:
+    """[h, w, s^2, C] put back to a picture [h s, w s, C], a pixel at a time."""
+    height, width, _, channels = blocks.shape
+    picture = torch.full((height * scale, width * scale, channels), math.nan)
+    for row in range(height * scale):
+        for column in range(width * scale):
+            sub = row % scale * scale + column % scale
+            picture[row, column] = blocks[row // scale, column // scale, sub]
+    return picture
+
+
+def plain_depth(depth: list[list[float]], x: float, y: float) -> float:
+    """Depth at (x, y), counted from the centre of pixel (0, 0); inf where there is none."""
+    row, column = math.floor(y), math.floor(x)
+    corners = []
+    for j in (row, row + 1):
+        for i in (column, column + 1):
+            z = depth[min(max(j, 0), len(depth) - 1)][min(max(i, 0), len(depth[0]) - 1)]
+            weight = (1 - abs(x - i)) * (1 - abs(y - j))
+            if weight > 0 and math.isfinite(z):
+                corners.append((z, weight))
+    nearest = min((z for z, _ in corners), default=math.inf)
+    kept = [(z, weight) for z, weight in corners if z <= nearest + TOLERANCE]
+    total = sum(weight for _, weight in kept)
+    return sum(z * weight for z, weight in kept) / total if kept else math.inf
+
+
+def plain_place(
+    depth: Tensor,
+    source: Camera,
+    camera: Camera,
+    scale: int,
+    row: int,
+    column: int,
+) -> tuple[float, float] | None:
+    """Where in the source picture a pixel is looked up, if it is in front of the source."""
+    u, v = column + 0.5, row + 0.5
+    z = plain_depth(depth.tolist(), u / scale - 0.5, v / scale - 0.5)
+    if math.isinf(z):
+        return None
+    local = torch.tensor(
+        [z * (u - camera.cx) / camera.fx, z * (v - camera.cy) / camera.fy, z], dtype=torch.float64
+    )
+    point = camera.c2w[:, :3].double() @ local + camera.c2w[:, 3].double()
+    x, y, ahead = source.c2w[:, :3].double().T @ (point - source.c2w[:, 3].double())
+    if ahead <= 0:
+        return None
+    return (source.fx * x / ahead + source.cx).item(), (source.fy * y / ahead + source.cy).item()
+
+
+def plain_look_up(picture: Tensor, x: float, y: float) -> Tensor:
+    """Bilinear, the border repeated."""
+    row, column = math.floor(y - 0.5), math.floor(x - 0.5)
+    value = torch.zeros(picture.shape[2], dtype=torch.float64)
+    for j in (row, row + 1):
+        for i in (column, column + 1):
+            clamped = min(max(j, 0), picture.shape[0] - 1), min(max(i, 0), picture.shape[1] - 1)
+            value += (1 - abs(x - 0.5 - i)) * (1 - abs(y - 0.5 - j)) * picture[clamped].double()
+    return value
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    ("scale", "channels"),
+    [(4, 3), (4, 1), (3, 5), (1, 3)],
+)
+def test_a_picture_is_the_definition(scale: int, channels: int, backend: str) -> None:
+    width, height = 9, 7
+    camera = straight(width * scale, height * scale, focal=8.0 * scale)
+    source = elsewhere(camera)
+    depth = uneven_depth()
+    picture = noise(source.height, source.width, channels)
+    values, valid = warp(picture, source, depth, camera, scale, backend=backend)
+    assert values.shape == (height, width, scale**2, channels)
+    values, valid = whole(values, scale), whole(valid[..., None], scale)[..., 0]
+
+    compared = 0
+    for row in range(camera.height):
+        for column in range(camera.width):
+            place = plain_place(depth, source, camera, scale, row, column)
+            want, inside = torch.zeros(channels, dtype=torch.float64), False
+            if place is not None:
+                x, y = place
+                borders = (x, y, x - source.width, y - source.height)
+                if min(abs(distance) for distance in borders) < ERROR:
+                    continue  # rounding decides
+                inside = 0 < x < source.width and 0 < y < source.height
+                if inside:
+                    want = plain_look_up(picture, x, y)
+            assert valid[row, column] == inside
+            # A place that is off by ERROR along two axes, where neighbours differ by at most 1.
+            torch.testing.assert_close(values[row, column].double(), want, rtol=0, atol=2 * ERROR)
+            compared += 1
+    assert compared > 0.99 * camera.width * camera.height
+    assert 0.3 < valid.mean() < 0.95
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("scale", [4, 3, 1])
+def test_an_enlarged_depth_is_the_definition(scale: int, backend: str) -> None:
+    depth = uneven_depth()
+    enlarged = whole(enlarge(depth, scale, backend=backend)[..., None], scale)[..., 0]
+    rows = depth.tolist()
+    for row in range(len(enlarged)):
+        for column in range(enlarged.shape[1]):
+            x, y = ((at + 0.5) / scale - 0.5 for at in (column, row))
+            # A mean of depths up to 4, after eight roundings.
+            want = pytest.approx(plain_depth(rows, x, y), rel=0, abs=8 * 4 * 2.0**-24)
+            assert enlarged[row, column].item() == want
+    assert 0.05 < enlarged.isinf().float().mean() < 0.5
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_some_cells_are_those_of_the_whole(backend: str) -> None:
+    depth, scale = uneven_depth(), 4
+    camera = straight(9 * scale, 7 * scale, focal=8.0 * scale)
+    source = elsewhere(camera)
+    picture = noise(source.height, source.width)
+    cells = torch.tensor([40, 0, 17, 17, 62])
+    fine = enlarge_cells(depth, cells, scale, backend=backend)
+    assert torch.equal(fine, enlarge(depth, scale, backend=backend).view(63, -1)[cells])
+    got = warp_cells(picture, source, fine, cells, camera, scale, backend=backend)
+    want = warp(picture, source, depth, camera, scale, backend=backend)
+    assert 0 < got[1].mean() < 1
+    for some, all_of_them in zip(got, want, strict=True):
+        assert torch.equal(some, all_of_them.flatten(0, 1)[cells])
+
+
+def test_an_enlarged_depth_of_float64_keeps_its_digits() -> None:
+    depth = torch.full((2, 3), 2 + 1e-12, dtype=torch.float64)
+    enlarged = enlarge(depth, 4, backend="reference")
+    assert enlarged.dtype == torch.float64
+    # A sum of 4 products and a quotient.
+    torch.testing.assert_close(enlarged, depth[..., None].expand(2, 3, 16), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_strided_depth_is_enlarged_as_it_stands(backend: str) -> None:
+    depth = uneven_depth()
+    got = enlarge(depth.T.contiguous().T, 4, backend=backend)
+    assert torch.equal(got, enlarge(depth, 4, backend=backend))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("scale", [1, 3, 4])
+def test_a_camera_that_rests_sees_the_picture_again(scale: int, backend: str) -> None:
+    camera = straight(6 * scale, 5 * scale)
+    picture = noise(5 * scale, 6 * scale)
+    values, valid = warp(picture, camera, torch.full((5, 6), 2.0), camera, scale, backend=backend)
+    assert torch.equal(whole(values, scale), picture)
+    assert (valid == 1).all()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_plane_moves_by_focal_length_times_offset_over_depth(backend: str) -> None:
+    camera, depth = straight(24, 16), torch.full((4, 6), 2.0)
+    picture = noise(16, 24)
+    # The camera has moved from the source: 32 * 0.1875 / 2 = 3 pixels right, 32 * 0.125 / 2 = 2 up.
+    source = replace(camera, c2w=camera.c2w.clone())
+    source.c2w[:2, 3] = torch.tensor([-0.1875, 0.125])
+    values, valid = (part for part in warp(picture, source, depth, camera, 4, backend=backend))
+    values, valid = whole(values, 4), whole(valid[..., None], 4)[..., 0]
+    assert torch.equal(values[2:, :-3], picture[:-2, 3:])
+    assert (valid[2:, :-3] == 1).all()
+    assert not valid[:2].any()
+    assert not valid[:, -3:].any()
+    assert not values[:2].any()
+    assert not values[:, -3:].any()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_half_a_pixel_is_the_mean_of_two(backend: str) -> None:
+    camera, depth = straight(24, 16), torch.full((4, 6), 2.0)
+    picture = noise(16, 24)
+    source = replace(camera, c2w=camera.c2w.clone())
+    source.c2w[0, 3] = -0.5 * 2 / 32
+    values, valid = warp(picture, source, depth, camera, 4, backend=backend)
+    shown = whole(values, 4)
+    torch.testing.assert_close(
+        shown[:, :-1], (picture[:, :-1] + picture[:, 1:]) / 2, rtol=0, atol=4 * 2.0**-24
+    )
+    # The last column's half lies on the border, which belongs to no pixel.
+    assert not whole(valid[..., None], 4)[:, -1].any()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_far_depth_beside_a_near_one_is_not_averaged(backend: str) -> None:
+    camera = straight(32, 4)
+    depth = torch.tensor([[1.0, 1.0, 1.0, 1.0, 4.0, 4.0, 4.0, 4.0]])
+    source = replace(camera, c2w=camera.c2w.clone())
+    source.c2w[0, 3] = -0.0625  # two pixels at depth 1, half a pixel at depth 4
+    ramp = torch.arange(32.0).expand(4, 32)[..., None]
+    values, _ = warp(ramp.contiguous(), source, depth, camera, 4, backend=backend)
+    shift = whole(values, 4)[0, :, 0] - torch.arange(32.0)
+    # The centres of the two in the middle are at 14 and 18: what lies between belongs to the near.
+    assert shift[:18].tolist() == [2.0] * 18
+    assert shift[18:31].tolist() == [0.5] * 13
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_depths_that_differ_by_less_than_the_tolerance_are_averaged(backend: str) -> None:
+    camera = straight(8, 4, focal=1024.0)
+    depth = torch.tensor([[1.0, 1.0 + 1 / 64]])
+    assert TOLERANCE > 1 / 64
+    source = replace(camera, c2w=camera.c2w.clone())
+    source.c2w[2, 3] = -1.0  # it sees a point at z at z + 1, at the z / (z + 1) part of its place
+    ramp = torch.arange(8.0).expand(4, 8)[..., None]
+    values, _ = warp(ramp.contiguous(), source, depth, camera, 4, backend=backend)
+    weight = ((torch.arange(8.0) + 0.5) / 4 - 0.5).clamp(0, 1)
+    z = 1 + weight / 64
+    place = 4 + (torch.arange(8.0) + 0.5 - 4) * z / (z + 1)
+    torch.testing.assert_close(whole(values, 4)[0, :, 0], place - 0.5, rtol=0, atol=ERROR)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_neighbour_without_weight_hides_nothing(backend: str) -> None:
+    camera = straight(5, 3)
+    depth = torch.tensor([[4.0, 4.0, 1.0, 4.0, 4.0]]).expand(3, 5)
+    picture = noise(3, 5)
+    values, valid = warp(picture, camera, depth, camera, 1, backend=backend)
+    assert (valid == 1).all()
+    assert torch.equal(values[:, :, 0], picture)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_depth_is_taken_in_the_middle_of_its_cell(backend: str) -> None:
+    camera = straight(24, 16)
+    depth = torch.full((4, 6), math.inf)
+    depth[2, 3] = 2.0
+    picture = torch.ones(16, 24, 1)
+    _, valid = warp(picture, camera, depth, camera, 4, backend=backend)
+    row, column = whole(valid[..., None], 4)[..., 0].nonzero().unbind(dim=1)
+    # All pixels less than 4 away from the sample at (14, 10).
+    for places, centre in ((column, 14), (row, 10)):
+        near = [i for i in range(24) if abs(i + 0.5 - centre) < 4]
+        assert places.unique().tolist() == near
+    assert len(row) == 64
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("depth", [math.inf, -math.inf, math.nan])
+def test_without_a_depth_nothing_is_known(depth: float, backend: str) -> None:
+    camera = straight(12, 8)
+    picture = noise(8, 12)
+    values, valid = warp(picture, camera, torch.full((2, 3), depth), camera, 4, backend=backend)
+    assert not values.any()
+    assert not valid.any()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_what_lies_behind_the_source_is_not_known(backend: str) -> None:
+    camera = straight(12, 8)
+    source = replace(camera, c2w=camera.c2w.clone())
+    source.c2w[2, 3] = 3.0
+    values, valid = warp(noise(8, 12), source, torch.full((2, 3), 2.0), camera, 4, backend=backend)
+    assert not values.any()
+    assert not valid.any()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_border_is_repeated_up_to_the_edge_of_the_picture(backend: str) -> None:
+    camera = straight(12, 8)
+    source = replace(camera, c2w=camera.c2w.clone())
+    source.c2w[0, 3] = 2 * 0.25 / 32  # a quarter of a pixel
+    picture = noise(8, 12)
+    values, valid = warp(picture, source, torch.full((2, 3), 2.0), camera, 4, backend=backend)
+    assert (valid == 1).all()
+    torch.testing.assert_close(whole(values, 4)[:, 0], picture[:, 0], rtol=0, atol=4 * 2.0**-24)
+
+
+def test_the_reference_keeps_the_digits_of_float64() -> None:
+    camera, depth = straight(8, 8), torch.full((2, 2), 2.0, dtype=torch.float64)
+    picture = 1 + 1e-12 * noise(8, 8).double()
+    values, _ = warp(picture, camera, depth, camera, 4, backend="reference")
+    assert values.dtype == torch.float64
+    assert torch.equal(values[0, 0, 5], picture[1, 1])
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_strided_pictures_are_read_as_they_stand(backend: str) -> None:
+    camera, depth = straight(12, 8), torch.full((3, 2), 2.0).T
+    picture = noise(12, 8).transpose(0, 1)
+    got = warp(picture, camera, depth, camera, 4, backend=backend)[0]
+    want = warp(picture.contiguous(), camera, depth.contiguous(), camera, 4, backend=backend)[0]
+    assert torch.equal(got, want)
+
+
+def test_wrong_arguments_are_named() -> None:
+    camera, depth, cells = straight(12, 8), torch.ones(6, 16), torch.arange(6)
+    picture = torch.zeros(8, 12, 3)
+    with pytest.raises(ValueError, match=r"picture: expected shape \[8, 12, any\], got \[8, 11, 3"):
+        warp_cells(picture[:, 1:], camera, depth, cells, camera, 4)
+    with pytest.raises(ValueError, match=r"depth: expected shape \[6, 16\], got \[96\]"):
+        warp_cells(picture, camera, depth.flatten(), cells, camera, 4)
+    with pytest.raises(ValueError, match=r"camera: expected cells of 4 x 4 pixels, got 12 x 9"):
+        warp_cells(picture, camera, depth, cells, replace(camera, height=9), 4)
+    with pytest.raises(ValueError, match="warps float32"):
+        warp_cells(picture.double(), camera, depth, cells, camera, 4, backend="cpu")
+    with pytest.raises(ValueError, match=r"depth: expected shape \[any, any\], got \[96\]"):
+        enlarge_cells(depth.flatten(), cells, 4)
+    with pytest.raises(ValueError, match="enlarges float32"):
+        enlarge_cells(depth.double(), cells, 4, backend="cpu")
