@@ -60,32 +60,6 @@ class WandB:
             sent.summary.update(headline(run))
 
 
-class MLflow:
-    """MLflow: a run with the key as a tag. MLflow's environment variables set the target."""
-
-    package = "mlflow"
-
-    def send(self, run: Run, outputs: Path) -> None:
-        import mlflow
-
-        mlflow.set_experiment(PROJECT)
-        tag = f"tags.`{PROJECT}.run` = '{run.key}'"
-        for old in mlflow.search_runs(filter_string=tag, output_format="list"):
-            mlflow.delete_run(old.info.run_id)
-        with mlflow.start_run(run_name=run.label, tags={f"{PROJECT}.run": run.key}):
-            mlflow.log_params(settings(run))
-            for frame, figures in series(run):
-                figures = {f"frame.{name}": value for name, value in figures.items()}
-                mlflow.log_metrics(_flat(figures), step=frame)
-            mlflow.log_metrics(_flat(headline(run)))
-            mlflow.log_artifacts(str(run.pictures), "pictures")
-
-
-def _flat(figures: Mapping[str, float]) -> dict[str, float]:
-    """Rename figures for MLflow, which treats a name with a slash as a file in a folder."""
-    return {name.replace("/", "."): value for name, value in figures.items()}
-
-
 class TensorBoard:
     """TensorBoard: event files in OUTPUTS/tensorboard/KEY, written once."""
 
@@ -112,7 +86,6 @@ class TensorBoard:
 
 TRACKERS: Mapping[str, Tracker] = {
     "wandb": WandB(),
-    "mlflow": MLflow(),
     "tensorboard": TensorBoard(),
 }
 

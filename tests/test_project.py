@@ -101,7 +101,6 @@ def test_extras_are_those_that_are_promised():
             "colmap",
             "tensorboard",
             "wandb",
-            "mlflow",
             "joblib",
             "ray",
             "slurm",

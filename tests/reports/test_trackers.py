@@ -33,23 +33,6 @@ def test_tensorboard_has_the_figures_of_every_frame_and_of_the_run(run, tmp_path
     assert set(events.Tags()["images"]) == {name for name, _ in pictures(run)}
 
 
-def test_mlflow_has_one_run_of_a_key_with_its_figures(run, tmp_path, monkeypatch):
-    mlflow = pytest.importorskip("mlflow")
-    monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
-    mlflow.set_tracking_uri(f"file:{tmp_path}/mlruns")
-    for _ in range(2):
-        tracker("mlflow").send(run, tmp_path)
-    (sent,) = mlflow.search_runs(experiment_names=["steerbench"], output_format="list")
-    assert sent.data.tags["steerbench.run"] == run.key
-    assert sent.data.params["command"] == run.record["command"]
-    for name, value in headline(run).items():
-        assert sent.data.metrics[name.replace("/", ".")] == pytest.approx(value)
-    psnr = mlflow.MlflowClient().get_metric_history(sent.info.run_id, "frame.psnr")
-    assert {x.step: x.value for x in psnr} == {i: x["psnr"] for i, x in series(run)}
-    names = mlflow.artifacts.list_artifacts(run_id=sent.info.run_id, artifact_path="pictures")
-    assert len(names) == len(list(pictures(run)))
-
-
 def test_wandb_has_a_run_whose_id_is_the_key(run, tmp_path, monkeypatch):
     pytest.importorskip("wandb")
     monkeypatch.setenv("WANDB_MODE", "offline")
@@ -63,7 +46,7 @@ def test_wandb_has_a_run_whose_id_is_the_key(run, tmp_path, monkeypatch):
 
 
 def test_an_unknown_tracker_and_one_that_is_not_installed_are_one_line(monkeypatch):
-    with pytest.raises(SteerbenchError, match="expected one of wandb, mlflow, tensorboard"):
+    with pytest.raises(SteerbenchError, match="expected one of wandb, tensorboard"):
         tracker("comet")
     monkeypatch.setattr(trackers, "find_spec", lambda name: None)
     with pytest.raises(Unavailable, match=r"pip install .*\[wandb\]"):
