@@ -24,7 +24,7 @@ from torch.nn import functional
 
 from bench.cameras import place_camera
 from bench.types import Camera, Frame, NullProbe, Probe
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy
 from methods.rendering.field import Field
 from methods.rendering.frame import FeatureFrame, Render, everywhere, render_frame
 from methods.rendering.rays import render_rays

@@ -12,8 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench.types import Camera, Probe, Rays
-from methods.kernels.composite import Pixels
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy, Pixels
 from methods.rendering.compaction import kept_indices
 from methods.rendering.field import Field
 from methods.rendering.frame import Render

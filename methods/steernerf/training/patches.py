@@ -13,8 +13,8 @@ from torch.nn import functional
 from bench.cameras import cast, pixel_grid
 from bench.compositing import composite
 from bench.types import Camera, NullProbe, Rays
-from methods.kernels.composite import Extent, Pixels
-from methods.kernels.march import Samples, sample_counts
+from methods.kernels.march import sample_counts
+from methods.kernels.types import Extent, Pixels, Samples
 from methods.rendering.batch import FirstPass, first_pass, second_pass
 from methods.rendering.compaction import compacts, indices_where, to_host
 from methods.rendering.frame import FeatureFrame, sees_matter
