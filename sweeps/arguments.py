@@ -221,6 +221,9 @@ ARGUMENTS = {
     "kernels": [
         *_one("--filter", help="only kernels whose name contains this", default=""),
         *_count("--repeats", 5, "timed calls of each"),
+        *_flag("--worth", "print what each brings to a frame and to a training of methods instead"),
+        *_count("--frames", 8, "with --worth: first frames of the trajectory"),
+        *_words("with --worth: all methods, scene=totem scene.width=100 budget=tiny"),
     ],
     "stress": [
         *_one("--filter", help="only subjects and cases with this in it", default=""),

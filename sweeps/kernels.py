@@ -26,6 +26,10 @@ def main(options: argparse.Namespace) -> int:
     from methods.checks import found
     from methods.kernels import compiled
 
+    if options.worth:
+        from sweeps.studies.worth import worth
+
+        return worth(options.overrides, options.frames, options.repeats)
     log, device = ConsoleLog(Path()), "cuda" if torch.cuda.is_available() else "cpu"
     cases = [case for case in found("cases") if options.filter in case.subject]
     with device_lock("auto", log):

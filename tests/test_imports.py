@@ -18,6 +18,7 @@ MAY_IMPORT = {
 }
 REACHES = {
     "sweeps/studies/accuracy.py": "methods.checks.",
+    "sweeps/studies/worth.py": "methods.kernels.",
     "sweeps/compile.py": "methods.checks.",
     "sweeps/kernels.py": ("methods.checks.", "methods.kernels."),
     "sweeps/catalogue.py": "methods.kernels.",

@@ -24,6 +24,7 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
+from torch import Tensor
 
 from methods.kernels.march import PARALLEL
 
@@ -66,6 +67,11 @@ def follow_torch_threads() -> None:
     numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
     if torch.get_num_threads() != threads:  # numba changed it on starting its threads
         torch.set_num_threads(threads)
+
+
+def arrays(*tensors: Tensor) -> list[np.ndarray]:
+    """The numbers of each tensor, as numpy sees them; contiguous, so a copy of one that is not."""
+    return [tensor.detach().contiguous().numpy() for tensor in tensors]
 
 
 @njit(cache=True, error_model="numpy")

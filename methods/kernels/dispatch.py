@@ -6,6 +6,8 @@ import difflib
 import importlib
 import importlib.util
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -92,6 +94,9 @@ def implementation(kernel: str, backend: str, device: torch.device) -> ModuleTyp
     Raises:
         Unavailable: see `resolve`; or the kernel has no such version.
     """
+    for called in _calls:
+        called.add(kernel)
+    backend = _forced.get(kernel, backend)
     name = resolve(backend, device)
     if backend == "auto" and name not in served(kernel):
         name = "reference"
@@ -103,6 +108,27 @@ def implementation(kernel: str, backend: str, device: torch.device) -> ModuleTyp
     if name == "cpu":
         _load("methods.kernels.cpu").follow_torch_threads()
     return _load(f"{kernel}.{name}")
+
+
+@contextmanager
+def forced(kernel: str, backend: str) -> Iterator[None]:
+    """Inside, `backend` computes every call of `kernel`, a package, whatever the call asks for."""
+    _forced[kernel] = backend
+    try:
+        yield
+    finally:
+        del _forced[kernel]
+
+
+@contextmanager
+def kernel_calls() -> Iterator[set[str]]:
+    """The packages of all kernels that are called inside."""
+    called: set[str] = set()
+    _calls.append(called)
+    try:
+        yield called
+    finally:
+        _calls.remove(called)
 
 
 @cache
@@ -122,6 +148,9 @@ def compiled(device: str) -> list[str]:
             continue
     return [name for name in usable if not (name == "gpu" and interpreted())]
 
+
+_forced: dict[str, str] = {}
+_calls: list[set[str]] = []
 
 # Imported on first use, because numba and Triton are heavy and not every machine has both.
 _load = cache(importlib.import_module)

@@ -28,7 +28,6 @@ ONE = u64(1)
 def sparse_adam_(
     table: Tensor, grad: Tensor, state: AdamState, rate: float, packed: Tensor | None
 ) -> None:
-    """See `methods.kernels.adam.sparse_adam_`."""
     _update(grad.view(-1).numpy(), table.shape[1], *_arrays(table, state, packed), f32(rate))
 
 
@@ -42,7 +41,6 @@ def hash_adam_(
     rate: float,
     packed: Tensor | None,
 ) -> None:
-    """See `methods.kernels.adam.hash_adam_`."""
     _update_levels(
         positions.numpy(),
         by_channel(grad).numpy(),
@@ -100,21 +98,10 @@ def _update_levels(
             begin, end = offsets[level], offsets[level + 1]
             a, b = begin * features, end * features
             words = packed[begin:end] if len(packed) else packed
+            own = table[a:b], first[a:b], second[a:b], steps[begin:end], words
             for entry in range(0, end - begin, CHUNK):
-                _entries(
-                    entry,
-                    min(end - begin, entry + CHUNK),
-                    features,
-                    total,
-                    table[a:b],
-                    first[a:b],
-                    second[a:b],
-                    steps[begin:end],
-                    words,
-                    to1,
-                    to2,
-                    rate,
-                )
+                last = min(end - begin, entry + CHUNK)
+                _entries(entry, last, features, total, *own, to1, to2, rate)
 
 
 @njit(cache=True, error_model="numpy")

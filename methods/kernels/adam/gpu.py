@@ -31,7 +31,6 @@ EPS = tl.constexpr(adam.EPS)
 def sparse_adam_(
     table: Tensor, grad: Tensor, state: AdamState, rate: float, packed: Tensor | None
 ) -> None:
-    """See `methods.kernels.adam.sparse_adam_`. All tensors must be contiguous."""
     given = {"table": table, "grad": grad, "first": state.first, "second": state.second}
     check_types(torch.float32, **given)
     for name, tensor in given.items():
@@ -66,7 +65,6 @@ def hash_adam_(
     rate: float,
     packed: Tensor | None,
 ) -> None:
-    """See `methods.kernels.adam.hash_adam_`."""
     sparse_adam_(table, table_gradient(positions, grad, grid), state, rate, packed)
 
 

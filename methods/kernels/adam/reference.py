@@ -14,7 +14,6 @@ from methods.kernels.encode.reference import encode
 def sparse_adam_(
     table: Tensor, grad: Tensor, state: AdamState, rate: float, packed: Tensor | None
 ) -> None:
-    """See `methods.kernels.adam.sparse_adam_`."""
     touched = (grad != 0).any(dim=-1, keepdim=True)  # a mask, as indices would wait for a GPU
     state.steps += touched.squeeze(-1)
     steps = state.steps[:, None].to(table.dtype)
@@ -39,7 +38,6 @@ def hash_adam_(
     rate: float,
     packed: Tensor | None,
 ) -> None:
-    """See `methods.kernels.adam.hash_adam_`."""
     asking = table.detach().requires_grad_()
     with torch.enable_grad():
         encoded = encode(positions, asking, grid)

@@ -1,4 +1,4 @@
-"""Cases of the compositing: agreement of the backends, extremes, long rays, invariances."""
+"""Cases of the compositing: agreement of the backends, extremes, long rays."""
 
 from __future__ import annotations
 
@@ -98,16 +98,8 @@ class Bundle:
         """The bundle on another device."""
         return replace(self.apply(lambda x: x.to(device)), counts=self.counts.to(device))
 
-    def rays(self, order: Tensor) -> Bundle:
-        """The rays at `order`, with their samples."""
-        counts = self.counts.tolist()
-        chosen = self.apply(lambda x: torch.cat([x.split(counts)[i] for i in order.tolist()]))
-        return replace(chosen, counts=self.counts[order])
-
 
 PER_SAMPLE = ("sigma", "values", "t", "delta")
-
-Change = Callable[[Bundle, str], tuple[Pixels, Pixels]]
 
 EXTREMES = {
     "density 0": (0.0, 0.1),
@@ -131,11 +123,10 @@ RAY = (
     "a weight has 4 roundings, what is in front 1, a sum of n in pairs log2 n: (8 + log2 n) u; in "
     "fp64, where nothing wider is there to sum thicknesses in, n u more"
 )
-SAME = "a sum in another order: twice (8 + log2 n) u; the compiled one has no order to choose: 0"
 
 
 def cases() -> list[Case]:
-    """One extreme sample among ordinary ones; sums of weights on long rays; invariances."""
+    """Agreements; one extreme sample among ordinary ones; sums of weights on long rays."""
     pixels = Property(
         "composite",
         "pixels are those of the closed form",
@@ -163,9 +154,6 @@ def cases() -> list[Case]:
         for kind in ("thin", "opaque", "alternating"):
             name = f"{count:,} samples, {kind}"
             found.append(light.case(name, partial(_light_error, count, kind)))
-    for name, changed, holds, derivation, cells in CHANGES:
-        change = Property("composite", holds, derivation, cells)
-        found.append(change.case(name, partial(_change_error, changed)))
     return found
 
 
@@ -331,96 +319,6 @@ def _light_error(count: int, kind: str, backend: str, device: str, precision: st
     left = math.exp(-math.fsum(delta.double().tolist()))
     sums = (pixels.values[0, 0], pixels.depth_sum[0], pixels.alpha[0])
     return max(abs(x.double().item() + left - 1) for x in sums)
-
-
-def random_rays(seed: int, rays: int, most: int) -> Bundle:
-    """`rays` rays with up to `most` samples each, from empty to opaque."""
-    generator = torch.Generator().manual_seed(seed)
-    counts = torch.randint(0, most + 1, (rays,), generator=generator)
-    total = int(counts.sum())
-    return Bundle(
-        10 ** (6 * torch.rand(total, generator=generator) - 3),
-        torch.rand(total, 3, generator=generator),
-        2 * torch.rand(total, generator=generator),
-        torch.rand(total, generator=generator) / 8,
-        counts,
-    )
-
-
-def change_error(changed: Change, samples: Bundle, backend: str, device: str) -> float:
-    """Largest difference between the pixels of `samples` before and after `changed`."""
-    return largest_error(*(_cpu(x) for x in changed(samples.to(device), backend)))
-
-
-def _change_error(changed: Change, backend: str, device: str, precision: str) -> float:
-    return change_error(changed, random_rays(0, 50, 64), backend, device)
-
-
-def split_interval(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
-    """Composite the front half of each ray first, then the rest behind it as `carry`."""
-    half = samples.counts // 2
-    first = _rank(samples) < half.repeat_interleave(samples.counts)
-    front = replace(samples.apply(lambda x: x[first]), counts=half)
-    behind = replace(samples.apply(lambda x: x[~first]), counts=samples.counts - half)
-    return samples.composite(backend), behind.composite(backend, front.composite(backend))
-
-
-def split_batch(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
-    """Composite the rays in reverse order, every third one in a batch of its own."""
-    whole, order = samples.composite(backend), torch.arange(len(samples.counts)).flip(0)
-    apart = whole.take(order)
-    for part in (order[order % 3 == 0], order[order % 3 != 0]):
-        if len(part):
-            apart.put(part, samples.rays(part).composite(backend))
-    return whole, apart
-
-
-def separate_channels(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
-    """Composite one channel after the other."""
-    apart = [replace(samples, values=samples.values[:, [i]]).composite(backend) for i in range(3)]
-    values = torch.cat([part.values for part in apart], dim=1)
-    return samples.composite(backend), Pixels(values, apart[0].depth_sum, apart[0].alpha)
-
-
-def add_empty_sample(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
-    """Put a sample without density in front of every ray."""
-    counts = samples.counts
-    first = samples.intervals.offsets[:-1] + torch.arange(len(counts), device=counts.device)
-    kept = first.repeat_interleave(counts) + 1 + _rank(samples)
-
-    def widened(x: Tensor, value: float) -> Tensor:
-        wide = x.new_full((len(x) + len(counts), *x.shape[1:]), value)
-        wide[kept] = x
-        return wide
-
-    more = replace(
-        samples.apply(lambda x: widened(x, 1.0)),
-        sigma=widened(samples.sigma, 0.0),
-        counts=counts + 1,
-    )
-    return samples.composite(backend), more.composite(backend)
-
-
-def _rank(samples: Bundle) -> Tensor:
-    """The index [S] of each sample on its ray."""
-    counts = samples.counts
-    return torch.cat([torch.arange(n, device=counts.device) for n in counts.tolist()])
-
-
-SAME_SUM = on_backends(2 * (8 + math.log2(64))) | {("cpu", "fp32"): 0.0}
-CHANGES = (
-    (
-        "interval split",
-        split_interval,
-        "[a, b] then [b, c] is [a, c]",
-        "two pixels of up to 2, and 1 - alpha between them: 64 u",
-        on_backends(64),
-    ),
-    ("batch split", split_batch, "each ray stays what it is", SAME, SAME_SUM),
-    ("channels apart", separate_channels, "each channel stays what it is", SAME, SAME_SUM),
-    ("empty sample added", add_empty_sample, "nothing changes", SAME, SAME_SUM),
-)
-"""Changes that may be made to rays, and what must hold for each."""
 
 
 def _cpu(pixels: Pixels) -> tuple[Tensor, ...]:

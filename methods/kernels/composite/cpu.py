@@ -13,7 +13,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from methods.kernels.cpu import f32
+from methods.kernels.cpu import arrays, f32
 from methods.kernels.types import Intervals, Pixels
 
 CHUNK = 64  # rays
@@ -23,7 +23,6 @@ f64 = np.float64
 def composite(
     sigma: Tensor, values: Tensor, intervals: Intervals, stop: float, carry: Pixels | None
 ) -> Pixels:
-    """See `methods.kernels.composite.composite`."""
     if not sigma.dtype == values.dtype == torch.float32:
         raise ValueError(
             f"backend 'cpu' composites float32, got sigma {sigma.dtype}, values {values.dtype}: "
@@ -34,21 +33,19 @@ def composite(
 
 
 def weights(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> Tensor:
-    """See `methods.kernels.composite.weights`."""
     weight = torch.empty_like(sigma, memory_format=torch.contiguous_format)
-    samples = (x.contiguous().numpy() for x in (sigma, intervals.delta, intervals.offsets))
-    _weights(*samples, f32(stop), front.contiguous().numpy(), weight.numpy())
+    samples = arrays(sigma, intervals.delta, intervals.offsets)
+    _weights(*samples, f32(stop), *arrays(front, weight))
     return weight
 
 
 def visible(
     sigma: Tensor, intervals: Intervals, stop: float, front: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """See `methods.kernels.composite.visible`."""
     counts = torch.empty(len(front), dtype=torch.int64)
     left = torch.empty(len(front))
-    samples = (x.contiguous().numpy() for x in (sigma, intervals.delta, intervals.offsets, front))
-    _visible(*samples, f32(stop), counts.numpy(), left.numpy())
+    samples = arrays(sigma, intervals.delta, intervals.offsets, front)
+    _visible(*samples, f32(stop), *arrays(counts, left))
     return counts, left
 
 
@@ -59,20 +56,14 @@ class _Composite(torch.autograd.Function):
         if carry is None:
             pixels = Pixels.blank(rays, channels)
         else:
-            pixels = Pixels(carry.values.clone(), carry.depth_sum.clone(), carry.alpha.clone())
+            parts = (carry.values, carry.depth_sum, carry.alpha)
+            pixels = Pixels(*(x.clone(memory_format=torch.contiguous_format) for x in parts))
         front = 1 - pixels.alpha
         samples = [x.contiguous() for x in (sigma, values, t, delta, offsets)]
         learns = any(ctx.needs_input_grad)
         opacity = torch.empty(len(sigma) if learns else 0, dtype=torch.float64)
-        _forward(
-            *(x.detach().numpy() for x in samples),
-            f32(stop),
-            front.numpy(),
-            pixels.values.numpy(),
-            pixels.depth_sum.numpy(),
-            pixels.alpha.numpy(),
-            opacity.numpy(),
-        )
+        outputs = pixels.values, pixels.depth_sum, pixels.alpha
+        _forward(*arrays(*samples), f32(stop), *arrays(front, *outputs, opacity))
         ctx.save_for_backward(*samples[1:], front, opacity)
         ctx.stop = stop
         return pixels.values, pixels.depth_sum, pixels.alpha
@@ -81,17 +72,8 @@ class _Composite(torch.autograd.Function):
     def backward(ctx, grad_values, grad_depth, grad_alpha):
         *samples, front, opacity = ctx.saved_tensors
         grad_sigma, grad_samples = torch.zeros(len(opacity)), torch.zeros_like(samples[0])
-        _backward(
-            opacity.numpy(),
-            *(x.detach().numpy() for x in samples),
-            f32(ctx.stop),
-            front.numpy(),
-            grad_values.contiguous().numpy(),
-            grad_depth.contiguous().numpy(),
-            grad_alpha.contiguous().numpy(),
-            grad_sigma.numpy(),
-            grad_samples.numpy(),
-        )
+        grads = grad_values, grad_depth, grad_alpha, grad_sigma, grad_samples
+        _backward(*arrays(opacity, *samples), f32(ctx.stop), *arrays(front, *grads))
         return grad_sigma, grad_samples, None, None, None, None, None
 
 

@@ -22,14 +22,12 @@ OPAQUE = tl.constexpr(128.0)
 def composite(
     sigma: Tensor, values: Tensor, intervals: Intervals, stop: float, carry: Pixels | None
 ) -> Pixels:
-    """See `methods.kernels.composite.composite`."""
     t, delta = intervals.t, intervals.delta
     check_types(torch.float32, sigma=sigma, values=values, t=t, delta=delta)
     return Pixels(*_Composite.apply(sigma, values, t, delta, intervals.offsets, stop, carry))
 
 
 def weights(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> Tensor:
-    """See `methods.kernels.composite.weights`."""
     check_types(torch.float32, sigma=sigma, delta=intervals.delta, front=front)
     weight = torch.zeros_like(sigma, memory_format=torch.contiguous_format)
     samples = (x.contiguous() for x in (sigma, intervals.delta, intervals.offsets, front))
@@ -40,7 +38,6 @@ def weights(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> 
 def visible(
     sigma: Tensor, intervals: Intervals, stop: float, front: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """See `methods.kernels.composite.visible`."""
     check_types(torch.float32, sigma=sigma, delta=intervals.delta, front=front)
     counts = intervals.offsets.new_zeros(len(front))
     left = torch.empty_like(front, memory_format=torch.contiguous_format)

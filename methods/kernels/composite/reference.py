@@ -11,7 +11,6 @@ from methods.kernels.types import Intervals, Pixels
 def composite(
     sigma: Tensor, values: Tensor, intervals: Intervals, stop: float, carry: Pixels | None
 ) -> Pixels:
-    """See `methods.kernels.composite.composite`."""
     slots = _padded_rays(intervals)
     front = sigma.new_ones(len(slots[0])) if carry is None else 1 - carry.alpha
     weight = _padded_weights(sigma, intervals.delta, slots, stop, front)
@@ -28,7 +27,6 @@ def composite(
 
 
 def weights(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> Tensor:
-    """See `methods.kernels.composite.weights`."""
     slots, starts = _padded_rays(intervals), intervals.offsets[:-1]
     weight = _padded_weights(sigma, intervals.delta, slots, stop, front)
     ray = torch.arange(len(starts), device=sigma.device).repeat_interleave(
@@ -40,7 +38,6 @@ def weights(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> 
 def visible(
     sigma: Tensor, intervals: Intervals, stop: float, front: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """See `methods.kernels.composite.visible`."""
     slots = _padded_rays(intervals)
     tau = _padded(_thickness(sigma, intervals.delta), slots)
     seen = (front[:, None] * _transmittance(tau) > stop) & slots[0]

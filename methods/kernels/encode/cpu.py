@@ -17,7 +17,7 @@ import torch
 from numba import get_num_threads, njit, prange
 from torch import Tensor
 
-from methods.kernels.cpu import add_pair, f32, i32, pack_bf16, u32, u64
+from methods.kernels.cpu import add_pair, arrays, f32, i32, pack_bf16, u32, u64
 from methods.kernels.encode import PRIMES, HashGrid
 
 CHUNK = 256  # samples; 256 * (8 indices + 8 weights + 8 values) * 4 bytes = 24 KiB
@@ -36,7 +36,6 @@ def encode(
     *,
     packed: Tensor | None = None,
 ) -> Tensor:
-    """See `methods.kernels.encode.encode`. Not differentiable in `positions`."""
     if positions.requires_grad:
         raise ValueError("backend 'cpu' gives no gradient for positions: use backend='reference'")
     if positions.dtype != torch.float32 or table.dtype != torch.float32:
@@ -55,7 +54,7 @@ class _Encode(torch.autograd.Function):
         shapes = level_arrays(grid)
         if packed is None:
             features = torch.empty(len(positions), grid.channels)
-            _encode_float(positions.numpy(), table.detach().numpy(), *shapes, features.numpy())
+            _encode_float(*arrays(positions, table), *shapes, features.numpy())
             return features
         words = torch.empty(len(positions), grid.levels, dtype=torch.int32)
         _encode_packed(positions.numpy(), _unsigned(packed), *shapes, _unsigned(words))
@@ -66,13 +65,8 @@ class _Encode(torch.autograd.Function):
         (positions,) = ctx.saved_tensors
         grid = ctx.grid
         target = torch.zeros(grid.entries, grid.features)
-        _scatter(
-            positions.numpy(),
-            by_channel(grad).numpy(),
-            *level_arrays(grid),
-            target.view(-1).numpy(),
-            get_num_threads(),
-        )
+        given = *arrays(positions, by_channel(grad)), *level_arrays(grid)
+        _scatter(*given, target.view(-1).numpy(), get_num_threads())
         return None, target, None, None
 
 

@@ -29,10 +29,7 @@ def encode(
     *,
     packed: Tensor | None = None,
 ) -> Tensor:
-    """See `methods.kernels.encode.encode`. Not differentiable in `positions`.
-
-    A float16 or bfloat16 table gives features of its type; products and sums are float32.
-    """
+    """A float16 or bfloat16 table gives features of its type; products and sums are float32."""
     if positions.requires_grad:
         raise ValueError("backend 'gpu' gives no gradient for positions: use backend='reference'")
     check_types(torch.float32, positions=positions)

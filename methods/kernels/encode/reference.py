@@ -15,7 +15,6 @@ def encode(
     *,
     packed: Tensor | None = None,
 ) -> Tensor:
-    """See `methods.kernels.encode.encode`."""
     inside = torch.where(positions > 0, positions, 0).clamp(max=1)
     found = []
     for level in range(grid.levels):

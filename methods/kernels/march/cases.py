@@ -4,15 +4,14 @@ corners, or come from very far."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from bench.case import DTYPES, U32, Agreement, Case, Property
+from bench.case import DTYPES, U32, Bound, Case, Given, Operation, Property
 from bench.types import Rays
 from methods.kernels.dispatch import served
 from methods.kernels.march import MAX_SAMPLES, march
@@ -37,29 +36,48 @@ def cases() -> list[Case]:
 
 
 def _agreements() -> list[Case]:
-    kinds: list[tuple[str, int, dict[str, Any]]] = [
-        ("no ray", 0, {}),
-        ("one ray", 1, {}),
-        ("inside and outside", 129, {}),
-        ("jitter", 129, {"jitter": True}),
-        ("window", 129, {"window": True}),
-        ("window without bounds", 129, {"unbounded": True}),
-        ("resumed", 129, {"resumed": True}),
-        ("limit 1", 129, {"limit": 1}),
-        ("limit 7", 129, {"limit": 7}),
-        ("empty grid", 65, {"grid": "empty"}),
-        ("full grid", 65, {"grid": "full"}),
-        ("one cell", 65, {"grid": "cell"}),
-        ("scattered cells", 65, {"grid": "dust"}),
-        ("axes, planes and corners", 0, {"special": True}),
+    """Rays from inside and outside through a grid of scattered cells; with windows and limits."""
+    generator = torch.Generator().manual_seed(4)
+    near = torch.rand(129, generator=generator)
+    everywhere = torch.tensor([-torch.inf, torch.inf]).expand(129, 2)
+    start = torch.randint(-1, 100, (129,), generator=generator).int()
+    kinds: list[tuple[str, Rays, str, dict[str, Any]]] = [
+        ("no ray", _rays(0), "dust", {}),
+        ("one ray", _rays(1), "dust", {}),
+        ("inside and outside", _rays(129), "dust", {}),
+        ("jitter", _rays(129), "dust", {"jitter": torch.rand(129, generator=generator)}),
+        ("window", _rays(129), "dust", {"window": torch.stack((near, near + 0.5), dim=1)}),
+        ("window without bounds", _rays(129), "dust", {"window": everywhere}),
+        ("resumed", _rays(129), "dust", {"start": start}),
+        ("limit 1", _rays(129), "dust", {"limit": 1}),
+        ("limit 7", _rays(129), "dust", {"limit": 7}),
+        ("empty grid", _rays(65), "empty", {}),
+        ("full grid", _rays(65), "full", {}),
+        ("one cell", _rays(65), "cell", {}),
+        ("axes, planes and corners", _special_rays(), "dust", {}),
     ]
-    kernel = Agreement("march", served(__package__), "the same operations in the same order: 0")
-    found = [kernel.case(name, partial(_prepare, rays, kind), 0.0) for name, rays, kind in kinds]
-    timed = partial(_prepare, 1 << 13, {"grid": "shell", "step": STEP})
-    return [*found, kernel.case("hollow sphere", timed, 0.0, items=1 << 13)]
+    found = []
+    for name, rays, grid, options in kinds:
+        given = {"rays": rays, "grid": grid, "step": LONG, "options": options}
+        found += MARCH.cases(name, partial(dict, given))
+    timed = {"rays": _rays(1 << 13), "grid": "shell", "step": STEP, "options": {}}
+    return [*found, *MARCH.cases("hollow sphere", partial(dict, timed), items=1 << 13)]
 
 
-def _grid(kind: str, device: str) -> Occupancy:
+def _march(given: Given, backend: str) -> tuple[Tensor, ...]:
+    rays = given["rays"]
+    grid = _grid(given["grid"], rays.origins.device)
+    samples = march(rays, grid, given["step"], backend=backend, **given["options"])
+    return tuple(getattr(samples, name) for name in OUTPUTS)
+
+
+OUTPUTS = ("offsets", "ray", "t", "delta", "positions", "resume")
+EQUAL = Bound("the same operations in the same order: 0", 0.0)
+MARCH = Operation("march", served(__package__), _march, dict.fromkeys(OUTPUTS, EQUAL))
+
+
+@cache
+def _grid(kind: str, device: torch.device) -> Occupancy:
     size = 128 if kind == "shell" else 32
     axis = (torch.arange(size) + 0.5) / size - 0.5
     radius = (axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2).sqrt()
@@ -93,31 +111,6 @@ def _special_rays() -> Rays:
     origins = torch.cat((far.reshape(-1, 3), near.reshape(-1, 3), bad))
     ahead = ALL.expand(4, 27, 3).reshape(-1, 3)
     return Rays(origins, torch.cat((ahead, ahead, torch.ones(3, 3))))
-
-
-def _prepare(count: int, kind: dict[str, Any], device: str) -> Callable[[str], tuple[Tensor, ...]]:
-    rays = _special_rays() if kind.get("special") else _rays(count)
-    count, generator = len(rays.origins), torch.Generator().manual_seed(4)
-    options: dict[str, Any] = {}
-    if kind.get("jitter"):
-        options["jitter"] = torch.rand(count, generator=generator).to(device)
-    if kind.get("window"):
-        near = torch.rand(count, generator=generator)
-        options["window"] = torch.stack((near, near + 0.5), dim=1).to(device)
-    if kind.get("unbounded"):
-        options["window"] = torch.tensor([-torch.inf, torch.inf]).expand(count, 2).to(device)
-    if kind.get("resumed"):
-        options["start"] = torch.randint(-1, 100, (count,), generator=generator).int().to(device)
-    if "limit" in kind:
-        options["limit"] = kind["limit"]
-    grid, step = _grid(kind.get("grid", "dust"), device), kind.get("step", LONG)
-    rays = Rays(rays.origins.to(device), rays.directions.to(device))
-
-    def call(backend: str) -> tuple[Tensor, ...]:
-        found = march(rays, grid, step, backend=backend, **options)
-        return found.offsets, found.ray, found.t, found.delta, found.positions, found.resume
-
-    return call
 
 
 def _ways() -> list[Case]:

@@ -15,7 +15,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from methods.kernels.cpu import f32, i32, slope, u64
+from methods.kernels.cpu import arrays, f32, i32, slope, u64
 from methods.kernels.march import Segments, longest_ray
 from methods.kernels.types import Extent, Occupancy, Samples
 
@@ -53,10 +53,7 @@ def march(
     limit: int,
     extent: Extent | None = None,
 ) -> Samples:
-    """See `methods.kernels.march.march`."""
-    origins, directions = (
-        x.contiguous() for x in (segments.rays.origins, segments.rays.directions)
-    )
+    origins, directions = segments.rays.origins, segments.rays.directions
     if origins.dtype != torch.float32:
         raise ValueError(f"backend 'cpu' marches float32, got {origins.dtype}")
     rays = len(origins)
@@ -66,38 +63,21 @@ def march(
     counts = torch.empty(rays, dtype=torch.int64)
     resume = torch.empty(rays, dtype=torch.int32)
     _find(
-        origins.numpy(),
-        directions.numpy(),
-        occupancy.words.numpy().reshape(-1),
-        occupancy.clearance.numpy().reshape(-1),
+        *arrays(origins, directions, occupancy.words.flatten(), occupancy.clearance.flatten()),
         occupancy.resolution,
-        occupancy.bounds.numpy(),
+        *arrays(occupancy.bounds),
         f32(step),
-        segments.window.contiguous().numpy(),
-        segments.jitter.contiguous().numpy(),
-        segments.start.contiguous().numpy(),
+        *arrays(segments.window, segments.jitter, segments.start),
         most,
-        scratch.numpy(),
-        owners.numpy(),
-        counts.numpy(),
-        resume.numpy(),
+        *arrays(scratch, owners, counts, resume),
     )
     offsets = torch.zeros(rays + 1, dtype=torch.int64)
     torch.cumsum(counts, dim=0, out=offsets[1:])
     total = int(offsets[-1])
     t, positions = torch.empty(total), torch.empty(total, 3)
     ray = torch.empty(total, dtype=torch.int32)
-    _place(
-        origins.numpy(),
-        directions.numpy(),
-        scratch.numpy(),
-        owners.numpy(),
-        most,
-        offsets.numpy(),
-        t.numpy(),
-        positions.numpy(),
-        ray.numpy(),
-    )
+    given = arrays(origins, directions, scratch, owners)
+    _place(*given, most, *arrays(offsets, t, positions, ray))
     return Samples(t, torch.full((total,), step), offsets, ray, positions, resume)
 
 

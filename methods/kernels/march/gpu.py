@@ -36,7 +36,6 @@ def march(
     limit: int,
     extent: Extent | None = None,
 ) -> Samples:
-    """See `methods.kernels.march.march`."""
     arguments = _arguments(segments, occupancy, step, limit)
     counts, resume = _counted(arguments)
     if extent is None:

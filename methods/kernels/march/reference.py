@@ -32,7 +32,6 @@ def march(
     limit: int,
     extent: Extent | None = None,
 ) -> Samples:
-    """See `methods.kernels.march.march`."""
     steps = _Steps.of(segments, step)
     parts = zip(*steps.taken(occupancy, limit), strict=True)
     kept, counts, resume = (torch.cat(column) for column in parts)

@@ -37,7 +37,6 @@ NOTHING = np.int16(0)
 
 
 def mlp(inputs: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
-    """See `methods.kernels.mlp.mlp`."""
     tensors = *inputs, *weights
     if all(tensor.dtype == torch.bfloat16 for tensor in tensors):
         return layer_by_layer(inputs, weights, _Relu.apply)

@@ -10,7 +10,6 @@ from torch.nn import functional
 
 
 def mlp(inputs: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
-    """See `methods.kernels.mlp.mlp`."""
     return layer_by_layer(inputs, weights, Tensor.relu_)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from bench.types import check_shape
+from bench.types import Unavailable, check_shape
 from methods.kernels.dispatch import implementation
 
 CHANNELS = 16
@@ -33,8 +33,11 @@ def shade(coefficients: Tensor, directions: Tensor, *, backend: str = "auto") ->
         directions: [N, 3] unit vectors.
 
     Raises:
-        ValueError: wrong shapes; backends "cpu", "gpu": not float32.
+        ValueError: wrong shapes; backend "cpu": not float32.
+        Unavailable: backend "gpu".
     """
+    if backend == "gpu":
+        raise Unavailable("backend='gpu': shade has no such version: use backend=auto")
     check_shape("coefficients", coefficients, len(directions), None, 3)
     check_shape("directions", directions, None, 3)
     if coefficients.shape[1] not in SIZES:

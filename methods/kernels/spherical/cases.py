@@ -25,7 +25,7 @@ HARMONICS = Operation(
 )
 SHADE = Operation(
     "shade",
-    served(__package__),
+    ("reference", "cpu"),
     lambda given, backend: (shade(given["coefficients"], given["directions"], backend=backend),),
     {
         "colours": Bound(

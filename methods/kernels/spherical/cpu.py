@@ -9,7 +9,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from methods.kernels.cpu import f32, u64
+from methods.kernels.cpu import arrays, f32, u64
 
 BLOCK = 256
 """Directions at a time; their 16 harmonics stay in the first-level cache."""
@@ -32,18 +32,16 @@ C32 = f32(sqrt(105 / (16 * pi)))
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:
-    """See `methods.kernels.spherical.spherical_harmonics`."""
     if directions.dtype != torch.float32 or directions.requires_grad:
         raise ValueError(
             "backend 'cpu' takes float32 directions without gradient: use backend='reference'"
         )
     values = torch.empty(len(directions), 16)
-    _evaluate(directions.contiguous().numpy(), values.numpy())
+    _evaluate(*arrays(directions, values))
     return values
 
 
 def shade(coefficients: Tensor, directions: Tensor) -> Tensor:
-    """See `methods.kernels.spherical.shade`."""
     if not coefficients.dtype == directions.dtype == torch.float32 or directions.requires_grad:
         raise ValueError(
             "backend 'cpu' takes float32, and directions without gradient: use backend='reference'"
@@ -55,9 +53,7 @@ class _Shade(torch.autograd.Function):
     @staticmethod
     def forward(ctx, coefficients, directions):
         colours = torch.empty(len(directions), 3)
-        coefficients = coefficients.detach().contiguous()
-        terms = coefficients.shape[1]
-        _shade(coefficients.view(-1).numpy(), directions.numpy(), terms, colours.numpy())
+        _shade(*arrays(coefficients.flatten(), directions), coefficients.shape[1], colours.numpy())
         ctx.save_for_backward(directions)
         ctx.shape = coefficients.shape
         return colours
@@ -66,8 +62,7 @@ class _Shade(torch.autograd.Function):
     def backward(ctx, grad):
         (directions,) = ctx.saved_tensors
         grads = torch.empty(ctx.shape)
-        given = grad.contiguous().numpy(), directions.numpy()
-        _unshade(*given, ctx.shape[1], grads.view(-1).numpy())
+        _unshade(*arrays(grad, directions), ctx.shape[1], grads.view(-1).numpy())
         return grads, None
 
 

@@ -1,10 +1,8 @@
 """Spherical harmonics with Triton.
 
-The harmonics of a direction (12 bytes) take 64 bytes; the gradients of a colour's coefficients take
-12 C bytes, from 24. They are written as rows, in memory order: each lane computes all harmonics of
-its direction and keeps those of its columns, which is cheaper than scattered writes. To shade, a
-lane takes a colour and reads its 12 C bytes of coefficients one by one; they come from the L1
-cache, into which they were loaded as a whole.
+The harmonics of a direction (12 bytes) take 64 bytes. They are written as rows, in memory order:
+each lane computes all harmonics of its direction and keeps those of its columns, which is cheaper
+than scattered writes.
 """
 
 from __future__ import annotations
@@ -22,9 +20,6 @@ from methods.kernels.spherical import CHANNELS
 BLOCK = 1024
 """Numbers that a program writes, 8 per lane."""
 
-LANES = 128
-"""Colours per program, one per lane."""
-
 C00 = tl.constexpr(sqrt(1 / (4 * pi)))
 C1 = tl.constexpr(sqrt(3 / (4 * pi)))
 C2 = tl.constexpr(sqrt(15 / (4 * pi)))
@@ -38,48 +33,14 @@ C32 = tl.constexpr(sqrt(105 / (16 * pi)))
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:
-    """See `methods.kernels.spherical.spherical_harmonics`."""
-    _check(directions)
+    check_types(torch.float32, directions=directions)
+    if directions.requires_grad:
+        raise ValueError("backend 'gpu' gives no gradient for directions: use backend='reference'")
     values = directions.new_empty(len(directions), CHANNELS)
     rows = BLOCK // CHANNELS
     grid = (triton.cdiv(len(values), rows),)
     launch(_evaluate, grid, directions.contiguous(), values, len(values), ROWS=rows, SIZE=CHANNELS)
     return values
-
-
-def shade(coefficients: Tensor, directions: Tensor) -> Tensor:
-    """See `methods.kernels.spherical.shade`."""
-    _check(directions)
-    check_types(torch.float32, coefficients=coefficients)
-    return _Shade.apply(coefficients, directions.contiguous())
-
-
-def _check(directions: Tensor) -> None:
-    check_types(torch.float32, directions=directions)
-    if directions.requires_grad:
-        raise ValueError("backend 'gpu' gives no gradient for directions: use backend='reference'")
-
-
-class _Shade(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, coefficients, directions):
-        count, size, _ = ctx.shape = coefficients.shape
-        ctx.save_for_backward(directions)
-        colours = torch.empty_like(directions)
-        given = directions, coefficients.detach().contiguous(), colours, count
-        launch(_shade, (triton.cdiv(count, LANES),), *given, SIZE=size, LANES=LANES)
-        return colours
-
-    @staticmethod
-    def backward(ctx, grad):
-        (directions,) = ctx.saved_tensors
-        count, size, _ = ctx.shape
-        grads, width = grad.new_empty(ctx.shape), triton.next_power_of_2(3 * size)
-        rows = BLOCK // width
-        given = directions, grad.contiguous(), grads, count
-        grid = (triton.cdiv(count, rows),)
-        launch(_unshade, grid, *given, ROWS=rows, WIDTH=width, SIZE=size)
-        return grads, None
 
 
 @triton.jit
@@ -137,41 +98,3 @@ def _evaluate(directions, values, count, ROWS: tl.constexpr, SIZE: tl.constexpr)
     column = tl.arange(0, SIZE)
     place = values + i[:, None] * SIZE + column[None, :]
     tl.store(place, _rows(x, y, z, column, SIZE), mask=inside[:, None])
-
-
-@triton.jit
-def _shade(directions, coefficients, colours, count, SIZE: tl.constexpr, LANES: tl.constexpr):
-    i = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
-    inside = i < count
-    x, y, z = vector(directions, i, inside)
-    red, green, blue = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
-    for k in tl.static_range(SIZE):
-        basis = _harmonic(x, y, z, k)
-        of_red, of_green, of_blue = vector(coefficients, i * SIZE + k, inside)
-        red += basis * of_red
-        green += basis * of_green
-        blue += basis * of_blue
-    tl.store(colours + 3 * i, red, mask=inside)
-    tl.store(colours + 3 * i + 1, green, mask=inside)
-    tl.store(colours + 3 * i + 2, blue, mask=inside)
-
-
-@triton.jit
-def _unshade(
-    directions,
-    grad,
-    grads,
-    count,
-    ROWS: tl.constexpr,
-    WIDTH: tl.constexpr,
-    SIZE: tl.constexpr,
-):
-    """Gradients of the coefficients: products of harmonics and gradients of the colours."""
-    i = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
-    inside = i < count
-    x, y, z = vector(directions, i, inside)
-    column = tl.arange(0, WIDTH)
-    there = inside[:, None] & (column < 3 * SIZE)[None, :]
-    of_colour = tl.load(grad + 3 * i[:, None] + (column % 3)[None, :], mask=there, other=0.0)
-    place = grads + i[:, None] * (3 * SIZE) + column[None, :]
-    tl.store(place, _rows(x, y, z, column // 3, SIZE) * of_colour, mask=there)

@@ -9,7 +9,6 @@ from torch import Tensor
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:
-    """See `methods.kernels.spherical.spherical_harmonics`."""
     x, y, z = directions.unbind(dim=-1)
     xx, yy, zz = x * x, y * y, z * z
     values = (
@@ -34,6 +33,5 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
 
 
 def shade(coefficients: Tensor, directions: Tensor) -> Tensor:
-    """See `methods.kernels.spherical.shade`."""
     basis = spherical_harmonics(directions)[:, : coefficients.shape[1]]
     return (basis[:, :, None] * coefficients).sum(dim=1)

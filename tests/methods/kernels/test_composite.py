@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 
+import hypothesis
 import pytest
 import torch
+from hypothesis import strategies as st
 from torch import Tensor
 
+from bench.case import U32
 from methods.kernels.composite import composite as composite_samples
 from methods.kernels.composite import visible, weights
 from methods.kernels.types import Intervals, Pixels
@@ -25,8 +28,10 @@ def intervals(inputs: dict) -> Intervals:
     return Intervals(inputs["t"], inputs["delta"], inputs["offsets"])
 
 
-def samples(counts: list[int], channels: int = 3, dtype: torch.dtype = torch.float32) -> dict:
-    generator = torch.Generator().manual_seed(len(counts))
+def samples(
+    counts: list[int], channels: int = 3, dtype: torch.dtype = torch.float32, seed: int = 0
+) -> dict:
+    generator = torch.Generator().manual_seed(len(counts) + seed)
     total = sum(counts)
 
     def draw(*shape: int) -> Tensor:
@@ -103,6 +108,51 @@ def test_a_homogeneous_medium_has_the_opacity_of_beer_lambert(backend: str) -> N
     # integral of t sigma exp(-sigma t) over [0, 1], by the midpoint rule: error below h^2 sigma^2.
     depth = (1 - math.exp(-sigma) * (1 + sigma)) / sigma
     assert pixels.depth_sum.item() == pytest.approx(depth, abs=sigma**2 / count**2)
+
+
+def part(inputs: dict, index: Tensor, counts: list[int]) -> dict:
+    """Only the samples at `index`, on rays of `counts`."""
+    columns = {name: inputs[name][index] for name in ("sigma", "values", "t", "delta")}
+    return columns | {"offsets": torch.tensor([0, *counts]).cumsum(0)}
+
+
+CHANNELS_APART, RAYS_APART, SPLIT = "channels apart", "rays apart", "behind a front half"
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("how", [CHANNELS_APART, RAYS_APART, SPLIT])
+@hypothesis.given(
+    counts=st.lists(st.integers(1, 64), min_size=1, max_size=12), seed=st.integers(0, 2**31)
+)
+def test_pixels_composited_in_parts_are_those_of_one_go(
+    how: str, backend: str, counts: list[int], seed: int
+) -> None:
+    inputs = samples(counts, seed=seed)
+    ray = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))
+    whole = composite(**inputs, stop=0.0, backend=backend)
+    if how == CHANNELS_APART:
+        values = [inputs["values"][:, [channel]] for channel in range(3)]
+        parts = [composite(**inputs | {"values": x}, stop=0.0, backend=backend) for x in values]
+        got = Pixels(torch.cat([x.values for x in parts], 1), parts[0].depth_sum, parts[0].alpha)
+    elif how == RAYS_APART:
+        got = whole.take(torch.arange(len(counts)).flip(0))
+        for number, count in enumerate(counts):
+            alone = part(inputs, ray == number, [count])
+            here = torch.tensor([number])
+            got.put(here, composite(**alone, stop=0.0, backend=backend))
+    else:
+        halves = [count // 2 for count in counts]
+        front = torch.cat([torch.arange(n) < half for n, half in zip(counts, halves, strict=True)])
+        rest = [count - half for count, half in zip(counts, halves, strict=True)]
+        carry = composite(**part(inputs, front, halves), stop=0.0, backend=backend)
+        behind = part(inputs, ~front, rest)
+        got = composite(**behind, stop=0.0, carry=carry, backend=backend)
+    # The compiled kernel adds up front to back, whatever lies beside; the reference in an order
+    # that depends on the longest ray, and at a split both round: sums of up to 64 weights.
+    exact = backend == "cpu" and how != SPLIT
+    for name, most in (("values", 1), ("depth_sum", 64), ("alpha", 1)):
+        error = (getattr(got, name) - getattr(whole, name)).abs().max().item()
+        assert error <= (0 if exact else 64 * most * U32), name
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

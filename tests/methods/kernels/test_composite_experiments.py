@@ -8,38 +8,27 @@ import pytest
 import torch
 from scipy import integrate
 
-from methods.kernels.composite.experiments import GAUSSIAN, SLAB, Medium
+from methods.kernels.composite.experiments import density, exact, thickness
 
-HEIGHTS = torch.tensor([0.0, 0.3, 1.0], dtype=torch.float64)
-MEDIA = pytest.mark.parametrize("medium", [GAUSSIAN, SLAB], ids=lambda medium: medium.name)
-
-
-def density(medium: Medium, x: float, y: float) -> float:
-    return medium.sigma(*(torch.tensor([at], dtype=torch.float64) for at in (x, y))).item()
+HEIGHTS = [0.0, 0.3, 1.0]
 
 
-@MEDIA
-def test_the_thickness_is_the_integral_of_the_density(medium):
-    for y in HEIGHTS.tolist():
-        for x in (0.2, 0.65, 1.0):
-            edges = [0.3 + 0.1 * y, 0.7]  # of the slab
-            want, _ = integrate.quad(lambda s, y=y: density(medium, s, y), 0, x, points=edges)
-            at = torch.tensor([x], dtype=torch.float64), torch.tensor([y], dtype=torch.float64)
-            assert medium.thickness(*at).item() == pytest.approx(want, rel=1e-9, abs=1e-12)
+def at(function, x: float, y: float) -> float:
+    return function(*(torch.tensor([place], dtype=torch.float64) for place in (x, y))).item()
 
 
-@MEDIA
-def test_opacity_and_depth_are_those_of_the_rendering_integral(medium):
-    def weight(x: float, y: float) -> float:
-        at = torch.tensor([x], dtype=torch.float64), torch.tensor([y], dtype=torch.float64)
-        return density(medium, x, y) * math.exp(-medium.thickness(*at).item())
+@pytest.mark.parametrize("y", HEIGHTS)
+def test_the_thickness_is_the_integral_of_the_density(y):
+    for x in (0.2, 0.65, 1.0):
+        want, _ = integrate.quad(lambda s: at(density, s, y), 0, x)
+        assert at(thickness, x, y) == pytest.approx(want, rel=1e-9, abs=1e-12)
 
-    quantities = {"alpha": 0} if medium is SLAB else {"alpha": 0, "depth_sum": 1}
-    for quantity, power in quantities.items():
-        exact = medium.exact(quantity, HEIGHTS)
-        for y, got in zip(HEIGHTS.tolist(), exact.tolist(), strict=True):
-            edges = [0.3 + 0.1 * y, 0.7]
-            want, _ = integrate.quad(
-                lambda x, y=y, power=power: x**power * weight(x, y), 0, 1, points=edges
-            )
-            assert got == pytest.approx(want, rel=1e-9)
+
+@pytest.mark.parametrize(("quantity", "power"), [("alpha", 0), ("depth_sum", 1)])
+def test_opacity_and_depth_are_those_of_the_rendering_integral(quantity, power):
+    answers = exact(quantity, torch.tensor(HEIGHTS, dtype=torch.float64)).tolist()
+    for y, got in zip(HEIGHTS, answers, strict=True):
+        want, _ = integrate.quad(
+            lambda x, y=y: x**power * at(density, x, y) * math.exp(-at(thickness, x, y)), 0, 1
+        )
+        assert got == pytest.approx(want, rel=1e-9)
