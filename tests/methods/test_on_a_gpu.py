@@ -26,7 +26,7 @@ from methods.diver.training import DiverLessons
 from methods.engines import cuda_graphs
 from methods.engines.torch_engine import TorchEngine
 from methods.gaussians.method import GaussianSplatting
-from methods.gaussians.training import Fitting, GaussianTraining
+from methods.gaussians.training import Fitting
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.method import InstantNgp
 from methods.instant_ngp.stage1 import Setup
@@ -80,19 +80,25 @@ def joint(**others: Any) -> JointOptions:
     return JointOptions(**{"motion": MOTION, "refined": 0.0} | few | others)
 
 
-def steernerf(field: str, **where: Any) -> Method:
+RELEASE = {
+    "reprojection": Reprojection("last", "paper", "sum"),
+    "history": False,
+    "surface": False,
+}
+
+
+def steernerf(field: str, **others: Any) -> Method:
     """The paper's, with its reprojection and range reduction."""
-    release = Reprojection("last", "paper", "sum")
-    return SteerNerf(
-        grid=GRID,
-        training=STAGE1,
-        model=small_model(reprojection=release, history=False, surface=False),
-        rendering=small_rendering(range=RangeReduction("paper")),
-        renderer=partial(UNet, width=4),
-        joint=joint(field=field, through="all", jitter=True),
-        engine=TorchEngine(),
-        **where,
-    )
+    given = {
+        "grid": GRID,
+        "training": STAGE1,
+        "model": small_model(**RELEASE),
+        "rendering": small_rendering(range=RangeReduction("paper")),
+        "renderer": partial(UNet, width=4),
+        "joint": joint(field=field, through="all", jitter=True),
+        "engine": TorchEngine(),
+    }
+    return SteerNerf(**given | others)
 
 
 def steernerf_lean(**where: Any) -> Method:
@@ -138,7 +144,9 @@ METHODS: Mapping[str, Callable[..., Method]] = {
 
 
 def fitted(name: str, device: str, scene: Scene, folder: Path) -> Method:
-    method = METHODS[name](device=device, backend="reference")
+    """On a GPU with the usual backend, which is the reference there."""
+    backend = "auto" if device == "cuda" else "reference"
+    method = METHODS[name](device=device, backend=backend)
     method.fit(scene, BUDGET, ConsoleLog(folder, quiet=True))
     return method
 
@@ -236,40 +244,6 @@ def test_its_rows_are_those_of_the_cpu(scene: Scene, tmp_path: Path) -> None:
     assert set(there["device"]) == {"cuda"}
 
 
-@pytest.mark.skipif(bool(availability()["gpu"]), reason="Triton has no build for this platform")
-def test_gaussians_of_triton_have_the_rows_of_the_cpu(scene: Scene, tmp_path: Path) -> None:
-    def of(device: str, backend: str) -> pd.DataFrame:
-        method = gaussians(start="scratch", device=device, backend=backend)
-        return rows(method, scene, tmp_path / device).reset_index(drop=True)
-
-    here = of("cpu", "reference")
-    with pretended_gpu():
-        there = of("cuda", "gpu")
-    known = here.columns.difference(["value", "device", "backend"])
-    assert here[known].equals(there[known])
-    assert there["backend"].str.match("gpu(?!.*gaussian)").all()
-    # Where a rounding turns the 8-bit level of one of 3 x 256 numbers, the PSNR of errors of 0.2 or
-    # more changes by at most 10 / ln 10 x 2 / (255 x 0.2) / 768 dB = 2.2e-4 dB.
-    assert (here["value"] - there["value"]).abs().max() < 1e-3
-
-
-@pytest.mark.skipif(bool(availability()["gpu"]), reason="Triton has no build for this platform")
-def test_gaussians_wait_once_a_frame_and_at_most_three_times_a_step(
-    gpu: PretendedGpu, scene: Scene, tmp_path: Path
-) -> None:
-    method = gaussians(start="scratch", device="cuda", backend="gpu")
-    method.fit(scene, BUDGET, ConsoleLog(tmp_path, quiet=True))
-    for size in (16, 40):
-        with device_waits() as waits:
-            method.render(scale_camera(scene.splits["test"].cameras[0], size, size), NullProbe())
-        assert waits.total() == 1
-    training = GaussianTraining(method.gaussians, scene, 10, Fitting(), "gpu", seed=0)
-    training.advance()  # draws the order of the pictures
-    with device_waits() as waits:
-        training.advance()
-    assert waits.total() <= 3
-
-
 def test_killed_in_stage_2_it_goes_on_as_if_it_had_not_been(
     gpu: PretendedGpu, scene: Scene, tmp_path: Path
 ) -> None:
@@ -358,28 +332,25 @@ def test_a_step_of_stage_2_waits_at_most_three_times(
     assert sum(counts) <= 3 * len(counts)
 
 
-def smallest(**where: Any) -> Method:
-    """The lean one, as small as it gets: an interpreter takes long for a step of a ray."""
-    long = {"step": 64.0, "refined_step": 64.0, "refined": 0.1}
+def smallest(name: str, **where: Any) -> Method:
+    """A method as small as it gets: an interpreter takes long for a step of a ray."""
+    few = {
+        "grid": replace(GRID, levels=2),
+        "training": TrainingOptions(march_step=64.0, grid_samples=16, max_rays=64),
+    }
+    if name == "ngp":
+        return InstantNgp(**few, **where)
     motion = MotionOptions(pool=1, length=1, least=1, uses=3, longer=0.0)
-    return SteerNerfLean(
-        grid=replace(GRID, levels=2),
-        training=TrainingOptions(march_step=64.0, grid_samples=16, max_rays=64),
-        model=small_model(step=64.0, frames=1),
-        rendering=small_rendering(range=RangeReduction("window"), overlap=0.1, **long),
-        renderer=partial(LeanRenderer, width=8, blocks=1, init="scratch"),
-        joint=joint(
-            refined=0.1, refined_step=64.0, grid_samples=0, distilled_views=0, motion=motion
-        ),
-        engine=TorchEngine(),
-        **where,
-    )
+    lessons = joint(through="all", grid_samples=0, distilled_views=0, motion=motion)
+    model = small_model(step=64.0, frames=1, **RELEASE)
+    return steernerf("joint", model=model, joint=lessons, **few, **where)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(bool(availability()["gpu"]), reason="Triton has no build for this platform")
+@pytest.mark.parametrize("name", ["ngp", "steernerf"])
 def test_by_triton_it_trains_and_renders_as_on_the_cpu(
-    ball_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, ball_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from triton.runtime.interpreter import interpreter_builder as builder
 
@@ -391,7 +362,7 @@ def test_by_triton_it_trains_and_renders_as_on_the_cpu(
     budget = replace(BUDGET, steps=1, samples=64, renderer_steps=1)
 
     def shown(device: str) -> list[torch.Tensor]:
-        method = smallest(device=device, backend="gpu")
+        method = smallest(name, device=device, backend="gpu")
         method.fit(tiny, budget, ConsoleLog(tmp_path / device, quiet=True))
         return frames(method, tiny)
 
@@ -429,29 +400,15 @@ def test_kernels_of_triton_compute_there_as_on_the_cpu() -> None:
 
 GO_ON = [
     ("adam", "30% of 70, 3 features"),
-    ("colours of networks", "fewer samples than go together"),
-    ("densities of networks", "fewer samples than go together"),
-    ("depth_to_space backward", "scale 3"),
-    ("depthwise backward", "scattered"),
-    ("gaussian projection backward", "1 Gaussians"),
-    ("integral", "257 segments"),
-    ("locate", "1 positions"),
-    ("render_voxels", "no voxel"),
-    ("shade backward", "131 colours of 16"),
-    ("shade_voxels backward", "300 of 4 harmonics"),
+    ("composite backward", "one sample a ray"),
+    ("encode backward", "one sample"),
+    ("hash adam", "1 samples, 2 features"),
     ("spherical", "131 directions"),
-    ("ssim backward", "noise, 20 x 3"),
-    ("warp", "holes"),
+    ("splat", "sparse"),
 ]
 """Cases of kernels for which the host does not wait."""
 
-WAIT = [
-    ("corner_gather backward", "257 samples of 27, no buffer"),
-    ("gaussian blending backward", "one pixel"),
-    ("grouped linear backward", "fewer samples than go together, 63 to 32"),
-    ("space_to_depth backward", "scale 3"),
-    ("voxel_walk", "limit 1"),
-]
+WAIT = [("march", "limit 1"), ("mlp backward", "97 of 7, 4 to 20, 5")]
 
 
 def preparation(which: tuple[str, str]) -> Prepare:

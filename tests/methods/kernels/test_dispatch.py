@@ -12,6 +12,7 @@ import torch
 
 from bench.errors import Unavailable
 from methods.kernels import availability, dispatch, resolve
+from methods.kernels.spherical import spherical_harmonics
 
 
 def test_auto_goes_by_the_device() -> None:
@@ -51,6 +52,17 @@ def test_a_version_that_a_kernel_lacks_is_refused_and_auto_does_without(plain: s
     with pytest.raises(Unavailable, match="only_plain has no such version, only reference"):
         dispatch.implementation(plain, "cpu", device)
     assert dispatch.implementation(plain, "auto", device).__name__ == "only_plain.reference"
+
+
+def test_for_a_while_a_kernel_is_computed_by_its_reference_whatever_is_asked_for() -> None:
+    """The reference alone gives a gradient for directions."""
+    directions = torch.rand(3, 3, requires_grad=True)
+    kernel = "methods.kernels.spherical"
+    with dispatch.forced(kernel, "reference"), dispatch.kernel_calls() as called:
+        assert spherical_harmonics(directions, backend="cpu").requires_grad
+    assert called == {kernel}
+    with pytest.raises(ValueError, match="without gradient"):
+        spherical_harmonics(directions, backend="cpu")
 
 
 def test_cpu_backend_refuses_tensors_of_another_device() -> None:

@@ -65,22 +65,6 @@ def test_samples_are_the_steps_in_occupied_cells(backend: str) -> None:
     assert differing <= 2
 
 
-@pytest.mark.parametrize("step", [STEP, STEP / 4])
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_full_grid_is_sampled_along_the_whole_chord(backend: str, step: float) -> None:
-    rays = rays_through_the_cube(200)
-    origins, directions = rays.origins, rays.directions
-    samples = march(rays, full(), step, backend=backend)
-    inverse = 1 / directions
-    first, second = -origins * inverse, (1 - origins) * inverse
-    near = torch.minimum(first, second).amax(dim=1).clamp(min=0)
-    far = torch.maximum(first, second).amin(dim=1)
-    chord = (far - near).clamp(min=0) * directions.norm(dim=1)
-    lengths = torch.zeros(200).double().index_add(0, samples.ray.long(), samples.delta.double())
-    # A midpoint rule covers the chord up to half a step, a sample more or less at its far end.
-    assert ((lengths - chord).abs() <= 0.5 * step + 1e-5).all()
-
-
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_positions_lie_on_their_ray_in_an_occupied_cell(backend: str) -> None:
     grid = dust(1)
@@ -130,18 +114,6 @@ def test_rounds_give_the_samples_of_one_go(backend: str, limit: int) -> None:
             parts[ray].append(t)
         start = part.resume
     assert sum(parts, []) == whole.t.tolist()  # noqa: RUF017
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_window_narrows_the_range(backend: str) -> None:
-    origins = torch.tensor([[0.5, 0.5, -1.0]]).expand(2, 3)
-    directions = torch.tensor([[0.0, 0.0, 2.0]]).expand(2, 3)
-    window = torch.tensor([[0.6, 0.7], [0.9, 5.0]])
-    samples = march(Rays(origins, directions), full(), STEP, window=window, backend=backend)
-    first, second = samples.t.split(samples.offsets.diff().tolist())
-    assert 0.6 < first.min() < first.max() < 0.7
-    assert 0.9 < second.min() < second.max() < 1.0
-    assert len(first) == round(0.2 / STEP)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -213,19 +185,6 @@ def test_the_front_of_a_ray_is_its_first_samples() -> None:
         whole = slice(int(samples.offsets[ray]), int(samples.offsets[ray]) + int(counts[ray]))
         for name in ("ray", "t", "delta", "positions"):
             assert torch.equal(getattr(front, name)[kept], getattr(samples, name)[whole])
-
-
-def test_the_first_samples_and_those_that_follow_are_the_samples_of_one_go() -> None:
-    rays, grid = rays_through_the_cube(60), dust(2)
-    whole, front = march(rays, grid, STEP), march(rays, grid, STEP, limit=3)
-    open_ = (front.resume >= 0).nonzero().squeeze(1)
-    assert 0 < len(open_) < 60
-    rest = march(rays.take(open_), grid, STEP, start=front.resume[open_])
-    order = torch.cat((front.ray, open_.int()[rest.ray])).argsort(stable=True)
-    for name in ("t", "delta", "positions"):
-        both = torch.cat((getattr(front, name), getattr(rest, name)))
-        assert torch.equal(both[order], getattr(whole, name)), name
-    assert (rest.resume == -1).all()
 
 
 def test_words_and_bounds_describe_the_cells() -> None:
