@@ -99,8 +99,10 @@ def _stops() -> Experiment:
     samples = Intervals(delta, delta, torch.arange(RAYS + 1) * 1024)
     sigma, nothing = torch.full_like(delta, 1024 * THIN), torch.zeros(len(delta), 1)
     truth = torch.full((RAYS,), -math.expm1(-1024 * THIN), dtype=torch.float64)
-    trials = [
-        Trial(stop, lambda stop=stop: composite(sigma, nothing, samples, stop=stop).alpha, truth)
-        for stop in (0.0, *(10.0**-power for power in range(7, 0, -1)))
-    ]
+
+    def opacity(stop: float) -> Tensor:
+        return composite(sigma, nothing, samples, stop=stop).alpha
+
+    stops = (0.0, *(10.0**-power for power in range(7, 0, -1)))
+    trials = [Trial(stop, partial(opacity, stop), truth) for stop in stops]
     return Experiment("early stop: light that leaks", "stop", trials, (1e-5, 1e-1))

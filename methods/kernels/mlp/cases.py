@@ -17,6 +17,8 @@ from bench.case import DTYPES, Bound, Case, Given, Operation
 from methods.kernels.dispatch import served
 from methods.kernels.mlp import mlp
 
+Network = tuple[tuple[int, ...], tuple[int, ...]]
+
 DENSITY, FEATURES = ((32,), (64, 16)), ((16, 16), (64, 64, 3))
 """Channels of the inputs, outputs of each layer: the networks of Instant-NGP."""
 
@@ -41,8 +43,7 @@ MLP = Operation(
 
 def cases() -> list[Case]:
     """No sample, one, more than go together; a sample of NaN; many, timed; bfloat16."""
-    found = []
-    for count, network, precision in (
+    kinds: list[tuple[int, Network, str]] = [
         (0, DENSITY, "fp32"),
         (1, FEATURES, "fp32"),
         (97, ((7, 4), (20, 5)), "fp32"),
@@ -52,7 +53,9 @@ def cases() -> list[Case]:
         (97, FEATURES, "bf16"),
         (MANY, DENSITY, "fp32"),
         (MANY, FEATURES, "fp32"),
-    ):
+    ]
+    found = []
+    for count, network, precision in kinds:
         inputs, widths = (", ".join(map(str, channels)) for channels in network)
         name = f"{count:,} of {inputs} to {widths}" + ", bf16" * (precision == "bf16")
         make, items = (
@@ -63,7 +66,8 @@ def cases() -> list[Case]:
     return [*found, *MLP.cases("a sample of NaN", _with_nan)]
 
 
-def _network(count: int, inputs: Sequence[int], widths: Sequence[int], precision: str) -> Given:
+def _network(count: int, network: Network, precision: str) -> Given:
+    inputs, widths = network
     generator = torch.Generator().manual_seed(count)
     channels = (sum(inputs), *widths)
     shapes = [(channels[n + 1], channels[n]) for n in range(len(widths))]
@@ -75,6 +79,6 @@ def _network(count: int, inputs: Sequence[int], widths: Sequence[int], precision
 
 
 def _with_nan() -> Given:
-    given = _network(97, *FEATURES, "fp32")
+    given = _network(97, FEATURES, "fp32")
     given["inputs"][1][50, 3] = math.nan
     return given
