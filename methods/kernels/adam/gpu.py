@@ -39,20 +39,10 @@ def sparse_adam_(
     entries, features = table.shape
     width = triton.next_power_of_2(max(features, 1))
     rows, known = max(BLOCK // width, 1), _corrections(table.device)
-    launch(
-        _update,
-        (triton.cdiv(entries, rows),),
-        *given.values(),
-        state.steps,
-        None if packed is None else packed.view(torch.bfloat16),
-        known,
-        known.shape[1] - 1,
-        rate,
-        entries,
-        ROWS=rows,
-        FEATURES=features,
-        WIDTH=width,
-    )
+    words = None if packed is None else packed.view(torch.bfloat16)
+    numbers = *given.values(), state.steps, words, known, known.shape[1] - 1, rate, entries
+    sizes = {"ROWS": rows, "FEATURES": features, "WIDTH": width}
+    launch(_update, (triton.cdiv(entries, rows),), *numbers, **sizes)
 
 
 @torch.no_grad()

@@ -46,6 +46,11 @@ def visible(
     return counts, left
 
 
+def _blocks(channels: int) -> dict[str, int]:
+    """The sizes of the blocks of a program."""
+    return {"CHANNELS": triton.next_power_of_2(max(channels, 1)), "BLOCK": BLOCK, "num_warps": 1}
+
+
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx, sigma, values, t, delta, offsets, stop, carry):
@@ -57,44 +62,24 @@ class _Composite(torch.autograd.Function):
             pixels = Pixels(*(x.clone(memory_format=torch.contiguous_format) for x in parts))
         front = 1 - pixels.alpha
         samples = [x.contiguous() for x in (sigma, values, t, delta, offsets)]
-        launch(
-            _forward,
-            (rays,),
-            *samples,
-            front,
-            stop,
-            pixels.values,
-            pixels.depth_sum,
-            pixels.alpha,
-            channels,
-            CHANNELS=triton.next_power_of_2(max(channels, 1)),
-            BLOCK=BLOCK,
-            num_warps=1,
-        )
+        outputs = pixels.values, pixels.depth_sum, pixels.alpha
+        given = *samples, front, stop, *outputs, channels
+        launch(_forward, (rays,), *given, **_blocks(channels))
         ctx.save_for_backward(*samples, front)
         ctx.stop = stop
-        return pixels.values, pixels.depth_sum, pixels.alpha
+        return outputs
 
     @staticmethod
     def backward(ctx, grad_values, grad_depth, grad_alpha):
         *samples, front = ctx.saved_tensors
         grad_sigma, grad_samples = torch.zeros_like(samples[0]), torch.zeros_like(samples[1])
         channels = samples[1].shape[1]
+        given = (x.contiguous() for x in (grad_values, grad_depth, grad_alpha))
         launch(
             _backward,
             (len(front),),
-            *samples,
-            front,
-            ctx.stop,
-            grad_values.contiguous(),
-            grad_depth.contiguous(),
-            grad_alpha.contiguous(),
-            grad_sigma,
-            grad_samples,
-            channels,
-            CHANNELS=triton.next_power_of_2(max(channels, 1)),
-            BLOCK=BLOCK,
-            num_warps=1,
+            *(*samples, front, ctx.stop, *given, grad_sigma, grad_samples, channels),
+            **_blocks(channels),
         )
         return grad_sigma, grad_samples, None, None, None, None, None
 

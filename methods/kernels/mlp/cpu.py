@@ -65,8 +65,7 @@ def _outputs(
         *_flat(left, right),
         left.shape[1],
         *_flat(_joined(weights, turned=False)),
-        np.array(widths),
-        np.array([_padded(width) for width in widths]),
+        *_sizes(widths),
         *_flat(kept, out),
     )
     return out, kept
@@ -91,8 +90,7 @@ class _Network(torch.autograd.Function):
             *_flat(left, right),
             left.shape[1],
             *_flat(turned),
-            np.array(widths),
-            np.array([_padded(width) for width in widths]),
+            *_sizes(widths),
             *_flat(kept, grad, *of_inputs),
             of_weights.numpy(),
         )
@@ -132,6 +130,11 @@ def _bits(x: Tensor) -> np.ndarray:
 def _padded(width: int) -> int:
     """`width` filled up to whole vectors."""
     return width + -width % LANES
+
+
+def _sizes(widths: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """The widths, and the same filled up to whole vectors."""
+    return np.array(widths), np.array([_padded(width) for width in widths])
 
 
 def _joined(weights: Sequence[Tensor], *, turned: bool) -> Tensor:

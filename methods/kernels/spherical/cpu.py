@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from math import pi, sqrt
-
 import numpy as np
 import torch
 from numba import njit, prange
 from torch import Tensor
 
 from methods.kernels.cpu import arrays, f32, u64
+from methods.kernels.spherical import FACTORS
 
 BLOCK = 256
 """Directions at a time; their 16 harmonics stay in the first-level cache."""
@@ -19,16 +18,7 @@ ROWS = 19
 
 ZERO = f32(0)
 ONE, TWO, THREE, NEXT = u64(1), u64(2), u64(3), u64(BLOCK)
-C00 = f32(sqrt(1 / (4 * pi)))
-C1 = f32(sqrt(3 / (4 * pi)))
-C2 = f32(sqrt(15 / (4 * pi)))
-C20 = f32(sqrt(5 / (16 * pi)))
-C22 = f32(sqrt(15 / (16 * pi)))
-C33 = f32(sqrt(35 / (32 * pi)))
-C3XYZ = f32(sqrt(105 / (4 * pi)))
-C31 = f32(sqrt(21 / (32 * pi)))
-C30 = f32(sqrt(7 / (16 * pi)))
-C32 = f32(sqrt(105 / (16 * pi)))
+C00, C1, C2, C20, C22, C33, C3XYZ, C31, C30, C32 = map(f32, FACTORS)
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:

@@ -7,29 +7,18 @@ than scattered writes.
 
 from __future__ import annotations
 
-from math import pi, sqrt
-
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
 from methods.kernels.gpu import check_types, launch, vector
-from methods.kernels.spherical import CHANNELS
+from methods.kernels.spherical import CHANNELS, FACTORS
 
 BLOCK = 1024
 """Numbers that a program writes, 8 per lane."""
 
-C00 = tl.constexpr(sqrt(1 / (4 * pi)))
-C1 = tl.constexpr(sqrt(3 / (4 * pi)))
-C2 = tl.constexpr(sqrt(15 / (4 * pi)))
-C20 = tl.constexpr(sqrt(5 / (16 * pi)))
-C22 = tl.constexpr(sqrt(15 / (16 * pi)))
-C33 = tl.constexpr(sqrt(35 / (32 * pi)))
-C3XYZ = tl.constexpr(sqrt(105 / (4 * pi)))
-C31 = tl.constexpr(sqrt(21 / (32 * pi)))
-C30 = tl.constexpr(sqrt(7 / (16 * pi)))
-C32 = tl.constexpr(sqrt(105 / (16 * pi)))
+C00, C1, C2, C20, C22, C33, C3XYZ, C31, C30, C32 = map(tl.constexpr, FACTORS)
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:

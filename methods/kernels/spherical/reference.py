@@ -2,32 +2,34 @@
 
 from __future__ import annotations
 
-from math import pi, sqrt
-
 import torch
 from torch import Tensor
+
+from methods.kernels.spherical import FACTORS
+
+C00, C1, C2, C20, C22, C33, C3XYZ, C31, C30, C32 = FACTORS
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:
     x, y, z = directions.unbind(dim=-1)
     xx, yy, zz = x * x, y * y, z * z
     values = (
-        torch.full_like(x, sqrt(1 / (4 * pi))),
-        sqrt(3 / (4 * pi)) * y,
-        sqrt(3 / (4 * pi)) * z,
-        sqrt(3 / (4 * pi)) * x,
-        sqrt(15 / (4 * pi)) * x * y,
-        sqrt(15 / (4 * pi)) * y * z,
-        sqrt(5 / (16 * pi)) * (2 * zz - xx - yy),
-        sqrt(15 / (4 * pi)) * x * z,
-        sqrt(15 / (16 * pi)) * (xx - yy),
-        sqrt(35 / (32 * pi)) * y * (3 * xx - yy),
-        sqrt(105 / (4 * pi)) * x * y * z,
-        sqrt(21 / (32 * pi)) * y * (4 * zz - xx - yy),
-        sqrt(7 / (16 * pi)) * z * (2 * zz - 3 * xx - 3 * yy),
-        sqrt(21 / (32 * pi)) * x * (4 * zz - xx - yy),
-        sqrt(105 / (16 * pi)) * z * (xx - yy),
-        sqrt(35 / (32 * pi)) * x * (xx - 3 * yy),
+        torch.full_like(x, C00),
+        C1 * y,
+        C1 * z,
+        C1 * x,
+        C2 * x * y,
+        C2 * y * z,
+        C20 * (2 * zz - xx - yy),
+        C2 * x * z,
+        C22 * (xx - yy),
+        C33 * y * (3 * xx - yy),
+        C3XYZ * x * y * z,
+        C31 * y * (4 * zz - xx - yy),
+        C30 * z * (2 * zz - 3 * xx - 3 * yy),
+        C31 * x * (4 * zz - xx - yy),
+        C32 * z * (xx - yy),
+        C33 * x * (xx - 3 * yy),
     )
     return torch.stack(values, dim=-1)
 
