@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import torch
-from torch import Tensor
 
 from bench.motion import preceding, viewing_target
 from bench.sharing import missing
-from bench.types import Camera, Log, NullProbe, Scene
+from bench.types import Log, NullProbe, Scene
 from methods.engines import Inputs
-from methods.steernerf.buffer import RenderingBuffer
-from methods.steernerf.options import Rendering
+from methods.steernerf.buffer import Buffer
 from methods.steernerf.pipeline import Pipeline
 from methods.training import checkpoint
 
@@ -33,7 +31,7 @@ class Calibration:
     """
 
     pipeline: Pipeline
-    rendering: Rendering
+    rendering: Any
     scene: Scene
     degrees: tuple[float, float]
     seed: int
@@ -47,15 +45,9 @@ class Calibration:
         path = folder / "inputs.safetensors"
         with missing(path, log) as to_record:
             if to_record:
-                frames = self.record(count, log)
-                tensors = {
-                    f"{frame:03} {place}": x
-                    for frame, inputs in enumerate(frames)
-                    for place, x in enumerate(inputs)
-                }
-                checkpoint.write(path, tensors, {})
-                return frames
-        log.info(f"frames to build the network on: found in {path}")
+                frames = enumerate(self.record(count, log))
+                named = {f"{n:03} {place}": x for n, xs in frames for place, x in enumerate(xs)}
+                checkpoint.write(path, named, {})
         tensors, _ = checkpoint.read(path)
         device = self.pipeline.background.device
         by_frame = groupby(sorted(tensors), lambda name: name.partition(" ")[0])
@@ -69,30 +61,16 @@ class Calibration:
         """
         generator = torch.Generator().manual_seed(self.seed)
         cameras, target = self.scene.splits["train"].cameras, viewing_target(self.scene)
-        renderer, frames = self.pipeline.renderer, []
-        seen: list[Inputs] = []
-
-        def recorded(*inputs: Tensor) -> Inputs:
-            seen.append(inputs)
-            return renderer.network(*inputs)
-
-        renderer.engine = recorded
-        try:
-            with log.progress("frames to build the network on", count) as progress:
-                for place in range(count):
-                    camera = cameras[place * len(cameras) // count]
-                    before = self.pipeline.model.frames + 1
-                    motion = preceding(camera, target, before, self.degrees, generator)
-                    self._render(motion, camera)
-                    frames.append(seen[-1])
-                    seen.clear()
-                    progress.advance()
-        finally:
-            renderer.engine = None
+        pipeline, length = self.pipeline, self.pipeline.model.frames
+        frames: list[Inputs] = []
+        with log.progress("frames to build the network on", count) as progress:
+            for place in range(count):
+                camera = cameras[place * len(cameras) // count]
+                buffer = Buffer(maxlen=length)
+                for before in preceding(camera, target, length + 1, self.degrees, generator):
+                    pipeline.remember(before, buffer, self.rendering)
+                network = pipeline.renderer.network
+                with network.register_forward_pre_hook(lambda _, xs: frames.append(xs)):
+                    pipeline.render(camera, buffer, self.rendering, NullProbe())
+                progress.advance()
         return frames
-
-    def _render(self, motion: Sequence[Camera], camera: Camera) -> None:
-        buffer = RenderingBuffer(self.pipeline.model.frames)
-        for before in motion:
-            self.pipeline.remember(before, buffer, self.rendering)
-        self.pipeline.render(camera, buffer, self.rendering, NullProbe())

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-
-import torch
+from typing import ClassVar
 
 from bench.sources import digest
 from bench.threads import torch_threads
@@ -16,7 +15,7 @@ from methods.instant_ngp.field import Precision
 from methods.instant_ngp.stage1 import Setup, train_field
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.encode import HashGrid
-from methods.steernerf.buffer import RenderingBuffer
+from methods.steernerf.buffer import Buffer
 from methods.steernerf.calibration import Calibration
 from methods.steernerf.options import Model, Rendering
 from methods.steernerf.renderer import Renderer2d
@@ -34,7 +33,7 @@ class SteerNerf:
             options share the result.
         model: the settings that stage 2 trains for.
         rendering: the settings chosen after training.
-        renderer: factory of the 2D renderer, called with K, L and s.
+        renderer: factory of the 2D renderer.
         joint: how stage 2 trains on patches.
         steps: of stage 2; None: `budget.renderer_steps`.
         after: share of these steps whose weights are used; see `training.stage2.Stage2`.
@@ -47,6 +46,7 @@ class SteerNerf:
     """
 
     study = STUDY
+    kind: ClassVar[type[Stage2]] = Stage2
 
     def __init__(
         self,
@@ -66,14 +66,13 @@ class SteerNerf:
         device: str = "auto",
         seed: int = 0,
     ) -> None:
-        self.stage2 = Stage2(model, renderer, joint, after)
-        _check(self.stage2, rendering)
+        self.stage2 = self.kind(model, renderer, joint, after)
+        _check_range(model, rendering)
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         engine.check(self.setup.device)
         self.rendering, self.engine, self.name = rendering, engine, name
-        self.steps = steps
-        self.memory, self.buffer = model.frames, RenderingBuffer(model.frames)
-        self.train_s = 0.0
+        self.steps, self.train_s = steps, 0.0
+        self.memory, self.buffer = model.frames, Buffer(maxlen=model.frames)
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Train both stages, or load their results if they were trained before."""
@@ -87,7 +86,7 @@ class SteerNerf:
 
     def reset(self) -> None:
         """Forget preceding frames."""
-        self.buffer.reset()
+        self.buffer.clear()
 
     def render(self, camera: Camera, probe: Probe) -> Frame:
         """Render the next frame of the sequence."""
@@ -98,7 +97,7 @@ class SteerNerf:
         return self.trained.sizes() | {"renderer2d": self.renderer_bytes}
 
     def settings(self) -> dict[str, str]:
-        """See `bench.types.Method.settings`; engine and precision are those of the 2D renderer."""
+        """Those of the field, with the engine and precision of the 2D renderer."""
         return self.setup.settings() | {
             "engine": self.engine.name,
             "precision": self.engine.computed(self.setup.device),
@@ -110,13 +109,11 @@ class SteerNerf:
         The engine is calibrated on frames rendered as in training, so that the result does not
         depend on `rendering`.
         """
-        renderer, engine, joint = second.pipeline.renderer, self.engine, self.stage2.joint
-        rendering = Rendering.in_training(self.stage2.model, joint.refined, joint.refined_step)
-        calibration = Calibration(
-            second.pipeline, rendering, scene, joint.motion.degrees, self.setup.seed
-        )
-        count, code = engine.samples(renderer.network), digest(Calibration)
-        key = {"trained": second.key, "calibration": code}
+        renderer, engine, stage2 = second.pipeline.renderer, self.engine, self.stage2
+        degrees, seed = stage2.joint.motion.degrees, self.setup.seed
+        calibration = Calibration(second.pipeline, stage2.rendering, scene, degrees, seed)
+        count = engine.samples(renderer.network)
+        key = {"trained": second.key, "calibration": digest(Calibration)}
 
         def samples() -> list[Inputs]:
             return calibration.inputs(count, log.stage_dir("inputs", {**key, "frames": count}), log)
@@ -128,34 +125,17 @@ class SteerNerf:
         renderer.engine, self.renderer_bytes = built.run, built.size
 
 
-def _check(stage2: Stage2, rendering: Rendering) -> None:
-    """Raise ValueError, before anything is trained, if settings contradict each other."""
-    model = stage2.model
-    if not model.frames and rendering.range.mode != "off":
+def _check_range(model: Model, rendering: Rendering) -> None:
+    """Raise ValueError if the range reduction and the model contradict each other."""
+    if rendering.range.mode == "off":
+        return
+    if not model.frames:
         raise ValueError(
             "rendering.range.mode: expected off without preceding frames (L = 0), got "
             f"{rendering.range.mode}"
         )
-    kinds = model.reprojection.depth, rendering.range.depth
-    if rendering.range.mode != "off" and kinds == ("expected", "sum"):
+    if (model.reprojection.depth, rendering.range.depth) == ("expected", "sum"):
         raise ValueError(
             "rendering.range.depth: expected the depth that is kept, model.reprojection.depth="
             "expected; got sum"
         )
-    with torch.random.fork_rng(devices=()):  # queried for its abilities; another one is trained
-        renderer = stage2.make_renderer(model.channels, model.frames, model.scale)
-    for name in ("history", "surface"):
-        if getattr(model, name) and not renderer.reads_details:
-            raise ValueError(
-                f"model.{name}: {type(renderer).__name__} does not read it: expected false, got "
-                "true"
-            )
-    for name, share in (
-        ("rendering.refined", rendering.refined),
-        ("joint.refined", stage2.joint.refined),
-    ):
-        if share and not renderer.estimates_error:
-            raise ValueError(
-                f"{name}: {type(renderer).__name__} does not estimate its error, expected 0, got "
-                f"{share}"
-            )

@@ -12,7 +12,7 @@ from bench.types import Probe
 from methods.engines.network import Network
 from methods.steernerf.kernels.splat import gather
 from methods.steernerf.options import check_size
-from methods.steernerf.renderer import UNWATCHED, Drawing, Observation, Renderer2d
+from methods.steernerf.renderer import UNWATCHED, Observation, Renderer2d
 
 
 class UNet(Renderer2d):
@@ -33,21 +33,21 @@ class UNet(Renderer2d):
     """
 
     def __init__(
-        self, channels: int, frames: int, scale: int, *, width: int = 64, aligned: bool = False
+        self, channels: int, frames: int, scale: int, *, width: int, aligned: bool
     ) -> None:
         super().__init__()
         check_size("renderer.width", width, 1, 4096)
         self.channels, self.frames, self.scale, self.aligned = channels, frames, scale, aligned
         self.network = _Network(channels * (frames + 1), width)
 
-    def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Drawing:
-        """See `Renderer2d`."""
+    def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Tensor:
+        """Draw all observations: pictures [B, H, W, 3]."""
         inputs = torch.stack([self._inputs(o) for o in observations])
-        (correction,) = self.run(probe, inputs)
-        return Drawing(self.base(observations) + correction.to(inputs).permute(0, 2, 3, 1))
+        (correction,) = self.run(probe, inputs)  # Eq. 11
+        return self.base(observations) + correction.to(inputs).permute(0, 2, 3, 1)
 
     def base(self, observations: Sequence[Observation]) -> Tensor:
-        """See `Renderer2d`."""
+        """The pictures [B, H, W, 3] that the network corrects: the present RGB, enlarged."""
         rgb = torch.stack([o.frame.values[..., :3] for o in observations]).permute(0, 3, 1, 2)
         enlarged = functional.interpolate(
             rgb, scale_factor=self.scale, mode="bilinear", align_corners=not self.aligned
@@ -105,7 +105,7 @@ class _Network(Network):
         return (self.last(self.leave(merged).relu())[..., :height, :width],)
 
     def products(self, *inputs: Tensor) -> int:
-        """See `Network`: every kernel counts once per pixel at its resolution."""
+        """Multiplications by weights: every kernel counts once per pixel at its resolution."""
         batch, _, height, width = inputs[0].shape
         full = batch * (-(-height // 4) * 4) * (-(-width // 4) * 4)
         used = {

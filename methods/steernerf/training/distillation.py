@@ -1,4 +1,5 @@
-"""Distilled views: pictures of the stage 1 field at random cameras, as further training views."""
+"""Distilled views: pictures of the stage 1 field at random cameras, as further training views
+(Section 3.5)."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from bench.sources import digest
 from bench.types import Budget, Camera, Log, NullProbe, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.rendering.frame import everywhere, render_frame
-from methods.steernerf.training.sequences import TrueView
+from methods.steernerf.training.examples import TrueView
 from methods.training import checkpoint
 
 
@@ -36,21 +37,19 @@ def distilled_views(
         if to_render:
             generator = torch.Generator().manual_seed(setup.seed)
             taken, target = scene.splits["train"].cameras, viewing_target(scene)
-            background = scene.background
             cameras = [novel_view(taken, target, generator) for _ in range(count)]
             began, tensors = time.monotonic(), {}
             with log.progress("distilling", count) as progress:
                 for number, camera in enumerate(cameras):
-                    tensors[f"{number}.picture"] = _picture(trained, camera, background)
+                    tensors[f"{number}.picture"] = _picture(trained, camera, scene.background)
                     tensors[f"{number}.camera"] = pack_camera(camera)
                     progress.advance()
-            figures = {"views": count, "seconds": time.monotonic() - began}
-            checkpoint.write(path, tensors, figures)
+            checkpoint.write(path, tensors, {"seconds": time.monotonic() - began})
     tensors, figures = checkpoint.read(path)
     with checkpoint.restoring(path):
         views = [
             TrueView(unpack_camera(tensors[f"{number}.camera"]), tensors[f"{number}.picture"])
-            for number in range(int(figures["views"]))
+            for number in range(count)
         ]
         return views, figures["seconds"]
 

@@ -1,0 +1,186 @@
+"""Training examples: a true picture, and the frames that came before it (Section 3.4).
+
+Training views are scattered, so the preceding cameras are synthetic: a random smooth motion that
+ends at the view. The pipeline renders these frames with its present weights, as it does when it is
+used. After a number of patches they are rendered again, along another motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bench.cameras import pack_camera, place_camera, unpack_camera
+from bench.motion import preceding, viewing_target
+from bench.types import Camera, Scene
+from methods.steernerf.buffer import Buffer, Cloud
+from methods.steernerf.pipeline import Pipeline
+from methods.steernerf.training.options import MotionOptions
+from methods.training.checkpoint import part
+
+
+@dataclass(frozen=True)
+class TrueView:
+    """A `camera` and its `picture`, uint8 [H, W, 3 or 4]."""
+
+    camera: Camera
+    picture: Tensor
+
+
+@dataclass(frozen=True)
+class TrainingViews:
+    """The views of a scene that a 2D renderer learns from.
+
+    Attributes:
+        real: the training pictures.
+        target: [3] the point that the cameras look at, roughly.
+        distilled: views whose pictures a trained field has rendered (Section 3.5).
+        share: share of the examples that end in a distilled view.
+    """
+
+    real: Sequence[TrueView]
+    target: Tensor
+    distilled: Sequence[TrueView] = ()
+    share: float = 0.0
+
+    @classmethod
+    def of(
+        cls, scene: Scene, distilled: Sequence[TrueView] = (), share: float = 0.0
+    ) -> TrainingViews:
+        """The training views of `scene`, and `distilled` ones for a `share` of the examples."""
+        split = scene.splits["train"]
+        real = [TrueView(c, p) for c, p in zip(split.cameras, split.images, strict=True)]
+        return cls(real, viewing_target(scene), distilled, share)
+
+    def __getitem__(self, number: int) -> TrueView:
+        """The real views, then the distilled ones."""
+        return [*self.real, *self.distilled][number]
+
+
+@dataclass
+class Example:
+    """A training view and the frames that precede it.
+
+    Attributes:
+        number: index of the view among all.
+        truth: the view and its picture.
+        buffer: the preceding frames.
+        uses: how many patches may still be cut from it.
+        lasting: whether it is then continued instead of replaced.
+    """
+
+    number: int
+    truth: TrueView
+    buffer: Buffer
+    uses: int
+    lasting: bool
+
+
+class ExamplePool:
+    """Examples that end in randomly chosen views and are replaced as `MotionOptions` says.
+
+    Args:
+        pipeline: renders the frames that precede a view.
+        rendering: how it renders them.
+        views: the views that examples end in.
+    """
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        rendering: Any,
+        views: TrainingViews,
+        options: MotionOptions,
+        generator: torch.Generator,
+    ) -> None:
+        self.pipeline, self.rendering = pipeline, rendering
+        self._views, self._options, self._generator = views, options, generator
+        self._pool: list[Example] = []
+
+    def draw(self) -> Example:
+        """Draw an example from the pool; counts as one use."""
+        place = self._random(self._options.pool)
+        if place >= len(self._pool):
+            self._pool.append(self._make())
+            place = len(self._pool) - 1
+        elif self._pool[place].uses <= 0:
+            old = self._pool[place]
+            self._pool[place] = self._go_on(old) if old.lasting else self._make()
+        example = self._pool[place]
+        example.uses -= 1
+        return example
+
+    def _make(self) -> Example:
+        views = self._views
+        distilled = self._chance() < (views.share if views.distilled else 0.0)
+        first, pictures = (len(views.real), views.distilled) if distilled else (0, views.real)
+        number = first + self._random(len(pictures))
+        buffer = Buffer(maxlen=self.pipeline.model.frames)
+        return self._ended(number, self._motion(views[number]), buffer)
+
+    def _go_on(self, old: Example) -> Example:
+        """Continue from the view that `old` ends in, there and back."""
+        back = self._motion(old.truth)
+        back = back[len(back) // 2 :]
+        path = [old.truth.camera, *reversed(back), *back[1:]]
+        return self._ended(old.number, path, old.buffer.copy())
+
+    def _motion(self, truth: TrueView) -> list[Camera]:
+        options = self._options
+        count = options.least + self._random(options.length - options.least + 1)
+        return preceding(truth.camera, self._views.target, count, options.degrees, self._generator)
+
+    def _ended(self, number: int, motion: Sequence[Camera], buffer: Buffer) -> Example:
+        """Make an example after rendering the frames of a `motion` into its `buffer`."""
+        if frames := self.pipeline.model.frames:
+            for camera in motion:
+                self.pipeline.remember(camera, buffer, self.rendering)
+        # Without preceding frames, continuing would only repeat the view.
+        lasting = self._chance() < self._options.longer and frames > 0
+        return Example(number, self._views[number], buffer, self._options.uses, lasting)
+
+    def _chance(self) -> float:
+        return torch.rand((), generator=self._generator).item()
+
+    def _random(self, below: int) -> int:
+        return int(torch.randint(below, (), generator=self._generator))
+
+    def state(self) -> dict[str, Tensor]:
+        """The state of all examples, to be kept in a file."""
+        tensors = {}
+        for place, example in enumerate(self._pool):
+            figures = (example.number, example.uses, example.lasting)
+            tensors[f"{place}.figures"] = torch.tensor(figures)
+            for age, cloud in enumerate(example.buffer):
+                for name, x in vars(cloud).items():
+                    packed = pack_camera(x) if isinstance(x, Camera) else x
+                    tensors[f"{place}.{age}.{name}"] = packed
+        return tensors
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restore the examples that `state` of a pool with the same views and options returned."""
+        count = sum(name.endswith(".figures") for name in tensors)
+        self._pool = [self._restored(part(tensors, f"{place}.")) for place in range(count)]
+
+    def _restored(self, tensors: Mapping[str, Tensor]) -> Example:
+        number, uses, lasting = tensors["figures"].tolist()
+        buffer = Buffer(maxlen=self.pipeline.model.frames)
+        ages = sum(name.endswith(".points") for name in tensors)
+        for age in range(ages):
+            buffer.append(self._unpacked(part(tensors, f"{age}.")))
+        return Example(number, self._views[number], buffer, uses, bool(lasting))
+
+    def _unpacked(self, tensors: Mapping[str, Tensor]) -> Cloud:
+        device = self.pipeline.background.device
+        parts = {
+            # Cameras alone are float64.
+            name: place_camera(unpack_camera(x), device)
+            if x.dtype == torch.float64
+            else x.to(device)
+            for name, x in tensors.items()
+        }
+        return self.pipeline.kept(**parts)
