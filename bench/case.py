@@ -7,9 +7,10 @@ the unit roundoff u of the type that the result is computed in, never from an ob
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import cache, partial
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,8 +20,17 @@ from bench.types import Unavailable
 Cell = tuple[str, str]
 """A backend or an engine, and a precision."""
 
-Prepare = Callable[[str], Callable[[str], tuple[Tensor, ...]]]
+Computation = Callable[[str], tuple[Tensor, ...]]
+"""Computes the outputs with a backend."""
+
+Prepare = Callable[[str], Computation]
 """Makes inputs on a device and returns a function of the backend that computes the outputs."""
+
+Given = Mapping[str, Any]
+"""The inputs of an operation, by name."""
+
+Tolerance = float | Tensor
+"""The largest allowed error of a result, or one of each of its numbers."""
 
 DTYPES = {
     "fp64": torch.float64,
@@ -35,6 +45,13 @@ U32 = 2.0**-24
 U16 = 2.0**-8
 """Unit roundoff of bfloat16, and its ulp from 1/2 to 1: two nearly equal numbers below 1 may round
 to neighbours."""
+
+
+class Apart(NamedTuple):
+    """An error, and the largest one that is allowed there."""
+
+    error: float
+    tolerance: float
 
 
 @dataclass(frozen=True)
@@ -54,9 +71,10 @@ class Case:
         name: what is special about the inputs.
         holds: what must hold.
         derivation: where the tolerances come from.
-        tolerances: the largest allowed error of each cell.
-        error: computes the largest error, given backend, device and precision. Raises `Unavailable`
-            if the cell does not exist on that device.
+        tolerances: the largest allowed error of each cell; None: `error` says it.
+        error: computes the largest error, given backend, device and precision, or `Apart` where it
+            is nearest to what is allowed. Raises `Unavailable` if the cell does not exist on that
+            device.
         timed: None if there are too few inputs for a meaningful throughput.
         slow: takes more than a moment, so the tests skip it.
     """
@@ -65,8 +83,8 @@ class Case:
     name: str
     holds: str
     derivation: str
-    tolerances: Mapping[Cell, float]
-    error: Callable[[str, str, str], float]
+    tolerances: Mapping[Cell, float | None]
+    error: Callable[[str, str, str], float | Apart]
     timed: Timed | None = None
     slow: bool = False
 
@@ -85,7 +103,9 @@ class Case:
         backend, precision = cell
         error, tolerance = math.inf, self.tolerances[cell]
         try:
-            error = self.error(backend, device, precision)
+            found = self.error(backend, device, precision)
+            error, tolerance = found if isinstance(found, Apart) else (found, tolerance)
+            assert tolerance is not None
             status = "ok" if error <= tolerance else "failed"
         except Unavailable as reason:
             status = f"unavailable: {reason}"
@@ -124,15 +144,151 @@ class Property:
 
 @dataclass(frozen=True)
 class Difference:
-    """Computes the largest difference from the reference backend on the CPU."""
+    """Computes how far results are from those of the reference backend on the CPU: where they are
+    nearest to their `tolerances`, or at most if there are none."""
 
     prepare: Prepare
+    tolerances: Callable[[], Sequence[Tolerance]] | None = None
 
-    def __call__(self, backend: str, device: str, precision: str) -> float:
+    def __call__(self, backend: str, device: str, precision: str) -> float | Apart:
         if (backend, device) == ("reference", "cpu"):
-            return 0.0
+            return 0.0 if self.tolerances is None else Apart(0.0, 0.0)
         got = tuple(result.cpu() for result in self.prepare(device)(backend))
-        return largest_error(got, self.prepare("cpu")("reference"))
+        return self.compare(got, self.prepare("cpu")("reference"))
+
+    def compare(self, got: Sequence[Tensor], want: Sequence[Tensor]) -> float | Apart:
+        """The difference between results and those of the reference."""
+        if self.tolerances is None:
+            return largest_error(got, want)
+        return nearest(got, want, self.tolerances())
+
+
+@dataclass(frozen=True)
+class Bound:
+    """How far a result may be from that of the reference.
+
+    Attributes:
+        why: where it comes from.
+        off: the tolerance, or a function of the inputs, on the CPU, that computes it.
+    """
+
+    why: str
+    off: Tolerance | Callable[[Given], Tolerance]
+
+    def of(self, given: Given) -> Tolerance:
+        """The tolerance for the inputs `given`."""
+        return self.off(given) if callable(self.off) else self.off
+
+
+def uniform(generator: torch.Generator, shape: Sequence[int]) -> Tensor:
+    """Random numbers from -1 to 1."""
+    return 2 * torch.rand(*shape, generator=generator) - 1
+
+
+@dataclass(frozen=True)
+class Operation:
+    """An operation; all its `backends` agree with the reference, forward and backward.
+
+    Attributes:
+        subject: its name.
+        compute: its results, a tuple, given the inputs and the backend.
+        outputs: the bound of each result, by its name, in their order.
+        gradients: the bound of the gradient of an input, by the name of the input, which is a
+            tensor or a list of them. There are no other gradients.
+        draw: the gradients of the results, at random.
+    """
+
+    subject: str
+    backends: Sequence[str]
+    compute: Callable[[Given, str], tuple[Tensor, ...]]
+    outputs: Mapping[str, Bound]
+    gradients: Mapping[str, Bound] = field(default_factory=dict)
+    draw: Callable[[torch.Generator, Sequence[int]], Tensor] = uniform
+
+    def cases(
+        self,
+        name: str,
+        make: Callable[[], Given],
+        *,
+        precision: str = "fp32",
+        items: int | None = None,
+    ) -> list[Case]:
+        """The cases with the inputs that `make` makes on the CPU: one of the outputs and, if there
+        are gradients, one of outputs and gradients. They are timed if `items`, the number that a
+        call processes, is given."""
+        ways = [(self.subject, self._outputs, self.outputs, self._tolerances)]
+        if self.gradients:
+            both = {**self.outputs, **{f"gradient of {k}": v for k, v in self.gradients.items()}}
+            ways.append((f"{self.subject} backward", self._both, both, self._all_tolerances))
+        return [
+            Case(
+                subject,
+                name,
+                "the result is that of the reference",
+                "; ".join(f"{result}: {bound.why}" for result, bound in bounds.items()),
+                dict.fromkeys((backend, precision) for backend in self.backends),
+                Difference(partial(prepare, make), partial(tolerances, make)),
+                None if items is None else Timed(items, partial(prepare, make)),
+            )
+            for subject, prepare, bounds, tolerances in ways
+        ]
+
+    def _outputs(self, make: Callable[[], Given], device: str) -> Computation:
+        return partial(self.compute, _placed(make(), device))
+
+    def _both(self, make: Callable[[], Given], device: str) -> Computation:
+        given = _placed(make(), device)
+        wanted = [x.requires_grad_() for x in self._wanted(given)]
+
+        @cache
+        def shine(*shapes: torch.Size) -> list[Tensor]:
+            generator = torch.Generator().manual_seed(1)
+            return [self.draw(generator, shape).to(device) for shape in shapes]
+
+        def call(backend: str) -> tuple[Tensor, ...]:
+            results = self.compute(given, backend)
+            learned = [x for x in results if x.requires_grad]
+            grads = [
+                grad.to(x.dtype)
+                for x, grad in zip(learned, shine(*(x.shape for x in learned)), strict=True)
+            ]
+            found = torch.autograd.grad(learned, wanted, grads, materialize_grads=True)
+            return (*(x.detach() for x in results), *found)
+
+        return call
+
+    def _wanted(self, given: Given) -> list[Tensor]:
+        return [x for name in self.gradients for x in _several(given[name])]
+
+    def _tolerances(self, make: Callable[[], Given]) -> list[Tolerance]:
+        given = make()
+        return [bound.of(given) for bound in self.outputs.values()]
+
+    def _all_tolerances(self, make: Callable[[], Given]) -> list[Tolerance]:
+        given = make()
+        wanted = [
+            bound.of(given) for name, bound in self.gradients.items() for _ in _several(given[name])
+        ]
+        return [*self._tolerances(make), *wanted]
+
+
+def _several(value: Tensor | Iterable[Tensor]) -> Iterable[Tensor]:
+    return [value] if isinstance(value, Tensor) else value
+
+
+def _placed(value: Any, device: str) -> Any:
+    """The tensors in mappings, lists and dataclasses on `device`, detached."""
+    if isinstance(value, Tensor):
+        return value.detach().to(device)
+    if isinstance(value, Mapping):
+        return {name: _placed(item, device) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_placed(item, device) for item in value]
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(
+            value, **{f.name: _placed(getattr(value, f.name), device) for f in fields(value)}
+        )
+    return value
 
 
 @dataclass(frozen=True)
@@ -179,14 +335,35 @@ def on_backends(
     return {cell: units * torch.finfo(DTYPES[cell[1]]).eps / 2 for cell in cells}
 
 
+def nearest(
+    results: Sequence[Tensor], reference: Sequence[Tensor], tolerances: Sequence[Tolerance]
+) -> Apart:
+    """The error of that number of all results which is nearest to its tolerance, or exceeds it by
+    the largest factor; inf if shapes or non-finite values differ."""
+    worst, nearness = Apart(0.0, 0.0), -1.0
+    for got, want, allowed in zip(results, reference, tolerances, strict=True):
+        error = _errors(got, want)
+        if not error.numel():
+            continue
+        tolerance = torch.as_tensor(allowed, dtype=torch.float64).expand_as(error).flatten()
+        error = error.flatten()
+        share = torch.where(error > 0, error / tolerance, 0)
+        at = int(share.argmax())
+        if share[at] > nearness:
+            nearness, worst = share[at].item(), Apart(error[at].item(), tolerance[at].item())
+    return worst
+
+
 def largest_error(results: Sequence[Tensor], reference: Sequence[Tensor]) -> float:
     """Largest |result - reference| over all outputs; inf if shapes or non-finite values differ."""
-    worst = 0.0
-    for got, want in zip(results, reference, strict=True):
-        if got.shape != want.shape:
-            return torch.inf
-        got, want = got.detach().double(), want.detach().double()
-        same = (got == want) | (got.isnan() & want.isnan())
-        error = torch.where(same, 0, (got - want).abs()).nan_to_num(nan=torch.inf)
-        worst = max(worst, error.max().item() if error.numel() else 0.0)
-    return worst
+    errors = [_errors(got, want) for got, want in zip(results, reference, strict=True)]
+    return max((x.max().item() for x in errors if x.numel()), default=0.0)
+
+
+def _errors(got: Tensor, want: Tensor) -> Tensor:
+    """|got - want| in float64; inf where only one is NaN or infinite, or if shapes differ."""
+    if got.shape != want.shape:
+        return torch.full((1,), torch.inf, dtype=torch.float64)
+    got, want = got.detach().double(), want.detach().double()
+    same = (got == want) | (got.isnan() & want.isnan())
+    return torch.where(same, 0, (got - want).abs()).nan_to_num(nan=torch.inf)

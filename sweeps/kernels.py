@@ -40,7 +40,7 @@ def main(options: argparse.Namespace) -> int:
 def _line(row: Mapping[str, Any]) -> tuple[str, ...]:
     labels = (row["kernel"], row["case"], row["backend"], row["dtype"])
     error = "not finite" if row["error"] is None else f"{row['error']:.1e}"
-    errors = (error, f"{row['tolerance']:.1e}")
+    errors = (error, "" if row["tolerance"] is None else f"{row['tolerance']:.1e}")
     if row["status"] != "ok":
         return (*labels, *errors, row["status"], "", "")
     ratio = f"{row['ratio']:.1f}x" if "ratio" in row else ""

@@ -75,7 +75,7 @@ def _end(row: Mapping[str, Any]) -> tuple[str, str, str]:
     seen = "not finite" if row["error"] is None else f"{row['error']:.1e}"
     if row["status"].startswith("unavailable"):
         seen = ""
-    return seen, f"{row['tolerance']:.1e}", row["status"]
+    return seen, "" if row["tolerance"] is None else f"{row['tolerance']:.1e}", row["status"]
 
 
 def _case_lines(rows: Iterable[Mapping[str, Any]]) -> Iterator[tuple[str, ...]]:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from bench.case import Agreement, Case, largest_error
+from bench.case import Agreement, Bound, Case, Operation, largest_error, nearest
 from bench.checking import failed, run_cases, timed_rows
 from bench.types import Log, Unavailable
 
@@ -70,6 +70,55 @@ def test_every_cell_of_every_case_gets_a_row(quiet_log: Log):
 
 def test_a_nan_is_an_infinite_error() -> None:
     assert largest_error((torch.tensor([torch.nan]),), (torch.ones(1),)) == torch.inf
+
+
+def scaled(wrong: str) -> Operation:
+    """x y of a list of tensors x and a tensor y; backend "cpu" gets one result wrong by 1/8."""
+
+    def compute(given, backend):
+        off = 0.125 * (backend == "cpu")
+        x, y = sum(given["x"]), given["y"]
+        if wrong == "gradient":
+            x = x + off * (x - x.detach())
+        return x * y + off * (wrong == "second"), y + off * (wrong == "last")
+
+    outputs = {"second": Bound("a", 0.1), "last": Bound("b", lambda given: given["y"].abs())}
+    gradients = {"x": Bound("c", torch.tensor(0.01))}
+    return Operation("scaled", ("reference", "cpu"), compute, outputs, gradients, torch_ones)
+
+
+def torch_ones(generator: torch.Generator, shape: torch.Size) -> torch.Tensor:
+    return torch.ones(*shape)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "forward", "backward"),
+    [
+        ("nothing", "ok 0.0", "ok 0.0"),
+        ("second", "failed 0.125 0.1", "failed 0.125 0.1"),
+        ("last", "failed 0.125 0.0625", "failed 0.125 0.0625"),
+        ("gradient", "ok 0.0", "failed 0.125 0.01"),
+    ],
+)
+def test_each_result_of_an_operation_has_its_own_tolerance(wrong, forward, backward):
+    inputs = {"x": [torch.ones(2), torch.ones(2)], "y": torch.tensor([1.0, 0.0625])}
+    there, back = scaled(wrong).cases("two", lambda: inputs)
+    assert (there.subject, back.subject) == ("scaled", "scaled backward")
+    assert back.derivation == "second: a; last: b; gradient of x: c"
+    for case, want in ((there, forward), (back, backward)):
+        row = case.check(("cpu", "fp32"), "cpu")
+        got = row["status"], row["error"], round(row["tolerance"], 6)
+        assert " ".join(map(str, got)).startswith(want), row
+    assert not inputs["y"].requires_grad
+
+
+def test_the_number_nearest_to_its_tolerance_is_reported() -> None:
+    zero, off = torch.zeros(3), torch.tensor([0.5, 0.02, 0.0])
+    tolerance = torch.tensor([1.0, 0.01, 0.0])
+    assert nearest((off,), (zero,), (tolerance,)) == pytest.approx((0.02, 0.01))
+    assert nearest((off, zero), (zero, off), (1.0, 0.1)) == (0.5, pytest.approx(0.1))
+    assert nearest((zero[:2],), (zero,), (1.0,)).error == torch.inf
+    assert nearest((zero[:0],), (zero[:0],), (tolerance[:0],)) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("items", [None, 10])
