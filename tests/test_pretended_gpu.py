@@ -19,7 +19,7 @@ from bench.waits import device_waits
 from methods.engines.torch_engine import TorchEngine
 from methods.kernels import dispatch
 from methods.kernels.encode import HashGrid, encode
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy
 from methods.rendering import rays
 from methods.rendering.frame import everywhere, render_frame
 from methods.rendering.march import March

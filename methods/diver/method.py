@@ -14,8 +14,7 @@ from methods.diver.model import CornerModel
 from methods.diver.rendering import Baked, Stored
 from methods.diver.training import DiverLessons, DiverTraining
 from methods.instant_ngp.stage1 import Setup, TrainedField
-from methods.kernels.composite import Pixels
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy, Pixels
 from methods.rendering.frame import Render
 from methods.students.method import Student
 

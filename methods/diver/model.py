@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from bench.types import Rays
 from methods.diver.decoder import CHANNELS, Decoder
 from methods.instant_ngp.stage1 import TrainedField
-from methods.kernels.composite import Intervals
 from methods.kernels.corner_gather import gather, integral_along
 from methods.kernels.encode import encode
+from methods.kernels.types import Intervals
 from methods.kernels.voxel_walk import Crossings, Voxels
 from methods.students.voxels import corners_of, occupied_voxels
 from methods.training import checkpoint

@@ -11,9 +11,8 @@ from bench.types import Probe, Rays
 from methods.diver.decoder import Merged
 from methods.diver.kernels.corner_rendering import Corners, render_segments
 from methods.diver.model import CornerModel
-from methods.kernels.composite import Pixels
 from methods.kernels.corner_gather import CORNERS
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy, Pixels
 from methods.rendering.compaction import to_host
 
 Stored = Literal["bf16", "fp32"]

@@ -13,7 +13,8 @@ from methods.diver.decoder import encode_directions
 from methods.diver.model import CornerModel, as_intervals
 from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.adam import AdamState, sparse_adam_
-from methods.kernels.composite import STOP, Pixels, composite, visible, weights
+from methods.kernels.composite import STOP, composite, visible, weights
+from methods.kernels.types import Pixels
 from methods.kernels.voxel_walk import Crossings, walk
 from methods.rendering.field import pad
 from methods.students.voxels import largest_weights

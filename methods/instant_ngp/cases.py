@@ -18,9 +18,9 @@ from bench.types import Budget, Camera, Scene, Split, SteerbenchError, Unavailab
 from methods.instant_ngp.field import LOG_DENSITY_CLAMP, HashField, Precision
 from methods.instant_ngp.training import MIN_RAYS, FieldTraining, TrainingOptions
 from methods.kernels import BACKENDS
-from methods.kernels.composite import Intervals, composite
+from methods.kernels.composite import composite
 from methods.kernels.encode import HashGrid
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Intervals, Occupancy
 from methods.rendering.occupancy import DECAY, RESOLUTION, THRESHOLD, DensityGrid
 from methods.training import loop
 

@@ -12,7 +12,7 @@ from methods.instant_ngp.field import HashField, Precision
 from methods.instant_ngp.training import FieldTraining, TrainingOptions, new_grid, restore_field
 from methods.kernels import multiplies_bf16, resolve
 from methods.kernels.encode import HashGrid
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy
 from methods.rendering.march import March
 from methods.rendering.occupancy import DensityGrid
 from methods.training import checkpoint, loop

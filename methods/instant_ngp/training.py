@@ -15,7 +15,8 @@ from methods.instant_ngp.error_map import REFRESHED, ErrorMap
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.optimiser import FieldOptimiser
 from methods.instant_ngp.pixels import PixelBatches
-from methods.kernels.composite import Pixels, check_stop
+from methods.kernels.composite import check_stop
+from methods.kernels.types import Pixels
 from methods.rendering.batch import opacity_entropy, render_batch
 from methods.rendering.march import March, check_step, suitable_step
 from methods.rendering.occupancy import EVERY, MIN_VIEWS, STEP, DensityGrid, learnable_cells

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy
 
 
 @dataclass(frozen=True)

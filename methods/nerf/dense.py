@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from bench.types import Probe, Rays
-from methods.kernels.composite import Pixels, composite
-from methods.kernels.march import Occupancy, march
+from methods.kernels.composite import composite
+from methods.kernels.march import march
+from methods.kernels.types import Occupancy, Pixels
 from methods.rendering.field import Field, query
 from methods.rendering.frame import Render
 from methods.rendering.march import March

@@ -9,7 +9,7 @@ import torch
 
 from bench.types import Probe
 from methods.instant_ngp.stage1 import Setup
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy
 from methods.nerf.dense import every_sample, whole_cube
 from methods.nerf.field import NerfField
 from methods.rendering.frame import Render

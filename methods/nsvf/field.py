@@ -11,7 +11,7 @@ from torch.nn import functional
 from bench.types import Probe
 from methods.instant_ngp.field import Precision
 from methods.kernels.corner_gather import CORNERS, gather, trilinear
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy
 from methods.students.fields import StudentField
 from methods.students.networks import (
     Dense,

@@ -12,7 +12,7 @@ import torch
 from bench.types import Budget, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.kernels.encode import encode
-from methods.kernels.march import BRICK, Occupancy
+from methods.kernels.types import BRICK, Occupancy
 from methods.nsvf.field import EMBEDDING, NsvfField
 from methods.rendering.march import check_step
 from methods.rendering.occupancy import STEP

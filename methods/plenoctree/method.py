@@ -13,8 +13,7 @@ from bench.study import Axis, Study, Variant, turned
 from bench.types import Budget, Probe, Rays, Scene
 from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import Setup, TrainedField
-from methods.kernels.composite import Pixels
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy, Pixels
 from methods.kernels.voxel_walk import render_voxels
 from methods.plenoctree.octree import Octree
 from methods.plenoctree.start import Extraction, extract

@@ -8,7 +8,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy
 from methods.kernels.voxel_walk import BRICK, Light, Voxels
 
 CELL = 4

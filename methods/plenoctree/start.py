@@ -13,8 +13,8 @@ from bench.types import Rays, SteerbenchError
 from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.composite import STOP, weights
-from methods.kernels.march import Occupancy
 from methods.kernels.spherical import spherical_harmonics
+from methods.kernels.types import Occupancy
 from methods.kernels.voxel_walk import BRICK, Crossings, Light, Voxels
 from methods.plenoctree.octree import Octree
 from methods.rendering.field import Field, pad

@@ -12,7 +12,8 @@ from torch.nn import functional
 from bench.types import Budget, Rays, Scene
 from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.adam import AdamState, sparse_adam_
-from methods.kernels.composite import STOP, Pixels, composite, visible
+from methods.kernels.composite import STOP, composite, visible
+from methods.kernels.types import Pixels
 from methods.kernels.voxel_shading import shade_voxels
 from methods.kernels.voxel_walk import walk
 from methods.plenoctree.octree import Octree

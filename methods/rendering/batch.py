@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from bench.types import Rays
-from methods.kernels.composite import Extent, Pixels, composite, visible
+from methods.kernels.composite import composite, visible
 from methods.kernels.keep import keep
-from methods.kernels.march import Occupancy, Samples, march
+from methods.kernels.march import march
+from methods.kernels.types import Extent, Occupancy, Pixels, Samples
 from methods.rendering.compaction import compacts
 from methods.rendering.field import CACHED_SAMPLES, CHUNK_SAMPLES, Encoder, Field, pad, query
 from methods.rendering.march import March

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from bench.cameras import cast, project
 from bench.types import EMPTY_ALPHA, Camera, Frame, Probe, Rays
-from methods.kernels.composite import Pixels
-from methods.kernels.march import BRICK, Occupancy
+from methods.kernels.types import BRICK, Occupancy, Pixels
 from methods.rendering.field import Field
 from methods.rendering.march import March
 from methods.rendering.rays import render_rays

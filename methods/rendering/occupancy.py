@@ -19,7 +19,8 @@ from torch import Tensor
 
 from bench.cameras import place_camera, project, within
 from bench.types import Camera
-from methods.kernels.march import BRICK, MAX_SAMPLES, Occupancy
+from methods.kernels.march import MAX_SAMPLES
+from methods.kernels.types import BRICK, Occupancy
 from methods.rendering.field import LOG_DENSITY_CLAMP, Field
 
 RESOLUTION = 128

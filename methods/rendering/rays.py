@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from bench.types import Probe, Rays
-from methods.kernels.composite import Pixels, composite, weights
-from methods.kernels.march import Occupancy, Samples, extents, march
+from methods.kernels.composite import composite, weights
+from methods.kernels.march import extents, march
+from methods.kernels.types import Occupancy, Pixels, Samples
 from methods.rendering.compaction import compacts
 from methods.rendering.field import CACHED_SAMPLES, CHUNK_SAMPLES, Field, pad, query
 from methods.rendering.march import March

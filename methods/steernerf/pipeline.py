@@ -21,7 +21,7 @@ from torch.nn import functional
 
 from bench.cameras import place_camera
 from bench.types import Camera, Frame, NullProbe, Probe
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy
 from methods.rendering.field import Field
 from methods.rendering.frame import FeatureFrame, everywhere, render_frame
 from methods.steernerf.buffer import Buffer, Cloud

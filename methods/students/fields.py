@@ -13,8 +13,7 @@ from torch.nn import functional
 from bench.types import Budget, Log, Probe, Rays, Scene
 from methods.instant_ngp.stage1 import TrainedField
 from methods.instant_ngp.training import MarchOptions, PixelTraining
-from methods.kernels.composite import Pixels
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy, Pixels
 from methods.rendering.batch import render_batch
 from methods.rendering.field import ROUND_SAMPLES, Field
 from methods.rendering.frame import Render, everywhere

@@ -19,7 +19,7 @@ from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
 from methods.instant_ngp.training import PixelOptions
 from methods.kernels.composite import check_stop
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy
 from methods.rendering.frame import Render, render_frame
 from methods.training import checkpoint, loop
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bench.types import Rays, check_shape
 from methods.instant_ngp.pixels import PixelBatches
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy
 from methods.kernels.voxel_walk import Crossings, Voxels, walk
 
 CHUNK_RAYS = 1 << 15

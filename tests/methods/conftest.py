@@ -16,7 +16,7 @@ from bench.types import Camera, Log, NullProbe, Scene, Split
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.stage1 import TrainedField, train_field
 from methods.kernels.encode import HashGrid
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy
 from tests.methods.trainings import TAUGHT, TEACHER
 
 SIZE = 32

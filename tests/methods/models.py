@@ -11,7 +11,7 @@ from methods.instant_ngp.field import HashField
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.composite import STOP
 from methods.kernels.encode import HashGrid
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy
 from methods.rendering.march import March
 from methods.rendering.occupancy import DensityGrid
 from methods.steernerf.options import Model, Rendering, Reprojection

@@ -34,7 +34,8 @@ from methods.instant_ngp.training import FieldTraining, TrainingOptions
 from methods.kernels import availability, multiplies_bf16
 from methods.kernels.composite import composite
 from methods.kernels.encode import HashGrid, encode
-from methods.kernels.march import Occupancy, longest_ray, march
+from methods.kernels.march import longest_ray, march
+from methods.kernels.types import Occupancy
 from methods.kilonerf.field import KiloField
 from methods.kilonerf.method import KiloNerf
 from methods.kilonerf.training import KiloLessons

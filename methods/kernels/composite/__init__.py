@@ -6,14 +6,11 @@ values = sum w_i f_i,  depth_sum = sum w_i t_i,  alpha = sum w_i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
-import torch
 from torch import Tensor
-from torch.nn import functional
 
 from bench.types import check_shape
 from methods.kernels.dispatch import implementation
+from methods.kernels.types import Intervals, Pixels
 
 STOP = 1e-4
 """Transmittance at which a ray ends: what lies behind changes a pixel by less than this."""
@@ -23,102 +20,6 @@ def check_stop(stop: float) -> None:
     """Raise ValueError unless 0 <= `stop` < 1; from 1 on, rays would end before they begin."""
     if not 0 <= stop < 1:
         raise ValueError(f"stop: expected a transmittance of 0 or more and less than 1, got {stop}")
-
-
-@dataclass(frozen=True)
-class Extent:
-    """Sample counts of some rays, known to the host.
-
-    Attributes:
-        total: samples of all rays together.
-        longest: samples of the ray that has the most.
-    """
-
-    total: int
-    longest: int
-
-    @classmethod
-    def of_each(cls, counts: Tensor) -> list[Extent]:
-        """The extent of each group of rays with `counts` [G, R] samples. Waits for a GPU, once."""
-        return [cls(*size) for size in cls.figures(counts).tolist()]
-
-    @staticmethod
-    def figures(counts: Tensor) -> Tensor:
-        """`total` and `longest` of each group of `counts` [G, R], on the same device: [G, 2]."""
-        counts = functional.pad(counts, (0, 1))  # for a group without rays
-        return torch.stack((counts.sum(dim=1), counts.amax(dim=1)), dim=1)
-
-
-@dataclass(frozen=True)
-class Intervals:
-    """The positions of samples on R rays, ray by ray, front to back.
-
-    Attributes:
-        t: [S] position along the ray (z-depth for rays of `bench.cameras.cast`).
-        delta: [S] length of the interval a sample represents, scene units.
-        offsets: [R + 1] int64, ray r owns samples offsets[r] to offsets[r + 1].
-        longest: samples of the ray that has the most, or more than that; None: unknown, it follows
-            from `offsets`.
-    """
-
-    t: Tensor
-    delta: Tensor
-    offsets: Tensor
-    longest: int | None = field(default=None, kw_only=True)
-
-    def first_of_each(
-        self, counts: Tensor, extent: Extent | None = None
-    ) -> tuple[Tensor, Tensor, int]:
-        """Indices of the first `counts` [R] samples of each ray, and their `offsets` and `longest`.
-
-        `extent` is that of `counts`; if None, the host waits for a GPU.
-        """
-        if extent is None:
-            (extent,) = Extent.of_each(counts[None])
-        offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
-        shift = (self.offsets - offsets)[:-1].repeat_interleave(counts, output_size=extent.total)
-        return torch.arange(extent.total, device=shift.device) + shift, offsets, extent.longest
-
-
-@dataclass(frozen=True)
-class Pixels:
-    """Composited rays: `values` [R, K], `depth_sum` [R] (sum w t, not divided), `alpha` [R]."""
-
-    values: Tensor
-    depth_sum: Tensor
-    alpha: Tensor
-
-    @classmethod
-    def blank(cls, rays: int, channels: int, device: torch.device | str = "cpu") -> Pixels:
-        """Rays before any sample is composited: all zeros."""
-        return cls(
-            torch.zeros(rays, channels, device=device),
-            torch.zeros(rays, device=device),
-            torch.zeros(rays, device=device),
-        )
-
-    def take(self, index: Tensor | slice) -> Pixels:
-        """The rays at `index`."""
-        if isinstance(index, slice):
-            return Pixels(*(x[index] for x in self._columns))
-        return Pixels(*(x.index_select(0, index) for x in self._columns))
-
-    def put(self, index: Tensor | slice, pixels: Pixels) -> None:
-        """Replace, in place, the rays at `index`."""
-        for column, new in zip(self._columns, pixels._columns, strict=True):
-            if isinstance(index, slice):
-                column[index] = new
-            else:  # a row at a time; `x[index]` goes number by number
-                column.index_copy_(0, index, new)
-
-    @property
-    def _columns(self) -> tuple[Tensor, Tensor, Tensor]:
-        return self.values, self.depth_sum, self.alpha
-
-    def over(self, background: Tensor) -> Pixels:
-        """Composite the rays onto a `background` [K] or [R, K], whose weight is 1 - alpha."""
-        shine = (1 - self.alpha)[:, None] * background
-        return Pixels(self.values + shine, self.depth_sum, self.alpha)
 
 
 def composite(
@@ -137,7 +38,7 @@ def composite(
     Args:
         sigma: [S] density, not negative.
         values: [S, K] colour or features.
-        intervals: positions of the samples, for example `march.Samples`.
+        intervals: positions of the samples, for example `Samples`.
         stop: samples behind a transmittance of at most `stop` have no weight; 0 uses all.
         carry: pixels of the samples in front of these, as a constant without gradient.
     """

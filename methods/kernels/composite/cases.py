@@ -12,8 +12,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from bench.case import DTYPES, U32, Agreement, Case, Property, largest_error, on_backends
-from methods.kernels.composite import Intervals, Pixels, composite, visible, weights
+from methods.kernels.composite import composite, visible, weights
 from methods.kernels.dispatch import served
+from methods.kernels.types import Intervals, Pixels
 
 INF = math.inf
 

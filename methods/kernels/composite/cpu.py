@@ -13,8 +13,8 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from methods.kernels.composite import Intervals, Pixels
 from methods.kernels.cpu import f32
+from methods.kernels.types import Intervals, Pixels
 
 CHUNK = 64  # rays
 f64 = np.float64

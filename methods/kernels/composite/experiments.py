@@ -20,8 +20,9 @@ from torch import Tensor
 
 from bench.accuracy import Experiment, Trial
 from bench.types import Rays
-from methods.kernels.composite import Intervals, composite
-from methods.kernels.march import Occupancy, march
+from methods.kernels.composite import composite
+from methods.kernels.march import march
+from methods.kernels.types import Intervals, Occupancy
 
 Quantity = Literal["alpha", "depth_sum"]
 

@@ -11,8 +11,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from methods.kernels.composite import Intervals, Pixels
 from methods.kernels.gpu import check_types, launch, opacity
+from methods.kernels.types import Intervals, Pixels
 
 BLOCK = 64  # samples
 OPAQUE = tl.constexpr(128.0)

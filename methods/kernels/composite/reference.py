@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from methods.kernels.composite import Intervals, Pixels
+from methods.kernels.types import Intervals, Pixels
 
 
 def composite(

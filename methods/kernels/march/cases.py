@@ -15,7 +15,8 @@ from torch.nn.functional import normalize
 from bench.case import DTYPES, U32, Agreement, Case, Property
 from bench.types import Rays
 from methods.kernels.dispatch import served
-from methods.kernels.march import MAX_SAMPLES, Occupancy, march
+from methods.kernels.march import MAX_SAMPLES, march
+from methods.kernels.types import Occupancy
 
 STEP = math.sqrt(3) / MAX_SAMPLES
 LONG = 4 * STEP  # for agreement: Triton's interpreter takes milliseconds per step

@@ -15,9 +15,9 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from methods.kernels.composite import Extent
 from methods.kernels.cpu import f32, i32, slope, u64
-from methods.kernels.march import Occupancy, Samples, Segments, longest_ray
+from methods.kernels.march import Segments, longest_ray
+from methods.kernels.types import Extent, Occupancy, Samples
 
 CHUNK = 128
 """Rays that are marched together; their numbers stay in the first-level cache."""

@@ -12,18 +12,11 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from methods.kernels.composite import Extent
 from methods.kernels.dispatch import interpreted
 from methods.kernels.gpu import check_types, launch, vector
-from methods.kernels.march import (
-    BRICK,
-    PARALLEL,
-    Occupancy,
-    Samples,
-    Segments,
-    longest_ray,
-)
+from methods.kernels.march import PARALLEL, Segments, longest_ray
 from methods.kernels.march.reference import clip
+from methods.kernels.types import BRICK, Extent, Occupancy, Samples
 
 BLOCK = 128 if interpreted() else 32
 """Rays per program: one warp, which waits for its longest ray. The interpreter takes as long for

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench.types import Rays
-from methods.kernels.composite import Extent
-from methods.kernels.march import PARALLEL, Occupancy, Samples, Segments, longest_ray
+from methods.kernels.march import PARALLEL, Segments, longest_ray
+from methods.kernels.types import Extent, Occupancy, Samples
 
 BLOCK = 1 << 12
 """Rays that are tested at a time: [BLOCK, 1024, 3] positions are 50 MB."""

@@ -16,9 +16,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench.types import Rays, check_shape
-from methods.kernels.composite import STOP, Intervals, Pixels, check_stop
+from methods.kernels.composite import STOP, check_stop
 from methods.kernels.dispatch import implementation
 from methods.kernels.spherical import SIZES
+from methods.kernels.types import Intervals, Pixels
 
 BRICK = 8
 """Cells along the side of a brick."""

@@ -17,9 +17,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from bench.types import Rays
-from methods.kernels.composite import Pixels
 from methods.kernels.cpu import f32, i32, prefetch, prefetch_row, sigmoid, slope
 from methods.kernels.spherical import spherical_harmonics
+from methods.kernels.types import Pixels
 from methods.kernels.voxel_shading.cpu import weighted_sum
 from methods.kernels.voxel_walk import Crossings, Light, Voxels
 

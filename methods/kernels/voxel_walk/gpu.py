@@ -16,10 +16,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from bench.types import Rays
-from methods.kernels.composite import Extent, Pixels
 from methods.kernels.dispatch import interpreted
 from methods.kernels.gpu import check_types, launch, opacity, vector
 from methods.kernels.spherical import CHANNELS, spherical_harmonics
+from methods.kernels.types import Extent, Pixels
 from methods.kernels.voxel_walk import Crossings, Light, Voxels
 from methods.kernels.voxel_walk.reference import clip, length, slopes
 

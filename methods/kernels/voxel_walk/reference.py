@@ -10,9 +10,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from bench.types import Rays
-from methods.kernels.composite import Pixels, composite, visible, weights
+from methods.kernels.composite import composite, visible, weights
 from methods.kernels.march import PARALLEL
 from methods.kernels.spherical import shade
+from methods.kernels.types import Pixels
 from methods.kernels.voxel_walk import BRICK, Crossings, Light, Voxels
 
 BLOCK = 1 << 11

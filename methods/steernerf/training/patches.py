@@ -14,7 +14,7 @@ from torch.nn import functional
 from bench.cameras import cast, pixel_grid
 from bench.compositing import composite
 from bench.types import Camera, Rays
-from methods.kernels.composite import Pixels
+from methods.kernels.types import Pixels
 from methods.rendering.batch import first_pass, second_pass
 from methods.rendering.compaction import indices_where
 from methods.rendering.frame import FeatureFrame, sees_matter

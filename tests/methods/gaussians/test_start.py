@@ -11,7 +11,7 @@ import torch
 
 from bench.types import Rays, Scene
 from methods.gaussians import start
-from methods.kernels.composite import Pixels
+from methods.kernels.types import Pixels
 
 
 def test_points_come_from_all_pictures_alike(

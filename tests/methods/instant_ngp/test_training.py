@@ -23,7 +23,7 @@ from methods.instant_ngp.training import (
     PixelTraining,
     TrainingOptions,
 )
-from methods.kernels.composite import Pixels
+from methods.kernels.types import Pixels
 from methods.training import checkpoint, loop
 from tests.methods.trainings import GRID, QUICK, TEACHER, killed
 

@@ -8,8 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from methods.kernels.composite import Intervals, Pixels, visible, weights
 from methods.kernels.composite import composite as composite_samples
+from methods.kernels.composite import visible, weights
+from methods.kernels.types import Intervals, Pixels
 
 BACKENDS = ["reference", "cpu"]
 

@@ -25,10 +25,11 @@ from methods.gaussians.kernels.projection import Ellipses, project_gaussians
 from methods.gaussians.kernels.ssim import ssim
 from methods.kernels import availability, corner_gather
 from methods.kernels.adam import AdamState, hash_adam_, sparse_adam_
-from methods.kernels.composite import Intervals, composite, visible, weights
+from methods.kernels.composite import composite, visible, weights
 from methods.kernels.encode import HashGrid, SampleGradients, encode
 from methods.kernels.encode.reference import corners
-from methods.kernels.march import Occupancy, extents, march
+from methods.kernels.march import extents, march
+from methods.kernels.types import Intervals, Occupancy
 from methods.kernels.voxel_shading import shade_voxels
 from methods.kernels.voxel_walk import Voxels, walk
 from methods.kilonerf.kernels.grouped_mlp import grouped_linear

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from bench.types import Rays
-from methods.kernels.march import Occupancy, extents, march
+from methods.kernels.march import extents, march
+from methods.kernels.types import Occupancy
 
 STEP = math.sqrt(3) / 1024
 BACKENDS = ["reference", "cpu"]

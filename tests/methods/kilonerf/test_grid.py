@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy
 from methods.kilonerf.field import KiloField
 from methods.kilonerf.grid import Pieces, place_networks
 

@@ -15,7 +15,7 @@ from torch.nn import functional
 from bench.types import Log, NullProbe, Scene
 from methods.instant_ngp.stage1 import train_field
 from methods.kernels.encode import encode
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy
 from methods.nsvf.field import NsvfField
 from methods.nsvf.method import Nsvf
 from methods.rendering.occupancy import STEP

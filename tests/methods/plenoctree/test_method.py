@@ -12,7 +12,7 @@ import torch
 from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene, SteerbenchError
 from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
-from methods.kernels.composite import Pixels
+from methods.kernels.types import Pixels
 from methods.plenoctree.method import PlenOctree, opaque_at_end
 from methods.plenoctree.octree import Octree
 from methods.plenoctree.start import Extraction, extract, fibonacci_sphere

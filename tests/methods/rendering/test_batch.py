@@ -12,7 +12,8 @@ from bench.cameras import cast
 from bench.types import Rays
 from methods.instant_ngp.field import HashField
 from methods.kernels.composite import composite
-from methods.kernels.march import Occupancy, march
+from methods.kernels.march import march
+from methods.kernels.types import Occupancy
 from methods.rendering.batch import KEPT_THIN, first_pass, render_batch, second_pass
 from methods.rendering.march import March
 from methods.rendering.occupancy import STEP

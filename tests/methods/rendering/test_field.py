@@ -10,7 +10,7 @@ import torch
 from bench.cameras import cast
 from bench.types import NullProbe
 from methods.instant_ngp.field import HashField
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy
 from methods.rendering.batch import render_batch
 from methods.rendering.field import BATCH_QUANTUM, Field, pad, query
 from methods.rendering.march import March

@@ -10,7 +10,8 @@ import torch
 from bench.cameras import cast
 from bench.types import EMPTY_ALPHA, NullProbe
 from methods.instant_ngp.field import HashField
-from methods.kernels.march import Occupancy, march
+from methods.kernels.march import march
+from methods.kernels.types import Occupancy
 from methods.rendering.frame import everywhere, rays_at_matter, render_frame
 from methods.rendering.march import March
 from methods.rendering.occupancy import STEP

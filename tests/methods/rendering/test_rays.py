@@ -10,7 +10,8 @@ import torch
 from bench.cameras import cast, place_camera
 from bench.types import NullProbe
 from methods.instant_ngp.field import HashField
-from methods.kernels.march import Occupancy, march
+from methods.kernels.march import march
+from methods.kernels.types import Occupancy
 from methods.rendering import rays as rendering
 from methods.rendering.batch import render_batch
 from methods.rendering.march import FAINT, March

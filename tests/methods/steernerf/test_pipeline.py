@@ -12,7 +12,7 @@ import torch
 from bench.cameras import cast, project
 from bench.probes import StageClock
 from bench.types import Camera, NullProbe
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy
 from methods.rendering.frame import everywhere, render_frame
 from methods.rendering.march import March
 from methods.rendering.occupancy import STEP

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from bench.types import Camera
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy
 from methods.rendering.field import ROUND_SAMPLES
 from methods.rendering.frame import FeatureFrame, everywhere, render_frame
 from methods.rendering.march import March

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from methods.kernels.march import Occupancy
+from methods.kernels.types import Occupancy
 from methods.students.voxels import OFFSETS, corners_of, occupied_voxels
 
 

@@ -14,9 +14,10 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from bench.types import Rays, check_shape
-from methods.kernels.composite import Pixels, check_stop
+from methods.kernels.composite import check_stop
 from methods.kernels.corner_gather import CORNERS
 from methods.kernels.dispatch import implementation
+from methods.kernels.types import Pixels
 from methods.kernels.voxel_walk import Voxels
 
 

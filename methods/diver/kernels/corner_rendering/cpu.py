@@ -18,9 +18,9 @@ from torch.nn import functional
 
 from bench.types import Rays
 from methods.diver.kernels.corner_rendering import Corners, Layers
-from methods.kernels.composite import Pixels
 from methods.kernels.corner_gather.cpu import blended, eight_of, local_coordinate, mean_weights
 from methods.kernels.cpu import LANES, ROWS, f32, multiply, prefetch, sigmoid
+from methods.kernels.types import Pixels
 from methods.kernels.voxel_walk import Voxels
 from methods.kernels.voxel_walk.cpu import walk_ray
 

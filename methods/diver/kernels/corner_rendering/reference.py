@@ -10,8 +10,9 @@ from torch.nn.functional import linear
 
 from bench.types import Rays
 from methods.diver.kernels.corner_rendering import Corners, Layers
-from methods.kernels.composite import Intervals, Pixels, composite, visible, weights
+from methods.kernels.composite import composite, visible, weights
 from methods.kernels.corner_gather import gather, integral_along
+from methods.kernels.types import Intervals, Pixels
 from methods.kernels.voxel_walk import Voxels, walk
 
 CHUNK_RAYS = 1 << 15

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from bench.types import check_shape
 from methods.gaussians.kernels.projection import Ellipses
-from methods.kernels.composite import STOP, Pixels
+from methods.kernels.composite import STOP
 from methods.kernels.dispatch import implementation
+from methods.kernels.types import Pixels
 
 LARGEST_ALPHA = 0.99
 

@@ -13,8 +13,9 @@ from bench.cameras import pixel_grid
 from bench.case import DTYPES, U32, Agreement, Case, Property, on_backends
 from methods.gaussians.kernels.blending import LARGEST_ALPHA, blend
 from methods.gaussians.kernels.projection import LEAST_ALPHA, Ellipses
-from methods.kernels.composite import STOP, Pixels
+from methods.kernels.composite import STOP
 from methods.kernels.dispatch import served
+from methods.kernels.types import Pixels
 
 CLEAR = 1e-4
 """Minimum relative distance of every opacity, at every pixel, from a threshold of a comparison."""

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from methods.gaussians.kernels.blending import LARGEST_ALPHA
 from methods.gaussians.kernels.projection import LEAST_ALPHA, Ellipses
-from methods.kernels.composite import Pixels
 from methods.kernels.cpu import f32, i32
+from methods.kernels.types import Pixels
 
 TILE = 16  # pixels, along both axes
 PIXELS = TILE * TILE

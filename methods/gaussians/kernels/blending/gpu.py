@@ -21,9 +21,9 @@ from torch import Tensor
 from methods.gaussians.kernels.projection import Ellipses
 from methods.kernels import gaussian_blending as interface
 from methods.kernels import gaussian_projection
-from methods.kernels.composite import Pixels
 from methods.kernels.dispatch import interpreted
 from methods.kernels.gpu import check_types, launch, vector
+from methods.kernels.types import Pixels
 
 TILE = 16  # pixels, along both axes
 BLOCK = 128  # Gaussians or entries per program that makes the lists

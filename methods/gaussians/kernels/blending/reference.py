@@ -8,7 +8,7 @@ from torch import Tensor
 from bench.cameras import pixel_grid
 from methods.gaussians.kernels.blending import LARGEST_ALPHA
 from methods.gaussians.kernels.projection import LEAST_ALPHA, Ellipses
-from methods.kernels.composite import Pixels
+from methods.kernels.types import Pixels
 
 BAND = 16
 """Rows that are blended together, which bounds the memory."""
