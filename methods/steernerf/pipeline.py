@@ -83,7 +83,7 @@ class Pipeline:
 
     @torch.no_grad()
     def remember(self, camera: Camera, buffer: Buffer, rendering: Any) -> None:
-        """Update `buffer` as `render` does; no later frame reads the picture, so it is not drawn."""
+        """Update `buffer` as `render` does, without drawing the picture: no later frame reads it."""
         view, probe = self.view(camera), NullProbe()
         preceding = self.select(buffer, view, rendering, probe)
         frame = self.features(view, preceding, rendering, probe)

@@ -52,18 +52,24 @@ from methods.steernerf.kernels.splat import splat
 from methods.steernerf.method import SteerNerf
 from methods.steernerf.options import RangeReduction, Reprojection
 from methods.steernerf.pipeline import Pipeline
-from methods.steernerf.training import joint as stage2
 from methods.steernerf.training.joint import JointTraining
-from methods.steernerf.training.options import JointOptions
-from methods.steernerf.training.sequences import MotionOptions
 from methods.steernerf.unet import UNet
+from methods.steernerf_lean import training as lean_training
 from methods.steernerf_lean.lean_renderer import LeanRenderer
 from methods.steernerf_lean.method import SteerNerfLean
 from methods.students.fields import StudentField
 from methods.students.networks import NetworkLessons
 from methods.training import loop
 from tests.methods.conftest import Work, look_at_the_middle
-from tests.methods.models import small_model, small_rendering
+from tests.methods.models import (
+    lean_joint,
+    lean_model,
+    lean_rendering,
+    small_joint,
+    small_model,
+    small_motion,
+    small_rendering,
+)
 from tests.methods.trainings import killed
 from tests.pretended_gpu import PretendedGpu, pretended_gpu
 
@@ -72,12 +78,11 @@ pytestmark = pytest.mark.skipif(torch.cuda.is_available(), reason="this machine 
 BUDGET = Budget("test", steps=4, samples=512, renderer_steps=2)
 GRID = HashGrid(levels=4, log2_table=10, n_min=4, n_max=32)
 STAGE1 = TrainingOptions(march_step=8.0, grid_samples=4096, max_rays=64)
-MOTION = MotionOptions(pool=1, length=2, least=2, uses=3, longer=0.0)
+MOTION = small_motion(pool=1, length=2, least=2, uses=3, longer=0.0)
+FEW: dict[str, Any] = {"batch": 1, "patch": 4, "distilled_views": 1, "motion": MOTION}
 
 
-def joint(**others: Any) -> JointOptions:
-    few = {"batch": 1, "patch": 4, "distilled_views": 1, "grid_samples": 512, "refined_rays": 64}
-    return JointOptions(**{"motion": MOTION, "refined": 0.0} | few | others)
+EXPECTED = RangeReduction("paper", 0.03, "expected")
 
 
 def steernerf(field: str, **where: Any) -> Method:
@@ -86,10 +91,10 @@ def steernerf(field: str, **where: Any) -> Method:
     return SteerNerf(
         grid=GRID,
         training=STAGE1,
-        model=small_model(reprojection=release, history=False, surface=False),
-        rendering=small_rendering(range=RangeReduction("paper")),
-        renderer=partial(UNet, width=4),
-        joint=joint(field=field, through="all", jitter=True),
+        model=small_model(reprojection=release),
+        rendering=small_rendering(range=RangeReduction("paper", 0.03, "sum")),
+        renderer=partial(UNet, width=4, aligned=False),
+        joint=small_joint(field=field, jitter=True, grid_samples=512, **FEW),
         engine=TorchEngine(),
         **where,
     )
@@ -99,10 +104,10 @@ def steernerf_lean(**where: Any) -> Method:
     return SteerNerfLean(
         grid=GRID,
         training=STAGE1,
-        model=small_model(),
-        rendering=small_rendering(range=RangeReduction("window"), refined=0.1, overlap=0.1),
+        model=lean_model(),
+        rendering=lean_rendering(range=EXPECTED, refined=0.1, overlap=0.1),
         renderer=partial(LeanRenderer, width=8, blocks=1, init="scratch"),
-        joint=joint(refined=0.1, grid_samples=0),
+        joint=lean_joint(refined=0.1, refined_rays=64, **FEW),
         engine=TorchEngine(),
         **where,
     )
@@ -182,7 +187,7 @@ def scene(ball_scene: Scene) -> Scene:
 def one_round(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of whole rays, as on a GPU, also where they are hidden in training, so that the sums have the
     same groups; and as few runs of a network before it is recorded."""
-    monkeypatch.setattr(stage2, "compacts", lambda device: False)
+    monkeypatch.setattr(lean_training, "compacts", lambda device: False)
     for kind in (HashField, StudentField, KiloField, NerfField, NsvfField):
         monkeypatch.setattr(kind, "round_samples", longest_ray(STEP))
     monkeypatch.setattr(cuda_graphs, "WARM_UP", 1)
@@ -361,16 +366,14 @@ def test_a_step_of_stage_2_waits_at_most_three_times(
 def smallest(**where: Any) -> Method:
     """The lean one, as small as it gets: an interpreter takes long for a step of a ray."""
     long = {"step": 64.0, "refined_step": 64.0, "refined": 0.1}
-    motion = MotionOptions(pool=1, length=1, least=1, uses=3, longer=0.0)
+    few = FEW | {"distilled_views": 0, "motion": replace(MOTION, length=1, least=1)}
     return SteerNerfLean(
         grid=replace(GRID, levels=2),
         training=TrainingOptions(march_step=64.0, grid_samples=16, max_rays=64),
-        model=small_model(step=64.0, frames=1),
-        rendering=small_rendering(range=RangeReduction("window"), overlap=0.1, **long),
+        model=lean_model(step=64.0),
+        rendering=lean_rendering(range=EXPECTED, overlap=0.1, **long),
         renderer=partial(LeanRenderer, width=8, blocks=1, init="scratch"),
-        joint=joint(
-            refined=0.1, refined_step=64.0, grid_samples=0, distilled_views=0, motion=motion
-        ),
+        joint=lean_joint(refined=0.1, refined_step=64.0, refined_rays=64, **few),
         engine=TorchEngine(),
         **where,
     )

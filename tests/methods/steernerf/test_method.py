@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from methods.steernerf.training.sequences import MotionOptions
 
 from bench.console import ConsoleLog
 from bench.errors import Unavailable
@@ -21,7 +22,6 @@ from methods.kernels.encode import HashGrid
 from methods.steernerf.method import SteerNerf
 from methods.steernerf.options import Model, RangeReduction, Rendering, Reprojection, Skips
 from methods.steernerf.training.options import JointOptions
-from methods.steernerf.training.sequences import MotionOptions
 from methods.steernerf.unet import UNet
 from methods.steernerf_lean.lean_renderer import LeanRenderer
 from tests.methods.models import small_model, small_rendering

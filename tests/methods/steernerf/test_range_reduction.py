@@ -8,6 +8,8 @@ from dataclasses import replace
 
 import pytest
 import torch
+from methods.steernerf.range_reduction import depth_interval
+from methods.steernerf_lean.window import EDGE, KEPT_ALPHA, DepthPrior, depth_prior, within
 from torch import Tensor
 
 from bench.types import Camera
@@ -18,8 +20,6 @@ from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
 from methods.steernerf.buffer import Cloud
 from methods.steernerf.options import RangeReduction, Reprojection
-from methods.steernerf.range_reduction import depth_interval
-from methods.steernerf_lean.window import EDGE, KEPT_ALPHA, DepthPrior, depth_prior, within
 from tests.methods.conftest import Work, look_at_the_middle
 from tests.methods.solids import Solid, ball, slab, wall
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from methods.steernerf.training.sequences import MotionOptions
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -15,7 +16,6 @@ from bench.console import ConsoleLog
 from bench.types import Budget, Log, Scene, SteerbenchError
 from methods.steernerf.training.joint import JointOptions, RendererTraining
 from methods.steernerf.training.patches import Batch
-from methods.steernerf.training.sequences import MotionOptions
 from methods.steernerf.training.stage2 import Stage2
 from methods.steernerf_lean import lean_renderer
 from methods.steernerf_lean.lean_renderer import LeanRenderer

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from methods.steernerf.training.sequences import TrueView
 
 from bench.cameras import pack_camera
 from bench.console import ConsoleLog
@@ -14,7 +15,6 @@ from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.rendering.frame import everywhere, render_frame
 from methods.steernerf.training import distillation
 from methods.steernerf.training.distillation import distilled_views
-from methods.steernerf.training.sequences import TrueView
 from tests.methods.conftest import SIZE
 from tests.methods.models import SMALL_GRID, misty_field, trained_field
 from tests.methods.trainings import QUICK

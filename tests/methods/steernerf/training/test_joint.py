@@ -9,6 +9,7 @@ from typing import Literal
 
 import pytest
 import torch
+from methods.steernerf.training.sequences import MotionOptions, SequencePool, TrainingViews
 from torch import Tensor
 
 from bench.types import Camera, Log, NullProbe, Scene, SteerbenchError
@@ -19,7 +20,6 @@ from methods.steernerf.renderer import Points, Renderer2d
 from methods.steernerf.training.joint import LEAST_ERROR, JointTraining, RendererTraining
 from methods.steernerf.training.options import JointOptions
 from methods.steernerf.training.patches import Batch, PatchSource, Through
-from methods.steernerf.training.sequences import MotionOptions, SequencePool, TrainingViews
 from methods.steernerf.unet import UNet
 from methods.steernerf.view import View
 from methods.steernerf_lean.cells import pixels_of

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 import torch
+from methods.steernerf.training.sequences import MotionOptions, SequencePool, TrainingViews
 
 from bench.types import Camera, Frame, NullProbe, Scene
 from methods.steernerf.buffer import RenderingBuffer
 from methods.steernerf.options import Rendering
-from methods.steernerf.training.sequences import MotionOptions, SequencePool, TrainingViews
 from methods.training import checkpoint
 from tests.methods.models import new_pipeline, small_model
 
