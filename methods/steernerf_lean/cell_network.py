@@ -7,8 +7,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from methods.engines.network import Network
+from methods.steernerf_lean.cell_inputs import Layout
 from methods.steernerf_lean.kernels.depthwise import TAPS, depthwise
-from methods.steernerf_lean.kernels.space_to_depth import Layout
 
 LEAK = 0.1
 """Slope of the activations below 0. With plain ReLU, units die on the sparse inputs and never
@@ -29,10 +29,9 @@ class CellNetwork(Network):
 
     def __init__(self, layout: Layout, width: int, blocks: int) -> None:
         super().__init__()
-        cell = layout.scale**2
         self.enter = _Linear(layout.width, width)
         self.trunk = nn.ModuleList(_Block(width) for _ in range(blocks))
-        self.leave = _Linear(width, cell * (3 + layout.history))
+        self.leave = _Linear(width, layout.pixels * (3 + layout.history))
         self.read = _Linear(width, 3 * (layout.channels + 1)) if layout.surface else None
         self.error = _Linear(width, 1)
         for layer in filter(None, (self.leave, self.read, self.error)):
@@ -40,13 +39,12 @@ class CellNetwork(Network):
             nn.init.zeros_(layer.bias)
 
     def forward(self, rows: Tensor, neighbours: Tensor) -> tuple[Tensor, ...]:
-        """Compute what `depth_to_space` needs from the `rows` [R, layout.width] of cells with
-        `neighbours` [R, 9].
+        """Compute what `CellInputs.drawn` needs from the `rows` [N, layout.width] of cells with
+        `neighbours` [N, 9].
 
         Returns:
-            correction and blending share of each pixel [R, s^2 (3 + layout.history)]; estimated
-            error [R, 1], the log of the mean squared error; with `layout.surface`, matrix
-            [R, 3 (K + 1)].
+            corrections and logits of the shares [N, (3 + layout.history) s^2]; estimated error
+            [N, 1], the log of the mean squared error; with `layout.surface`, matrix [N, 3 (K + 1)].
         """
         hidden = self.enter(rows).to(rows)
         for block in self.trunk:
@@ -56,7 +54,7 @@ class CellNetwork(Network):
         return tuple(head(hidden) for head in heads if head is not None)
 
     def products(self, *inputs: Tensor) -> int:
-        """See `Network`: every matrix, and the taps of every channel, count once per cell."""
+        """Every matrix, and the taps of every channel, count once per cell."""
         return len(inputs[0]) * sum(x.numel() for x in self.parameters() if x.dim() > 1)
 
 

@@ -18,10 +18,9 @@ from methods.kernels import availability, dispatch
 CASES = found("cases")
 QUICK = [case for case in CASES if case.quick]
 DEAR = (
-    *("march", "voxel_walk", "render_voxels", "warp"),
+    *("march", "voxel_walk", "render_voxels"),
     *("composite backward", "encode backward", "gaussian blending backward"),
     *("grouped linear", "grouped linear backward", "ssim", "ssim backward"),
-    *("space_to_depth", "space_to_depth backward"),
 )
 """Subjects whose kernels of the GPU have loops or many operations: interpreted, they take long."""
 

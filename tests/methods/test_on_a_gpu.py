@@ -434,8 +434,6 @@ GO_ON = [
     ("adam", "30% of 70, 3 features"),
     ("colours of networks", "fewer samples than go together"),
     ("densities of networks", "fewer samples than go together"),
-    ("depth_to_space backward", "scale 3"),
-    ("depthwise backward", "scattered"),
     ("gaussian projection backward", "1 Gaussians"),
     ("integral", "257 segments"),
     ("locate", "1 positions"),
@@ -444,7 +442,6 @@ GO_ON = [
     ("shade_voxels backward", "300 of 4 harmonics"),
     ("spherical", "131 directions"),
     ("ssim backward", "noise, 20 x 3"),
-    ("warp", "holes"),
 ]
 """Cases of kernels for which the host does not wait."""
 
@@ -452,7 +449,6 @@ WAIT = [
     ("corner_gather backward", "257 samples of 27, no buffer"),
     ("gaussian blending backward", "one pixel"),
     ("grouped linear backward", "fewer samples than go together, 63 to 32"),
-    ("space_to_depth backward", "scale 3"),
     ("voxel_walk", "limit 1"),
 ]
 

@@ -34,8 +34,6 @@ from methods.kernels.voxel_shading import shade_voxels
 from methods.kernels.voxel_walk import Voxels, walk
 from methods.kilonerf.kernels.grouped_mlp import grouped_linear
 from methods.steernerf.kernels.splat import gather, splat
-from methods.steernerf_lean.kernels.space_to_depth import CellInputs, Layout, space_to_depth
-from methods.steernerf_lean.kernels.space_to_depth.cases import cases
 
 pytestmark = pytest.mark.skipif(
     bool(availability()["gpu"]), reason="Triton has no build for this platform"
@@ -118,20 +116,6 @@ def test_told_to_be_deterministic_it_adds_up_in_an_order_that_repeats() -> None:
     assert largest_error(first, second) == 0
     # At most 4,000 terms below 1: 2 n roundings of a sum of n, as independent errors.
     assert 0 < largest_error(first, free) <= 6 * 4000**0.5 * 4000 * U32
-
-
-def test_told_to_be_deterministic_it_adds_up_what_cells_share_in_an_order_that_repeats() -> None:
-    """Numbers are short: that order and every other give the same sums."""
-    case = next(
-        case
-        for case in cases()
-        if case.subject == "space_to_depth backward" and case.name == "all cells"
-    )
-    torch.use_deterministic_algorithms(True)
-    try:
-        assert case.error("gpu", DEVICE, "fp32") == 0
-    finally:
-        torch.use_deterministic_algorithms(False)
 
 
 def test_what_is_not_a_number_shows_and_what_is_behind_it_does_not() -> None:
@@ -363,18 +347,3 @@ def test_a_table_that_cannot_be_changed_in_place_is_refused() -> None:
     table = torch.zeros(2, 5, device=DEVICE).T
     with pytest.raises(ValueError, match="expects table to be contiguous"):
         sparse_adam_(table, table, AdamState.like(table), 0.1, backend="gpu")
-
-
-@pytest.mark.parametrize("wrong", [-2, 5])
-@pytest.mark.parametrize("of", ["preceding", "surface"])
-def test_an_index_that_names_no_point_is_refused(of: str, wrong: int) -> None:
-    layout = Layout(channels=3, frames=1, scale=2, history=False, surface=True)
-    index = {"preceding": torch.zeros(4, 6), "surface": torch.zeros(6, 4)}
-    index[of][2, 3] = wrong
-    preceding, surface = (x.to(DEVICE, torch.int32) for x in index.values())
-    points = torch.zeros(5, 4, device=DEVICE)
-    frame = torch.zeros(2, 3, 3), torch.zeros(2, 3), torch.zeros(3), torch.arange(6)
-    pairs = [(points[:, :3], preceding)]
-    given = CellInputs(*(x.to(DEVICE) for x in frame), pairs, None, (points, surface))
-    with pytest.raises(ValueError, match="expected -1 or that of a point, got 1 that"):
-        space_to_depth(given, layout, backend="gpu")
