@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from methods.steernerf.renderer import Observation
+from methods.steernerf_lean.observation import LeanObservation
 
 
 @dataclass(frozen=True)
@@ -24,13 +24,11 @@ class Layout:
         channels: K.
         scale: s.
         history: whether it reads the preceding picture.
-        surface: whether it reads the features at the surface of each pixel.
     """
 
     channels: int
     scale: int
     history: bool
-    surface: bool
 
     @property
     def pixels(self) -> int:
@@ -41,16 +39,14 @@ class Layout:
     def columns(self) -> dict[str, int]:
         """The parts of a row, in this order, and their columns; see `CellInputs`."""
         rest, pixels = self.channels - 3, self.pixels
-        columns = {"colour": 3, "opacity": 1, "rest": rest}
-        if self.history:
-            columns |= {"history": 3 * pixels, "valid": pixels}
-        if self.surface:
-            columns |= {
-                "surface": 3 * pixels,
-                "surface opacity": pixels,
-                "surface rest": rest * pixels,
-            }
-        return columns
+        history = {"history": 3 * pixels, "valid": pixels} if self.history else {}
+        return {
+            **{"colour": 3, "opacity": 1, "rest": rest},
+            **history,
+            "surface": 3 * pixels,
+            "surface opacity": pixels,
+            "surface rest": rest * pixels,
+        }
 
     @property
     def width(self) -> int:
@@ -80,7 +76,7 @@ class CellInputs:
     parts: dict[str, Tensor]
 
     @classmethod
-    def of(cls, observations: Sequence[Observation], layout: Layout) -> CellInputs:
+    def of(cls, observations: Sequence[LeanObservation], layout: Layout) -> CellInputs:
         """The inputs of all cells, observation by observation.
 
         Differentiable in the features of frame and surface.
@@ -95,59 +91,48 @@ class CellInputs:
         """The input of the network, [N, layout.width]."""
         return torch.cat([part.flatten(1) for part in self.parts.values()], dim=1)
 
-    def drawn(self, output: Tensor, matrix: Tensor | None = None) -> Tensor:
+    def drawn(self, output: Tensor, matrix: Tensor) -> Tensor:
         """Pixels [N, s^2, 3] = base + correction + share * preceding colour + matrix [opacity *
         colour, opacity, rest of the surface].
 
         Args:
             output: [N, 3 s^2] corrections; with history followed by [N, s^2] logits of the shares.
-            matrix: [N, 3 (K + 1)], shared by the pixels of a cell; None without surface.
+            matrix: [N, 3 (K + 1)], shared by the pixels of a cell.
         """
         parts, pixels = self.parts, self.base.shape[1]
         drawn = self.base + output[:, : 3 * pixels].view_as(self.base)
         if "history" in parts:
             share = output[:, 3 * pixels :, None].sigmoid() * parts["valid"]
             drawn = drawn + share * parts["history"]
-        if matrix is not None:
-            opacity = parts["surface opacity"]
-            seen = torch.cat((opacity * parts["surface"], opacity, parts["surface rest"]), dim=-1)
-            with torch.autocast(drawn.device.type, enabled=False):
-                drawn = torch.baddbmm(drawn, seen, matrix.unflatten(1, (3, -1)).transpose(1, 2))
-        return drawn
+        opacity = parts["surface opacity"]
+        seen = torch.cat((opacity * parts["surface"], opacity, parts["surface rest"]), dim=-1)
+        with torch.autocast(drawn.device.type, enabled=False):
+            return torch.baddbmm(drawn, seen, matrix.unflatten(1, (3, -1)).transpose(1, 2))
 
 
-def _inputs(observation: Observation, layout: Layout) -> CellInputs:
-    o, cells = observation, observation.cells
+def _inputs(o: LeanObservation, layout: Layout) -> CellInputs:
     less = o.frame.values - o.background
-    base = enlarged(less[..., :3], cells, layout.scale)
-    present = less.flatten(0, 1).index_select(0, cells)
-    opacity = o.frame.alpha.flatten().index_select(0, cells)
+    base = enlarged(less[..., :3], o.cells, layout.scale)
+    present = less.flatten(0, 1).index_select(0, o.cells)
+    opacity = o.frame.alpha.flatten().index_select(0, o.cells)
     parts = {"colour": present[:, :3], "opacity": opacity[:, None], "rest": present[:, 3:]}
     if layout.history:
         parts |= _history(o, base)
-    if layout.surface:
-        parts |= _surface(o, base)
-    return CellInputs(base, parts)
+    return CellInputs(base, {**parts, **_surface(o, base)})
 
 
-def _history(o: Observation, base: Tensor) -> dict[str, Tensor]:
+def _history(o: LeanObservation, base: Tensor) -> dict[str, Tensor]:
     if o.history is None:
         return {"history": torch.zeros_like(base), "valid": torch.zeros_like(base[..., :1])}
     valid = o.history.valid[..., None]
     return {"history": (o.history.values - o.background[:3] - base) * valid, "valid": valid}
 
 
-def _surface(o: Observation, base: Tensor) -> dict[str, Tensor]:
-    if o.surface is None:
-        seen = base.new_zeros(*base.shape[:2], len(o.background) + 1)
-        colour = seen[..., :3]
-    else:
-        less = o.surface.values - functional.pad(o.background, (0, 1))
-        rows = functional.pad(less, (0, 0, 1, 0))  # the index -1 shows a row of 0
-        seen = rows.index_select(0, o.surface.index.flatten() + 1).view(
-            *o.surface.index.shape, rows.shape[1]
-        )
-        colour = seen[..., :3] - base * (o.surface.index >= 0)[..., None]
+def _surface(o: LeanObservation, base: Tensor) -> dict[str, Tensor]:
+    less = o.surface.values - functional.pad(o.background, (0, 1))
+    rows, index = functional.pad(less, (0, 0, 1, 0)), o.surface.index  # -1 shows a row of 0
+    seen = rows.index_select(0, index.flatten() + 1).view(*index.shape, rows.shape[1])
+    colour = seen[..., :3] - base * (index >= 0)[..., None]
     return {"surface": colour, "surface opacity": seen[..., -1:], "surface rest": seen[..., 3:-1]}
 
 

@@ -32,9 +32,9 @@ class CellNetwork(Network):
         self.enter = _Linear(layout.width, width)
         self.trunk = nn.ModuleList(_Block(width) for _ in range(blocks))
         self.leave = _Linear(width, layout.pixels * (3 + layout.history))
-        self.read = _Linear(width, 3 * (layout.channels + 1)) if layout.surface else None
         self.error = _Linear(width, 1)
-        for layer in filter(None, (self.leave, self.read, self.error)):
+        self.read = _Linear(width, 3 * (layout.channels + 1))
+        for layer in (self.leave, self.error, self.read):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
 
@@ -44,14 +44,13 @@ class CellNetwork(Network):
 
         Returns:
             corrections and logits of the shares [N, (3 + layout.history) s^2]; estimated error
-            [N, 1], the log of the mean squared error; with `layout.surface`, matrix [N, 3 (K + 1)].
+            [N, 1], the log of the mean squared error; matrices [N, 3 (K + 1)].
         """
         hidden = self.enter(rows).to(rows)
         for block in self.trunk:
             hidden = block(hidden, neighbours, self.backend)
         hidden = functional.leaky_relu(hidden, LEAK)
-        heads = (self.leave, self.error, self.read)
-        return tuple(head(hidden) for head in heads if head is not None)
+        return self.leave(hidden), self.error(hidden), self.read(hidden)
 
     def products(self, *inputs: Tensor) -> int:
         """Every matrix, and the taps of every channel, count once per cell."""

@@ -13,16 +13,17 @@ from torch.nn import functional
 
 from bench.types import Probe
 from methods.steernerf.options import check_size
-from methods.steernerf.renderer import UNWATCHED, Drawing, Observation, Renderer2d
-from methods.steernerf_lean.cell_inputs import CellInputs, Layout, enlarged
+from methods.steernerf.renderer import UNWATCHED, Renderer2d
+from methods.steernerf_lean.cell_inputs import CellInputs, Layout
 from methods.steernerf_lean.cell_network import CellNetwork
 from methods.steernerf_lean.cells import number, paint
 from methods.steernerf_lean.kernels.depthwise import neighbours_of
+from methods.steernerf_lean.observation import Drawing, LeanObservation
 
 PRETRAINED = Path(__file__).parent / "weights" / "lean.safetensors"
 """Weights trained on other scenes, by `steerbench pretrain`."""
 
-PRETRAINED_LAYOUT = Layout(channels=3, scale=4, history=True, surface=True)
+PRETRAINED_LAYOUT = Layout(channels=3, scale=4, history=True)
 """The inputs that those weights expect."""
 
 
@@ -42,43 +43,35 @@ class LeanRenderer(Renderer2d):
 
     Args:
         channels: K.
-        frames: L; without preceding frames there is no preceding picture.
         scale: s.
+        history: whether to use the preceding picture.
         width: channels of the trunk.
         blocks: residual blocks of the trunk.
         init: "pretrained": start from the weights that come with the package, trained on other
             scenes; "scratch": from random ones.
-        history: whether to use the preceding picture.
-        surface: whether to use the features at the surface of each pixel.
     """
 
-    draws_cells = True
-    estimates_error = True
-    reads_details = True
     network: CellNetwork
 
     def __init__(
         self,
         channels: int,
-        frames: int,
         scale: int,
         *,
-        width: int = 64,
-        blocks: int = 6,
-        init: Literal["pretrained", "scratch"] = "pretrained",
-        history: bool = True,
-        surface: bool = True,
+        history: bool,
+        width: int,
+        blocks: int,
+        init: Literal["pretrained", "scratch"],
     ) -> None:
         super().__init__()
         check_size("renderer.width", width, 1, 4096)
         check_size("renderer.blocks", blocks, 0, 256)
-        self.scale = scale
-        self.layout = Layout(channels, scale, history and frames > 0, surface)
+        self.layout = Layout(channels, scale, history)
         self.network = CellNetwork(self.layout, width, blocks)
         if init == "pretrained":
             self._start_from(load_file(PRETRAINED))
 
-    def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Drawing:
+    def forward(self, observations: Sequence[LeanObservation], probe: Probe = UNWATCHED) -> Drawing:
         """Draw all observations; the estimated errors are those of their cells."""
         for o in observations:
             probe.count("cells", len(o.cells), o.frame.alpha.numel())
@@ -88,24 +81,15 @@ class LeanRenderer(Renderer2d):
         # itself. Rows of 0 round the size up, so that it sees few different ones.
         count = len(rows)
         surplus = (0, 0, 0, -count % self.network.quantum)
-        rows, neighbours = (
-            functional.pad(rows, surplus),
-            functional.pad(neighbours, surplus, value=-1),
-        )
+        rows = functional.pad(rows, surplus)
+        neighbours = functional.pad(neighbours, surplus, value=-1)
         self.network.backend = observations[0].backend
-        output, error, *matrix = self.run(probe, rows, neighbours)
-        drawn = inputs.drawn(*(x[:count].to(inputs.base) for x in (output, *matrix)))
-        return Drawing(self._paint(observations, drawn), error[:count, 0].to(inputs.base))
+        outputs = self.run(probe, rows, neighbours)
+        output, error, matrix = (x[:count].to(inputs.base) for x in outputs)
+        drawn = inputs.drawn(output, matrix)
+        return Drawing(self._paint(observations, drawn), error[:, 0])
 
-    def base(self, observations: Sequence[Observation]) -> Tensor:
-        """The pictures [B, H, W, 3] that the network corrects: RGB, bilinearly enlarged."""
-        parts = [
-            enlarged(o.frame.values[..., :3] - o.background[:3], o.cells, self.scale)
-            for o in observations
-        ]
-        return self._paint(observations, torch.cat(parts))
-
-    def _neighbours(self, observations: Sequence[Observation]) -> Tensor:
+    def _neighbours(self, observations: Sequence[LeanObservation]) -> Tensor:
         """The neighbours [N, 9] of all cells."""
         size, device = observations[0].frame.alpha.shape, observations[0].cells.device
         active = torch.zeros(len(observations), *size, dtype=torch.bool, device=device)
@@ -113,27 +97,27 @@ class LeanRenderer(Renderer2d):
         active.view(-1).index_fill_(0, cells, True)
         return neighbours_of(active, len(cells))
 
-    def _paint(self, observations: Sequence[Observation], less: Tensor) -> Tensor:
+    def _paint(self, observations: Sequence[LeanObservation], less: Tensor) -> Tensor:
         """Pictures [B, H, W, 3] from the pixels `less` [N, s^2, 3] of all cells, relative to the
         background."""
         size, background = observations[0].frame.alpha.shape, observations[0].background[:3]
         shown = [o.cells for o in observations]
-        pixels = less.flatten(1) + background.repeat(self.scale**2)  # a cell at a time
-        return paint(shown, size, self.scale, pixels.view_as(less), background)
+        pixels = less.flatten(1) + background.repeat(self.layout.scale**2)  # a cell at a time
+        return paint(shown, size, self.layout.scale, pixels.view_as(less), background)
 
     @torch.no_grad()
     def _start_from(self, pretrained: Mapping[str, Tensor]) -> None:
-        """Copy the weights of a renderer with the same trunk that was trained at K = 3 with history
-        and surface. Weights for features beyond RGB stay as they are.
+        """Copy the weights of a renderer with the same trunk that was trained at K = 3.
+
+        Weights for features beyond RGB stay as they are.
 
         Raises:
             ValueError: this renderer has another shape.
         """
         ours, theirs = self.layout, PRETRAINED_LAYOUT
         weights = dict(self.network.named_parameters())
-        unused = set() if ours.surface else {name for name in pretrained if name.startswith("read")}
         try:
-            if weights.keys() != pretrained.keys() - unused or ours.scale != theirs.scale:
+            if weights.keys() != pretrained.keys() or ours.scale != theirs.scale:
                 raise RuntimeError("other layers, or another scale")
             if (inputs := pretrained["enter.weight"].shape[1]) != theirs.width:
                 raise RuntimeError(f"{inputs} inputs instead of {theirs.width}")
