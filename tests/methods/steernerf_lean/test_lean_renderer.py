@@ -1,9 +1,8 @@
-"""The lean 2D renderer: against a dense network, its base, how far it sees."""
+"""The lean 2D renderer: against a dense network, what it takes from each input, how far it sees."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
@@ -11,16 +10,18 @@ from torch import Tensor
 from torch.nn import functional
 from torch.utils.flop_counter import FlopCounterMode
 
-from methods.steernerf.renderer import Detail, Observation, cells_at_matter
+from methods.steernerf_lean.cell_inputs import CellInputs
 from methods.steernerf_lean.cell_network import LEAK
 from methods.steernerf_lean.cells import REACH
 from methods.steernerf_lean.lean_renderer import LeanRenderer
+from methods.steernerf_lean.observation import Detail, LeanObservation
 from tests.methods.observations import (
     BACKGROUND,
     FLOAT32_ERROR,
     ROUNDING,
     at_surface,
     before,
+    cells_with,
     cut,
     doubled,
     enlarged,
@@ -31,10 +32,11 @@ from tests.methods.observations import (
     spot,
 )
 
-observed = partial(observe, frames=0)
+BLENDING = 6 * 2.0**-24
+"""Error of base + share (other - base), less the background and with it again, of size 1."""
 
 
-def reached(observation: Observation) -> Tensor:
+def reached(observation: LeanObservation) -> Tensor:
     """[h, w] bool: cells within REACH of matter, a cell at a time."""
     seen = observation.frame.alpha > 0
     active = torch.zeros_like(seen)
@@ -44,9 +46,9 @@ def reached(observation: Observation) -> Tensor:
     return active
 
 
-def dense(renderer: LeanRenderer, observation: Observation) -> Tensor:
+def dense(renderer: LeanRenderer, observation: LeanObservation) -> Tensor:
     """The same network on all cells, with dense convolutions of pictures that are masked."""
-    scale, background = renderer.scale, observation.background
+    scale, background = renderer.layout.scale, observation.background
     active = reached(observation)
     drawn_at = active.repeat_interleave(scale, 0).repeat_interleave(scale, 1)[..., None]
     base = enlarged(observation, scale) - background[:3]
@@ -65,12 +67,11 @@ def dense(renderer: LeanRenderer, observation: Observation) -> Tensor:
         picture, known = before(observation, scale)
         recent = (picture - background[:3] - base) * known
         planes += [in_cells(recent), in_cells(known)]
-    if renderer.layout.surface:
-        values, known = at_surface(observation, scale)
-        less = (values[..., :-1] - background) * known[..., None]
-        opacity = values[..., -1:] * known[..., None]
-        less[..., :3] -= base * known[..., None]
-        planes += [in_cells(x) for x in (less[..., :3], opacity, less[..., 3:])]
+    values, known = at_surface(observation, scale)
+    less = (values[..., :-1] - background) * known[..., None]
+    opacity = values[..., -1:] * known[..., None]
+    less[..., :3] -= base * known[..., None]
+    planes += [in_cells(x) for x in (less[..., :3], opacity, less[..., 3:]) if x.numel()]
 
     def pointwise(x: Tensor, layer: torch.nn.Linear) -> Tensor:
         return functional.conv2d(x, layer.weight[:, :, None, None], layer.bias)
@@ -92,61 +93,61 @@ def dense(renderer: LeanRenderer, observation: Observation) -> Tensor:
     drawn = base + of_pixels(left[: 3 * scale**2])
     if renderer.layout.history:
         drawn = drawn + of_pixels(left[3 * scale**2 :]).sigmoid() * recent
-    if renderer.network.read is not None:
-        matrices = pointwise(hidden, renderer.network.read)[0]
-        matrices = matrices.repeat_interleave(scale, 1).repeat_interleave(scale, 2)
-        read = torch.cat((less[..., :3] * opacity, opacity, less[..., 3:]), dim=-1)
-        read = read.permute(2, 0, 1)
-        drawn = drawn + (matrices.view(3, *read.shape) * read).sum(dim=1).permute(1, 2, 0)
+    matrices = pointwise(hidden, renderer.network.read)[0]
+    matrices = matrices.repeat_interleave(scale, 1).repeat_interleave(scale, 2)
+    read = torch.cat((less[..., :3] * opacity, opacity, less[..., 3:]), dim=-1).permute(2, 0, 1)
+    drawn = drawn + (matrices.view(3, *read.shape) * read).sum(dim=1).permute(1, 2, 0)
     return torch.where(drawn_at, drawn, 0) + background[:3]
 
 
 @pytest.mark.parametrize("history", [False, True])
-@pytest.mark.parametrize("surface", [False, True])
 @pytest.mark.parametrize("share", [0.03, 1.0])
-def test_cells_are_drawn_as_by_a_dense_network(history: bool, surface: bool, share: float) -> None:
+@pytest.mark.parametrize(("channels", "scale"), [(6, 4), (3, 2), (4, 1)])
+def test_cells_are_drawn_as_by_a_dense_network(
+    history: bool, share: float, channels: int, scale: int
+) -> None:
     matter = torch.rand(12, 14, generator=torch.Generator().manual_seed(2)) < share
-    observation = observed(12, 14, matter=matter)
-    renderer = shaken(new_renderer(history=history, surface=surface))
-    active = reached(observation)
-    assert (active.float().mean() < 0.9) == (share < 1)
+    observation = observe(12, 14, channels=channels, scale=scale, matter=matter)
+    renderer = shaken(new_renderer(channels, scale, history=history))
+    assert (reached(observation).float().mean() < 0.9) == (share < 1)
     want = dense(renderer.double(), doubled(observation))
     assert (want != 1).any()
     got = renderer([doubled(observation)]).pictures[0]
     torch.testing.assert_close(got, want, rtol=0, atol=ROUNDING)
-    quick = renderer.float()([observation]).pictures[0]
-    torch.testing.assert_close(quick.double(), want, rtol=0, atol=FLOAT32_ERROR)
-
-
-@pytest.mark.parametrize(
-    ("channels", "scale", "height", "width"),
-    [(6, 4, 5, 7), (3, 4, 3, 4), (8, 3, 5, 3), (4, 1, 1, 9)],
-)
-def test_any_features_and_sizes_are_taken(
-    channels: int, scale: int, height: int, width: int
-) -> None:
-    renderer = new_renderer(channels, scale=scale)
-    observations = [
-        observed(height, width, channels=channels, scale=scale, seed=seed) for seed in range(2)
-    ]
-    for batch in (observations[:1], observations):
-        pictures, base = renderer(batch).pictures, renderer.base(batch)
-        assert pictures.shape == base.shape == (len(batch), height * scale, width * scale, 3)
-        assert pictures.isfinite().all()
+    quick = renderer.float()([observation])
+    torch.testing.assert_close(quick.pictures[0].double(), want, rtol=0, atol=FLOAT32_ERROR)
+    with torch.no_grad():  # where products are convolutions, of another order of sums
+        frozen = renderer([observation])
+    torch.testing.assert_close(frozen.pictures, quick.pictures, rtol=0, atol=FLOAT32_ERROR)
+    torch.testing.assert_close(frozen.error, quick.error, rtol=0, atol=FLOAT32_ERROR)
 
 
 def test_a_picture_and_a_surface_that_are_missing_show_nothing() -> None:
-    renderer, warm = shaken(new_renderer()), observed()
+    renderer, warm = shaken(new_renderer()), observe()
     assert warm.history is not None
-    assert warm.surface is not None
-    nothing = replace(
-        warm,
-        history=Detail(warm.history.values, torch.zeros_like(warm.history.valid)),
-        surface=replace(warm.surface, index=torch.full_like(warm.surface.index, -1)),
-    )
-    cold = renderer([replace(warm, history=None, surface=None)]).pictures
-    assert torch.equal(renderer([nothing]).pictures, cold)
+    unknown = Detail(warm.history.values, torch.zeros_like(warm.history.valid))
+    cold = renderer([replace(warm, history=None)]).pictures
+    assert torch.equal(renderer([replace(warm, history=unknown)]).pictures, cold)
     assert (renderer([warm]).pictures - cold).abs().max() > 1e-3
+    empty = replace(warm.surface, index=torch.full_like(warm.surface.index, -1))
+    other = replace(empty, values=torch.rand_like(empty.values))
+    bare, same = (renderer([replace(warm, surface=s)]).pictures for s in (empty, other))
+    assert torch.equal(bare, same)
+    assert (renderer([warm]).pictures - bare).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("wrong", [-2, 20])
+def test_an_index_that_names_no_point_of_the_surface_is_refused(wrong: int) -> None:
+    observation = observe()
+    observation.surface.index[3, 2] = wrong
+    with pytest.raises(IndexError, match="out of range"):
+        new_renderer()([observation])
+
+
+def test_a_renderer_without_history_ignores_the_preceding_picture() -> None:
+    observation = observe()
+    renderer, without = shaken(new_renderer(history=False)), replace(observation, history=None)
+    assert torch.equal(renderer([observation]).pictures, renderer([without]).pictures)
 
 
 @pytest.mark.parametrize("history", [False, True])
@@ -154,11 +155,10 @@ def test_gradients_reach_every_parameter_and_the_features_of_all_that_is_shown(
     history: bool,
 ) -> None:
     renderer = shaken(new_renderer(history=history))
-    observation = observed(history=history)
+    observation = observe(history=history)
     features = [tensor.requires_grad_() for tensor in features_of(observation)]
     assert len(features) == 2  # of the present and the surface
     drawing = renderer([observation])
-    assert drawing.error is not None
     (drawing.pictures.square().sum() + drawing.error.sum()).backward()
     for name, parameter in renderer.named_parameters():
         assert parameter.grad is not None, name
@@ -168,75 +168,109 @@ def test_gradients_reach_every_parameter_and_the_features_of_all_that_is_shown(
         assert tensor.grad.any(dim=0).all()  # every channel, RGB and others
 
 
-@pytest.mark.parametrize("scale", [1, 2, 4])
-@pytest.mark.parametrize("history", [False, True])
-def test_an_untrained_network_draws_the_aligned_bilinear_base(history: bool, scale: int) -> None:
-    """Whatever is at the surface. A preceding picture is blended in half and half, so there is
-    none, or none that the network looks at."""
-    renderer = new_renderer(scale=scale, history=not history)
-    observation = observed(6, 5, scale=scale, history=history)
-    assert observation.surface is not None
+def test_gradients_of_inputs_and_pixels_are_finite_differences() -> None:
+    observation, layout = doubled(observe(2, 3, channels=4, scale=2)), new_renderer(4, 2).layout
+    output, matrix = torch.rand(6, 16, dtype=torch.float64), torch.rand(6, 15, dtype=torch.float64)
+
+    def computed(values: Tensor, surface: Tensor, *outputs: Tensor) -> tuple[Tensor, ...]:
+        shown = replace(
+            observation,
+            frame=replace(observation.frame, values=values),
+            surface=replace(observation.surface, values=surface),
+        )
+        inputs = CellInputs.of([shown], layout)
+        return inputs.rows(), inputs.drawn(*outputs)
+
+    learned = [*features_of(observation), output, matrix]
+    assert torch.autograd.gradcheck(computed, [x.requires_grad_() for x in learned])
+
+
+@pytest.mark.parametrize("scale", [1, 2, 3, 4])
+def test_an_untrained_network_draws_the_present_colours_enlarged(scale: int) -> None:
+    """Whatever is at the surface. A preceding picture would be blended in half and half."""
+    observation = observe(6, 5, scale=scale)
     assert (observation.surface.index >= 0).any()
-    base = renderer.base([observation])
-    # Weights and values are multiples of 1/4096: nothing is rounded.
-    assert torch.equal(base[0], enlarged(observation, scale))
-    assert torch.equal(renderer([observation]).pictures, base)
+    picture = new_renderer(scale=scale, history=False)([observation]).pictures[0]
+    # With scales of 2^n, weights and values are multiples of 1/4096: nothing is rounded.
+    rounded = BLENDING if scale == 3 else 0
+    torch.testing.assert_close(picture, enlarged(observation, scale), rtol=0, atol=rounded)
 
 
-def test_the_base_reproduces_a_ramp() -> None:
-    height, width, scale = 5, 7, 4
-    observation = observed(height, width)
-    across = scale * (torch.arange(width) + 0.5)
-    down = scale * (torch.arange(height) + 0.5)
-    observation.frame.values[..., 0] = across / 64
-    observation.frame.values[..., 1] = down[:, None] / 64
-    observation.frame.values[..., 2] = (2 * down[:, None] - across) / 64
-    base = new_renderer().base([observation])
-    # Within the samples; beyond the outermost ones the border is repeated.
-    u, v = torch.arange(width * scale) + 0.5, torch.arange(height * scale) + 0.5
-    columns = ((u >= across[0]) & (u <= across[-1])).nonzero().squeeze(1)
-    rows = ((v >= down[0]) & (v <= down[-1])).nonzero().squeeze(1)
-    x, y = u[columns][None, :], v[rows][:, None]
-    want = torch.stack((x + 0 * y, y + 0 * x, 2 * y - x), dim=-1) / 64
-    assert torch.equal(base[0][rows][:, columns], want)
-    assert (base[0, :, 0, 0] <= across[1] / 64).all()
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_the_preceding_picture_is_blended_in_where_it_is_known(share: float) -> None:
+    scale, renderer, observation = 4, new_renderer(), observe()
+    with torch.no_grad():
+        renderer.network.leave.bias[-(scale**2) :] = 40.0 if share else -200.0
+    picture, valid = before(observation, scale)
+    base = enlarged(observation, scale)
+    want = torch.where(valid > 0, share * picture + (1 - share) * base, base)
+    assert 0.5 < valid.mean() < 0.8
+    torch.testing.assert_close(renderer([observation]).pictures[0], want, rtol=0, atol=BLENDING)
+
+
+def test_the_surface_covers_the_base_as_far_as_it_is_opaque() -> None:
+    """Where the matrix of every cell is the identity on RGB and looks at nothing else."""
+    scale, renderer, observation = 4, new_renderer(history=False), observe()
+    with torch.no_grad():
+        renderer.network.read.bias.view(3, -1)[:, :3] = torch.eye(3)
+    values, known = at_surface(observation, scale)
+    base = enlarged(observation, scale)
+    covered = base + values[..., -1:] * (values[..., :3] - base)
+    want = torch.where(known[..., None] > 0, covered, base)
+    assert 0.5 < known.mean() < 0.8
+    torch.testing.assert_close(renderer([observation]).pictures[0], want, rtol=0, atol=BLENDING)
+
+
+@pytest.mark.parametrize("column", [3, 4, 6])
+def test_a_matrix_reads_opacity_and_other_features_less_the_background(column: int) -> None:
+    """Of K = 6: the opacity is behind the colours, then come the others."""
+    scale, renderer, observation = 4, new_renderer(history=False), observe()
+    with torch.no_grad():
+        renderer.network.read.bias.view(3, -1)[1, column] = 1.0  # into green
+    values, known = at_surface(observation, scale)
+    read = values[..., -1] if column == 3 else values[..., column - 1] - BACKGROUND[column - 1]
+    want = enlarged(observation, scale)
+    want[..., 1] += known * read
+    torch.testing.assert_close(renderer([observation]).pictures[0], want, rtol=0, atol=BLENDING)
 
 
 @pytest.mark.parametrize("batch", [1, 2])
 def test_far_from_anything_the_picture_is_the_background(batch: int) -> None:
     height, width, scale = 14, 16, 4
-    observation = observed(height, width, matter=spot(height, width, 5, 6))
-    renderer = shaken(new_renderer())
-    pictures, base = renderer([observation] * batch).pictures, renderer.base([observation] * batch)
+    observation = observe(height, width, matter=spot(height, width, 5, 6))
+    pictures = shaken(new_renderer())([observation] * batch).pictures
     near = torch.zeros(height * scale, width * scale, dtype=torch.bool)
     rows = slice(scale * (5 - REACH), scale * (7 + REACH))
     columns = slice(scale * (6 - REACH), scale * (9 + REACH))
     near[rows, columns] = True
-    for picture in (*pictures, *base):
+    for picture in pictures:
         assert (picture[~near] == BACKGROUND[:3]).all()
-    assert ((pictures[0] != BACKGROUND[:3]).any(dim=-1) == near).float().mean() > 0.99
-    assert torch.equal(base[0][near], enlarged(observation, scale)[near])
+        assert ((picture != BACKGROUND[:3]).any(dim=-1) == near).float().mean() > 0.99
 
 
 def test_where_nothing_is_the_picture_is_the_background() -> None:
-    observation = observed(matter=torch.zeros(5, 7, dtype=torch.bool))
-    renderer = shaken(new_renderer())
-    assert (renderer([observation]).pictures == 1).all()
-    assert (renderer.base([observation]) == 1).all()
-    for empty in (observation, replace(observation, history=None, surface=None)):
-        renderer([empty]).pictures.sum().backward()  # a patch without matter stops no training
+    observation = observe(matter=torch.zeros(5, 7, dtype=torch.bool))
+    pictures = shaken(new_renderer())([observation]).pictures
+    assert (pictures == 1).all()
+    pictures.sum().backward()  # a patch without matter stops no training
 
 
 @pytest.mark.parametrize(("row", "column"), [(5, 6), (0, 0), (12, 13)])
 def test_a_batch_of_two_is_one_after_the_other(row: int, column: int) -> None:
     observations = [
-        doubled(observed(14, 16, matter=spot(14, 16, row, column))),
-        doubled(observed(14, 16, matter=spot(14, 16, 3, 3), seed=1)),
+        doubled(observe(14, 16, matter=spot(14, 16, row, column))),
+        doubled(observe(14, 16, matter=spot(14, 16, 3, 3), seed=1)),
     ]
     renderer = shaken(new_renderer()).double()
-    for draw in (lambda shown: renderer(shown).pictures, renderer.base):
-        alone = torch.cat([draw([observation]) for observation in observations])
-        torch.testing.assert_close(draw(observations), alone, rtol=0, atol=ROUNDING)
+    together = renderer(observations)
+    first, second = (renderer([observation]) for observation in observations)
+    for got, parts in (
+        (together.pictures, (first.pictures, second.pictures)),
+        (together.error, (first.error, second.error)),
+    ):
+        torch.testing.assert_close(got, torch.cat(parts), rtol=0, atol=ROUNDING)
+    assert second.error.shape == (len(observations[1].cells),)
+    assert second.error.std() > 0
 
 
 @pytest.mark.parametrize("blocks", [1, 3])
@@ -246,18 +280,16 @@ def test_a_patch_is_drawn_as_the_whole_frame(blocks: int) -> None:
     scale, size = 4, 24
     halo = blocks + REACH
     matter = torch.rand(size, size, generator=torch.Generator().manual_seed(5)) < 0.03
-    observation = doubled(observed(size, size, matter=matter))
+    observation = doubled(observe(size, size, matter=matter))
     renderer = shaken(new_renderer(blocks=blocks)).double()
     begin, end = 9, 15
     side = slice(begin - halo, end + halo)
-    patch = cut(observation, scale, side, side)
     inside = slice(scale * halo, scale * (halo + end - begin))
     there = slice(scale * begin, scale * end)
-    for draw in (lambda shown: renderer(shown).pictures, renderer.base):
-        want = draw([observation])[0, there, there]
-        assert (want != 1).any()
-        got = draw([patch])[0, inside, inside]
-        torch.testing.assert_close(got, want, rtol=0, atol=ROUNDING)
+    want = renderer([observation]).pictures[0, there, there]
+    assert (want != 1).any()
+    got = renderer([cut(observation, side, side)]).pictures[0, inside, inside]
+    torch.testing.assert_close(got, want, rtol=0, atol=ROUNDING)
 
 
 def test_a_cell_sees_as_far_as_a_patch_has_to_reach() -> None:
@@ -267,46 +299,29 @@ def test_a_cell_sees_as_far_as_a_patch_has_to_reach() -> None:
     """
     assert REACH == 1
     blocks, size = 2, 12
-    observation = observed(size, size, surface=False, matter=spot(size, size, 5, 5))
-    renderer = shaken(new_renderer(frames=0, blocks=blocks, surface=False)).double()
+    observation = doubled(observe(size, size, history=False, matter=spot(size, size, 5, 5)))
+    renderer = shaken(new_renderer(blocks=blocks, history=False)).double()
     middle = 0, slice(20, 24), slice(20, 24)  # cell (5, 5)
-    without = renderer([doubled(observation)]).pictures[middle]
-    for away, seen in ((blocks + REACH, True), (blocks + REACH + 1, False)):
+    without = renderer([observation]).pictures[middle]
+    for away, noticed in ((blocks + REACH, True), (blocks + REACH + 1, False)):
         alpha = observation.frame.alpha.clone()
         alpha[5 - away, 5] = 1e-6
-        frame = replace(observation.frame, alpha=alpha)
-        changed = replace(observation, frame=frame, cells=cells_at_matter(alpha, []))
-        difference = (renderer([doubled(changed)]).pictures[middle] - without).abs().max()
-        assert (difference > ROUNDING) == seen
-
-
-def test_an_error_is_estimated_for_each_cell_of_each_observation() -> None:
-    observations = [observed(9, 9, matter=spot(9, 9, 3, 3)), observed(9, 9, seed=1)]
-    renderer = shaken(new_renderer())
-    error = renderer(observations).error
-    assert error is not None
-    assert error.shape == (len(observations[0].cells) + len(observations[1].cells),)
-    alone = renderer(observations[1:]).error
-    assert alone is not None
-    assert alone.std() > 0
-    torch.testing.assert_close(error[-len(alone) :], alone, rtol=0, atol=FLOAT32_ERROR)
-
-
-@pytest.mark.parametrize("share", [0.03, 1.0])
-def test_without_gradient_the_same_is_drawn(share: float) -> None:
-    """Where products are convolutions, of another order of sums."""
-    matter = torch.rand(20, 14, generator=torch.Generator().manual_seed(2)) < share
-    renderer, observation = shaken(new_renderer()), observed(20, 14, matter=matter)
-    want = renderer([observation])
-    with torch.no_grad():
-        got = renderer([observation])
-    torch.testing.assert_close(got.pictures, want.pictures, rtol=0, atol=FLOAT32_ERROR)
-    torch.testing.assert_close(got.error, want.error, rtol=0, atol=FLOAT32_ERROR)
+        cells, surface = cells_with(alpha), observation.surface
+        index = torch.full((len(cells), 16), -1, dtype=torch.int32)
+        index[torch.isin(cells, observation.cells)] = surface.index
+        changed = replace(
+            observation,
+            frame=replace(observation.frame, alpha=alpha),
+            cells=cells,
+            surface=replace(surface, index=index),
+        )
+        difference = (renderer([changed]).pictures[middle] - without).abs().max()
+        assert (difference > ROUNDING) == noticed
 
 
 def test_its_products_are_those_that_torch_counts_and_nine_for_each_channel_of_a_block() -> None:
     width, blocks, cells = 16, 2, 5
-    network = LeanRenderer(6, 2, 4, width=width, blocks=blocks, init="scratch").network
+    network = new_renderer(width=width, blocks=blocks).network
     inputs = torch.zeros(cells, network.enter.in_features), torch.full((cells, 9), -1)
     with FlopCounterMode(display=False) as counter:
         network(*inputs)
@@ -314,12 +329,12 @@ def test_its_products_are_those_that_torch_counts_and_nine_for_each_channel_of_a
     assert network.products(*inputs) == counter.get_total_flops() // 2 + taps
 
 
-def test_half_precision_changes_little() -> None:
-    renderer = shaken(new_renderer())
-    observation = observed()
+def test_half_precision_changes_the_network_and_nothing_else() -> None:
+    renderer, observation = shaken(new_renderer()), observe()
     with torch.autocast("cpu", torch.bfloat16):
         half = renderer([observation]).pictures
-        assert torch.equal(renderer.base([observation]), new_renderer().base([observation]))
+        still = new_renderer(history=False)([observation]).pictures
     assert half.dtype == torch.float32
+    assert torch.equal(still[0], enlarged(observation, 4))
     # A correction below 1, of sums of which each term is off by 1/256.
     assert 0 < (half - renderer([observation]).pictures).abs().max() < 0.1
