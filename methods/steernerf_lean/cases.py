@@ -16,14 +16,14 @@ from torch import Tensor
 from bench.case import Case, Cell, Property
 from bench.console import ConsoleLog
 from methods.engines import Engine, Inputs, Precision
-from methods.engines.onnxruntime_engine import OnnxRuntime
 from methods.engines.openvino_engine import OpenVino
 from methods.engines.tensorrt_engine import TensorRt
 from methods.engines.torch_engine import TorchEngine
+from methods.steernerf_lean.cell_network import CellNetwork
 from methods.steernerf_lean.kernels.depthwise import neighbours_of
-from methods.steernerf_lean.lean_renderer import LeanRenderer
+from methods.steernerf_lean.lean_renderer import PRETRAINED_LAYOUT, LeanRenderer
 
-ENGINES: tuple[type[Engine], ...] = (TorchEngine, OpenVino, OnnxRuntime, TensorRt)
+ENGINES: tuple[type[Engine], ...] = (TorchEngine, OpenVino, TensorRt)
 CELLS: list[Cell] = [
     (engine.name, precision) for engine in ENGINES for precision in engine.precisions
 ]
@@ -42,38 +42,38 @@ def cases() -> list[Case]:
     """Constant inputs, values far outside the calibration range, a cell of NaN."""
     shares = {cell: TOLERANCE[cell[1]] for cell in CELLS}
     rounded = {cell: share for cell, share in shares.items() if cell[1] != "int8"}
-    counted = {cell: 0.0 for cell in CELLS if cell[1] == "int8"}
-    same = "the output is that of the network"
+    counted = dict.fromkeys(CELLS, 0.0)
+    same, finite = "the output is that of the network", "the output is finite"
+    saturates = "int8 saturates: twice as large, they give the same output, number by number"
+    spread = "its output is NaN, but in int8; cells out of its reach are unchanged"
     cases = [
         Property("engine", same, SHARE, shares).case("all inputs 0", partial(_error, 0.0)),
         # Not in int8: layers saturate, as no view of the calibration has such large activations.
         Property("engine", same, SHARE, rounded).case("all inputs 1/2", partial(_error, 0.5)),
-        Property(
-            "engine", "the output is finite", "it is, or is not: 0", dict.fromkeys(CELLS, 0.0)
-        ).case("inputs up to 1e4", _not_finite),
+        Property("engine", finite, "numbers that are not are counted: 0", counted).case(
+            "inputs up to 1e4", _not_finite
+        ),
         Property(
             "engine",
-            "int8 saturates: twice as large, they give the same output, number by number",
+            saturates,
             "numbers that differ are counted: 0",
-            counted,
+            {cell: 0.0 for cell in CELLS if cell[1] == "int8"},
         ).case("inputs 8 times as large as in the calibration", _not_saturated),
-        Property(
-            "engine",
-            "its output is NaN, but in int8; cells out of its reach are unchanged",
-            SHARE,
-            shares,
-        ).case("a cell of NaN", _spread_of_nan),
+        Property("engine", spread, SHARE, shares).case("a cell of NaN", _spread_of_nan),
     ]
     return [replace(case, slow=True) for case in cases]  # engines take seconds to build
 
 
 @cache
-def _renderer() -> LeanRenderer:
-    """The lean renderer with the weights that come with the package."""
-    return LeanRenderer(3, 1, 4).requires_grad_(False)
+def _network() -> CellNetwork:
+    """The network with the weights that come with the package."""
+    layout = PRETRAINED_LAYOUT
+    shape = {"history": layout.history, "width": 64, "blocks": BLOCKS}
+    renderer = LeanRenderer(layout.channels, layout.scale, **shape, init="pretrained")
+    return renderer.network.requires_grad_(False)
 
 
-def _placed(rows: Tensor, device: str) -> Inputs:
+def _inputs(rows: Tensor, device: str) -> Inputs:
     """The network's inputs: `rows` and the neighbours of each."""
     neighbours = neighbours_of(torch.ones(1, SIDE, SIDE, dtype=torch.bool))
     return rows.to(device), neighbours.to(device)
@@ -82,7 +82,7 @@ def _placed(rows: Tensor, device: str) -> Inputs:
 def _random_rows(seed: int) -> Tensor:
     """Rows of a random view of 16 x 16 cells."""
     generator = torch.Generator().manual_seed(seed)
-    return torch.rand(SIDE**2, _renderer().layout.width, generator=generator) - 0.5
+    return torch.rand(SIDE**2, PRETRAINED_LAYOUT.width, generator=generator) - 0.5
 
 
 @cache
@@ -94,8 +94,8 @@ def _built(engine: str, device: str, precision: Precision) -> Callable[..., Inpu
     """
     chosen = next(kind for kind in ENGINES if kind.name == engine)(precision)
     chosen.check(torch.device(device))
-    network = deepcopy(_renderer().network).to(device)
-    views = [_placed(_random_rows(seed), device) for seed in range(4)]
+    network = deepcopy(_network()).to(device)
+    views = [_inputs(_random_rows(seed), device) for seed in range(4)]
     with tempfile.TemporaryDirectory() as folder:
         log = ConsoleLog(Path(folder), quiet=True)
         return chosen.build(network, lambda: views, lambda: Path(folder), log).run
@@ -105,7 +105,7 @@ def _outputs(engine: str, device: str, precision: str, rows: Tensor) -> list[Ten
     """All outputs of the engine for `rows`, in float64."""
     run = _built(engine, device, precision)
     with torch.no_grad():
-        return [x.cpu().double().clone() for x in run(*_placed(rows, device))]
+        return [x.cpu().double().clone() for x in run(*_inputs(rows, device))]
 
 
 def _apart(got: list[Tensor], want: list[Tensor]) -> float:
@@ -120,7 +120,7 @@ def _apart(got: list[Tensor], want: list[Tensor]) -> float:
 def _error(value: float, engine: str, device: str, precision: str) -> float:
     rows = torch.full_like(_random_rows(0), value)
     with torch.no_grad():
-        want = [x.double() for x in _renderer().network(*_placed(rows, "cpu"))]
+        want = [x.double() for x in _network()(*_inputs(rows, "cpu"))]
     return _apart(_outputs(engine, device, precision, rows), want)
 
 

@@ -81,11 +81,11 @@ class CellInputs:
 
         Differentiable in the features of frame and surface.
         """
-        every = [_inputs(o, layout) for o in observations]
-        if len(every) == 1:
-            return every[0]
-        parts = {name: torch.cat([one.parts[name] for one in every]) for name in layout.columns}
-        return cls(torch.cat([one.base for one in every]), parts)
+        each = [_inputs(o, layout) for o in observations]
+        if len(each) == 1:
+            return each[0]
+        parts = {name: torch.cat([x.parts[name] for x in each]) for name in layout.columns}
+        return cls(torch.cat([x.base for x in each]), parts)
 
     def rows(self) -> Tensor:
         """The input of the network, [N, layout.width]."""
@@ -112,7 +112,7 @@ class CellInputs:
 
 def _inputs(o: LeanObservation, layout: Layout) -> CellInputs:
     less = o.frame.values - o.background
-    base = enlarged(less[..., :3], o.cells, layout.scale)
+    base = _enlarged(less[..., :3], o.cells, layout.scale)
     present = less.flatten(0, 1).index_select(0, o.cells)
     opacity = o.frame.alpha.flatten().index_select(0, o.cells)
     parts = {"colour": present[:, :3], "opacity": opacity[:, None], "rest": present[:, 3:]}
@@ -136,7 +136,7 @@ def _surface(o: LeanObservation, base: Tensor) -> dict[str, Tensor]:
     return {"surface": colour, "surface opacity": seen[..., -1:], "surface rest": seen[..., 3:-1]}
 
 
-def enlarged(colours: Tensor, cells: Tensor, scale: int) -> Tensor:
+def _enlarged(colours: Tensor, cells: Tensor, scale: int) -> Tensor:
     """Bilinearly enlarge `colours` [h, w, 3] in `cells`, with a repeated border: [N, s^2, 3]."""
     height, width, _ = colours.shape
     around = torch.arange(-1, 2, device=cells.device)

@@ -21,7 +21,6 @@ from tests.methods.observations import (
     ROUNDING,
     at_surface,
     before,
-    cells_with,
     cut,
     doubled,
     enlarged,
@@ -234,20 +233,6 @@ def test_a_matrix_reads_opacity_and_other_features_less_the_background(column: i
     torch.testing.assert_close(renderer([observation]).pictures[0], want, rtol=0, atol=BLENDING)
 
 
-@pytest.mark.parametrize("batch", [1, 2])
-def test_far_from_anything_the_picture_is_the_background(batch: int) -> None:
-    height, width, scale = 14, 16, 4
-    observation = observe(height, width, matter=spot(height, width, 5, 6))
-    pictures = shaken(new_renderer())([observation] * batch).pictures
-    near = torch.zeros(height * scale, width * scale, dtype=torch.bool)
-    rows = slice(scale * (5 - REACH), scale * (7 + REACH))
-    columns = slice(scale * (6 - REACH), scale * (9 + REACH))
-    near[rows, columns] = True
-    for picture in pictures:
-        assert (picture[~near] == BACKGROUND[:3]).all()
-        assert ((picture != BACKGROUND[:3]).any(dim=-1) == near).float().mean() > 0.99
-
-
 def test_where_nothing_is_the_picture_is_the_background() -> None:
     observation = observe(matter=torch.zeros(5, 7, dtype=torch.bool))
     pictures = shaken(new_renderer())([observation]).pictures
@@ -290,33 +275,6 @@ def test_a_patch_is_drawn_as_the_whole_frame(blocks: int) -> None:
     assert (want != 1).any()
     got = renderer([cut(observation, side, side)]).pictures[0, inside, inside]
     torch.testing.assert_close(got, want, rtol=0, atol=ROUNDING)
-
-
-def test_a_cell_sees_as_far_as_a_patch_has_to_reach() -> None:
-    """Whether something is `blocks + REACH` away decides whether the cell `blocks` away is there.
-
-    The cell between them is there in either case, because of what is in the first.
-    """
-    assert REACH == 1
-    blocks, size = 2, 12
-    observation = doubled(observe(size, size, history=False, matter=spot(size, size, 5, 5)))
-    renderer = shaken(new_renderer(blocks=blocks, history=False)).double()
-    middle = 0, slice(20, 24), slice(20, 24)  # cell (5, 5)
-    without = renderer([observation]).pictures[middle]
-    for away, noticed in ((blocks + REACH, True), (blocks + REACH + 1, False)):
-        alpha = observation.frame.alpha.clone()
-        alpha[5 - away, 5] = 1e-6
-        cells, surface = cells_with(alpha), observation.surface
-        index = torch.full((len(cells), 16), -1, dtype=torch.int32)
-        index[torch.isin(cells, observation.cells)] = surface.index
-        changed = replace(
-            observation,
-            frame=replace(observation.frame, alpha=alpha),
-            cells=cells,
-            surface=replace(surface, index=index),
-        )
-        difference = (renderer([changed]).pictures[middle] - without).abs().max()
-        assert (difference > ROUNDING) == noticed
 
 
 def test_its_products_are_those_that_torch_counts_and_nine_for_each_channel_of_a_block() -> None:
