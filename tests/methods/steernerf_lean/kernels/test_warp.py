@@ -297,5 +297,5 @@ def test_wrong_arguments_are_named() -> None:
         warp_cells(picture.double(), camera, depth, cells, camera, 4, backend="cpu")
     with pytest.raises(ValueError, match=r"depth: expected shape \[any, any\], got \[96\]"):
         enlarge_cells(depth.flatten(), cells, 4)
-    with pytest.raises(ValueError, match="enlarges float32"):
+    with pytest.raises(ValueError, match="warps float32"):
         enlarge_cells(depth.double(), cells, 4, backend="cpu")
