@@ -31,22 +31,12 @@ class Layout:
     history: bool
 
     @property
-    def pixels(self) -> int:
-        """Pixels of a cell, s^2."""
-        return self.scale**2
-
-    @property
     def columns(self) -> dict[str, int]:
         """The parts of a row, in this order, and their columns; see `CellInputs`."""
-        rest, pixels = self.channels - 3, self.pixels
+        rest, pixels = self.channels - 3, self.scale**2
         history = {"history": 3 * pixels, "valid": pixels} if self.history else {}
-        return {
-            **{"colour": 3, "opacity": 1, "rest": rest},
-            **history,
-            "surface": 3 * pixels,
-            "surface opacity": pixels,
-            "surface rest": rest * pixels,
-        }
+        surface = {"surface": 3 * pixels, "surface opacity": pixels, "surface rest": rest * pixels}
+        return {"colour": 3, "opacity": 1, "rest": rest, **history, **surface}
 
     @property
     def width(self) -> int:
@@ -77,10 +67,7 @@ class CellInputs:
 
     @classmethod
     def of(cls, observations: Sequence[LeanObservation], layout: Layout) -> CellInputs:
-        """The inputs of all cells, observation by observation.
-
-        Differentiable in the features of frame and surface.
-        """
+        """The inputs of all cells; differentiable in the features of frame and surface."""
         each = [_inputs(o, layout) for o in observations]
         if len(each) == 1:
             return each[0]
@@ -116,16 +103,13 @@ def _inputs(o: LeanObservation, layout: Layout) -> CellInputs:
     present = less.flatten(0, 1).index_select(0, o.cells)
     opacity = o.frame.alpha.flatten().index_select(0, o.cells)
     parts = {"colour": present[:, :3], "opacity": opacity[:, None], "rest": present[:, 3:]}
-    if layout.history:
-        parts |= _history(o, base)
+    if layout.history and o.history is None:
+        parts |= {"history": torch.zeros_like(base), "valid": torch.zeros_like(base[..., :1])}
+    elif layout.history and o.history is not None:
+        valid = o.history.valid[..., None]
+        recent = (o.history.values - o.background[:3] - base) * valid
+        parts |= {"history": recent, "valid": valid}
     return CellInputs(base, {**parts, **_surface(o, base)})
-
-
-def _history(o: LeanObservation, base: Tensor) -> dict[str, Tensor]:
-    if o.history is None:
-        return {"history": torch.zeros_like(base), "valid": torch.zeros_like(base[..., :1])}
-    valid = o.history.valid[..., None]
-    return {"history": (o.history.values - o.background[:3] - base) * valid, "valid": valid}
 
 
 def _surface(o: LeanObservation, base: Tensor) -> dict[str, Tensor]:

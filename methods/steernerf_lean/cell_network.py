@@ -31,7 +31,7 @@ class CellNetwork(Network):
         super().__init__()
         self.enter = _Linear(layout.width, width)
         self.trunk = nn.ModuleList(_Block(width) for _ in range(blocks))
-        self.leave = _Linear(width, layout.pixels * (3 + layout.history))
+        self.leave = _Linear(width, layout.scale**2 * (3 + layout.history))
         self.error = _Linear(width, 1)
         self.read = _Linear(width, 3 * (layout.channels + 1))
         for layer in (self.leave, self.error, self.read):

@@ -114,25 +114,21 @@ class LeanRenderer(Renderer2d):
         Raises:
             ValueError: this renderer has another shape.
         """
-        ours, theirs = self.layout, PRETRAINED_LAYOUT
-        weights = dict(self.network.named_parameters())
         try:
-            if weights.keys() != pretrained.keys() or ours.scale != theirs.scale:
-                raise RuntimeError("other layers, or another scale")
-            if (inputs := pretrained["enter.weight"].shape[1]) != theirs.width:
-                raise RuntimeError(f"{inputs} inputs instead of {theirs.width}")
-            for name, weight in weights.items():
-                new = pretrained[name].float()
+            known = PRETRAINED_LAYOUT.split(pretrained["enter.weight"])
+            for name, weight in self.network.named_parameters():
+                new = pretrained[name]
                 if name == "enter.weight":
-                    known = theirs.split(new)
-                    for part, columns in ours.split(weight).items():
-                        if columns.shape == known[part].shape:
+                    for part, columns in self.layout.split(weight).items():
+                        if not part.endswith("rest"):
                             columns.copy_(known[part])
                 elif name.startswith("read"):
                     weight.unflatten(0, (3, -1))[:, :4] = new.unflatten(0, (3, 4))
                 else:
                     weight.copy_(new[: len(weight)] if name.startswith("leave") else new)
-        except RuntimeError as error:
+            if more := pretrained.keys() - self.network.state_dict().keys():
+                raise KeyError(*more)
+        except (KeyError, RuntimeError) as error:
             raise ValueError(
                 "renderer.init=pretrained: those weights are of a renderer of the default "
                 f"scale, width and blocks ({error}): use renderer.init=scratch"
