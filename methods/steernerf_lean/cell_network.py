@@ -59,19 +59,15 @@ class CellNetwork(Network):
 
 class _Linear(nn.Linear):
     def forward(self, x: Tensor) -> Tensor:
-        return _product(x, self.weight, self.bias)
+        """x W^T + b of `x` [N, C].
 
-
-def _product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """x W^T + b of `x` [N, C] and `weight` [D, C].
-
-    Without gradient it is computed as a 1 x 1 convolution: torch hands products of float32 to MKL,
-    but convolutions to oneDNN, which is twice as fast on non-Intel processors.
-    """
-    if torch.is_grad_enabled() or torch.jit.is_tracing() or not len(x):
-        return functional.linear(x, weight, bias)
-    picture = x[None, :, None].permute(0, 3, 1, 2)  # [1, C, N, 1], the channels last in memory
-    return functional.conv2d(picture, weight[:, :, None, None], bias)[0, :, :, 0].T
+        Without gradient it is computed as a 1 x 1 convolution: torch hands products of float32 to
+        MKL, but convolutions to oneDNN, which is twice as fast on non-Intel processors.
+        """
+        if torch.is_grad_enabled() or torch.jit.is_tracing() or not len(x):
+            return super().forward(x)
+        picture = x[None, :, None].permute(0, 3, 1, 2)  # [1, C, N, 1], channels last in memory
+        return functional.conv2d(picture, self.weight[:, :, None, None], self.bias)[0, :, :, 0].T
 
 
 class _Block(nn.Module):

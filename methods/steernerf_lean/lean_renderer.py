@@ -73,37 +73,25 @@ class LeanRenderer(Renderer2d):
 
     def forward(self, observations: Sequence[LeanObservation], probe: Probe = UNWATCHED) -> Drawing:
         """Draw all observations; the estimated errors are those of their cells."""
-        for o in observations:
-            probe.count("cells", len(o.cells), o.frame.alpha.numel())
+        first, cells = observations[0], [o.cells for o in observations]
+        size, background = first.frame.alpha.shape, first.background[:3]
+        for some in cells:
+            probe.count("cells", len(some), size.numel())
         inputs = CellInputs.of(observations, self.layout)
-        rows, neighbours = inputs.rows(), self._neighbours(observations)
+        rows = inputs.rows()
+        drawn_at = torch.zeros(len(cells), *size, dtype=torch.bool, device=rows.device)
+        drawn_at.view(-1).index_fill_(0, number(cells, size), True)
+        neighbours = neighbours_of(drawn_at, len(rows))
         # The matrix library prepares code for every new size, which takes longer than the product
         # itself. Rows of 0 round the size up, so that it sees few different ones.
-        count = len(rows)
-        surplus = (0, 0, 0, -count % self.network.quantum)
-        rows = functional.pad(rows, surplus)
-        neighbours = functional.pad(neighbours, surplus, value=-1)
-        self.network.backend = observations[0].backend
-        outputs = self.run(probe, rows, neighbours)
+        surplus = (0, 0, 0, -len(rows) % self.network.quantum)
+        rows, count = functional.pad(rows, surplus), len(rows)
+        self.network.backend = first.backend
+        outputs = self.run(probe, rows, functional.pad(neighbours, surplus, value=-1))
         output, error, matrix = (x[:count].to(inputs.base) for x in outputs)
-        drawn = inputs.drawn(output, matrix)
-        return Drawing(self._paint(observations, drawn), error[:, 0])
-
-    def _neighbours(self, observations: Sequence[LeanObservation]) -> Tensor:
-        """The neighbours [N, 9] of all cells."""
-        size, device = observations[0].frame.alpha.shape, observations[0].cells.device
-        active = torch.zeros(len(observations), *size, dtype=torch.bool, device=device)
-        cells = number([o.cells for o in observations], size)
-        active.view(-1).index_fill_(0, cells, True)
-        return neighbours_of(active, len(cells))
-
-    def _paint(self, observations: Sequence[LeanObservation], less: Tensor) -> Tensor:
-        """Pictures [B, H, W, 3] from the pixels `less` [N, s^2, 3] of all cells, relative to the
-        background."""
-        size, background = observations[0].frame.alpha.shape, observations[0].background[:3]
-        shown = [o.cells for o in observations]
-        pixels = less.flatten(1) + background.repeat(self.layout.scale**2)  # a cell at a time
-        return paint(shown, size, self.layout.scale, pixels.view_as(less), background)
+        less = inputs.drawn(output, matrix).flatten(1)
+        pixels = (less + background.repeat(self.layout.scale**2)).view_as(inputs.base)
+        return Drawing(paint(cells, size, self.layout.scale, pixels, background), error[:, 0])
 
     @torch.no_grad()
     def _start_from(self, pretrained: Mapping[str, Tensor]) -> None:

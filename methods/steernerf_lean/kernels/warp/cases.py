@@ -41,7 +41,6 @@ class Kind:
 
     Attributes:
         turn, move: rotation vector of the source, in radians, and its offset.
-        zoom: focal length of the source over that of the camera.
         holes: whether some pixels have no depth.
         edge: how much farther away the right half of the depth map and one row are.
         channels: channels of the picture.
@@ -53,7 +52,6 @@ class Kind:
     scale: int = 4
     turn: Vector = (0.0, 0.0, 0.0)
     move: Vector = (0.0, 0.0, 0.0)
-    zoom: float = 1.0
     holes: bool = False
     edge: float = 0.0
     channels: int = 3
@@ -73,7 +71,7 @@ KINDS = {
     "edges": Kind(move=(0.03, 0.0, 0.1), edge=0.5),
     "edges and holes": Kind(edge=0.5, holes=True),
     "holes, NaN, 1e20 and 2": Kind(edge=1e20, holes=True),
-    "leaving the picture": Kind(turn=(0.0, 0.2, 0.0), zoom=2.0),
+    "leaving the picture": Kind(turn=(0.0, 0.2, 0.0)),
     "behind the source": Kind(turn=(0.0, math.pi, 0.0)),
     "partly behind the source": Kind(move=(0.0, 0.0, 2.25), edge=2.0),
     "half of it empty": Kind(edge=math.inf),
@@ -166,12 +164,12 @@ def _given(kind: Kind) -> Given:
 def _cameras(kind: Kind) -> tuple[Camera, Camera]:
     """The source and the camera, which is at the origin."""
     width, height = kind.width * kind.scale, kind.height * kind.scale
-    focal, (x, y, z) = 1.2 * width, kind.turn
-    camera = Camera(torch.eye(3, 4), focal, focal, width / 2, height / 2, width, height)
-    skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
-    move = torch.tensor(kind.move, dtype=torch.float64)
+    pinhole = 1.2 * width, 1.2 * width, width / 2, height / 2
+    camera = Camera(torch.eye(3, 4), *pinhole, width, height)
+    turn, move = (torch.tensor(v, dtype=torch.float64) for v in (kind.turn, kind.move))
+    skew = torch.linalg.cross(turn.expand(3, 3), torch.eye(3).double()).T
     c2w = torch.cat((torch.linalg.matrix_exp(skew), move[:, None]), dim=1).float()
-    return replace(camera, c2w=c2w, fx=kind.zoom * focal, fy=kind.zoom * focal), camera
+    return replace(camera, c2w=c2w), camera
 
 
 def _depth(kind: Kind) -> Tensor:
