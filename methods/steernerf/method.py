@@ -67,7 +67,11 @@ class SteerNerf:
         seed: int = 0,
     ) -> None:
         self.stage2 = self.kind(model, renderer, joint, after)
-        _check_range(model, rendering)
+        if rendering.range.mode != "off" and not model.frames:
+            raise ValueError(
+                "rendering.range.mode: expected off without preceding frames (L = 0), got "
+                f"{rendering.range.mode}"
+            )
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         engine.check(self.setup.device)
         self.rendering, self.engine, self.name = rendering, engine, name
@@ -123,19 +127,3 @@ class SteerNerf:
 
         built = engine.build(renderer.network, samples, folder, log)
         renderer.engine, self.renderer_bytes = built.run, built.size
-
-
-def _check_range(model: Model, rendering: Rendering) -> None:
-    """Raise ValueError if the range reduction and the model contradict each other."""
-    if rendering.range.mode == "off":
-        return
-    if not model.frames:
-        raise ValueError(
-            "rendering.range.mode: expected off without preceding frames (L = 0), got "
-            f"{rendering.range.mode}"
-        )
-    if (model.reprojection.depth, rendering.range.depth) == ("expected", "sum"):
-        raise ValueError(
-            "rendering.range.depth: expected the depth that is kept, model.reprojection.depth="
-            "expected; got sum"
-        )

@@ -83,11 +83,11 @@ class Pipeline:
 
     @torch.no_grad()
     def remember(self, camera: Camera, buffer: Buffer, rendering: Any) -> None:
-        """Update `buffer` as `render` does, without drawing the picture: no later frame reads it."""
+        """Update `buffer` as `render` does but draw no picture: no later frame reads it."""
         view, probe = self.view(camera), NullProbe()
         preceding = self.select(buffer, view, rendering, probe)
         frame = self.features(view, preceding, rendering, probe)
-        buffer.appendleft(Cloud.of(frame, self.model.reprojection))
+        buffer.appendleft(Cloud.of(frame))
 
     def select(
         self, buffer: Sequence[Cloud], view: View, rendering: Any, probe: Probe
@@ -104,10 +104,10 @@ class Pipeline:
         how, reduction = rendering.march, rendering.range
         if preceding and reduction.mode == "paper":
             with probe.stage("depth_reprojection"):
-                cloud, reprojection = preceding[0], self.model.reprojection
-                if reprojection.depth == "sum" and reduction.depth == "expected":
+                cloud = preceding[0]
+                if reduction.depth == "expected":
                     cloud = cloud.expected()
-                near_far = cloud.interval(view.low, reduction.epsilon, reprojection, self.backend)
+                near_far = cloud.interval(view.low, reduction.epsilon, self.backend)
                 how = how.within(near_far.view(-1, 2))
         with probe.stage("field"):
             occupancy = self.occupied(rendering)
@@ -116,7 +116,7 @@ class Pipeline:
 
     def reproject(self, cloud: Cloud, view: View) -> Points:
         """Reproject the features of a preceding frame into the present view (Eq. 9, 10)."""
-        index, _ = cloud.splat(view.full, self.model.reprojection, self.backend)
+        index, _ = cloud.splat(view.full, self.backend)
         return Points(cloud.values, index)
 
     def observe(
@@ -138,7 +138,7 @@ class Pipeline:
 
     def keep(self, frame: FeatureFrame, view: View, picture: Tensor) -> Cloud:
         """What later frames need of this one."""
-        return Cloud.of(frame, self.model.reprojection)
+        return Cloud.of(frame)
 
     def occupied(self, rendering: Rendering) -> Occupancy:
         """Where rays take samples."""

@@ -11,7 +11,7 @@ from torch.nn import functional
 from bench.cameras import project, within
 from bench.types import Camera
 from methods.rendering.compaction import kept_indices
-from methods.steernerf.buffer import SPLAT_ALPHA, Cloud
+from methods.steernerf.buffer import Cloud
 from methods.steernerf.view import View
 from methods.steernerf_lean.kernels.warp import warp
 from methods.steernerf_lean.observation import Detail
@@ -40,7 +40,7 @@ def overlap(cloud: Cloud, camera: Camera) -> Tensor:
     two views of it: on a ball, the share of the visible disc that both cameras see. Occlusion is
     ignored. A frame that shows nothing gives 0.
     """
-    clear = cloud.alpha > SPLAT_ALPHA
+    clear = cloud.clear
     number = clear.cumsum(dim=0)  # from 1
     every = (number[-1:] + OVERLAP_POINTS - 1) // OVERLAP_POINTS
     sampled = clear & ((number - 1) % every.clamp(min=1) == 0)

@@ -101,5 +101,4 @@ class LeanPipeline(Pipeline):
 
     def keep(self, frame: FeatureFrame, view: View, picture: Tensor) -> Kept:
         """The points of the frame, and its picture."""
-        cloud = Cloud.of(frame, self.model.reprojection)
-        return Kept(**vars(cloud), full=view.full, picture=picture)
+        return Kept(**vars(Cloud.of(frame)), full=view.full, picture=picture)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -14,17 +13,16 @@ from bench.sources import digest
 from bench.types import Budget, Log, Scene, SteerbenchError
 from methods.instant_ngp.stage1 import Setup, train_field
 from methods.steernerf.training.examples import TrainingViews
-from methods.steernerf.training.patches import Batch, PatchSource
+from methods.steernerf.training.patches import Batch, Patches
 from methods.steernerf_lean.training import LeanStage2
 from methods.training import checkpoint, loop
 
 
-@dataclass(frozen=True)
-class AnyOf:
+class AnyOf(Patches):
     """Draws each batch of patches from one of `sources`, which `generator` chooses."""
 
-    sources: Sequence[PatchSource]
-    generator: torch.Generator
+    def __init__(self, sources: Sequence[Patches], generator: torch.Generator) -> None:
+        self.sources, self.generator = sources, generator
 
     def draw(self, count: int) -> Batch:
         """Draw `count` patches, all from the same source."""

@@ -13,12 +13,11 @@ from torch.nn import functional
 from bench.types import NullProbe, Rays
 from methods.rendering.batch import render_batch
 from methods.rendering.compaction import compacts, indices_where
-from methods.rendering.frame import FeatureFrame
 from methods.steernerf.options import EVERYWHERE
 from methods.steernerf.renderer import Points, Renderer2d
 from methods.steernerf.training.examples import Example
 from methods.steernerf.training.joint import JointTraining
-from methods.steernerf.training.patches import Batch, Patch, Patches
+from methods.steernerf.training.patches import Batch, Patch, Patches, Shown
 from methods.steernerf.training.stage2 import Stage2
 from methods.steernerf.view import View
 from methods.steernerf_lean.cells import pixels_of
@@ -46,7 +45,7 @@ class LeanPatches(Patches):
     ) -> Sequence[int]:
         """Choose the first row and column of a patch that shows more than background."""
         if example.number not in self._content:
-            self._content[example.number] = self._cells(example.truth.picture)
+            self._content[example.number] = self._cells(example.picture)
         cells = self._content[example.number]
         chosen = cells[self.random(len(cells))].tolist()
         return [
@@ -74,17 +73,14 @@ class LeanPatches(Patches):
         return ()
 
     def observations(
-        self,
-        patches: Sequence[Patch],
-        frames: Sequence[FeatureFrame],
-        points: Sequence[Sequence[Points]],
+        self, patches: Sequence[Patch], shown: Sequence[Shown]
     ) -> Sequence[LeanObservation]:
         """What the 2D renderer is shown of `patches`; the host waits once for the cells of all."""
         pipeline, how, probe = self.pipeline, self.rendering, NullProbe()
-        near = indices_where([pipeline.near(frame, how).flatten() for frame in frames])
+        near = indices_where([pipeline.near(frame, how).flatten() for frame, _ in shown])
         return [
             pipeline.observe(frame, patch.example.buffer, patch.view, how, probe, cells)
-            for patch, frame, cells in zip(patches, frames, near, strict=True)
+            for patch, (frame, _), cells in zip(patches, shown, near, strict=True)
         ]
 
 

@@ -14,7 +14,7 @@ from methods.kernels.encode import HashGrid
 from methods.kernels.types import Occupancy
 from methods.rendering.march import March
 from methods.rendering.occupancy import DensityGrid
-from methods.steernerf.options import EVERYWHERE, Model, Rendering, Reprojection, Skips
+from methods.steernerf.options import EVERYWHERE, Model, Rendering, Skips
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.training.options import JointOptions, MotionOptions
 from methods.steernerf.unet import UNet
@@ -23,14 +23,12 @@ from methods.steernerf_lean.options import LeanJointOptions, LeanModel, LeanRend
 from methods.steernerf_lean.pipeline import LeanPipeline
 
 SMALL_GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)
-EXACT = Reprojection("nearest", "exact", "expected")
 MODEL = Model(
     channels=4,
     frames=2,
     scale=4,
     step=8.0,
     stop=STOP,
-    reprojection=EXACT,
     feature_background=0.5,
 )
 RENDERING = Rendering(8.0, STOP, EVERYWHERE, Skips(empty=True, hidden=True))

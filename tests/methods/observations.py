@@ -74,7 +74,7 @@ def observe_paper(
     scale: int = 4,
     seed: int = 0,
 ) -> Observation:
-    """Random features in steps of 1/256, and points of preceding frames on a third of the pixels."""
+    """Random features in steps of 1/256, and preceding points on a third of the pixels."""
     frame, fine, generator = _frame(height, width, channels, scale, None, seed)
     preceding = [_scattered(fine, 0.33, channels, generator) for _ in range(frames)]
     return Observation(frame, preceding, "auto")

@@ -50,7 +50,7 @@ from methods.rendering import field, rays
 from methods.rendering.occupancy import EVERY, STEP
 from methods.steernerf.kernels.splat import splat
 from methods.steernerf.method import SteerNerf
-from methods.steernerf.options import RangeReduction, Reprojection
+from methods.steernerf.options import RangeReduction
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.training.joint import JointTraining
 from methods.steernerf.unet import UNet
@@ -86,12 +86,11 @@ EXPECTED = RangeReduction("paper", 0.03, "expected")
 
 
 def steernerf(field: str, **where: Any) -> Method:
-    """The paper's, with its reprojection and range reduction."""
-    release = Reprojection("last", "paper", "sum")
+    """The paper's, with its range reduction."""
     return SteerNerf(
         grid=GRID,
         training=STAGE1,
-        model=small_model(reprojection=release),
+        model=small_model(),
         rendering=small_rendering(range=RangeReduction("paper", 0.03, "sum")),
         renderer=partial(UNet, width=4, aligned=False),
         joint=small_joint(field=field, jitter=True, grid_samples=512, **FEW),

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from bench.cameras import pack_camera, place_camera, unpack_camera
 from bench.motion import preceding, viewing_target
-from bench.types import Camera, Scene
+from bench.types import Camera, Scene, Split
 from methods.steernerf.buffer import Buffer, Cloud
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.training.options import MotionOptions
@@ -24,60 +24,36 @@ from methods.training.checkpoint import part
 
 
 @dataclass(frozen=True)
-class TrueView:
-    """A `camera` and its `picture`, uint8 [H, W, 3 or 4]."""
-
-    camera: Camera
-    picture: Tensor
-
-
-@dataclass(frozen=True)
 class TrainingViews:
-    """The views of a scene that a 2D renderer learns from.
+    """The views of a scene that a 2D renderer learns from: the real ones, then distilled ones, whose
+    pictures a trained field has rendered (Section 3.5)."""
 
-    Attributes:
-        real: the training pictures.
-        target: [3] the point that the cameras look at, roughly.
-        distilled: views whose pictures a trained field has rendered (Section 3.5).
-        share: share of the examples that end in a distilled view.
-    """
-
-    real: Sequence[TrueView]
-    target: Tensor
-    distilled: Sequence[TrueView] = ()
-    share: float = 0.0
+    cameras: Sequence[Camera]
+    pictures: Sequence[Tensor]  # uint8 [H, W, 3 or 4]
+    real: int  # how many of them are real
+    share: float  # share of the examples that end in a distilled view
+    target: Tensor  # [3] the point that the cameras look at, roughly
 
     @classmethod
-    def of(
-        cls, scene: Scene, distilled: Sequence[TrueView] = (), share: float = 0.0
-    ) -> TrainingViews:
+    def of(cls, scene: Scene, distilled: Split | None = None, share: float = 0.0) -> TrainingViews:
         """The training views of `scene`, and `distilled` ones for a `share` of the examples."""
-        split = scene.splits["train"]
-        real = [TrueView(c, p) for c, p in zip(split.cameras, split.images, strict=True)]
-        return cls(real, viewing_target(scene), distilled, share)
-
-    def __getitem__(self, number: int) -> TrueView:
-        """The real views, then the distilled ones."""
-        return [*self.real, *self.distilled][number]
+        splits = [scene.splits["train"], *([distilled] if distilled else [])]
+        cameras = [camera for split in splits for camera in split.cameras]
+        pictures = [picture for split in splits for picture in split.images]
+        real = len(splits[0].cameras)
+        return cls(cameras, pictures, real, share, viewing_target(scene))
 
 
 @dataclass
 class Example:
-    """A training view and the frames that precede it.
+    """A training view and the frames that precede it."""
 
-    Attributes:
-        number: index of the view among all.
-        truth: the view and its picture.
-        buffer: the preceding frames.
-        uses: how many patches may still be cut from it.
-        lasting: whether it is then continued instead of replaced.
-    """
-
-    number: int
-    truth: TrueView
+    number: int  # of the view
+    camera: Camera
+    picture: Tensor  # the true one
     buffer: Buffer
-    uses: int
-    lasting: bool
+    uses: int  # patches that may still be cut from it
+    lasting: bool  # whether it is then continued instead of replaced
 
 
 class ExamplePool:
@@ -115,24 +91,26 @@ class ExamplePool:
         return example
 
     def _make(self) -> Example:
-        views = self._views
-        distilled = self._chance() < (views.share if views.distilled else 0.0)
-        first, pictures = (len(views.real), views.distilled) if distilled else (0, views.real)
-        number = first + self._random(len(pictures))
+        views, real = self._views, self._views.real
+        distilled = len(views.cameras) - real
+        if self._chance() < (views.share if distilled else 0.0):
+            number = real + self._random(distilled)
+        else:
+            number = self._random(real)
         buffer = Buffer(maxlen=self.pipeline.model.frames)
-        return self._ended(number, self._motion(views[number]), buffer)
+        return self._ended(number, self._motion(views.cameras[number]), buffer)
 
     def _go_on(self, old: Example) -> Example:
         """Continue from the view that `old` ends in, there and back."""
-        back = self._motion(old.truth)
+        back = self._motion(old.camera)
         back = back[len(back) // 2 :]
-        path = [old.truth.camera, *reversed(back), *back[1:]]
+        path = [old.camera, *reversed(back), *back[1:]]
         return self._ended(old.number, path, old.buffer.copy())
 
-    def _motion(self, truth: TrueView) -> list[Camera]:
+    def _motion(self, camera: Camera) -> list[Camera]:
         options = self._options
         count = options.least + self._random(options.length - options.least + 1)
-        return preceding(truth.camera, self._views.target, count, options.degrees, self._generator)
+        return preceding(camera, self._views.target, count, options.degrees, self._generator)
 
     def _ended(self, number: int, motion: Sequence[Camera], buffer: Buffer) -> Example:
         """Make an example after rendering the frames of a `motion` into its `buffer`."""
@@ -141,7 +119,11 @@ class ExamplePool:
                 self.pipeline.remember(camera, buffer, self.rendering)
         # Without preceding frames, continuing would only repeat the view.
         lasting = self._chance() < self._options.longer and frames > 0
-        return Example(number, self._views[number], buffer, self._options.uses, lasting)
+        return self._example(number, buffer, self._options.uses, lasting)
+
+    def _example(self, number: int, buffer: Buffer, uses: int, lasting: bool) -> Example:
+        camera, picture = self._views.cameras[number], self._views.pictures[number]
+        return Example(number, camera, picture, buffer, uses, lasting)
 
     def _chance(self) -> float:
         return torch.rand((), generator=self._generator).item()
@@ -169,18 +151,15 @@ class ExamplePool:
     def _restored(self, tensors: Mapping[str, Tensor]) -> Example:
         number, uses, lasting = tensors["figures"].tolist()
         buffer = Buffer(maxlen=self.pipeline.model.frames)
-        ages = sum(name.endswith(".points") for name in tensors)
-        for age in range(ages):
+        for age in range(sum(name.endswith(".points") for name in tensors)):
             buffer.append(self._unpacked(part(tensors, f"{age}.")))
-        return Example(number, self._views[number], buffer, uses, bool(lasting))
+        return self._example(number, buffer, uses, bool(lasting))
 
     def _unpacked(self, tensors: Mapping[str, Tensor]) -> Cloud:
         device = self.pipeline.background.device
-        parts = {
-            # Cameras alone are float64.
+        cameras = {
             name: place_camera(unpack_camera(x), device)
-            if x.dtype == torch.float64
-            else x.to(device)
             for name, x in tensors.items()
+            if x.dtype == torch.float64  # as nothing else in a cloud
         }
-        return self.pipeline.kept(**parts)
+        return self.pipeline.kept(**{name: x.to(device) for name, x in tensors.items()} | cameras)

@@ -18,7 +18,7 @@ from methods.rendering.batch import opacity_entropy
 from methods.rendering.occupancy import EVERY
 from methods.steernerf.renderer import Renderer2d
 from methods.steernerf.training.options import JointOptions
-from methods.steernerf.training.patches import Batch, PatchSource
+from methods.steernerf.training.patches import Batch, Patches
 from methods.training import checkpoint, loop
 from methods.training.optimiser import cosine, step_at
 
@@ -43,7 +43,7 @@ class JointTraining:
     def __init__(
         self,
         renderer: Renderer2d,
-        patches: PatchSource,
+        patches: Patches,
         options: JointOptions,
         steps: int,
         generator: torch.Generator,

@@ -10,25 +10,14 @@ from typing import Any, Literal
 
 @dataclass(frozen=True)
 class MotionOptions:
-    """The synthetic motions before a training view.
+    """The synthetic motions before a training view."""
 
-    Attributes:
-        degrees: range of the angular speed, in degrees per frame.
-        length: maximum number of frames that precede a view.
-        least: minimum number; fewer than L, and sometimes none, teach the cold start. The release
-            always trains with L.
-        pool: number of examples kept at a time.
-        uses: patches cut from an example before it is replaced.
-        longer: probability that it is continued instead, there and back to its view, so that what
-            is drawn becomes its own history.
-    """
-
-    degrees: tuple[float, float]
-    length: int
-    least: int
-    pool: int
-    uses: int
-    longer: float
+    degrees: tuple[float, float]  # range of the angular speed, in degrees per frame
+    length: int  # maximum number of frames that precede a view
+    least: int  # minimum number; fewer than L, and sometimes none, teach the cold start
+    pool: int  # examples kept at a time
+    uses: int  # patches cut from an example before it is replaced
+    longer: float  # probability that it is continued instead, there and back to its view
 
     def __post_init__(self) -> None:
         low, high = self.degrees
@@ -46,46 +35,23 @@ class MotionOptions:
 
 @dataclass(frozen=True)
 class JointOptions:
-    """How stage 2 is trained.
+    """How stage 2 is trained; rates fall or wave along `methods.training.optimiser.cosine`."""
 
-    Attributes:
-        field: "joint", or "frozen" as stage 1 left it (the ablation of the paper's Table 5).
-        features: how the features beyond RGB start: "random", with random weights, or "constant",
-            1/2 everywhere.
-        rate: initial learning rate of the 2D renderer.
-        field_rate: initial learning rate of the field.
-        final_rate: learning rate of both at the end of the cosine schedule.
-        half_waves: half waves of that schedule, an odd number; see
-            `methods.training.optimiser.cosine`.
-        patch: maximum side of a patch, in low-resolution pixels.
-        patch_share: maximum side of a patch, as a share of the shorter side of the low-resolution
-            frame.
-        batch: patches per step.
-        jitter: whether the samples of each ray have a random phase.
-        opacity_entropy: weight of -o ln o of the rays' opacity o.
-        grid_samples: cells visited in an update of the density grid while the field learns; 0: it
-            stays as stage 1 left it.
-        distilled_views: maximum number of pictures of the stage 1 field, at random views, that are
-            also learned from.
-        distilled_share: share of the patches that come from these pictures.
-        motion: the motion that precedes a training view.
-    """
-
-    field: Literal["joint", "frozen"]
-    features: Literal["random", "constant"]
-    rate: float
-    field_rate: float
-    final_rate: float
-    half_waves: int
-    patch: int
-    patch_share: float
-    batch: int
-    jitter: bool
-    opacity_entropy: float
-    grid_samples: int
-    distilled_views: int
-    distilled_share: float
-    motion: MotionOptions
+    field: Literal["joint", "frozen"]  # frozen: as stage 1 left it (the paper's Table 5)
+    features: Literal["random", "constant"]  # initial features beyond RGB; constant: 1/2
+    rate: float  # initial learning rate of the 2D renderer
+    field_rate: float  # initial learning rate of the field
+    final_rate: float  # final learning rate of both
+    half_waves: int  # half waves of their schedule, an odd number
+    patch: int  # maximum side of a patch, in low-resolution pixels
+    patch_share: float  # the same as a share of the shorter side of the low-resolution frame
+    batch: int  # patches per step
+    jitter: bool  # whether the samples of each ray have a random phase
+    opacity_entropy: float  # weight of -o ln o of the rays' opacity o
+    grid_samples: int  # cells visited per update of the density grid; 0: it stays as it was
+    distilled_views: int  # maximum number of pictures of the stage 1 field to learn from as well
+    distilled_share: float  # share of the patches that come from these pictures
+    motion: MotionOptions  # the motion that precedes a training view
 
     def __post_init__(self) -> None:
         check_options(
@@ -101,10 +67,8 @@ class JointOptions:
         )
 
     def distilled(self, steps: int, frames: int) -> int:
-        """How many distilled views a training of `steps` steps can use.
-
-        With no preceding `frames` (L = 0), examples are never continued.
-        """
+        """How many distilled views a training of `steps` steps can use. With no preceding `frames`
+        (L = 0), examples are never continued."""
         longer = self.motion.longer if frames else 0.0
         examples = self.motion.pool + (1 - longer) * steps * self.batch / self.motion.uses
         return min(self.distilled_views, math.ceil(self.distilled_share * examples))

@@ -1,11 +1,11 @@
-"""Patches of training views, rendered as far as the input of the 2D renderer."""
+"""Patches of training views, rendered as far as the input of the 2D renderer (Section 3.4)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
-from typing import Any, Protocol
+from itertools import accumulate
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from bench.cameras import cast, pixel_grid
 from bench.compositing import composite
 from bench.types import Camera, Rays
 from methods.kernels.types import Pixels
-from methods.rendering.batch import first_pass, second_pass
+from methods.rendering.batch import render_batch
 from methods.rendering.compaction import indices_where
 from methods.rendering.frame import FeatureFrame, sees_matter
 from methods.steernerf.renderer import Observation, Points
@@ -23,83 +23,42 @@ from methods.steernerf.training.examples import Example, ExamplePool
 from methods.steernerf.training.options import JointOptions
 from methods.steernerf.view import View
 
+Shown = tuple[FeatureFrame, Sequence[Points]]
+"""The present features of a patch, and those of preceding frames."""
+
 
 @dataclass(frozen=True)
 class Patch:
-    """A patch of a training view, and the rays of the field that it needs.
+    """A patch of a training view."""
 
-    Attributes:
-        example: the example it was cut from.
-        view: its cameras.
-        truth: [H, W, 3] the true picture.
-        points: the features of each preceding frame, reprojected into `view`.
-        masks: which rays are rendered: of the pixels of `view.low` [h w], then, if the field learns
-            from them, of the points [N] of each preceding frame.
-    """
-
-    example: Example
-    view: View
-    truth: Tensor
-    points: Sequence[Points]
-    masks: Sequence[Tensor]
-
-    def rays(self, chosen: Sequence[Tensor]) -> Rays:
-        """The rays of the `chosen` pixels and points, given as indices for each of `masks`."""
-        pixels, *points = chosen
-        shown = zip(self.example.buffer, points, strict=False)  # no points if none are learned from
-        parts = [(cloud.camera, cloud.source[some]) for cloud, some in shown]
-        return Rays.joined([_rays_of(*part) for part in [(self.view.low, pixels), *parts]])
+    example: Example  # that it was cut from
+    view: View  # its cameras
+    truth: Tensor  # [H, W, 3] the true picture
+    points: Sequence[Points]  # features of preceding frames, reprojected into `view`
+    rendered: Sequence[tuple[Camera, Tensor]]  # cameras, and which of their pixels [h w] have rays:
+    # `view.low`, then, if the field learns from them, the preceding frames
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Patches to learn from.
+    """Patches to learn from."""
 
-    Attributes:
-        observations: the renderer's input for each, with a gradient if the field learns.
-        views: the cameras of each.
-        truth: their true pictures, [B, H, W, 3].
-        opacity: opacity of all rendered rays.
-    """
-
-    observations: Sequence[Any]
+    observations: Sequence[Any]  # the input of the 2D renderer; with a gradient if the field learns
     views: Sequence[View]
-    truth: Tensor
-    opacity: Tensor
-
-
-class PatchSource(Protocol):
-    """A source of patches for a training."""
-
-    def draw(self, count: int) -> Batch:
-        """Draw `count` patches."""
-
-    def state(self) -> dict[str, Tensor]:
-        """What the next patches depend on, besides the pipeline and the random numbers."""
-
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore what `state` returned."""
+    truth: Tensor  # [B, H, W, 3] the true pictures
+    opacity: Tensor  # [R] of all rendered rays
 
 
 class Patches:
-    """Draws batches of random patches from the examples of a pool.
-
-    Args:
-        options: size of a patch, and whether its rays are jittered.
-        learning: whether the field learns.
-    """
+    """Draws batches of random patches from the examples of a pool; `learning` says whether the
+    field learns. A subclass may override `place`, `points` and `observations`."""
 
     def __init__(
-        self,
-        pool: ExamplePool,
-        options: JointOptions,
-        learning: bool,
-        generator: torch.Generator,
+        self, pool: ExamplePool, options: JointOptions, learning: bool, generator: torch.Generator
     ) -> None:
         self.pipeline, self.rendering = pool.pipeline, pool.rendering
         self.pool, self.options = pool, options
         self.learning, self.generator = learning, generator
-        self.state, self.restore = pool.state, pool.restore
 
     def draw(self, count: int) -> Batch:
         """Draw `count` patches, each from an example of the pool."""
@@ -108,19 +67,28 @@ class Patches:
         truth = torch.stack([patch.truth for patch in patches])
         return Batch(observations, [patch.view for patch in patches], truth, opacity)
 
+    def state(self) -> dict[str, Tensor]:
+        """What the next patches depend on, besides the pipeline and the random numbers."""
+        return self.pool.state()
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restore what `state` returned."""
+        self.pool.restore(tensors)
+
     def cut(self, example: Example) -> Patch:
         """Cut a random patch from `example`."""
-        view, options = self.pipeline.view(example.truth.camera), self.options
+        view, options = self.pipeline.view(example.camera), self.options
         size = view.low.height, view.low.width
         largest = min(options.patch, max(1, int(options.patch_share * min(size))))
         height, width = (min(largest, side) for side in size)
         top, left = self.place(example, (height, width), size)
         cut = view.crop(left, top, width, height)
-        seen = sees_matter(cut.low, self.pipeline.occupancy).flatten()
         points = self.points(example, cut)
-        masks = [_shown(p.index, len(p.values)) for p in points] if self.learning else []
-        truth = self._truth(example, top, left, cut.full)
-        return Patch(example, cut, truth, points, [seen, *masks])
+        rendered = [(cut.low, sees_matter(cut.low, self.pipeline.occupancy).flatten())]
+        if self.learning:
+            shown = [_shown(old.index, len(old.values)) for old in points]
+            rendered += zip([cloud.camera for cloud in example.buffer], shown, strict=False)
+        return Patch(example, cut, self._truth(example, top, left, cut.full), points, rendered)
 
     def place(
         self, example: Example, extents: tuple[int, int], size: tuple[int, int]
@@ -129,87 +97,66 @@ class Patches:
         return [self.random(side - extent + 1) for extent, side in zip(extents, size, strict=True)]
 
     def points(self, example: Example, view: View) -> Sequence[Points]:
-        """The features of the preceding frames that the 2D renderer is shown."""
+        """The features of preceding frames that the 2D renderer is shown in `view`."""
         return [self.pipeline.reproject(cloud, view) for cloud in example.buffer]
 
     def _truth(self, example: Example, top: int, left: int, full: Camera) -> Tensor:
         """The true picture [H, W, 3] of the patch. Beyond the border of a picture whose sides are
         no multiples of the scale, its last row and column are repeated."""
-        scale = self.pipeline.model.scale
-        background = self.pipeline.background[:3]
+        scale, background = self.pipeline.model.scale, self.pipeline.background[:3]
         rows = slice(top * scale, top * scale + full.height)
         columns = slice(left * scale, left * scale + full.width)
-        picture = example.truth.picture[rows, columns]
-        part = composite(picture.to(background.device, non_blocking=True), background)
+        picture = example.picture[rows, columns].to(background.device, non_blocking=True)
+        part = composite(picture, background)
         missing = 0, full.width - part.shape[1], 0, full.height - part.shape[0]
         return functional.pad(part.movedim(-1, 0), missing, mode="replicate").movedim(0, -1)
 
     def observe(self, patches: Sequence[Patch]) -> tuple[Sequence[Any], Tensor]:
-        """Compute the renderer's input for `patches`, with a gradient if the field learns, and the
-        opacities of the rays."""
-        masks = [mask for patch in patches for mask in patch.masks]
-        found = indices_where(masks)
-        chosen = list(_of_each(patches, found))
-        rays = Rays.joined([p.rays(some) for p, some in zip(patches, chosen, strict=True)])
-        field, how, jitter = self.pipeline.field, self.rendering.march, None
+        """Compute the input of the 2D renderer for `patches`, and the opacities of their rays."""
+        rendered = [part for patch in patches for part in patch.rendered]
+        chosen = indices_where([mask for _, mask in rendered])
+        parts = [_rays_of(camera, some) for (camera, _), some in zip(rendered, chosen, strict=True)]
+        rays, field, jitter = Rays.joined(parts), self.pipeline.field, None
         if self.options.jitter:
             jitter = torch.rand(len(rays.origins), generator=self.generator)
             jitter = jitter.to(field.device, non_blocking=True)
-        first = first_pass(field, rays, self.pipeline.occupancy, how, jitter=jitter)
-        samples = first.visible()
         with torch.set_grad_enabled(self.learning):
-            pixels = second_pass(field, rays, samples, how)
-            rendered = _of_each(patches, _split(pixels, [len(some) for some in found]))
-            given = list(zip(patches, chosen, rendered, strict=True))
-            frames = [self._frame(patch, some[0], parts[0]) for patch, some, parts in given]
-            learned = [self._learned(patch, some[1:], parts[1:]) for patch, some, parts in given]
-            return self.observations(patches, frames, learned), pixels.alpha
+            march, occupancy = self.rendering.march, self.pipeline.occupancy
+            pixels, _ = render_batch(field, rays, occupancy, march, jitter=jitter)
+            ends = accumulate(len(some) for some in chosen)
+            of_each = iter(
+                [(x, pixels.take(slice(end - len(x), end))) for x, end in zip(chosen, ends)]
+            )
+            shown = [
+                (
+                    self._frame(patch.view.low, *next(of_each)),
+                    [self._learned(old, *next(of_each)) for old in patch.points]
+                    if self.learning
+                    else patch.points,
+                )
+                for patch in patches
+            ]
+            return self.observations(patches, shown), pixels.alpha
 
-    def observations(
-        self,
-        patches: Sequence[Patch],
-        frames: Sequence[FeatureFrame],
-        points: Sequence[Sequence[Points]],
-    ) -> Sequence[Any]:
-        """What the 2D renderer is shown of `patches`, whose present features are `frames` and whose
-        preceding ones are `points`."""
-        return [
-            Observation(*both, self.pipeline.backend) for both in zip(frames, points, strict=True)
-        ]
+    def observations(self, patches: Sequence[Patch], shown: Sequence[Shown]) -> Sequence[Any]:
+        """What the 2D renderer is shown of `patches`."""
+        return [Observation(frame, points, self.pipeline.backend) for frame, points in shown]
 
-    def _learned(
-        self, patch: Patch, shown: Sequence[Tensor], rendered: Sequence[Pixels]
-    ) -> Sequence[Points]:
-        """The preceding features of `patch`, those `shown` as `rendered` now, with a gradient."""
-        if not shown:
-            return patch.points
-        background = self.pipeline.background
-        return [
-            replace(old, values=old.values.index_copy(0, some, pixels.over(background).values))
-            for old, some, pixels in zip(patch.points, shown, rendered, strict=True)
-        ]
-
-    def _frame(self, patch: Patch, seen: Tensor, pixels: Pixels) -> FeatureFrame:
-        """The frame of the whole patch, from its rendered pixels, those at indices `seen`."""
-        low = patch.view.low
-        parts = (pixels.values, pixels.depth_sum, pixels.alpha)
-        size = low.height * low.width
-        blanks = (part.new_zeros(size, *part.shape[1:]) for part in parts)
-        canvas = Pixels(
-            *(b.index_copy(0, seen, part) for b, part in zip(blanks, parts, strict=True))
-        )
+    def _frame(self, low: Camera, seen: Tensor, pixels: Pixels) -> FeatureFrame:
+        """The frame of the whole patch, from its rendered `pixels`, those at indices `seen`."""
+        canvas = Pixels.blank(low.height * low.width, pixels.values.shape[1], seen.device)
+        canvas.put(seen, pixels)
         frame = FeatureFrame.of(low, canvas, self.pipeline.background)
         return replace(frame, depth=frame.depth.detach())
+
+    def _learned(self, old: Points, shown: Tensor, pixels: Pixels) -> Points:
+        """Preceding features, those of the points `shown` as they are rendered now."""
+        values = pixels.over(self.pipeline.background).values
+        return replace(old, values=old.values.index_copy(0, shown, values))
 
     def random(self, below: int) -> int:
         """A random number of 0 to less than `below`."""
         return int(torch.randint(below, (), generator=self.generator))
-
-
-def _of_each(patches: Iterable[Patch], parts: Iterable[Any]) -> Iterator[Sequence[Any]]:
-    """Group `parts`, one for each mask of all patches, by patch."""
-    following = iter(parts)
-    return (list(islice(following, len(patch.masks))) for patch in patches)
 
 
 def _shown(index: Tensor, count: int) -> Tensor:
@@ -221,8 +168,3 @@ def _shown(index: Tensor, count: int) -> Tensor:
 def _rays_of(camera: Camera, pixels: Tensor) -> Rays:
     """Rays through the centres of `pixels` [P], counted row by row."""
     return cast(camera, pixel_grid(camera.width, camera.height, pixels.device)[pixels])
-
-
-def _split(pixels: Pixels, sizes: list[int]) -> list[Pixels]:
-    parts = (x.split(sizes) for x in (pixels.values, pixels.depth_sum, pixels.alpha))
-    return [Pixels(*part) for part in zip(*parts, strict=True)]
