@@ -25,8 +25,8 @@ from methods.training.checkpoint import part
 
 @dataclass(frozen=True)
 class TrainingViews:
-    """The views of a scene that a 2D renderer learns from: the real ones, then distilled ones, whose
-    pictures a trained field has rendered (Section 3.5)."""
+    """The views of a scene that a 2D renderer learns from: the real ones, then distilled ones, with
+    pictures that a trained field has rendered (Section 3.5)."""
 
     cameras: Sequence[Camera]
     pictures: Sequence[Tensor]  # uint8 [H, W, 3 or 4]

@@ -124,18 +124,14 @@ class Patches:
             march, occupancy = self.rendering.march, self.pipeline.occupancy
             pixels, _ = render_batch(field, rays, occupancy, march, jitter=jitter)
             ends = accumulate(len(some) for some in chosen)
-            of_each = iter(
-                [(x, pixels.take(slice(end - len(x), end))) for x, end in zip(chosen, ends)]
-            )
-            shown = [
-                (
-                    self._frame(patch.view.low, *next(of_each)),
-                    [self._learned(old, *next(of_each)) for old in patch.points]
-                    if self.learning
-                    else patch.points,
-                )
-                for patch in patches
-            ]
+            parts = (pixels.take(slice(e - len(x), e)) for x, e in zip(chosen, ends, strict=True))
+            of_each = zip(chosen, parts, strict=True)
+            shown: list[Shown] = []
+            for patch in patches:
+                frame, points = self._frame(patch.view.low, *next(of_each)), patch.points
+                if self.learning:
+                    points = [self._learned(old, *next(of_each)) for old in points]
+                shown.append((frame, points))
             return self.observations(patches, shown), pixels.alpha
 
     def observations(self, patches: Sequence[Patch], shown: Sequence[Shown]) -> Sequence[Any]:

@@ -14,7 +14,13 @@ from bench.types import Scene, SteerbenchError
 from methods.engines import Inputs
 from methods.steernerf.calibration import Calibration
 from methods.steernerf.pipeline import Pipeline
-from tests.methods.models import new_pipeline, small_model, small_rendering
+from tests.methods.models import (
+    lean_pipeline,
+    lean_rendering,
+    new_pipeline,
+    small_model,
+    small_rendering,
+)
 
 FRAMES: list[Inputs] = [
     (torch.full((frame + 1, 2), float(frame)), torch.arange(frame + 1, dtype=torch.int32))
@@ -24,8 +30,7 @@ FRAMES: list[Inputs] = [
 
 
 def of(scene: Scene, pipeline: Pipeline | None = None, seed: int = 0) -> Calibration:
-    pipeline = pipeline or new_pipeline()
-    return Calibration(pipeline, small_rendering(), scene, (0.0, 2.0), seed)
+    return Calibration(pipeline or new_pipeline(), small_rendering(), scene, (0.0, 2.0), seed)
 
 
 @pytest.fixture
@@ -83,24 +88,33 @@ def test_a_frame_is_recorded_behind_as_many_as_the_buffer_holds_and_one_more(
     ball_scene: Scene, quiet_log: ConsoleLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pipeline, rendered = new_pipeline(small_model(frames=1)), []
-    render = Pipeline.render
+    features = Pipeline.features
 
-    def counted(self, camera, buffer, rendering, probe):
-        rendered.append((camera, len(buffer.frames)))
-        return render(self, camera, buffer, rendering, probe)
+    def counted(self, view, preceding, *rest):
+        rendered.append((view.full.c2w, len(preceding)))
+        return features(self, view, preceding, *rest)
 
-    monkeypatch.setattr(Pipeline, "render", counted)
+    monkeypatch.setattr(Pipeline, "features", counted)
     frames = of(ball_scene, pipeline).record(3, quiet_log)
-    assert [remembered for _, remembered in rendered] == 3 * [0, 1, 1]
+    assert [preceding for _, preceding in rendered] == 3 * [0, 1, 1]
     train = ball_scene.splits["train"].cameras
-    assert [camera for camera, _ in rendered[2::3]] == [train[0], train[8], train[16]]
-    assert pipeline.renderer.engine is None
-    width = pipeline.renderer.layout.width
-    assert [rows.shape[1] for rows, _ in frames] == 3 * [width]
+    views = [train[place].c2w for place in (0, 8, 16)]
+    assert all(map(torch.equal, [c2w for c2w, _ in rendered[2::3]], views))
+    assert [inputs.shape for (inputs,) in frames] == 3 * [(1, 2 * 4, 32, 32)]
     assert not torch.equal(frames[0][0], frames[1][0])
+
+
+def test_of_a_lean_pipeline_only_the_frame_itself_is_recorded(
+    ball_scene: Scene, quiet_log: ConsoleLog
+) -> None:
+    """Not those before it, whose pictures are drawn as well."""
+    pipeline = lean_pipeline()
+    calibration = Calibration(pipeline, lean_rendering(), ball_scene, (0.0, 2.0), 0)
+    frames = calibration.record(3, quiet_log)
+    assert [rows.shape[1] for rows, _ in frames] == 3 * [pipeline.renderer.layout.width]
 
 
 def test_the_seed_decides_the_motions(ball_scene: Scene, quiet_log: ConsoleLog) -> None:
     first, again, other = (of(ball_scene, seed=seed).record(1, quiet_log)[0] for seed in (0, 0, 1))
     assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
-    assert first[0].shape != other[0].shape or not torch.equal(first[0], other[0])
+    assert not torch.equal(first[0], other[0])
