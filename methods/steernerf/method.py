@@ -7,17 +7,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
+import torch
+
+from bench.motion import preceding, viewing_target
 from bench.sources import digest
 from bench.threads import torch_threads
-from bench.types import Budget, Camera, Frame, Log, Probe, Scene
+from bench.types import Budget, Camera, Frame, Log, NullProbe, Probe, Scene
 from methods.engines import Engine, Inputs
 from methods.instant_ngp.field import Precision
 from methods.instant_ngp.stage1 import Setup, train_field
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.encode import HashGrid
 from methods.steernerf.buffer import Buffer
-from methods.steernerf.calibration import Calibration
 from methods.steernerf.options import Model, Rendering
+from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.renderer import Renderer2d
 from methods.steernerf.study import STUDY
 from methods.steernerf.training.options import JointOptions
@@ -29,10 +32,9 @@ class SteerNerf:
 
     Args:
         grid: shape of the hash table.
-        training: how stage 1 trains the field alone, at full resolution; all methods with the same
-            options share the result.
+        training: how stage 1 trains the field alone; methods with the same options share it.
         model: the settings that stage 2 trains for.
-        rendering: the settings chosen after training.
+        rendering: the settings chosen after training; may be replaced between frames.
         renderer: factory of the 2D renderer.
         joint: how stage 2 trains on patches.
         steps: of stage 2; None: `budget.renderer_steps`.
@@ -40,9 +42,6 @@ class SteerNerf:
         engine: computes the network of the 2D renderer once it is trained.
         precision: of the field, "bf16" (packed table, bfloat16 networks) or "fp32".
         name: as shown in result rows.
-
-    Attributes:
-        rendering: may be replaced between frames.
     """
 
     study = STUDY
@@ -108,22 +107,36 @@ class SteerNerf:
         }
 
     def _build_network(self, second: TrainedPipeline, scene: Scene, log: Log) -> None:
-        """Build the network of the 2D renderer with the engine, which computes it from now on.
-
-        The engine is calibrated on frames rendered as in training, so that the result does not
-        depend on `rendering`.
-        """
-        renderer, engine, stage2 = second.pipeline.renderer, self.engine, self.stage2
-        degrees, seed = stage2.joint.motion.degrees, self.setup.seed
-        calibration = Calibration(second.pipeline, stage2.rendering, scene, degrees, seed)
+        """Build the network of the 2D renderer with the engine, which computes it from now on."""
+        renderer, engine = second.pipeline.renderer, self.engine
         count = engine.samples(renderer.network)
-        key = {"trained": second.key, "calibration": digest(Calibration)}
 
         def samples() -> list[Inputs]:
-            return calibration.inputs(count, log.stage_dir("inputs", {**key, "frames": count}), log)
+            return self.record(second.pipeline, scene, count, log)
 
         def folder() -> Path:
-            return log.stage_dir("network", {**key, "engine": engine.key()})
+            key = {"trained": second.key, "engine": engine.key(), "recorded": digest(type(self))}
+            return log.stage_dir("network", key)
 
         built = engine.build(renderer.network, samples, folder, log)
         renderer.engine, self.renderer_bytes = built.run, built.size
+
+    def record(self, pipeline: Pipeline, scene: Scene, count: int, log: Log) -> list[Inputs]:
+        """The inputs of the network in `count` training views, evenly spread, on which an engine is
+        calibrated. They are rendered as in training, so that the result does not depend on
+        `rendering`, each after L + 1 frames of a random smooth motion: even the oldest frame in the
+        buffer had a preceding one."""
+        generator = torch.Generator().manual_seed(self.setup.seed)
+        cameras, target = scene.splits["train"].cameras, viewing_target(scene)
+        rendering, degrees = self.stage2.rendering, self.stage2.joint.motion.degrees
+        network, frames = pipeline.renderer.network, pipeline.model.frames
+        recorded: list[Inputs] = []
+        with log.progress("frames to build the network on", count) as progress:
+            for place in range(count):
+                camera, buffer = cameras[place * len(cameras) // count], Buffer(maxlen=frames)
+                for before in preceding(camera, target, frames + 1, degrees, generator):
+                    pipeline.remember(before, buffer, rendering)
+                with network.register_forward_pre_hook(lambda _, xs: recorded.append(xs)):
+                    pipeline.render(camera, buffer, rendering, NullProbe())
+                progress.advance()
+        return recorded

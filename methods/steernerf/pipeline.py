@@ -12,7 +12,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -31,21 +30,14 @@ from methods.steernerf.view import View
 
 
 class Pipeline:
-    """A field and a 2D renderer that together render frames, one after the other.
+    """A `field` and a 2D `renderer` that together render frames, one after the other.
+
+    `occupancy` says where the field may hold matter, `background` [3] is that of the scene, `model`
+    is what both are trained for.
 
     A subclass may override which preceding frames are used (`select`), what the 2D renderer is
     shown (`observe`), what becomes of its output (`draw`), and what is kept for later frames
-    (`keep`, `remember`).
-
-    Args:
-        field: a field with `model.channels` features.
-        occupancy: where the field may hold matter.
-        background: [3] background colour of the scene.
-        renderer: the 2D renderer; may be replaced later.
-        model: what both are trained for.
-
-    Attributes:
-        kept: the class of what `keep` returns.
+    (`keep`, an object of the class `kept`, and `remember`).
     """
 
     kept: type[Cloud] = Cloud
@@ -60,9 +52,8 @@ class Pipeline:
     ) -> None:
         self.field, self.occupancy, self.renderer = field, occupancy, renderer
         self.model, self.backend = model, field.backend
-        self.background = functional.pad(
-            background, (0, model.channels - 3), value=model.feature_background
-        )  # [K]
+        more = (0, model.channels - 3)
+        self.background = functional.pad(background, more, value=model.feature_background)  # [K]
 
     def view(self, camera: Camera) -> View:
         """The view of `camera`, on the device of the field."""
@@ -83,11 +74,10 @@ class Pipeline:
 
     @torch.no_grad()
     def remember(self, camera: Camera, buffer: Buffer, rendering: Any) -> None:
-        """Update `buffer` as `render` does but draw no picture: no later frame reads it."""
+        """Update `buffer` as `render` does, but draw no picture: no later frame reads it."""
         view, probe = self.view(camera), NullProbe()
         preceding = self.select(buffer, view, rendering, probe)
-        frame = self.features(view, preceding, rendering, probe)
-        buffer.appendleft(Cloud.of(frame))
+        buffer.appendleft(Cloud.of(self.features(view, preceding, rendering, probe)))
 
     def select(
         self, buffer: Sequence[Cloud], view: View, rendering: Any, probe: Probe
@@ -104,20 +94,18 @@ class Pipeline:
         how, reduction = rendering.march, rendering.range
         if preceding and reduction.mode == "paper":
             with probe.stage("depth_reprojection"):
-                cloud = preceding[0]
-                if reduction.depth == "expected":
-                    cloud = cloud.expected()
+                expected = reduction.depth == "expected"
+                cloud = preceding[0].expected() if expected else preceding[0]
                 near_far = cloud.interval(view.low, reduction.epsilon, self.backend)
                 how = how.within(near_far.view(-1, 2))
         with probe.stage("field"):
-            occupancy = self.occupied(rendering)
-            render = everywhere(self.field, occupancy, probe, how)
-            return render_frame(view.low, occupancy, self.background, probe, render)
+            where = self.occupied(rendering)
+            render = everywhere(self.field, where, probe, how)
+            return render_frame(view.low, where, self.background, probe, render)
 
     def reproject(self, cloud: Cloud, view: View) -> Points:
         """Reproject the features of a preceding frame into the present view (Eq. 9, 10)."""
-        index, _ = cloud.splat(view.full, self.backend)
-        return Points(cloud.values, index)
+        return Points(cloud.values, cloud.splat(view.full, self.backend)[0])
 
     def observe(
         self,
@@ -128,7 +116,7 @@ class Pipeline:
         probe: Probe,
     ) -> Any:
         """What the 2D renderer is shown: the present `frame` and the `preceding` features."""
-        points = [self.reproject(cloud, view) for cloud in preceding]
+        points = [self.reproject(cloud, view) for cloud in preceding]  # Eq. 9, 10
         return Observation(frame, points, self.backend)
 
     def draw(self, shown: Any, view: View, rendering: Any, probe: Probe) -> Tensor:
@@ -142,11 +130,8 @@ class Pipeline:
 
     def occupied(self, rendering: Rendering) -> Occupancy:
         """Where rays take samples."""
-        return self.occupancy if rendering.skip.empty else self._full
-
-    @cached_property
-    def _full(self) -> Occupancy:
-        return Occupancy(torch.ones_like(self.occupancy.cells))
+        cells = self.occupancy.cells
+        return self.occupancy if rendering.skip.empty else Occupancy(torch.ones_like(cells))
 
 
 def _finished(camera: Camera, picture: Tensor, frame: FeatureFrame, scale: int) -> Frame:

@@ -18,36 +18,24 @@ UNWATCHED = NullProbe()
 
 @dataclass(frozen=True)
 class Points:
-    """Features of points, `values` [P, C], and the row of `values` that each pixel shows: `index`
-    [...], int32, -1 for none."""
+    """Features of points, and the point that each pixel shows."""
 
-    values: Tensor
-    index: Tensor
+    values: Tensor  # [P, C]
+    index: Tensor  # [...] int32, a row of `values`, -1 for none
 
 
 @dataclass(frozen=True)
 class Observation:
-    """What the 2D renderer is shown.
+    """What the 2D renderer is shown."""
 
-    Attributes:
-        frame: the present features F, [h, w, K].
-        preceding: features of the preceding frames, newest first, with an index for every pixel
-            [H, W]; fewer than L after a cold start.
-        backend: backend of the kernels that a renderer calls.
-    """
-
-    frame: FeatureFrame
-    preceding: Sequence[Points]
-    backend: str
+    frame: FeatureFrame  # the present features F, [h, w, K]
+    preceding: Sequence[Points]  # features of preceding frames, newest first, indices [H, W]; at
+    # most L, fewer after a cold start
+    backend: str  # of the kernels that a renderer calls
 
 
 class Renderer2d(nn.Module, ABC):
-    """Turns observations into pictures with a network.
-
-    Attributes:
-        network: the trainable network.
-        engine: computes the output of `network` in its place, if set; see `methods.engines`.
-    """
+    """Turns observations into pictures with a `network`, which an `engine` computes if set."""
 
     network: Network
     engine: Callable[..., tuple[Tensor, ...]] | None = None

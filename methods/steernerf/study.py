@@ -14,9 +14,7 @@ SKIPS = {
 
 def not_skipped(skips: Mapping[str, str]) -> list[Variant]:
     """Variants that each switch off one of `skips`."""
-    return [
-        Variant(f"{name} not skipped", (f"{setting}=false",)) for name, setting in skips.items()
-    ]
+    return [Variant(f"{name} not skipped", (f"{word}=false",)) for name, word in skips.items()]
 
 
 TABLES = (14, 16, 17, 19)

@@ -23,13 +23,9 @@ class UNet(Renderer2d):
     added to the bilinearly enlarged RGB of the present frame. It has 2,115,587 parameters at L = 2,
     K = 6 and width 64, and gives the outputs of the release (tests/data/steernerf_release.npz).
 
-    Args:
-        channels: K.
-        frames: L.
-        scale: s.
-        width: channels at full resolution; 64 in the release.
-        aligned: whether enlarging the base keeps every pixel in its place. False, as in the
-            release, uses align_corners=True, which moves all pixels but the middle one.
+    `channels`, `frames` and `scale` are K, L and s; `width` is the number of channels at full
+    resolution. Enlarging the base keeps every pixel in its place if `aligned`; the release uses
+    align_corners=True, which moves all pixels but the middle one.
     """
 
     def __init__(
@@ -49,10 +45,8 @@ class UNet(Renderer2d):
     def base(self, observations: Sequence[Observation]) -> Tensor:
         """The pictures [B, H, W, 3] that the network corrects: the present RGB, enlarged."""
         rgb = torch.stack([o.frame.values[..., :3] for o in observations]).permute(0, 3, 1, 2)
-        enlarged = functional.interpolate(
-            rgb, scale_factor=self.scale, mode="bilinear", align_corners=not self.aligned
-        )
-        return enlarged.permute(0, 2, 3, 1)
+        how = {"mode": "bilinear", "align_corners": not self.aligned}
+        return functional.interpolate(rgb, scale_factor=self.scale, **how).permute(0, 2, 3, 1)
 
     def _inputs(self, observation: Observation) -> Tensor:
         """[K (L + 1), H, W]: the RGB of all frames, then their other features."""
@@ -107,19 +101,16 @@ class _Network(Network):
     def products(self, *inputs: Tensor) -> int:
         """Multiplications by weights: every kernel counts once per pixel at its resolution."""
         batch, _, height, width = inputs[0].shape
-        full = batch * (-(-height // 4) * 4) * (-(-width // 4) * 4)
-        used = {
-            full: (self.first, self.enter, self.merge_full, self.leave, self.last),
-            full // 4: (self.at_half, self.merge_half, self.half_again, self.widen_half),
-            full // 16: (self.narrow, self.at_quarter, self.widen_quarter),
-        }
-        return sum(
-            pixels * x.numel()
-            for pixels, layers in used.items()
-            for layer in layers
-            for x in layer.parameters()
-            if x.dim() > 1
-        )
+        pixels = batch * (-(-height // 4) * 4) * (-(-width // 4) * 4)
+        half = (self.at_half, self.merge_half, self.half_again, self.widen_half)
+        quarter = (self.narrow, self.at_quarter, self.widen_quarter)
+
+        def weights(*layers: nn.Module) -> int:
+            return sum(x.numel() for y in layers for x in y.parameters() if x.dim() > 1)
+
+        lower = weights(*half), weights(*quarter)
+        full = weights(self) - sum(lower)
+        return pixels * full + pixels // 4 * lower[0] + pixels // 16 * lower[1]
 
 
 class _Residual(nn.Module):

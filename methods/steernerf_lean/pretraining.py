@@ -64,7 +64,7 @@ def pretrain_renderer(
         )
     with explained(output.parent):
         output.parent.mkdir(parents=True, exist_ok=True)
-    renderer = stage2.placed_renderer(setup)
+    renderer = stage2.new_renderer(setup)
     generator = torch.Generator().manual_seed(setup.seed)
     sources = []
     for number, scene in enumerate(scenes, 1):

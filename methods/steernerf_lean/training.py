@@ -173,10 +173,10 @@ class LeanStage2(Stage2):
     joint: LeanJointOptions
     pipeline, patches, training = LeanPipeline, LeanPatches, LeanTraining
 
-    def new_renderer(self) -> Renderer2d:
+    def make(self) -> Renderer2d:
         """Make an untrained 2D renderer; it reads the preceding picture if L = 1."""
         model = self.model
-        return self.make_renderer(model.channels, model.scale, history=model.frames > 0)
+        return self.renderer(model.channels, model.scale, history=model.frames > 0)
 
     @property
     def rendering(self) -> LeanRendering:

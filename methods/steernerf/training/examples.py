@@ -57,13 +57,8 @@ class Example:
 
 
 class ExamplePool:
-    """Examples that end in randomly chosen views and are replaced as `MotionOptions` says.
-
-    Args:
-        pipeline: renders the frames that precede a view.
-        rendering: how it renders them.
-        views: the views that examples end in.
-    """
+    """Examples that end in randomly chosen `views` and are replaced as `MotionOptions` says; the
+    frames that precede a view are rendered by `pipeline`, as `rendering` says."""
 
     def __init__(
         self,
@@ -79,16 +74,14 @@ class ExamplePool:
 
     def draw(self) -> Example:
         """Draw an example from the pool; counts as one use."""
-        place = self._random(self._options.pool)
-        if place >= len(self._pool):
-            self._pool.append(self._make())
-            place = len(self._pool) - 1
-        elif self._pool[place].uses <= 0:
-            old = self._pool[place]
-            self._pool[place] = self._go_on(old) if old.lasting else self._make()
-        example = self._pool[place]
-        example.uses -= 1
-        return example
+        place = min(self._random(self._options.pool), len(self._pool))
+        old = self._pool[place] if place < len(self._pool) else None
+        if old is None or old.uses <= 0:
+            self._pool[place : place + 1] = [
+                self._go_on(old) if old and old.lasting else self._make()
+            ]
+        self._pool[place].uses -= 1
+        return self._pool[place]
 
     def _make(self) -> Example:
         views, real = self._views, self._views.real

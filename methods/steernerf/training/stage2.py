@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
@@ -33,21 +32,14 @@ as a curve over the steps."""
 class Stage2:
     """What is trained in stage 2, and how.
 
-    A variant of the method overrides `new_renderer`, `rendering`, and the classes of the pipeline,
-    of its patches and of the training.
-
-    Attributes:
-        model: the settings it is trained for.
-        make_renderer: factory of the 2D renderer.
-        joint: how it is trained.
-        after: share of the steps whose weights are used, 1 or one of `MARKS`; one training serves
-            all of them.
+    A variant of the method overrides `make`, `rendering`, and the classes of the pipeline, of its
+    patches and of the training.
     """
 
-    model: Model
-    make_renderer: Callable[..., Renderer2d]
-    joint: JointOptions
-    after: float = 1.0
+    model: Model  # the settings it is trained for
+    renderer: Callable[..., Renderer2d]  # factory of the 2D renderer
+    joint: JointOptions  # how it is trained
+    after: float = 1.0  # share of the steps whose weights are used, 1 or one of `MARKS`
 
     pipeline: ClassVar[type[Pipeline]] = Pipeline
     patches: ClassVar[type[Patches]] = Patches
@@ -58,20 +50,20 @@ class Stage2:
             choices = ", ".join(map(str, MARKS))
             raise ValueError(f"after: expected {choices} or 1, got {self.after}")
 
-    def new_renderer(self) -> Renderer2d:
+    def make(self) -> Renderer2d:
         """Make an untrained 2D renderer."""
-        return self.make_renderer(self.model.channels, self.model.frames, self.model.scale)
+        return self.renderer(self.model.channels, self.model.frames, self.model.scale)
 
     @property
     def rendering(self) -> Any:
-        """How frames are rendered during training: without range reduction, so that one training
-        serves all choices."""
+        """How frames are rendered in training: everywhere, so that one training serves all
+        choices."""
         skips = Skips(empty=True, hidden=True)
         return Rendering(self.model.step, self.model.stop, EVERYWHERE, skips)
 
     def key(self, budget: Budget) -> dict[str, object]:
         """Everything that the training depends on, besides the field of stage 1."""
-        make: Any = self.make_renderer
+        make: Any = self.renderer
         kind, settings = (make.func, make.keywords) if isinstance(make, partial) else (make, {})
         return {
             "renderer_steps": budget.renderer_steps,
@@ -82,17 +74,16 @@ class Stage2:
             "stage2_libraries": libraries(type(self), kind),
         }
 
-    def placed_renderer(self, setup: Setup) -> Renderer2d:
+    def new_renderer(self, setup: Setup) -> Renderer2d:
         """Make the untrained 2D renderer of the seed and the device of `setup`."""
         torch.manual_seed(setup.seed)
-        renderer = self.new_renderer().to(setup.device)
-        return renderer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        made = self.make().to(setup.device)
+        return made.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def patches_of(
         self, pipeline: Pipeline, views: TrainingViews, learning: bool, generator: torch.Generator
     ) -> Patches:
-        """The patches of `views` that `pipeline` renders; its field learns from them if it is
-        `learning`."""
+        """Patches of `views` that `pipeline` renders; its field learns from them if `learning`."""
         pool = ExamplePool(pipeline, self.rendering, views, self.joint.motion, generator)
         return self.patches(pool, self.joint, learning, generator)
 
@@ -120,7 +111,7 @@ def train_stage2(
     random = torch.Generator().manual_seed(setup.seed) if joint.features == "random" else None
     trained.field.widen(model.channels, random)
 
-    renderer, learning = stage2.placed_renderer(setup), joint.field == "joint"
+    renderer, learning = stage2.new_renderer(setup), joint.field == "joint"
     background = scene.background.to(setup.device)
     pipeline = stage2.pipeline(trained.field, trained.occupancy, background, renderer, model)
     views = TrainingViews.of(scene, distilled, joint.distilled_share)
@@ -129,10 +120,12 @@ def train_stage2(
     learned = trained if learning else None
     training = stage2.training(renderer, patches, joint, steps, generator, learned)
     pipeline.renderer, training.seconds = training.outcome, distilled_s
-    marks = {_at(folder, share): math.ceil(share * steps) for share in MARKS}
-    loop.train(training, finished, "training the 2D renderer", log, marks)
+
+    marks = {share: folder / f"after-{share}.safetensors" for share in MARKS}
+    at = {mark: math.ceil(share * steps) for share, mark in marks.items()}
+    loop.train(training, finished, "training the 2D renderer", log, at)
     if stage2.after < 1:
-        mark = _at(folder, stage2.after)
+        mark = marks[stage2.after]
         if not mark.exists():
             raise SteerbenchError(f"{mark} is missing: remove {folder} to train again")
         loop.load(training, mark)
@@ -140,8 +133,3 @@ def train_stage2(
     trained.field.requires_grad_(False).gradients = None
     pipeline.renderer.requires_grad_(False)
     return TrainedPipeline(pipeline, key, training.seconds)
-
-
-def _at(folder: Path, share: float) -> Path:
-    """The file of the weights after a `share` of the steps."""
-    return folder / f"after-{share}.safetensors"

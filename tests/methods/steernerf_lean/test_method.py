@@ -15,7 +15,7 @@ from methods.steernerf.options import RangeReduction
 from methods.steernerf_lean.lean_renderer import LeanRenderer
 from methods.steernerf_lean.method import SteerNerfLean
 from methods.steernerf_lean.options import LeanJointOptions, LeanRendering, LeanSkips
-from tests.methods.models import lean_joint, lean_model, lean_rendering, small_motion
+from tests.methods.models import lean_joint, lean_model, lean_pipeline, lean_rendering, small_motion
 from tests.methods.trainings import GRID, QUICK
 
 BUDGET = Budget("test", steps=40, samples=1024, renderer_steps=4)
@@ -82,3 +82,12 @@ def test_training_renders_everywhere_and_refines_as_its_options_say() -> None:
     assert (rendering.step, rendering.refined, rendering.refined_step) == (4.0, 0.2, 2.0)
     assert (rendering.range.mode, rendering.overlap) == ("off", 0.0)
     assert rendering.skip == LeanSkips(empty=True, hidden=True, background=True)
+
+
+def test_of_a_frame_for_the_engine_only_its_own_inputs_are_recorded(
+    ball_scene: Scene, quiet_log: Log
+) -> None:
+    """Not those of the frames before it, whose pictures are drawn as well."""
+    pipeline = lean_pipeline()
+    frames = new_method().record(pipeline, ball_scene, 3, quiet_log)
+    assert [rows.shape[1] for rows, _ in frames] == 3 * [pipeline.renderer.layout.width]

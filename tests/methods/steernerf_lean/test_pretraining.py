@@ -13,6 +13,7 @@ from torch import Tensor
 
 from bench.console import ConsoleLog
 from bench.types import Budget, Log, Scene, SteerbenchError
+from methods.steernerf.training.joint import JointTraining
 from methods.steernerf.training.patches import Batch
 from methods.steernerf_lean import lean_renderer
 from methods.steernerf_lean.lean_renderer import LeanRenderer
