@@ -57,4 +57,19 @@ def gather(values: Tensor, index: Tensor, *, backend: str = "auto") -> Tensor:
                 f"index: expected -1 to {len(values) - 1} for {len(values)} rows of values, "
                 f"got {least} to {most}"
             )
-    return implementation(__name__, backend, values.device).gather(values, index)
+    chosen = implementation(__name__, backend, values.device)
+    rows = _Gather.apply(values.contiguous(), index.contiguous().view(-1), chosen)
+    return rows.view(*index.shape, values.shape[1])
+
+
+class _Gather(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, values, index, chosen):
+        ctx.save_for_backward(index)
+        ctx.points, ctx.chosen = len(values), chosen
+        return chosen.gather(values.detach(), index)
+
+    @staticmethod
+    def backward(ctx, grad):
+        (index,) = ctx.saved_tensors
+        return ctx.chosen.scatter(grad.contiguous(), index, ctx.points), None, None

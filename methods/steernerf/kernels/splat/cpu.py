@@ -17,42 +17,30 @@ def splat(pixels: Tensor, depth: Tensor, width: int, height: int) -> Tensor:
     """The last point in each pixel."""
     _check_float32(pixels=pixels, depth=depth)
     index = torch.empty(height, width, dtype=torch.int32)
-    _splat(
-        pixels.contiguous().numpy(), depth.contiguous().numpy(), index.numpy(), get_num_threads()
-    )
+    u_v, z = pixels.contiguous().numpy(), depth.contiguous().numpy()
+    _splat(u_v, z, index.numpy(), get_num_threads())
     return index
 
 
 def gather(values: Tensor, index: Tensor) -> Tensor:
-    """The rows of the points that pixels show."""
+    """The rows [P, C] of the points that pixels show."""
     _check_float32(values=values)
-    rows = _Gather.apply(values.contiguous(), index.contiguous().view(-1))
-    return rows.view(*index.shape, values.shape[1])
+    rows = torch.zeros(len(index), values.shape[1])
+    _gather(values.numpy(), index.numpy(), rows.numpy())
+    return rows
+
+
+def scatter(rows: Tensor, index: Tensor, points: int) -> Tensor:
+    """Sums [points, C] of the `rows` of the pixels that show each point."""
+    sums = torch.zeros(points, rows.shape[1])
+    _scatter(rows.numpy(), index.numpy(), sums.numpy())
+    return sums
 
 
 def _check_float32(**tensors: Tensor) -> None:
-    for name, tensor in tensors.items():
-        if tensor.dtype != torch.float32:
-            raise ValueError(
-                f"backend 'cpu' splats float32, got {name} {tensor.dtype}: use backend='reference'"
-            )
-
-
-class _Gather(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, values, index):
-        ctx.save_for_backward(index)
-        ctx.points = len(values)
-        rows = torch.zeros(len(index), values.shape[1])
-        _gather(values.detach().numpy(), index.numpy(), rows.numpy())
-        return rows
-
-    @staticmethod
-    def backward(ctx, grad):
-        (index,) = ctx.saved_tensors
-        grad_values = torch.zeros(ctx.points, grad.shape[1])
-        _scatter(grad.contiguous().numpy(), index.numpy(), grad_values.numpy())
-        return grad_values, None
+    for name, x in tensors.items():
+        if x.dtype != torch.float32:
+            raise ValueError(f"backend 'cpu' splats float32, got {name} {x.dtype}: use 'reference'")
 
 
 @njit(cache=True, parallel=True)

@@ -25,31 +25,22 @@ def splat(pixels: Tensor, depth: Tensor, width: int, height: int) -> Tensor:
 
 
 def gather(values: Tensor, index: Tensor) -> Tensor:
-    """The rows of the points that pixels show."""
+    """The rows [P, C] of the points that pixels show."""
     check_types(torch.float32, values=values)
-    rows = _Gather.apply(values.contiguous(), index.contiguous().view(-1))
-    return rows.view(*index.shape, values.shape[1])
+    rows = values.new_zeros(len(index), values.shape[1])
+    _move(_gather, values, index, rows)
+    return rows
 
 
-class _Gather(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, values, index):
-        ctx.save_for_backward(index)
-        ctx.points = len(values)
-        rows = values.new_zeros(len(index), values.shape[1])
-        _move(_gather, values.detach(), index, rows)
-        return rows
-
-    @staticmethod
-    def backward(ctx, grad):
-        (index,) = ctx.saved_tensors
-        grad_values = grad.new_zeros(ctx.points, grad.shape[1])
-        if torch.are_deterministic_algorithms_enabled():
-            shown = index >= 0
-            grad_values.index_put_((index[shown].long(),), grad[shown], accumulate=True)
-        else:
-            _move(_scatter, grad_values, index, grad.contiguous())
-        return grad_values, None
+def scatter(rows: Tensor, index: Tensor, points: int) -> Tensor:
+    """Sums [points, C] of the `rows` of the pixels that show each point."""
+    sums = rows.new_zeros(points, rows.shape[1])
+    if torch.are_deterministic_algorithms_enabled():
+        shown = index >= 0
+        sums.index_put_((index[shown].long(),), rows[shown], accumulate=True)
+    else:
+        _move(_scatter, sums, index, rows)
+    return sums
 
 
 def _move(kernel: triton.JITFunction, values: Tensor, index: Tensor, rows: Tensor) -> None:

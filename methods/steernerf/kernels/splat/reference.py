@@ -24,5 +24,11 @@ def splat(pixels: Tensor, depth: Tensor, width: int, height: int) -> Tensor:
 
 
 def gather(values: Tensor, index: Tensor) -> Tensor:
-    """The rows of the points that pixels show; index -1 is an appended row of zeros."""
+    """The rows [P, C] of the points that pixels show; index -1 is an appended row of zeros."""
     return torch.cat((values, values.new_zeros(1, values.shape[1])))[index]
+
+
+def scatter(rows: Tensor, index: Tensor, points: int) -> Tensor:
+    """Sums [points, C] of the `rows` of the pixels that show each point."""
+    sums = rows.new_zeros(points + 1, rows.shape[1])
+    return sums.index_put_((index.long(),), rows, accumulate=True)[:-1]
