@@ -12,10 +12,10 @@ from methods.steernerf.renderer import Points
 
 @dataclass(frozen=True)
 class Detail:
-    """The pixels of N cells, `values` [N, s^2, C], and where they are known, `valid` [N, s^2]."""
+    """The pixels of N cells."""
 
-    values: Tensor
-    valid: Tensor
+    values: Tensor  # [N, s^2, C]
+    valid: Tensor  # [N, s^2] where they are known
 
 
 @dataclass(frozen=True)
@@ -25,12 +25,11 @@ class LeanObservation:
     Attributes:
         frame: the present features, [h, w, K].
         background: [K] background that they are composited on.
-        cells: [N] int64, the cells that may show matter; see `cells`.
+        cells: [N] int64, the cells to draw; see `cells`.
         surface: features of the field at the surface of each pixel, which the low-resolution depth
             gives, with the opacity as the last of K + 1 channels; an index for every pixel of
             `cells` [N, s^2].
-        history: the preceding picture, warped into `cells`; None if there is none, after a cold
-            start or with L = 0.
+        history: the preceding picture, warped into `cells`; None after a cold start and at L = 0.
         backend: backend of the kernels that the renderer calls.
     """
 
@@ -44,13 +43,7 @@ class LeanObservation:
 
 @dataclass(frozen=True)
 class Drawing:
-    """What the lean 2D renderer gives.
+    """What the lean 2D renderer gives."""
 
-    Attributes:
-        pictures: [B, H, W, 3].
-        error: [N] estimated error of all cells, observation by observation: the log of the mean
-            squared error of their pixels.
-    """
-
-    pictures: Tensor
-    error: Tensor
+    pictures: Tensor  # [B, H, W, 3]
+    error: Tensor  # [N] estimated log of the mean squared error of each cell, picture by picture

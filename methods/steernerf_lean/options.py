@@ -21,31 +21,21 @@ class LeanModel(Model):
 
 @dataclass(frozen=True)
 class LeanSkips(Skips):
-    """Further work to skip.
+    """Further work to skip."""
 
-    Attributes:
-        background: cells that are not near matter.
-    """
-
-    background: bool
+    background: bool  # cells that are not near matter
 
 
 @dataclass(frozen=True)
 class LeanRendering(Rendering):
-    """Further settings that are chosen after training.
-
-    Attributes:
-        overlap: the preceding frame is dropped if the present view sees less than this share of
-            what it shows; see `history.overlap`.
-        refined: share of the cells whose pixels the field renders instead: those with the largest
-            estimated error.
-        refined_step: ray-marching step in these cells, in diagonals of the cube / 1024.
-    """
+    """Further settings that are chosen after training."""
 
     skip: LeanSkips
-    overlap: float
-    refined: float
-    refined_step: float
+    overlap: (
+        float  # least share of the preceding frame that the present view sees, or it is dropped
+    )
+    refined: float  # share of the cells that the field renders: those with the largest error
+    refined_step: float  # ray-marching step in these cells, in diagonals of the cube / 1024
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -62,25 +52,14 @@ class LeanRendering(Rendering):
 
 @dataclass(frozen=True)
 class LeanJointOptions(JointOptions):
-    """Further settings of stage 2.
+    """Further settings of stage 2."""
 
-    Attributes:
-        error_weight: weight of the squared difference between the estimated log error and the
-            true one.
-        refined: share of the cells that are refined during training.
-        refined_step: ray-marching step in these cells, in diagonals of the cube / 1024.
-        refined_rays: pixels of these cells that the field learns from in a step.
-        clip: maximum norm of the 2D renderer's gradient; None: no clipping.
-        average: decay of the running mean of the 2D renderer's weights, which is the result; 0: the
-            weights themselves.
-    """
-
-    error_weight: float
-    refined: float
-    refined_step: float
-    refined_rays: int
-    clip: float | None
-    average: float
+    error_weight: float  # weight of the squared difference of estimated and true log error
+    refined: float  # share of the cells that are refined during training
+    refined_step: float  # ray-marching step in these cells, in diagonals of the cube / 1024
+    refined_rays: int  # pixels of these cells that the field learns from in a step
+    clip: float | None  # maximum norm of the 2D renderer's gradient; None: no clipping
+    average: float  # decay of the running mean of the weights, which is the result; 0: no mean
 
     def __post_init__(self) -> None:
         super().__post_init__()
