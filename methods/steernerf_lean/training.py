@@ -45,7 +45,7 @@ class LeanPatches(Patches):
     ) -> Sequence[int]:
         """Choose the first row and column of a patch that shows more than background."""
         if example.number not in self._content:
-            self._content[example.number] = self._cells(example.picture)
+            self._content[example.number] = self._cells(self.pool.views.pictures[example.number])
         cells = self._content[example.number]
         chosen = cells[self.random(len(cells))].tolist()
         return [

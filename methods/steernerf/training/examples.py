@@ -49,9 +49,7 @@ class Example:
     """A training view and the frames that precede it."""
 
     number: int  # of the view
-    camera: Camera
-    picture: Tensor  # the true one
-    buffer: Buffer
+    buffer: Buffer  # the preceding frames
     uses: int  # patches that may still be cut from it
     lasting: bool  # whether it is then continued instead of replaced
 
@@ -69,7 +67,7 @@ class ExamplePool:
         generator: torch.Generator,
     ) -> None:
         self.pipeline, self.rendering = pipeline, rendering
-        self._views, self._options, self._generator = views, options, generator
+        self.views, self._options, self._generator = views, options, generator
         self._pool: list[Example] = []
 
     def draw(self) -> Example:
@@ -84,7 +82,7 @@ class ExamplePool:
         return self._pool[place]
 
     def _make(self) -> Example:
-        views, real = self._views, self._views.real
+        views, real = self.views, self.views.real
         distilled = len(views.cameras) - real
         if self._chance() < (views.share if distilled else 0.0):
             number = real + self._random(distilled)
@@ -95,15 +93,16 @@ class ExamplePool:
 
     def _go_on(self, old: Example) -> Example:
         """Continue from the view that `old` ends in, there and back."""
-        back = self._motion(old.camera)
+        camera = self.views.cameras[old.number]
+        back = self._motion(camera)
         back = back[len(back) // 2 :]
-        path = [old.camera, *reversed(back), *back[1:]]
+        path = [camera, *reversed(back), *back[1:]]
         return self._ended(old.number, path, old.buffer.copy())
 
     def _motion(self, camera: Camera) -> list[Camera]:
         options = self._options
         count = options.least + self._random(options.length - options.least + 1)
-        return preceding(camera, self._views.target, count, options.degrees, self._generator)
+        return preceding(camera, self.views.target, count, options.degrees, self._generator)
 
     def _ended(self, number: int, motion: Sequence[Camera], buffer: Buffer) -> Example:
         """Make an example after rendering the frames of a `motion` into its `buffer`."""
@@ -112,11 +111,7 @@ class ExamplePool:
                 self.pipeline.remember(camera, buffer, self.rendering)
         # Without preceding frames, continuing would only repeat the view.
         lasting = self._chance() < self._options.longer and frames > 0
-        return self._example(number, buffer, self._options.uses, lasting)
-
-    def _example(self, number: int, buffer: Buffer, uses: int, lasting: bool) -> Example:
-        camera, picture = self._views.cameras[number], self._views.pictures[number]
-        return Example(number, camera, picture, buffer, uses, lasting)
+        return Example(number, buffer, self._options.uses, lasting)
 
     def _chance(self) -> float:
         return torch.rand((), generator=self._generator).item()
@@ -146,7 +141,7 @@ class ExamplePool:
         buffer = Buffer(maxlen=self.pipeline.model.frames)
         for age in range(sum(name.endswith(".points") for name in tensors)):
             buffer.append(self._unpacked(part(tensors, f"{age}.")))
-        return self._example(number, buffer, uses, bool(lasting))
+        return Example(number, buffer, uses, bool(lasting))
 
     def _unpacked(self, tensors: Mapping[str, Tensor]) -> Cloud:
         device = self.pipeline.background.device

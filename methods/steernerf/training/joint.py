@@ -24,17 +24,11 @@ from methods.training.optimiser import cosine, step_at
 
 
 class JointTraining:
-    """Stage 2 as a `loop.Training`. A subclass may override `judge`, `update` and `outcome`.
+    """Stage 2 as a `loop.Training`: trains `renderer` in place, on patches from `patches`, and the
+    field `trained`, unless that is None: then it is frozen. `generator` is the source of all random
+    numbers, also those of `patches`; `outcome` is the 2D renderer that results.
 
-    Args:
-        renderer: the 2D renderer, trained in place.
-        patches: source of the patches it learns from.
-        steps: number of optimiser steps.
-        generator: source of all random numbers, including those of `patches`.
-        trained: the field of `patches`, trained in place as well; None: it is frozen.
-
-    Attributes:
-        outcome: the 2D renderer that results.
+    A subclass may override `judge`, `update` and `outcome`.
     """
 
     advice = "Try smaller learning rates (method.joint.rate, method.joint.field_rate)."

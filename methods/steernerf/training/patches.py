@@ -77,7 +77,8 @@ class Patches:
 
     def cut(self, example: Example) -> Patch:
         """Cut a random patch from `example`."""
-        view, options = self.pipeline.view(example.camera), self.options
+        options, camera = self.options, self.pool.views.cameras[example.number]
+        view = self.pipeline.view(camera)
         size = view.low.height, view.low.width
         largest = min(options.patch, max(1, int(options.patch_share * min(size))))
         height, width = (min(largest, side) for side in size)
@@ -106,7 +107,9 @@ class Patches:
         scale, background = self.pipeline.model.scale, self.pipeline.background[:3]
         rows = slice(top * scale, top * scale + full.height)
         columns = slice(left * scale, left * scale + full.width)
-        picture = example.picture[rows, columns].to(background.device, non_blocking=True)
+        picture = self.pool.views.pictures[example.number][rows, columns].to(
+            background.device, non_blocking=True
+        )
         part = composite(picture, background)
         missing = 0, full.width - part.shape[1], 0, full.height - part.shape[0]
         return functional.pad(part.movedim(-1, 0), missing, mode="replicate").movedim(0, -1)
