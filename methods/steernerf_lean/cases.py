@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache, partial
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from bench.case import Case, Cell, Property
 from bench.console import ConsoleLog
-from methods.engines import Engine, Inputs, Precision
+from methods.engines import Engine, Inputs
 from methods.engines.openvino_engine import OpenVino
 from methods.engines.tensorrt_engine import TensorRt
 from methods.engines.torch_engine import TorchEngine
@@ -66,9 +66,8 @@ def cases() -> list[Case]:
 @cache
 def _network() -> CellNetwork:
     """The network with the weights that come with the package."""
-    channels, scale = PRETRAINED_LAYOUT.channels, PRETRAINED_LAYOUT.scale
-    shape = {"history": True, "width": 64, "blocks": BLOCKS}
-    return LeanRenderer(channels, scale, **shape, init="pretrained").network.requires_grad_(False)
+    renderer = LeanRenderer(3, 4, history=True, width=64, blocks=BLOCKS, init="pretrained")
+    return renderer.network.requires_grad_(False)
 
 
 def _inputs(rows: Tensor, device: str) -> Inputs:
@@ -84,7 +83,7 @@ def _random_rows(seed: int) -> Tensor:
 
 
 @cache
-def _built(engine: str, device: str, precision: Precision) -> Callable[..., Inputs]:
+def _built(engine: str, device: str, precision: str) -> Callable[..., Inputs]:
     """The network as an engine runs it, calibrated on random views.
 
     Raises:
@@ -99,11 +98,10 @@ def _built(engine: str, device: str, precision: Precision) -> Callable[..., Inpu
 
 
 @torch.no_grad()
-def _outputs(cell: tuple[str, str, str], rows: Tensor) -> list[Tensor]:
+def _outputs(cell: Sequence[str], rows: Tensor) -> list[Tensor]:
     """All outputs for `rows` of an engine, on a device, in a precision, as float64."""
-    engine, device, precision = cell
-    run = _built(engine, device, precision)
-    return [x.cpu().double().clone() for x in run(*_inputs(rows, device))]
+    run = _built(*cell)
+    return [x.cpu().double().clone() for x in run(*_inputs(rows, cell[1]))]
 
 
 def _apart(got: list[Tensor], want: list[Tensor]) -> float:
@@ -123,14 +121,15 @@ def _error(value: float, *cell: str) -> float:
 
 
 def _not_finite(*cell: str) -> float:
-    return float(sum((~x.isfinite()).sum() for x in _outputs(cell, 2e4 * _random_rows(0))))
+    outputs = _outputs(cell, 2e4 * _random_rows(0))
+    return float(sum(x.numel() - int(x.isfinite().sum()) for x in outputs))
 
 
 def _not_saturated(*cell: str) -> float:
     """How many values of the output change when inputs out of range double."""
     rows = _random_rows(0).sign() * 4
     pairs = zip(*(_outputs(cell, factor * rows) for factor in (1, 2)), strict=True)
-    return float(sum((once != twice).sum() for once, twice in pairs))
+    return float(sum(int((once != twice).sum()) for once, twice in pairs))
 
 
 def _spread_of_nan(*cell: str) -> float:
