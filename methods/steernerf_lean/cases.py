@@ -9,6 +9,7 @@ from copy import deepcopy
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -83,7 +84,7 @@ def _random_rows(seed: int) -> Tensor:
 
 
 @cache
-def _built(engine: str, device: str, precision: str) -> Callable[..., Inputs]:
+def _built(engine: str, device: str, precision: Any) -> Callable[..., Inputs]:
     """The network as an engine runs it, calibrated on random views.
 
     Raises:
