@@ -39,13 +39,9 @@ class CellNetwork(Network):
             nn.init.zeros_(layer.bias)
 
     def forward(self, rows: Tensor, neighbours: Tensor) -> tuple[Tensor, ...]:
-        """Compute what `CellInputs.drawn` needs from the `rows` [N, layout.width] of cells with
-        `neighbours` [N, 9].
-
-        Returns:
-            corrections and logits of the shares [N, (3 + layout.history) s^2]; estimated error
-            [N, 1], the log of the mean squared error; matrices [N, 3 (K + 1)].
-        """
+        """Corrections and logits of the shares [N, (3 + layout.history) s^2]; estimated error
+        [N, 1], the log of the mean squared error; matrices [N, 3 (K + 1)]: of cells with the `rows`
+        [N, layout.width] and the `neighbours` [N, 9]."""
         hidden = self.enter(rows).to(rows)
         for block in self.trunk:
             hidden = block(hidden, neighbours, self.backend)

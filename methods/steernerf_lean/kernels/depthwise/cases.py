@@ -21,8 +21,7 @@ products then has at most 23 bits."""
 
 EXACT = Bound("short numbers: 0", 0.0)
 
-FRAME = "a quarter of 200 x 200, 64 channels"
-"""As large as in the lean renderer."""
+FRAME = "a quarter of 200 x 200, 64 channels"  # of the lean renderer
 
 
 def _draw(generator: torch.Generator, shape: Sequence[int]) -> Tensor:

@@ -109,6 +109,8 @@ WARP = Operation(
     },
 )
 
+BACK = "x, y and w rounded 6 times at the size of the picture, looked up twice: 24 reach + 8 u"
+
 
 def cases() -> list[Case]:
     """Enlarging and warping by all backends; the same view again, from many cameras."""
@@ -118,13 +120,8 @@ def cases() -> list[Case]:
     for name, camera in CAMERAS.items():
         reach = max(abs(camera.cx), abs(camera.cy), camera.width, camera.height)
         exact = () if camera.c2w[:, 3].any() else ("fp64",)  # where the pose is exact
-        same = Property(
-            "warp",
-            "the picture is unchanged",
-            "x, y and w rounded 6 times at the size of the picture, looked up twice: 24 reach + 8 "
-            "u",
-            on_backends(24 * reach + 8, *exact),
-        )
+        tolerances = on_backends(24 * reach + 8, *exact)
+        same = Property("warp", "the picture is unchanged", BACK, tolerances)
         for depth in (1e-20, 1.0, 1e20):
             error = partial(_same_error, camera, depth)
             found.append(same.case(f"same pose, {name}, depth {depth:g}", error))
