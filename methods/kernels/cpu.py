@@ -105,10 +105,12 @@ def pack_bf16(low, high):
 
 @njit(cache=True)
 def _round_bits(value):
-    """Bits of a float32 after rounding; the upper half is the bfloat16."""
+    """Bits of a float32 after rounding; the upper half is the bfloat16. NaN stays NaN: rounded like
+    a number, 0x7FFFFFFF would become -0."""
     bits = f32(value).view(np.uint32)
     tie_to_even = u32(u32(bits >> u32(16)) & u32(1))
-    return u32(u32(bits + u32(0x7FFF)) + tie_to_even)
+    rounded = u32(u32(bits + u32(0x7FFF)) + tie_to_even)
+    return rounded if value == value else u32(bits | u32(0x400000))  # the bit of a quiet NaN
 
 
 @intrinsic

@@ -85,8 +85,21 @@ def multiplies_bf16(kind: str) -> bool:
 
 
 def implementation(kernel: str, backend: str, device: torch.device) -> ModuleType:
-    """The module that implements `kernel`, a package, for tensors on `device`."""
+    """The module that implements `kernel`, a package, for tensors on `device`.
+
+    With `auto`, a kernel without a version for the CPU is computed there by its reference.
+
+    Raises:
+        Unavailable: see `resolve`; or the kernel has no such version.
+    """
     name = resolve(backend, device)
+    if backend == "auto" and name not in served(kernel):
+        name = "reference"
+    if name not in served(kernel):
+        raise Unavailable(
+            f"backend={name!r}: {kernel.rpartition('.')[2]} has no such version, only "
+            f"{' and '.join(served(kernel))}: use backend=auto"
+        )
     if name == "cpu":
         _load("methods.kernels.cpu").follow_torch_threads()
     return _load(f"{kernel}.{name}")

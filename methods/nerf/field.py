@@ -8,7 +8,6 @@ from torch.nn import functional
 
 from bench.types import Probe
 from methods.instant_ngp.field import Precision
-from methods.kernels.relu import relu_
 from methods.students.fields import REACH, StudentField
 from methods.students.networks import (
     Dense,
@@ -80,7 +79,7 @@ class NerfField(StudentField):
         for number, layer in enumerate(self.trunk):
             if number == SKIP:
                 hidden = torch.cat((encoded.to(hidden.dtype), hidden), dim=1)
-            hidden = relu_(layer(hidden), backend=self.backend)
+            hidden = layer(hidden).relu_()
         raw = self.opacity(hidden)[:, 0].to(positions.dtype)
         return DENSITY * density_of(raw), hidden
 
@@ -94,7 +93,7 @@ class NerfField(StudentField):
         return torch.cat([self._colours(*pair) for pair in pairs])
 
     def _colours(self, geometry: Tensor, encoded: Tensor) -> Tensor:
-        hidden = relu_(self._view(geometry, encoded), backend=self.backend)
+        hidden = self._view(geometry, encoded).relu_()
         return self.colour(hidden).to(encoded.dtype).sigmoid()
 
     def _view(self, geometry: Tensor, encoded: Tensor) -> Tensor:

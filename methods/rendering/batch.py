@@ -9,7 +9,6 @@ from torch import Tensor
 
 from bench.types import Rays
 from methods.kernels.composite import composite, visible
-from methods.kernels.keep import keep
 from methods.kernels.march import march
 from methods.kernels.types import Extent, Occupancy, Pixels, Samples
 from methods.rendering.compaction import compacts
@@ -56,18 +55,14 @@ class Round:
 
 @dataclass(frozen=True)
 class FirstPass:
-    """The `rounds` in which the samples of R rays were looked at; on a GPU, there is one.
-
-    `backend` is that of the kernels.
-    """
+    """The `rounds` in which the samples of R rays were looked at; on a GPU, there is one."""
 
     rounds: list[Round]
-    backend: str
 
     @property
     def counts(self) -> Tensor:
         """[R] number of visible samples of each ray."""
-        return self._pieces()[1].sum(dim=0)
+        return self._seen()[-1]
 
     def opaque(self) -> Tensor:
         """Which rays have an opacity of more than 0, [R] bool."""
@@ -96,11 +91,38 @@ class FirstPass:
         together = self._together()
         delta = together.delta
         faint = torch.cat([some.sigma for some in self.rounds]) * delta < thin
-        index, counts = keep(*self._pieces(), turns, faint, KEPT_THIN, backend=self.backend)
+        numbers, visible = self._numbered(turns)
+        index = (visible & (~faint | (numbers % KEPT_THIN == 0))).nonzero().squeeze(1)
+        ray = together.ray.index_select(0, index)
+        counts = torch.zeros_like(self.rounds[0].counts)
+        counts.index_add_(0, ray, torch.ones_like(index))
         offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
         longest = together.longest if len(self.rounds) == 1 else None  # it has no more
         lengths = torch.where(faint, KEPT_THIN * delta, delta)
+        # Those of a ray lie in memory in their order, round after round.
+        index = index.index_select(0, ray.argsort(stable=True))
         return replace(together, delta=lengths).chosen(index, offsets, longest)
+
+    def _numbered(self, turns: Tensor) -> tuple[Tensor, Tensor]:
+        """The number of each sample of all rounds on its ray, from its turn [R] on, and whether it
+        is visible; [S] each. Only the visible ones are counted."""
+        numbers, visible = [], []
+        for some, seen in zip(self.rounds, self._seen(), strict=False):
+            own = some.samples.ray
+            number = torch.arange(len(own), device=own.device)
+            number -= some.samples.offsets.index_select(0, own)
+            visible.append(number < some.counts.index_select(0, own))
+            numbers.append(number + (turns + seen).index_select(0, some.ray))
+        return torch.cat(numbers), torch.cat(visible)
+
+    def _seen(self) -> list[Tensor]:
+        """How many visible samples each ray has before each round, and after the last: [R] each."""
+        seen = [torch.zeros_like(self.rounds[0].counts)]
+        for some in self.rounds:
+            of_round = torch.zeros_like(seen[0])
+            some.place(of_round, some.counts)
+            seen.append(seen[-1] + of_round)
+        return seen
 
     def _together(self) -> Samples:
         """The samples of all rounds, one round after the other. `offsets`, `resume` and `longest`
@@ -117,19 +139,6 @@ class FirstPass:
             positions=torch.cat([samples.positions for samples in every]),
             encoded=torch.cat(encoded) if encoded else None,
         )
-
-    def _pieces(self) -> tuple[Tensor, Tensor]:
-        """Where the samples of each ray start in each round, and how many are visible: [K, R]."""
-        total = sum(len(some.samples) for some in self.rounds)
-        of_each = len(self.rounds), len(self.rounds[0].counts)
-        starts = self.rounds[0].counts.new_full(of_each, total)
-        counts = torch.zeros_like(starts)
-        begin = 0
-        for k, some in enumerate(self.rounds):
-            some.place(starts[k], some.samples.offsets[:-1] + begin)
-            some.place(counts[k], some.counts)
-            begin += len(some.samples)
-        return starts, counts
 
 
 def render_batch(
@@ -217,7 +226,7 @@ def first_pass(
             break
         chosen = going if chosen is None else chosen[going]
         start, front = samples.resume[going], left[going]
-    return FirstPass(rounds, field.backend)
+    return FirstPass(rounds)
 
 
 def _densities(field: Field, samples: Samples) -> Tensor:

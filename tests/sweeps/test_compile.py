@@ -57,8 +57,8 @@ def test_a_kernel_that_this_machine_cannot_have_is_not_wrong(monkeypatch):
 
 @pytest.mark.slow
 def test_the_command_computes_the_cases_of_all_modules_in_processes(steerbench, monkeypatch):
-    monkeypatch.setattr("methods.checks.modules", lambda name: ["methods.kernels.relu.cases"])
+    monkeypatch.setattr("methods.checks.modules", lambda name: ["methods.kernels.spherical.cases"])
     assert steerbench("compile").status == 0
-    monkeypatch.setattr("methods.checks.modules", lambda name: ["methods.kernels.relu"])
+    monkeypatch.setattr("methods.checks.modules", lambda name: ["methods.kernels.spherical"])
     with pytest.raises(AttributeError, match="has no attribute 'cases'"):
         steerbench("compile")

@@ -7,16 +7,15 @@ a hash table's gradient are exact in any order.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from bench.case import U16, U32, Agreement, Case, Property
-from methods.kernels.adam import AdamState, hash_adam_, sparse_adam_
+from bench.case import U32, Bound, Case, Given, Operation, Property, uniform
+from methods.kernels.adam import BETAS, AdamState, hash_adam_, sparse_adam_
 from methods.kernels.dispatch import served
-from methods.kernels.encode import HashGrid, SampleGradients, pack
+from methods.kernels.encode import HashGrid, SampleGradients, encode, pack
 
 STEPS = 3
 RATE = 1e-2
@@ -25,17 +24,40 @@ LARGE = 1 << 20
 DYADIC = {"levels": 2, "log2_table": 8, "n_min": 5, "n_max": 9}
 """A dense and a hashed level of 4 and 8 cells along an axis."""
 
+SHARES = tuple(1 / (1 - beta) for beta in BETAS)
+"""Rounding beta changes 1 - beta by at most this many u of itself, 10 and 100; and 1 - beta^n."""
+
+SECOND = 2 * U32 * (1 - BETAS[1] ** STEPS) * (SHARES[1] + 3 * STEPS)
+FIRST = 2 * U32 * (1 - BETAS[0] ** STEPS) * (SHARES[0] + 3 * STEPS)
+OF_STEP = 1.2 * RATE * (2 * SHARES[0] + SHARES[1] + 16)
+
+BOUNDS = {
+    "table": Bound(
+        "a step of at most 1.2 rates is off by the moments, the root of one of them, their "
+        "corrections, and 16 u more: 1.2 rates (2 x 10 + 100 + 16) u; a sum of at most 1.04 by as "
+        "many u; in 3 steps of two backends",
+        2 * STEPS * (OF_STEP + 1.04) * U32,
+    ),
+    "first": Bound(
+        "gradients of at most g by 1 - 0.9^3: 10 u of 1 - beta, 3 roundings a step, twice",
+        lambda given: FIRST * given["most"],
+    ),
+    "second": Bound(
+        "squares of at most g^2 by 1 - 0.99^3: 100 u of 1 - beta, 3 roundings a step, twice",
+        lambda given: SECOND * given["most"] ** 2,
+    ),
+    "steps": Bound("counted: 0", 0.0),
+    "packed": Bound(
+        "of the backend's own table, it is one of the two nearest bfloat16: 2^-7 of a number",
+        lambda given: (given["table"].abs() + 1.2 * STEPS * RATE) / 128,
+    ),
+}
+
 
 def cases() -> list[Case]:
     """Tables in which none, some or all entries have a gradient; tiny and huge gradients."""
-    kernel = Agreement(
-        "adam",
-        served(__package__),
-        "moments of gradients below 6 are sums of products below 36; the table, at most 1 + 3 "
-        "rates, is off by a few roundings a step, its bfloat16 copy by an ulp above 1",
-    )
-    tolerance = STEPS * 4 * 36 * U32 + 2 * U16
-    kinds = ((0, 0.5), (1, 1.0), (5000, 0.0), (5000, 0.3), (5000, 1.0), (LARGE, 0.3))
+    dense = Operation("adam", served(__package__), _dense_steps, BOUNDS)
+    hashed = Operation("hash adam", served(__package__), _hash_steps, BOUNDS)
     first = Property(
         "adam",
         "the step is that of the closed form",
@@ -46,65 +68,73 @@ def cases() -> list[Case]:
         first.case(f"first gradient {gradient:g}", partial(_first_step_error, gradient))
         for gradient in (0.0, 1e-40, 1e-30, 1e-15, 1.0, 1e15)
     ]
-    for count, share in kinds:
-        name, items = f"{share:.0%} of {count:,}", count if count == LARGE else None
-        found.append(kernel.case(name, partial(_prepare, count, share, 2), tolerance, items=items))
+    for count, share in ((0, 0.5), (1, 1.0), (5000, 0.0), (5000, 0.3), (5000, 1.0), (LARGE, 0.3)):
+        make, items = partial(_dense, count, share, 2), count if count == LARGE else None
+        found += dense.cases(f"{share:.0%} of {count:,}", make, items=items)
     for features in (1, 3, 48):
-        make = partial(_prepare, 70, 0.3, features)
-        found.append(kernel.case(f"30% of 70, {features} features", make, tolerance))
+        found += dense.cases(f"30% of 70, {features} features", partial(_dense, 70, 0.3, features))
     for samples, features in ((0, 2), (1, 2), (60, 2), (60, 1), (60, 3)):
-        name = f"hash table, {samples} samples, {features} features"
-        found.append(kernel.case(name, partial(_prepare_hash, samples, features), tolerance))
+        make = partial(_hashed, samples, features)
+        found += hashed.cases(f"{samples} samples, {features} features", make)
     return found
 
 
-def _prepare(
-    count: int, share: float, features: int, device: str
-) -> Callable[[str], tuple[Tensor, ...]]:
-    """With two features, the packed copy is checked, too."""
+def _dense(count: int, share: float, features: int) -> Given:
     generator = torch.Generator().manual_seed(count)
-    table = torch.rand(count, features, generator=generator) * 2 - 1
+    table = uniform(generator, (count, features))
     grads = [
-        torch.randn(count, features, generator=generator)
-        * (torch.rand(count, 1, generator=generator) < share)
+        uniform(generator, (count, features)) * (torch.rand(count, 1, generator=generator) < share)
         for _ in range(STEPS)
     ]
-    table, grads = table.to(device), [grad.to(device) for grad in grads]
-
-    def call(backend: str) -> tuple[Tensor, ...]:
-        trained, state = table.clone(), AdamState.like(table)
-        packed = pack(trained) if features == 2 else None
-        for grad in grads:
-            sparse_adam_(trained, grad.clone(), state, RATE, packed=packed, backend=backend)
-        changed = trained, state.first, state.second, state.steps
-        return changed if packed is None else (*changed, packed[:, None].view(torch.bfloat16))
-
-    return call
+    return {"table": table, "grads": grads, "most": 1.0}
 
 
-def _prepare_hash(samples: int, features: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
-    """The gradient of an entry is at most 3, the sum over its samples of weight and gradient."""
+def _dense_steps(given: Given, backend: str) -> tuple[Tensor, ...]:
+    table, state, packed = _start(given["table"])
+    for grad in given["grads"]:
+        sparse_adam_(table, grad.clone(), state, RATE, packed=packed, backend=backend)
+    return _end(table, state, packed)
+
+
+def _hashed(samples: int, features: int) -> Given:
     grid = HashGrid(**DYADIC, features=features)
     generator = torch.Generator().manual_seed(samples)
-    table = (torch.rand(grid.entries, features, generator=generator) * 2 - 1).to(device)
-    steps = []
+    table = uniform(generator, (grid.entries, features))
+    steps, most = [], 0.0
     for _ in range(STEPS):
         positions = torch.randint(33, (samples, 3), generator=generator) / 32
         grads = torch.randint(-2, 3, (samples, grid.channels), generator=generator) / 4
-        steps.append((positions.to(device), grads.to(device)))
+        steps.append((positions, grads))
+        learned = table.clone().requires_grad_()
+        encoded = encode(positions, learned, grid, backend="reference")
+        (total,) = torch.autograd.grad(encoded, learned, grads.abs())
+        most = max(most, total.max().item())
+    return {"table": table, "steps": steps, "grid": grid, "most": most}
 
-    def call(backend: str) -> tuple[Tensor, ...]:
-        trained, state = table.clone(), AdamState.like(table)
-        packed = pack(trained) if features == 2 else None
-        for positions, grads in steps:
-            gradients = SampleGradients()
-            for part in zip(positions.split(40), grads.split(40), strict=True):
-                gradients.add(*part)
-            hash_adam_(trained, gradients, grid, state, RATE, packed=packed, backend=backend)
-        changed = trained, state.first, state.second, state.steps
-        return changed if packed is None else (*changed, packed[:, None].view(torch.bfloat16))
 
-    return call
+def _hash_steps(given: Given, backend: str) -> tuple[Tensor, ...]:
+    table, state, packed = _start(given["table"])
+    for positions, grads in given["steps"]:
+        parts = SampleGradients()
+        for part in zip(positions.split(40), grads.split(40), strict=True):
+            parts.add(*part)
+        hash_adam_(table, parts, given["grid"], state, RATE, packed=packed, backend=backend)
+    return _end(table, state, packed)
+
+
+def _start(table: Tensor) -> tuple[Tensor, AdamState, Tensor | None]:
+    """With two features, there is a packed copy."""
+    return table.clone(), AdamState.like(table), pack(table) if table.shape[1] == 2 else None
+
+
+def _end(table: Tensor, state: AdamState, packed: Tensor | None) -> tuple[Tensor, ...]:
+    """What has changed; of the packed copy, by how much it is off the table's."""
+    off = table.new_zeros(0) if packed is None else _rounded(packed) - _rounded(pack(table))
+    return table, state.first, state.second, state.steps, off
+
+
+def _rounded(packed: Tensor) -> Tensor:
+    return packed[:, None].view(torch.bfloat16).float()
 
 
 def _first_step_error(gradient: float, backend: str, device: str, precision: str) -> float:

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from bench.case import DTYPES, U32, Agreement, Case, Property, largest_error, on_backends
+from bench.case import (
+    DTYPES,
+    U32,
+    Bound,
+    Case,
+    Given,
+    Operation,
+    Property,
+    largest_error,
+    on_backends,
+)
 from methods.kernels.composite import composite, visible, weights
 from methods.kernels.dispatch import served
 from methods.kernels.types import Intervals, Pixels
@@ -19,7 +30,7 @@ from methods.kernels.types import Intervals, Pixels
 INF = math.inf
 
 DEPTH = 2.0
-"""Largest t of the samples, which bounds the summands, since values are at most 1."""
+"""Largest t of the samples; values and gradients of pixels are at most 1."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +41,6 @@ class Kind:
     most: int
     channels: int = 3
     density: float = 2.0
-    background: bool = False
     carry: bool = False
     stop: float = 0.0
 
@@ -45,17 +55,18 @@ KINDS = {
     "no density": Kind(9, 12, density=0.0),
     "opaque at once": Kind(9, 12, density=1e30),
     "continued": Kind(33, 20, carry=True),
-    "a background a ray": Kind(33, 20, background=True),
-    # A ray could end a sample earlier only if its transmittance is within rounding of `stop`.
+    # A ray could end a sample earlier only if its transmittance, one in 10^6, is within rounding
+    # of `stop`.
+    "stopped after a few samples": Kind(40, 12, stop=0.3),
     "stopped after many samples": Kind(20, 200, stop=0.3),
+    "continued and stopped": Kind(33, 20, carry=True, stop=0.3),
 }
 
 TIMED = Kind(1 << 12, 64)
 
-WEIGHTS = (
-    "transmittance, a product of n rounded exponentials or the exponential of a rounded sum, is "
-    "off by n u in each backend, and so are the weights, which add up to 1; adding them up: n u "
-    "more; t up to 2: 8 (n + 8) u"
+LIGHT = (
+    "a transmittance T = exp(-tau), tau a sum of n, or a product of n, is off by (n + 8) T tau u "
+    "in each backend, T tau < 1"
 )
 
 
@@ -92,20 +103,6 @@ class Bundle:
         counts = self.counts.tolist()
         chosen = self.apply(lambda x: torch.cat([x.split(counts)[i] for i in order.tolist()]))
         return replace(chosen, counts=self.counts[order])
-
-
-@dataclass(frozen=True)
-class Inputs:
-    """Inputs of an agreement: samples, the pixels in front, the background, a gradient."""
-
-    samples: Bundle
-    carry: Pixels | None
-    background: Tensor
-    grad: Tensor
-
-
-Outputs = Callable[[Inputs, float, str], tuple[Tensor, ...]]
-"""Computes results from inputs, stop and backend."""
 
 
 PER_SAMPLE = ("sigma", "values", "t", "delta")
@@ -174,20 +171,13 @@ def cases() -> list[Case]:
 
 def _agreements() -> list[Case]:
     found = []
-    for subject, (outputs, derivation, factor) in OUTPUTS.items():
-        kernel = Agreement(subject, served(__package__), derivation)
-        for name, kind in KINDS.items():
-            # 4 (n + 8) roundings, each relative to the size of t.
-            tolerance = factor(kind) * 4 * (kind.most + 8) * U32 * DEPTH
-            found.append(kernel.case(name, partial(_prepare, outputs, kind), tolerance))
-        if outputs in (_pixels, _gradients):
-            tolerance = factor(TIMED) * 4 * (TIMED.most + 8) * U32 * DEPTH
-            prepare = partial(_prepare, outputs, TIMED)
-            found.append(kernel.case("64 samples a ray", prepare, tolerance, items=1 << 18))
-    return found
+    for name, kind in KINDS.items():
+        for operation in (COMPOSITE, WEIGHTS, VISIBLE):
+            found += operation.cases(name, partial(_given, kind))
+    return [*found, *COMPOSITE.cases("64 samples a ray", partial(_given, TIMED), items=1 << 18)]
 
 
-def _prepare(outputs: Outputs, kind: Kind, device: str) -> Callable[[str], tuple[Tensor, ...]]:
+def _given(kind: Kind) -> Given:
     generator = torch.Generator().manual_seed(kind.rays + kind.most)
     rays, channels = kind.rays, kind.channels
     draw = partial(torch.rand, generator=generator)
@@ -195,58 +185,90 @@ def _prepare(outputs: Outputs, kind: Kind, device: str) -> Callable[[str], tuple
     if kind == Kind(rays, kind.most):
         counts[: rays // 2] = kind.most  # make sure that longest rays occur
     total = int(counts.sum())
-    samples = Bundle(
-        (kind.density * draw(total)).to(device).requires_grad_(),
-        draw(total, channels).to(device).requires_grad_(),
-        (DEPTH * draw(total)).to(device),
-        (2.0 / max(kind.most, 1) * draw(total)).to(device),
-        counts.to(device),
-    )
-    background = draw(rays, channels).to(device) if kind.background else torch.zeros(1)
-    alpha = draw(rays).to(device)
-    in_front = Pixels(alpha[:, None].expand(rays, channels), DEPTH * alpha, alpha)
-    grad = draw(rays, channels + 2).to(device)
-    inputs = Inputs(samples, in_front if kind.carry else None, background.to(device), grad)
-    return partial(outputs, inputs, kind.stop)
+    alpha = draw(rays)
+    carry = Pixels(alpha[:, None].expand(rays, channels), DEPTH * alpha, alpha)
+    return {
+        "sigma": kind.density * draw(total),
+        "values": draw(total, channels),
+        "t": DEPTH * draw(total),
+        "delta": DEPTH / max(kind.most, 1) * draw(total),
+        "counts": counts,
+        "carry": carry if kind.carry else None,
+        "kind": kind,
+    }
 
 
-def _pixels(inputs: Inputs, stop: float, backend: str) -> tuple[Tensor, ...]:
-    pixels = inputs.samples.composite(backend, inputs.carry, stop).over(inputs.background)
+def _bundle(given: Given) -> Bundle:
+    return Bundle(*(given[name] for name in (*PER_SAMPLE, "counts")))
+
+
+def _composite(given: Given, backend: str) -> tuple[Tensor, ...]:
+    pixels = _bundle(given).composite(backend, given["carry"], given["kind"].stop)
     return pixels.values, pixels.depth_sum, pixels.alpha
 
 
-def _gradients(inputs: Inputs, stop: float, backend: str) -> tuple[Tensor, ...]:
-    values, depth_sum, alpha = _pixels(inputs, stop, backend)
-    outputs = torch.cat((values, depth_sum[:, None], alpha[:, None]), dim=1)
-    return torch.autograd.grad(outputs, [inputs.samples.sigma, inputs.samples.values], inputs.grad)
+def _lit(given: Given, backend: str) -> dict[str, Any]:
+    """The optional arguments of `weights` and `visible`."""
+    front = None if given["carry"] is None else 1 - given["carry"].alpha
+    return {"stop": given["kind"].stop, "front": front, "backend": backend}
 
 
-def _found_weights(inputs: Inputs, stop: float, backend: str) -> tuple[Tensor, ...]:
-    samples, front = inputs.samples, None if inputs.carry is None else 1 - inputs.carry.alpha
-    return (weights(samples.sigma, samples.intervals, stop=stop, front=front, backend=backend),)
+def _weights(given: Given, backend: str) -> tuple[Tensor]:
+    return (weights(given["sigma"], _bundle(given).intervals, **_lit(given, backend)),)
 
 
-def _visible(inputs: Inputs, stop: float, backend: str) -> tuple[Tensor, ...]:
-    samples = inputs.samples
-    front = None if inputs.carry is None else 1 - inputs.carry.alpha
-    return visible(samples.sigma, samples.intervals, stop=0.3, front=front, backend=backend)
+def _visible(given: Given, backend: str) -> tuple[Tensor, ...]:
+    return visible(given["sigma"], _bundle(given).intervals, **_lit(given, backend))
 
 
-OUTPUTS: dict[str, tuple[Outputs, str, Callable[[Kind], int]]] = {
-    "composite": (_pixels, WEIGHTS, lambda kind: 1),
-    "composite backward": (
-        _gradients,
-        WEIGHTS + "; a gain is a product with K + 2 gradients of at most 1: K + 2 times that",
-        lambda kind: kind.channels + 2,
-    ),
-    "composite weights": (_found_weights, WEIGHTS, lambda kind: 1),
-    "composite visible": (
-        _visible,
-        WEIGHTS + "; a count is off by one if a transmittance, one in 10^6, is so near to the stop",
-        lambda kind: 1,
-    ),
-}
-"""What is computed, the derivation of its tolerance, and the factor of the tolerance."""
+def _roundings(given: Given) -> float:
+    """Those of a transmittance in both backends: 2 (n + 8) u."""
+    return 2 * (given["kind"].most + 8) * U32
+
+
+def _of_weights(given: Given) -> Tensor:
+    return _roundings(given) * (given["sigma"] * given["delta"]).clamp(max=1)
+
+
+def _of_sigma(given: Given) -> Tensor:
+    channels = given["kind"].channels
+    gain = channels + DEPTH + 1
+    return given["delta"] * gain * (2 * _roundings(given) + 2 * (channels + 2) * U32)
+
+
+SUM = f"{LIGHT}, and so are the weights together; adding them up, n u more: 4 (n + 8) u"
+OF_A_WEIGHT = f"{LIGHT}; a weight is at most tau_i T: 2 (n + 8) min(tau_i, 1) u"
+
+COMPOSITE = Operation(
+    "composite",
+    served(__package__),
+    _composite,
+    {
+        "values": Bound(SUM, lambda given: 2 * _roundings(given)),
+        "depth_sum": Bound("by t of at most 2, twice that", lambda given: 4 * _roundings(given)),
+        "alpha": Bound("that of the values", lambda given: 2 * _roundings(given)),
+    },
+    {
+        "sigma": Bound(
+            "length times a difference of weighted gains; a gain is a sum of K + 2 products of at "
+            "most K + 3: delta (K + 3) (4 (n + 8) + 2 (K + 2)) u",
+            _of_sigma,
+        ),
+        "values": Bound(OF_A_WEIGHT, lambda given: _of_weights(given)[:, None]),
+    },
+)
+WEIGHTS = Operation(
+    "composite weights", served(__package__), _weights, {"weights": Bound(OF_A_WEIGHT, _of_weights)}
+)
+VISIBLE = Operation(
+    "composite visible",
+    served(__package__),
+    _visible,
+    {
+        "counts": Bound("no transmittance is within rounding of the stop: 0", 0.0),
+        "left": Bound(f"{LIGHT}: 2 (n + 8) u", _roundings),
+    },
+)
 
 
 def _samples(extreme: tuple[float, float]) -> Bundle:
@@ -334,11 +356,6 @@ def _change_error(changed: Change, backend: str, device: str, precision: str) ->
     return change_error(changed, random_rays(0, 50, 64), backend, device)
 
 
-def _joined(parts: Sequence[Pixels]) -> Pixels:
-    columns = ("values", "depth_sum", "alpha")
-    return Pixels(*(torch.cat([getattr(part, name) for part in parts]) for name in columns))
-
-
 def split_interval(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
     """Composite the front half of each ray first, then the rest behind it as `carry`."""
     half = samples.counts // 2
@@ -348,18 +365,14 @@ def split_interval(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
     return samples.composite(backend), behind.composite(backend, front.composite(backend))
 
 
-def permute_rays(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
-    """Composite the rays in reverse order."""
-    order = torch.arange(len(samples.counts)).flip(0)
-    return samples.composite(backend).take(order), samples.rays(order).composite(backend)
-
-
 def split_batch(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
-    """Composite every third ray in a batch of its own."""
-    order = torch.arange(len(samples.counts))
-    parts = [order[order % 3 == 0], order[order % 3 != 0]]
-    apart = _joined([samples.rays(part).composite(backend) for part in parts if len(part)])
-    return samples.composite(backend).take(torch.cat(parts)), apart
+    """Composite the rays in reverse order, every third one in a batch of its own."""
+    whole, order = samples.composite(backend), torch.arange(len(samples.counts)).flip(0)
+    apart = whole.take(order)
+    for part in (order[order % 3 == 0], order[order % 3 != 0]):
+        if len(part):
+            apart.put(part, samples.rays(part).composite(backend))
+    return whole, apart
 
 
 def separate_channels(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
@@ -388,15 +401,6 @@ def add_empty_sample(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
     return samples.composite(backend), more.composite(backend)
 
 
-def add_backgrounds(samples: Bundle, backend: str) -> tuple[Pixels, Pixels]:
-    """Composite onto the sum of two backgrounds; compare with the sum of the separate results."""
-    one, other = samples.values.new_tensor(((0.2, 0.5, 1.0), (0.7, 0.1, 0.4)))
-    none = samples.composite(backend)
-    first, second = (none.over(background) for background in (one, other))
-    values = first.values + second.values - none.values
-    return none.over(one + other), Pixels(values, none.depth_sum, none.alpha)
-
-
 def _rank(samples: Bundle) -> Tensor:
     """The index [S] of each sample on its ray."""
     counts = samples.counts
@@ -412,17 +416,9 @@ CHANGES = (
         "two pixels of up to 2, and 1 - alpha between them: 64 u",
         on_backends(64),
     ),
-    ("rays permuted", permute_rays, "each ray stays what it is", SAME, SAME_SUM),
     ("batch split", split_batch, "each ray stays what it is", SAME, SAME_SUM),
     ("channels apart", separate_channels, "each channel stays what it is", SAME, SAME_SUM),
     ("empty sample added", add_empty_sample, "nothing changes", SAME, SAME_SUM),
-    (
-        "sum of backgrounds",
-        add_backgrounds,
-        "pixels are linear in the background",
-        "three products and sums of up to 4: 16 u",
-        on_backends(16),
-    ),
 )
 """Changes that may be made to rays, and what must hold for each."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -15,12 +14,14 @@ from bench.case import (
     DTYPES,
     U16,
     U32,
-    Agreement,
+    Bound,
     Case,
-    Prepare,
+    Given,
+    Operation,
     Property,
     largest_error,
     on_backends,
+    uniform,
 )
 from methods.kernels.dispatch import served
 from methods.kernels.encode import PRIMES, HashGrid, encode, pack
@@ -40,58 +41,82 @@ BELOW_1 = 1 - 2.0**-24
 """The float32 before 1."""
 
 FEATURES = (
-    "a position is off by 2 u N_max along each of 3 axes, where values of at most 1 differ by 2; a "
-    "blend of 8 corners has 11 roundings: 12 N_max + 11 u; bf16: half an ulp more"
+    "at a level of N cells a position is off by 2 u N along each of 3 axes, where values of at "
+    "most 1 differ by 2; a blend of 8 corners has 11 roundings: 12 N + 11 u; bf16: half an ulp more"
 )
 SUMS = (
-    "an entry sums gradients of at most 1 over n samples; a weight is off by its 3 fractions, a "
-    "partial sum by n u; 2 n independent roundings add up to 6 sqrt(n) of them but for one case in "
-    "10^8 (Higham, Mary 2019)"
+    "an entry sums gradients of at most 1 over n samples by weights that add up to w; a weight is "
+    "off by its 3 fractions, 6 N u, and a sum by w u; of 2 n independent roundings, 8 sqrt(n) add "
+    "up, but for one entry in 10^13 (Higham, Mary 2019)"
+)
+
+
+def _of_features(given: Given) -> Tensor:
+    """Tolerance of the features of each channel; see `FEATURES`."""
+    grid = given["grid"]
+    rounding = 0.0 if given["packed"] is None else U16
+    of_level = [_units(scale) * U32 + rounding for scale in grid.scales]
+    return torch.tensor(of_level).repeat_interleave(grid.features)
+
+
+def _of_sums(given: Given) -> Tensor:
+    """Tolerance of the gradient of each entry of the table, [entries, 1]; see `SUMS`."""
+    grid, tolerance = given["grid"], []
+    for level, (scale, size) in enumerate(zip(grid.scales, grid.sizes, strict=True)):
+        entries, weights = corners(given["positions"], grid, level)
+        entry = entries.flatten() - grid.offsets[level]
+        count = torch.bincount(entry, minlength=size)
+        total = torch.bincount(entry, weights.flatten(), minlength=size)
+        tolerance.append(8 * count.sqrt() * (6 * scale + total) * U32)
+    return torch.cat(tolerance)[:, None]
+
+
+def _units(cells: float) -> float:
+    """Tolerance of a feature in units of u; see `FEATURES`."""
+    return 12 * cells + 11
+
+
+def _encode(given: Given, backend: str) -> tuple[Tensor]:
+    inputs = given["positions"], given["table"], given["grid"]
+    return (encode(*inputs, packed=given["packed"], backend=backend),)
+
+
+ENCODE = Operation(
+    "encode",
+    served(__package__),
+    _encode,
+    {"features": Bound(FEATURES, _of_features)},
+    {"table": Bound(SUMS, _of_sums)},
 )
 
 
 def cases() -> list[Case]:
     """Awkward shapes; one view; positions at borders, on grid lines and outside; a huge table."""
-    return [*_agreements(), *_extremes()]
-
-
-def _agreements() -> list[Case]:
-    backends = served(__package__)
-    forward = Agreement("encode", backends, FEATURES)
-    backward = Agreement("encode backward", backends, SUMS)
-    shapes: list[tuple[str, HashGrid, Tensor]] = [
-        ("no sample", SMALL, _random(0)),
-        ("one sample", SMALL, _random(1)),
-        ("257 samples", SMALL, _random(257)),
-        ("three features", ODD, _random(1000)),
-    ]
     found = []
-    for name, grid, positions in shapes:
-        found += [
-            forward.case(name, _features(positions, grid), _units(grid) * U32),
-            backward.case(name, _gradient(positions, grid), _sum_error(positions, grid)),
-        ]
-    edges = _product(0.0, 0.5, 1.0).float()
-    found.append(forward.case("corners", _features(edges, SMALL), _units(SMALL) * U32))
-    for name, grid, positions, items in (
-        ("257 samples", SMALL, _random(257), None),
-        ("view", LARGE, _view(VIEW), VIEW),
-        ("random", LARGE, _random(VIEW), VIEW),
+    for name, grid, positions, packed in (
+        ("no sample", SMALL, _random(0), False),
+        ("one sample", SMALL, _random(1), False),
+        ("257 samples", SMALL, _random(257), False),
+        ("three features", ODD, _random(1000), False),
+        ("corners", SMALL, _product(0.0, 0.5, 1.0).float(), False),
+        ("257 samples, packed", SMALL, _random(257), True),
+        ("view", LARGE, _view(VIEW), False),
+        ("random", LARGE, _random(VIEW), False),
+        ("view, packed", LARGE, _view(VIEW), True),
+        ("random, packed", LARGE, _random(VIEW), True),
     ):
-        if items:
-            tolerance = _sum_error(positions, grid)
-            found += [
-                forward.case(name, _features(positions, grid), _units(grid) * U32, items=items),
-                backward.case(name, _gradient(positions, grid), tolerance, items=items),
-            ]
-        packed, tolerance = _features(positions, grid, packed=True), _units(grid) * U32 + U16
-        found.append(
-            forward.case(f"{name}, packed", packed, tolerance, precision="bf16", items=items)
-        )
-    packed = _gradient(_random(257), SMALL, packed=True)
-    tolerance = _sum_error(_random(257), SMALL)
-    found.append(backward.case("257 samples, packed", packed, tolerance, precision="bf16"))
-    return found
+        make, items = partial(_given, positions, grid, packed), VIEW if grid is LARGE else None
+        precision = "bf16" if packed else "fp32"
+        found += ENCODE.cases(name, make, precision=precision, items=items)
+    return [*found, *_extremes()]
+
+
+def _given(positions: Tensor, grid: HashGrid, packed: bool) -> Given:
+    """A random table of values of magnitude at most 1."""
+    generator = torch.Generator().manual_seed(len(positions))
+    table = uniform(generator, (grid.entries, grid.features))
+    words = pack(table) if packed else None
+    return {"positions": positions, "table": table, "grid": grid, "packed": words}
 
 
 def _random(count: int) -> Tensor:
@@ -109,53 +134,8 @@ def _view(count: int) -> Tensor:
     return (origin[..., None, :] + t[:, None] * direction[..., None, :]).reshape(-1, 3)
 
 
-def _units(grid: HashGrid) -> float:
-    """Tolerance of a feature in units of u; see `FEATURES`."""
-    return 12 * grid.n_max + 11
-
-
-def _sum_error(positions: Tensor, grid: HashGrid) -> float:
-    """Tolerance of a gradient; see `SUMS`. Sums are longest at the coarsest level."""
-    entries, _ = corners(positions, grid, 0)
-    touched = int(entries.flatten().bincount().max()) if len(positions) else 0
-    return 6 * math.sqrt(touched) * (3 * 2 * U32 * grid.n_max + touched * U32)
-
-
-def _random_table(count: int, grid: HashGrid, device: str) -> Tensor:
-    """A table of values of magnitude at most 1."""
-    generator = torch.Generator().manual_seed(count)
-    return (torch.rand(grid.entries, grid.features, generator=generator) * 2 - 1).to(device)
-
-
-def _features(positions: Tensor, grid: HashGrid, *, packed: bool = False) -> Prepare:
-    def prepare(device: str) -> Callable[[str], tuple[Tensor, ...]]:
-        placed, table = positions.to(device), _random_table(len(positions), grid, device)
-        words = pack(table) if packed else None
-        return lambda backend: (encode(placed, table, grid, packed=words, backend=backend),)
-
-    return prepare
-
-
-def _gradient(positions: Tensor, grid: HashGrid, *, packed: bool = False) -> Prepare:
-    def prepare(device: str) -> Callable[[str], tuple[Tensor, ...]]:
-        placed, table = positions.to(device), _random_table(len(positions), grid, device)
-        words = pack(table) if packed else None
-        table.requires_grad_()
-        generator = torch.Generator().manual_seed(1)
-        grad = (torch.rand(len(positions), grid.channels, generator=generator) * 2 - 1).to(device)
-        grad = grad.bfloat16() if packed else grad
-
-        def call(backend: str) -> tuple[Tensor, ...]:
-            features = encode(placed, table, grid, packed=words, backend=backend)
-            return torch.autograd.grad(features, table, grad)
-
-        return call
-
-    return prepare
-
-
 def _extremes() -> list[Case]:
-    packed = {(backend, "bf16"): _units(GRID) * U32 + U16 for backend in ("reference", "cpu")}
+    packed = {(backend, "bf16"): _units(GRID.n_max) * U32 + U16 for backend in ("reference", "cpu")}
     kinds = {
         "at 0": _product(0.0),
         "at 1": _product(1.0),
@@ -168,7 +148,7 @@ def _extremes() -> list[Case]:
         "encode",
         "features are those of the closed form at the nearest position in the cube",
         FEATURES,
-        on_backends(_units(GRID), "fp64") | packed,
+        on_backends(_units(GRID.n_max), "fp64") | packed,
     )
     not_a_number = Property(
         "encode",
@@ -177,7 +157,10 @@ def _extremes() -> list[Case]:
         dict.fromkeys([*on_backends(0), *packed], 0.0),
     )
     huge = Property(
-        "encode", "features are those of the closed form", FEATURES, on_backends(_units(LARGEST))
+        "encode",
+        "features are those of the closed form",
+        FEATURES,
+        on_backends(_units(LARGEST.n_max)),
     )
     return [
         *(closed_form.case(name, partial(_feature_error, at)) for name, at in kinds.items()),

@@ -7,13 +7,13 @@ that it is exact in any order, and no activation lies within rounding of the cor
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from bench.case import DTYPES, Agreement, Case
+from bench.case import DTYPES, Bound, Case, Given, Operation
 from methods.kernels.dispatch import served
 from methods.kernels.mlp import mlp
 
@@ -23,12 +23,26 @@ DENSITY, FEATURES = ((32,), (64, 16)), ((16, 16), (64, 64, 3))
 MANY = 1 << 17
 
 
+def _eighths(generator: torch.Generator, shape: Sequence[int], most: int = 8) -> Tensor:
+    """Random multiples of 1/8, of at most `most`/8."""
+    return torch.randint(-most, most + 1, tuple(shape), generator=generator) / 8
+
+
+EXACT = Bound("sums of few bits: 0", 0.0)
+MLP = Operation(
+    "mlp",
+    served(__package__),
+    lambda given, backend: (mlp(given["inputs"], given["weights"], backend=backend),),
+    {"outputs": EXACT},
+    {"inputs": EXACT, "weights": EXACT},
+    _eighths,
+)
+
+
 def cases() -> list[Case]:
     """No sample, one, more than go together; a sample of NaN; many, timed; bfloat16."""
-    forward = Agreement("mlp", served(__package__), "sums of few bits: 0")
-    backward = Agreement("mlp backward", served(__package__), "sums of few bits: 0")
     found = []
-    for count, (inputs, widths), dtype in (
+    for count, network, precision in (
         (0, DENSITY, "fp32"),
         (1, FEATURES, "fp32"),
         (97, ((7, 4), (20, 5)), "fp32"),
@@ -39,62 +53,28 @@ def cases() -> list[Case]:
         (MANY, DENSITY, "fp32"),
         (MANY, FEATURES, "fp32"),
     ):
-        name = f"{count:,} of {' and '.join(map(str, inputs))}, {', '.join(map(str, widths))}"
-        name += ", bf16" if dtype == "bf16" else ""
-        items = count if count == MANY else None
-        for kind, prepare in ((forward, _forward), (backward, _backward)):
-            found.append(
-                kind.case(
-                    name,
-                    partial(prepare, count, inputs, widths, dtype),
-                    0.0,
-                    precision=dtype,
-                    items=items,
-                )
-            )
-    return [*found, forward.case("a sample of NaN", _with_nan, 0.0)]
+        inputs, widths = (", ".join(map(str, channels)) for channels in network)
+        name = f"{count:,} of {inputs} to {widths}" + ", bf16" * (precision == "bf16")
+        make, items = (
+            partial(_network, count, *network, precision),
+            count if count == MANY else None,
+        )
+        found += MLP.cases(name, make, precision=precision, items=items)
+    return [*found, *MLP.cases("a sample of NaN", _with_nan)]
 
 
-def _eighths(seed: int, most: int, *shape: int) -> Tensor:
-    """Random multiples of 1/8, of at most `most`/8."""
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randint(-most, most + 1, shape, generator=generator) / 8
-
-
-def _network(
-    count: int, inputs: Sequence[int], widths: Sequence[int], dtype: str, device: str
-) -> tuple[list[Tensor], list[Tensor]]:
-    given = [_eighths(seed, 8, count, channels) for seed, channels in enumerate(inputs)]
+def _network(count: int, inputs: Sequence[int], widths: Sequence[int], precision: str) -> Given:
+    generator = torch.Generator().manual_seed(count)
     channels = (sum(inputs), *widths)
-    layers = [_eighths(9 + n, 1, channels[n + 1], channels[n]) for n in range(len(widths))]
-    return _placed(given, dtype, device), _placed(layers, dtype, device)
+    shapes = [(channels[n + 1], channels[n]) for n in range(len(widths))]
+    dtype = DTYPES[precision]
+    return {
+        "inputs": [_eighths(generator, (count, part)).to(dtype) for part in inputs],
+        "weights": [_eighths(generator, shape, 1).to(dtype) for shape in shapes],
+    }
 
 
-def _placed(tensors: list[Tensor], dtype: str, device: str) -> list[Tensor]:
-    return [tensor.to(device, DTYPES[dtype]) for tensor in tensors]
-
-
-def _forward(
-    count: int, inputs: Sequence[int], widths: Sequence[int], dtype: str, device: str
-) -> Callable[[str], tuple[Tensor, ...]]:
-    given, layers = _network(count, inputs, widths, dtype, device)
-    return lambda backend: (mlp(given, layers, backend=backend),)
-
-
-def _backward(
-    count: int, inputs: Sequence[int], widths: Sequence[int], dtype: str, device: str
-) -> Callable[[str], tuple[Tensor, ...]]:
-    given, layers = _network(count, inputs, widths, dtype, device)
-    learned = [x.requires_grad_() for x in (*given, *layers)]
-    grad = _eighths(19, 8, count, widths[-1]).to(device, DTYPES[dtype])
-
-    def call(backend: str) -> tuple[Tensor, ...]:
-        return torch.autograd.grad(mlp(given, layers, backend=backend), learned, grad)
-
-    return call
-
-
-def _with_nan(device: str) -> Callable[[str], tuple[Tensor, ...]]:
-    given, layers = _network(97, *FEATURES, "fp32", device)
-    given[1][50, 3] = math.nan
-    return lambda backend: (mlp(given, layers, backend=backend),)
+def _with_nan() -> Given:
+    given = _network(97, *FEATURES, "fp32")
+    given["inputs"][1][50, 3] = math.nan
+    return given

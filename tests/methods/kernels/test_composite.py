@@ -106,22 +106,6 @@ def test_a_homogeneous_medium_has_the_opacity_of_beer_lambert(backend: str) -> N
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_two_halves_of_a_ray_are_the_whole(backend: str) -> None:
-    inputs = samples([8])
-    whole = composite(**inputs, stop=0.0, backend=backend)
-    halves = [
-        {name: inputs[name][part] for name in ("sigma", "values", "t", "delta")}
-        | {"offsets": torch.tensor([0, len(inputs["sigma"][part])])}
-        for part in (slice(0, 3), slice(3, 8))
-    ]
-    front = composite(**halves[0], stop=0.0, backend=backend)
-    both = composite(**halves[1], stop=0.0, carry=front, backend=backend)
-    torch.testing.assert_close(both.values, whole.values, rtol=0, atol=1e-6)
-    torch.testing.assert_close(both.depth_sum, whole.depth_sum, rtol=0, atol=4e-6)
-    torch.testing.assert_close(both.alpha, whole.alpha, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("stop", [1e-4, 1e-2, 0.3])
 def test_the_early_stop_changes_a_pixel_by_less_than_its_threshold(
     backend: str, stop: float
@@ -186,31 +170,6 @@ def test_weights_are_the_gradients_of_the_values(backend: str) -> None:
     torch.testing.assert_close(found, gradient[:, 0], rtol=1e-5, atol=1e-7)
     assert (found == 0).any()
     assert (found > 0.05).any()
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_infinite_density_is_opaque_and_without_length_nothing(backend: str) -> None:
-    inputs = {
-        "sigma": torch.tensor([torch.inf, torch.inf]),
-        "values": torch.tensor([[0.5], [0.25]]),
-        "t": torch.tensor([1.0, 2.0]),
-        "delta": torch.tensor([0.0, 0.1]),
-        "offsets": torch.tensor([0, 2]),
-    }
-    pixels = composite(**inputs, stop=0.0, backend=backend)
-    assert pixels.values.tolist() == [[0.25]]
-    assert pixels.alpha.tolist() == [1.0]
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_channels_do_not_mix(backend: str) -> None:
-    inputs = samples([5, 7], channels=3)
-    together = composite(**inputs, backend=backend).values
-    alone = [
-        composite(**inputs | {"values": inputs["values"][:, [c]]}, backend=backend).values
-        for c in range(3)
-    ]
-    assert torch.equal(together, torch.cat(alone, dim=1))
 
 
 def test_wrong_arguments_are_named() -> None:

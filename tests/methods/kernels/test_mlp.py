@@ -61,3 +61,13 @@ def test_other_numbers_and_shapes_are_refused() -> None:
         mlp(inputs, layers[::-1])
     with pytest.raises(ValueError, match="weights"):
         mlp(inputs, [])
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_nan_passes_the_relu_whatever_its_sign(backend: str, sign: int) -> None:
+    x = torch.tensor([[sign * torch.nan], [-torch.inf], [-0.0], [torch.inf]]).bfloat16()
+    one = torch.ones(1, 1, dtype=torch.bfloat16)
+    got = mlp([x], [one, one], backend=backend)[:, 0]
+    assert got[0].isnan()
+    assert got[1:].tolist() == [0, 0, torch.inf]

@@ -13,8 +13,15 @@ from bench.types import Rays
 from methods.instant_ngp.field import HashField
 from methods.kernels.composite import composite
 from methods.kernels.march import march
-from methods.kernels.types import Occupancy
-from methods.rendering.batch import KEPT_THIN, first_pass, render_batch, second_pass
+from methods.kernels.types import Occupancy, Samples
+from methods.rendering.batch import (
+    KEPT_THIN,
+    FirstPass,
+    Round,
+    first_pass,
+    render_batch,
+    second_pass,
+)
 from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
 from tests.methods.conftest import look_at_the_middle
@@ -87,6 +94,31 @@ def test_thin_samples_are_kept_in_turn_and_stand_for_the_others(
     expected = torch.zeros_like(length).index_add_(0, every.ray, every.delta)
     # Sums of at most 1,024 steps, in another order.
     torch.testing.assert_close(length, expected, rtol=1024 * 2**-24, atol=0)
+
+
+def round_of(rays: list[int] | None, held: list[int], seen: list[int], sigma: list[int]) -> Round:
+    """The next samples of `rays`: each has as many as `held` says, of which `seen` are visible."""
+    ray = torch.arange(len(held)).repeat_interleave(torch.tensor(held)).int()
+    place = torch.arange(len(ray)).float()
+    offsets, resume = torch.tensor([0, *held]).cumsum(0), torch.zeros(len(held)).int()
+    samples = Samples(
+        place, torch.ones(len(ray)), offsets, ray, place[:, None].expand(-1, 3), resume
+    )
+    chosen = None if rays is None else torch.tensor(rays)
+    return Round(chosen, samples, torch.tensor(sigma).float(), torch.tensor(seen))
+
+
+def test_of_the_thin_samples_of_a_ray_every_fourth_is_kept_through_its_rounds() -> None:
+    """Ray 0 has samples 0 to 2 and 6 to 8, of which 8 is hidden; ray 1 has 3 to 5; ray 2 none."""
+    first = round_of(None, [3, 3, 0], [3, 2, 0], [0, 9, 0, 0, 0, 9])
+    second = round_of([0], [3], [2], [0, 0, 9])
+    turns = torch.tensor([0.0, 3.0, 0.0]) / 2**12
+    kept = FirstPass([first, second]).thinned(1.0, turns)
+    # Of ray 0 numbers 0 (thin), 1 (thick) and 4 (thin); of ray 1, which begins at 3, number 4.
+    assert kept.ray.tolist() == [0, 0, 0, 1]
+    assert kept.t.tolist() == [0, 1, 1, 4]
+    assert kept.delta.tolist() == [4, 1, 4, 4]
+    assert kept.offsets.tolist() == [0, 3, 4, 4]
 
 
 def test_the_rounds_of_the_first_pass_change_no_sample(
