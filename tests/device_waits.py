@@ -24,6 +24,7 @@ from bench.waits import Line, device_waits
 from methods.instant_ngp.training import FieldTraining
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.training.joint import JointTraining
+from methods.steernerf_lean.pipeline import LeanPipeline
 from tests.methods.conftest import ball, look_at_the_middle
 from tests.methods.test_on_a_gpu import BUDGET, METHODS
 from tests.pretended_gpu import pretended_gpu
@@ -32,6 +33,7 @@ PARTS = {
     "a step of stage 1": (FieldTraining, "advance"),
     "a step of stage 2": (JointTraining, "advance"),
     "a frame that precedes what stage 2 learns from": (Pipeline, "remember"),
+    "the same of the lean method": (LeanPipeline, "remember"),
 }
 
 

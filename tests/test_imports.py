@@ -40,7 +40,7 @@ STANDS_ON = {
     "kilonerf": {"kernels", "rendering", "training", "instant_ngp", "students"},
     "plenoctree": {"kernels", "rendering", "training", "instant_ngp", "students"},
     "diver": {"kernels", "rendering", "training", "instant_ngp", "students"},
-    "steernerf": {"kernels", "engines", "rendering", "training", "instant_ngp", "steernerf_lean"},
+    "steernerf": {"kernels", "engines", "rendering", "training", "instant_ngp"},
     "steernerf_lean": {"kernels", "engines", "rendering", "training", "instant_ngp", "steernerf"},
 }
 """The folders of `methods` from which each may import, beside itself; `methods/checks.py` stands

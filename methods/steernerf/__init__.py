@@ -1,1 +1,1 @@
-"""SteerNeRF (Li et al. 2022), after Section 3 of the paper; `beyond` holds our extensions."""
+"""SteerNeRF (Li et al. 2022), in the order of Section 3 of the paper."""

@@ -5,20 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 
+from bench.motion import preceding, viewing_target
 from bench.sources import digest
 from bench.threads import torch_threads
-from bench.types import Budget, Camera, Frame, Log, Probe, Scene
+from bench.types import Budget, Camera, Frame, Log, NullProbe, Probe, Scene
 from methods.engines import Engine, Inputs
 from methods.instant_ngp.field import Precision
 from methods.instant_ngp.stage1 import Setup, train_field
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.encode import HashGrid
-from methods.steernerf.buffer import RenderingBuffer
-from methods.steernerf.calibration import Calibration
+from methods.steernerf.buffer import Buffer
 from methods.steernerf.options import Model, Rendering
+from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.renderer import Renderer2d
 from methods.steernerf.study import STUDY
 from methods.steernerf.training.options import JointOptions
@@ -30,23 +32,20 @@ class SteerNerf:
 
     Args:
         grid: shape of the hash table.
-        training: how stage 1 trains the field alone, at full resolution; all methods with the same
-            options share the result.
+        training: how stage 1 trains the field alone; methods with the same options share it.
         model: the settings that stage 2 trains for.
-        rendering: the settings chosen after training.
-        renderer: factory of the 2D renderer, called with K, L and s.
+        rendering: the settings chosen after training; may be replaced between frames.
+        renderer: factory of the 2D renderer.
         joint: how stage 2 trains on patches.
         steps: of stage 2; None: `budget.renderer_steps`.
         after: share of these steps whose weights are used; see `training.stage2.Stage2`.
         engine: computes the network of the 2D renderer once it is trained.
         precision: of the field, "bf16" (packed table, bfloat16 networks) or "fp32".
         name: as shown in result rows.
-
-    Attributes:
-        rendering: may be replaced between frames.
     """
 
     study = STUDY
+    kind: ClassVar[type[Stage2]] = Stage2
 
     def __init__(
         self,
@@ -66,14 +65,17 @@ class SteerNerf:
         device: str = "auto",
         seed: int = 0,
     ) -> None:
-        self.stage2 = Stage2(model, renderer, joint, after)
-        _check(self.stage2, rendering)
+        self.stage2 = self.kind(model, renderer, joint, after)
+        if rendering.range.mode != "off" and not model.frames:
+            raise ValueError(
+                "rendering.range.mode: expected off without preceding frames (L = 0), got "
+                f"{rendering.range.mode}"
+            )
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         engine.check(self.setup.device)
         self.rendering, self.engine, self.name = rendering, engine, name
-        self.steps = steps
-        self.memory, self.buffer = model.frames, RenderingBuffer(model.frames)
-        self.train_s = 0.0
+        self.steps, self.train_s = steps, 0.0
+        self.memory, self.buffer = model.frames, Buffer(maxlen=model.frames)
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Train both stages, or load their results if they were trained before."""
@@ -87,7 +89,7 @@ class SteerNerf:
 
     def reset(self) -> None:
         """Forget preceding frames."""
-        self.buffer.reset()
+        self.buffer.clear()
 
     def render(self, camera: Camera, probe: Probe) -> Frame:
         """Render the next frame of the sequence."""
@@ -98,64 +100,43 @@ class SteerNerf:
         return self.trained.sizes() | {"renderer2d": self.renderer_bytes}
 
     def settings(self) -> dict[str, str]:
-        """See `bench.types.Method.settings`; engine and precision are those of the 2D renderer."""
+        """Those of the field, with the engine and precision of the 2D renderer."""
         return self.setup.settings() | {
             "engine": self.engine.name,
             "precision": self.engine.computed(self.setup.device),
         }
 
     def _build_network(self, second: TrainedPipeline, scene: Scene, log: Log) -> None:
-        """Build the network of the 2D renderer with the engine, which computes it from now on.
-
-        The engine is calibrated on frames rendered as in training, so that the result does not
-        depend on `rendering`.
-        """
-        renderer, engine, joint = second.pipeline.renderer, self.engine, self.stage2.joint
-        rendering = Rendering.in_training(self.stage2.model, joint.refined, joint.refined_step)
-        calibration = Calibration(
-            second.pipeline, rendering, scene, joint.motion.degrees, self.setup.seed
-        )
-        count, code = engine.samples(renderer.network), digest(Calibration)
-        key = {"trained": second.key, "calibration": code}
+        """Build the network of the 2D renderer with the engine, which computes it from now on."""
+        renderer, engine = second.pipeline.renderer, self.engine
+        count = engine.samples(renderer.network)
 
         def samples() -> list[Inputs]:
-            return calibration.inputs(count, log.stage_dir("inputs", {**key, "frames": count}), log)
+            return self.record(second.pipeline, scene, count, log)
 
         def folder() -> Path:
-            return log.stage_dir("network", {**key, "engine": engine.key()})
+            key = {"trained": second.key, "engine": engine.key(), "recorded": digest(type(self))}
+            return log.stage_dir("network", key)
 
         built = engine.build(renderer.network, samples, folder, log)
         renderer.engine, self.renderer_bytes = built.run, built.size
 
-
-def _check(stage2: Stage2, rendering: Rendering) -> None:
-    """Raise ValueError, before anything is trained, if settings contradict each other."""
-    model = stage2.model
-    if not model.frames and rendering.range.mode != "off":
-        raise ValueError(
-            "rendering.range.mode: expected off without preceding frames (L = 0), got "
-            f"{rendering.range.mode}"
-        )
-    kinds = model.reprojection.depth, rendering.range.depth
-    if rendering.range.mode != "off" and kinds == ("expected", "sum"):
-        raise ValueError(
-            "rendering.range.depth: expected the depth that is kept, model.reprojection.depth="
-            "expected; got sum"
-        )
-    with torch.random.fork_rng(devices=()):  # queried for its abilities; another one is trained
-        renderer = stage2.make_renderer(model.channels, model.frames, model.scale)
-    for name in ("history", "surface"):
-        if getattr(model, name) and not renderer.reads_details:
-            raise ValueError(
-                f"model.{name}: {type(renderer).__name__} does not read it: expected false, got "
-                "true"
-            )
-    for name, share in (
-        ("rendering.refined", rendering.refined),
-        ("joint.refined", stage2.joint.refined),
-    ):
-        if share and not renderer.estimates_error:
-            raise ValueError(
-                f"{name}: {type(renderer).__name__} does not estimate its error, expected 0, got "
-                f"{share}"
-            )
+    def record(self, pipeline: Pipeline, scene: Scene, count: int, log: Log) -> list[Inputs]:
+        """The inputs of the network in `count` training views, evenly spread, on which an engine is
+        calibrated. They are rendered as in training, so that the result does not depend on
+        `rendering`, each after L + 1 frames of a random smooth motion: even the oldest frame in the
+        buffer had a preceding one."""
+        generator = torch.Generator().manual_seed(self.setup.seed)
+        cameras, target = scene.splits["train"].cameras, viewing_target(scene)
+        rendering, degrees = self.stage2.rendering, self.stage2.joint.motion.degrees
+        network, frames = pipeline.renderer.network, pipeline.model.frames
+        recorded: list[Inputs] = []
+        with log.progress("frames to build the network on", count) as progress:
+            for place in range(count):
+                camera, buffer = cameras[place * len(cameras) // count], Buffer(maxlen=frames)
+                for before in preceding(camera, target, frames + 1, degrees, generator):
+                    pipeline.remember(before, buffer, rendering)
+                with network.register_forward_pre_hook(lambda _, xs: recorded.append(xs)):
+                    pipeline.render(camera, buffer, rendering, NullProbe())
+                progress.advance()
+        return recorded

@@ -12,7 +12,7 @@ from bench.types import Probe
 from methods.engines.network import Network
 from methods.steernerf.kernels.splat import gather
 from methods.steernerf.options import check_size
-from methods.steernerf.renderer import UNWATCHED, Drawing, Observation, Renderer2d
+from methods.steernerf.renderer import UNWATCHED, Observation, Renderer2d
 
 
 class UNet(Renderer2d):
@@ -23,36 +23,30 @@ class UNet(Renderer2d):
     added to the bilinearly enlarged RGB of the present frame. It has 2,115,587 parameters at L = 2,
     K = 6 and width 64, and gives the outputs of the release (tests/data/steernerf_release.npz).
 
-    Args:
-        channels: K.
-        frames: L.
-        scale: s.
-        width: channels at full resolution; 64 in the release.
-        aligned: whether enlarging the base keeps every pixel in its place. False, as in the
-            release, uses align_corners=True, which moves all pixels but the middle one.
+    `channels`, `frames` and `scale` are K, L and s; `width` is the number of channels at full
+    resolution. Enlarging the base keeps every pixel in its place if `aligned`; the release uses
+    align_corners=True, which moves all pixels but the middle one.
     """
 
     def __init__(
-        self, channels: int, frames: int, scale: int, *, width: int = 64, aligned: bool = False
+        self, channels: int, frames: int, scale: int, *, width: int, aligned: bool
     ) -> None:
         super().__init__()
         check_size("renderer.width", width, 1, 4096)
         self.channels, self.frames, self.scale, self.aligned = channels, frames, scale, aligned
         self.network = _Network(channels * (frames + 1), width)
 
-    def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Drawing:
-        """See `Renderer2d`."""
+    def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Tensor:
+        """Draw all observations: pictures [B, H, W, 3]."""
         inputs = torch.stack([self._inputs(o) for o in observations])
-        (correction,) = self.run(probe, inputs)
-        return Drawing(self.base(observations) + correction.to(inputs).permute(0, 2, 3, 1))
+        (correction,) = self.run(probe, inputs)  # Eq. 11
+        return self.base(observations) + correction.to(inputs).permute(0, 2, 3, 1)
 
     def base(self, observations: Sequence[Observation]) -> Tensor:
-        """See `Renderer2d`."""
+        """The pictures [B, H, W, 3] that the network corrects: the present RGB, enlarged."""
         rgb = torch.stack([o.frame.values[..., :3] for o in observations]).permute(0, 3, 1, 2)
-        enlarged = functional.interpolate(
-            rgb, scale_factor=self.scale, mode="bilinear", align_corners=not self.aligned
-        )
-        return enlarged.permute(0, 2, 3, 1)
+        how = {"mode": "bilinear", "align_corners": not self.aligned}
+        return functional.interpolate(rgb, scale_factor=self.scale, **how).permute(0, 2, 3, 1)
 
     def _inputs(self, observation: Observation) -> Tensor:
         """[K (L + 1), H, W]: the RGB of all frames, then their other features."""
@@ -105,21 +99,18 @@ class _Network(Network):
         return (self.last(self.leave(merged).relu())[..., :height, :width],)
 
     def products(self, *inputs: Tensor) -> int:
-        """See `Network`: every kernel counts once per pixel at its resolution."""
+        """Multiplications by weights: every kernel counts once per pixel at its resolution."""
         batch, _, height, width = inputs[0].shape
-        full = batch * (-(-height // 4) * 4) * (-(-width // 4) * 4)
-        used = {
-            full: (self.first, self.enter, self.merge_full, self.leave, self.last),
-            full // 4: (self.at_half, self.merge_half, self.half_again, self.widen_half),
-            full // 16: (self.narrow, self.at_quarter, self.widen_quarter),
-        }
-        return sum(
-            pixels * x.numel()
-            for pixels, layers in used.items()
-            for layer in layers
-            for x in layer.parameters()
-            if x.dim() > 1
-        )
+        pixels = batch * (-(-height // 4) * 4) * (-(-width // 4) * 4)
+        half = (self.at_half, self.merge_half, self.half_again, self.widen_half)
+        quarter = (self.narrow, self.at_quarter, self.widen_quarter)
+
+        def weights(*layers: nn.Module) -> int:
+            return sum(x.numel() for y in layers for x in y.parameters() if x.dim() > 1)
+
+        lower = weights(*half), weights(*quarter)
+        full = weights(self) - sum(lower)
+        return pixels * full + pixels // 4 * lower[0] + pixels // 16 * lower[1]
 
 
 class _Residual(nn.Module):

@@ -10,18 +10,11 @@ from bench.types import Camera
 
 @dataclass(frozen=True)
 class View:
-    """A camera at both resolutions.
+    """A camera at both resolutions."""
 
-    Attributes:
-        full: the camera, its picture padded at the right and bottom to multiples of s.
-        low: the same view at 1/s of the resolution; its intrinsics are K_l of Eq. 7, those of
-            `full` K_h of Eq. 9.
-        scale: s.
-    """
-
-    full: Camera
-    low: Camera
-    scale: int
+    full: Camera  # its picture padded to multiples of s; its intrinsics are K_h of Eq. 9
+    low: Camera  # the same view at 1/s of the resolution; K_l of Eq. 7
+    scale: int  # s
 
     @classmethod
     def of(cls, camera: Camera, scale: int) -> View:

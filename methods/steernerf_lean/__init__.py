@@ -1,1 +1,1 @@
-"""Extensions beyond the paper: a lean 2D renderer, the field at the surface, refinement."""
+"""Ours, beyond the paper: a lean 2D renderer, the field at the surface, refinement."""

@@ -7,8 +7,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from methods.engines.network import Network
+from methods.steernerf_lean.cell_inputs import Layout
 from methods.steernerf_lean.kernels.depthwise import TAPS, depthwise
-from methods.steernerf_lean.kernels.space_to_depth import Layout
 
 LEAK = 0.1
 """Slope of the activations below 0. With plain ReLU, units die on the sparse inputs and never
@@ -29,52 +29,41 @@ class CellNetwork(Network):
 
     def __init__(self, layout: Layout, width: int, blocks: int) -> None:
         super().__init__()
-        cell = layout.scale**2
         self.enter = _Linear(layout.width, width)
         self.trunk = nn.ModuleList(_Block(width) for _ in range(blocks))
-        self.leave = _Linear(width, cell * (3 + layout.history))
-        self.read = _Linear(width, 3 * (layout.channels + 1)) if layout.surface else None
+        self.leave = _Linear(width, layout.scale**2 * (3 + layout.history))
         self.error = _Linear(width, 1)
-        for layer in filter(None, (self.leave, self.read, self.error)):
+        self.read = _Linear(width, 3 * (layout.channels + 1))
+        for layer in (self.leave, self.error, self.read):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
 
     def forward(self, rows: Tensor, neighbours: Tensor) -> tuple[Tensor, ...]:
-        """Compute what `depth_to_space` needs from the `rows` [R, layout.width] of cells with
-        `neighbours` [R, 9].
-
-        Returns:
-            correction and blending share of each pixel [R, s^2 (3 + layout.history)]; estimated
-            error [R, 1], the log of the mean squared error; with `layout.surface`, matrix
-            [R, 3 (K + 1)].
-        """
+        """Corrections and logits of the shares [N, (3 + layout.history) s^2]; estimated error
+        [N, 1], the log of the mean squared error; matrices [N, 3 (K + 1)]: of cells with the `rows`
+        [N, layout.width] and the `neighbours` [N, 9]."""
         hidden = self.enter(rows).to(rows)
         for block in self.trunk:
             hidden = block(hidden, neighbours, self.backend)
         hidden = functional.leaky_relu(hidden, LEAK)
-        heads = (self.leave, self.error, self.read)
-        return tuple(head(hidden) for head in heads if head is not None)
+        return self.leave(hidden), self.error(hidden), self.read(hidden)
 
     def products(self, *inputs: Tensor) -> int:
-        """See `Network`: every matrix, and the taps of every channel, count once per cell."""
+        """Every matrix, and the taps of every channel, count once per cell."""
         return len(inputs[0]) * sum(x.numel() for x in self.parameters() if x.dim() > 1)
 
 
 class _Linear(nn.Linear):
     def forward(self, x: Tensor) -> Tensor:
-        return _product(x, self.weight, self.bias)
+        """x W^T + b of `x` [N, C].
 
-
-def _product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """x W^T + b of `x` [N, C] and `weight` [D, C].
-
-    Without gradient it is computed as a 1 x 1 convolution: torch hands products of float32 to MKL,
-    but convolutions to oneDNN, which is twice as fast on non-Intel processors.
-    """
-    if torch.is_grad_enabled() or torch.jit.is_tracing() or not len(x):
-        return functional.linear(x, weight, bias)
-    picture = x[None, :, None].permute(0, 3, 1, 2)  # [1, C, N, 1], the channels last in memory
-    return functional.conv2d(picture, weight[:, :, None, None], bias)[0, :, :, 0].T
+        Without gradient it is computed as a 1 x 1 convolution: torch hands products of float32 to
+        MKL, but convolutions to oneDNN, which is twice as fast on non-Intel processors.
+        """
+        if torch.is_grad_enabled() or torch.jit.is_tracing() or not len(x):
+            return super().forward(x)
+        picture = x[None, :, None].permute(0, 3, 1, 2)  # [1, C, N, 1], channels last in memory
+        return functional.conv2d(picture, self.weight[:, :, None, None], self.bias)[0, :, :, 0].T
 
 
 class _Block(nn.Module):

@@ -13,21 +13,17 @@ from torch.nn import functional
 
 from bench.types import Probe
 from methods.steernerf.options import check_size
-from methods.steernerf.renderer import UNWATCHED, Drawing, Observation, Renderer2d
+from methods.steernerf.renderer import UNWATCHED, Renderer2d
+from methods.steernerf_lean.cell_inputs import CellInputs, Layout
 from methods.steernerf_lean.cell_network import CellNetwork
 from methods.steernerf_lean.cells import number, paint
 from methods.steernerf_lean.kernels.depthwise import neighbours_of
-from methods.steernerf_lean.kernels.space_to_depth import (
-    CellInputs,
-    Layout,
-    depth_to_space,
-    space_to_depth,
-)
+from methods.steernerf_lean.observation import Drawing, LeanObservation
 
 PRETRAINED = Path(__file__).parent / "weights" / "lean.safetensors"
 """Weights trained on other scenes, by `steerbench pretrain`."""
 
-PRETRAINED_LAYOUT = Layout(channels=3, frames=1, scale=4, history=True, surface=True)
+PRETRAINED_LAYOUT = Layout(channels=3, scale=4, history=True)
 """The inputs that those weights expect."""
 
 
@@ -47,167 +43,81 @@ class LeanRenderer(Renderer2d):
 
     Args:
         channels: K.
-        frames: L.
         scale: s.
+        history: whether to use the preceding picture.
         width: channels of the trunk.
         blocks: residual blocks of the trunk.
         init: "pretrained": start from the weights that come with the package, trained on other
             scenes; "scratch": from random ones.
-        history: whether to use the preceding picture.
-        surface: whether to use the features at the surface of each pixel.
     """
 
-    draws_cells = True
-    estimates_error = True
-    reads_details = True
     network: CellNetwork
 
     def __init__(
         self,
         channels: int,
-        frames: int,
         scale: int,
         *,
-        width: int = 64,
-        blocks: int = 6,
-        init: Literal["pretrained", "scratch"] = "pretrained",
-        history: bool = True,
-        surface: bool = True,
+        history: bool,
+        width: int,
+        blocks: int,
+        init: Literal["pretrained", "scratch"],
     ) -> None:
         super().__init__()
         check_size("renderer.width", width, 1, 4096)
         check_size("renderer.blocks", blocks, 0, 256)
-        self.channels, self.frames, self.scale = channels, frames, scale
-        layout = self.layout = Layout(channels, frames, scale, history and frames > 0, surface)
-        self.network = CellNetwork(layout, width, blocks)
+        self.layout = Layout(channels, scale, history)
+        self.network = CellNetwork(self.layout, width, blocks)
         if init == "pretrained":
             self._start_from(load_file(PRETRAINED))
 
-    def forward(self, observations: Sequence[Observation], probe: Probe = UNWATCHED) -> Drawing:
-        """See `Renderer2d`."""
-        for o in observations:
-            probe.count("cells", len(o.cells), o.frame.alpha.numel())
-        base, rows = self._rows(observations)
-        neighbours, backend = self._neighbours(observations, len(rows)), observations[0].backend
-        self.network.backend = backend
-        output, error, *matrix = (x.to(base) for x in self.run(probe, rows, neighbours))
-        drawn = depth_to_space(
-            base, rows, output, next(iter(matrix), None), self.layout, backend=backend
-        )
-        return Drawing(self._paint(observations, drawn), error[: len(base), 0])
-
-    def base(self, observations: Sequence[Observation]) -> Tensor:
-        """See `Renderer2d`."""
-        alone = Layout(self.channels, 0, self.scale, history=False, surface=False)
-        parts = [
-            space_to_depth(
-                CellInputs(o.frame.values, o.frame.alpha, o.background, o.cells),
-                alone,
-                backend=o.backend,
-            )[0]
-            for o in observations
-        ]
-        return self._paint(observations, torch.cat(parts))
-
-    def _rows(self, observations: Sequence[Observation]) -> tuple[Tensor, Tensor]:
-        """The base and the rows of all their cells, followed by rows of 0; see `space_to_depth`.
-
-        The matrix library prepares code for every new size, which takes longer than the product
-        itself. Rows of 0 round the size up, so that it sees few different ones.
-        """
-        alone = len(observations) == 1
-        quantum = self.network.quantum
-        parts = [self._cells_of(o, quantum if alone else 1) for o in observations]
-        if alone:
-            return parts[0]
-        base, rows = (torch.cat(some) for some in zip(*parts, strict=True))
-        return base, functional.pad(rows, (0, 0, 0, -len(rows) % quantum))
-
-    def _cells_of(self, observation: Observation, multiple: int) -> tuple[Tensor, Tensor]:
-        o, layout = observation, self.layout
-        history = surface = None
-        if o.history is not None and layout.history:
-            history = o.history.values, o.history.valid
-        if o.surface is not None and layout.surface:
-            surface = o.surface.values, o.surface.index
-        inputs = CellInputs(
-            o.frame.values,
-            o.frame.alpha,
-            o.background,
-            o.cells,
-            [(points.values, points.index) for points in o.preceding],
-            history,
-            surface,
-        )
-        return space_to_depth(inputs, layout, multiple=multiple, backend=o.backend)
-
-    def _neighbours(self, observations: Sequence[Observation], rows: int) -> Tensor:
-        """The neighbours [R, 9] of all cells; rows without any follow, up to `rows`."""
-        size, device = observations[0].frame.alpha.shape, observations[0].cells.device
-        active = torch.zeros(len(observations), *size, dtype=torch.bool, device=device)
-        cells = number([o.cells for o in observations], size)
-        active.view(-1).index_fill_(0, cells, True)
-        neighbours = neighbours_of(active, len(cells))
-        return functional.pad(neighbours, (0, 0, 0, rows - len(neighbours)), value=-1)
-
-    def _paint(self, observations: Sequence[Observation], less: Tensor) -> Tensor:
-        """Pictures [B, H, W, 3] from the pixels `less` [N, s^2, 3] of all cells, relative to the
-        background."""
-        size, background = observations[0].frame.alpha.shape, observations[0].background[:3]
-        shown = [o.cells for o in observations]
-        pixels = less.flatten(1) + background.repeat(self.scale**2)  # a cell at a time
-        return paint(shown, size, self.scale, pixels.view_as(less), background)
+    def forward(self, observations: Sequence[LeanObservation], probe: Probe = UNWATCHED) -> Drawing:
+        """Draw all observations; the estimated errors are those of their cells."""
+        first, cells = observations[0], [o.cells for o in observations]
+        size, background = first.frame.alpha.shape, first.background[:3]
+        for some in cells:
+            probe.count("cells", len(some), size.numel())
+        inputs = CellInputs.of(observations, self.layout)
+        rows = inputs.rows()
+        drawn_at = torch.zeros(len(cells), *size, dtype=torch.bool, device=rows.device)
+        drawn_at.view(-1).index_fill_(0, number(cells, size), True)
+        neighbours = neighbours_of(drawn_at, len(rows))
+        # The matrix library prepares code for every new size, which takes longer than the product
+        # itself. Rows of 0 round the size up, so that it sees few different ones.
+        surplus = (0, 0, 0, -len(rows) % self.network.quantum)
+        rows, count = functional.pad(rows, surplus), len(rows)
+        self.network.backend = first.backend
+        outputs = self.run(probe, rows, functional.pad(neighbours, surplus, value=-1))
+        output, error, matrix = (x[:count].to(inputs.base) for x in outputs)
+        less = inputs.drawn(output, matrix).flatten(1)
+        pixels = (less + background.repeat(self.layout.scale**2)).view_as(inputs.base)
+        return Drawing(paint(cells, size, self.layout.scale, pixels, background), error[:, 0])
 
     @torch.no_grad()
     def _start_from(self, pretrained: Mapping[str, Tensor]) -> None:
-        """Copy the weights of a renderer with the same trunk that was trained at K = 3, L = 1.
+        """Copy the weights of a renderer with the same trunk that was trained at K = 3.
 
-        Weights for features beyond RGB, and for frames that it did not have, stay as they are.
+        Weights for features beyond RGB stay as they are.
 
         Raises:
             ValueError: this renderer has another shape.
         """
-        weights = dict(self.network.named_parameters())
-        unused = {
-            name for name in pretrained if name.startswith("read") and not self.layout.surface
-        }
-        ours, theirs = _same_columns(self.layout, PRETRAINED_LAYOUT)
-        slots = range(self.scale**2)
-        written = [4 * slot + i for slot in slots for i in range(3 + self.layout.history)]
-        matrix = [(self.channels + 1) * row + column for row in range(3) for column in range(4)]
         try:
-            same_layers = weights.keys() == pretrained.keys() - unused
-            if not same_layers or self.scale != PRETRAINED_LAYOUT.scale:
-                raise RuntimeError("other layers, or another scale")
-            if (inputs := pretrained["enter.weight"].shape[1]) != PRETRAINED_LAYOUT.width:
-                raise RuntimeError(f"{inputs} inputs instead of {PRETRAINED_LAYOUT.width}")
-            for name, weight in weights.items():
-                new = pretrained[name].float()
+            known = PRETRAINED_LAYOUT.split(pretrained["enter.weight"])
+            for name, weight in self.network.named_parameters():
+                new = pretrained[name]
                 if name == "enter.weight":
-                    weight[:, ours] = new[:, theirs]
+                    for part, columns in self.layout.split(weight).items():
+                        if not part.endswith("rest"):
+                            columns.copy_(known[part])
                 elif name.startswith("read"):
-                    weight[matrix] = new
+                    weight.unflatten(0, (3, -1))[:, :4] = new.unflatten(0, (3, 4))
                 else:
-                    weight.copy_(new[written] if name.startswith("leave") else new)
-        except RuntimeError as error:
+                    weight.copy_(new[: len(weight)] if name.startswith("leave") else new)
+            if more := pretrained.keys() - self.network.state_dict().keys():
+                raise KeyError(*more)
+        except (KeyError, RuntimeError) as error:
             raise ValueError(
                 "renderer.init=pretrained: those weights are of a renderer of the default "
                 f"scale, width and blocks ({error}): use renderer.init=scratch"
             ) from error
-
-
-def _same_columns(ours: Layout, theirs: Layout) -> tuple[list[int], list[int]]:
-    """The input columns of colours and validity that both layouts have, as indices into each."""
-    mine, others = _columns(ours), _columns(theirs)
-    both = [key for key in mine if key in others]
-    return [mine[key] for key in both], [others[key] for key in both]
-
-
-def _columns(layout: Layout) -> dict[tuple[str, int, int], int]:
-    """The input columns of colours and validity, by group, slot and feature."""
-    return {
-        (name, slot, feature): layout.begins[name] + slot * features + feature
-        for name, slots, features in layout.groups
-        for slot in range(slots)
-        for feature in range(min(features, 4))
-    }

@@ -9,11 +9,17 @@ from pathlib import Path
 from bench.study import Variant, turned
 from bench.types import Budget, Log, Scene
 from methods.steernerf.method import SteerNerf
-from methods.steernerf.study import STUDY, not_skipped, ranges
+from methods.steernerf.study import SKIPS, STUDY, not_skipped
 from methods.steernerf_lean.pretraining import pretrain_renderer
+from methods.steernerf_lean.training import LeanStage2
 
 SHARES = (0, 0.06, 0.25, 0.5, 1)
-SKIPS = {**STUDY.skips, "background cells": "method.rendering.skip.background"}
+ALL_SKIPS = {**SKIPS, "background cells": "method.rendering.skip.background"}
+PARTS = {
+    **STUDY.parts,
+    "feature_reprojection/surface": "surface",
+    "refinement": "refinement",
+}
 
 
 def _both(one: Variant, other: Variant) -> Variant:
@@ -30,21 +36,23 @@ def _refined_steps(lengths: Sequence[float]) -> list[Variant]:
 
 def _together() -> list[Variant]:
     """Variants that turn two knobs at a time."""
-    low = [*turned("step", "method.rendering.step", (1,)), *ranges("window", (0.03,))]
+    (low,) = turned("step", "method.rendering.step", (1,))
+    (refined,) = _refined_steps((1,))
     return [
-        *(_both(share, other) for share in _refined(SHARES) for other in low),
-        *(_both(share, step) for share in _refined(SHARES[1:]) for step in _refined_steps((1,))),
+        *(_both(share, low) for share in _refined(SHARES)),
+        *(_both(share, refined) for share in _refined(SHARES[1:])),
     ]
 
 
 class SteerNerfLean(SteerNerf):
-    """SteerNeRF with a lean 2D renderer, preceding pictures, and refinement."""
+    """SteerNeRF with a lean 2D renderer, the preceding picture, and refinement."""
 
+    kind = LeanStage2
     study = replace(
         STUDY,
         knobs={
             **STUDY.knobs,
-            "skips": not_skipped(SKIPS),
+            "skips": not_skipped(ALL_SKIPS),
             "step length": turned("step", "method.rendering.step", (1, 1.5, 3, 4)),
             "refined step length": _refined_steps((1, 1.5, 3)),
             "refined share": _refined((0, 0.03, 0.06, 0.25, 0.5, 1)),
@@ -52,7 +60,7 @@ class SteerNerfLean(SteerNerf):
         },
         trained={
             **STUDY.trained,
-            "L, trained": turned("L", "method.model.frames", (0, 2, 3)),
+            "L, trained": turned("L", "method.model.frames", (0,)),
             "s, trained": turned(
                 "s", "method.model.scale", (2, 4, 8), "method.renderer.init=scratch"
             ),
@@ -60,11 +68,14 @@ class SteerNerfLean(SteerNerf):
         },
         exact=(
             *STUDY.exact,
+            "method.rendering.overlap=0",
             "method.rendering.refined=1",
             "method.rendering.skip.background=false",
         ),
-        skips=SKIPS,
+        skips=ALL_SKIPS,
         skips_with=("method.rendering.refined=0",),  # refinement takes a share of the cells drawn
+        axes={name: axis for name, axis in STUDY.axes.items() if name != "L"},
+        parts=PARTS,
         beside={
             **STUDY.beside,
             # The release's network; its cost does not depend on how well it is trained.
@@ -79,6 +90,5 @@ class SteerNerfLean(SteerNerf):
     def pretrain_renderer(
         self, scenes: Sequence[Scene], budget: Budget, output: Path, log: Log
     ) -> None:
-        """Train a 2D renderer on many scenes, as a start for others; see
-        `beyond.pretraining.pretrain_renderer`."""
+        """Train a 2D renderer on many scenes, as a start for others."""
         pretrain_renderer(self.setup, self.stage2, scenes, budget, output, log)

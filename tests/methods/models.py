@@ -14,32 +14,87 @@ from methods.kernels.encode import HashGrid
 from methods.kernels.types import Occupancy
 from methods.rendering.march import March
 from methods.rendering.occupancy import DensityGrid
-from methods.steernerf.options import Model, Rendering, Reprojection
+from methods.steernerf.options import EVERYWHERE, Model, Rendering, Skips
 from methods.steernerf.pipeline import Pipeline
+from methods.steernerf.training.options import JointOptions, MotionOptions
+from methods.steernerf.unet import UNet
 from methods.steernerf_lean.lean_renderer import LeanRenderer
+from methods.steernerf_lean.options import LeanJointOptions, LeanModel, LeanRendering, LeanSkips
+from methods.steernerf_lean.pipeline import LeanPipeline
 
 SMALL_GRID = HashGrid(levels=4, log2_table=8, n_min=4, n_max=16)
+MODEL = Model(
+    channels=4,
+    frames=2,
+    scale=4,
+    step=8.0,
+    stop=STOP,
+    feature_background=0.5,
+)
+RENDERING = Rendering(8.0, STOP, EVERYWHERE, Skips(empty=True, hidden=True))
+MOTION = MotionOptions(degrees=(0.0, 2.5), length=4, least=0, pool=12, uses=16, longer=0.75)
+JOINT = JointOptions(
+    field="joint",
+    features="constant",
+    rate=1e-3,
+    field_rate=1e-3,
+    final_rate=1e-5,
+    half_waves=1,
+    patch=32,
+    patch_share=1.0,
+    batch=2,
+    jitter=False,
+    opacity_entropy=1e-3,
+    grid_samples=0,
+    distilled_views=100,
+    distilled_share=0.5,
+    motion=MOTION,
+)
 
 
 def small_model(**others: Any) -> Model:
     """K = 4, L = 2, s = 4, long steps; `others` replace fields."""
-    fields: dict[str, Any] = {
-        "channels": 4,
-        "frames": 2,
-        "scale": 4,
-        "step": 8.0,
-        "stop": STOP,
-        "reprojection": Reprojection(),
-        "feature_background": 0.5,
-        "history": True,
-        "surface": True,
-    }
-    return Model(**fields | others)
+    return replace(MODEL, **others)
 
 
 def small_rendering(**others: Any) -> Rendering:
-    """As `small_model()` is trained, but without refinement; `others` replace fields."""
-    return replace(Rendering.in_training(small_model(), refined=0.0, refined_step=1.0), **others)
+    """As `small_model()` is trained; `others` replace fields."""
+    return replace(RENDERING, **others)
+
+
+def small_motion(**others: Any) -> MotionOptions:
+    """0 to 4 frames before a view; `others` replace fields."""
+    return replace(MOTION, **others)
+
+
+def small_joint(**others: Any) -> JointOptions:
+    """Two patches of at most 32 x 32 a step; `others` replace fields."""
+    return replace(JOINT, **others)
+
+
+def lean_model(**others: Any) -> LeanModel:
+    """K = 4, L = 1, s = 4, long steps; `others` replace fields."""
+    return replace(LeanModel(**vars(MODEL) | {"frames": 1}), **others)
+
+
+def lean_rendering(**others: Any) -> LeanRendering:
+    """As `lean_model()` is trained, but without refinement; `others` replace fields."""
+    skip = LeanSkips(empty=True, hidden=True, background=True)
+    own = {"skip": skip, "overlap": 0.0, "refined": 0.0, "refined_step": 1.0}
+    return replace(LeanRendering(**vars(RENDERING) | own), **others)
+
+
+def lean_joint(**others: Any) -> LeanJointOptions:
+    """Two patches a step, refinement with steps of 2; `others` replace fields."""
+    own = {
+        "error_weight": 1e-4,
+        "refined": 0.2,
+        "refined_step": 2.0,
+        "refined_rays": 2048,
+        "clip": 1.0,
+        "average": 0.999,
+    }
+    return replace(LeanJointOptions(**vars(JOINT) | own), **others)
 
 
 def shell() -> Occupancy:
@@ -67,23 +122,25 @@ def misty_field(precision: str = "bf16", backend: str = "auto", channels: int = 
     return field
 
 
-def small_renderer(model: Model, *, width: int = 8) -> LeanRenderer:
+def lean_renderer(model: LeanModel, *, width: int = 8) -> LeanRenderer:
     """An untrained lean 2D renderer of one block for `model`."""
+    history = model.frames > 0
     return LeanRenderer(
-        model.channels,
-        model.frames,
-        model.scale,
-        width=width,
-        blocks=1,
-        init="scratch",
-        history=model.history,
-        surface=model.surface,
+        model.channels, model.scale, history=history, width=width, blocks=1, init="scratch"
     )
 
 
-def new_pipeline(model: Model | None = None) -> Pipeline:
-    """A misty field and an untrained 2D renderer on white; always the same weights."""
+def new_pipeline(model: Model = MODEL) -> Pipeline:
+    """A misty field and an untrained U-Net on white; always the same weights."""
     torch.manual_seed(0)
-    model = model or small_model()
     field = misty_field(channels=model.channels)
-    return Pipeline(field, shell(), torch.ones(3), small_renderer(model), model)
+    unet = UNet(model.channels, model.frames, model.scale, width=4, aligned=False)
+    return Pipeline(field, shell(), torch.ones(3), unet, model)
+
+
+def lean_pipeline(model: LeanModel | None = None) -> LeanPipeline:
+    """A misty field and an untrained lean 2D renderer on white; always the same weights."""
+    torch.manual_seed(0)
+    model = model or lean_model()
+    field = misty_field(channels=model.channels)
+    return LeanPipeline(field, shell(), torch.ones(3), lean_renderer(model), model)

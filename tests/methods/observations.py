@@ -11,8 +11,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from methods.rendering.frame import FeatureFrame
-from methods.steernerf.renderer import Detail, Observation, Points, Renderer2d, cells_at_matter
+from methods.steernerf.renderer import Observation, Points, Renderer2d
+from methods.steernerf_lean.cells import cells_near
 from methods.steernerf_lean.lean_renderer import LeanRenderer
+from methods.steernerf_lean.observation import Detail, LeanObservation
 from tests.methods.conftest import look_at_the_middle
 
 CAMERA = look_at_the_middle(0.0, 0.0)  # no renderer looks at it
@@ -28,6 +30,7 @@ a few layers deep."""
 POINTS = 20
 
 AnyRenderer = TypeVar("AnyRenderer", bound=Renderer2d)
+AnyObservation = TypeVar("AnyObservation", Observation, LeanObservation)
 
 
 def observe(
@@ -35,48 +38,72 @@ def observe(
     width: int = 7,
     *,
     channels: int = 6,
-    frames: int = 2,
     scale: int = 4,
     matter: Tensor | None = None,
     history: bool = True,
-    surface: bool = True,
     seed: int = 0,
-) -> Observation:
+) -> LeanObservation:
     """Random features in steps of 1/256 where there is `matter` [h, w], the background elsewhere.
 
-    Preceding points are on a third of the pixels of cells with matter; the preceding picture, and
-    the surface, are known in two thirds of them. Points of the surface have an opacity, too.
+    The preceding picture, and the surface, are known in two thirds of the pixels of cells with
+    matter. Points of the surface have an opacity, too.
     """
+    frame, fine, generator = _frame(height, width, channels, scale, matter, seed)
+    cells = cells_with(frame.alpha)
+    valid = torch.rand(height, width, scale**2, generator=generator) < 0.66
+    valid = (valid & (frame.alpha > 0)[..., None]).float()
+    picture = torch.rand(height, width, scale**2, 3, generator=generator) * valid[..., None]
+    at_surface = _scattered(fine, 0.66, channels + 1, generator)
+    index = to_blocks(at_surface.index[..., None], scale).squeeze(-1)
+    return LeanObservation(
+        frame,
+        BACKGROUND[:channels],
+        cells,
+        Points(at_surface.values, index.flatten(0, 1)[cells]),
+        Detail(picture.flatten(0, 1)[cells], valid.flatten(0, 1)[cells]) if history else None,
+        "auto",
+    )
+
+
+def observe_paper(
+    height: int = 5,
+    width: int = 7,
+    *,
+    channels: int = 6,
+    frames: int = 2,
+    scale: int = 4,
+    seed: int = 0,
+) -> Observation:
+    """Random features in steps of 1/256, and preceding points on a third of the pixels."""
+    frame, fine, generator = _frame(height, width, channels, scale, None, seed)
+    preceding = [_scattered(fine, 0.33, channels, generator) for _ in range(frames)]
+    return Observation(frame, preceding, "auto")
+
+
+def _frame(
+    height: int, width: int, channels: int, scale: int, matter: Tensor | None, seed: int
+) -> tuple[FeatureFrame, Tensor, torch.Generator]:
+    """A frame, its matter at full resolution, and the generator of its random numbers."""
     generator = torch.Generator().manual_seed(seed)
     if matter is None:
         matter = torch.ones(height, width, dtype=torch.bool)
-    background = BACKGROUND[:channels]
     values = torch.randint(257, (height, width, channels), generator=generator) / 256
-    values = torch.where(matter[..., None], values, background)
+    values = torch.where(matter[..., None], values, BACKGROUND[:channels])
     fine = matter.repeat_interleave(scale, 0).repeat_interleave(scale, 1)
-
-    def scattered(share: float, features: int) -> Points:
-        points = torch.rand(POINTS, features, generator=generator)
-        index = torch.randint(POINTS, fine.shape, generator=generator, dtype=torch.int32)
-        shown = fine & (torch.rand(fine.shape, generator=generator) < share)
-        return Points(points, torch.where(shown, index, -1))
-
-    preceding = [scattered(0.33, channels) for _ in range(frames)]
-    cells = cells_at_matter(matter.float(), preceding)
-    valid = torch.rand(height, width, scale**2, generator=generator) < 0.66
-    valid = (valid & matter[..., None]).float()
-    picture = torch.rand(height, width, scale**2, 3, generator=generator) * valid[..., None]
-    at_surface = scattered(0.66, channels + 1)
-    index = to_blocks(at_surface.index[..., None], scale).squeeze(-1)
     frame = FeatureFrame(CAMERA, values, torch.where(matter, 1.5, torch.inf), matter.float())
-    return Observation(
-        frame,
-        background,
-        preceding,
-        cells,
-        Detail(picture.flatten(0, 1)[cells], valid.flatten(0, 1)[cells]) if history else None,
-        Points(at_surface.values, index.flatten(0, 1)[cells]) if surface else None,
-    )
+    return frame, fine, generator
+
+
+def _scattered(fine: Tensor, share: float, features: int, generator: torch.Generator) -> Points:
+    points = torch.rand(POINTS, features, generator=generator)
+    index = torch.randint(POINTS, fine.shape, generator=generator, dtype=torch.int32)
+    shown = fine & (torch.rand(fine.shape, generator=generator) < share)
+    return Points(points, torch.where(shown, index, -1))
+
+
+def cells_with(alpha: Tensor) -> Tensor:
+    """The cells near matter, where `alpha` [h, w] is more than 0."""
+    return cells_near(alpha > 0).flatten().nonzero().squeeze(1)
 
 
 def to_blocks(picture: Tensor, scale: int) -> Tensor:
@@ -86,7 +113,7 @@ def to_blocks(picture: Tensor, scale: int) -> Tensor:
     return parts.transpose(1, 2).flatten(2, 3)
 
 
-def everywhere(part: Tensor, observation: Observation, otherwise: float = 0) -> Tensor:
+def everywhere(part: Tensor, observation: LeanObservation, otherwise: float = 0) -> Tensor:
     """[h, w, ...] of what is known of the cells [N, ...]."""
     height, width = observation.frame.alpha.shape
     whole = torch.full((height * width, *part.shape[1:]), otherwise, dtype=part.dtype)
@@ -101,32 +128,26 @@ def spot(height: int, width: int, row: int, column: int) -> Tensor:
     return matter
 
 
-def doubled(observation: Observation) -> Observation:
+def doubled(observation: AnyObservation) -> AnyObservation:
     """In float64, for the backend that takes it."""
-    frame, history, surface = observation.frame, observation.history, observation.surface
-    return replace(
-        observation,
-        frame=replace(
-            frame,
-            values=frame.values.double(),
-            depth=frame.depth.double(),
-            alpha=frame.alpha.double(),
-        ),
-        background=observation.background.double(),
-        preceding=[replace(p, values=p.values.double()) for p in observation.preceding],
-        history=history and Detail(history.values.double(), history.valid.double()),
-        surface=surface and replace(surface, values=surface.values.double()),
-        backend="reference",
-    )
+
+    def twice(part):
+        if isinstance(part, Tensor):
+            return part.double() if part.is_floating_point() else part
+        if isinstance(part, list):
+            return [twice(one) for one in part]
+        if isinstance(part, FeatureFrame | Points | Detail | LeanObservation | Observation):
+            return replace(part, **{name: twice(x) for name, x in vars(part).items()})
+        return part
+
+    return replace(twice(observation), backend="reference")
 
 
-def cut(observation: Observation, scale: int, rows: slice, columns: slice) -> Observation:
+def cut(observation: LeanObservation, rows: slice, columns: slice) -> LeanObservation:
     """The low-resolution pixels `rows` x `columns` of an observation, and all that is in them."""
-    fine = tuple(slice(scale * part.start, scale * part.stop) for part in (rows, columns))
     frame, history, surface = observation.frame, observation.history, observation.surface
     alpha = frame.alpha[rows, columns]
-    preceding = [replace(p, index=p.index[fine]) for p in observation.preceding]
-    cells = cells_at_matter(alpha, preceding)
+    cells = cells_with(alpha)
 
     def inside(part: Tensor, otherwise: float = 0) -> Tensor:
         return everywhere(part, observation, otherwise)[rows, columns].flatten(0, 1)[cells]
@@ -139,10 +160,9 @@ def cut(observation: Observation, scale: int, rows: slice, columns: slice) -> Ob
             depth=frame.depth[rows, columns],
             alpha=alpha,
         ),
-        preceding=preceding,
         cells=cells,
         history=history and Detail(inside(history.values), inside(history.valid)),
-        surface=surface and replace(surface, index=inside(surface.index, -1)),
+        surface=replace(surface, index=inside(surface.index, -1)),
     )
 
 
@@ -155,18 +175,22 @@ def shaken(renderer: AnyRenderer, seed: int = 0) -> AnyRenderer:
     return renderer
 
 
-def features_of(observation: Observation) -> Iterator[Tensor]:
+def features_of(observation: Observation | LeanObservation) -> Iterator[Tensor]:
     """All that a field may learn from: of the present, of preceding frames, of the surface."""
     yield observation.frame.values
-    yield from (frame.values for frame in observation.preceding)
-    if observation.surface is not None:
+    if isinstance(observation, LeanObservation):
         yield observation.surface.values
+    else:
+        yield from (points.values for points in observation.preceding)
 
 
 def new_renderer(
-    channels: int = 6, frames: int = 2, scale: int = 4, *, width: int = 16, blocks: int = 2, **rest
+    channels: int = 6, scale: int = 4, *, history: bool = True, width: int = 16, blocks: int = 2
 ) -> LeanRenderer:
-    return LeanRenderer(channels, frames, scale, width=width, blocks=blocks, init="scratch", **rest)
+    """An untrained lean renderer."""
+    return LeanRenderer(
+        channels, scale, history=history, width=width, blocks=blocks, init="scratch"
+    )
 
 
 def to_picture(blocks: Tensor, scale: int) -> Tensor:
@@ -181,15 +205,14 @@ def shown_by(points: Points) -> tuple[Tensor, Tensor]:
     return points.values[points.index.clamp(min=0).long()], (points.index >= 0).to(points.values)
 
 
-def at_surface(observation: Observation, scale: int) -> tuple[Tensor, Tensor]:
+def at_surface(observation: LeanObservation, scale: int) -> tuple[Tensor, Tensor]:
     """[H, W, K + 1] and [H, W]: what each pixel shows of the surface, and whether."""
-    assert observation.surface is not None
     parts = shown_by(observation.surface)
     values, known = (everywhere(part, observation) for part in parts)
     return to_picture(values, scale), to_picture(known[..., None], scale)[..., 0]
 
 
-def before(observation: Observation, scale: int) -> tuple[Tensor, Tensor]:
+def before(observation: LeanObservation, scale: int) -> tuple[Tensor, Tensor]:
     """[H, W, 3] and [H, W, 1]: the preceding picture, and where it is known."""
     assert observation.history is not None
     values = everywhere(observation.history.values, observation)
@@ -197,7 +220,7 @@ def before(observation: Observation, scale: int) -> tuple[Tensor, Tensor]:
     return to_picture(values, scale), to_picture(valid, scale)
 
 
-def enlarged(observation: Observation, scale: int) -> Tensor:
+def enlarged(observation: LeanObservation, scale: int) -> Tensor:
     """[H, W, 3]: the present colours, bilinear, the corners at the centres of corner pixels."""
     rgb = observation.frame.values[..., :3].permute(2, 0, 1)[None]
     large = functional.interpolate(rgb, scale_factor=scale, mode="bilinear", align_corners=False)

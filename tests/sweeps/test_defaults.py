@@ -14,7 +14,7 @@ from sweeps.overrides import composed
 
 BASES = (
     *("ngp", "gaussians", "plenoctree", "diver", "kilonerf", "nsvf", "nerf"),
-    "steernerf_lean",
+    *("steernerf", "steernerf_lean"),
 )
 """What the other methods' configurations stand on."""
 

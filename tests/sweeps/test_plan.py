@@ -110,7 +110,7 @@ def test_a_failure_stands_beside_what_was_measured_before(measured: Store, tmp_p
     assert line.gaps == ["failed when it was tried again: no such folder"]
 
 
-@pytest.mark.parametrize("name", ["method", "method.joint.through"])
+@pytest.mark.parametrize("name", ["method", "method.joint.features"])
 def test_a_setting_outside_the_sweep_fills_no_line(name: str) -> None:
     first, *others = TABLE.lines
     wrong = replace(first, job={name: "all"})

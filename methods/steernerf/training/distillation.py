@@ -1,4 +1,5 @@
-"""Distilled views: pictures of the stage 1 field at random cameras, as further training views."""
+"""Distilled views: pictures of the stage 1 field at random cameras, as further training views
+(Section 3.5)."""
 
 from __future__ import annotations
 
@@ -11,16 +12,15 @@ from bench.cameras import pack_camera, place_camera, unpack_camera
 from bench.motion import novel_view, viewing_target
 from bench.sharing import missing
 from bench.sources import digest
-from bench.types import Budget, Camera, Log, NullProbe, Scene
+from bench.types import Budget, Camera, Log, NullProbe, Scene, Split
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.rendering.frame import everywhere, render_frame
-from methods.steernerf.training.sequences import TrueView
 from methods.training import checkpoint
 
 
 def distilled_views(
     setup: Setup, trained: TrainedField, scene: Scene, budget: Budget, count: int, log: Log
-) -> tuple[list[TrueView], float]:
+) -> tuple[Split, float]:
     """Render `count` random views among the training cameras with `trained`, at full resolution.
 
     They are cached, by `setup`, `scene`, `budget` and `count`.
@@ -29,30 +29,27 @@ def distilled_views(
         the views, and the seconds that it took to render them.
     """
     if not count:
-        return [], 0.0
+        return Split([], [], []), 0.0
     key = {**setup.key(scene, budget), "views": count, "distillation": digest(distilled_views)}
     path = log.stage_dir("distilled", key) / "views.safetensors"
+    names = [str(number) for number in range(count)]
     with missing(path, log) as to_render:
         if to_render:
             generator = torch.Generator().manual_seed(setup.seed)
             taken, target = scene.splits["train"].cameras, viewing_target(scene)
-            background = scene.background
-            cameras = [novel_view(taken, target, generator) for _ in range(count)]
+            cameras = [novel_view(taken, target, generator) for _ in names]
             began, tensors = time.monotonic(), {}
             with log.progress("distilling", count) as progress:
-                for number, camera in enumerate(cameras):
-                    tensors[f"{number}.picture"] = _picture(trained, camera, background)
-                    tensors[f"{number}.camera"] = pack_camera(camera)
+                for name, camera in zip(names, cameras, strict=True):
+                    tensors[f"{name}.picture"] = _picture(trained, camera, scene.background)
+                    tensors[f"{name}.camera"] = pack_camera(camera)
                     progress.advance()
-            figures = {"views": count, "seconds": time.monotonic() - began}
-            checkpoint.write(path, tensors, figures)
+            checkpoint.write(path, tensors, {"seconds": time.monotonic() - began})
     tensors, figures = checkpoint.read(path)
     with checkpoint.restoring(path):
-        views = [
-            TrueView(unpack_camera(tensors[f"{number}.camera"]), tensors[f"{number}.picture"])
-            for number in range(int(figures["views"]))
-        ]
-        return views, figures["seconds"]
+        cameras = [unpack_camera(tensors[f"{name}.camera"]) for name in names]
+        pictures = [tensors[f"{name}.picture"] for name in names]
+        return Split(cameras, pictures, names), figures["seconds"]
 
 
 def _picture(trained: TrainedField, camera: Camera, background: Tensor) -> Tensor:

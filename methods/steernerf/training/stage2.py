@@ -6,23 +6,21 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
-from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
-from torch import Tensor
 
 from bench.sources import digest, libraries
 from bench.types import Budget, Log, Scene, SteerbenchError
 from methods.instant_ngp.stage1 import Setup, TrainedField
-from methods.steernerf.options import Model, Rendering
+from methods.steernerf.options import EVERYWHERE, Model, Rendering, Skips
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.renderer import Renderer2d
 from methods.steernerf.training.distillation import distilled_views
-from methods.steernerf.training.joint import JointTraining, RendererTraining
+from methods.steernerf.training.examples import ExamplePool, TrainingViews
+from methods.steernerf.training.joint import JointTraining
 from methods.steernerf.training.options import JointOptions
-from methods.steernerf.training.patches import PatchSource
-from methods.steernerf.training.sequences import SequencePool, TrainingViews
+from methods.steernerf.training.patches import Patches
 from methods.training import loop
 
 MARKS = (0.125, 0.25, 0.5)
@@ -34,43 +32,60 @@ as a curve over the steps."""
 class Stage2:
     """What is trained in stage 2, and how.
 
-    Attributes:
-        model: the settings it is trained for.
-        make_renderer: factory of the 2D renderer, called with K, L and s.
-        joint: how it is trained.
-        after: share of the steps whose weights are used, 1 or one of `MARKS`; one training serves
-            all of them.
+    A variant of the method overrides `make`, `rendering`, and the classes of the pipeline, of its
+    patches and of the training.
     """
 
-    model: Model
-    make_renderer: Callable[..., Renderer2d]
-    joint: JointOptions
-    after: float = 1.0
+    model: Model  # the settings it is trained for
+    renderer: Callable[..., Renderer2d]  # factory of the 2D renderer
+    joint: JointOptions  # how it is trained
+    after: float = 1.0  # share of the steps whose weights are used, 1 or one of `MARKS`
+
+    pipeline: ClassVar[type[Pipeline]] = Pipeline
+    patches: ClassVar[type[Patches]] = Patches
+    training: ClassVar[type[JointTraining]] = JointTraining
 
     def __post_init__(self) -> None:
         if self.after not in (*MARKS, 1):
             choices = ", ".join(map(str, MARKS))
             raise ValueError(f"after: expected {choices} or 1, got {self.after}")
 
-    def new_renderer(self, seed: int, device: torch.device) -> Renderer2d:
+    def make(self) -> Renderer2d:
         """Make an untrained 2D renderer."""
-        torch.manual_seed(seed)
-        model = self.model
-        renderer = self.make_renderer(model.channels, model.frames, model.scale).to(device)
-        return renderer.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        return self.renderer(self.model.channels, self.model.frames, self.model.scale)
+
+    @property
+    def rendering(self) -> Any:
+        """How frames are rendered in training: everywhere, so that one training serves all
+        choices."""
+        skips = Skips(empty=True, hidden=True)
+        return Rendering(self.model.step, self.model.stop, EVERYWHERE, skips)
 
     def key(self, budget: Budget) -> dict[str, object]:
         """Everything that the training depends on, besides the field of stage 1."""
-        make: Any = self.make_renderer
+        make: Any = self.renderer
         kind, settings = (make.func, make.keywords) if isinstance(make, partial) else (make, {})
         return {
             "renderer_steps": budget.renderer_steps,
             "model": asdict(self.model),
             "renderer": {"kind": f"{kind.__module__}.{kind.__qualname__}", **settings},
             "joint": asdict(self.joint),
-            "stage2": digest(train_stage2, kind),
-            "stage2_libraries": libraries(train_stage2, kind),
+            "stage2": digest(type(self), kind),
+            "stage2_libraries": libraries(type(self), kind),
         }
+
+    def new_renderer(self, setup: Setup) -> Renderer2d:
+        """Make the untrained 2D renderer of the seed and the device of `setup`."""
+        torch.manual_seed(setup.seed)
+        made = self.make().to(setup.device)
+        return made.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def patches_of(
+        self, pipeline: Pipeline, views: TrainingViews, learning: bool, generator: torch.Generator
+    ) -> Patches:
+        """Patches of `views` that `pipeline` renders; its field learns from them if `learning`."""
+        pool = ExamplePool(pipeline, self.rendering, views, self.joint.motion, generator)
+        return self.patches(pool, self.joint, learning, generator)
 
 
 @dataclass(frozen=True)
@@ -87,22 +102,30 @@ def train_stage2(
 ) -> TrainedPipeline:
     """Train `stage2` on the field that `setup` made for `scene`, or load the result of the same
     training. The field is widened to K features and changed in place."""
-    model, joint = stage2.model, stage2.joint
+    model, joint, steps = stage2.model, stage2.joint, budget.renderer_steps
     key = {**setup.key(scene, budget), **stage2.key(budget)}
     folder = log.stage_dir("steernerf", key)
     finished = folder / "steernerf.safetensors"
-    count = 0 if finished.exists() else joint.distilled(budget.renderer_steps, model.frames)
+    count = 0 if finished.exists() else joint.distilled(steps, model.frames)
     distilled, distilled_s = distilled_views(setup, trained, scene, budget, count, log)
     random = torch.Generator().manual_seed(setup.seed) if joint.features == "random" else None
     trained.field.widen(model.channels, random)
-    views = TrainingViews.of(scene, distilled, joint.distilled_share)
+
+    renderer, learning = stage2.new_renderer(setup), joint.field == "joint"
     background = scene.background.to(setup.device)
-    pipeline, training = _prepared(trained, background, stage2, views, budget, setup.seed)
-    training.seconds = distilled_s
-    marks = {_at(folder, share): math.ceil(share * training.steps) for share in MARKS}
-    loop.train(training, finished, "training the 2D renderer", log, marks)
+    pipeline = stage2.pipeline(trained.field, trained.occupancy, background, renderer, model)
+    views = TrainingViews.of(scene, distilled, joint.distilled_share)
+    generator = torch.Generator().manual_seed(setup.seed)
+    patches = stage2.patches_of(pipeline, views, learning, generator)
+    learned = trained if learning else None
+    training = stage2.training(renderer, patches, joint, steps, generator, learned)
+    pipeline.renderer, training.seconds = training.outcome, distilled_s
+
+    marks = {share: folder / f"after-{share}.safetensors" for share in MARKS}
+    at = {mark: math.ceil(share * steps) for share, mark in marks.items()}
+    loop.train(training, finished, "training the 2D renderer", log, at)
     if stage2.after < 1:
-        mark = _at(folder, stage2.after)
+        mark = marks[stage2.after]
         if not mark.exists():
             raise SteerbenchError(f"{mark} is missing: remove {folder} to train again")
         loop.load(training, mark)
@@ -110,31 +133,3 @@ def train_stage2(
     trained.field.requires_grad_(False).gradients = None
     pipeline.renderer.requires_grad_(False)
     return TrainedPipeline(pipeline, key, training.seconds)
-
-
-def _at(folder: Path, share: float) -> Path:
-    """The file of the weights after a `share` of the steps."""
-    return folder / f"after-{share}.safetensors"
-
-
-def _prepared(
-    trained: TrainedField,
-    background: Tensor,
-    stage2: Stage2,
-    views: TrainingViews,
-    budget: Budget,
-    seed: int,
-) -> tuple[Pipeline, RendererTraining]:
-    model, joint, field = stage2.model, stage2.joint, trained.field
-    renderer = stage2.new_renderer(seed, field.device)
-    pipeline = Pipeline(field, trained.occupancy, background, renderer, model)
-    generator = torch.Generator().manual_seed(seed)
-    rendering = Rendering.in_training(model, joint.refined, joint.refined_step)
-    pool = SequencePool(pipeline, rendering, views, joint.motion, generator)
-    learning = joint.field == "joint"
-    through = joint.through if learning else "none"
-    patches = PatchSource(pool, joint, through, generator)
-    rest = renderer, patches, joint, budget.renderer_steps, generator
-    training = JointTraining(trained, *rest) if learning else RendererTraining(*rest)
-    pipeline.renderer = training.mean
-    return pipeline, training

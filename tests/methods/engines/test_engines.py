@@ -18,8 +18,7 @@ from methods.engines.openvino_engine import OpenVino, _capabilities
 from methods.engines.torch_engine import TorchEngine
 from methods.steernerf.unet import UNet
 from methods.steernerf_lean.kernels.depthwise import neighbours_of
-from methods.steernerf_lean.lean_renderer import LeanRenderer
-from tests.methods.observations import shaken
+from tests.methods.observations import new_renderer, shaken
 
 NO_BF16 = "BF16" not in _capabilities(required("openvino", "openvino", "openvino"))
 
@@ -40,7 +39,7 @@ was seen in (int8), before each of half a dozen layers; single layers are kept h
 
 def cells(count: int, seed: int = 0) -> Inputs:
     """Rows and neighbours of `count` cells in a square."""
-    renderer = LeanRenderer(6, 2, 4, init="scratch")
+    renderer = new_renderer(width=64, blocks=6)
     generator = torch.Generator().manual_seed(seed)
     side = round(count**0.5)
     neighbours = neighbours_of(torch.ones(1, side, side, dtype=torch.bool))
@@ -50,7 +49,7 @@ def cells(count: int, seed: int = 0) -> Inputs:
 def lean() -> tuple[Network, list[Inputs]]:
     """The lean network, and inputs of three sizes."""
     torch.manual_seed(1000)  # other numbers than those of the inputs
-    renderer = shaken(LeanRenderer(6, 2, 4, init="scratch")).requires_grad_(False)
+    renderer = shaken(new_renderer(width=64, blocks=6)).requires_grad_(False)
     return renderer.network, [cells(count, seed) for seed, count in enumerate((64, 100, 64, 144))]
 
 
@@ -66,7 +65,7 @@ def test_a_view_of_nothing_has_no_cells(
 
 def unet() -> tuple[Network, list[Inputs]]:
     torch.manual_seed(1000)
-    renderer = shaken(UNet(6, 1, 4)).requires_grad_(False)
+    renderer = shaken(UNet(6, 1, 4, width=64, aligned=False)).requires_grad_(False)
     generator = torch.Generator().manual_seed(0)
     return renderer.network, [(torch.rand(1, 12, 36, 44, generator=generator),) for _ in range(3)]
 

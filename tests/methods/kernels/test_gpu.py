@@ -25,7 +25,7 @@ from methods.kernels.encode import HashGrid, SampleGradients, encode
 from methods.kernels.encode.reference import corners
 from methods.kernels.march import extents, march
 from methods.kernels.types import Intervals, Occupancy
-from methods.steernerf.kernels.splat import gather, splat
+from methods.steernerf.kernels.splat import gather
 
 pytestmark = pytest.mark.skipif(
     bool(availability()["gpu"]), reason="Triton has no build for this platform"
@@ -122,16 +122,6 @@ def test_behind_what_is_not_a_number_a_long_ray_has_no_weights() -> None:
     assert not found[11:].any()
     counts, _ = visible(sigma, intervals, backend="gpu")
     assert counts.tolist() == [11]
-
-
-@pytest.mark.parametrize("axis", [0, 1])
-def test_a_zero_is_in_its_place_whatever_its_sign(axis: int) -> None:
-    """Of two points in one place the first is shown, by the bits of -0 it would be the second."""
-    pixels = torch.full((2, 2), 0.5, device=DEVICE)
-    pixels[:, axis] = torch.tensor([0.0, -0.0], device=DEVICE)
-    depth = torch.ones(2, device=DEVICE)
-    for order in ([0, 1], [1, 0]):
-        assert splat(pixels[order], depth, 1, 1, backend="gpu").item() == 0
 
 
 def test_what_is_not_contiguous_is_read_all_the_same() -> None:

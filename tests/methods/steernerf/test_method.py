@@ -12,25 +12,27 @@ import torch
 
 from bench.console import ConsoleLog
 from bench.errors import Unavailable
+from bench.sources import sources
 from bench.types import Budget, Log, NullProbe, Scene
 from methods.engines import Engine
 from methods.engines.openvino_engine import OpenVino
 from methods.engines.torch_engine import TorchEngine
-from methods.instant_ngp.training import TrainingOptions
-from methods.kernels.encode import HashGrid
 from methods.steernerf.method import SteerNerf
-from methods.steernerf.options import Model, RangeReduction, Rendering, Reprojection, Skips
-from methods.steernerf.training.options import JointOptions
-from methods.steernerf.training.sequences import MotionOptions
+from methods.steernerf.options import Model, RangeReduction, Rendering, Skips
+from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.unet import UNet
-from methods.steernerf_lean.lean_renderer import LeanRenderer
-from tests.methods.models import small_model, small_rendering
+from tests.methods.models import (
+    new_pipeline,
+    small_joint,
+    small_model,
+    small_motion,
+    small_rendering,
+)
 from tests.methods.trainings import GRID, QUICK
 
 BUDGET = Budget("test", steps=40, samples=1024, renderer_steps=4)
-
-
-RENDERER = partial(LeanRenderer, width=8, blocks=1, init="scratch")
+RENDERER = partial(UNet, width=4, aligned=False)
+RANGED = RangeReduction("paper", 0.03, "sum")
 
 
 def new_method(
@@ -42,18 +44,14 @@ def new_method(
     steps: int | None = None,
     **rendering: Any,
 ) -> SteerNerf:
+    motion = small_motion(pool=2, length=2)
     return SteerNerf(
         grid=GRID,
         training=QUICK,
         model=small_model(channels=5, frames=frames, step=4.0),
         rendering=small_rendering(**{"step": 4.0} | rendering),
         renderer=RENDERER,
-        joint=JointOptions(
-            patch=4,
-            rate=rate,
-            distilled_views=2,
-            motion=MotionOptions(pool=2, length=2),
-        ),
+        joint=small_joint(patch=4, rate=rate, distilled_views=2, motion=motion),
         engine=engine or TorchEngine(),
         after=after,
         steps=steps,
@@ -84,8 +82,7 @@ def test_what_was_trained_is_found_again_and_renders_the_same(
     monkeypatch.delattr(torch.optim, "Adam")  # which takes seconds to make, and is not needed
     second.fit(ball_scene, BUDGET, log)
     assert "training the 2D renderer: found in" in capsys.readouterr().err
-    inputs = ["inputs"] * (device == "cuda")  # for which the engine records the network
-    assert stages(tmp_path) == ["distilled", "field", *inputs, "steernerf"]
+    assert stages(tmp_path) == ["distilled", "field", "steernerf"]
     assert second.train_s == first.train_s > 0
     for camera in ball_scene.splits["test"].cameras:
         frames = [method.render(camera, NullProbe()).rgb for method in (first, second)]
@@ -145,7 +142,7 @@ def test_a_network_is_built_once_for_each_training_and_for_no_other(
 
     assert built() == 1
     # Not trained for, nor calibrated for.
-    assert built(refined=0.5, range=RangeReduction("window"), overlap=0.9) == 1
+    assert built(range=RANGED, stop=0.1) == 1
     assert built(rate=3e-3) == 2
 
 
@@ -154,9 +151,10 @@ def test_an_engine_that_does_not_compute_on_the_device_is_refused() -> None:
         OpenVino("fp32").check(torch.device("cuda"))
 
 
-def test_shorter_sequences_use_more_distilled_views() -> None:
-    options = JointOptions(distilled_share=1.0, motion=MotionOptions(pool=2, uses=4, longer=0.75))
-    # 2 sequences at the beginning, and 100 steps of 2 patches, 4 of a sequence.
+def test_shorter_examples_use_more_distilled_views() -> None:
+    motion = small_motion(pool=2, uses=4, longer=0.75)
+    options = small_joint(distilled_share=1.0, motion=motion)
+    # 2 examples at the beginning, and 100 steps of 2 patches, 4 of an example.
     assert options.distilled(100, frames=2) == 2 + 50 / 4 // 1 + 1
     assert options.distilled(100, frames=0) == 2 + 50
 
@@ -167,53 +165,45 @@ OTHERWISE: dict[str, Any] = {
     "scale": 2,
     "step": 2.0,
     "stop": 1e-2,
-    "reprojection": Reprojection(rule="last"),
     "feature_background": 1.0,
-    "history": False,
-    "surface": False,
 }
 """Another value of every field of a model."""
 
 TURNED: dict[str, Any] = {
     "step": 1.5,
     "stop": 1e-1,
-    "range": RangeReduction("paper", 0.1),
-    "overlap": 0.5,
-    "refined": 0.25,
-    "refined_step": 2.0,
-    "skip": Skips(empty=False),
+    "range": RANGED,
+    "skip": Skips(empty=False, hidden=True),
 }
 """Another value of every field of a rendering."""
 
 
-def key_of(model: Model, rendering: Rendering) -> dict[str, object]:
-    method = SteerNerf(
-        grid=HashGrid(),
-        training=TrainingOptions(),
-        model=model,
-        rendering=rendering,
-        renderer=RENDERER,
-        joint=JointOptions(),
-        engine=TorchEngine(),
-        device="cpu",
-    )
-    return method.stage2.key(BUDGET)
+def key_of(method: SteerNerf, **changed: Any) -> dict[str, object]:
+    return replace(method.stage2, **changed).key(BUDGET)
 
 
 @pytest.mark.parametrize("name", [field.name for field in fields(Model)])
 def test_every_field_of_a_model_is_in_the_key_of_its_training(name: str) -> None:
-    usual = small_model()
-    other = replace(usual, **{name: OTHERWISE[name]})
-    assert other != usual
-    assert key_of(other, small_rendering()) != key_of(usual, small_rendering())
+    method = new_method()
+    other = replace(method.stage2.model, **{name: OTHERWISE[name]})
+    assert key_of(method, model=other) != key_of(method)
 
 
 @pytest.mark.parametrize("name", [field.name for field in fields(Rendering)])
 def test_no_field_of_a_rendering_is_in_the_key_of_a_training(name: str) -> None:
-    usual = small_rendering()
-    other = replace(usual, **{name: TURNED[name]})
-    assert other != usual
-    assert key_of(small_model(), other) == key_of(small_model(), usual)
+    usual, other = new_method(), new_method(**{name: TURNED[name]})
+    assert usual.rendering != other.rendering
+    assert key_of(usual) == key_of(other)
+
+
+def test_the_key_of_a_training_depends_on_nothing_of_the_lean_method() -> None:
+    """Neither on its files, nor on a setting that only it has."""
+    method = new_method()
+    names = sources(type(method.stage2), UNet)
+    assert "methods/steernerf/training/joint.py" in names
+    assert not [name for name in names if name.startswith("methods/steernerf_lean")]
+    key = key_of(method)
+    assert not {"refined", "refined_step", "error_weight", "average"} & set(key["joint"])
 
 
 @pytest.mark.slow
@@ -238,71 +228,46 @@ def test_an_unknown_share_of_the_steps_is_refused() -> None:
 
 
 def test_training_renders_everywhere_whatever_is_chosen_afterwards() -> None:
-    model = small_model(step=2.0, stop=1e-2)
-    rendering = Rendering.in_training(model, refined=0.2, refined_step=3.0)
-    assert (rendering.step, rendering.stop, rendering.refined) == (2.0, 1e-2, 0.2)
-    assert (rendering.range.mode, rendering.overlap, rendering.refined_step) == ("off", 0.0, 3.0)
-    assert rendering.skip == Skips()
+    rendering = new_method(step=1.0, stop=0.5, range=RANGED).stage2.rendering
+    assert (rendering.step, rendering.stop) == (4.0, small_model().stop)
+    assert rendering.range.mode == "off"
+    assert rendering.skip == Skips(empty=True, hidden=True)
 
 
-def refused(**others: Any) -> SteerNerf:
-    parts: dict[str, Any] = {
-        "model": small_model(history=False, surface=False),
-        "rendering": small_rendering(),
-        "renderer": UNet,
-        "joint": JointOptions(refined=0.0),
-    }
-    return SteerNerf(
-        grid=HashGrid(),
-        training=TrainingOptions(),
-        engine=TorchEngine(),
-        device="cpu",
-        **parts | others,
-    )
+def test_without_preceding_frames_there_is_no_range_reduction() -> None:
+    new_method(frames=1, range=RANGED)  # with them there is
+    with pytest.raises(ValueError, match=r"range.mode: expected off without .* got paper"):
+        new_method(frames=0, range=RANGED)
 
 
-def test_a_renderer_that_does_not_estimate_its_error_cannot_be_refined() -> None:
-    refused()  # as it is, it is not
-    said = "UNet does not estimate its error, expected 0, got 0.1"
-    with pytest.raises(ValueError, match=rf"^rendering\.refined: {said}"):
-        refused(rendering=small_rendering(refined=0.1))
-    with pytest.raises(ValueError, match=rf"^joint\.refined: {said}"):
-        refused(joint=JointOptions(refined=0.1))
+def recorded(scene: Scene, log: Log, frames: int, seed: int = 0) -> list[torch.Tensor]:
+    """The inputs of the network in three views."""
+    method = new_method(frames)
+    method.setup = replace(method.setup, seed=seed)
+    pipeline = new_pipeline(small_model(frames=frames))
+    return [inputs for (inputs,) in method.record(pipeline, scene, 3, log)]
 
 
-def test_where_the_depth_is_kept_no_sum_can_be_reprojected() -> None:
-    kept = {
-        depth: small_model(history=False, surface=False, reprojection=Reprojection(depth=depth))
-        for depth in ("expected", "sum")
-    }
-    wanted = small_rendering(range=RangeReduction("paper", depth="sum"))
-    refused(model=kept["sum"], rendering=wanted)  # there it can
-    with pytest.raises(ValueError, match=r"range\.depth: expected the depth that is kept"):
-        refused(model=kept["expected"], rendering=wanted)
+def test_a_frame_is_recorded_behind_as_many_as_the_buffer_holds_and_one_more(
+    ball_scene: Scene, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rendered, features = [], Pipeline.features
+
+    def counted(self, view, preceding, *rest):
+        rendered.append((view.full.c2w, len(preceding)))
+        return features(self, view, preceding, *rest)
+
+    monkeypatch.setattr(Pipeline, "features", counted)
+    frames = recorded(ball_scene, quiet_log, 1)
+    assert [preceding for _, preceding in rendered] == 3 * [0, 1, 1]
+    train = ball_scene.splits["train"].cameras
+    views = [train[place].c2w for place in (0, 8, 16)]
+    assert all(map(torch.equal, [c2w for c2w, _ in rendered[2::3]], views))
+    assert [inputs.shape for inputs in frames] == 3 * [(1, 2 * 4, 32, 32)]
+    assert not torch.equal(frames[0], frames[1])
 
 
-@pytest.mark.parametrize("mode", ["paper", "window"])
-def test_without_preceding_frames_there_is_no_range_reduction(mode: str) -> None:
-    ranged = small_rendering(range=RangeReduction(mode))
-    refused(rendering=ranged)  # with them there is
-    with pytest.raises(ValueError, match=rf"range.mode: expected off without .* got {mode}"):
-        refused(model=small_model(frames=0, history=False, surface=False), rendering=ranged)
-
-
-def test_a_rendering_may_be_exchanged_between_frames(ball_scene: Scene, shared_log: Log) -> None:
-    method = new_method(refined=1.0)
-    method.fit(ball_scene, BUDGET, shared_log)
-    camera = ball_scene.splits["test"].cameras[0]
-    refined = method.render(camera, NullProbe()).rgb
-    method.reset()
-    method.rendering = replace(method.rendering, refined=0.0)
-    drawn = method.render(camera, NullProbe()).rgb
-    assert not torch.equal(drawn, refined)
-
-
-@pytest.mark.parametrize("name", ["history", "surface"])
-def test_what_the_renderer_does_not_read_is_refused(name: str) -> None:
-    only = {"history": False, "surface": False} | {name: True}
-    with pytest.raises(ValueError, match=rf"^model\.{name}: UNet does not read it"):
-        refused(model=small_model(**only))
-    refused(model=small_model(**only), renderer=RENDERER)
+def test_the_seed_decides_the_motions_of_recorded_frames(ball_scene: Scene, quiet_log: Log) -> None:
+    first, again, other = (recorded(ball_scene, quiet_log, 1, seed)[0] for seed in (0, 0, 1))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)

@@ -14,10 +14,14 @@ from torch.nn import functional
 from torch.utils.flop_counter import FlopCounterMode
 
 from methods.steernerf.unet import UNet
-from tests.methods.observations import ROUNDING, doubled, features_of, observe, shaken
+from tests.methods.observations import ROUNDING, doubled, features_of, observe_paper, shaken
 
 RELEASE = np.load(Path(__file__).parents[2] / "data" / "steernerf_release.npz")
 """What the released code computes on the formulas below."""
+
+
+def unet(channels: int, frames: int, scale: int, width: int = 64, aligned: bool = False) -> UNet:
+    return UNet(channels, frames, scale, width=width, aligned=aligned)
 
 
 def hashed(count: int, number: int) -> Tensor:
@@ -29,7 +33,7 @@ def hashed(count: int, number: int) -> Tensor:
 
 @pytest.mark.parametrize("frames", [0, 2])
 def test_it_computes_what_the_released_network_computes(frames: int) -> None:
-    network = UNet(6, frames, 4).network
+    network = unet(6, frames, 4).network
     convolutions = [layer for layer in network.modules() if isinstance(layer, nn.Conv2d)]
     with torch.no_grad():
         for number, layer in enumerate(convolutions):
@@ -47,7 +51,7 @@ def test_it_computes_what_the_released_network_computes(frames: int) -> None:
 
 def test_its_first_weights_are_drawn_as_those_of_the_release() -> None:
     """Residual blocks: Kaiming times 0.1; before a pixel shuffle: Kaiming; others as torch does."""
-    network = UNet(6, 2, 4).network
+    network = unet(6, 2, 4).network
     layers = {n: x for n, x in network.named_modules() if isinstance(x, nn.Conv2d)}
     for name, layer in layers.items():
         residual, shuffled = "." in name or "again" in name, name.startswith("widen")
@@ -61,7 +65,7 @@ def test_its_first_weights_are_drawn_as_those_of_the_release() -> None:
 @pytest.mark.parametrize("width", [16, 32])
 def test_a_width_scales_all_channels(width: int) -> None:
     inputs = torch.zeros(1, 18, 8, 8)
-    whole, narrow = (UNet(6, 2, 4, width=w).network.products(inputs) for w in (64, width))
+    whole, narrow = (unet(6, 2, 4, width=w).network.products(inputs) for w in (64, width))
     ends = 9 * 64 * (18 + 3)  # of the first and the last layer, which scale with the width alone
     share = width / 64
     assert narrow == share**2 * (whole - 64 * ends) + share * 64 * ends
@@ -69,7 +73,7 @@ def test_a_width_scales_all_channels(width: int) -> None:
 
 @pytest.mark.parametrize(("frames", "count"), [(0, 2_108_675), (1, 2_112_131), (2, 2_115_587)])
 def test_it_has_the_number_of_parameters_of_the_release(frames: int, count: int) -> None:
-    renderer = UNet(6, frames, 4)
+    renderer = unet(6, frames, 4)
     assert sum(parameter.numel() for parameter in renderer.parameters()) == count
 
 
@@ -81,20 +85,20 @@ def test_any_features_frames_and_sizes_are_taken(
     channels: int, frames: int, scale: int, height: int, width: int
 ) -> None:
     """Sides of the picture that are no multiple of 4 as well: of 15 x 9, 6 x 10 and 9 x 6."""
-    renderer = UNet(channels, frames, scale)
+    renderer = unet(channels, frames, scale)
     observations = [
-        observe(height, width, channels=channels, frames=frames, scale=scale, seed=seed)
+        observe_paper(height, width, channels=channels, frames=frames, scale=scale, seed=seed)
         for seed in range(2)
     ]
     for batch in (observations[:1], observations):
-        pictures, base = renderer(batch).pictures, renderer.base(batch)
+        pictures, base = renderer(batch), renderer.base(batch)
         assert pictures.shape == base.shape == (len(batch), height * scale, width * scale, 3)
         assert pictures.isfinite().all()
 
 
 @pytest.mark.parametrize(("height", "width"), [(8, 12), (9, 6)])
 def test_its_products_are_those_that_torch_counts(height: int, width: int) -> None:
-    network = UNet(6, 2, 4).network
+    network = unet(6, 2, 4).network
     inputs = torch.zeros(2, 18, height, width)
     with FlopCounterMode(display=False) as counter:
         network(inputs)
@@ -102,36 +106,29 @@ def test_its_products_are_those_that_torch_counts(height: int, width: int) -> No
 
 
 def test_frames_that_are_missing_after_a_cold_start_show_nothing() -> None:
-    renderer = shaken(UNet(6, 2, 4)).double()
-    warm = doubled(observe())
+    renderer = shaken(unet(6, 2, 4)).double()
+    warm = doubled(observe_paper())
     empty = replace(warm.preceding[1], index=torch.full_like(warm.preceding[1].index, -1))
-    pictures = renderer([replace(warm, preceding=warm.preceding[:1])]).pictures
-    unseen = renderer([replace(warm, preceding=[warm.preceding[0], empty])]).pictures
+    pictures = renderer([replace(warm, preceding=warm.preceding[:1])])
+    unseen = renderer([replace(warm, preceding=[warm.preceding[0], empty])])
     assert torch.equal(pictures, unseen)
-    cold = renderer([replace(warm, preceding=[])]).pictures
+    cold = renderer([replace(warm, preceding=[])])
     assert cold.isfinite().all()
     assert (cold - pictures).abs().max() > 1e-3
 
 
 def test_a_batch_of_two_is_one_after_the_other() -> None:
-    renderer = shaken(UNet(6, 1, 4)).double()
-    observations = [doubled(observe(frames=1, seed=seed)) for seed in range(2)]
-    alone = torch.cat([renderer([observation]).pictures for observation in observations])
-    torch.testing.assert_close(renderer(observations).pictures, alone, rtol=0, atol=ROUNDING)
-
-
-def test_neither_the_preceding_picture_nor_the_surface_is_looked_at() -> None:
-    renderer = shaken(UNet(6, 1, 4))
-    observation = observe(frames=1)
-    without = replace(observation, history=None, surface=None)
-    assert torch.equal(renderer([observation]).pictures, renderer([without]).pictures)
+    renderer = shaken(unet(6, 1, 4)).double()
+    observations = [doubled(observe_paper(frames=1, seed=seed)) for seed in range(2)]
+    alone = torch.cat([renderer([observation]) for observation in observations])
+    torch.testing.assert_close(renderer(observations), alone, rtol=0, atol=ROUNDING)
 
 
 def test_gradients_reach_every_parameter_and_the_features_of_all_frames() -> None:
-    renderer = shaken(UNet(6, 2, 4))
-    observation = observe(surface=False)
+    renderer = shaken(unet(6, 2, 4))
+    observation = observe_paper()
     features = [tensor.requires_grad_() for tensor in features_of(observation)]
-    renderer([observation]).pictures.square().sum().backward()
+    renderer([observation]).square().sum().backward()
     for name, parameter in renderer.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.any(), name
@@ -143,10 +140,10 @@ def test_gradients_reach_every_parameter_and_the_features_of_all_frames() -> Non
 @pytest.mark.parametrize("aligned", [False, True])
 def test_the_base_puts_the_corners_on_corners_or_centres(aligned: bool) -> None:
     height, width, scale = 4, 6, 4
-    observation = observe(height, width, frames=0)
+    observation = observe_paper(height, width, frames=0)
     row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     observation.frame.values[..., 0], observation.frame.values[..., 1] = row / 8, column / 8
-    base = UNet(6, 0, scale, aligned=aligned).base([observation])
+    base = unet(6, 0, scale, aligned=aligned).base([observation])
     for channel, size in ((0, height), (1, width)):
         pixel = torch.arange(size * scale)
         if aligned:
@@ -158,12 +155,12 @@ def test_the_base_puts_the_corners_on_corners_or_centres(aligned: bool) -> None:
 
 
 def test_without_an_output_of_the_network_the_picture_is_the_base() -> None:
-    renderer = UNet(6, 2, 4, aligned=True)
+    renderer = unet(6, 2, 4, aligned=True)
     for layer in renderer.network.last.parameters():
         torch.nn.init.zeros_(layer)
-    observation = observe()
+    observation = observe_paper()
     base = renderer.base([observation])
-    assert torch.equal(renderer([observation]).pictures, base)
+    assert torch.equal(renderer([observation]), base)
     rgb = observation.frame.values[..., :3].permute(2, 0, 1)[None]
     want = functional.interpolate(rgb, scale_factor=4, mode="bilinear", align_corners=False)
     assert torch.equal(base, want.permute(0, 2, 3, 1))

@@ -9,7 +9,6 @@ from methods.steernerf_lean.cells import (
     REACH,
     cells_near,
     centres,
-    largest_in_cell,
     number,
     paint,
     pixels_of,
@@ -38,14 +37,6 @@ def test_cells_near_matter_are_within_reach_of_it() -> None:
     ]
     assert cells_near(seen).flatten().nonzero().flatten().tolist() == want
     assert not cells_near(torch.zeros_like(seen)).any()
-
-
-def test_a_cell_has_the_largest_of_its_pixels() -> None:
-    image = torch.full((HEIGHT * SCALE, WIDTH * SCALE), -1, dtype=torch.int32)
-    image[5, 3], image[11, 14], image[9, 12] = 7, 2, 1
-    want = torch.full((HEIGHT, WIDTH), -1, dtype=torch.int32)
-    want[1, 1], want[3, 4] = 7, 2
-    assert torch.equal(largest_in_cell(image, SCALE), want)
 
 
 def test_pixels_of_a_cell_are_those_at_their_centres() -> None:

@@ -4,84 +4,63 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.nn import functional
 
-from methods.steernerf.renderer import Observation
 from methods.steernerf_lean import lean_renderer
-from methods.steernerf_lean.lean_renderer import LeanRenderer
+from methods.steernerf_lean.lean_renderer import PRETRAINED, PRETRAINED_LAYOUT, LeanRenderer
+from methods.steernerf_lean.observation import LeanObservation
 from tests.methods.observations import ROUNDING, doubled, new_renderer, observe, shaken
 
 
 def pretrained() -> LeanRenderer:
     """What the weights that come with the package were trained as, but smaller."""
-    return shaken(new_renderer(3, 1, 4), seed=1)
+    return shaken(new_renderer(3, 4), seed=1)
 
 
-def widened(observation: Observation) -> Observation:
+def widened(observation: LeanObservation) -> LeanObservation:
     """Six features, of which the last three are everywhere what they are in the background."""
 
     def wide(values: Tensor) -> Tensor:
         return functional.pad(values, (0, 3), value=0.5)
 
-    surface = observation.surface
-    if surface is not None:  # whose last value, the opacity, stays the last
-        colours, opacity = surface.values[:, :-1], surface.values[:, -1:]
-        surface = replace(surface, values=torch.cat((wide(colours), opacity), dim=1))
+    surface = observation.surface  # whose last value, the opacity, stays the last
+    values = torch.cat((wide(surface.values[:, :-1]), surface.values[:, -1:]), dim=1)
     return replace(
         observation,
         frame=replace(observation.frame, values=wide(observation.frame.values)),
         background=wide(observation.background),
-        preceding=[replace(p, values=wide(p.values)) for p in observation.preceding],
-        surface=surface,
+        surface=replace(surface, values=values),
     )
 
 
 @pytest.mark.parametrize("channels", [3, 6])
-@pytest.mark.parametrize(
-    "parts",
-    [
-        {"frames": 1},
-        {"frames": 0},
-        {"frames": 2},
-        {"frames": 1, "history": False},
-        {"frames": 1, "surface": False},
-        {"frames": 0, "surface": False},
-    ],
-    ids=str,
-)
-def test_a_renderer_starts_as_the_pretrained_one_draws(channels: int, parts: dict) -> None:
+@pytest.mark.parametrize("history", [False, True])
+def test_a_renderer_starts_as_the_pretrained_one_draws(channels: int, history: bool) -> None:
     """Of what both know: the same picture, whatever else it may be shown later."""
-    start = pretrained()
-    renderer = new_renderer(channels, scale=4, **parts)
+    start, renderer = pretrained(), new_renderer(channels, history=history)
     renderer._start_from(start.network.state_dict())
-    known = doubled(
-        observe(
-            channels=3,
-            frames=min(parts["frames"], 1),
-            history=renderer.layout.history,
-            surface=renderer.layout.surface,
-        )
-    )
+    known = doubled(observe(channels=3, history=history))
     want = start.double()([known]).pictures
     got = renderer.double()([widened(known) if channels == 6 else known]).pictures
     torch.testing.assert_close(got, want, rtol=0, atol=ROUNDING)
 
 
 def test_the_weights_of_what_the_pretrained_one_never_saw_stay() -> None:
-    renderer = new_renderer(4, 2)
+    renderer = new_renderer(4)
     before = {name: x.clone() for name, x in renderer.network.state_dict().items()}
     renderer._start_from(pretrained().network.state_dict())
     stayed = {name: x == before[name] for name, x in renderer.network.state_dict().items()}
-    cell = [False, False, False, False, True]  # the colour, whether it is known, a feature
-    preceding = 16 * cell + 16 * [True] * 5
-    assert (
-        stayed["enter.weight"].all(dim=0).tolist() == cell + preceding + 16 * cell[:4] + 16 * cell
-    )
+    columns = renderer.layout.split(stayed["enter.weight"].all(dim=0))
+    assert columns["rest"].all()
+    assert columns["surface rest"].all()
+    assert not any(part.any() for name, part in columns.items() if not name.endswith("rest"))
+    cell = [False, False, False, False, True]  # the colour, the opacity, a feature
     assert stayed["read.weight"].all(dim=1).tolist() == 3 * cell
     assert stayed["read.bias"].tolist() == 3 * cell
     for name in ("leave.weight", "leave.bias", "trunk.0.spread"):
@@ -94,22 +73,25 @@ def test_pretrained_weights_are_read_from_their_file(
     halves = {name: x.half() for name, x in pretrained().network.state_dict().items()}
     save_file(halves, tmp_path / "lean.safetensors")
     monkeypatch.setattr(lean_renderer, "PRETRAINED", tmp_path / "lean.safetensors")
-    renderer = LeanRenderer(3, 1, 4, width=16, blocks=2)
+    renderer = LeanRenderer(3, 4, history=True, width=16, blocks=2, init="pretrained")
     for name, weight in renderer.network.state_dict().items():
         assert torch.equal(weight, halves[name].float()), name
 
 
+def test_the_weights_of_the_package_have_the_inputs_that_are_read() -> None:
+    assert load_file(PRETRAINED)["enter.weight"].shape[1] == PRETRAINED_LAYOUT.width
+
+
 @pytest.mark.parametrize("other", [{"width": 8}, {"blocks": 1}, {"blocks": 3}, {"scale": 2}])
-def test_pretrained_weights_of_another_shape_are_refused(other: dict[str, int]) -> None:
-    renderer = new_renderer(3, **other)
+def test_pretrained_weights_of_another_shape_are_refused(other: dict[str, Any]) -> None:
     with pytest.raises(
         ValueError, match=r"renderer\.init=pretrained: .* use renderer\.init=scratch"
     ):
-        renderer._start_from(pretrained().network.state_dict())
+        new_renderer(3, **other)._start_from(pretrained().network.state_dict())
 
 
 def test_weights_that_were_pretrained_with_other_inputs_are_refused() -> None:
     """Their columns would be taken for others."""
-    more = new_renderer(3, 2, 4)
-    with pytest.raises(ValueError, match="260 inputs instead of 196"):
-        new_renderer(3, 1, 4)._start_from(more.network.state_dict())
+    without = new_renderer(3, history=False)
+    with pytest.raises(ValueError, match=r"renderer\.init=pretrained: .* 68"):
+        new_renderer(3)._start_from(without.network.state_dict())

@@ -13,26 +13,25 @@ from torch import Tensor
 
 from bench.console import ConsoleLog
 from bench.types import Budget, Log, Scene, SteerbenchError
-from methods.steernerf.training.joint import JointOptions, RendererTraining
+from methods.steernerf.training.joint import JointTraining
 from methods.steernerf.training.patches import Batch
-from methods.steernerf.training.sequences import MotionOptions
-from methods.steernerf.training.stage2 import Stage2
 from methods.steernerf_lean import lean_renderer
 from methods.steernerf_lean.lean_renderer import LeanRenderer
 from methods.steernerf_lean.pretraining import AnyOf, pretrain_renderer
+from methods.steernerf_lean.training import LeanStage2
 from methods.training import checkpoint
-from tests.methods.models import small_model
+from tests.methods.models import lean_joint, lean_model, small_motion
 from tests.methods.trainings import TEACHER
 
-MODEL = small_model(channels=3, frames=1, step=4.0)
-JOINT = JointOptions(patch=4, motion=MotionOptions(pool=2, length=2))
+MODEL = lean_model(channels=3, step=4.0)
+JOINT = lean_joint(patch=4, motion=small_motion(pool=2, length=2))
 BUDGET = Budget("test", steps=40, samples=1024, renderer_steps=8)
-RENDERER = partial(LeanRenderer, width=8, blocks=1)
+RENDERER = partial(LeanRenderer, width=8, blocks=1, init="pretrained")
 
 
 def train(scenes: list[Scene], output: Path, log: Log, channels: int = 3) -> dict[str, Tensor]:
     model = replace(MODEL, channels=channels)
-    stage2 = Stage2(model, partial(RENDERER, init="scratch"), JOINT)
+    stage2 = LeanStage2(model, partial(RENDERER, init="scratch"), JOINT)
     pretrain_renderer(TEACHER, stage2, scenes, BUDGET, output, log)
     return load_file(output)
 
@@ -50,12 +49,12 @@ def test_the_weights_of_several_scenes_are_what_a_renderer_starts_from(
         assert written[name].isfinite().all(), name
         assert written[name].any(), name  # the last three were 0 before the training
     monkeypatch.setattr(lean_renderer, "PRETRAINED", output)
-    started = RENDERER(3, 1, 4)
+    started = RENDERER(3, 4, history=True)
     assert started.network.state_dict().keys() == written.keys()
     for name, weight in started.network.state_dict().items():
         assert torch.equal(weight, written[name].float()), name
-    for channels, frames, history in ((6, 2, True), (3, 0, False), (4, 1, False)):
-        other = RENDERER(channels, frames, 4, history=history)
+    for channels, history in ((6, True), (3, False), (4, False)):
+        other = RENDERER(channels, 4, history=history)
         assert torch.equal(other.network.trunk[0].spread, started.network.trunk[0].spread)
 
 
@@ -83,7 +82,7 @@ def test_a_renderer_that_was_trained_on_the_same_scenes_is_found_again(
     ball_scene: Scene, tmp_path: Path, quiet_log: Log, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = train([ball_scene], tmp_path / "first.safetensors", quiet_log)
-    monkeypatch.delattr(RendererTraining, "advance")
+    monkeypatch.delattr(JointTraining, "advance")
     again = train([ball_scene], tmp_path / "again.safetensors", quiet_log)
     for name, weight in first.items():
         assert torch.equal(again[name], weight), name

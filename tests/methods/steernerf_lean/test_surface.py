@@ -11,13 +11,7 @@ from methods.steernerf.renderer import Points
 from methods.steernerf.view import View
 from methods.steernerf_lean.surface import LAYER, surface_points
 from tests.methods.conftest import Work, look_at_the_middle
-from tests.methods.models import (
-    SMALL_GRID,
-    misty_field,
-    new_pipeline,
-    small_model,
-    small_rendering,
-)
+from tests.methods.models import SMALL_GRID, misty_field
 from tests.methods.observations import to_blocks
 
 CHANNELS = 4
@@ -55,15 +49,6 @@ def test_where_no_pixel_has_a_depth_there_is_none() -> None:
     assert not work.done["surface_samples"]
     assert points.values.shape == (0, CHANNELS + 1)
     assert (points.index == -1).all()
-
-
-def test_a_pipeline_that_has_no_use_for_it_has_none() -> None:
-    for surface in (False, True):
-        pipeline, probe = new_pipeline(small_model(surface=surface)), Work()
-        frame = pipeline.features(VIEW, (), small_rendering(), probe)
-        observation = pipeline.observe(frame, [], None, VIEW, small_rendering(), probe)
-        assert (observation.surface is not None) == surface
-        assert bool(probe.done["surface_samples"]) == surface
 
 
 @pytest.fixture

@@ -6,54 +6,36 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
-
 import torch
 from torch import Tensor
 
 from bench.types import check_shape
 from methods.kernels.dispatch import implementation
 
-Rule = Literal["nearest", "last"]
-"""Which of several points in a pixel is shown."""
-
 
 def splat(
-    pixels: Tensor,
-    depth: Tensor,
-    width: int,
-    height: int,
-    *,
-    rule: Rule = "nearest",
-    backend: str = "auto",
+    pixels: Tensor, depth: Tensor, width: int, height: int, *, backend: str = "auto"
 ) -> Tensor:
     """Find which of N points each pixel of a width x height picture shows: [height, width] int32.
 
-    An entry is the index of a point, -1 where none lands. Only points inside the picture with a
-    finite positive depth count; points that are not finite are ignored. Not differentiable; for
-    features use `gather`.
+    An entry is the index of the last point that lands there, whatever its depth, -1 for none: in
+    SteerNeRF's release points overwrite each other. Only points inside the picture with a finite
+    positive depth count. Not differentiable; for features use `gather`.
 
     Args:
         pixels: [N, 2] continuous coordinates (u, v), in pixels.
         depth: [N] z-depth.
         width, height: pixels of the picture, 1 or more.
-        rule: "nearest": the point with the smallest depth, then the smallest u, then the smallest
-            v, so that the order of points matters only for exact duplicates (the first wins).
-            "last": the point with the highest index, whatever its depth, as in SteerNeRF's
-            release, where points overwrite each other.
 
     Raises:
-        ValueError: wrong shape, size or rule; backend "cpu": not float32.
+        ValueError: wrong shape or size; backend "cpu": not float32.
     """
     check_shape("pixels", pixels, None, 2)
     check_shape("depth", depth, len(pixels))
     if width < 1 or height < 1:
         raise ValueError(f"width, height: expected 1 or more, got {width} x {height}")
-    if rule not in get_args(Rule):
-        raise ValueError(f"rule: expected one of {', '.join(get_args(Rule))}, got {rule!r}")
-    return implementation(__name__, backend, pixels.device).splat(
-        pixels.detach(), depth.detach(), width, height, rule
-    )
+    chosen = implementation(__name__, backend, pixels.device)
+    return chosen.splat(pixels.detach(), depth.detach(), width, height)
 
 
 def gather(values: Tensor, index: Tensor, *, backend: str = "auto") -> Tensor:
@@ -75,4 +57,19 @@ def gather(values: Tensor, index: Tensor, *, backend: str = "auto") -> Tensor:
                 f"index: expected -1 to {len(values) - 1} for {len(values)} rows of values, "
                 f"got {least} to {most}"
             )
-    return implementation(__name__, backend, values.device).gather(values, index)
+    chosen = implementation(__name__, backend, values.device)
+    rows = _Gather.apply(values.contiguous(), index.contiguous().view(-1), chosen)
+    return rows.view(*index.shape, values.shape[1])
+
+
+class _Gather(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, values, index, chosen):
+        ctx.save_for_backward(index)
+        ctx.points, ctx.chosen = len(values), chosen
+        return chosen.gather(values.detach(), index)
+
+    @staticmethod
+    def backward(ctx, grad):
+        (index,) = ctx.saved_tensors
+        return ctx.chosen.scatter(grad.contiguous(), index, ctx.points), None, None

@@ -11,66 +11,40 @@ from numba import get_num_threads, njit, prange
 from torch import Tensor
 
 from methods.kernels.cpu import i32
-from methods.steernerf.kernels.splat import Rule
 
 
-def splat(pixels: Tensor, depth: Tensor, width: int, height: int, rule: Rule) -> Tensor:
-    """See `methods.steernerf.kernels.splat.splat`."""
-    if not pixels.dtype == depth.dtype == torch.float32:
-        raise ValueError(
-            f"backend 'cpu' splats float32, got pixels {pixels.dtype}, depth {depth.dtype}: "
-            "use backend='reference'"
-        )
+def splat(pixels: Tensor, depth: Tensor, width: int, height: int) -> Tensor:
+    """The last point in each pixel."""
+    _check_float32(pixels=pixels, depth=depth)
     index = torch.empty(height, width, dtype=torch.int32)
-    _splat(
-        pixels.contiguous().numpy(),
-        depth.contiguous().numpy(),
-        rule == "last",
-        index.numpy(),
-        get_num_threads(),
-    )
+    u_v, z = pixels.contiguous().numpy(), depth.contiguous().numpy()
+    _splat(u_v, z, index.numpy(), get_num_threads())
     return index
 
 
 def gather(values: Tensor, index: Tensor) -> Tensor:
-    """See `methods.steernerf.kernels.splat.gather`."""
-    if values.dtype != torch.float32:
-        raise ValueError(
-            f"backend 'cpu' gathers float32, got values {values.dtype}: use backend='reference'"
-        )
-    rows = _Gather.apply(values.contiguous(), index.contiguous().view(-1))
-    return rows.view(*index.shape, values.shape[1])
+    """The rows [P, C] of the points that pixels show."""
+    _check_float32(values=values)
+    rows = torch.zeros(len(index), values.shape[1])
+    _gather(values.numpy(), index.numpy(), rows.numpy())
+    return rows
 
 
-class _Gather(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, values, index):
-        ctx.save_for_backward(index)
-        ctx.points = len(values)
-        rows = torch.zeros(len(index), values.shape[1])
-        _gather(values.detach().numpy(), index.numpy(), rows.numpy())
-        return rows
-
-    @staticmethod
-    def backward(ctx, grad):
-        (index,) = ctx.saved_tensors
-        grad_values = torch.zeros(ctx.points, grad.shape[1])
-        _scatter(grad.contiguous().numpy(), index.numpy(), grad_values.numpy())
-        return grad_values, None
+def scatter(rows: Tensor, index: Tensor, points: int) -> Tensor:
+    """Sums [points, C] of the `rows` of the pixels that show each point."""
+    sums = torch.zeros(points, rows.shape[1])
+    _scatter(rows.numpy(), index.numpy(), sums.numpy())
+    return sums
 
 
-@njit(cache=True)
-def _nearer(pixels, depth, a, b):
-    """Whether point a lies before point b: by depth, then u, then v."""
-    if depth[a] != depth[b]:
-        return depth[a] < depth[b]
-    if pixels[a, 0] != pixels[b, 0]:
-        return pixels[a, 0] < pixels[b, 0]
-    return pixels[a, 1] < pixels[b, 1]
+def _check_float32(**tensors: Tensor) -> None:
+    for name, x in tensors.items():
+        if x.dtype != torch.float32:
+            raise ValueError(f"backend 'cpu' splats float32, got {name} {x.dtype}: use 'reference'")
 
 
 @njit(cache=True, parallel=True)
-def _splat(pixels, depth, last, index, bands):
+def _splat(pixels, depth, index, bands):
     height, width = index.shape
     for band in prange(bands):
         top, bottom = height * band // bands, height * (band + 1) // bands
@@ -78,13 +52,9 @@ def _splat(pixels, depth, last, index, bands):
         for point in range(len(depth)):
             u, v, z = pixels[point, 0], pixels[point, 1], depth[point]
             # Compared as floats, where comparisons with NaN are false; converting huge or
-            # non-finite values to integers is undefined.
+            # non-finite values to integers is undefined. Not negative: truncation is floor.
             if top <= v < bottom and 0 <= u < width and 0 < z < np.inf:
-                row, column = int(v), int(u)  # not negative: truncation is floor
-                shown = index[row, column]
-                # The index serves as z-buffer: the depth of the shown point is looked up.
-                if shown < 0 or last or _nearer(pixels, depth, point, shown):
-                    index[row, column] = i32(point)
+                index[int(v), int(u)] = i32(point)
 
 
 @njit(cache=True, parallel=True)

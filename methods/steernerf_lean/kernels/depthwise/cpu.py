@@ -15,12 +15,9 @@ CHUNKS = 16
 
 
 def depthwise(x: Tensor, neighbours: Tensor, weight: Tensor) -> Tensor:
-    """See `methods.steernerf_lean.kernels.depthwise.depthwise`."""
+    """As the reference, of float32."""
     if not x.dtype == weight.dtype == torch.float32:
-        raise ValueError(
-            f"backend 'cpu' convolves float32, got x {x.dtype}, weight {weight.dtype}: "
-            "use backend='reference'"
-        )
+        raise ValueError("backend 'cpu' convolves float32 only: use backend='reference'")
     return _Depthwise.apply(x, neighbours, weight)
 
 

@@ -8,9 +8,9 @@ from torch.nn import functional
 
 
 def depthwise(x: Tensor, neighbours: Tensor, weight: Tensor) -> Tensor:
-    """See `methods.steernerf_lean.kernels.depthwise.depthwise`."""
+    """Sum the weighted rows of the neighbours, a tap at a time."""
     padded = functional.pad(x, (0, 0, 1, 0))  # the row of zeros that -1 stands for
     near = neighbours.long() + 1
-    # A tap at a time: inference engines fuse that, and are slow with [N, 9, C] numbers at once.
+    # Inference engines fuse this, and are slow with [N, 9, C] numbers at once.
     taps = zip(near.unbind(dim=1), weight, strict=True)
     return sum((padded[cells] * share for cells, share in taps), torch.zeros_like(x))

@@ -78,18 +78,14 @@ def warp(
 def source_from_camera(source: Camera, camera: Camera) -> tuple[Tensor, Tensor]:
     """M [3, 3], m [3]: homogeneous source pixel = z M (u, v, 1) + m.
 
-    In float64, on the device of the cameras.
+    In float64, on the device of the cameras, to which intrinsics are copied without waiting.
     """
     to, of = source.c2w.double(), camera.c2w.double()
     rotation = to[:, :3].T @ of[:, :3]
     offset = to[:, :3].T @ (of[:, 3] - to[:, 3])
-    inside = _intrinsics(source).to(to.device, non_blocking=True)
-    outside = _intrinsics(camera).inverse().to(to.device, non_blocking=True)
-    return inside @ rotation @ outside, inside @ offset
-
-
-def _intrinsics(camera: Camera) -> Tensor:
-    """The intrinsic matrix [3, 3] on the CPU, from which it is copied to a GPU without waiting."""
-    return torch.tensor(
-        [(camera.fx, 0, camera.cx), (0, camera.fy, camera.cy), (0, 0, 1)], dtype=torch.float64
+    inside, outside = (
+        torch.tensor([(c.fx, 0, c.cx), (0, c.fy, c.cy), (0, 0, 1)], dtype=torch.float64)
+        for c in (source, camera)
     )
+    inside = inside.to(to.device, non_blocking=True)
+    return inside @ rotation @ outside.inverse().to(to.device, non_blocking=True), inside @ offset

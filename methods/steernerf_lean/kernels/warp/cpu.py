@@ -13,11 +13,8 @@ from methods.steernerf_lean.kernels.warp import TOLERANCE
 
 
 def enlarge(depth: Tensor, cells: Tensor, scale: int) -> Tensor:
-    """See `methods.steernerf_lean.kernels.warp.enlarge`."""
-    if depth.dtype != torch.float32:
-        raise ValueError(
-            f"backend 'cpu' enlarges float32, got depth {depth.dtype}: use backend='reference'"
-        )
+    """As the reference, of float32."""
+    _check_float32(depth)
     out = torch.empty(len(cells), scale**2)
     _enlarge(depth.contiguous().numpy(), cells.numpy(), scale, f32(TOLERANCE), out.numpy())
     return out
@@ -31,24 +28,19 @@ def warp(
     scale: int,
     projection: tuple[Tensor, Tensor],
 ) -> tuple[Tensor, Tensor]:
-    """See `methods.steernerf_lean.kernels.warp.warp`."""
-    if not picture.dtype == depth.dtype == torch.float32:
-        raise ValueError(
-            f"backend 'cpu' warps float32, got picture {picture.dtype}, depth {depth.dtype}: "
-            "use backend='reference'"
-        )
+    """As the reference, of float32."""
+    _check_float32(picture, depth)
     values, valid = torch.empty(*depth.shape, picture.shape[2]), torch.empty(depth.shape)
-    _warp(
-        picture.contiguous().numpy(),
-        depth.contiguous().numpy(),
-        cells.numpy(),
-        width,
-        scale,
-        *(x.float().numpy() for x in projection),
-        values.numpy(),
-        valid.numpy(),
-    )
+    given = (picture.contiguous(), depth.contiguous(), cells)
+    matrix, offset = (x.float().numpy() for x in projection)
+    view = width, scale, matrix, offset
+    _warp(*(x.numpy() for x in given), *view, values.numpy(), valid.numpy())
     return values, valid
+
+
+def _check_float32(*tensors: Tensor) -> None:
+    if wrong := {x.dtype for x in tensors} - {torch.float32}:
+        raise ValueError(f"backend 'cpu' warps float32, got {wrong.pop()}: use backend='reference'")
 
 
 @njit(cache=True, parallel=True)
@@ -99,21 +91,23 @@ def _anything_near(depth, row, column):
 
 
 @njit(cache=True)
-def _clamp(value, size):
-    return min(max(value, 0), size - 1)
+def _corners(y, x, height, width):
+    """Rows, columns, and fractions on the way to the second ones, around (y, x) relative to the
+    centre of pixel (0, 0)."""
+    row, column = math.floor(y), math.floor(x)
+    top, bottom = min(max(int(row), 0), height - 1), min(max(int(row) + 1, 0), height - 1)
+    left, right = min(max(int(column), 0), width - 1), min(max(int(column) + 1, 0), width - 1)
+    return top, bottom, left, right, f32(y - row), f32(x - column)
 
 
 @njit(cache=True)
 def _depth_at(depth, y, x, tolerance):
-    """Depth at a continuous position relative to the centre of pixel (0, 0); inf if none."""
-    row, column = math.floor(y), math.floor(x)
-    down, right = f32(y - row), f32(x - column)
-    top, bottom = _clamp(int(row), depth.shape[0]), _clamp(int(row) + 1, depth.shape[0])
-    left, other = _clamp(int(column), depth.shape[1]), _clamp(int(column) + 1, depth.shape[1])
-    w0, w1 = (f32(1) - down) * (f32(1) - right), (f32(1) - down) * right
-    w2, w3 = down * (f32(1) - right), down * right
-    z0, z1 = _known(depth[top, left], w0), _known(depth[top, other], w1)
-    z2, z3 = _known(depth[bottom, left], w2), _known(depth[bottom, other], w3)
+    """The mean depth at (y, x); inf if there is none."""
+    top, bottom, left, right, down, across = _corners(y, x, *depth.shape)
+    w0, w1 = (f32(1) - down) * (f32(1) - across), (f32(1) - down) * across
+    w2, w3 = down * (f32(1) - across), down * across
+    z0, z1 = _known(depth[top, left], w0), _known(depth[top, right], w1)
+    z2, z3 = _known(depth[bottom, left], w2), _known(depth[bottom, right], w3)
     limit = min(min(z0, z1), min(z2, z3)) + tolerance
     total, weights = f32(0), f32(0)
     for z, weight in ((z0, w0), (z1, w1), (z2, w2), (z3, w3)):
@@ -131,11 +125,8 @@ def _known(z, weight):
 
 @njit(cache=True)
 def _look_up(picture, y, x, out):
-    row, column = math.floor(y), math.floor(x)
-    down, right = f32(y - row), f32(x - column)
-    top, bottom = _clamp(int(row), picture.shape[0]), _clamp(int(row) + 1, picture.shape[0])
-    left, other = _clamp(int(column), picture.shape[1]), _clamp(int(column) + 1, picture.shape[1])
+    top, bottom, left, right, down, across = _corners(y, x, picture.shape[0], picture.shape[1])
     for c in range(picture.shape[2]):
-        above = (f32(1) - right) * picture[top, left, c] + right * picture[top, other, c]
-        below = (f32(1) - right) * picture[bottom, left, c] + right * picture[bottom, other, c]
+        above = (f32(1) - across) * picture[top, left, c] + across * picture[top, right, c]
+        below = (f32(1) - across) * picture[bottom, left, c] + across * picture[bottom, right, c]
         out[c] = (f32(1) - down) * above + down * below

@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 
 from bench.cameras import pixel_grid
-from methods.steernerf.kernels.splat import Rule, gather, splat
+from methods.steernerf.kernels.splat import gather, splat
 
 BACKENDS = ["reference", "cpu"]
-RULES: list[Rule] = ["nearest", "last"]
 
 
 def scatter_points(
@@ -26,84 +25,46 @@ def scatter_points(
     return ((4 * pixels).round() / 4).to(dtype), depth.to(dtype)
 
 
-def plain_splat(
-    pixels: Tensor, depth: Tensor, width: int, height: int, rule: Rule
-) -> list[list[int]]:
+def plain_splat(pixels: Tensor, depth: Tensor, width: int, height: int) -> list[list[int]]:
     """The definition, a point at a time, in Python numbers."""
-    shown: dict[tuple[int, int], tuple[float, ...]] = {}
+    shown: dict[tuple[int, int], int] = {}
     for i, ((u, v), z) in enumerate(zip(pixels.tolist(), depth.tolist(), strict=True)):
-        if not (math.isfinite(u) and math.isfinite(v) and math.isfinite(z) and z > 0):
-            continue
-        cell = math.floor(v), math.floor(u)
-        key = (z, u, v, i) if rule == "nearest" else (-i, i)
-        if cell not in shown or key < shown[cell]:
-            shown[cell] = key
-    return [
-        [int(shown.get((row, column), (-1,))[-1]) for column in range(width)]
-        for row in range(height)
-    ]
+        if math.isfinite(u) and math.isfinite(v) and math.isfinite(z) and z > 0:
+            shown[math.floor(v), math.floor(u)] = i
+    return [[shown.get((row, column), -1) for column in range(width)] for row in range(height)]
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize(
     ("width", "height"), [(1, 1), (13, 7), (60, 80), (4097, 3)], ids=lambda size: str(size)
 )
-def test_a_picture_is_the_definition(rule: Rule, width: int, height: int, backend: str) -> None:
+def test_a_picture_is_the_definition(width: int, height: int, backend: str) -> None:
     pixels, depth = scatter_points(2000, width, height)
-    index = splat(pixels, depth, width, height, rule=rule, backend=backend)
+    index = splat(pixels, depth, width, height, backend=backend)
     assert index.dtype == torch.int32
-    assert index.tolist() == plain_splat(pixels, depth, width, height, rule)
+    assert index.tolist() == plain_splat(pixels, depth, width, height)
     assert (index >= 0).any()
 
 
-@pytest.mark.parametrize("rule", RULES)
-def test_the_reference_keeps_the_digits_of_float64(rule: Rule) -> None:
+def test_the_reference_keeps_the_digits_of_float64() -> None:
     pixels, depth = scatter_points(500, 9, 9, torch.float64)
-    depth += torch.arange(500).flip(0) * 1e-12  # nothing in float32
-    index = splat(pixels, depth, 9, 9, rule=rule, backend="reference")
-    assert index.tolist() == plain_splat(pixels, depth, 9, 9, rule)
+    pixels -= 1e-12  # nothing in float32: over the border of a pixel
+    index = splat(pixels, depth, 9, 9, backend="reference")
+    assert index.tolist() == plain_splat(pixels, depth, 9, 9)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_the_order_of_the_points_does_not_matter_even_at_equal_depth(backend: str) -> None:
-    pixels, depth = scatter_points(2000, 11, 11)
-    points = torch.cat((pixels, depth[:, None]), dim=1)
-    assert len(points.unique(dim=0)) < len(points)  # duplicates are among them
-    want = gather(points, splat(pixels, depth, 11, 11, backend=backend))
-    for seed in range(5):
-        order = torch.randperm(2000, generator=torch.Generator().manual_seed(seed))
-        index = splat(pixels[order], depth[order], 11, 11, backend=backend)
-        assert torch.equal(gather(points[order], index), want)
+def test_the_last_of_several_points_is_shown_whatever_its_depth(backend: str) -> None:
+    pixels, depth = torch.tensor([[0.5, 0.5], [0.1, 0.1], [0.9, 0.2]]), torch.tensor([2.0, 3.0, -1])
+    assert splat(pixels, depth, 1, 1, backend=backend).item() == 1
+    assert splat(pixels[:2].flip(0), depth[:2].flip(0), 1, 1, backend=backend).item() == 1
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize(
-    ("points", "shown"),
-    [
-        ([(0.5, 0.5, 2.0), (0.1, 0.1, 3.0)], 0),
-        ([(0.5, 0.1, 2.0), (0.4, 0.9, 2.0)], 1),
-        ([(0.5, 0.5, 2.0), (0.5, 0.4, 2.0)], 1),
-        ([(0.5, 0.5, 2.0), (0.5, 0.5, 2.0)], 0),
-    ],
-    ids=["depth", "u", "v", "index"],
-)
-def test_the_nearest_is_found_by_depth_then_u_then_v_then_index(
-    points: list[tuple[float, float, float]], shown: int, backend: str
-) -> None:
-    table = torch.tensor(points)
-    assert splat(table[:, :2], table[:, 2], 1, 1, backend=backend).item() == shown
-    assert splat(table[:, :2], table[:, 2], 1, 1, rule="last", backend=backend).item() == 1
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("depth", [0.0, -0.0, -1.0, -1e20, math.inf, -math.inf, math.nan])
-def test_a_depth_that_is_not_finite_and_positive_is_not_shown(
-    depth: float, rule: Rule, backend: str
-) -> None:
+def test_a_depth_that_is_not_finite_and_positive_is_not_shown(depth: float, backend: str) -> None:
     table = torch.tensor([[0.5, 0.5, 1e10], [0.5, 0.5, depth]])
-    index = splat(table[:, :2], table[:, 2], 1, 1, rule=rule, backend=backend)
+    index = splat(table[:, :2], table[:, 2], 1, 1, backend=backend)
     assert index.item() == 0
 
 
@@ -153,17 +114,15 @@ def test_the_border_of_a_pixel_belongs_to_the_next_and_that_of_the_picture_to_no
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("rule", RULES)
-def test_without_points_nothing_is_shown(rule: Rule, backend: str) -> None:
-    index = splat(torch.zeros(0, 2), torch.zeros(0), 3, 2, rule=rule, backend=backend)
+def test_without_points_nothing_is_shown(backend: str) -> None:
+    index = splat(torch.zeros(0, 2), torch.zeros(0), 3, 2, backend=backend)
     assert index.tolist() == [[-1, -1, -1], [-1, -1, -1]]
     assert gather(torch.zeros(0, 4), index, backend=backend).tolist() == [[[0.0] * 4] * 3] * 2
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("rule", RULES)
-def test_pixel_centres_land_in_their_own_pixel(rule: Rule, backend: str) -> None:
-    index = splat(pixel_grid(31, 17), torch.ones(31 * 17), 31, 17, rule=rule, backend=backend)
+def test_pixel_centres_land_in_their_own_pixel(backend: str) -> None:
+    index = splat(pixel_grid(31, 17), torch.ones(31 * 17), 31, 17, backend=backend)
     assert index.flatten().tolist() == list(range(31 * 17))
 
 
@@ -251,8 +210,6 @@ def test_wrong_arguments_are_named() -> None:
         splat(pixels, depth[:2], 5, 4)
     with pytest.raises(ValueError, match="width, height: expected 1 or more, got 5 x 0"):
         splat(pixels, depth, 5, 0)
-    with pytest.raises(ValueError, match="rule: expected one of nearest, last, got 'first'"):
-        splat(pixels, depth, 5, 4, rule="first")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="splats float32"):
         splat(pixels.double(), depth, 5, 4, backend="cpu")
     with pytest.raises(ValueError, match="values: expected shape"):
@@ -262,5 +219,5 @@ def test_wrong_arguments_are_named() -> None:
     for wrong in (-2, 3):
         with pytest.raises(ValueError, match="index: expected -1 to 2 for 3 rows of values"):
             gather(values, index + wrong)
-    with pytest.raises(ValueError, match="gathers float32"):
+    with pytest.raises(ValueError, match="splats float32, got values"):
         gather(values.double(), index, backend="cpu")

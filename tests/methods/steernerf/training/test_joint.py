@@ -2,38 +2,43 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import pytest
 import torch
 from torch import Tensor
 
-from bench.types import Camera, Log, NullProbe, Scene, SteerbenchError
+from bench.types import Camera, Log, Scene, SteerbenchError
 from methods.instant_ngp.field import HashField
-from methods.steernerf.options import Model, Rendering
+from methods.steernerf.options import Model
 from methods.steernerf.pipeline import Pipeline
-from methods.steernerf.renderer import Points, Renderer2d
-from methods.steernerf.training.joint import LEAST_ERROR, JointTraining, RendererTraining
+from methods.steernerf.renderer import Renderer2d
+from methods.steernerf.training.examples import TrainingViews
+from methods.steernerf.training.joint import JointTraining
 from methods.steernerf.training.options import JointOptions
-from methods.steernerf.training.patches import Batch, PatchSource, Through
-from methods.steernerf.training.sequences import MotionOptions, SequencePool, TrainingViews
+from methods.steernerf.training.stage2 import Stage2
 from methods.steernerf.unet import UNet
-from methods.steernerf.view import View
-from methods.steernerf_lean.cells import pixels_of
-from methods.steernerf_lean.surface import surface_points
 from methods.training import loop
 from tests.methods.conftest import SIZE, ball
-from tests.methods.models import misty_field, shell, small_model, small_renderer, trained_field
-from tests.methods.observations import shaken
+from tests.methods.models import (
+    misty_field,
+    shell,
+    small_joint,
+    small_model,
+    small_motion,
+    trained_field,
+)
 from tests.methods.trainings import killed
 
-MOTION = MotionOptions(pool=3, uses=4, length=2)
-OPTIONS = JointOptions(patch=4, batch=2, motion=MOTION, refined=0.0)
+MOTION = small_motion(pool=3, uses=4, length=2)
+OPTIONS = small_joint(patch=4, batch=2, motion=MOTION)
 MODEL = small_model()
-Place = Literal["anywhere", "content"]
+
+
+def small_unet(model: Model = MODEL) -> UNet:
+    return UNet(model.channels, model.frames, model.scale, width=8, aligned=False)
 
 
 def new_training(
@@ -43,69 +48,47 @@ def new_training(
     field: HashField | None = None,
     renderer: Renderer2d | None = None,
     steps: int = 12,
-) -> RendererTraining:
+) -> JointTraining:
     torch.manual_seed(0)
     field = field or misty_field(channels=model.channels)
-    renderer = renderer or small_renderer(model)
+    renderer = renderer or small_unet(model)
     generator = torch.Generator().manual_seed(1)
     pipeline = Pipeline(field, shell(), scene.background, renderer, model)
-    rendering = Rendering.in_training(model, options.refined, options.refined_step)
-    pool = SequencePool(pipeline, rendering, TrainingViews.of(scene), options.motion, generator)
+    stage2 = Stage2(model, UNet, options)
     learning = options.field == "joint"
-    through = options.through if learning else "none"
-    patches = PatchSource(pool, options, through, generator)
-    rest = (renderer, patches, options, steps, generator)
-    trained = trained_field(field)
-    training = JointTraining(trained, *rest) if learning else RendererTraining(*rest)
-    pipeline.renderer = training.mean
-    return training
+    patches = stage2.patches_of(pipeline, TrainingViews.of(scene), learning, generator)
+    trained = trained_field(field) if learning else None
+    return JointTraining(renderer, patches, options, steps, generator, trained)
 
 
-@pytest.mark.parametrize("surface", [False, True])
-@pytest.mark.parametrize("through", ["all", "present"])
 def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
-    ball_scene: Scene, through: Through, surface: bool, monkeypatch: pytest.MonkeyPatch
+    ball_scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In float64, along a random direction of all parameters, against a central difference.
 
     Table, networks and renderer are differentiated through compositing, the splatted features of
-    two preceding frames, the features at the surface, and the 2D renderer; depths, and so places,
-    are constants.
+    two preceding frames, and the 2D renderer; depths, and so places, are constants.
     """
     field = misty_field("fp32", "reference").double()
-    model = small_model(history=False, surface=surface)
-    renderer = small_renderer(model, width=6)
-    options = replace(OPTIONS, through=through, motion=MotionOptions(pool=4, length=2, least=2))
-    with torch.no_grad():
-        for layer in filter(
-            None, (renderer.network.leave, renderer.network.read, renderer.network.error)
-        ):
-            layer.weight.normal_(0, 0.1)
-    training = new_training(ball_scene, options, model, field.float(), renderer)
+    options = replace(OPTIONS, motion=replace(MOTION, pool=4, least=2))
+    training = new_training(ball_scene, options, field=field.float())
+    renderer, pipeline = training.renderer, training.patches.pipeline
     patches = [training.patches.cut(training.patches.pool.draw()) for _ in range(8)]
-    patches = [patch for patch in patches if all((i >= 0).any() for i in patch.indices)][:2]
-    assert [len(patch.indices) for patch in patches] == [2, 2]
+    shown = [p for p in patches if all((old.index >= 0).any() for old in p.points)][:2]
+    assert [len(patch.points) for patch in shown] == [2, 2]
     field.double(), renderer.double()
-    training.patches.pipeline.background = torch.ones(4, dtype=torch.float64)
+    pipeline.background = torch.ones(4, dtype=torch.float64)
     field.gradients = None
-    clouds = [f.cloud for patch in patches for f in patch.sequence.buffer.frames]
-    frozen = [cloud.values.double() for cloud in clouds]
-    for cloud, values in zip(clouds, frozen, strict=True):
-        object.__setattr__(cloud, "values", values)
-    depths: dict[int, Tensor] = {}
-
-    def at_first_depth(field: HashField, depth: Tensor, cells: Tensor, view: View, *rest) -> Points:
-        return surface_points(field, depths.setdefault(id(view), depth), cells, view, *rest)
-
-    monkeypatch.setattr("methods.steernerf.pipeline.surface_points", at_first_depth)
+    monkeypatch.setattr(torch, "zeros", partial(torch.zeros, dtype=torch.float64))  # of a canvas
+    patches = [
+        replace(p, points=[replace(old, values=old.values.double()) for old in p.points])
+        for p in shown
+    ]
+    truth = torch.stack([patch.truth for patch in patches])
 
     def loss() -> Tensor:
         observations, opacity = training.patches.observe(patches)
-        drawing = renderer(observations)
-        assert drawing.error is not None
-        truth = torch.stack([patch.truth for patch in patches])
-        more = opacity.square().mean() + drawing.error.square().mean()
-        return (drawing.pictures - truth).square().mean() + 1e-2 * more
+        return (renderer(observations) - truth).square().mean() + 1e-2 * opacity.square().mean()
 
     parameters = [field.table, *field.layers.values(), *renderer.parameters()]
     gradient = torch.autograd.grad(loss(), parameters)
@@ -128,7 +111,7 @@ def test_the_gradient_of_the_whole_chain_is_that_of_the_loss(
         assert (values[0] - values[1]) / (2 * step) == pytest.approx(slope, rel=1e-4)
 
 
-def state_of(training: RendererTraining) -> dict[str, Tensor]:
+def state_of(training: JointTraining) -> dict[str, Tensor]:
     return {name: tensor.clone() for name, tensor in training.result().items()}
 
 
@@ -151,11 +134,7 @@ def test_joint_trains_table_networks_and_renderer(ball_scene: Scene) -> None:
     after = training.result()
     changed = {name for name in before if not torch.equal(before[name], after[name])}
     assert {"field.table", "field.layers.density_out", "field.layers.feature_out"} <= changed
-    assert {
-        "mean.network.leave.weight",
-        "mean.network.leave.bias",
-        "mean.network.read.weight",
-    } <= changed
+    assert {"outcome.network.first.weight", "outcome.network.last.bias"} <= changed
 
 
 @pytest.mark.slow
@@ -170,7 +149,7 @@ def test_the_error_falls(ball_scene: Scene, frames: int) -> None:
     @torch.no_grad()
     def error() -> float:
         observations, _ = training.patches.observe(kept)
-        return (training.mean(observations).pictures - truth).square().mean().item()
+        return (training.outcome(observations) - truth).square().mean().item()
 
     before = error()
     for _ in range(120):
@@ -178,69 +157,15 @@ def test_the_error_falls(ball_scene: Scene, frames: int) -> None:
     assert error() < 0.8 * before
 
 
-def refined_loss(training: JointTraining, batch: Batch) -> Tensor:
-    loss = training._refinement_loss(batch, training.renderer(batch.observations))
-    assert isinstance(loss, Tensor)
-    return loss
-
-
-def test_the_field_learns_from_the_pixels_it_is_to_refine(ball_scene: Scene) -> None:
-    """From all of them: the squared error of the field's own rays, over all numbers of the
-    pictures. From some: the same in the mean."""
-    training = new_training(ball_scene, replace(OPTIONS, refined=0.25, refined_rays=10**6))
-    assert isinstance(training, JointTraining)
-    shaken(training.renderer)
-    batch = training.patches.draw(2)
-    estimated = training.renderer(batch.observations).error
-    assert estimated is not None
-    pipeline, rendering = training.patches.pipeline, training.patches.rendering
-    error, first = 0.0, 0
-    for o, view, truth in zip(batch.observations, batch.views, batch.truth, strict=True):
-        own = estimated[first : first + len(o.cells)]
-        first += len(o.cells)
-        worst = own.sort(descending=True).indices[: math.ceil(0.25 * len(own))]
-        shown = pipeline.refined(o.cells[worst], o.frame, view, rendering, NullProbe())
-        error += (shown - pixels_of(truth, o.cells[worst], 4)).square().sum().item()
-    whole = refined_loss(training, batch)
-    # The same samples, taken in rounds or at once, and a thousand squares added up.
-    torch.testing.assert_close(whole.item(), error / batch.truth.numel(), rtol=1e-4, atol=0)
-    whole.backward()
-    assert training.field.gradients
-    _, gradients = training.field.gradients.joined()
-    assert gradients.any()
-
-    training.options = replace(OPTIONS, refined=0.25, refined_rays=64)
-    some = torch.stack([refined_loss(training, batch).detach() for _ in range(80)])
-    # 5 standard deviations of the mean of 80.
-    assert (some.mean() - whole.detach()).abs() < 5 * some.std() / math.sqrt(80)
-
-
-def test_the_estimated_error_learns_the_log_of_the_error(ball_scene: Scene) -> None:
-    training = new_training(ball_scene)
-    batch = training.patches.draw(2)
-    drawing = training.renderer(batch.observations)
-    assert drawing.error is not None
-    made = [
-        pixels_of((picture - truth).square(), o.cells, 4).flatten(1).mean(dim=1)
-        for picture, truth, o in zip(drawing.pictures, batch.truth, batch.observations, strict=True)
-    ]
-    right = (torch.cat(made) + LEAST_ERROR).log()
-    at_best = training._error_loss(batch, replace(drawing, error=right))
-    assert at_best < 1e-12  # the logarithm is rounded
-    off = training._error_loss(batch, replace(drawing, error=right + 2))
-    torch.testing.assert_close(off, torch.tensor(4 * OPTIONS.error_weight), rtol=1e-5, atol=0)
-
-
-def test_the_renderer_of_the_release_can_be_trained(ball_scene: Scene) -> None:
-    model = small_model(frames=1, history=False)
-    options = replace(OPTIONS, batch=1)
-    training = new_training(ball_scene, options, model, renderer=UNet(4, 1, 4))
-    before = state_of(training)
+def test_a_step_enlarges_the_present_colours_once(
+    ball_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For the picture, not for a note on the progress as well."""
+    enlarged, training = [], new_training(ball_scene)
+    base = UNet.base
+    monkeypatch.setattr(UNet, "base", lambda *given: (enlarged.append(1), base(*given))[1])
     training.advance()
-    after = training.result()
-    assert all(
-        not torch.equal(before[name], after[name]) for name in before if name.endswith("weight")
-    )
+    assert len(enlarged) == 1
 
 
 def test_the_learning_rate_only_falls(ball_scene: Scene) -> None:
@@ -267,28 +192,19 @@ def test_both_learning_rates_of_the_release_fall_twice_to_the_same(ball_scene: S
         replace(OPTIONS, half_waves=2)
 
 
-def test_without_a_running_mean_the_result_is_the_weights(ball_scene: Scene) -> None:
-    training = new_training(ball_scene, replace(OPTIONS, average=0.0, clip=None))
-    for _ in range(2):
-        training.advance()
-    for one, other in zip(training.mean.parameters(), training.renderer.parameters(), strict=True):
-        assert torch.equal(one, other)
-
-
 def test_the_density_grid_follows_the_field_if_it_is_to(ball_scene: Scene) -> None:
     """The field of the test is dense everywhere, the grid knows of a shell alone: half of the
     visits are to any cell."""
     for visits in (0, 512):
         training = new_training(ball_scene, replace(OPTIONS, grid_samples=visits))
-        assert isinstance(training, JointTraining)
-        before = training.grid.density.clone()
+        before = training.trained.grid.density.clone()
         training.advance()
-        changed = not torch.equal(training.grid.density, before)
+        changed = not torch.equal(training.trained.grid.density, before)
         assert changed == (visits > 0)
         kept = training.result()["grid.density"]
-        assert torch.equal(kept, training.grid.density)
+        assert torch.equal(kept, training.trained.grid.density)
         assert training.patches.pipeline.occupancy is (
-            training.grid.occupancy if visits else training.patches.pipeline.occupancy
+            training.trained.grid.occupancy if visits else training.patches.pipeline.occupancy
         )
 
 
@@ -302,19 +218,14 @@ def test_a_patch_has_its_side_and_at_most_its_share_of_the_frame(
     assert (patch.view.low.width, patch.view.low.height) == (side, side)
 
 
-@pytest.mark.parametrize("place", ["anywhere", "content"])
-def test_a_patch_lies_anywhere_or_around_content(ball_scene: Scene, place: Place) -> None:
-    """Of a side of 2: the corner of a picture has no content, a patch around content has some."""
-    options = replace(OPTIONS, patch=2, place=place, motion=replace(MOTION, uses=100))
+def test_a_patch_lies_anywhere(ball_scene: Scene) -> None:
+    """Of a side of 2: the corner of a picture shows background alone."""
+    options = replace(OPTIONS, patch=2, motion=replace(MOTION, uses=100))
     source = new_training(ball_scene, options).patches
     patches = [source.cut(source.pool.draw()) for _ in range(200)]
     corners = {(round(patch.view.low.cx, 3), round(patch.view.low.cy, 3)) for patch in patches}
-    background = [bool((patch.truth == 1).all()) for patch in patches]
-    if place == "anywhere":
-        assert len(corners) > 40  # of 7 x 7, one of which 200 draws miss in the mean
-        assert any(background)
-    else:
-        assert not any(background)
+    assert len(corners) > 40  # of 7 x 7, one of which 200 draws miss in the mean
+    assert any((patch.truth == 1).all() for patch in patches)
 
 
 def test_rays_of_patches_are_jittered_if_they_are_to(ball_scene: Scene) -> None:
@@ -331,11 +242,11 @@ def test_a_killed_training_of_the_u_net_goes_on_in_its_memory_order(
 ) -> None:
     """Its kernels are channels last, and files keep no order; a fused optimiser reads both as they
     lie."""
-    model = small_model(frames=1, history=False, surface=False)
+    model = small_model(frames=1)
 
-    def new() -> RendererTraining:
+    def new() -> JointTraining:
         torch.manual_seed(0)
-        renderer = UNet(4, 1, 4, width=8).to(memory_format=torch.channels_last)
+        renderer = small_unet(model).to(memory_format=torch.channels_last)
         return new_training(ball_scene, replace(OPTIONS, batch=1), model, renderer=renderer)
 
     whole, again = new(), new()
@@ -381,7 +292,7 @@ def test_beyond_the_border_of_a_picture_its_last_row_and_column_go_on(ball_scene
     images = [image[:19, :18] for image in split.images]
     cropped = replace(split, cameras=cameras, images=images)
     scene = replace(ball_scene, splits={**ball_scene.splits, "train": cropped})
-    options = replace(OPTIONS, patch=SIZE, place="anywhere")
+    options = replace(OPTIONS, patch=SIZE)
     truth = new_training(scene, options).patches.draw(1).truth[0]
     assert truth.shape == (20, 20, 3)
     assert truth[:, 17].std() > 0  # not of background alone
@@ -394,7 +305,7 @@ def test_a_killed_training_goes_on_with_the_same_state(
 ) -> None:
     training = new_training(ball_scene)
     finished = tmp_path / "steernerf.safetensors"
-    with killed(RendererTraining, 5):
+    with killed(JointTraining, 5):
         loop.train(training, finished, "training", quiet_log)
     again = new_training(ball_scene)
     loop.resume(again, tmp_path / "checkpoint.safetensors")
@@ -407,7 +318,7 @@ def test_a_killed_training_goes_on_with_the_same_state(
     loop.train(again, finished, "training", quiet_log)
     assert {path.name for path in tmp_path.iterdir()} == {"steernerf.safetensors", "lock"}
     found = new_training(ball_scene)
-    monkeypatch.delattr(RendererTraining, "advance")
+    monkeypatch.delattr(JointTraining, "advance")
     loop.train(found, finished, "training", quiet_log)
     assert found.seconds == again.seconds
     for name, tensor in again.result().items():
@@ -417,8 +328,8 @@ def test_a_killed_training_goes_on_with_the_same_state(
 def test_a_killed_training_ends_as_if_it_had_never_stopped(
     ball_scene: Scene, tmp_path: Path
 ) -> None:
-    """The sequences go on, too: there and back, or are replaced when they are used up."""
-    options = replace(OPTIONS, motion=MotionOptions(pool=2, uses=3, longer=0.5))
+    """The examples go on, too: there and back, or are replaced when they are used up."""
+    options = replace(OPTIONS, motion=small_motion(pool=2, uses=3, longer=0.5))
     whole = new_training(ball_scene, options)
     for _ in range(4):
         whole.advance()
@@ -435,8 +346,8 @@ def test_a_killed_training_ends_as_if_it_had_never_stopped(
 def test_a_loss_that_is_no_number_stops_and_names_what_is_not_finite(ball_scene: Scene) -> None:
     training = new_training(ball_scene)
     with torch.no_grad():
-        training.renderer.network.leave.bias[0] = torch.nan
+        training.renderer.network.last.bias[0] = torch.nan
     with pytest.raises(
-        SteerbenchError, match=r"step 0: not finite: .*renderer\.network\.leave\.bias.*rate"
+        SteerbenchError, match=r"step 0: not finite: .*renderer\.network\.last\.bias.*rate"
     ):
         training.advance()

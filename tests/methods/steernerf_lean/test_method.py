@@ -1,0 +1,93 @@
+"""The lean method as the harness uses it."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+
+from bench.types import Budget, Log, NullProbe, Scene
+from methods.engines.torch_engine import TorchEngine
+from methods.steernerf.options import RangeReduction
+from methods.steernerf_lean.lean_renderer import LeanRenderer
+from methods.steernerf_lean.method import SteerNerfLean
+from methods.steernerf_lean.options import LeanJointOptions, LeanRendering, LeanSkips
+from tests.methods.models import lean_joint, lean_model, lean_pipeline, lean_rendering, small_motion
+from tests.methods.trainings import GRID, QUICK
+
+BUDGET = Budget("test", steps=40, samples=1024, renderer_steps=4)
+
+
+def new_method(frames: int = 1, **rendering: Any) -> SteerNerfLean:
+    motion = small_motion(pool=2, length=2)
+    return SteerNerfLean(
+        grid=GRID,
+        training=QUICK,
+        model=lean_model(channels=5, frames=frames, step=4.0),
+        rendering=lean_rendering(**{"step": 4.0} | rendering),
+        renderer=partial(LeanRenderer, width=8, blocks=1, init="scratch"),
+        joint=lean_joint(patch=4, distilled_views=2, motion=motion),
+        engine=TorchEngine(),
+        device="cpu",
+    )
+
+
+@pytest.mark.parametrize("frames", [0, 1])
+def test_a_rendering_may_be_exchanged_between_frames(
+    ball_scene: Scene, shared_log: Log, frames: int
+) -> None:
+    method = new_method(frames, refined=1.0)
+    method.fit(ball_scene, BUDGET, shared_log)
+    assert method.pipeline.renderer.layout.history == (frames > 0)
+    camera = ball_scene.splits["test"].cameras[0]
+    refined = method.render(camera, NullProbe()).rgb
+    method.reset()
+    method.rendering = replace(method.rendering, refined=0.0)
+    drawn = method.render(camera, NullProbe()).rgb
+    assert not torch.equal(drawn, refined)
+
+
+TURNED: dict[str, Any] = {
+    "step": 1.5,
+    "stop": 1e-1,
+    "range": RangeReduction("paper", 0.1, "expected"),
+    "overlap": 0.5,
+    "refined": 0.25,
+    "refined_step": 2.0,
+    "skip": LeanSkips(empty=True, hidden=True, background=False),
+}
+"""Another value of every field of a rendering."""
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(LeanRendering)])
+def test_no_field_of_a_rendering_is_in_the_key_of_a_training(name: str) -> None:
+    usual, other = new_method(), new_method(**{name: TURNED[name]})
+    assert usual.rendering != other.rendering
+    assert usual.stage2.key(BUDGET) == other.stage2.key(BUDGET)
+
+
+@pytest.mark.parametrize("name", ["error_weight", "refined", "refined_step", "clip", "average"])
+def test_every_option_of_its_own_is_in_the_key(name: str) -> None:
+    stage2 = new_method().stage2
+    assert isinstance(stage2.joint, LeanJointOptions)
+    joint = replace(stage2.joint, **{name: getattr(stage2.joint, name) / 2})
+    assert replace(stage2, joint=joint).key(BUDGET) != stage2.key(BUDGET)
+
+
+def test_training_renders_everywhere_and_refines_as_its_options_say() -> None:
+    rendering = new_method(refined=0.9, overlap=0.9).stage2.rendering
+    assert (rendering.step, rendering.refined, rendering.refined_step) == (4.0, 0.2, 2.0)
+    assert (rendering.range.mode, rendering.overlap) == ("off", 0.0)
+    assert rendering.skip == LeanSkips(empty=True, hidden=True, background=True)
+
+
+def test_of_a_frame_for_the_engine_only_its_own_inputs_are_recorded(
+    ball_scene: Scene, quiet_log: Log
+) -> None:
+    """Not those of the frames before it, whose pictures are drawn as well."""
+    pipeline = lean_pipeline()
+    frames = new_method().record(pipeline, ball_scene, 3, quiet_log)
+    assert [rows.shape[1] for rows, _ in frames] == 3 * [pipeline.renderer.layout.width]

@@ -1,0 +1,160 @@
+"""Stage 2 of the lean method: its losses, its patches, the mean of its weights."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from bench.types import NullProbe, Scene
+from methods.steernerf.training.examples import TrainingViews
+from methods.steernerf.training.patches import Batch
+from methods.steernerf_lean.cells import pixels_of
+from methods.steernerf_lean.lean_renderer import LeanRenderer
+from methods.steernerf_lean.training import LEAST_ERROR, LeanStage2, LeanTraining
+from methods.training import loop
+from tests.methods.models import (
+    lean_joint,
+    lean_model,
+    lean_renderer,
+    misty_field,
+    shell,
+    small_motion,
+    trained_field,
+)
+from tests.methods.observations import shaken
+
+MOTION = small_motion(pool=3, uses=4, length=2)
+OPTIONS = lean_joint(patch=4, motion=MOTION, refined=0.0)
+RENDERER = partial(LeanRenderer, width=8, blocks=1, init="scratch")
+
+
+def new_training(scene: Scene, options=OPTIONS, frames: int = 1, steps: int = 12) -> LeanTraining:
+    torch.manual_seed(0)
+    model, field = lean_model(frames=frames), misty_field()
+    renderer, generator = lean_renderer(model), torch.Generator().manual_seed(1)
+    stage2 = LeanStage2(model, RENDERER, options)
+    pipeline = stage2.pipeline(field, shell(), scene.background, renderer, model)
+    patches = stage2.patches_of(pipeline, TrainingViews.of(scene), True, generator)
+    training = LeanTraining(renderer, patches, options, steps, generator, trained_field(field))
+    pipeline.renderer = training.outcome
+    return training
+
+
+def refinement_loss(training: LeanTraining, batch: Batch) -> Tensor:
+    loss = training.refinement_loss(training.renderer(batch.observations), batch)
+    assert isinstance(loss, Tensor)
+    return loss
+
+
+def test_the_field_learns_from_the_pixels_it_is_to_refine(ball_scene: Scene) -> None:
+    """From all of them: the squared error of the field's own rays, over all numbers of the
+    pictures. From some: the same in the mean."""
+    training = new_training(ball_scene, replace(OPTIONS, refined=0.25, refined_rays=10**6))
+    shaken(training.renderer)
+    batch = training.patches.draw(2)
+    estimated = training.renderer(batch.observations).error
+    pipeline, rendering = training.patches.pipeline, training.patches.rendering
+    error, first = 0.0, 0
+    for o, view, truth in zip(batch.observations, batch.views, batch.truth, strict=True):
+        own = estimated[first : first + len(o.cells)]
+        first += len(o.cells)
+        worst = o.cells[own.sort(descending=True).indices[: math.ceil(0.25 * len(own))]]
+        shown = pipeline.refined(worst, view, rendering, NullProbe())
+        error += (shown - pixels_of(truth, worst, 4)).square().sum().item()
+    whole = refinement_loss(training, batch)
+    # The same samples, taken in rounds or at once, and a thousand squares added up.
+    torch.testing.assert_close(whole.item(), error / batch.truth.numel(), rtol=1e-4, atol=0)
+    whole.backward()
+    assert training.trained is not None
+    _, gradients = training.trained.field.gradients.joined()
+    assert gradients.any()
+
+    training.options = replace(training.options, refined_rays=64)
+    some = torch.stack([refinement_loss(training, batch).detach() for _ in range(80)])
+    # 5 standard deviations of the mean of 80.
+    assert (some.mean() - whole.detach()).abs() < 5 * some.std() / math.sqrt(80)
+
+
+def test_the_estimated_error_learns_the_log_of_the_error(ball_scene: Scene) -> None:
+    training = new_training(ball_scene)
+    batch = training.patches.draw(2)
+    drawing = training.renderer(batch.observations)
+    made = [
+        pixels_of((picture - truth).square(), o.cells, 4).flatten(1).mean(dim=1)
+        for picture, truth, o in zip(drawing.pictures, batch.truth, batch.observations, strict=True)
+    ]
+    right = (torch.cat(made) + LEAST_ERROR).log()
+    at_best = training.error_loss(replace(drawing, error=right), batch)
+    assert at_best < 1e-12  # the logarithm is rounded
+    off = training.error_loss(replace(drawing, error=right + 2), batch)
+    torch.testing.assert_close(off, torch.tensor(4 * OPTIONS.error_weight), rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("frames", [0, 1])
+def test_a_step_trains_field_renderer_and_mean(ball_scene: Scene, frames: int) -> None:
+    training = new_training(ball_scene, replace(OPTIONS, refined=0.25), frames=frames)
+    before = {name: x.clone() for name, x in training.result().items()}
+    for _ in range(3):
+        training.advance()
+    after = training.result()
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert {"field.table", "field.layers.density_out", "field.layers.feature_out"} <= changed
+    assert {f"outcome.network.{name}.weight" for name in ("leave", "read", "error")} <= changed
+
+
+def test_the_result_is_the_running_mean_of_the_weights_or_the_weights(ball_scene: Scene) -> None:
+    for average in (0.0, 0.999):
+        training = new_training(ball_scene, replace(OPTIONS, average=average, clip=None))
+        for _ in range(2):
+            training.advance()
+        pairs = zip(training.outcome.parameters(), training.renderer.parameters(), strict=True)
+        assert all(torch.equal(one, other) for one, other in pairs) == (average == 0)
+
+
+def test_a_killed_training_ends_as_if_it_had_never_stopped(
+    ball_scene: Scene, tmp_path: Path
+) -> None:
+    """The weights, their mean, and the preceding pictures."""
+    options = replace(OPTIONS, refined=0.25, motion=small_motion(pool=2, uses=3, longer=0.5))
+    whole, again = (new_training(ball_scene, options) for _ in range(2))
+    for _ in range(4):
+        whole.advance()
+    loop.save(whole, tmp_path / "checkpoint.safetensors")
+    loop.resume(again, tmp_path / "checkpoint.safetensors")
+    for training in (whole, again):
+        for _ in range(4):
+            training.advance()
+    for name, tensor in (whole.result() | whole.state()[0]).items():
+        assert torch.equal(tensor, (again.result() | again.state()[0])[name]), name
+
+
+def test_a_patch_lies_around_content(ball_scene: Scene) -> None:
+    """Of a side of 2: the corner of a picture has none."""
+    options = replace(OPTIONS, patch=2, motion=replace(MOTION, uses=100))
+    source = new_training(ball_scene, options).patches
+    patches = [source.cut(source.pool.draw()) for _ in range(100)]
+    assert not any((patch.truth == 1).all() for patch in patches)
+    assert len({(patch.view.low.cx, patch.view.low.cy) for patch in patches}) > 15
+
+
+def test_content_is_in_the_cells_that_show_more_than_background(ball_scene: Scene) -> None:
+    source = new_training(ball_scene).patches
+    picture = ball_scene.splits["train"].images[0]
+    alpha = picture[..., 3].float().view(8, 4, 8, 4).amax(dim=(1, 3))
+    assert torch.equal(source._cells(picture), (alpha > 0).nonzero())
+    on_white = torch.where(picture[..., 3:] > 0, picture[..., :3], 255)
+    assert torch.equal(source._cells(on_white), (alpha > 0).nonzero())
+    assert len(source._cells(torch.full_like(on_white, 255))) == 64
+
+
+def test_wrong_options_are_named() -> None:
+    with pytest.raises(ValueError, match=r"^joint\.average: expected a share of less than 1"):
+        lean_joint(average=1.0)
+    with pytest.raises(ValueError, match=r"^joint\.clip: expected more than 0, or null, got 0"):
+        lean_joint(clip=0.0)
