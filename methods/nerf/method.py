@@ -56,4 +56,4 @@ class Nerf(FieldStudent):
         if self.skip:
             return super().renderer(probe)
         cube = whole_cube(self.occupancy)
-        return cube, every_sample(self.field, self.occupancy, cube, probe, self.march)
+        return cube, every_sample(self.field, self.occupancy, cube, probe, self.sampling)

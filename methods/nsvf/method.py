@@ -14,8 +14,8 @@ from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.kernels.encode import encode
 from methods.kernels.types import BRICK, Occupancy
 from methods.nsvf.field import EMBEDDING, NsvfField
-from methods.rendering.march import check_step
 from methods.rendering.occupancy import STEP
+from methods.rendering.sampling import check_step
 from methods.students.fields import FieldStudent, StudentTraining
 from methods.students.networks import NetworkLessons
 from methods.students.voxels import occupied_voxels

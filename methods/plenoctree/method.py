@@ -20,7 +20,7 @@ from methods.plenoctree.start import Extraction, extract
 from methods.plenoctree.training import OctreeLessons, OctreeTraining
 from methods.rendering.compaction import to_host
 from methods.rendering.frame import Render
-from methods.rendering.march import March
+from methods.rendering.sampling import Sampling
 from methods.students.method import Student
 
 Stored = Literal["fp16", "fp32"]
@@ -101,7 +101,7 @@ class PlenOctree(Student):
                     octree.voxels,
                     octree.light,
                     stop=self.stop,
-                    faint=March(stop=self.stop).least_weight,
+                    faint=Sampling(stop=self.stop).least_weight,
                     backend=self.teacher.backend,
                 )
                 samples, shown = to_host([crossed.sum(), shaded.sum()])

@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from bench.types import Budget, Log, Probe, Rays, Scene
 from methods.instant_ngp.stage1 import TrainedField
-from methods.instant_ngp.training import MarchOptions, PixelTraining
+from methods.instant_ngp.training import PixelTraining, SamplingOptions
 from methods.kernels.types import Occupancy, Pixels
 from methods.rendering.batch import render_batch
 from methods.rendering.field import ROUND_SAMPLES, Field
@@ -28,7 +28,7 @@ in the units of its scenes."""
 
 
 @dataclass(frozen=True)
-class FieldLessons(MarchOptions):
+class FieldLessons(SamplingOptions):
     """How to train a student that is a field: first on points, then on rays as Instant-NGP is.
 
     Attributes:
@@ -110,7 +110,7 @@ class StudentTraining(PixelTraining):
         super().__init__(scene, device, budget.renderer_steps, samples, options, seed)
         self.field, self.teacher = field, teacher.field
         self.occupancy = occupancy or teacher.occupancy
-        self.march, self.cells = options.march(budget), self.occupancy.cells.nonzero()
+        self.sampling, self.cells = options.sampling(budget), self.occupancy.cells.nonzero()
         self.points_until = options.points * self.steps if len(self.cells) else 0
         self.optimiser = torch.optim.Adam(
             field.parameters(), betas=(0.9, 0.99), eps=1e-15, fused=True
@@ -157,7 +157,7 @@ class StudentTraining(PixelTraining):
             self.field,
             rays,
             self.occupancy,
-            self.march,
+            self.sampling,
             jitter=jitter,
             background=background,
             guide=self.teacher,
@@ -233,11 +233,11 @@ class FieldStudent(Student):
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """See `Student`."""
         super().fit(scene, budget, log)
-        self.march = replace(self.training.march(budget), stop=self.stop)
+        self.sampling = replace(self.training.sampling(budget), stop=self.stop)
 
     def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
         """See `Student`."""
-        return self.occupancy, everywhere(self.field, self.occupancy, probe, self.march)
+        return self.occupancy, everywhere(self.field, self.occupancy, probe, self.sampling)
 
     def sizes(self) -> dict[str, int]:
         """Bytes of the field and of the occupancy bits."""

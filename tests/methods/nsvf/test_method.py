@@ -149,7 +149,7 @@ def test_a_training_is_found_again_and_depends_on_its_step(
     camera = ball_scene.splits["test"].cameras[0]
     pictures = [method.render(camera, NullProbe()).rgb for method in (first, again)]
     assert torch.equal(*pictures)
-    assert first.march.step == pytest.approx(0.5 / 32)
+    assert first.sampling.step == pytest.approx(0.5 / 32)
     assert new_method(step=0.25).training.march_step * STEP == pytest.approx(0.25 / 32)
 
 
