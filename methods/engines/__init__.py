@@ -7,6 +7,7 @@ Kernels, reprojection and the field do not use an engine.
 from __future__ import annotations
 
 import importlib
+import json
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -42,9 +43,6 @@ CALIBRATION = 16
 """Number of frames whose inputs determine the ranges of all 8-bit numbers, and the sizes of varying
 axes to expect."""
 
-SIZES = "steerbench_sizes"
-"""Metadata key in a stored model for the sizes of varying axes to prepare."""
-
 
 @dataclass(frozen=True)
 class Built:
@@ -71,8 +69,6 @@ class Engine(ABC):
         name: as shown in rows.
         precisions: the supported precisions.
         libraries: distributions that the constructor loads.
-        prepares_sizes: whether it prepares for the sizes of varying axes seen in the samples,
-            before any frame is rendered.
 
     Raises:
         Unavailable: the engine does not have this precision, or cannot be used here.
@@ -81,7 +77,6 @@ class Engine(ABC):
     name: ClassVar[str]
     precisions: ClassVar[tuple[Precision, ...]]
     libraries: ClassVar[tuple[str, ...]] = ()
-    prepares_sizes: ClassVar[bool] = True
 
     def __init__(self, precision: Precision = "fp32", calibration: Calibration = "frames") -> None:
         if precision not in self.precisions:
@@ -112,8 +107,7 @@ class Engine(ABC):
     def samples(self, network: Network) -> int:
         """Number of frames whose inputs `build` needs. If it is 1, only their shapes are read."""
         calibrated = self.precision == "int8" and not self.uncalibrated
-        several = calibrated or (self.prepares_sizes and any(network.varying))
-        return CALIBRATION if several else 1
+        return CALIBRATION if calibrated or any(network.varying) else 1
 
     def key(self) -> dict[str, object]:
         """Everything that the built network depends on, besides the network and its inputs."""
@@ -158,6 +152,16 @@ def keep(path: Path, write: Callable[[Path], None], log: Log) -> None:
                 part.replace(path.parent / part.name)
 
 
+def note_sizes(model: Path, samples: Sequence[Inputs], network: Network) -> None:
+    """Note beside a stored `model` which sizes of varying axes to prepare."""
+    model.with_suffix(".json").write_text(json.dumps(sizes_to_expect(samples, network)))
+
+
+def noted_sizes(model: Path) -> list[int]:
+    """The sizes that `note_sizes` noted."""
+    return json.loads(model.with_suffix(".json").read_text())
+
+
 def readable(network: Network) -> Network:
     """A copy of `network` in plain torch, which converters of engines can trace."""
     copy = deepcopy(network)
@@ -165,14 +169,15 @@ def readable(network: Network) -> Network:
     return copy
 
 
+def varying_sizes(inputs: Inputs, network: Network) -> list[int]:
+    """The sizes of the varying axes of `inputs`."""
+    pairs = zip(inputs, network.varying, strict=True)
+    return [x.shape[axis] for x, axes in pairs for axis in axes]
+
+
 def sizes_to_expect(samples: Sequence[Inputs], network: Network) -> list[int]:
     """Sizes of varying axes to prepare: the range in `samples`, plus one quantum at each end."""
-    seen = {
-        x.shape[axis]
-        for inputs in samples
-        for x, axes in zip(inputs, network.varying, strict=True)
-        for axis in axes
-    }
+    seen = {size for inputs in samples for size in varying_sizes(inputs, network)}
     if not seen:
         return []
     step = network.quantum

@@ -13,9 +13,11 @@ from torch import Tensor, nn
 class Network(nn.Module, ABC):
     """A network that engines can run: it maps tensors to a tuple of tensors.
 
+    Inputs are rows [N, C] or pictures [B, C, H, W]; only their C is always the same.
+
     Attributes:
-        varying: for each input, the axes whose size differs from frame to frame; all of them have
-            the same size.
+        varying: for each input, the axes whose size differs even between frames of one camera path,
+            so that engines prepare for several; all of them have the same size.
         quantum: this size is a multiple of `quantum` while frames are rendered.
         backend: backend of its kernels; engines convert it with "reference", which is plain torch.
     """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import sys
 import warnings
@@ -18,7 +17,6 @@ from torch import Tensor
 from bench.errors import Unavailable
 from bench.types import Log
 from methods.engines import (
-    SIZES,
     Built,
     Calibration,
     Engine,
@@ -28,9 +26,10 @@ from methods.engines import (
     Precision,
     Samples,
     keep,
+    note_sizes,
+    noted_sizes,
     readable,
     required,
-    sizes_to_expect,
 )
 from methods.engines.fixed_ranges import largest
 
@@ -69,24 +68,24 @@ class OpenVino(Engine):
             )
 
     def computed(self, device: torch.device) -> str:
-        """See `Engine.computed`."""
+        """As of any engine; beside int8, this CPU may compute in bfloat16."""
         computed = super().computed(device)
         return computed.replace("+fp32", "+bf16") if self._half else computed
 
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
-        """See `Engine.build`."""
+        """Convert `network`, for int8 quantised, and compile it for the sizes to expect."""
 
         def write(path: Path) -> None:
             seen = samples()
             model = self._convert(network, seen)
-            model.set_rt_info(json.dumps(sizes_to_expect(seen, network)), SIZES)
             self._openvino.save_model(model, path, compress_to_fp16=self.precision == "bf16")
+            note_sizes(path, seen, network)
 
         path = folder() / "network.xml"
         keep(path, write, log)
         model = self._openvino.Core().read_model(path)
         compiled = _Compiled(self._openvino, model, network.varying, half=self._half)
-        sizes = json.loads(model.get_rt_info(SIZES).value)
+        sizes = noted_sizes(path)
         with log.progress("compiling", len(sizes)) as progress:
             for size in sizes:
                 compiled.prepare(size)
@@ -95,9 +94,9 @@ class OpenVino(Engine):
         return Built(compiled, sum(op.data.nbytes for op in weights))
 
     def _convert(self, network: Network, samples: Sequence[Inputs]) -> Any:
+        # Of rows [N, C] and pictures [B, C, H, W]; frames may have another size than the samples.
         shapes = [
-            [-1 if axis in axes else length for axis, length in enumerate(x.shape)]
-            for x, axes in zip(samples[0], network.varying, strict=True)
+            [length if axis == 1 else -1 for axis, length in enumerate(x.shape)] for x in samples[0]
         ]
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # from the tracer, and about argument checks

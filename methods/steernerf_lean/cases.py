@@ -16,14 +16,13 @@ from torch import Tensor
 from bench.case import Case, Cell, Property
 from bench.console import ConsoleLog
 from methods.engines import Engine, Inputs, Precision
-from methods.engines.onnxruntime_engine import OnnxRuntime
 from methods.engines.openvino_engine import OpenVino
 from methods.engines.tensorrt_engine import TensorRt
 from methods.engines.torch_engine import TorchEngine
 from methods.steernerf_lean.kernels.depthwise import neighbours_of
 from methods.steernerf_lean.lean_renderer import LeanRenderer
 
-ENGINES: tuple[type[Engine], ...] = (TorchEngine, OpenVino, OnnxRuntime, TensorRt)
+ENGINES: tuple[type[Engine], ...] = (TorchEngine, OpenVino, TensorRt)
 CELLS: list[Cell] = [
     (engine.name, precision) for engine in ENGINES for precision in engine.precisions
 ]

@@ -13,9 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from bench.console import ConsoleLog
-from bench.errors import Unavailable
 from methods.engines import CALIBRATION, Engine, Inputs, Network, required
-from methods.engines.onnxruntime_engine import OnnxRuntime
 from methods.engines.openvino_engine import OpenVino
 from methods.engines.tensorrt_engine import TensorRt
 from tests.methods.engines.test_engines import lean, unet
@@ -219,34 +217,9 @@ def test_no_more_frames_are_needed_than_without_int8(
     assert kind("int8", "frames").samples(module) == CALIBRATION
 
 
-@pytest.mark.parametrize("kind", [*KINDS, OnnxRuntime])
+@pytest.mark.parametrize("kind", KINDS)
 def test_only_int8_depends_on_the_calibration(kind: Kind) -> None:
     assert kind("int8", "none").key() != kind("int8", "frames").key()
+    assert kind("int8", "none").computed(CPU) == "int8 uncalibrated+fp32"
     assert kind("fp32", "none").key() == kind("fp32", "frames").key()
     assert kind("fp32", "none").computed(CPU) == "fp32"
-
-
-def test_without_int8_the_result_is_the_same(tmp_path: Path, quiet_log: ConsoleLog) -> None:
-    module, found = layers(), []
-    for calibration in ("frames", "none"):
-        place = tmp_path / calibration
-        place.mkdir()
-        engine = OpenVino("fp32", calibration)
-        found.append(engine.build(module, lambda: [noise(0)], lambda at=place: at, quiet_log).run)
-    for a, b in zip(*(run(*noise(1)) for run in found), strict=True):
-        assert torch.equal(a, b)
-
-
-@pytest.mark.parametrize(("half", "rest"), [(["BF16"], "bf16"), ([], "fp32")])
-def test_rows_say_that_int8_was_not_calibrated(
-    half: list[str], rest: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("methods.engines.openvino_engine._capabilities", lambda openvino: half)
-    assert OpenVino("int8", "none").computed(CPU) == f"int8 uncalibrated+{rest}"
-    assert TensorRt("int8", "none").computed(CPU) == "int8 uncalibrated+fp32"
-
-
-def test_onnx_runtime_refuses_before_anything_is_trained() -> None:
-    with pytest.raises(Unavailable, match=r"calibration=none: .* use engine=openvino"):
-        OnnxRuntime("int8", "none").check(CPU)
-    OnnxRuntime("fp32", "none").check(CPU)
