@@ -93,7 +93,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class TrainedField:
-    """A trained `field`, the `grid` of its densities, the `sampling` of the rays that it learned from,
+    """A trained `field`, the `grid` of its densities, the `sampling` of the rays it learned from,
     and the seconds that its training took."""
 
     field: HashField
