@@ -18,9 +18,7 @@ from methods.kernels import availability, dispatch
 CASES = found("cases")
 QUICK = [case for case in CASES if case.quick]
 DEAR = (
-    *("march", "voxel_walk", "render_voxels", "warp"),
-    *("composite backward", "encode backward", "gaussian blending backward"),
-    *("grouped linear", "grouped linear backward", "ssim", "ssim backward"),
+    *("march", "warp", "composite backward", "encode backward"),
     *("space_to_depth", "space_to_depth backward"),
 )
 """Subjects whose kernels of the GPU have loops or many operations: interpreted, they take long."""
@@ -52,12 +50,7 @@ def test_it_holds(case: Case, cell: Cell, device: str) -> None:
     assert row["status"] == "ok", row
 
 
-MANY_BLOCKS = {
-    "methods.gaussians.kernels.blending": {"parts of tiles"},
-    "methods.kernels.march": {"inside and outside"},
-    "methods.gaussians.kernels.ssim": {"noise, 33 x 40"},
-    "methods.kernels.voxel_walk": {"inside and outside", "stop and faint"},
-}
+MANY_BLOCKS = {"methods.kernels.march": {"inside and outside"}}
 """Kernels whose blocks are larger where they are interpreted, and cases of several small blocks."""
 
 

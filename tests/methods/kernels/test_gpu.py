@@ -9,30 +9,22 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
-from bench.cameras import place_camera
 from bench.case import U32, largest_error
-from bench.types import Camera, Rays
+from bench.types import Rays
 from methods.checks import kernels
-from methods.gaussians.kernels.blending import blend
-from methods.gaussians.kernels.projection import Ellipses, project_gaussians
-from methods.gaussians.kernels.ssim import ssim
-from methods.kernels import availability, corner_gather
+from methods.kernels import availability
 from methods.kernels.adam import AdamState, hash_adam_, sparse_adam_
 from methods.kernels.composite import composite, visible, weights
 from methods.kernels.encode import HashGrid, SampleGradients, encode
 from methods.kernels.encode.reference import corners
 from methods.kernels.march import extents, march
 from methods.kernels.types import Intervals, Occupancy
-from methods.kernels.voxel_shading import shade_voxels
-from methods.kernels.voxel_walk import Voxels, walk
-from methods.kilonerf.kernels.grouped_mlp import grouped_linear
 from methods.steernerf.kernels.splat import gather, splat
 from methods.steernerf_lean.kernels.space_to_depth import CellInputs, Layout, space_to_depth
 from methods.steernerf_lean.kernels.space_to_depth.cases import cases
@@ -41,9 +33,6 @@ pytestmark = pytest.mark.skipif(
     bool(availability()["gpu"]), reason="Triton has no build for this platform"
 )
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
-POSE = torch.tensor([[1.0, 0.0, 0.0, 0.5], [0.0, 1.0, 0.0, 0.5], [0.0, 0.0, 1.0, -1.0]])
-FRONT = Camera(POSE, 20.0, 20.0, 10.0, 9.0, 20, 18)
-"""It looks at the unit cube, which fills the picture."""
 
 
 def test_a_table_of_half_precision_gives_features_of_its_type() -> None:
@@ -94,20 +83,11 @@ def test_told_to_be_deterministic_it_adds_up_in_an_order_that_repeats() -> None:
     values = torch.rand(3, 5, device=DEVICE, requires_grad=True)
     index = torch.randint(-1, 3, (4000,), dtype=torch.int32, device=DEVICE)
     rows = torch.rand(4000, 5, device=DEVICE)
-    corners = torch.arange(16, dtype=torch.int32, device=DEVICE).view(2, 8)
-    features = torch.rand(16, 5, device=DEVICE, requires_grad=True)
-    of_corners = torch.rand(4000, 8, device=DEVICE)
-    harmonics = torch.rand(2, 4, 3, device=DEVICE, requires_grad=True)
-    up = torch.tensor([[0.0, 0.0, 1.0]], device=DEVICE)
-    voxel, ray = index.clamp(0, 1), torch.zeros_like(index)
 
     def gradients() -> tuple[Tensor, ...]:
         loss = (encode(positions, table, grid, backend="gpu") * weights_of_rows).sum()
         loss = loss + (gather(values, index, backend="gpu") * rows).sum()
-        at_corners = corner_gather.gather(features, corners, voxel, of_corners, backend="gpu")
-        colours = shade_voxels(harmonics, voxel, ray, up, backend="gpu")
-        loss = loss + (at_corners * rows).sum() + (colours * rows[:, :3]).sum()
-        return torch.autograd.grad(loss, (table, values, features, harmonics))
+        return torch.autograd.grad(loss, (table, values))
 
     free = gradients()
     torch.use_deterministic_algorithms(True)
@@ -184,118 +164,6 @@ def test_what_is_not_contiguous_is_read_all_the_same() -> None:
     assert largest_error(*gradients) <= 6 * 50**0.5 * (fractions + 50 * U32)
 
 
-def gaussian_gradients(given: list[Tensor]) -> tuple[Tensor, ...]:
-    """Those of the sum of a picture of 20 x 18 pixels, by all that Gaussians consist of."""
-    means, scales, rotations, opacities, colours = (x.detach().requires_grad_() for x in given)
-    ellipses = project_gaussians(
-        means, scales, rotations, opacities, place_camera(FRONT, DEVICE), backend="gpu"
-    )
-    pixels = blend(ellipses, opacities, colours, 20, 18, backend="gpu")
-    total = pixels.values.sum() + pixels.alpha.sum()  # its gradients are expanded, not contiguous
-    return torch.autograd.grad(total, (means, scales, rotations, opacities, colours))
-
-
-def some_gaussians() -> list[Tensor]:
-    """Means, scales, rotations, opacities and colours, each transposed in memory."""
-    generator = torch.Generator().manual_seed(0)
-    means, scales, rotations, colours = (
-        torch.rand(size, 12, generator=generator).to(DEVICE).T for size in (3, 3, 4, 3)
-    )
-    opacities = torch.rand(12, 2, generator=generator).to(DEVICE)[:, 0]
-    return [means, 0.2 * scales, rotations, opacities, colours]
-
-
-def test_gaussians_that_are_not_contiguous_are_the_same() -> None:
-    given = some_gaussians()
-    assert not any(x.is_contiguous() for x in given)
-    found = gaussian_gradients(given)
-    assert all(grad.count_nonzero() for grad in found)
-    assert largest_error(found, gaussian_gradients([x.contiguous() for x in given])) == 0
-
-
-def test_gradients_of_gaussians_repeat_to_the_last_bit() -> None:
-    """Nothing has to be told to be deterministic."""
-    given = some_gaussians()
-    assert largest_error(gaussian_gradients(given), gaussian_gradients(given)) == 0
-
-
-@pytest.mark.parametrize("far", [-1e30, -1e3, 1e3, 1e30])
-@pytest.mark.parametrize("axis", [0, 1])
-def test_a_gaussian_far_outside_of_the_picture_is_not_in_it(axis: int, far: float) -> None:
-    centres = torch.full((1, 2), 8.0, device=DEVICE)
-    centres[0, axis] = far
-    ones = torch.ones(1, 3, device=DEVICE)
-    ellipses = Ellipses(centres, ones, ones[:, 0], torch.full_like(centres, 4.0))
-    assert not blend(ellipses, ones[:, 0], ones, 17, 33, backend="gpu").alpha.any()
-
-
-def scattered(x: Tensor) -> Tensor:
-    """The same numbers, with the last axis outermost in memory."""
-    axes = tuple(reversed(range(x.dim())))
-    return x.permute(axes).contiguous().permute(axes)
-
-
-def ssim_of(picture: Tensor, target: Tensor, grad: Tensor) -> tuple[Tensor, ...]:
-    found = ssim(picture.requires_grad_(), target, backend="gpu")
-    return found, *torch.autograd.grad(found, picture, grad)
-
-
-def linear_of(x: Tensor, weights: Tensor, biases: Tensor, grad: Tensor) -> tuple[Tensor, ...]:
-    offsets = torch.tensor([0, 3, 7], device=DEVICE)
-    given = x.requires_grad_(), weights.requires_grad_(), biases.requires_grad_()
-    out = grouped_linear(*given, offsets, relu=True, backend="gpu")
-    return out, *torch.autograd.grad(out, given, grad)
-
-
-def corner_features_of(
-    table: Tensor, corners: Tensor, weights: Tensor, grad: Tensor, buffer: Tensor
-) -> tuple[Tensor, ...]:
-    """Of voxels that share no corner: a sum has one term, in every order."""
-    given = table.requires_grad_(), corners.int(), torch.tensor([1, 0], device=DEVICE).int()
-    out = corner_gather.gather(*given, weights, grad_buffer=buffer, backend="gpu")
-    out.backward(grad)
-    return out, buffer
-
-
-def colours_of(
-    harmonics: Tensor, directions: Tensor, grad: Tensor, buffer: Tensor
-) -> tuple[Tensor, ...]:
-    """Of voxels that are seen once."""
-    voxel, ray = (torch.tensor(x, device=DEVICE).int() for x in ([2, 0, 1], [1, 0, 1]))
-    out = shade_voxels(harmonics, voxel, ray, directions, grad_buffer=buffer, backend="gpu")
-    out.backward(grad)
-    return out, buffer
-
-
-def crossed_by(origins: Tensor, directions: Tensor, cells: Tensor) -> tuple[Tensor, ...]:
-    voxels = Voxels((8 * cells).long().unique(dim=0), 8)
-    found = walk(Rays(origins - 1, directions + 0.5), voxels, limit=2, backend="gpu")
-    assert len(found)
-    return found.t, found.delta, found.voxel
-
-
-@pytest.mark.parametrize(
-    ("compute", "shapes"),
-    [
-        (ssim_of, [(4, 5, 3), (4, 5, 3), ()]),
-        (linear_of, [(7, 5), (2, 5, 3), (2, 3), (7, 3)]),
-        (corner_features_of, [(16, 5), (2, 8), (2, 8), (2, 5), (16, 5)]),
-        (colours_of, [(3, 4, 3), (2, 3), (3, 3), (3, 4, 3)]),
-        (crossed_by, [(6, 3), (6, 3), (300, 3)]),
-    ],
-)
-def test_where_numbers_lie_in_memory_changes_nothing(
-    compute: Callable[..., tuple[Tensor, ...]], shapes: list[tuple[int, ...]]
-) -> None:
-    generator = torch.Generator().manual_seed(0)
-    given = [torch.rand(shape, generator=generator).to(DEVICE) for shape in shapes]
-    if compute is corner_features_of:
-        given[1] = torch.arange(16.0, device=DEVICE).view(2, 8)
-    there = [scattered(x) for x in given]
-    right = compute(*(x.clone() for x in given))
-    assert all(torch.equal(x, y) for x, y in zip(compute(*there), right, strict=True))
-
-
 def test_a_thin_haze_keeps_its_light_to_the_last_digits() -> None:
     """1 - exp(-tau) of a tau far below 1, which a difference of float32 numbers does not have."""
     sigma = torch.logspace(-30, 0, 61, device=DEVICE)
@@ -336,15 +204,6 @@ def test_types_that_it_does_not_serve_are_refused() -> None:
     positions = torch.rand(2, 3, dtype=torch.float64, device=DEVICE)
     with pytest.raises(ValueError, match="expects positions of float32"):
         encode(positions, torch.rand(grid.entries, 2, device=DEVICE), grid, backend="gpu")
-
-
-def test_gaussians_of_another_type_are_refused() -> None:
-    means, scales, rotations, opacities, colours = (x.double() for x in some_gaussians())
-    with pytest.raises(ValueError, match="expects means of float32"):
-        project_gaussians(means, scales, rotations, opacities, FRONT, backend="gpu")
-    ellipses = Ellipses(means[:, :2], scales, opacities, means[:, :2])
-    with pytest.raises(ValueError, match="expects centres of float32"):
-        blend(ellipses, opacities, colours, 4, 4, backend="gpu")
 
 
 def test_the_first_step_moves_the_corners_of_a_sample_by_the_rate() -> None:
