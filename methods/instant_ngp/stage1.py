@@ -93,8 +93,8 @@ class Setup:
 
 @dataclass(frozen=True)
 class TrainedField:
-    """A trained `field`, the `grid` of its densities, the `sampling` of the rays it learned from,
-    and the seconds that its training took."""
+    """A trained `field`, the `grid` of its densities, the `sampling` of its rays in training, and
+    the seconds that its training took."""
 
     field: HashField
     grid: DensityGrid

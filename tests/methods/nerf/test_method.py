@@ -22,12 +22,12 @@ from tests.methods.conftest import Work
 from tests.methods.trainings import EXACT_TEACHER, TAUGHT, goes_on_after_a_kill, quality
 
 BUDGET = replace(TAUGHT, steps=80, renderer_steps=4)
-LONG = 8.0
-"""Marching step, in the usual ones: few samples for a large network."""
+LONG = EXACT_TEACHER.training.march_step
+"""Step of the rays, in the usual ones."""
 
 
 def new_method(**options: Any) -> Nerf:
-    training = NetworkLessons(rate=1e-3, march_step=LONG)
+    training = NetworkLessons(rate=1e-3)
     return Nerf(**{"teacher": EXACT_TEACHER, "training": training} | options)
 
 
