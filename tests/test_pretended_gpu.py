@@ -275,10 +275,11 @@ def test_planted_a_kernel_of_the_cpu_is_found(
 class Asking(nn.Module):
     """A network that asks for a number."""
 
+    varying = False
+
     def __init__(self) -> None:
         super().__init__()
         self.factor = nn.Parameter(torch.ones(1))
-        self.varying: tuple[tuple[int, ...], ...] = ((),)
 
     def forward(self, x: Tensor) -> tuple[Tensor]:
         return (x * self.factor.item(),)

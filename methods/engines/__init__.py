@@ -40,8 +40,8 @@ Folder = Callable[[], Path]
 """Returns a folder reserved for one network and engine. Called only if a build stores something."""
 
 CALIBRATION = 16
-"""Number of frames whose inputs determine the ranges of all 8-bit numbers, and the sizes of varying
-axes to expect."""
+"""Number of frames whose inputs determine the ranges of all 8-bit numbers, and the numbers of rows
+to expect."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Engine(ABC):
     def samples(self, network: Network) -> int:
         """Number of frames whose inputs `build` needs. If it is 1, only their shapes are read."""
         calibrated = self.precision == "int8" and not self.uncalibrated
-        return CALIBRATION if calibrated or any(network.varying) else 1
+        return CALIBRATION if calibrated or network.varying else 1
 
     def key(self) -> dict[str, object]:
         """Everything that the built network depends on, besides the network and its inputs."""
@@ -153,12 +153,12 @@ def keep(path: Path, write: Callable[[Path], None], log: Log) -> None:
 
 
 def note_sizes(model: Path, samples: Sequence[Inputs], network: Network) -> None:
-    """Note beside a stored `model` which sizes of varying axes to prepare."""
+    """Note beside a stored `model` which numbers of rows to prepare for."""
     model.with_suffix(".json").write_text(json.dumps(sizes_to_expect(samples, network)))
 
 
 def noted_sizes(model: Path) -> list[int]:
-    """The sizes that `note_sizes` noted."""
+    """The numbers of rows that `note_sizes` noted."""
     return json.loads(model.with_suffix(".json").read_text())
 
 
@@ -169,29 +169,18 @@ def readable(network: Network) -> Network:
     return copy
 
 
-def varying_sizes(inputs: Inputs, network: Network) -> list[int]:
-    """The sizes of the varying axes of `inputs`."""
-    pairs = zip(inputs, network.varying, strict=True)
-    return [x.shape[axis] for x, axes in pairs for axis in axes]
-
-
 def sizes_to_expect(samples: Sequence[Inputs], network: Network) -> list[int]:
-    """Sizes of varying axes to prepare: the range in `samples`, plus one quantum at each end."""
-    seen = {size for inputs in samples for size in varying_sizes(inputs, network)}
-    if not seen:
+    """Numbers of rows to prepare for: the range in `samples`, plus one quantum at each end."""
+    if not network.varying:
         return []
-    step = network.quantum
+    seen, step = {len(inputs[0]) for inputs in samples}, network.quantum
     least, most = max(min(seen) // step - 1, 1), -(-max(seen) // step) + 1
     return sorted({*seen, *range(least * step, most * step + 1, step)})
 
 
-def resized(sample: Inputs, network: Network, size: int) -> Inputs:
-    """Zeros like `sample`, with varying axes of `size`."""
-    shapes = (
-        [size if axis in axes else length for axis, length in enumerate(x.shape)]
-        for x, axes in zip(sample, network.varying, strict=True)
-    )
-    return tuple(x.new_zeros(shape) for x, shape in zip(sample, shapes, strict=True))
+def resized(sample: Inputs, size: int) -> Inputs:
+    """Zeros like `sample`, but `size` rows."""
+    return tuple(x.new_zeros(size, *x.shape[1:]) for x in sample)
 
 
 def required(engine: str, library: str, extra: str) -> ModuleType:

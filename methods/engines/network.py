@@ -16,13 +16,12 @@ class Network(nn.Module, ABC):
     Inputs are rows [N, C] or pictures [B, C, H, W]; only their C is always the same.
 
     Attributes:
-        varying: for each input, the axes whose size differs even between frames of one camera path,
-            so that engines prepare for several; all of them have the same size.
-        quantum: this size is a multiple of `quantum` while frames are rendered.
+        varying: whether inputs are rows, whose N differs from frame to frame.
+        quantum: N is a multiple of `quantum` while frames are rendered.
         backend: backend of its kernels; engines convert it with "reference", which is plain torch.
     """
 
-    varying: tuple[tuple[int, ...], ...]
+    varying = False
     quantum = 1
     backend = "auto"
 

@@ -97,7 +97,7 @@ def _export(module: nn.Module, network: Network, sample: Inputs, path: Path) -> 
             path,
             input_names=inputs,
             output_names=names("output", outputs),
-            dynamic_axes=dict(zip(inputs, map(list, network.varying), strict=True)),
+            dynamic_axes={name: [0] for name in inputs if network.varying},
             opset_version=OPSET,
             dynamo=False,
         )

@@ -24,7 +24,6 @@ from methods.engines import (
     noted_sizes,
     onnx_model,
     required,
-    varying_sizes,
 )
 
 
@@ -98,7 +97,7 @@ class _Plans:
     def __call__(self, *inputs: Tensor) -> Inputs:
         if not all(x.numel() for x in inputs):
             return self._network(*inputs)
-        size = max(varying_sizes(inputs, self._network), default=1)
+        size = len(inputs[0]) if self._network.varying else 1
         return self._execution(_ceiling(size))(*inputs)
 
     def _execution(self, ceiling: int) -> _Execution:

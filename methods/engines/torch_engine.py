@@ -65,10 +65,10 @@ class TorchEngine(Engine):
 def _recorded(run: Callable[..., Inputs], network: Network, samples: Samples, log: Log) -> Replayed:
     """`run` as CUDA graphs, recorded beforehand for the expected sizes."""
     replayed, seen = Replayed(run), samples()
-    sizes = sizes_to_expect(seen, network) or [1]  # a network of fixed size has one graph
-    with torch.no_grad(), log.progress("recording CUDA graphs", len(sizes)) as progress:
-        for size in sizes:
-            replayed(*resized(seen[0], network, size))
+    expected = [resized(seen[0], size) for size in sizes_to_expect(seen, network)] or seen[:1]
+    with torch.no_grad(), log.progress("recording CUDA graphs", len(expected)) as progress:
+        for inputs in expected:
+            replayed(*inputs)
             progress.advance()
     return replayed
 

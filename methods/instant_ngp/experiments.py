@@ -22,44 +22,29 @@ def experiments() -> list[Experiment]:
     table = torch.empty(GRID.entries, GRID.features).uniform_(-1, 1, generator=generator)
     positions = torch.rand(SAMPLES, 3, generator=generator)
     directions = torch.randn(SAMPLES, 3, generator=generator)
-    field = HashField(GRID, precision="fp32", generator=generator).requires_grad_(False)
-    field.table.copy_(table.bfloat16())
-    return [_table(table, positions), *_networks(field, positions, directions)]
-
-
-def _table(table: Tensor, positions: Tensor) -> Experiment:
     exact = encode(positions.double(), table.double(), GRID, backend="reference")
     packed = pack(table)
-    trials = [
+    formats = [
         Trial("float32", lambda: encode(positions, table, GRID), exact),
         Trial("packed bf16", lambda: encode(positions, table, GRID, packed=packed), exact),
     ]
-    return Experiment("encoding: features, entries of -1 to 1", "table", trials)
+    found = [Experiment("encoding: features, entries of -1 to 1", "table", formats)]
 
-
-def _networks(field: HashField, positions: Tensor, directions: Tensor) -> list[Experiment]:
+    field = HashField(GRID, precision="fp32", generator=generator).requires_grad_(False)
+    field.table.copy_(table.bfloat16())
+    rounded = HashField(GRID, precision="bf16").requires_grad_(False)
+    rounded.load_state_dict(field.state_dict())
+    rounded.repack()
     exact_field = copy.deepcopy(field).double()
     exact_field.backend = "reference"
-    exact = _answers(exact_field, positions.double(), directions.double())
-    fields = {"float32": field, "bf16": _in_bf16(field)}
-    return [
-        Experiment(
-            f"field: {name}",
-            "networks",
-            [
-                Trial(kind, partial(_answer, of_kind, positions, directions, index), exact[index])
-                for kind, of_kind in fields.items()
-            ],
-        )
-        for index, name in enumerate(("log density", "features"))
-    ]
-
-
-def _in_bf16(field: HashField) -> HashField:
-    other = HashField(field.grid, field.channels, precision="bf16")
-    other.load_state_dict(field.state_dict())
-    other.repack()
-    return other.requires_grad_(False)
+    answers = _answers(exact_field, positions.double(), directions.double())
+    for index, name in enumerate(("log density", "features")):
+        trials = [
+            Trial(kind, partial(_answer, of_kind, positions, directions, index), answers[index])
+            for kind, of_kind in (("float32", field), ("bf16", rounded))
+        ]
+        found.append(Experiment(f"field: {name}", "networks", trials))
+    return found
 
 
 def _answer(field: HashField, positions: Tensor, directions: Tensor, index: int) -> Tensor:

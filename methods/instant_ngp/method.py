@@ -83,5 +83,5 @@ class InstantNgp:
         return self.trained.sizes()
 
     def settings(self) -> dict[str, str]:
-        """See `bench.types.Method.settings`."""
+        """The settings that a row of results shows, as they really are."""
         return self.setup.settings()

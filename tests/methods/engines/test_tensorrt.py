@@ -42,7 +42,7 @@ def test_tensors_go_in_and_out_as_the_network_takes_and_gives_them(
 
 def test_plans_are_built_for_the_sizes_to_expect_and_found_again(double, tmp_path, quiet_log):
     module, _ = lean()
-    sample = resized(cells(0), module, 2 * module.quantum)
+    sample = resized(cells(0), 2 * module.quantum)
 
     def build(samples: Callable) -> None:
         TensorRt("fp16").build(module, samples, lambda: tmp_path, quiet_log)

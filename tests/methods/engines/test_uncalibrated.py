@@ -29,8 +29,6 @@ CPU = torch.device("cpu")
 class Layers(Network):
     """Two convolutions, and one of what is pooled between them."""
 
-    varying = ((),)
-
     def __init__(self) -> None:
         super().__init__()
         self.first, self.second = nn.Conv2d(4, 8, 3, padding=1), nn.Conv2d(8, 3, 3, padding=1)
