@@ -29,7 +29,7 @@ from methods.engines.network import Network as Network
 Precision = Literal["fp32", "bf16", "fp16", "int8"]
 
 Calibration = Literal["frames", "none"]
-"""Source of the ranges of 8-bit activations: real frames, or none (see `fixed_ranges`)."""
+"""Source of the ranges of 8-bit activations: real frames, or none: `fixed_ranges`."""
 
 Inputs = tuple[Tensor, ...]
 

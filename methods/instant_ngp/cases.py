@@ -42,18 +42,18 @@ def cases() -> list[Case]:
         "pictures of one pixel": partial(_scene, 128, size=1),
         "all cameras the same": partial(_scene, 128, apart=0.0),
     }
-    found = []
+    checks = []
     holds = f"losses and parameters stay finite for {STEPS} steps"
     for name, make in pictures.items():
-        found.append(_exactly("training", holds).case(name, partial(_stays_finite, make)))
+        checks.append(_exactly("training", holds).case(name, partial(_stays_finite, make)))
     holds = "it stays finite, or stops with a SteerbenchError and a good last state"
     for rate in (10.0, 1e10, 1e30):
         error = partial(_keeps_a_good_state, rate)
-        found.append(_exactly("training", holds).case(f"learning rate {rate:g}", error))
+        checks.append(_exactly("training", holds).case(f"learning rate {rate:g}", error))
     holds = "the next step stops with a SteerbenchError that names the table"
     for value in (math.nan, math.inf):
         error = partial(_reports, value)
-        found.append(_exactly("training", holds).case(f"{value} in the table", error))
+        checks.append(_exactly("training", holds).case(f"{value} in the table", error))
     shrunk = Property(
         "training",
         "they do not vanish: 1e-20 of what they were",
@@ -61,14 +61,14 @@ def cases() -> list[Case]:
         "roundings of size 1: 16 u, in bf16 5 ulp",
         {(b, p): 16 * U32 if p == "fp32" else 5 * U16 for b, p in BY},
     )
-    found.append(shrunk.case("gradients 1e-20 as large", _shrunk_gradient_error))
+    checks.append(shrunk.case("gradients 1e-20 as large", _shrunk_gradient_error))
     holds = f"no cell counts as occupied after {FORGOTTEN_AFTER} visits"
     forgotten = _exactly("density grid", holds)
-    found.append(forgotten.case("field explodes, then is empty", _unforgotten))
+    checks.append(forgotten.case("field explodes, then is empty", _unforgotten))
     for raw in (-1e4, -100.0, 100.0, 1e4):
         finite = _exactly("field", "pixels, opacity and gradients are finite")
-        found.append(finite.case(f"log density {raw:g}", partial(_extreme_density, raw)))
-    return found
+        checks.append(finite.case(f"log density {raw:g}", partial(_extreme_density, raw)))
+    return checks
 
 
 def _exactly(subject: str, holds: str) -> Property:

@@ -28,7 +28,7 @@ def experiments() -> list[Experiment]:
         Trial("float32", lambda: encode(positions, table, GRID), exact),
         Trial("packed bf16", lambda: encode(positions, table, GRID, packed=packed), exact),
     ]
-    found = [Experiment("encoding: features, entries of -1 to 1", "table", formats)]
+    made = [Experiment("encoding: features, entries of -1 to 1", "table", formats)]
 
     field = HashField(GRID, precision="fp32", generator=generator).requires_grad_(False)
     field.table.copy_(table.bfloat16())
@@ -43,8 +43,8 @@ def experiments() -> list[Experiment]:
             Trial(kind, partial(_answer, of_kind, positions, directions, index), answers[index])
             for kind, of_kind in (("float32", field), ("bf16", rounded))
         ]
-        found.append(Experiment(f"field: {name}", "networks", trials))
-    return found
+        made.append(Experiment(f"field: {name}", "networks", trials))
+    return made
 
 
 def _answer(field: HashField, positions: Tensor, directions: Tensor, index: int) -> Tensor:

@@ -26,15 +26,10 @@ def render_rays(
     occupancy: Occupancy,
     probe: Probe,
     how: Sampling,
-    carry: Pixels | None = None,
 ) -> Pixels:
-    """Render R `rays`. Values are not composited on a background.
-
-    Args:
-        carry: pixels of what lies in front of the windows of `how`; changed in place and returned.
-    """
+    """Render R `rays`. Values are not composited on a background."""
     device = rays.origins.device
-    canvas = carry or Pixels.blank(len(rays.origins), field.channels, device)
+    canvas = Pixels.blank(len(rays.origins), field.channels, device)
     render = _in_rounds if compacts(device) else _at_once
     render(field, rays, occupancy, probe, how, canvas)
     return canvas
@@ -118,8 +113,8 @@ def _at_once(
                 samples.ray.split(CHUNK_SAMPLES),
                 strict=True,
             )
-            found = [query(field, positions, ray, encoded) for positions, ray in pieces]
-            sigma, values = (torch.cat(column) for column in zip(*found, strict=True))
+            parts = [query(field, positions, ray, encoded) for positions, ray in pieces]
+            sigma, values = (torch.cat(column) for column in zip(*parts, strict=True))
             through = 1 - front.alpha
             weight = weights(sigma, samples, stop=how.stop, front=through, backend=backend)
             values = torch.where((weight > how.least_weight)[:, None], values, 0)
