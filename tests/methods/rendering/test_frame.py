@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bench.cameras import cast
+from bench.cameras import cast, place_camera
 from bench.types import EMPTY_ALPHA, NullProbe
 from methods.instant_ngp.field import HashField
 from methods.kernels.march import march
@@ -45,8 +45,7 @@ def test_a_camera_inside_the_matter_sees_it_in_all_pixels() -> None:
 
 def test_a_frame_is_its_rays_on_the_background(cloud: tuple[HashField, Occupancy]) -> None:
     field, occupancy = cloud
-    camera = look_at_the_middle(0.1, 0.4)
-    camera = replace(camera, c2w=camera.c2w.to(field.device), width=20)
+    camera = replace(place_camera(look_at_the_middle(0.1, 0.4), field.device), width=20)
     background, work = torch.tensor((0.25, 0.5, 1.0), device=field.device), Work()
     render = everywhere(field, occupancy, work, Sampling())
     frame = render_frame(camera, occupancy, background, work, render)
@@ -68,8 +67,7 @@ def test_a_frame_is_its_rays_on_the_background(cloud: tuple[HashField, Occupancy
 def test_a_window_is_that_of_its_pixel(cloud: tuple[HashField, Occupancy]) -> None:
     """Half of the pixels may look nowhere, though `render_frame` asks for some pixels only."""
     field, occupancy = cloud
-    camera = look_at_the_middle(0.1, 0.4)
-    camera = replace(camera, c2w=camera.c2w.to(field.device))
+    camera = place_camera(look_at_the_middle(0.1, 0.4), field.device)
     window = torch.tensor((0.0, torch.inf), device=field.device).repeat(32, 32, 1)
     window[:, :16] = 0.0
     black, probe = torch.zeros(3, device=field.device), NullProbe()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -22,8 +20,7 @@ from tests.methods.conftest import GRID, Work, look_at_the_middle
 
 def test_rounds_render_what_one_go_renders(cloud: tuple[HashField, Occupancy], device: str) -> None:
     field, occupancy = cloud
-    camera = look_at_the_middle(0.1, 0.4)
-    rays = cast(replace(camera, c2w=camera.c2w.to(device)))
+    rays = cast(place_camera(look_at_the_middle(0.1, 0.4), device))
     half = torch.full((len(rays.origins),), 0.5, device=device)
     with torch.no_grad():
         whole, _ = render_batch(field, rays, occupancy, Sampling(), jitter=half)
@@ -75,8 +72,7 @@ def test_faint_samples_are_black_and_not_looked_at_in_rounds(
 ) -> None:
     monkeypatch.setattr(rendering, "compacts", lambda device: compacts)
     field, occupancy = cloud
-    camera = look_at_the_middle(0.1, 0.4)
-    rays = cast(replace(camera, c2w=camera.c2w.to(field.device)))
+    rays = cast(place_camera(look_at_the_middle(0.1, 0.4), field.device))
     stop, work = 0.01, Work()
     rendered = render_rays(field, rays, occupancy, work, Sampling(stop=stop))
     assert work.done["shaded_samples"] > 0
@@ -103,26 +99,3 @@ def test_an_empty_grid_renders_nothing(compacts: bool, monkeypatch: pytest.Monke
     rendered = render_rays(field, cast(camera), occupancy, NullProbe(), Sampling())
     assert len(rendered.alpha) == camera.width * camera.height
     assert not rendered.alpha.any()
-
-
-def test_rays_go_on_behind_what_they_carry(cloud: tuple[HashField, Occupancy]) -> None:
-    """In two windows, one behind the other, they see what they see in one go."""
-    field, occupancy = cloud
-    camera = look_at_the_middle(0.1, 0.4)
-    rays = cast(replace(camera, c2w=camera.c2w.to(field.device)))
-    near = torch.zeros(len(rays.origins), 2, device=field.device)
-    near[:, 1] = 1.6  # half of the way through the box
-    far = torch.stack((near[:, 1], torch.full_like(near[:, 1], torch.inf)), dim=1)
-    whole = render_rays(field, rays, occupancy, NullProbe(), Sampling())
-    front = render_rays(field, rays, occupancy, NullProbe(), Sampling().within(near))
-    assert 0 < front.alpha.sum() < 0.95 * whole.alpha.sum()
-    both = render_rays(field, rays, occupancy, NullProbe(), Sampling().within(far), front)
-    assert both is front
-    # A sample on the border may be in both or in neither of the windows: a share of 1 / 1000 of
-    # the cube.
-    torch.testing.assert_close(both.alpha, whole.alpha, rtol=0, atol=0.02)
-
-
-def test_a_weight_is_faint_below_a_share_of_the_transmittance_at_the_end() -> None:
-    assert Sampling(stop=0.01).least_weight == FAINT * 0.01
-    assert Sampling(stop=0.01, faint=0.25).least_weight == 0.25
