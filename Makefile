@@ -70,6 +70,6 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	  fi; \
 	  echo "making $(VENV) with $$($$found --version)"; \
 	  $$found -m venv --clear $(VENV); }
-	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e ".[dev,openvino,onnx,video,viewer,colmap,tensorboard]"
+	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e ".[dev,openvino,video,viewer,colmap,tensorboard]"
 	-$(BIN)/steerbench compile
 	@touch $@

@@ -94,7 +94,6 @@ def test_extras_are_those_that_are_promised():
     assert set(EXTRAS) == {
         *(
             "openvino",
-            "onnx",
             "tensorrt",
             "video",
             "viewer",

@@ -41,23 +41,23 @@ class CornerModel(nn.Module):
 
     @classmethod
     def taught(
-        cls, teacher: TrainedField, resolution: int, generator: torch.Generator
+        cls, trained: TrainedField, resolution: int, generator: torch.Generator
     ) -> CornerModel:
-        """Make a model with voxels where the teacher is occupied.
+        """Make a model with voxels where the trained field is occupied.
 
-        The features of a corner are the teacher's hash encoding, 16 levels of 2, divided by their
+        The features of a corner are its hash encoding, 16 levels of 2, divided by their
         standard deviation; the decoder is random.
 
         Raises:
             ValueError: the encoding has more than 32 channels.
         """
-        field = teacher.field
+        field = trained.field
         if field.grid.channels > CHANNELS:
             raise ValueError(
                 f"a corner has {CHANNELS} features: expected a hash grid of at most as many "
                 f"channels, got {field.grid.channels}; choose fewer levels or features"
             )
-        coordinates = occupied_voxels(teacher.occupancy, resolution)
+        coordinates = occupied_voxels(trained.occupancy, resolution)
         decoder = Decoder(generator).to(field.device)
         model = cls(coordinates, resolution, decoder, field.backend)
         with torch.no_grad():

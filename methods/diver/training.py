@@ -153,7 +153,7 @@ class DiverTraining(PixelTraining):
         return tensors | checkpoint.optimiser_tensors(self.networks, "adam."), figures
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        """See `loop.Training`."""
+        """Restore what `result` and `state` returned."""
         super().restore(tensors, figures)
         self.moments = AdamState.of(tensors, "moments.", self.model.table.device)
         self.grad = torch.zeros_like(self.model.table)

@@ -7,6 +7,7 @@ Kernels, reprojection and the field do not use an engine.
 from __future__ import annotations
 
 import importlib
+import json
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -28,7 +29,7 @@ from methods.engines.network import Network as Network
 Precision = Literal["fp32", "bf16", "fp16", "int8"]
 
 Calibration = Literal["frames", "none"]
-"""Source of the ranges of 8-bit activations: real frames, or none (see `fixed_ranges`)."""
+"""Source of the ranges of 8-bit activations: real frames, or none: `fixed_ranges`."""
 
 Inputs = tuple[Tensor, ...]
 
@@ -39,11 +40,8 @@ Folder = Callable[[], Path]
 """Returns a folder reserved for one network and engine. Called only if a build stores something."""
 
 CALIBRATION = 16
-"""Number of frames whose inputs determine the ranges of all 8-bit numbers, and the sizes of varying
-axes to expect."""
-
-SIZES = "steerbench_sizes"
-"""Metadata key in a stored model for the sizes of varying axes to prepare."""
+"""Number of frames whose inputs determine the ranges of all 8-bit numbers, and the numbers of rows
+to expect."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +69,6 @@ class Engine(ABC):
         name: as shown in rows.
         precisions: the supported precisions.
         libraries: distributions that the constructor loads.
-        prepares_sizes: whether it prepares for the sizes of varying axes seen in the samples,
-            before any frame is rendered.
 
     Raises:
         Unavailable: the engine does not have this precision, or cannot be used here.
@@ -81,7 +77,6 @@ class Engine(ABC):
     name: ClassVar[str]
     precisions: ClassVar[tuple[Precision, ...]]
     libraries: ClassVar[tuple[str, ...]] = ()
-    prepares_sizes: ClassVar[bool] = True
 
     def __init__(self, precision: Precision = "fp32", calibration: Calibration = "frames") -> None:
         if precision not in self.precisions:
@@ -112,8 +107,7 @@ class Engine(ABC):
     def samples(self, network: Network) -> int:
         """Number of frames whose inputs `build` needs. If it is 1, only their shapes are read."""
         calibrated = self.precision == "int8" and not self.uncalibrated
-        several = calibrated or (self.prepares_sizes and any(network.varying))
-        return CALIBRATION if several else 1
+        return CALIBRATION if calibrated or network.varying else 1
 
     def key(self) -> dict[str, object]:
         """Everything that the built network depends on, besides the network and its inputs."""
@@ -158,6 +152,16 @@ def keep(path: Path, write: Callable[[Path], None], log: Log) -> None:
                 part.replace(path.parent / part.name)
 
 
+def note_sizes(model: Path, samples: Sequence[Inputs], network: Network) -> None:
+    """Note beside a stored `model` which numbers of rows to prepare for."""
+    model.with_suffix(".json").write_text(json.dumps(sizes_to_expect(samples, network)))
+
+
+def noted_sizes(model: Path) -> list[int]:
+    """The numbers of rows that `note_sizes` noted."""
+    return json.loads(model.with_suffix(".json").read_text())
+
+
 def readable(network: Network) -> Network:
     """A copy of `network` in plain torch, which converters of engines can trace."""
     copy = deepcopy(network)
@@ -166,27 +170,17 @@ def readable(network: Network) -> Network:
 
 
 def sizes_to_expect(samples: Sequence[Inputs], network: Network) -> list[int]:
-    """Sizes of varying axes to prepare: the range in `samples`, plus one quantum at each end."""
-    seen = {
-        x.shape[axis]
-        for inputs in samples
-        for x, axes in zip(inputs, network.varying, strict=True)
-        for axis in axes
-    }
-    if not seen:
+    """Numbers of rows to prepare for: the range in `samples`, plus one quantum at each end."""
+    if not network.varying:
         return []
-    step = network.quantum
+    seen, step = {len(inputs[0]) for inputs in samples}, network.quantum
     least, most = max(min(seen) // step - 1, 1), -(-max(seen) // step) + 1
     return sorted({*seen, *range(least * step, most * step + 1, step)})
 
 
-def resized(sample: Inputs, network: Network, size: int) -> Inputs:
-    """Zeros like `sample`, with varying axes of `size`."""
-    shapes = (
-        [size if axis in axes else length for axis, length in enumerate(x.shape)]
-        for x, axes in zip(sample, network.varying, strict=True)
-    )
-    return tuple(x.new_zeros(shape) for x, shape in zip(sample, shapes, strict=True))
+def resized(sample: Inputs, size: int) -> Inputs:
+    """Zeros like `sample`, but `size` rows."""
+    return tuple(x.new_zeros(size, *x.shape[1:]) for x in sample)
 
 
 def required(engine: str, library: str, extra: str) -> ModuleType:

@@ -13,14 +13,15 @@ from torch import Tensor, nn
 class Network(nn.Module, ABC):
     """A network that engines can run: it maps tensors to a tuple of tensors.
 
+    Inputs are rows [N, C] or pictures [B, C, H, W]; only their C is always the same.
+
     Attributes:
-        varying: for each input, the axes whose size differs from frame to frame; all of them have
-            the same size.
-        quantum: this size is a multiple of `quantum` while frames are rendered.
+        varying: whether inputs are rows, whose N differs from frame to frame.
+        quantum: N is a multiple of `quantum` while frames are rendered.
         backend: backend of its kernels; engines convert it with "reference", which is plain torch.
     """
 
-    varying: tuple[tuple[int, ...], ...]
+    varying = False
     quantum = 1
     backend = "auto"
 

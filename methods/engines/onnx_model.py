@@ -1,10 +1,15 @@
-"""Exports a network as an ONNX model, for engines that read one, and quantises it to 8 bits."""
+"""Exports a network as an ONNX model for TensorRT, and quantises it to 8 bits with ONNX Runtime.
+
+TensorRT 11 computes in the types of the model (strong typing), so the model contains them: fp16 by
+casting the network, int8 by pairs of QuantizeLinear and DequantizeLinear. TensorRT requires that
+these are symmetric and leave the bias in float32
+(https://docs.nvidia.com/deeplearning/tensorrt, "Explicit Quantization").
+"""
 
 from __future__ import annotations
 
-import json
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,17 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from bench.types import Log
-from methods.engines import (
-    SIZES,
-    Engine,
-    Folder,
-    Inputs,
-    Network,
-    Samples,
-    keep,
-    readable,
-    sizes_to_expect,
-)
+from methods.engines import Engine, Folder, Inputs, Network, Samples, keep, note_sizes, readable
 from methods.engines.fixed_ranges import largest
 
 OPSET = 17
@@ -32,15 +27,10 @@ OPSET = 17
 PRODUCTS = ("Conv", "Gemm", "MatMul")
 """Operators to quantise. Sums and activations in 8 bits would cost quality and save nothing."""
 
+SYMMETRIC = {"ActivationSymmetric": True, "QuantizeBias": False}
 
-def kept(
-    network: Network,
-    samples: Samples,
-    folder: Folder,
-    engine: Engine,
-    log: Log,
-    options: Mapping[str, Any] | None = None,
-) -> Path:
+
+def kept(network: Network, samples: Samples, folder: Folder, engine: Engine, log: Log) -> Path:
     """The path of the ONNX model of `network` in `folder`; the model is made if it is missing.
 
     Args:
@@ -50,7 +40,6 @@ def kept(
         engine: its precision is that of the model: fp32; fp16, with inputs and outputs in float32;
             or int8, with the rest in float32, and with `fixed_ranges` if uncalibrated.
         log: shows what is found or made.
-        options: further options of ONNX Runtime's quantiser.
 
     Raises:
         SteerbenchError: the folder cannot be written to.
@@ -58,39 +47,18 @@ def kept(
 
     def write(path: Path) -> None:
         seen = [tuple(x.cpu() for x in inputs) for inputs in samples()]
-        plain = readable(network).cpu()
+        plain: nn.Module = readable(network).cpu()
+        if engine.precision == "fp16":
+            plain = _Halved(plain)
+        exact = path if engine.precision != "int8" else path.with_name("exported.onnx")
+        _export(plain, network, seen[0], exact)
         if engine.precision == "int8":
-            exported, prepared = path.with_name("exported.onnx"), path.with_name("prepared.onnx")
-            _export(plain, network, seen[0], exported)
-            _prepare(exported, prepared)
-            further = _uncalibrated(prepared) if engine.uncalibrated else {}
-            _quantise(prepared, seen, input_names(network), path, {**(options or {}), **further})
-        else:
-            half = engine.precision == "fp16"
-            _export(_Halved(plain) if half else plain, network, seen[0], path)
-        _note_sizes(path, sizes_to_expect(seen, network))
+            _quantise(exact, seen, path, uncalibrated=engine.uncalibrated)
+        note_sizes(path, seen, network)
 
     path = folder() / "network.onnx"
     keep(path, write, log)
     return path
-
-
-def input_names(network: Network) -> list[str]:
-    """Names of the inputs of an exported `network`, in order."""
-    return [f"input{place}" for place in range(len(network.varying))]
-
-
-def output_names(count: int) -> list[str]:
-    """Names of `count` outputs of an exported network, in order."""
-    return [f"output{place}" for place in range(count)]
-
-
-def sizes(path: Path) -> list[int]:
-    """The sizes of varying axes to expect, as stored in the model's metadata."""
-    import onnx
-
-    noted = {entry.key: entry.value for entry in onnx.load(path).metadata_props}
-    return json.loads(noted[SIZES])
 
 
 def weight_bytes(path: Path) -> int:
@@ -101,12 +69,9 @@ def weight_bytes(path: Path) -> int:
     return sum(onnx.numpy_helper.to_array(weight).nbytes for weight in weights)
 
 
-def _note_sizes(path: Path, expected: list[int]) -> None:
-    import onnx
-
-    model = onnx.load(path)
-    onnx.helper.set_model_props(model, {SIZES: json.dumps(expected)})
-    onnx.save(model, path)
+def names(kind: str, count: int) -> list[str]:
+    """Names of `count` inputs or outputs (the `kind`) of an exported network, in order."""
+    return [f"{kind}{place}" for place in range(count)]
 
 
 class _Halved(nn.Module):
@@ -122,8 +87,7 @@ class _Halved(nn.Module):
 
 
 def _export(module: nn.Module, network: Network, sample: Inputs, path: Path) -> None:
-    names = input_names(network)
-    varying = dict(zip(names, map(list, network.varying), strict=True))
+    inputs = names("input", len(sample))
     with torch.no_grad(), warnings.catch_warnings():
         outputs = len(module(*sample))
         warnings.simplefilter("ignore")  # the exporter's own deprecations
@@ -131,18 +95,34 @@ def _export(module: nn.Module, network: Network, sample: Inputs, path: Path) -> 
             module,
             sample,
             path,
-            input_names=names,
-            output_names=output_names(outputs),
-            dynamic_axes=varying,
+            input_names=inputs,
+            output_names=names("output", outputs),
+            dynamic_axes={name: [0] for name in inputs if network.varying},
             opset_version=OPSET,
             dynamo=False,
         )
 
 
-def _prepare(exported: Path, prepared: Path) -> None:
+def _quantise(exported: Path, samples: Sequence[Inputs], path: Path, *, uncalibrated: bool) -> None:
+    """Quantise the products of a model to 8 bits, with ranges from `samples` or with fixed ones."""
+    from onnxruntime import quantization
     from onnxruntime.quantization import shape_inference
 
+    prepared = path.with_name("prepared.onnx")
     shape_inference.quant_pre_process(exported, prepared, skip_symbolic_shape=True)
+    frames = iter(
+        dict(zip(names("input", len(inputs)), (x.numpy() for x in inputs), strict=True))
+        for inputs in samples
+    )
+    quantization.quantize_static(
+        prepared,
+        path,
+        SimpleNamespace(get_next=lambda: next(frames, None)),
+        quant_format=quantization.QuantFormat.QDQ,
+        per_channel=True,
+        op_types_to_quantize=list(PRODUCTS),
+        extra_options={**SYMMETRIC, **(_uncalibrated(prepared) if uncalibrated else {})},
+    )
 
 
 def _uncalibrated(prepared: Path) -> dict[str, Any]:
@@ -167,26 +147,3 @@ def _uncalibrated(prepared: Path) -> dict[str, Any]:
             for name in sorted(read & bounds.keys())
         },
     }
-
-
-def _quantise(
-    prepared: Path,
-    samples: Sequence[Inputs],
-    names: Sequence[str],
-    path: Path,
-    options: Mapping[str, Any],
-) -> None:
-    """Quantise the products of the model `prepared` to 8 bits, calibrated on `samples`."""
-    from onnxruntime import quantization
-
-    arrays = [[x.numpy() for x in inputs] for inputs in samples]
-    frames = iter([dict(zip(names, frame, strict=True)) for frame in arrays])
-    quantization.quantize_static(
-        prepared,
-        path,
-        SimpleNamespace(get_next=lambda: next(frames, None)),
-        quant_format=quantization.QuantFormat.QDQ,
-        per_channel=True,
-        op_types_to_quantize=list(PRODUCTS),
-        extra_options=dict(options),
-    )

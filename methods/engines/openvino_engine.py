@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import sys
 import warnings
@@ -18,7 +17,6 @@ from torch import Tensor
 from bench.errors import Unavailable
 from bench.types import Log
 from methods.engines import (
-    SIZES,
     Built,
     Calibration,
     Engine,
@@ -28,16 +26,15 @@ from methods.engines import (
     Precision,
     Samples,
     keep,
+    note_sizes,
+    noted_sizes,
     readable,
     required,
-    sizes_to_expect,
 )
 from methods.engines.fixed_ranges import largest
 
 # Disables the telemetry of OpenVINO and NNCF; both work without this package.
 sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
-
-Varying = tuple[tuple[int, ...], ...]
 
 NO_PRODUCTS = ("Add", "Multiply", "MaxPool")
 """Operators whose inputs NNCF would also round, unlike `fixed_ranges`."""
@@ -69,24 +66,24 @@ class OpenVino(Engine):
             )
 
     def computed(self, device: torch.device) -> str:
-        """See `Engine.computed`."""
+        """As of any engine; beside int8, this CPU may compute in bfloat16."""
         computed = super().computed(device)
         return computed.replace("+fp32", "+bf16") if self._half else computed
 
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
-        """See `Engine.build`."""
+        """Convert `network`, for int8 quantised, and compile it for the rows to expect."""
 
         def write(path: Path) -> None:
             seen = samples()
             model = self._convert(network, seen)
-            model.set_rt_info(json.dumps(sizes_to_expect(seen, network)), SIZES)
             self._openvino.save_model(model, path, compress_to_fp16=self.precision == "bf16")
+            note_sizes(path, seen, network)
 
         path = folder() / "network.xml"
         keep(path, write, log)
         model = self._openvino.Core().read_model(path)
-        compiled = _Compiled(self._openvino, model, network.varying, half=self._half)
-        sizes = json.loads(model.get_rt_info(SIZES).value)
+        compiled = _Compiled(self._openvino, model, half=self._half)
+        sizes = noted_sizes(path)
         with log.progress("compiling", len(sizes)) as progress:
             for size in sizes:
                 compiled.prepare(size)
@@ -95,10 +92,8 @@ class OpenVino(Engine):
         return Built(compiled, sum(op.data.nbytes for op in weights))
 
     def _convert(self, network: Network, samples: Sequence[Inputs]) -> Any:
-        shapes = [
-            [-1 if axis in axes else length for axis, length in enumerate(x.shape)]
-            for x, axes in zip(samples[0], network.varying, strict=True)
-        ]
+        # Only C is fixed: frames may have another size than the samples.
+        shapes = [[-1, x.shape[1], *[-1] * (x.dim() - 2)] for x in samples[0]]
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # from the tracer, and about argument checks
             model = self._openvino.convert_model(
@@ -154,8 +149,8 @@ class _Compiled:
     Compiled for a fixed size, it is a third faster than for dynamic sizes.
     """
 
-    def __init__(self, openvino: Any, model: Any, varying: Varying, *, half: bool) -> None:
-        self._model, self._varying, self._core = model, varying, openvino.Core()
+    def __init__(self, openvino: Any, model: Any, *, half: bool) -> None:
+        self._model, self._core = model, openvino.Core()
         self._requests: dict[tuple[tuple[int, ...], ...], Any] = {}
         self._settings = {
             "INFERENCE_PRECISION_HINT": "bf16" if half else "f32",
@@ -164,14 +159,11 @@ class _Compiled:
         }
 
     def prepare(self, size: int) -> None:
-        """Compile for varying axes of `size`, and do the one-time work of the first call."""
-        inputs = []
-        for port, axes in zip(self._model.inputs, self._varying, strict=True):
-            shape = [
-                size if axis in axes else part.get_length()
-                for axis, part in enumerate(port.partial_shape)
-            ]
-            inputs.append(np.zeros(shape, port.element_type.to_dtype()))
+        """Compile for `size` rows, and do the one-time work of the first call."""
+        inputs = [
+            np.zeros((size, port.partial_shape[1].get_length()), port.element_type.to_dtype())
+            for port in self._model.inputs
+        ]
         self._request(tuple(x.shape for x in inputs)).infer(inputs)
 
     def __call__(self, *inputs: Tensor) -> Inputs:

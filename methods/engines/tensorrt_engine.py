@@ -1,10 +1,4 @@
-"""TensorRT as an engine: fp32, fp16, and int8 quantised by ONNX Runtime.
-
-TensorRT 11 computes in the types of the model (strong typing), so the ONNX model contains them:
-fp16 by casting the network, int8 by pairs of QuantizeLinear and DequantizeLinear. TensorRT requires
-that these are symmetric and leave the bias in float32
-(https://docs.nvidia.com/deeplearning/tensorrt, "Explicit Quantization").
-"""
+"""TensorRT as an engine: fp32, fp16, and int8; it reads an `onnx_model`."""
 
 from __future__ import annotations
 
@@ -27,11 +21,10 @@ from methods.engines import (
     Precision,
     Samples,
     keep,
+    noted_sizes,
     onnx_model,
     required,
 )
-
-QUANTISED = {"ActivationSymmetric": True, "QuantizeBias": False}
 
 
 class TensorRt(Engine):
@@ -54,13 +47,13 @@ class TensorRt(Engine):
         if not torch.cuda.is_available():
             raise Unavailable(
                 "engine=tensorrt computes on a CUDA GPU, and torch sees none here: use "
-                "engine=openvino or engine=onnxruntime"
+                "engine=openvino"
             )
         loaded = [required(self.name, library, "tensorrt") for library in self.libraries]
         self._tensorrt = loaded[-1]
 
     def check(self, device: torch.device) -> None:
-        """See `Engine.check`."""
+        """Raise `Unavailable` unless `device` is the first CUDA GPU."""
         if device.type != "cuda" or device.index:
             raise Unavailable(
                 f"engine=tensorrt computes on the first CUDA GPU, this is device={device}: use "
@@ -68,14 +61,14 @@ class TensorRt(Engine):
             )
 
     def key(self) -> dict[str, object]:
-        """See `Engine.key`."""
+        """As of any engine, and the model of the GPU: plans are valid for one."""
         return super().key() | {"gpu": torch.cuda.get_device_name()}
 
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
-        """See `Engine.build`."""
-        path = onnx_model.kept(network, samples, folder, self, log, QUANTISED)
+        """Export `network` as an ONNX model, and build plans for the sizes to expect."""
+        path = onnx_model.kept(network, samples, folder, self, log)
         plans = _Plans(self._tensorrt, path, network, exact=self.precision != "fp16", log=log)
-        plans.prepare(onnx_model.sizes(path))
+        plans.prepare(noted_sizes(path))
         return Built(plans, onnx_model.weight_bytes(path))
 
 
@@ -104,19 +97,14 @@ class _Plans:
     def __call__(self, *inputs: Tensor) -> Inputs:
         if not all(x.numel() for x in inputs):
             return self._network(*inputs)
-        sizes = {
-            x.shape[axis]
-            for x, axes in zip(inputs, self._network.varying, strict=True)
-            for axis in axes
-        }
-        return self._execution(_ceiling(max(sizes, default=1)))(*inputs)
+        size = len(inputs[0]) if self._network.varying else 1
+        return self._execution(_ceiling(size))(*inputs)
 
     def _execution(self, ceiling: int) -> _Execution:
         if ceiling not in self._executions:
             path = self._model.with_name(f"upto-{ceiling}.plan")
             keep(path, lambda new: self._build(ceiling, new), self._log)
-            names = onnx_model.input_names(self._network)
-            self._executions[ceiling] = _Execution(self._tensorrt, path, self._logger, names)
+            self._executions[ceiling] = _Execution(self._tensorrt, path, self._logger)
         return self._executions[ceiling]
 
     def _build(self, ceiling: int, path: Path) -> None:
@@ -151,40 +139,29 @@ class _Plans:
 class _Execution:
     """A plan run on its own stream: on torch's default stream TensorRT would synchronise."""
 
-    def __init__(self, tensorrt: Any, path: Path, logger: Any, inputs: Sequence[str]) -> None:
+    def __init__(self, tensorrt: Any, path: Path, logger: Any) -> None:
         engine = tensorrt.Runtime(logger).deserialize_cuda_engine(path.read_bytes())
         if engine is None:
             raise SteerbenchError(f"TensorRT cannot load its plan: remove {path} and run again")
         self._context = engine.create_execution_context()
-        self._inputs = inputs
-        self._outputs = onnx_model.output_names(engine.num_io_tensors - len(inputs))
-        self._stream = torch.cuda.Stream()
+        self._tensors, self._stream = engine.num_io_tensors, torch.cuda.Stream()
 
     def __call__(self, *inputs: Tensor) -> Inputs:
         inputs, context = tuple(x.contiguous() for x in inputs), self._context
-        accepted = [
-            context.set_input_shape(name, tuple(x.shape))
-            for name, x in zip(self._inputs, inputs, strict=True)
-        ]
-        if not all(accepted):
-            raise _refused(inputs)
-        outputs = [
-            torch.empty(tuple(context.get_tensor_shape(name)), device=inputs[0].device)
-            for name in self._outputs
-        ]
-        for name, x in zip((*self._inputs, *self._outputs), (*inputs, *outputs), strict=True):
-            accepted.append(context.set_tensor_address(name, x.data_ptr()))
+        named = dict(zip(onnx_model.names("input", len(inputs)), inputs, strict=True))
+        accepted = [context.set_input_shape(name, tuple(x.shape)) for name, x in named.items()]
+        outputs = onnx_model.names("output", self._tensors - len(inputs)) if all(accepted) else []
+        for name in outputs:
+            shape = tuple(context.get_tensor_shape(name))
+            named[name] = torch.empty(shape, device=inputs[0].device)
+        accepted += [context.set_tensor_address(name, x.data_ptr()) for name, x in named.items()]
         current = torch.cuda.current_stream()
         self._stream.wait_stream(current)
         if not all(accepted) or not context.execute_async_v3(self._stream.cuda_stream):
-            raise _refused(inputs)
+            shapes = ", ".join(str(list(x.shape)) for x in inputs)
+            raise SteerbenchError(f"TensorRT cannot run a network on {shapes}; it says why above")
         current.wait_stream(self._stream)
-        return tuple(outputs)
-
-
-def _refused(inputs: Inputs) -> SteerbenchError:
-    shapes = ", ".join(str(list(x.shape)) for x in inputs)
-    return SteerbenchError(f"TensorRT cannot run a network on {shapes}; it says why above")
+        return tuple(named[name] for name in outputs)
 
 
 def _ceiling(size: int) -> int:

@@ -37,21 +37,21 @@ class TorchEngine(Engine):
     precisions = ("fp32", "bf16", "fp16")
 
     def check(self, device: torch.device) -> None:
-        """See `Engine.check`."""
+        """Raise `Unavailable` for fp16 on a CPU."""
         if self.precision == "fp16" and device.type == "cpu":
             raise Unavailable("precision=fp16: engine=torch has it on a GPU, on a CPU use bf16")
 
     def computed(self, device: torch.device) -> str:
-        """See `Engine.computed`."""
+        """The precision of products: bf16 may be emulated on `device`."""
         emulated = self.precision == "bf16" and not multiplies_bf16(device.type)
         return "bf16 in fp32" if emulated else super().computed(device)
 
     def samples(self, network: Network) -> int:
-        """See `Engine.samples`: none on a CPU, which runs the network directly."""
+        """Frames whose inputs `build` needs: none on a CPU, which runs the network itself."""
         return 0 if _on_cpu(network) else super().samples(network)
 
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
-        """See `Engine.build`."""
+        """Make `network` compute at this precision; on a GPU, record CUDA graphs of it."""
         dtype = DTYPES[self.precision]
 
         def run(*inputs: Tensor) -> Inputs:
@@ -65,10 +65,10 @@ class TorchEngine(Engine):
 def _recorded(run: Callable[..., Inputs], network: Network, samples: Samples, log: Log) -> Replayed:
     """`run` as CUDA graphs, recorded beforehand for the expected sizes."""
     replayed, seen = Replayed(run), samples()
-    sizes = sizes_to_expect(seen, network) or [1]  # a network of fixed size has one graph
-    with torch.no_grad(), log.progress("recording CUDA graphs", len(sizes)) as progress:
-        for size in sizes:
-            replayed(*resized(seen[0], network, size))
+    expected = [resized(seen[0], size) for size in sizes_to_expect(seen, network)] or seen[:1]
+    with torch.no_grad(), log.progress("recording CUDA graphs", len(expected)) as progress:
+        for inputs in expected:
+            replayed(*inputs)
             progress.advance()
     return replayed
 

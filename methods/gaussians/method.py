@@ -23,6 +23,7 @@ from methods.instant_ngp.field import Precision
 from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.composite import STOP, check_stop
+from methods.kernels.dispatch import refuse_gpu
 from methods.kernels.encode import HashGrid
 from methods.rendering.frame import FeatureFrame
 from methods.training import loop
@@ -78,6 +79,7 @@ class GaussianSplatting:
         if count < 1 or degree not in range(4):
             raise ValueError(f"expected count >= 1 and degree 0 to 3, got {count} and {degree}")
         check_stop(stop)
+        refuse_gpu(backend, name)
         self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
         self.fitting, self.count, self.degree, self.start = fitting, count, degree, start
         self.stored, self.stop, self.name = stored, stop, name
@@ -163,5 +165,5 @@ class GaussianSplatting:
         return {"gaussians": sum(4 * x.numel() for x in self.gaussians.parameters())}
 
     def settings(self) -> dict[str, str]:
-        """See `bench.types.Method.settings`."""
+        """What a row says of how it ran."""
         return self.setup.settings() | {"precision": self.stored, "engine": "none"}

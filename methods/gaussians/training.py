@@ -170,7 +170,7 @@ class GaussianTraining:
         return checkpoint.optimiser_tensors(self.optimiser, "adam.") | more, {}
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        """See `loop.Training`."""
+        """Restore what `result` and `state` returned."""
         self.restore_result(tensors)
         checkpoint.restore_optimiser(self.optimiser, tensors, "adam.")
         self.generator.set_state(tensors["generator"].cpu())

@@ -131,8 +131,8 @@ class HashField(nn.Module):
     def _density(
         self, positions: Tensor, known: Tensor | None, weights: list[Tensor]
     ) -> tuple[Tensor, Tensor]:
-        found = self.encode(positions) if known is None else self._learning(known, positions)
-        geometry = mlp([found.to(self._compute_dtype)], weights, backend=self.backend)
+        features = self.encode(positions) if known is None else self._learning(known, positions)
+        geometry = mlp([features.to(self._compute_dtype)], weights, backend=self.backend)
         return _ClampedExp.apply(geometry[:, 0].to(self.table.dtype)), geometry
 
     def _learning(self, known: Tensor, positions: Tensor) -> Tensor:

@@ -18,8 +18,8 @@ from methods.instant_ngp.pixels import PixelBatches
 from methods.kernels.composite import check_stop
 from methods.kernels.types import Pixels
 from methods.rendering.batch import opacity_entropy, render_batch
-from methods.rendering.march import March, check_step, suitable_step
 from methods.rendering.occupancy import EVERY, MIN_VIEWS, STEP, DensityGrid, learnable_cells
+from methods.rendering.sampling import Sampling, check_step, suitable_step
 from methods.training import checkpoint, loop
 from methods.training.optimiser import cosine
 
@@ -41,7 +41,7 @@ class PixelOptions:
         random_background: composite RGBA pictures on a random colour per ray instead of the scene's
             background, so that no density can pass for background.
         max_rays: maximum number of rays in a step.
-        by_error: share of the rays that are drawn where the error is, see `ErrorMap`; the others
+        by_error: share of the rays that are drawn where the error is, by an `ErrorMap`; the others
             go through all pixels alike.
     """
 
@@ -53,61 +53,29 @@ class PixelOptions:
     by_error: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (self.rate > 0 and 0 < self.final_rate <= 1 and self.opacity_entropy >= 0):
-            raise ValueError(
-                f"expected rate > 0, final_rate in (0, 1], opacity_entropy >= 0: {self}"
-            )
-        if self.max_rays < MIN_RAYS:
-            raise ValueError(f"expected max_rays >= {MIN_RAYS}: {self}")
-        if not 0 <= self.by_error < 1:
-            raise ValueError(f"by_error: expected a share from 0 to less than 1, got {self}")
+        expect(self.rate > 0, "rate", "more than 0", self.rate)
+        expect(0 < self.final_rate <= 1, "final_rate", "a share in (0, 1]", self.final_rate)
+        expect(self.opacity_entropy >= 0, "opacity_entropy", "0 or more", self.opacity_entropy)
+        expect(self.max_rays >= MIN_RAYS, "max_rays", f"{MIN_RAYS} or more", self.max_rays)
+        expect(0 <= self.by_error < 1, "by_error", "a share in [0, 1)", self.by_error)
 
 
 @dataclass(frozen=True)
-class MarchOptions(PixelOptions):
-    """How to train a field that is sampled along rays.
-
-    Attributes:
-        march_step: length of a ray-marching step, in diagonals of the cube / 1024; 1 in the
-            release. None: it follows from the steps of the field's training, see `suitable_step`.
-        share: samples with a gradient in a step, as a share of the budget's.
-    """
-
-    march_step: float | None = None
-    share: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.march_step is not None:
-            check_step("march_step", self.march_step)
-        if not 0 < self.share <= 1:
-            raise ValueError(
-                f"share: expected more than 0, up to 1, of the samples, got {self.share}"
-            )
-
-    def march(self, budget: Budget) -> March:
-        """How rays are marched in a training within `budget`, and later to render its result."""
-        if self.march_step is None:
-            return March(step=suitable_step(budget.steps))
-        return March(step=self.march_step * STEP)
-
-    def samples(self, budget: Budget) -> int:
-        """Samples with a gradient that a step within `budget` aims at."""
-        return math.ceil(self.share * budget.samples)
-
-
-@dataclass(frozen=True)
-class TrainingOptions(MarchOptions):
+class TrainingOptions(PixelOptions):
     """How to train a field in stage 1; `rate` is that of table and networks. The defaults are made
     for a short training on a CPU (docs/log.md); `budget=full` sets those of SteerNeRF's release.
 
     Attributes:
+        march_step: length of a ray-marching step, in diagonals of the cube / 1024; 1 in the
+            release. None: the `suitable_step` of a training of so many steps.
+        share: samples with a gradient in a step, as a share of the budget's.
         grid_samples: cells visited in an update of the density grid.
         rays: number of rays in every step; None: as many as give `share` of the budget's samples.
         stop: transmittance at which a ray ends.
-        thin: optical depth of a sample below which only some are kept, see `render_batch`.
+        thin: optical depth of a sample below which only some are kept; `render_batch` says how.
     """
 
+    march_step: float | None = None
     share: float = 0.5
     grid_samples: int = 1 << 17
     rays: int | None = None
@@ -117,13 +85,26 @@ class TrainingOptions(MarchOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.grid_samples < 2:
-            raise ValueError(f"expected grid_samples >= 2: {self}")
-        if self.rays is not None and self.rays < MIN_RAYS:
-            raise ValueError(f"expected rays >= {MIN_RAYS}: {self}")
+        if self.march_step is not None:
+            check_step("march_step", self.march_step)
+        expect(0 < self.share <= 1, "share", "a share in (0, 1], of the samples", self.share)
+        expect(self.grid_samples >= 2, "grid_samples", "2 or more", self.grid_samples)
+        if self.rays is not None:
+            expect(self.rays >= MIN_RAYS, "rays", f"{MIN_RAYS} or more", self.rays)
         check_stop(self.stop)
-        if not self.thin >= 0:
-            raise ValueError(f"thin: expected an optical depth of 0 or more, got {self.thin}")
+        expect(self.thin >= 0, "thin", "an optical depth of 0 or more", self.thin)
+
+    def sampling(self, budget: Budget) -> Sampling:
+        """How rays are marched in a training within `budget`, and later to render its result."""
+        if self.march_step is None:
+            return Sampling(step=suitable_step(budget.steps))
+        return Sampling(step=self.march_step * STEP)
+
+
+def expect(holds: bool, name: str, expected: str, got: float) -> None:
+    """Raise ValueError with the `name` of a setting, and what is expected, unless that `holds`."""
+    if not holds:
+        raise ValueError(f"{name}: expected {expected}, got {got}")
 
 
 def new_grid(scene: Scene, device: torch.device) -> DensityGrid:
@@ -137,8 +118,8 @@ def new_grid(scene: Scene, device: torch.device) -> DensityGrid:
     return DensityGrid(cells)
 
 
-class PixelTraining(ABC):
-    """A `loop.Training` whose steps render random pixels of the training pictures.
+class PixelTraining(loop.Training, ABC):
+    """A training whose steps render random pixels of the training pictures.
 
     Subclasses say what is trained, how its rays are rendered and how its parameters are updated.
 
@@ -162,9 +143,8 @@ class PixelTraining(ABC):
         self.batches = PixelBatches(scene.splits["train"], device)
         self.errors = ErrorMap(len(self.batches), device) if options.by_error else None
         self.background = scene.background.to(device)
-        self.step, self.steps = 0, steps
+        self.step, self.steps, self.seconds = 0, steps, 0.0
         self.rays = min(1024, options.max_rays)
-        self.seconds = 0.0
         self.generator = torch.Generator(device).manual_seed(seed)
 
     @abstractmethod
@@ -176,24 +156,12 @@ class PixelTraining(ABC):
     def _update(self) -> None:
         """Take a step of the optimiser and clear the gradients."""
 
-    @abstractmethod
-    def watched(self) -> Mapping[str, Tensor]:
-        """See `loop.Training`."""
-
-    @abstractmethod
-    def result(self) -> dict[str, Tensor]:
-        """See `loop.Training`."""
-
-    @abstractmethod
-    def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
-        """See `loop.Training`."""
-
     def learning_rate(self) -> float:
         """The learning rate of the next step."""
         return self.options.rate * cosine(self.step / self.steps, self.options.final_rate)
 
     def advance(self) -> dict[str, float]:
-        """Take one step; return its mean squared error, see `loop.look`.
+        """Take one step; return its mean squared error, where `loop.look` does.
 
         Raises:
             SteerbenchError: the loss is not finite.
@@ -252,7 +220,7 @@ class PixelTraining(ABC):
         return tensors, {"rays": self.rays}
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        """See `loop.Training`."""
+        """Restore the result, and what `state` returned."""
         self.restore_result(tensors)
         self.rays = int(figures["rays"])
         self.generator.set_state(tensors["generator"].cpu())
@@ -269,19 +237,18 @@ class FieldTraining(PixelTraining):
     def __init__(
         self, field: HashField, scene: Scene, budget: Budget, options: TrainingOptions, seed: int
     ) -> None:
-        samples = options.samples(budget)
+        samples = math.ceil(options.share * budget.samples)
         super().__init__(scene, field.device, budget.steps, samples, options, seed)
         self.field, self.grid = field, new_grid(scene, field.device)
-        self.grid_samples, self.march = options.grid_samples, options.march(budget)
+        self.sampling = options.sampling(budget)
         self.rays = options.rays or self.rays
         self.optimiser = FieldOptimiser(field)
 
     def advance(self) -> dict[str, float]:
         """Take one step; return its mean squared error."""
         if self.step % EVERY == 0:
-            young = self.step < GRID_YOUTH_STEPS
-            samples = self.grid_samples * (4 if young else 1)
-            self.grid.update(self.field, self.generator, samples)
+            times = 4 if self.step < GRID_YOUTH_STEPS else 1
+            self.grid.update(self.field, self.generator, times * self.options.grid_samples)
         return super().advance()
 
     def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
@@ -289,7 +256,7 @@ class FieldTraining(PixelTraining):
             self.field,
             rays,
             self.grid.occupancy,
-            replace(self.march, stop=self.options.stop),
+            replace(self.sampling, stop=self.options.stop),
             jitter=jitter,
             background=background,
             thin=self.options.thin,
@@ -322,7 +289,7 @@ class FieldTraining(PixelTraining):
         return self.optimiser.tensors() | tensors, figures
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        """See `loop.Training`."""
+        """Restore the result, and what `state` returned."""
         super().restore(tensors, figures)
         self.optimiser.restore(tensors)
 

@@ -11,7 +11,7 @@ from methods.kernels.march import march
 from methods.kernels.types import Occupancy, Pixels
 from methods.rendering.field import Field, query
 from methods.rendering.frame import Render
-from methods.rendering.march import March
+from methods.rendering.sampling import Sampling
 
 CHUNK_RAYS = 1 << 9
 """Rays whose samples are evaluated together: 200 MiB of outputs of a trunk of 256 channels."""
@@ -23,7 +23,7 @@ def whole_cube(occupancy: Occupancy) -> Occupancy:
 
 
 def every_sample(
-    field: Field, occupancy: Occupancy, cube: Occupancy, probe: Probe, how: March
+    field: Field, occupancy: Occupancy, cube: Occupancy, probe: Probe, how: Sampling
 ) -> Render:
     """Make the argument `render` of `render_frame` that evaluates density and colour of all samples
     in `cube`, the whole one.

@@ -70,19 +70,19 @@ class Extraction:
 
 @torch.no_grad()
 def extract(
-    teacher: TrainedField,
+    trained: TrainedField,
     batches: PixelBatches,
     options: Extraction,
     generator: torch.Generator,
 ) -> Octree:
-    """Extract the octree of what `teacher` shows to the training rays of `batches`.
+    """Extract the octree of what `trained` shows to the training rays of `batches`.
 
     Raises:
         SteerbenchError: there are more candidates than allowed, or nothing to be seen.
     """
-    candidates = _candidates(teacher.occupancy, options)
-    density = _densities(teacher.field, candidates, options.resolution, options.points, generator)
-    voxels, backend = Voxels(candidates, options.resolution), teacher.field.backend
+    candidates = _candidates(trained.occupancy, options)
+    density = _densities(trained.field, candidates, options.resolution, options.points, generator)
+    voxels, backend = Voxels(candidates, options.resolution), trained.field.backend
 
     def weigh(_: Rays, crossings: Crossings) -> Tensor:
         return weights(density[crossings.voxel], crossings, stop=STOP, backend=backend)
@@ -95,7 +95,7 @@ def extract(
             "a trained field; give it more steps (budget.steps)"
         )
     voxels = Voxels(candidates[kept], options.resolution)
-    harmonics = _harmonics(teacher.field, voxels, options.degree, options.directions)
+    harmonics = _harmonics(trained.field, voxels, options.degree, options.directions)
     return Octree(voxels, Light(density[kept], harmonics))
 
 

@@ -128,7 +128,7 @@ class OctreeTraining(PixelTraining):
         return tensors, figures
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        """See `loop.Training`."""
+        """Restore what `result` and `state` returned."""
         super().restore(tensors, figures)
         device = self.octree.light.density.device
         self.moments = {name: AdamState.of(tensors, f"{name}.", device) for name in self.tables}

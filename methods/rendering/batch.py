@@ -10,17 +10,17 @@ from torch import Tensor
 from bench.types import Rays
 from methods.kernels.composite import composite, visible
 from methods.kernels.march import march
-from methods.kernels.types import Extent, Occupancy, Pixels, Samples
+from methods.kernels.types import Occupancy, Pixels, Samples
 from methods.rendering.compaction import compacts
 from methods.rendering.field import CACHED_SAMPLES, CHUNK_SAMPLES, Encoder, Field, pad, query
-from methods.rendering.march import March
+from methods.rendering.sampling import Sampling
 
 FIRST_ROUNDS = (8, 16)
 """How many samples of a ray a CPU evaluates in each of the first rounds, before it knows whether
 the ray goes on; a last round has all that are left."""
 
 KEPT_THIN = 4
-"""One of so many thin samples is kept; see `render_batch`."""
+"""One of so many thin samples is kept, with the length of all."""
 
 
 @dataclass(frozen=True)
@@ -64,23 +64,15 @@ class FirstPass:
         """[R] number of visible samples of each ray."""
         return self._seen()[-1]
 
-    def opaque(self) -> Tensor:
-        """Which rays have an opacity of more than 0, [R] bool."""
-        found = torch.zeros_like(self.rounds[0].counts, dtype=torch.int32)
-        for some in self.rounds:
-            thick = some.sigma * some.samples.delta > 0
-            found.scatter_reduce_(0, some.ray.long(), thick.int(), "amax")
-        return found > 0
-
-    def visible(self, extent: Extent | None = None) -> Samples:
-        """The visible samples. `extent` is theirs; None: the host waits for a GPU."""
+    def visible(self) -> Samples:
+        """The visible samples; the host waits for a GPU to count them."""
         front = self.rounds[0]
         if len(self.rounds) == 1:
-            return front.samples.front(front.counts, extent)
+            return front.samples.front(front.counts)
         return self._kept(0.0, torch.zeros_like(front.samples.resume))
 
     def thinned(self, thin: float, jitter: Tensor) -> Samples:
-        """The visible samples, without most of the thin ones; see `render_batch`."""
+        """The visible samples without most of the thin ones, as `render_batch` renders them."""
         # Digits of the phase that say nothing of where in a step the samples lie.
         return self._kept(thin, (jitter * 2**12).int())
 
@@ -145,7 +137,7 @@ def render_batch(
     field: Field,
     rays: Rays,
     occupancy: Occupancy,
-    how: March,
+    how: Sampling,
     *,
     jitter: Tensor | None = None,
     background: Tensor | None = None,
@@ -176,8 +168,7 @@ def render_batch(
         samples = march(rays, occupancy, how.step, jitter=jitter, backend=field.backend)
     else:
         first = first_pass(field, rays, occupancy, how, jitter=jitter, guide=guide)
-        kept = None if jitter is None or not thin else first.thinned(thin, jitter)
-        samples = first.visible() if kept is None else kept
+        samples = first.visible() if jitter is None or not thin else first.thinned(thin, jitter)
     pixels = second_pass(field, rays, samples, how)
     return pixels if background is None else pixels.over(background), len(samples)
 
@@ -187,17 +178,12 @@ def first_pass(
     field: Field,
     rays: Rays,
     occupancy: Occupancy,
-    how: March,
+    how: Sampling,
     *,
     jitter: Tensor | None = None,
-    extent: Extent | None = None,
     guide: Field | None = None,
 ) -> FirstPass:
-    """Evaluate the density of the samples of `rays`; see `render_batch`.
-
-    Args:
-        extent: how many samples there are, only on a GPU; None: the host waits to count them.
-    """
+    """Evaluate the density of the samples of `rays`; the arguments are those of `render_batch`."""
     # Most rays end soon; a CPU looks further only along the others.
     limits = FIRST_ROUNDS if compacts(rays.origins.device) else ()
     rounds: list[Round] = []
@@ -210,7 +196,6 @@ def first_pass(
             jitter=jitter if jitter is None or chosen is None else jitter[chosen],
             start=start,
             limit=limit,
-            extent=extent,
             backend=field.backend,
         )
         if guide is None and isinstance(field, Encoder):
@@ -247,7 +232,7 @@ def _encoded_densities(field: Encoder, samples: Samples) -> tuple[Tensor, Sample
     return torch.cat(sigma)[: len(samples)], replace(samples, encoded=known)
 
 
-def second_pass(field: Field, rays: Rays, samples: Samples, how: March) -> Pixels:
+def second_pass(field: Field, rays: Rays, samples: Samples, how: Sampling) -> Pixels:
     """Composite the `samples` of `rays`, with a gradient."""
     directions = field.encode_directions(rays.directions)
     sigma, values = query(field, samples.positions, samples.ray, directions, samples.encoded)

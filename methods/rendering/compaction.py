@@ -29,16 +29,11 @@ def to_host(numbers: Sequence[Tensor]) -> list[int]:
     return torch.cat([number.flatten() for number in numbers]).tolist()
 
 
-def indices_where(masks: Sequence[Tensor], sizes: Sequence[int] | None = None) -> list[Tensor]:
-    """Indices where each of `masks` is true, in order.
-
-    Args:
-        sizes: number of true entries of each; None: the host waits for a GPU, once for all.
-    """
+def indices_where(masks: Sequence[Tensor]) -> list[Tensor]:
+    """Indices where each of `masks` is true, in order; the host waits for a GPU, once for all."""
     if not masks:
         return []
-    if sizes is None:
-        sizes = to_host([mask.sum() for mask in masks])
+    sizes = to_host([mask.sum() for mask in masks])
     return [
         torch.nonzero_static(mask, size=size).squeeze(1)
         for mask, size in zip(masks, sizes, strict=True)

@@ -102,8 +102,8 @@ class DensityGrid:
         cells = self._draw(samples, generator)
         sigma = torch.cat([self._visit(field, part, generator) for part in cells.split(CHUNK)])
         density = self.density.view(-1)
-        found = torch.fmax(DECAY * density[cells], sigma.clamp(max=LARGEST))  # not NaN
-        density.scatter_reduce_(0, cells, found, "amax", include_self=False)
+        values = torch.fmax(DECAY * density[cells], sigma.clamp(max=LARGEST))  # not NaN
+        density.scatter_reduce_(0, cells, values, "amax", include_self=False)
         self._threshold()
 
     def _visit(self, field: Field, cells: Tensor, generator: torch.Generator) -> Tensor:

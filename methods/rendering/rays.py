@@ -12,7 +12,7 @@ from methods.kernels.march import extents, march
 from methods.kernels.types import Occupancy, Pixels, Samples
 from methods.rendering.compaction import compacts
 from methods.rendering.field import CACHED_SAMPLES, CHUNK_SAMPLES, Field, pad, query
-from methods.rendering.march import March
+from methods.rendering.sampling import Sampling
 
 CHUNK_RAYS = 1 << 16
 """Rays rendered together: enough to keep all threads busy, few enough to stay in the cache. This
@@ -25,23 +25,18 @@ def render_rays(
     rays: Rays,
     occupancy: Occupancy,
     probe: Probe,
-    how: March,
-    carry: Pixels | None = None,
+    how: Sampling,
 ) -> Pixels:
-    """Render R `rays`. Values are not composited on a background.
-
-    Args:
-        carry: pixels of what lies in front of the windows of `how`; changed in place and returned.
-    """
+    """Render R `rays`. Values are not composited on a background."""
     device = rays.origins.device
-    canvas = carry or Pixels.blank(len(rays.origins), field.channels, device)
+    canvas = Pixels.blank(len(rays.origins), field.channels, device)
     render = _in_rounds if compacts(device) else _at_once
     render(field, rays, occupancy, probe, how, canvas)
     return canvas
 
 
 def _in_rounds(
-    field: Field, rays: Rays, occupancy: Occupancy, probe: Probe, how: March, canvas: Pixels
+    field: Field, rays: Rays, occupancy: Occupancy, probe: Probe, how: Sampling, canvas: Pixels
 ) -> None:
     """Render into `canvas` in rounds, so that few samples are evaluated behind the early stop.
 
@@ -82,7 +77,7 @@ def _in_rounds(
 
 
 def _at_once(
-    field: Field, rays: Rays, occupancy: Occupancy, probe: Probe, how: March, canvas: Pixels
+    field: Field, rays: Rays, occupancy: Occupancy, probe: Probe, how: Sampling, canvas: Pixels
 ) -> None:
     """Render into `canvas` so that the host waits once, for the sample counts of all chunks.
 
@@ -118,8 +113,8 @@ def _at_once(
                 samples.ray.split(CHUNK_SAMPLES),
                 strict=True,
             )
-            found = [query(field, positions, ray, encoded) for positions, ray in pieces]
-            sigma, values = (torch.cat(column) for column in zip(*found, strict=True))
+            parts = [query(field, positions, ray, encoded) for positions, ray in pieces]
+            sigma, values = (torch.cat(column) for column in zip(*parts, strict=True))
             through = 1 - front.alpha
             weight = weights(sigma, samples, stop=how.stop, front=through, backend=backend)
             values = torch.where((weight > how.least_weight)[:, None], values, 0)
@@ -129,7 +124,7 @@ def _at_once(
 
 
 def _evaluated(
-    field: Field, samples: Samples, directions: Tensor, front: Pixels, how: March, probe: Probe
+    field: Field, samples: Samples, directions: Tensor, front: Pixels, how: Sampling, probe: Probe
 ) -> tuple[Tensor, Tensor]:
     """Density [S] and features [S, K] of `samples` behind the pixels in `front`; features of faint
     samples are 0."""

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from methods.kernels.composite import check_stop
-from methods.rendering.march import March, check_step
 from methods.rendering.occupancy import STEP
+from methods.rendering.sampling import Sampling, check_step
 
 SIZES = {"channels": (3, 256), "frames": (0, 64), "scale": (1, 64)}
 """Minimum and maximum of K, L and s."""
@@ -77,9 +77,9 @@ class Rendering:
         check_stop(self.stop)
 
     @property
-    def march(self) -> March:
+    def sampling(self) -> Sampling:
         """How rays at low resolution are marched."""
-        return March(step=self.step * STEP, stop=self.stop if self.skip.hidden else 0.0)
+        return Sampling(step=self.step * STEP, stop=self.stop if self.skip.hidden else 0.0)
 
 
 def check_size(name: str, got: int, least: int, most: int) -> None:

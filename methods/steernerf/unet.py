@@ -65,8 +65,6 @@ class UNet(Renderer2d):
 class _Network(Network):
     """The layers of `ReconstructionNet_v4`, with `width` channels at full resolution."""
 
-    varying = ((),)
-
     def __init__(self, inputs: int, width: int) -> None:
         super().__init__()
         self.first, self.enter = _conv(inputs, width), _conv(width, width)

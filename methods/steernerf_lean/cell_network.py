@@ -24,7 +24,7 @@ class CellNetwork(Network):
         blocks: residual blocks of the trunk.
     """
 
-    varying = ((0,), (0,))  # cells
+    varying = True  # cells
     quantum = 512
 
     def __init__(self, layout: Layout, width: int, blocks: int) -> None:

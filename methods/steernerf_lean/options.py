@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from methods.rendering.march import March, check_step
 from methods.rendering.occupancy import STEP
+from methods.rendering.sampling import Sampling, check_step
 from methods.steernerf.options import Model, Rendering, Skips, check_size
 from methods.steernerf.training.options import JointOptions, check_options
 
@@ -45,9 +45,9 @@ class LeanRendering(Rendering):
                 raise ValueError(f"{name}: expected a share of 0 to 1, got {share}")
 
     @property
-    def refined_march(self) -> March:
+    def refined_sampling(self) -> Sampling:
         """How rays of refined cells are marched."""
-        return replace(self.march, step=self.refined_step * STEP)
+        return replace(self.sampling, step=self.refined_step * STEP)
 
 
 @dataclass(frozen=True)

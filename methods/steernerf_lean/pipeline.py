@@ -95,7 +95,7 @@ class LeanPipeline(Pipeline):
         """Render the colours [n, s^2, 3] of `cells` [n] with a ray through each of their pixels."""
         rays = rays_of_cells(cells, view)
         probe.count("refined_rays", len(rays.origins), view.full.width * view.full.height)
-        how, occupancy = rendering.refined_march, self.occupied(rendering)
+        how, occupancy = rendering.refined_sampling, self.occupied(rendering)
         pixels = render_rays(self.field, rays, occupancy, probe, how).over(self.background)
         return pixels.values[:, :3].clamp_(0, 1).view(len(cells), view.scale**2, 3)
 

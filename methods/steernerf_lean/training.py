@@ -132,7 +132,7 @@ class LeanTraining(JointTraining):
             self.trained.field,
             every.take(some),
             pipeline.occupancy,
-            rendering.refined_march,
+            rendering.refined_sampling,
             background=pipeline.background,
             hidden=not compacts(wanted.device),
         )

@@ -57,10 +57,8 @@ class Training(Protocol):
     asked: Asked | None
 
     def advance(self) -> Mapping[str, float]:
-        """Take one step; return the mean squared errors to show, by label ("" for the main one).
-
-        See `look`.
-        """
+        """Take one step; return what `look` returns, the mean squared errors to show by label (""
+        for the main one)."""
 
     def watched(self) -> Mapping[str, Tensor]:
         """The tensors that must be finite in a good state, by name."""
@@ -102,18 +100,6 @@ def train(
             log.info(f"{label}: found in {finished}")
 
 
-def load(training: Training, path: Path) -> None:
-    """Load into `training` a result that `train` wrote to `path`.
-
-    Raises:
-        SteerbenchError: the file is damaged, or belongs to another training.
-    """
-    tensors, figures = checkpoint.read(path)
-    with checkpoint.restoring(path):
-        training.restore_result(tensors)
-        training.seconds = figures["seconds"]
-
-
 def _drive(
     training: Training, finished: Path, label: str, log: Log, marks: Mapping[Path, int]
 ) -> None:
@@ -128,7 +114,8 @@ def _drive(
         while training.step < training.steps:
             errors = training.advance()
             means |= {k: 0.99 * means.get(k, mse) + 0.01 * mse for k, mse in errors.items()}
-            progress.advance(note=", ".join(f"{k} {_db(mse)}".strip() for k, mse in means.items()))
+            shown = {k: -10 * math.log10(max(mse, 1e-10)) for k, mse in means.items()}
+            progress.advance(note=", ".join(f"{k} {db:.1f} dB".strip() for k, db in shown.items()))
             training.seconds = time.monotonic() - began
             for path, step in marks.items():
                 if training.step == step:
@@ -149,6 +136,18 @@ def save(training: Training, path: Path, done: bool = False) -> None:
     more, figures = training.state()
     figures |= {"step": training.step, "seconds": training.seconds}
     checkpoint.write(path, training.result() | ({} if done else more), figures)
+
+
+def load(training: Training, path: Path) -> None:
+    """Load into `training` a result that `train` wrote to `path`.
+
+    Raises:
+        SteerbenchError: the file is damaged, or belongs to another training.
+    """
+    tensors, figures = checkpoint.read(path)
+    with checkpoint.restoring(path):
+        training.restore_result(tensors)
+        training.seconds = figures["seconds"]
 
 
 def resume(training: Training, path: Path) -> None:
@@ -194,7 +193,3 @@ def check_finite(training: Training, more: Mapping[str, Tensor] | None = None) -
             f"training stopped at step {training.step}: not finite: {', '.join(bad)}. The last "
             f"good checkpoint was kept. {training.advice}"
         )
-
-
-def _db(mse: float) -> str:
-    return f"{-10 * math.log10(max(mse, 1e-10)):.1f} dB"

@@ -126,13 +126,13 @@ def test_a_line_that_no_job_fills_is_named() -> None:
 
 
 @pytest.mark.parametrize(("gpu", "engine"), [(False, "OpenVino"), (True, "TorchEngine")])
-@pytest.mark.parametrize("asked", [[], ["engine=onnxruntime"]])
+@pytest.mark.parametrize("asked", [[], ["engine=torch"]])
 def test_the_engine_of_the_first_table_is_one_for_the_device(
     gpu: bool, engine: str, asked: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
     (table,) = (table for table in paper_tables() if table.name == "table1")
     targets = {job.config.engine._target_.split(".")[-1] for job in plan(table, asked)}
-    assert targets == {"OnnxRuntime" if asked else engine}
+    assert targets == {"TorchEngine" if asked else engine}
     words = with_engine([*asked, "device=auto"])
     assert composed(words).engine._target_.split(".")[-1] in targets

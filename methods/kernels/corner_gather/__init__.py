@@ -39,8 +39,8 @@ def gather(
             from autograd, so that a training step neither allocates nor clears a second table.
 
     Raises:
-        ValueError: wrong shapes; on a CPU, a voxel that is not a row of `corners`; backends "cpu",
-            "gpu": other types.
+        ValueError: wrong shapes; on a CPU, a voxel that is not a row of `corners`; other types than
+            float32 for the backend "cpu".
     """
     check_shape("table", table, None, None)
     check_shape("corners", corners, None, CORNERS)
@@ -67,7 +67,7 @@ def trilinear(local: Tensor, *, backend: str = "auto") -> Tensor:
     Differentiable with backend="reference" only.
 
     Raises:
-        ValueError: a shape other than this; backends "cpu", "gpu": not float32.
+        ValueError: a shape other than this; backend "cpu": not float32.
     """
     check_shape("local", local, None, 3)
     return implementation(__name__, backend, local.device).trilinear(local)
@@ -85,7 +85,7 @@ def integral(entry: Tensor, leave: Tensor, *, backend: str = "auto") -> Tensor:
         leave: [S, 3] local coordinates of the other end.
 
     Raises:
-        ValueError: a shape other than these; backends "cpu", "gpu": not float32.
+        ValueError: a shape other than these; backend "cpu": not float32.
     """
     check_shape("entry", entry, None, 3)
     check_shape("leave", leave, len(entry), 3)
@@ -100,7 +100,7 @@ def integral_along(
     Not differentiable.
 
     Raises:
-        ValueError: rays or voxels do not belong to the crossings; backends "cpu", "gpu": not
+        ValueError: rays or voxels do not belong to the crossings; backend "cpu": not
             float32.
     """
     count = len(rays.origins)

@@ -35,7 +35,7 @@ def shade_voxels(
             hidden from autograd.
 
     Raises:
-        ValueError: wrong shapes; backends "cpu", "gpu": not float32.
+        ValueError: wrong shapes; backend "cpu": not float32.
     """
     check_shape("harmonics", harmonics, None, None, 3)
     if harmonics.shape[1] not in SIZES:

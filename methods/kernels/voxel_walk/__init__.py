@@ -178,7 +178,7 @@ def walk(
         limit: maximum number of crossings per ray; None: all.
 
     Raises:
-        ValueError: wrong shapes, a limit below 1; backends "cpu", "gpu": not float32.
+        ValueError: wrong shapes, a limit below 1; backend "cpu": not float32.
     """
     origins, count = rays.origins, len(rays.origins)
     check_shape("origins", origins, None, 3)
@@ -217,7 +217,7 @@ def render_voxels(
         faint: voxels with at most this weight count for opacity but are not shaded.
 
     Raises:
-        ValueError: wrong shapes, a stop outside [0, 1); backends "cpu", "gpu": not float32.
+        ValueError: wrong shapes, a stop outside [0, 1); backend "cpu": not float32.
     """
     check_stop(stop)
     check_shape("origins", rays.origins, None, 3)

@@ -124,8 +124,8 @@ class Patches:
             jitter = torch.rand(len(rays.origins), generator=self.generator)
             jitter = jitter.to(field.device, non_blocking=True)
         with torch.set_grad_enabled(self.learning):
-            march, occupancy = self.rendering.march, self.pipeline.occupancy
-            pixels, _ = render_batch(field, rays, occupancy, march, jitter=jitter)
+            how, occupancy = self.rendering.sampling, self.pipeline.occupancy
+            pixels, _ = render_batch(field, rays, occupancy, how, jitter=jitter)
             ends = accumulate(len(some) for some in chosen)
             parts = (pixels.take(slice(e - len(x), e)) for x, e in zip(chosen, ends, strict=True))
             of_each = zip(chosen, parts, strict=True)

@@ -45,30 +45,22 @@ class Network:
     model: bytes
 
     @property
-    def _inputs(self) -> list[onnx.ValueInfoProto]:
-        return list(onnx.load_from_string(self.model).graph.input)
-
-    @property
     def num_inputs(self) -> int:
-        return len(self._inputs)
+        return len(onnx.load_from_string(self.model).graph.input)
 
     def get_input(self, index: int) -> SimpleNamespace:
-        tensor = self._inputs[index]
+        tensor = onnx.load_from_string(self.model).graph.input[index]
         axes = tensor.type.tensor_type.shape.dim
-        return SimpleNamespace(
-            name=tensor.name, shape=tuple(-1 if axis.dim_param else axis.dim_value for axis in axes)
-        )
+        shape = tuple(-1 if axis.dim_param else axis.dim_value for axis in axes)
+        return SimpleNamespace(name=tensor.name, shape=shape)
 
 
-class Profile:
-    def __init__(self) -> None:
-        self.shapes: dict[str, list[list[int]]] = {}
-
+class Profile(dict[str, list[list[int]]]):
     def set_shape(
         self, input: str, min: Sequence[int], opt: Sequence[int], max: Sequence[int]
     ) -> None:
         assert all(a <= b <= c for a, b, c in zip(min, opt, max, strict=True))
-        self.shapes[input] = [list(min), list(max)]
+        self[input] = [list(min), list(max)]
 
 
 class Config:
@@ -102,7 +94,7 @@ class Builder:
     def build_serialized_network(self, network: Network, config: Config) -> bytes | None:
         assert config.profile is not None
         Builder.built += 1
-        return json.dumps(config.profile.shapes).encode() + b"\n" + network.model
+        return json.dumps(config.profile).encode() + b"\n" + network.model
 
 
 class OnnxParser:
@@ -155,22 +147,20 @@ class ExecutionContext:
         return True
 
     def get_tensor_shape(self, name: str) -> tuple[int, ...]:
-        arrays = {
-            x.name: np.zeros(self._shapes[x.name], ONNX_TYPES[x.type])
-            for x in self._engine.session.get_inputs()
-        }
-        return self._engine.session.run([name], arrays)[0].shape
+        zeros = {x: np.zeros(self._shapes[x], kind) for x, kind in self._kinds().items()}
+        return self._engine.session.run([name], zeros)[0].shape
 
     def execute_async_v3(self, stream_handle: int) -> bool:
         session = self._engine.session
-        arrays = {
-            x.name: self._memory(x.name, self._shapes[x.name], ONNX_TYPES[x.type])
-            for x in session.get_inputs()
-        }
+        kinds = self._kinds().items()
+        arrays = {x: self._memory(x, self._shapes[x], kind) for x, kind in kinds}
         names = [x.name for x in session.get_outputs()]
         for name, value in zip(names, session.run(names, arrays), strict=True):
             self._memory(name, value.shape, value.dtype)[...] = value
         return True
+
+    def _kinds(self) -> dict[str, type[np.generic]]:
+        return {x.name: ONNX_TYPES[x.type] for x in self._engine.session.get_inputs()}
 
     def _memory(
         self, name: str, shape: tuple[int, ...], dtype: type[np.generic] | np.dtype

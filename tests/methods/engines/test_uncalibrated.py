@@ -13,9 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from bench.console import ConsoleLog
-from bench.errors import Unavailable
 from methods.engines import CALIBRATION, Engine, Inputs, Network, required
-from methods.engines.onnxruntime_engine import OnnxRuntime
 from methods.engines.openvino_engine import OpenVino
 from methods.engines.tensorrt_engine import TensorRt
 from tests.methods.engines.test_engines import lean, unet
@@ -30,8 +28,6 @@ CPU = torch.device("cpu")
 
 class Layers(Network):
     """Two convolutions, and one of what is pooled between them."""
-
-    varying = ((),)
 
     def __init__(self) -> None:
         super().__init__()
@@ -86,31 +82,20 @@ def built(
 def weights(kind: Kind, folder: Path) -> list[np.ndarray]:
     """All 8-bit constants, and the scales of those that are convolved with."""
     if kind is OpenVino:
-        model = (
-            required("openvino", "openvino", "openvino").Core().read_model(folder / "network.xml")
-        )
-        kernels = [
-            op.input_value(1).get_node()
-            for op in model.get_ordered_ops()
-            if op.get_type_name() == "Convolution"
-        ]
-        return [
-            x
+        openvino = required("openvino", "openvino", "openvino")
+        model = openvino.Core().read_model(folder / "network.xml")
+        convolved = [op for op in model.get_ordered_ops() if op.get_type_name() == "Convolution"]
+        kernels = [op.input_value(1).get_node() for op in convolved]
+        pairs = [
+            (kernel.input_value(0).get_node().input_value(0), kernel.input_value(1))
             for kernel in kernels
-            for x in (
-                kernel.input_value(0).get_node().input_value(0).get_node().data,
-                kernel.input_value(1).get_node().data,
-            )
         ]
+        return [x.get_node().data for pair in pairs for x in pair]
     graph = onnx.load(folder / "network.onnx").graph
     values = {x.name: onnx.numpy_helper.to_array(x) for x in graph.initializer}
     makers = {name: node for node in graph.node for name in node.output}
     kernels = [makers[node.input[1]] for node in graph.node if node.op_type == "Conv"]
     return [values[name] for kernel in kernels for name in kernel.input[:2]]
-
-
-def per_channel(scale: np.ndarray) -> np.ndarray:
-    return scale.reshape(-1, 1, 1, 1)
 
 
 def adds_products_exactly() -> bool:
@@ -128,7 +113,7 @@ def test_activations_are_rounded_on_the_ranges_of_trtexec(kind: Kind, tmp_path: 
     got = built(kind, module, [noise(0)], tmp_path)(*inputs)
     found = weights(kind, tmp_path)
     kernels = [
-        torch.from_numpy(q * per_channel(scale))
+        torch.from_numpy(q * scale.reshape(-1, 1, 1, 1))
         for q, scale in zip(found[::2], found[1::2], strict=True)
     ]
     by_shape = {tuple(kernel.shape): kernel for kernel in kernels}
@@ -172,19 +157,15 @@ def test_weights_are_those_of_int8_on_frames(kind: Kind, tmp_path: Path) -> None
     assert len(found["none"]) == 6
     for some, others in zip(found["none"], found["frames"], strict=True):
         assert np.array_equal(some, others)
-
-
-def test_every_channel_of_weights_is_scaled_by_its_largest(tmp_path: Path) -> None:
-    module = layers()
-    built(TensorRt, module, [noise(0)], tmp_path)
-    largest = {
-        tuple(layer.weight.shape): layer.weight.abs().amax((1, 2, 3)).numpy()
-        for layer in (module.first, module.second, module.pooled)
-    }
-    found = weights(TensorRt, tmp_path)
-    for q, scale in zip(found[::2], found[1::2], strict=True):
-        assert np.allclose(127 * scale, largest[q.shape], rtol=1e-6)
-        assert (np.abs(q.astype(int)).reshape(len(q), -1).max(1) == 127).all()
+    if kind is TensorRt:  # every channel is scaled by its largest weight
+        module = layers()
+        largest = {
+            tuple(layer.weight.shape): layer.weight.abs().amax((1, 2, 3)).numpy()
+            for layer in (module.first, module.second, module.pooled)
+        }
+        for q, scale in zip(found["none"][::2], found["none"][1::2], strict=True):
+            assert np.allclose(127 * scale, largest[q.shape], rtol=1e-6)
+            assert (np.abs(q.astype(int)).reshape(len(q), -1).max(1) == 127).all()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -219,34 +200,9 @@ def test_no_more_frames_are_needed_than_without_int8(
     assert kind("int8", "frames").samples(module) == CALIBRATION
 
 
-@pytest.mark.parametrize("kind", [*KINDS, OnnxRuntime])
+@pytest.mark.parametrize("kind", KINDS)
 def test_only_int8_depends_on_the_calibration(kind: Kind) -> None:
     assert kind("int8", "none").key() != kind("int8", "frames").key()
+    assert kind("int8", "none").computed(CPU) == "int8 uncalibrated+fp32"
     assert kind("fp32", "none").key() == kind("fp32", "frames").key()
     assert kind("fp32", "none").computed(CPU) == "fp32"
-
-
-def test_without_int8_the_result_is_the_same(tmp_path: Path, quiet_log: ConsoleLog) -> None:
-    module, found = layers(), []
-    for calibration in ("frames", "none"):
-        place = tmp_path / calibration
-        place.mkdir()
-        engine = OpenVino("fp32", calibration)
-        found.append(engine.build(module, lambda: [noise(0)], lambda at=place: at, quiet_log).run)
-    for a, b in zip(*(run(*noise(1)) for run in found), strict=True):
-        assert torch.equal(a, b)
-
-
-@pytest.mark.parametrize(("half", "rest"), [(["BF16"], "bf16"), ([], "fp32")])
-def test_rows_say_that_int8_was_not_calibrated(
-    half: list[str], rest: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("methods.engines.openvino_engine._capabilities", lambda openvino: half)
-    assert OpenVino("int8", "none").computed(CPU) == f"int8 uncalibrated+{rest}"
-    assert TensorRt("int8", "none").computed(CPU) == "int8 uncalibrated+fp32"
-
-
-def test_onnx_runtime_refuses_before_anything_is_trained() -> None:
-    with pytest.raises(Unavailable, match=r"calibration=none: .* use engine=openvino"):
-        OnnxRuntime("int8", "none").check(CPU)
-    OnnxRuntime("fp32", "none").check(CPU)

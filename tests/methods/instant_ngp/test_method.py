@@ -83,17 +83,17 @@ def test_settings_say_in_which_precision_a_field_is_multiplied(
     assert method.settings()["precision"] == said
 
 
-def test_a_packed_table_needs_two_features() -> None:
-    with pytest.raises(ValueError, match=r"grid\.features is 4: use precision=fp32"):
-        InstantNgp(grid=HashGrid(features=4), training=QUICK, device="cpu")
-
-
-def test_a_stop_that_ends_every_ray_at_once_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"stop: expected a transmittance of 0 or more and less"):
-        InstantNgp(grid=HashGrid(), training=QUICK, stop=1.0, device="cpu")
-
-
-@pytest.mark.parametrize("device", ["", "gpu", "cpu:0", "meta"])
-def test_what_is_no_name_of_a_device_is_refused(device: str) -> None:
-    with pytest.raises(ValueError, match=rf"^device: expected auto, .* got '{device}'"):
-        InstantNgp(grid=GRID, training=QUICK, device=device)
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"grid": HashGrid(features=4)}, r"grid\.features is 4: use precision=fp32"),
+        ({"stop": 1.0}, "stop: expected a transmittance of 0 or more and less"),
+        *(
+            ({"device": name}, rf"^device: expected auto, .* got '{name}'")
+            for name in ("", "gpu", "cpu:0", "meta")
+        ),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(wrong: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        InstantNgp(**{"grid": GRID, "training": QUICK, "device": "cpu", **wrong})

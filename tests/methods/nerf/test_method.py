@@ -15,19 +15,19 @@ from methods.instant_ngp.stage1 import TrainedField, train_field
 from methods.kernels.composite import STOP
 from methods.nerf.field import NerfField
 from methods.nerf.method import Nerf
-from methods.rendering.march import March
+from methods.rendering.sampling import Sampling
 from methods.students.networks import NetworkLessons
 from methods.training import loop
 from tests.methods.conftest import Work
 from tests.methods.trainings import EXACT_TEACHER, TAUGHT, goes_on_after_a_kill, quality
 
 BUDGET = replace(TAUGHT, steps=80, renderer_steps=4)
-LONG = 8.0
-"""March step, in the usual ones: few samples for a large network."""
+LONG = EXACT_TEACHER.training.march_step
+"""Step of the rays, in the usual ones."""
 
 
 def new_method(**options: Any) -> Nerf:
-    training = NetworkLessons(rate=1e-3, march_step=LONG)
+    training = NetworkLessons(rate=1e-3)
     return Nerf(**{"teacher": EXACT_TEACHER, "training": training} | options)
 
 
@@ -55,8 +55,8 @@ def test_skipping_changes_no_picture_and_saves_products(ball_scene: Scene, share
     method.skip = False
     slow = method.render(camera, dense)
     # A ray has at most 1024 / LONG samples; the faint ones, which only the dense picture has
-    # colours of, weigh at most that of `March.least_weight` each. Sums differ by their rounding.
-    faint = 1024 / LONG * March(stop=STOP).least_weight
+    # colours of, weigh at most that of `Sampling.least_weight` each. Sums differ by their rounding.
+    faint = 1024 / LONG * Sampling(stop=STOP).least_weight
     torch.testing.assert_close(fast.rgb, slow.rgb, rtol=0, atol=faint + 1e-5)
     torch.testing.assert_close(fast.alpha, slow.alpha, rtol=0, atol=1e-5)
     assert dense.done["products"] == dense.done["samples"] * products_of_a_sample()

@@ -18,7 +18,6 @@ from methods.kernels.encode import encode
 from methods.kernels.types import Occupancy
 from methods.nsvf.field import NsvfField
 from methods.nsvf.method import Nsvf
-from methods.rendering.occupancy import STEP
 from methods.students.networks import NetworkLessons
 from methods.training import loop
 from tests.methods.trainings import (
@@ -149,8 +148,8 @@ def test_a_training_is_found_again_and_depends_on_its_step(
     camera = ball_scene.splits["test"].cameras[0]
     pictures = [method.render(camera, NullProbe()).rgb for method in (first, again)]
     assert torch.equal(*pictures)
-    assert first.march.step == pytest.approx(0.5 / 32)
-    assert new_method(step=0.25).training.march_step * STEP == pytest.approx(0.25 / 32)
+    assert first.how.step == 0.5 / 32
+    assert new_method(step=0.25).sampling(BUDGET).step == 0.25 / 32
 
 
 def test_embeddings_begin_as_the_teachers_features(ball_scene: Scene, shared_log: Log) -> None:

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 from torch import Tensor
 
-from bench.cameras import cast
+from bench.cameras import cast, place_camera
 from bench.types import Rays
 from methods.instant_ngp.field import HashField
 from methods.kernels.composite import composite
 from methods.kernels.march import march
-from methods.kernels.types import Occupancy, Samples
+from methods.kernels.types import Occupancy, Pixels, Samples
 from methods.rendering.batch import (
     KEPT_THIN,
     FirstPass,
     Round,
     first_pass,
     render_batch,
-    second_pass,
 )
-from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
+from methods.rendering.sampling import Sampling
 from tests.methods.conftest import look_at_the_middle
 
 Thick = tuple[HashField, Occupancy, Rays]
@@ -40,8 +37,23 @@ def thick(cloud: tuple[HashField, Occupancy], device: str) -> Thick:
         return 100 * sigma, geometry
 
     field.density = density  # type: ignore[method-assign]
-    camera = look_at_the_middle(0.1, 0.4)
-    return field, occupancy, cast(replace(camera, c2w=camera.c2w.to(device)))
+    return field, occupancy, rays_on(device)
+
+
+def rays_on(device: str) -> Rays:
+    """Rays through the cloud."""
+    return cast(place_camera(look_at_the_middle(0.1, 0.4), device))
+
+
+def learned(pixels: Pixels, field: HashField) -> list[Tensor]:
+    """The gradients of all parameters, for some loss of `pixels`."""
+    return list(torch.autograd.grad(pixels.values.square().sum(), list(field.parameters())))
+
+
+def assert_the_same(grads: list[Tensor], wanted: list[Tensor]) -> None:
+    for got, want in zip(grads, wanted, strict=True):
+        # Sums over up to 10^5 samples, in another grouping.
+        torch.testing.assert_close(got, want, rtol=1e-3, atol=1e-4 * want.abs().max().item())
 
 
 def test_leaving_out_hidden_samples_changes_no_gradient(thick: Thick, device: str) -> None:
@@ -49,33 +61,25 @@ def test_leaving_out_hidden_samples_changes_no_gradient(thick: Thick, device: st
     jitter = torch.rand(len(rays.origins), generator=torch.Generator().manual_seed(0)).to(device)
     white = torch.ones(3, device=device)
 
-    pixels, used = render_batch(field, rays, occupancy, March(), jitter=jitter, background=white)
-    pixels.values.square().sum().backward()
-    grads = [p.grad.clone() for p in field.parameters() if p.grad is not None]
-    field.zero_grad()
+    pixels, used = render_batch(field, rays, occupancy, Sampling(), jitter=jitter, background=white)
+    grads = learned(pixels, field)
 
     samples = march(rays, occupancy, STEP, jitter=jitter)
     sigma, geometry = field.density(samples.positions)
     values = field.features(geometry, field.encode_directions(rays.directions)[samples.ray])
     whole = composite(sigma, values, samples).over(white)
-    whole.values.square().sum().backward()
-
     assert used < 0.9 * len(samples)
     assert len(grads) == 6
-    for got, want in zip(grads, (p.grad for p in field.parameters()), strict=True):
-        assert want is not None
-        # Sums over up to 10^5 samples, in another grouping.
-        torch.testing.assert_close(got, want, rtol=1e-3, atol=1e-4 * want.abs().max().item())
+    assert_the_same(grads, learned(whole, field))
 
 
 def test_thin_samples_are_kept_in_turn_and_stand_for_the_others(
     cloud: tuple[HashField, Occupancy], device: str
 ) -> None:
     field, occupancy = cloud
-    camera = look_at_the_middle(0.1, 0.4)
-    rays = cast(replace(camera, c2w=camera.c2w.to(device)))
+    rays = rays_on(device)
     jitter = torch.full((len(rays.origins),), 0.5, device=device)
-    first = first_pass(field, rays, occupancy, March(), jitter=jitter)
+    first = first_pass(field, rays, occupancy, Sampling(), jitter=jitter)
     every = first.visible()
     depth = (field.density(every.positions)[0] * every.delta).median().item()
     thick = first.thinned(0.0, jitter)
@@ -130,7 +134,7 @@ def test_the_rounds_of_the_first_pass_change_no_sample(
     found = []
     for rounds in ((), (2,), (1, 3)):
         monkeypatch.setattr("methods.rendering.batch.FIRST_ROUNDS", rounds)
-        first = first_pass(field, rays, occupancy, March(), jitter=jitter)
+        first = first_pass(field, rays, occupancy, Sampling(), jitter=jitter)
         found.append((first.counts, first.visible(), first.thinned(1.0, jitter)))
     for counts, *chosen in found[1:]:
         assert torch.equal(counts, found[0][0])
@@ -144,45 +148,17 @@ def test_the_rounds_of_the_first_pass_change_no_sample(
 
 def test_hidden_samples_may_be_evaluated_too(thick: Thick) -> None:
     field, occupancy, rays = thick
-    grads, used = [], []
-    for hidden in (False, True):
-        pixels, samples = render_batch(field, rays, occupancy, March(), hidden=hidden)
-        pixels.values.square().sum().backward()
-        grads.append([p.grad.clone() for p in field.parameters() if p.grad is not None])
-        used.append(samples)
-        field.zero_grad()
-    assert used[0] < 0.9 * used[1]
-    for got, want in zip(*grads, strict=True):
-        # Sums over up to 10^5 samples, in another grouping.
-        torch.testing.assert_close(got, want, rtol=1e-3, atol=1e-4 * want.abs().max().item())
-
-
-def test_rays_are_opaque_where_any_of_their_samples_is(
-    cloud: tuple[HashField, Occupancy], device: str
-) -> None:
-    field, occupancy = cloud
-    holey = field.density
-
-    def density(positions: Tensor, known: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        sigma, geometry = holey(positions, known)
-        return torch.where(positions[:, 0] < 0.5, sigma, 0), geometry
-
-    field.density = density  # type: ignore[method-assign]
-    camera = look_at_the_middle(0.1, 0.4)
-    rays = cast(replace(camera, c2w=camera.c2w.to(device)))
-    first = first_pass(field, rays, occupancy, March())
-    samples = march(rays, occupancy, STEP)
-    alpha = second_pass(field, rays, samples, March()).alpha
-    assert 0 < (alpha > 0).sum() < (samples.offsets.diff() > 0).sum()
-    assert torch.equal(first.opaque(), alpha > 0)
+    some, few = render_batch(field, rays, occupancy, Sampling())
+    every, most = render_batch(field, rays, occupancy, Sampling(), hidden=True)
+    assert few < 0.9 * most
+    assert_the_same(learned(some, field), learned(every, field))
 
 
 def test_a_guide_tells_which_samples_are_hidden(
     cloud: tuple[HashField, Occupancy], device: str
 ) -> None:
     field, occupancy = cloud
-    camera = look_at_the_middle(0.1, 0.4)
-    rays = cast(replace(camera, c2w=camera.c2w.to(device)))
+    rays = rays_on(device)
 
     class Guide:
         """As dense everywhere as is given, without colours."""
@@ -193,12 +169,12 @@ def test_a_guide_tells_which_samples_are_hidden(
         def density(self, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
             return torch.full_like(positions[:, 0], self.sigma), positions
 
-    own, most = render_batch(field, rays, occupancy, March(stop=0))
-    clear, all_ = render_batch(field, rays, occupancy, March(stop=0), guide=Guide(0.0))  # type: ignore[arg-type]
+    own, most = render_batch(field, rays, occupancy, Sampling(stop=0))
+    clear, all_ = render_batch(field, rays, occupancy, Sampling(stop=0), guide=Guide(0.0))  # type: ignore[arg-type]
     assert all_ == most
     assert torch.equal(own.values, clear.values)
     # Opaque at once: only the first sample of every ray is seen.
-    wall, few = render_batch(field, rays, occupancy, March(), guide=Guide(1e6))  # type: ignore[arg-type]
+    wall, few = render_batch(field, rays, occupancy, Sampling(), guide=Guide(1e6))  # type: ignore[arg-type]
     offsets = march(rays, occupancy, STEP).offsets
     assert few == int((offsets.diff() > 0).sum())
     assert (wall.alpha <= own.alpha + 1e-6).all()

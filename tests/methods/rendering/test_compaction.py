@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from bench.waits import device_waits
-from methods.rendering.compaction import indices_where, kept_indices, to_host
+from methods.rendering.compaction import indices_where, kept_indices
 from tests.pretended_gpu import PretendedGpu
 
 MASK = torch.tensor([False, True, True, False, True])
@@ -29,16 +29,6 @@ def test_the_places_of_many_masks_are_waited_for_once(gpu: PretendedGpu) -> None
     with device_waits() as waits:
         found = indices_where(there)
     assert [place.tolist() for place in found] == [[1, 2, 4], [0, 3], [], []]
-    assert waits.total() == 1
-
-
-def test_how_often_masks_are_true_may_be_told_with_other_numbers(gpu: PretendedGpu) -> None:
-    masks, more = [MASK.to("cuda"), ~MASK.to("cuda")], torch.tensor([[7, 8]]).to("cuda")
-    with device_waits() as waits:
-        *sizes, seven, eight = to_host([*(mask.sum() for mask in masks), more])
-        found = indices_where(masks, sizes)
-    assert [place.tolist() for place in found] == [[1, 2, 4], [0, 3]]
-    assert (seven, eight) == (7, 8)
     assert waits.total() == 1
 
 

@@ -7,15 +7,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bench.cameras import cast
+from bench.cameras import cast, place_camera
 from bench.types import EMPTY_ALPHA, NullProbe
 from methods.instant_ngp.field import HashField
 from methods.kernels.march import march
 from methods.kernels.types import Occupancy
 from methods.rendering.frame import everywhere, rays_at_matter, render_frame
-from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
 from methods.rendering.rays import render_rays
+from methods.rendering.sampling import Sampling
 from tests.methods.conftest import Work, look_at_the_middle
 
 
@@ -45,13 +45,12 @@ def test_a_camera_inside_the_matter_sees_it_in_all_pixels() -> None:
 
 def test_a_frame_is_its_rays_on_the_background(cloud: tuple[HashField, Occupancy]) -> None:
     field, occupancy = cloud
-    camera = look_at_the_middle(0.1, 0.4)
-    camera = replace(camera, c2w=camera.c2w.to(field.device), width=20)
+    camera = replace(place_camera(look_at_the_middle(0.1, 0.4), field.device), width=20)
     background, work = torch.tensor((0.25, 0.5, 1.0), device=field.device), Work()
-    render = everywhere(field, occupancy, work, March())
+    render = everywhere(field, occupancy, work, Sampling())
     frame = render_frame(camera, occupancy, background, work, render)
     assert frame.values.shape == (32, 20, 3)
-    pixels = render_rays(field, cast(camera), occupancy, NullProbe(), March())
+    pixels = render_rays(field, cast(camera), occupancy, NullProbe(), Sampling())
     # The same rays among others: sums of float32 in another order.
     alpha = pixels.alpha.view(32, 20)
     torch.testing.assert_close(frame.alpha, alpha, rtol=0, atol=1e-6)
@@ -68,14 +67,13 @@ def test_a_frame_is_its_rays_on_the_background(cloud: tuple[HashField, Occupancy
 def test_a_window_is_that_of_its_pixel(cloud: tuple[HashField, Occupancy]) -> None:
     """Half of the pixels may look nowhere, though `render_frame` asks for some pixels only."""
     field, occupancy = cloud
-    camera = look_at_the_middle(0.1, 0.4)
-    camera = replace(camera, c2w=camera.c2w.to(field.device))
+    camera = place_camera(look_at_the_middle(0.1, 0.4), field.device)
     window = torch.tensor((0.0, torch.inf), device=field.device).repeat(32, 32, 1)
     window[:, :16] = 0.0
     black, probe = torch.zeros(3, device=field.device), NullProbe()
     whole, half = (
         render_frame(camera, occupancy, black, probe, everywhere(field, occupancy, probe, how))
-        for how in (March(), March(window=window.view(-1, 2)))
+        for how in (Sampling(), Sampling(window=window.view(-1, 2)))
     )
     assert whole.alpha[:, :16].any()
     assert not half.alpha[:, :16].any()

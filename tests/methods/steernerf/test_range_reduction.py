@@ -12,8 +12,8 @@ from torch import Tensor
 from bench.types import Camera
 from methods.kernels.types import Occupancy
 from methods.rendering.frame import FeatureFrame, everywhere, render_frame
-from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
+from methods.rendering.sampling import Sampling
 from methods.steernerf.buffer import CLEAR_ALPHA, Cloud
 from methods.steernerf.options import RangeReduction
 from tests.methods.conftest import Work, look_at_the_middle
@@ -33,7 +33,7 @@ def along_x() -> Camera:
 
 def render(field: Solid, interval: Tensor | None = None) -> tuple[FeatureFrame, int]:
     """The frame, in the interval [h, w, 2] or everywhere, and how many samples it took."""
-    probe, how = Work(), March(step=4 * STEP)
+    probe, how = Work(), Sampling(step=4 * STEP)
     if interval is not None:
         how = how.within(interval.view(-1, 2))
     by = everywhere(field, EVERYWHERE, probe, how)

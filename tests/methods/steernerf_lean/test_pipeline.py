@@ -12,8 +12,8 @@ from bench.probes import StageClock
 from bench.types import Camera, NullProbe
 from methods.kernels.types import Occupancy
 from methods.rendering.frame import everywhere, render_frame
-from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
+from methods.rendering.sampling import Sampling
 from methods.steernerf.buffer import Buffer, Cloud
 from methods.steernerf.options import RangeReduction
 from methods.steernerf.view import View
@@ -33,7 +33,7 @@ def test_where_every_cell_is_refined_the_picture_is_that_of_the_field() -> None:
     rendering = replace(USUAL, refined=1.0, refined_step=4.0)
     pipeline, buffer, probe = lean_pipeline(), Buffer(maxlen=1), NullProbe()
     shown = pipeline.render(CAMERA, buffer, rendering, probe).rgb
-    render = everywhere(pipeline.field, pipeline.occupancy, probe, March(step=4.0 * STEP))
+    render = everywhere(pipeline.field, pipeline.occupancy, probe, Sampling(step=4.0 * STEP))
     field = render_frame(CAMERA, pipeline.occupancy, pipeline.background, probe, render)
     low = pipeline.features(pipeline.view(CAMERA), (), rendering, probe)
     drawn = cells_near(low.alpha > 0).flatten().nonzero().squeeze(1)

@@ -134,7 +134,7 @@ def test_a_line_of_another_budget_has_no_quality(study, monkeypatch):
 def test_parity_compares_every_engine_with_torch_in_fp32(study):
     found = {row["engine"]: row for row in rows(study("parity", "shades"))}
     assert next(iter(found)) == "torch, fp32"
-    assert "onnxruntime, int8" in found
+    assert "openvino, int8" in found
     for row in found.values():
         assert (row["lost"], row["apart"], row["bytes"]) == (0, None, 4)
         assert 0 < row["network_ms"] < row["frame_ms"]

@@ -33,26 +33,24 @@ def check_step(name: str, length: float) -> None:
 
 
 @dataclass(frozen=True)
-class March:
+class Sampling:
     """How rays are marched.
 
     Attributes:
         step: world length of a step.
         stop: transmittance at which a ray ends.
         window: [R, 2] nearest and farthest t of each ray; None: all of it.
-        faint: weight below which a sample has an opacity but no features; None: `FAINT * stop`.
     """
 
     step: float = STEP
     stop: float = STOP
     window: Tensor | None = None
-    faint: float | None = None
 
     @property
     def least_weight(self) -> float:
         """Weight of a sample below which its features are not evaluated."""
-        return FAINT * self.stop if self.faint is None else self.faint
+        return FAINT * self.stop
 
-    def within(self, window: Tensor | None) -> March:
+    def within(self, window: Tensor | None) -> Sampling:
         """The same within `window` [R, 2]."""
         return replace(self, window=window)
