@@ -22,7 +22,7 @@ from methods.kernels.encode import HashGrid, encode
 from methods.kernels.types import Occupancy
 from methods.rendering import rays
 from methods.rendering.frame import everywhere, render_frame
-from methods.rendering.march import March
+from methods.rendering.sampling import Sampling
 from tests.methods.conftest import look_at_the_middle
 from tests.methods.models import misty_field, shell
 from tests.pretended_gpu import PretendedGpu, pretended_gpu
@@ -242,7 +242,7 @@ def draw(background: Tensor) -> Tensor:
     field = misty_field(backend="reference").to("cuda")
     occupancy = Occupancy(shell().cells.cuda())
     camera = place_camera(look_at_the_middle(0.1, 0.2), "cuda")
-    render = everywhere(field, occupancy, NullProbe(), March(step=0.05))
+    render = everywhere(field, occupancy, NullProbe(), Sampling(step=0.05))
     return render_frame(camera, occupancy, background, NullProbe(), render).values
 
 

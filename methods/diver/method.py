@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -13,7 +14,7 @@ from methods.diver.decoder import Decoder
 from methods.diver.model import CornerModel
 from methods.diver.rendering import Baked, Stored
 from methods.diver.training import DiverLessons, DiverTraining
-from methods.instant_ngp.stage1 import Setup, TrainedField
+from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import Occupancy, Pixels
 from methods.rendering.frame import Render
 from methods.students.method import Student
@@ -24,22 +25,23 @@ MULTIPLE = 16
 FINEST = 512
 
 
+@dataclass(kw_only=True, eq=False)
 class Diver(Student):
     """Corner features of sparse voxels, integrated along rays and decoded by a small network.
 
-    Args:
-        teacher: the field that it starts from, and where it runs.
-        training: how corners and decoder are trained.
+    Attributes:
         resolution: voxels along the unit cube, a multiple of 16, at most 512.
         stored: "bf16" or "fp32", the precision of the corners' features when rendering.
         faint: weight below which a segment has an opacity but no colour.
-        stop: transmittance at which a ray ends when rendering, less than 1.
-        name: as shown in result rows.
-        steps: steps of its own training; None: `budget.renderer_steps`.
     """
 
-    kind = "diver"
     training: DiverLessons
+    name: str = "diver"
+    resolution: int = 256
+    stored: Stored = "bf16"
+    faint: float = 1e-2
+
+    kind = "diver"
     study = Study(
         knobs={
             "stop": turned("stop", "method.stop", ("1e-1", "1e-3", "1e-4")),
@@ -51,41 +53,32 @@ class Diver(Student):
         axes={"G": Axis("{} voxels a side", "method.resolution", (128, 192, 256))},
     )
 
-    def __init__(
-        self,
-        *,
-        teacher: Setup,
-        training: DiverLessons,
-        resolution: int = 256,
-        stored: Stored = "bf16",
-        faint: float = 1e-2,
-        stop: float = 1e-2,
-        name: str = "diver",
-        steps: int | None = None,
-    ) -> None:
-        super().__init__(teacher, training, stop, name, steps)
-        if resolution % MULTIPLE or not MULTIPLE <= resolution <= FINEST:
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        size = self.resolution
+        if size % MULTIPLE or not MULTIPLE <= size <= FINEST:
             raise ValueError(
-                f"resolution: expected a multiple of {MULTIPLE} up to {FINEST}, got {resolution}"
+                f"resolution: expected a multiple of {MULTIPLE} up to {FINEST}, got {size}"
             )
-        if stored not in ("bf16", "fp32"):
-            raise ValueError(f"stored: expected bf16 or fp32, got {stored!r}")
-        if not 0 <= faint < 1:
-            raise ValueError(f"faint: expected a weight of 0 or more and less than 1, got {faint}")
-        self.resolution, self.stored, self.faint = resolution, stored, faint
+        if self.stored not in ("bf16", "fp32"):
+            raise ValueError(f"stored: expected bf16 or fp32, got {self.stored!r}")
+        if not 0 <= self.faint < 1:
+            raise ValueError(
+                f"faint: expected a weight of 0 or more and less than 1, got {self.faint}"
+            )
 
     def model_settings(self) -> Mapping[str, object]:
-        """See `Student`."""
+        """The number of voxels."""
         return {"resolution": self.resolution}
 
-    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> DiverTraining:
-        """See `Student`."""
+    def begin(self, trained: TrainedField, scene: Scene, budget: Budget) -> DiverTraining:
+        """Make the training of corners that start as the trained field encodes them."""
         generator = torch.Generator().manual_seed(self.teacher.seed)
-        model = CornerModel.taught(teacher, self.resolution, generator)
+        model = CornerModel.taught(trained, self.resolution, generator)
         return DiverTraining(model, scene, budget, self.training, self.teacher.seed)
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """See `Student`."""
+        """Load a model, and bake it."""
         device = self.teacher.device
         blank = torch.zeros(0, 3, dtype=torch.int32, device=device)
         model = CornerModel(blank, self.resolution, Decoder().to(device), self.teacher.backend)
@@ -93,7 +86,7 @@ class Diver(Student):
         self.baked = Baked(model, self.stored)
 
     def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
-        """See `Student`."""
+        """The cells of its voxels, and the baked model."""
 
         def render(_: Tensor, rays: Rays) -> Pixels:
             return self.baked.render_rays(rays, probe, self.stop, self.faint)
@@ -105,5 +98,4 @@ class Diver(Student):
         return self.baked.sizes()
 
     def settings(self) -> dict[str, str]:
-        """See `bench.types.Method.settings`."""
         return super().settings() | {"precision": self.stored}

@@ -9,8 +9,9 @@ from torch import Tensor, nn
 
 from bench.types import Rays
 from methods.diver.decoder import CHANNELS, Decoder
+from methods.diver.kernels.segments import segment_weights
 from methods.instant_ngp.stage1 import TrainedField
-from methods.kernels.corner_gather import gather, integral_along
+from methods.kernels.corner_gather import corner_gather
 from methods.kernels.encode import encode
 from methods.kernels.types import Intervals
 from methods.kernels.voxel_walk import Crossings, Voxels
@@ -41,23 +42,23 @@ class CornerModel(nn.Module):
 
     @classmethod
     def taught(
-        cls, teacher: TrainedField, resolution: int, generator: torch.Generator
+        cls, trained: TrainedField, resolution: int, generator: torch.Generator
     ) -> CornerModel:
-        """Make a model with voxels where the teacher is occupied.
+        """Make a model with voxels where the trained field is occupied.
 
-        The features of a corner are the teacher's hash encoding, 16 levels of 2, divided by their
+        The features of a corner are its hash encoding, 16 levels of 2, divided by their
         standard deviation; the decoder is random.
 
         Raises:
             ValueError: the encoding has more than 32 channels.
         """
-        field = teacher.field
+        field = trained.field
         if field.grid.channels > CHANNELS:
             raise ValueError(
                 f"a corner has {CHANNELS} features: expected a hash grid of at most as many "
                 f"channels, got {field.grid.channels}; choose fewer levels or features"
             )
-        coordinates = occupied_voxels(teacher.occupancy, resolution)
+        coordinates = occupied_voxels(trained.occupancy, resolution)
         decoder = Decoder(generator).to(field.device)
         model = cls(coordinates, resolution, decoder, field.backend)
         with torch.no_grad():
@@ -79,11 +80,11 @@ class CornerModel(nn.Module):
 
     def weights(self, rays: Rays, crossings: Crossings) -> Tensor:
         """Weights [S, 8] of the corners in the integrals over `crossings` of `rays`."""
-        return integral_along(rays, crossings, self.voxels, backend=self.backend)
+        return segment_weights(rays, crossings, self.voxels, backend=self.backend)
 
     def features(self, voxel: Tensor, weights: Tensor, grad_buffer: Tensor | None = None) -> Tensor:
         """Integrals [S, 32] of features over segments in voxels [S]."""
-        return gather(
+        return corner_gather(
             self.table, self.corners, voxel, weights, grad_buffer=grad_buffer, backend=self.backend
         )
 

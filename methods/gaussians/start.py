@@ -32,7 +32,7 @@ def on_surfaces(
     colours: list[Tensor] = []
     for _ in range(64):  # too few if less than 1/64 of the pixels show matter
         rays, _ = batches.draw(count, generator)
-        pixels = render_rays(field, rays, trained.occupancy, NullProbe(), trained.march)
+        pixels = render_rays(field, rays, trained.occupancy, NullProbe(), trained.sampling)
         hit = pixels.alpha > SOLID
         depth = pixels.depth_sum[hit] / pixels.alpha[hit]
         points.append(rays.origins[hit] + depth[:, None] * rays.directions[hit])

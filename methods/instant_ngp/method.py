@@ -74,8 +74,8 @@ class InstantNgp:
         """Render one frame at the camera's full resolution."""
         camera = place_camera(camera, self.setup.device)
         field, occupancy = self.trained.field, self.trained.occupancy
-        march = replace(self.trained.march, stop=self.stop)
-        render = everywhere(field, occupancy, probe, march)
+        sampling = replace(self.trained.sampling, stop=self.stop)
+        render = everywhere(field, occupancy, probe, sampling)
         return render_frame(camera, occupancy, self.background, probe, render).picture()
 
     def sizes(self) -> dict[str, int]:

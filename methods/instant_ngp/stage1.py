@@ -13,8 +13,8 @@ from methods.instant_ngp.training import FieldTraining, TrainingOptions, new_gri
 from methods.kernels import multiplies_bf16, resolve
 from methods.kernels.encode import HashGrid
 from methods.kernels.types import Occupancy
-from methods.rendering.march import March
 from methods.rendering.occupancy import DensityGrid
+from methods.rendering.sampling import Sampling
 from methods.training import checkpoint, loop
 
 
@@ -93,12 +93,12 @@ class Setup:
 
 @dataclass(frozen=True)
 class TrainedField:
-    """A trained `field`, the `grid` of its densities, how its rays were marched (`march`), and the
-    seconds that its training took."""
+    """A trained `field`, the `grid` of its densities, the `sampling` of its rays in training, and
+    the seconds that its training took."""
 
     field: HashField
     grid: DensityGrid
-    march: March
+    sampling: Sampling
     train_s: float
 
     @property
@@ -128,8 +128,8 @@ def train_field(setup: Setup, scene: Scene, budget: Budget, log: Log) -> Trained
             restore_field(field, grid, tensors)
             seconds = figures["seconds"]
         log.info(f"trained field found: {finished}")
-        return TrainedField(field, grid, setup.training.march(budget), seconds)
+        return TrainedField(field, grid, setup.training.sampling(budget), seconds)
     training = FieldTraining(field, scene, budget, setup.training, setup.seed)
     loop.train(training, finished, "training", log)
     field.gradients = None
-    return TrainedField(field, training.grid, training.march, training.seconds)
+    return TrainedField(field, training.grid, training.sampling, training.seconds)

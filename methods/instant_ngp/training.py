@@ -18,8 +18,8 @@ from methods.instant_ngp.pixels import PixelBatches
 from methods.kernels.composite import check_stop
 from methods.kernels.types import Pixels
 from methods.rendering.batch import opacity_entropy, render_batch
-from methods.rendering.march import March, check_step, suitable_step
 from methods.rendering.occupancy import EVERY, MIN_VIEWS, STEP, DensityGrid, learnable_cells
+from methods.rendering.sampling import Sampling, check_step, suitable_step
 from methods.training import checkpoint, loop
 from methods.training.optimiser import cosine
 
@@ -64,7 +64,7 @@ class PixelOptions:
 
 
 @dataclass(frozen=True)
-class MarchOptions(PixelOptions):
+class SamplingOptions(PixelOptions):
     """How to train a field that is sampled along rays.
 
     Attributes:
@@ -85,11 +85,11 @@ class MarchOptions(PixelOptions):
                 f"share: expected more than 0, up to 1, of the samples, got {self.share}"
             )
 
-    def march(self, budget: Budget) -> March:
+    def sampling(self, budget: Budget) -> Sampling:
         """How rays are marched in a training within `budget`, and later to render its result."""
         if self.march_step is None:
-            return March(step=suitable_step(budget.steps))
-        return March(step=self.march_step * STEP)
+            return Sampling(step=suitable_step(budget.steps))
+        return Sampling(step=self.march_step * STEP)
 
     def samples(self, budget: Budget) -> int:
         """Samples with a gradient that a step within `budget` aims at."""
@@ -97,7 +97,7 @@ class MarchOptions(PixelOptions):
 
 
 @dataclass(frozen=True)
-class TrainingOptions(MarchOptions):
+class TrainingOptions(SamplingOptions):
     """How to train a field in stage 1; `rate` is that of table and networks. The defaults are made
     for a short training on a CPU (docs/log.md); `budget=full` sets those of SteerNeRF's release.
 
@@ -272,7 +272,7 @@ class FieldTraining(PixelTraining):
         samples = options.samples(budget)
         super().__init__(scene, field.device, budget.steps, samples, options, seed)
         self.field, self.grid = field, new_grid(scene, field.device)
-        self.grid_samples, self.march = options.grid_samples, options.march(budget)
+        self.grid_samples, self.sampling = options.grid_samples, options.sampling(budget)
         self.rays = options.rays or self.rays
         self.optimiser = FieldOptimiser(field)
 
@@ -289,7 +289,7 @@ class FieldTraining(PixelTraining):
             self.field,
             rays,
             self.grid.occupancy,
-            replace(self.march, stop=self.options.stop),
+            replace(self.sampling, stop=self.options.stop),
             jitter=jitter,
             background=background,
             thin=self.options.thin,

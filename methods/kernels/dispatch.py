@@ -74,6 +74,15 @@ def resolve(backend: str, device: torch.device | str) -> str:
     return backend
 
 
+def refuse_gpu(backend: str, method: str) -> None:
+    """Raise `Unavailable` if `backend` is "gpu": `method` has kernels without a Triton version."""
+    if backend == "gpu":
+        raise Unavailable(
+            f"backend='gpu': {method} has no Triton kernels: use backend=auto, which computes with "
+            "torch on a GPU"
+        )
+
+
 @cache
 def multiplies_bf16(kind: str) -> bool:
     """Whether devices of this kind ("cpu", "cuda") here have products of bfloat16.

@@ -6,8 +6,6 @@ is set in the environment, as the tests do.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -38,22 +36,6 @@ def check_types(*served: torch.dtype, **tensors: Tensor) -> None:
                 f"backend 'gpu' expects {name} of {expected}, got {tensor.dtype}: use "
                 "backend='reference'"
             )
-
-
-@contextmanager
-def gradient(buffer: Tensor | None, shape: torch.Size, device: torch.device) -> Iterator[Tensor]:
-    """A contiguous float32 tensor for a kernel to add a gradient to.
-
-    It is `buffer` itself if that is contiguous float32; otherwise zeros of `shape`, which are added
-    to any `buffer` at the end.
-    """
-    if buffer is not None and buffer.dtype == torch.float32 and buffer.is_contiguous():
-        yield buffer
-        return
-    target = torch.zeros(shape, device=device)
-    yield target
-    if buffer is not None:
-        buffer += target
 
 
 @triton.jit

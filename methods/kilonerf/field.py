@@ -72,7 +72,7 @@ class KiloField(StudentField):
         return densities(local, numbers, self._layers, backend=self.backend)
 
     def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """See `Field`."""
+        """Density [S], and what `features` needs of each sample [S, 33]."""
         raw, geometry = self.raw_density(positions)
         return raw.relu() / REACH, geometry
 
@@ -82,11 +82,10 @@ class KiloField(StudentField):
         return encode_frequencies(unit, DIRECTION_FREQUENCIES, backend=self.backend)
 
     def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
-        """See `Field`."""
+        """Colours [S, 3]."""
         return colours(geometry, encoded, self._layers, backend=self.backend)
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
-        """See `Field`."""
         products = {name: inputs * outputs for name, (inputs, outputs) in SHAPES.items()}
         density = sum(products[name] for name in DENSITY_LAYERS)
         probe.count("products", density * samples + (sum(products.values()) - density) * shaded)

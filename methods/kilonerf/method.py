@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from bench.types import Budget, Scene
-from methods.instant_ngp.stage1 import Setup, TrainedField
+from methods.instant_ngp.stage1 import TrainedField
 from methods.kilonerf.field import KiloField
 from methods.kilonerf.grid import Grid, place_networks
 from methods.kilonerf.training import KiloLessons, KiloTraining
@@ -19,54 +20,43 @@ MOST = 32
 """Maximum number of networks along an axis: they are numbered in int16."""
 
 
+@dataclass(kw_only=True, eq=False)
 class KiloNerf(FieldStudent):
     """KiloNeRF as a `bench.types.Method`.
 
-    Args:
-        teacher: the field that it starts from, and where it runs.
-        training: how the networks are trained.
+    Attributes:
         networks: how many there are along the longest side of the scene, 1 to 32.
-        stop: transmittance at which a ray ends when rendering, less than 1.
-        name: as shown in result rows.
-        steps: steps of its own training; None: `budget.renderer_steps`.
     """
 
-    kind = "kilonerf"
     training: KiloLessons
+    name: str = "kilonerf"
+    networks: int = 16
 
-    def __init__(
-        self,
-        *,
-        teacher: Setup,
-        training: KiloLessons,
-        networks: int = 16,
-        stop: float = 1e-2,
-        name: str = "kilonerf",
-        steps: int | None = None,
-    ) -> None:
-        super().__init__(teacher, training, stop, name, steps)
-        if not 1 <= networks <= MOST:
-            raise ValueError(f"networks: expected 1 to {MOST} along an axis, got {networks}")
-        self.networks = networks
+    kind = "kilonerf"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 1 <= self.networks <= MOST:
+            raise ValueError(f"networks: expected 1 to {MOST} along an axis, got {self.networks}")
 
     def model_settings(self) -> Mapping[str, object]:
-        """See `Student`."""
+        """The number of networks."""
         return {"networks": self.networks}
 
     def new_field(self) -> KiloField:
-        """See `FieldStudent`; the grid is the one that was placed or restored last."""
+        """Make the networks of the grid that was placed or restored last."""
         generator = torch.Generator().manual_seed(self.teacher.seed)
         return KiloField(self.grid, self.teacher.backend, generator).to(self.teacher.device)
 
-    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> KiloTraining:
-        """See `Student`."""
+    def begin(self, trained: TrainedField, scene: Scene, budget: Budget) -> KiloTraining:
+        """Place the networks, and make their training."""
         bounds = scene.bounds.to(self.teacher.device)
-        self.grid, pieces = place_networks(teacher.occupancy, bounds, self.networks)
-        field, seed = self.new_field(), self.teacher.seed
-        return KiloTraining(field, pieces, teacher, scene, budget, self.training, seed)
+        self.occupancy = trained.occupancy
+        self.grid, pieces = place_networks(trained.occupancy, bounds, self.networks)
+        return KiloTraining(self, self.new_field(), pieces, trained, scene, budget)
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """See `Student`."""
+        """Load the networks, and where they are."""
         parts = checkpoint.part(tensors, "field.")
         self.grid = Grid(parts["networks"], parts["corner"], parts["side"])
         super().restore(tensors)

@@ -1,4 +1,4 @@
-"""Distillation of the teacher into the small networks, then training on photos (Section 3.2)."""
+"""Distillation of a field into the small networks, then training on photos (Section 3.2)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bench.types import Budget, Scene
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kilonerf.field import KiloField
 from methods.kilonerf.grid import Pieces
-from methods.students.fields import FieldLessons, StudentTraining
+from methods.students.fields import FieldLessons, FieldStudent, StudentTraining
 
 LEAK = 0.01
 """Slope of the density below 0 in distillation, so that its gradient does not vanish in empty
@@ -25,7 +25,7 @@ class KiloLessons(FieldLessons):
 
     Attributes:
         points_each: points of each network in a step of the distillation.
-        view_cost: weight of the norms of the weights that see directions, in training on rays.
+        view_cost: weight of the norms of the layers that see directions, in training on rays.
     """
 
     rate: float = 3e-3
@@ -41,21 +41,22 @@ class KiloLessons(FieldLessons):
 class KiloTraining(StudentTraining):
     """Like `StudentTraining`, with the same number of points for each network."""
 
+    options: KiloLessons
+
     def __init__(
         self,
+        student: FieldStudent,
         field: KiloField,
         pieces: Pieces,
-        teacher: TrainedField,
+        trained: TrainedField,
         scene: Scene,
         budget: Budget,
-        options: KiloLessons,
-        seed: int,
     ) -> None:
-        super().__init__(field, teacher, scene, budget, options, seed)
-        self.networks, self.pieces, self.lessons = field, pieces, options
+        super().__init__(student, field, trained, scene, budget)
+        self.networks, self.pieces = field, pieces
 
     def _places(self) -> tuple[Tensor, Tensor]:
-        positions = self.pieces.draw(self.lessons.points_each, self.generator)
+        positions = self.pieces.draw(self.options.points_each, self.generator)
         directions = torch.randn(
             len(positions), 3, generator=self.generator, device=positions.device
         )
@@ -80,5 +81,5 @@ class KiloTraining(StudentTraining):
         for name in ("direction", "colour"):
             for parameter in (self.networks.weights[name], self.networks.biases[name]):
                 if parameter.grad is not None:
-                    scale = self.lessons.view_cost / parameter.norm().clamp(min=1e-12)
+                    scale = self.options.view_cost / parameter.norm().clamp(min=1e-12)
                     parameter.grad.add_(parameter * scale)

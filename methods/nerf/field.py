@@ -68,7 +68,7 @@ class NerfField(StudentField):
         self.colour = Dense(VIEW_WIDTH, 3, precision, generator)
 
     def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """See `Field`; the geometry is the output of the trunk."""
+        """Density [S], and the output of the trunk as the geometry."""
         parts = [self._density(part) for part in positions.split(CHUNK)]
         sigma, geometry = (torch.cat(column) for column in zip(*parts, strict=True))
         return sigma, geometry
@@ -84,11 +84,11 @@ class NerfField(StudentField):
         return DENSITY * density_of(raw), hidden
 
     def encode_directions(self, directions: Tensor) -> Tensor:
-        """See `Field`."""
+        """Encoding [R, 27] of the unit directions."""
         return positional(functional.normalize(directions, dim=-1), DIRECTION_FREQUENCIES)
 
     def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
-        """See `Field`."""
+        """Colours [S, 3]."""
         pairs = zip(geometry.split(CHUNK), encoded.split(CHUNK), strict=True)
         return torch.cat([self._colours(*pair) for pair in pairs])
 
@@ -106,11 +106,9 @@ class NerfField(StudentField):
         return self.view.forward_with(inputs, weight, bias)
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
-        """See `Field`."""
         density = products(self.trunk, self.opacity)
         colour = products(self.view, self.colour)
         probe.count("products", density * samples + colour * shaded)
 
     def sizes(self) -> dict[str, int]:
-        """See `StudentField`."""
         return {"network": parameter_bytes(self)}

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from bench.types import Probe
 from methods.instant_ngp.field import Precision
-from methods.kernels.corner_gather import CORNERS, gather, trilinear
+from methods.kernels.corner_gather import CORNERS, corner_gather, trilinear
 from methods.kernels.types import Occupancy
 from methods.students.fields import StudentField
 from methods.students.networks import (
@@ -112,7 +112,7 @@ class NsvfField(StudentField):
         )
 
     def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """See `Field`; density is 0 outside all voxels. The geometry is the output of the trunk."""
+        """Density [S], 0 outside all voxels, and the output of the trunk as the geometry."""
         parts = [self._density(part) for part in positions.split(CHUNK)]
         sigma, geometry = (torch.cat(column) for column in zip(*parts, strict=True))
         return sigma, geometry
@@ -129,31 +129,29 @@ class NsvfField(StudentField):
         scaled = positions * size
         cell = scaled.long().clamp(0, size - 1)
         voxel = self.index[cell[:, 0], cell[:, 1], cell[:, 2]]
-        weights = trilinear(scaled - cell, backend=self.backend)
+        weights = trilinear(scaled - cell)
         # Samples outside all voxels read some voxel: their density is set to 0.
         read = voxel.clamp(min=0)
-        return gather(
+        return corner_gather(
             self.embeddings, self.corners, read, weights, backend=self.backend
         ), voxel >= 0
 
     def encode_directions(self, directions: Tensor) -> Tensor:
-        """See `Field`. Encodes the direction itself, where the release encodes its arc cosines."""
+        """Encoding [R, 24] of the unit directions; the release encodes their arc cosines."""
         unit = functional.normalize(directions, dim=-1)
         return positional(unit, DIRECTION_FREQUENCIES, identity=False, scale=1.0)
 
     def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
-        """See `Field`; the network's output is linear, -1 for black, 1 for white, as released."""
+        """Colours [S, 3]; the network's output is linear, -1 black and 1 white, as released."""
         pairs = zip(geometry.split(CHUNK), encoded.split(CHUNK), strict=True)
         shown = [self.colour(torch.cat((hidden, d.to(hidden)), dim=1)) for hidden, d in pairs]
         return (torch.cat(shown).to(encoded.dtype) + 1) / 2
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
-        """See `Field`."""
         density, colour = products(self.trunk, self.opacity), products(self.colour)
         probe.count("table_reads", CORNERS * samples)
         probe.count("products", density * samples + colour * shaded)
 
     def sizes(self) -> dict[str, int]:
-        """See `StudentField`."""
         embeddings = self.embeddings.numel() * self.embeddings.element_size()
         return {"embeddings": embeddings, "network": parameter_bytes(self) - embeddings}

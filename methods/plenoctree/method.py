@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Literal
 
 import torch
@@ -12,36 +12,35 @@ from torch import Tensor
 from bench.study import Axis, Study, Variant, turned
 from bench.types import Budget, Probe, Rays, Scene
 from methods.instant_ngp.pixels import PixelBatches
-from methods.instant_ngp.stage1 import Setup, TrainedField
+from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import Occupancy, Pixels
-from methods.kernels.voxel_walk import render_voxels
+from methods.plenoctree.kernels.voxel_light import render_voxels
 from methods.plenoctree.octree import Octree
 from methods.plenoctree.start import Extraction, extract
 from methods.plenoctree.training import OctreeLessons, OctreeTraining
 from methods.rendering.compaction import to_host
 from methods.rendering.frame import Render
-from methods.rendering.march import March
+from methods.rendering.sampling import Sampling
 from methods.students.method import Student
 
-Stored = Literal["fp16", "fp32"]
 
-
+@dataclass(kw_only=True, eq=False)
 class PlenOctree(Student):
     """A sparse grid of densities and spherical harmonics, extracted from a trained field and
     fine-tuned on the photos.
 
-    Args:
-        teacher: the field that it is extracted from.
+    Attributes:
         extraction: which leaves there are, and their initial values.
-        training: how they are trained.
-        stored: precision of the values in a file, at which they are also rendered.
-        stop: transmittance at which a ray ends, less than 1.
-        name: as shown in result rows.
-        steps: steps of its own training; None: `budget.renderer_steps`.
+        stored: "fp16" or "fp32", precision of the values in a file, at which they are also
+            rendered.
     """
 
-    kind = "plenoctree"
     training: OctreeLessons
+    extraction: Extraction
+    name: str = "plenoctree"
+    stored: Literal["fp16", "fp32"] = "fp16"
+
+    kind = "plenoctree"
     study = Study(
         knobs={
             "stop": turned("stop", "method.stop", ("1e-1", "1e-3", "1e-4")),
@@ -57,41 +56,30 @@ class PlenOctree(Student):
         axes={"G": Axis("{}³ leaves", "method.extraction.resolution", (128, 256, 512))},
     )
 
-    def __init__(
-        self,
-        *,
-        teacher: Setup,
-        extraction: Extraction,
-        training: OctreeLessons,
-        stored: Stored = "fp16",
-        stop: float = 1e-2,
-        name: str = "plenoctree",
-        steps: int | None = None,
-    ) -> None:
-        if stored not in ("fp16", "fp32"):
-            raise ValueError(f"stored: expected fp16 or fp32, got {stored!r}")
-        super().__init__(teacher, training, stop, name, steps)
-        self.extraction, self.stored = extraction, stored
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.stored not in ("fp16", "fp32"):
+            raise ValueError(f"stored: expected fp16 or fp32, got {self.stored!r}")
 
     def model_settings(self) -> Mapping[str, object]:
-        """See `Student`: the settings of the extraction."""
+        """The settings of the extraction."""
         return asdict(self.extraction)
 
-    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> OctreeTraining:
-        """See `Student`."""
+    def begin(self, trained: TrainedField, scene: Scene, budget: Budget) -> OctreeTraining:
+        """Extract an octree, and make its training."""
         setup = self.teacher
         generator = torch.Generator(setup.device).manual_seed(setup.seed)
         batches = PixelBatches(scene.splits["train"], setup.device)
-        octree = extract(teacher, batches, self.extraction, generator)
+        octree = extract(trained, batches, self.extraction, generator)
         return OctreeTraining(octree, scene, budget, self.training, setup.seed, setup.backend)
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """See `Student`."""
+        """Load the leaves that show anything, as they are stored."""
         octree = Octree.of(tensors, self.teacher.device)
         self.octree = octree.rounded() if self.stored == "fp16" else octree.visible()
 
     def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
-        """See `Student`."""
+        """The cells that hold leaves, and one pass through them."""
         octree = self.octree
 
         def render(_: Tensor, rays: Rays) -> Pixels:
@@ -101,7 +89,7 @@ class PlenOctree(Student):
                     octree.voxels,
                     octree.light,
                     stop=self.stop,
-                    faint=March(stop=self.stop).least_weight,
+                    faint=Sampling(stop=self.stop).least_weight,
                     backend=self.teacher.backend,
                 )
                 samples, shown = to_host([crossed.sum(), shaded.sum()])
@@ -116,7 +104,6 @@ class PlenOctree(Student):
         return self.octree.sizes(2 if self.stored == "fp16" else 4)
 
     def settings(self) -> dict[str, str]:
-        """See `bench.types.Method.settings`."""
         return super().settings() | {"precision": self.stored}
 
 

@@ -15,7 +15,8 @@ from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.composite import STOP, weights
 from methods.kernels.spherical import spherical_harmonics
 from methods.kernels.types import Occupancy
-from methods.kernels.voxel_walk import BRICK, Crossings, Light, Voxels
+from methods.kernels.voxel_walk import BRICK, Crossings, Voxels
+from methods.plenoctree.kernels.voxel_light import Light
 from methods.plenoctree.octree import Octree
 from methods.rendering.field import Field, pad
 from methods.students.voxels import largest_weights
@@ -70,19 +71,19 @@ class Extraction:
 
 @torch.no_grad()
 def extract(
-    teacher: TrainedField,
+    trained: TrainedField,
     batches: PixelBatches,
     options: Extraction,
     generator: torch.Generator,
 ) -> Octree:
-    """Extract the octree of what `teacher` shows to the training rays of `batches`.
+    """Extract the octree of what `trained` shows to the training rays of `batches`.
 
     Raises:
         SteerbenchError: there are more candidates than allowed, or nothing to be seen.
     """
-    candidates = _candidates(teacher.occupancy, options)
-    density = _densities(teacher.field, candidates, options.resolution, options.points, generator)
-    voxels, backend = Voxels(candidates, options.resolution), teacher.field.backend
+    candidates = _candidates(trained.occupancy, options)
+    density = _densities(trained.field, candidates, options.resolution, options.points, generator)
+    voxels, backend = Voxels(candidates, options.resolution), trained.field.backend
 
     def weigh(_: Rays, crossings: Crossings) -> Tensor:
         return weights(density[crossings.voxel], crossings, stop=STOP, backend=backend)
@@ -95,7 +96,7 @@ def extract(
             "a trained field; give it more steps (budget.steps)"
         )
     voxels = Voxels(candidates[kept], options.resolution)
-    harmonics = _harmonics(teacher.field, voxels, options.degree, options.directions)
+    harmonics = _harmonics(trained.field, voxels, options.degree, options.directions)
     return Octree(voxels, Light(density[kept], harmonics))
 
 

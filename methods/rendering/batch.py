@@ -13,7 +13,7 @@ from methods.kernels.march import march
 from methods.kernels.types import Extent, Occupancy, Pixels, Samples
 from methods.rendering.compaction import compacts
 from methods.rendering.field import CACHED_SAMPLES, CHUNK_SAMPLES, Encoder, Field, pad, query
-from methods.rendering.march import March
+from methods.rendering.sampling import Sampling
 
 FIRST_ROUNDS = (8, 16)
 """How many samples of a ray a CPU evaluates in each of the first rounds, before it knows whether
@@ -145,7 +145,7 @@ def render_batch(
     field: Field,
     rays: Rays,
     occupancy: Occupancy,
-    how: March,
+    how: Sampling,
     *,
     jitter: Tensor | None = None,
     background: Tensor | None = None,
@@ -187,7 +187,7 @@ def first_pass(
     field: Field,
     rays: Rays,
     occupancy: Occupancy,
-    how: March,
+    how: Sampling,
     *,
     jitter: Tensor | None = None,
     extent: Extent | None = None,
@@ -247,7 +247,7 @@ def _encoded_densities(field: Encoder, samples: Samples) -> tuple[Tensor, Sample
     return torch.cat(sigma)[: len(samples)], replace(samples, encoded=known)
 
 
-def second_pass(field: Field, rays: Rays, samples: Samples, how: March) -> Pixels:
+def second_pass(field: Field, rays: Rays, samples: Samples, how: Sampling) -> Pixels:
     """Composite the `samples` of `rays`, with a gradient."""
     directions = field.encode_directions(rays.directions)
     sigma, values = query(field, samples.positions, samples.ray, directions, samples.encoded)

@@ -12,8 +12,8 @@ from bench.cameras import cast, project
 from bench.types import EMPTY_ALPHA, Camera, Frame, Probe, Rays
 from methods.kernels.types import BRICK, Occupancy, Pixels
 from methods.rendering.field import Field
-from methods.rendering.march import March
 from methods.rendering.rays import render_rays
+from methods.rendering.sampling import Sampling
 
 Render = Callable[[Tensor, Rays], Pixels]
 """Renders some pixels of a frame, given their row-major indices [P] and their rays."""
@@ -73,7 +73,7 @@ def render_frame(
         return FeatureFrame.of(camera, canvas, background)
 
 
-def everywhere(field: Field, occupancy: Occupancy, probe: Probe, how: March) -> Render:
+def everywhere(field: Field, occupancy: Occupancy, probe: Probe, how: Sampling) -> Render:
     """Make the argument `render` of `render_frame` that marches whole rays, or marches them within
     `how.window` [h * w, 2], which is given for all pixels."""
 

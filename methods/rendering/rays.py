@@ -12,7 +12,7 @@ from methods.kernels.march import extents, march
 from methods.kernels.types import Occupancy, Pixels, Samples
 from methods.rendering.compaction import compacts
 from methods.rendering.field import CACHED_SAMPLES, CHUNK_SAMPLES, Field, pad, query
-from methods.rendering.march import March
+from methods.rendering.sampling import Sampling
 
 CHUNK_RAYS = 1 << 16
 """Rays rendered together: enough to keep all threads busy, few enough to stay in the cache. This
@@ -25,7 +25,7 @@ def render_rays(
     rays: Rays,
     occupancy: Occupancy,
     probe: Probe,
-    how: March,
+    how: Sampling,
     carry: Pixels | None = None,
 ) -> Pixels:
     """Render R `rays`. Values are not composited on a background.
@@ -41,7 +41,7 @@ def render_rays(
 
 
 def _in_rounds(
-    field: Field, rays: Rays, occupancy: Occupancy, probe: Probe, how: March, canvas: Pixels
+    field: Field, rays: Rays, occupancy: Occupancy, probe: Probe, how: Sampling, canvas: Pixels
 ) -> None:
     """Render into `canvas` in rounds, so that few samples are evaluated behind the early stop.
 
@@ -82,7 +82,7 @@ def _in_rounds(
 
 
 def _at_once(
-    field: Field, rays: Rays, occupancy: Occupancy, probe: Probe, how: March, canvas: Pixels
+    field: Field, rays: Rays, occupancy: Occupancy, probe: Probe, how: Sampling, canvas: Pixels
 ) -> None:
     """Render into `canvas` so that the host waits once, for the sample counts of all chunks.
 
@@ -129,7 +129,7 @@ def _at_once(
 
 
 def _evaluated(
-    field: Field, samples: Samples, directions: Tensor, front: Pixels, how: March, probe: Probe
+    field: Field, samples: Samples, directions: Tensor, front: Pixels, how: Sampling, probe: Probe
 ) -> tuple[Tensor, Tensor]:
     """Density [S] and features [S, K] of `samples` behind the pixels in `front`; features of faint
     samples are 0."""

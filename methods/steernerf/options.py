@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from methods.kernels.composite import check_stop
-from methods.rendering.march import March, check_step
 from methods.rendering.occupancy import STEP
+from methods.rendering.sampling import Sampling, check_step
 
 SIZES = {"channels": (3, 256), "frames": (0, 64), "scale": (1, 64)}
 """Minimum and maximum of K, L and s."""
@@ -152,17 +152,17 @@ class Rendering:
         )
 
     @property
-    def march(self) -> March:
+    def sampling(self) -> Sampling:
         """How rays at low resolution are marched."""
-        return self._march(self.step)
+        return self._sampling(self.step)
 
     @property
-    def refined_march(self) -> March:
+    def refined_sampling(self) -> Sampling:
         """How rays of refined cells are marched."""
-        return self._march(self.refined_step)
+        return self._sampling(self.refined_step)
 
-    def _march(self, step: float) -> March:
-        return March(step=step * STEP, stop=self.stop if self.skip.hidden else 0.0)
+    def _sampling(self, step: float) -> Sampling:
+        return Sampling(step=step * STEP, stop=self.stop if self.skip.hidden else 0.0)
 
 
 def check_size(name: str, got: int, least: int, most: int) -> None:

@@ -42,7 +42,7 @@ from methods.steernerf.view import View
 from methods.steernerf_lean import window
 from methods.steernerf_lean.cells import put_pixels
 from methods.steernerf_lean.kernels.warp import enlarge, warp
-from methods.steernerf_lean.refinement import rays_of_cells, refined_march, worst_cells
+from methods.steernerf_lean.refinement import rays_of_cells, refined_sampling, worst_cells
 from methods.steernerf_lean.surface import surface_points
 
 
@@ -138,7 +138,7 @@ class Pipeline:
         self, newest: Cloud | None, view: View, rendering: Rendering, probe: Probe
     ) -> Render:
         """Make the argument `render` of `render_frame`, which marches the low-resolution rays."""
-        occupancy, how, reduction = self._occupied(rendering), rendering.march, rendering.range
+        occupancy, how, reduction = self._occupied(rendering), rendering.sampling, rendering.range
         if newest is None or reduction.mode == "off":
             return everywhere(self.field, occupancy, probe, how)
         reprojection = self.model.reprojection
@@ -212,7 +212,7 @@ class Pipeline:
     ) -> Tensor:
         """Render the colours [n, s^2, 3] of `cells` [n] with a ray through each of their pixels."""
         rays = rays_of_cells(cells, view)
-        how = refined_march(cells, frame, view.scale, rendering)
+        how = refined_sampling(cells, frame, view.scale, rendering)
         probe.count("refined_rays", len(rays.origins), view.full.width * view.full.height)
         found = render_rays(self.field, rays, self._occupied(rendering), probe, how)
         colours = found.over(self.background).values[:, :3]

@@ -9,7 +9,7 @@ from torch import Tensor
 from bench.cameras import cast
 from bench.types import Rays
 from methods.rendering.frame import FeatureFrame
-from methods.rendering.march import March
+from methods.rendering.sampling import Sampling
 from methods.steernerf.options import Rendering
 from methods.steernerf.view import View
 from methods.steernerf_lean.cells import centres
@@ -26,13 +26,15 @@ def rays_of_cells(cells: Tensor, view: View) -> Rays:
     return cast(view.full, centres(cells, view.low.width, view.scale).flatten(0, 1))
 
 
-def refined_march(cells: Tensor, frame: FeatureFrame, scale: int, rendering: Rendering) -> March:
+def refined_sampling(
+    cells: Tensor, frame: FeatureFrame, scale: int, rendering: Rendering
+) -> Sampling:
     """How the rays of `cells` [n] are marched.
 
     With range reduction in mode "window" they are sampled only near the depths of the
     low-resolution `frame` around their cell.
     """
-    how = rendering.refined_march
+    how = rendering.refined_sampling
     if rendering.range.mode != "window":
         return how
     # Twice epsilon: between low-resolution pixels the surface may lie farther off.

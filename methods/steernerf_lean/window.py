@@ -16,8 +16,8 @@ from methods.kernels.types import Occupancy, Pixels
 from methods.rendering.compaction import kept_indices
 from methods.rendering.field import Field
 from methods.rendering.frame import Render
-from methods.rendering.march import FAINT, March
 from methods.rendering.rays import render_rays
+from methods.rendering.sampling import FAINT, Sampling
 from methods.steernerf.buffer import Cloud
 from methods.steernerf.options import Reprojection
 from methods.steernerf.range_reduction import at_pixels
@@ -75,7 +75,7 @@ def _highest(image: Tensor) -> Tensor:
 
 
 def within(
-    field: Field, occupancy: Occupancy, probe: Probe, how: March, prior: DepthPrior
+    field: Field, occupancy: Occupancy, probe: Probe, how: Sampling, prior: DepthPrior
 ) -> Render:
     """Make the argument `render` of `rendering.frame.render_frame` that samples each ray in its
     window of `prior`, and behind it if the ray does not reach the expected opacity."""
@@ -86,7 +86,7 @@ def within(
         inside = kept_indices(narrow)
         expected, near = expected[inside], torch.where(narrow[:, None], window, 0)[inside]
         # A stricter faint limit: rays that go on would lack the faint samples in front.
-        loose = March(how.step, max(how.stop, 1 - KEPT_ALPHA), near, faint=FAINT * how.stop)
+        loose = Sampling(how.step, max(how.stop, 1 - KEPT_ALPHA), near, faint=FAINT * how.stop)
         first = render_rays(field, rays.take(inside), occupancy, probe, loose)
         enough = narrow[inside] & (first.alpha >= KEPT_ALPHA * expected)
         # Scale to the expected opacity, as if the rest looked like what was found.

@@ -1,1 +1,1 @@
-"""Shared by the methods whose model starts from a trained Instant-NGP field, their teacher."""
+"""Shared by the methods whose model starts from a trained Instant-NGP field."""

@@ -1,8 +1,10 @@
-"""Students that are fields: they learn the teacher's densities and colours, then the photos."""
+"""Students that are fields: they learn the densities and colours of a trained field, their guide,
+then the photos."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+import math
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -12,12 +14,13 @@ from torch.nn import functional
 
 from bench.types import Budget, Log, Probe, Rays, Scene
 from methods.instant_ngp.stage1 import TrainedField
-from methods.instant_ngp.training import MarchOptions, PixelTraining
+from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.types import Occupancy, Pixels
 from methods.rendering.batch import render_batch
 from methods.rendering.field import ROUND_SAMPLES, Field
 from methods.rendering.frame import Render, everywhere
 from methods.rendering.occupancy import STEP
+from methods.rendering.sampling import Sampling
 from methods.students.method import Student
 from methods.training import checkpoint, loop
 from methods.training.optimiser import step_at
@@ -28,28 +31,28 @@ in the units of its scenes."""
 
 
 @dataclass(frozen=True)
-class FieldLessons(MarchOptions):
+class FieldLessons(PixelOptions):
     """How to train a student that is a field: first on points, then on rays as Instant-NGP is.
 
     Attributes:
         points: share of the steps, at the beginning, that compare densities and colours at random
-            points of occupied cells with the teacher's.
+            points of occupied cells with the guide's.
+        share: samples with a gradient in a step, as a share of the budget's.
     """
 
     points: float = 0.5
+    share: float = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 <= self.points <= 1:
-            raise ValueError(f"points: expected a share of the steps, 0 to 1, got {self.points}")
+        if not (0 <= self.points <= 1 and 0 < self.share <= 1):
+            raise ValueError(
+                f"points, share: expected shares from 0 to 1, of samples more than 0: {self}"
+            )
 
 
-class StudentField(nn.Module, ABC):
-    """A trainable `methods.rendering.field.Field` whose features are colours.
-
-    Args:
-        backend: backend of the kernels that render it.
-    """
+class StudentField(nn.Module, Field):
+    """A trainable field whose features are colours, rendered by kernels of `backend`."""
 
     channels = 3
     round_samples = ROUND_SAMPLES
@@ -64,53 +67,79 @@ class StudentField(nn.Module, ABC):
         return next(self.parameters()).device
 
     @abstractmethod
-    def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """See `Field`."""
-
-    @abstractmethod
-    def encode_directions(self, directions: Tensor) -> Tensor:
-        """See `Field`."""
-
-    @abstractmethod
-    def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
-        """See `Field`."""
-
-    @abstractmethod
-    def count(self, probe: Probe, samples: int, shaded: int) -> None:
-        """See `Field`."""
-
-    @abstractmethod
     def sizes(self) -> dict[str, int]:
         """Bytes by component."""
 
 
-class StudentTraining(PixelTraining):
-    """Trains on points of the teacher, then on rays of the photos, within occupied cells.
+class FieldStudent(Student):
+    """Base of the methods that train another field and render it as Instant-NGP is rendered."""
 
-    On rays, samples that the teacher's density hides are left out: it costs less than the density
-    of a large network.
+    training: FieldLessons
+
+    @abstractmethod
+    def new_field(self) -> StudentField:
+        """Make the untrained field on the device of its guide, with weights drawn from the seed;
+        the occupied cells are known already."""
+
+    def occupied(self, trained: TrainedField) -> Occupancy:
+        """The cells in which the field may hold matter; it is empty elsewhere."""
+        return trained.occupancy
+
+    def sampling(self, budget: Budget) -> Sampling:
+        """How its rays are sampled in training: as those of its guide."""
+        return self.teacher.training.sampling(budget)
+
+    def begin(self, trained: TrainedField, scene: Scene, budget: Budget) -> StudentTraining:
+        """Make the training of a new field."""
+        self.occupancy = self.occupied(trained)
+        return StudentTraining(self, self.new_field(), trained, scene, budget)
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Load a field, and where it is occupied."""
+        self.occupancy = Occupancy(tensors["cells"].to(self.teacher.device))
+        self.field = self.new_field()
+        self.field.load_state_dict(checkpoint.part(tensors, "field."))
+
+    def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
+        """Train both fields, or load them; frames are sampled as the training was."""
+        super().fit(scene, budget, log)
+        self.how = replace(self.sampling(budget), stop=self.stop)
+
+    def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
+        """The occupied cells, and a march through them."""
+        return self.occupancy, everywhere(self.field, self.occupancy, probe, self.how)
+
+    def sizes(self) -> dict[str, int]:
+        """Bytes of the field and of the occupancy bits."""
+        return self.field.sizes() | {"occupancy": self.occupancy.cells.numel() // 8}
+
+
+class StudentTraining(PixelTraining):
+    """Trains on points of the guide, then on rays of the photos, within occupied cells.
+
+    On rays, samples that the guide's density hides are left out: it costs less than the density of
+    a large network.
 
     Args:
-        occupancy: where the field is trained and rendered; it is empty elsewhere. None: the
-            teacher's.
+        student: whose `training`, `sampling` and `occupancy` it follows.
+        field: what is trained.
+        trained: holds its guide.
     """
 
     def __init__(
         self,
+        student: FieldStudent,
         field: StudentField,
-        teacher: TrainedField,
+        trained: TrainedField,
         scene: Scene,
         budget: Budget,
-        options: FieldLessons,
-        seed: int,
-        occupancy: Occupancy | None = None,
     ) -> None:
-        device = teacher.field.device
-        samples = options.samples(budget)
+        options, seed = student.training, student.teacher.seed
+        samples, device = math.ceil(options.share * budget.samples), trained.field.device
         super().__init__(scene, device, budget.renderer_steps, samples, options, seed)
-        self.field, self.teacher = field, teacher.field
-        self.occupancy = occupancy or teacher.occupancy
-        self.march, self.cells = options.march(budget), self.occupancy.cells.nonzero()
+        self.field, self.guide = field, trained.field
+        self.occupancy, self.sampling = student.occupancy, student.sampling(budget)
+        self.cells = self.occupancy.cells.nonzero()
         self.points_until = options.points * self.steps if len(self.cells) else 0
         self.optimiser = torch.optim.Adam(
             field.parameters(), betas=(0.9, 0.99), eps=1e-15, fused=True
@@ -139,9 +168,9 @@ class StudentTraining(PixelTraining):
 
     def _difference(self, positions: Tensor, directions: Tensor) -> Tensor:
         """Mean squared difference in opacity over `REACH`, plus those in red, green and blue,
-        weighted by the teacher's opacity."""
+        weighted by the guide's opacity."""
         with torch.no_grad():
-            wanted, shown = _seen(self.teacher, positions, directions)
+            wanted, shown = _seen(self.guide, positions, directions)
         opacity, colour = self._learned(positions, directions)
         return (
             functional.mse_loss(opacity, wanted)
@@ -149,7 +178,7 @@ class StudentTraining(PixelTraining):
         )
 
     def _learned(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """The opacity [S] over `REACH` and colour [S, 3] that are compared with the teacher's."""
+        """The opacity [S] over `REACH` and colour [S, 3] that are compared with the guide's."""
         return _seen(self.field, positions, directions)
 
     def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
@@ -157,17 +186,16 @@ class StudentTraining(PixelTraining):
             self.field,
             rays,
             self.occupancy,
-            self.march,
+            self.sampling,
             jitter=jitter,
             background=background,
-            guide=self.teacher,
+            guide=self.guide,
         )
 
     def _update(self) -> None:
         step_at(self.optimiser, self.learning_rate())
 
     def watched(self) -> dict[str, Tensor]:
-        """All parameters."""
         return dict(self.field.named_parameters())
 
     def result(self) -> dict[str, Tensor]:
@@ -176,7 +204,6 @@ class StudentTraining(PixelTraining):
         return tensors | {"cells": self.occupancy.cells}
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore what `result` returned."""
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
@@ -185,7 +212,6 @@ class StudentTraining(PixelTraining):
         return tensors | checkpoint.optimiser_tensors(self.optimiser, "adam."), figures
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        """See `loop.Training`."""
         super().restore(tensors, figures)
         checkpoint.restore_optimiser(self.optimiser, tensors, "adam.")
 
@@ -195,50 +221,3 @@ def _seen(field: Field, positions: Tensor, directions: Tensor) -> tuple[Tensor, 
     sigma, geometry = field.density(positions)
     colour = field.features(geometry, field.encode_directions(directions))[:, :3]
     return 1 - torch.exp(-sigma * REACH), colour
-
-
-class FieldStudent(Student):
-    """Base of the methods that train another field and render it as Instant-NGP is rendered."""
-
-    training: FieldLessons
-
-    @abstractmethod
-    def new_field(self) -> StudentField:
-        """Make the untrained field on the teacher's device, with weights drawn from the seed; the
-        occupied cells are known already."""
-
-    def occupied(self, teacher: TrainedField) -> Occupancy:
-        """The cells in which the field may hold matter: those of the teacher."""
-        return teacher.occupancy
-
-    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> StudentTraining:
-        """See `Student`."""
-        self.occupancy = self.occupied(teacher)
-        return StudentTraining(
-            self.new_field(),
-            teacher,
-            scene,
-            budget,
-            self.training,
-            self.teacher.seed,
-            self.occupancy,
-        )
-
-    def restore(self, tensors: Mapping[str, Tensor]) -> None:
-        """See `Student`."""
-        self.occupancy = Occupancy(tensors["cells"].to(self.teacher.device))
-        self.field = self.new_field()
-        self.field.load_state_dict(checkpoint.part(tensors, "field."))
-
-    def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
-        """See `Student`."""
-        super().fit(scene, budget, log)
-        self.march = replace(self.training.march(budget), stop=self.stop)
-
-    def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
-        """See `Student`."""
-        return self.occupancy, everywhere(self.field, self.occupancy, probe, self.march)
-
-    def sizes(self) -> dict[str, int]:
-        """Bytes of the field and of the occupancy bits."""
-        return self.field.sizes() | {"occupancy": self.occupancy.cells.numel() // 8}

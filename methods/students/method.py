@@ -1,11 +1,11 @@
-"""A method whose model starts from a trained field, its teacher, then learns from the photos."""
+"""A method whose model starts from a trained field, then learns from the photos."""
 
 from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -19,24 +19,32 @@ from bench.types import Budget, Camera, Frame, Log, Probe, Scene
 from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
 from methods.instant_ngp.training import PixelOptions
 from methods.kernels.composite import check_stop
+from methods.kernels.dispatch import refuse_gpu
 from methods.kernels.types import Occupancy
 from methods.rendering.frame import Render, render_frame
 from methods.training import checkpoint, loop
 
 
+@dataclass(kw_only=True, eq=False)
 class Student(ABC):
     """Base of the methods that start from the Instant-NGP field that all methods share.
 
     `train_s` counts the training of the field, the initialisation of the model and its own
     training.
 
-    Args:
+    Attributes:
         teacher: the field that it starts from, and where it runs.
         training: how the model is trained.
         stop: transmittance at which a ray ends when rendering, less than 1.
         name: as shown in result rows.
         steps: steps of its own training; None: `budget.renderer_steps`.
     """
+
+    teacher: Setup
+    training: PixelOptions
+    stop: float = 1e-2
+    name: str
+    steps: int | None = None
 
     memory = 0
     kind: ClassVar[str]
@@ -48,21 +56,19 @@ class Student(ABC):
         parts=dict.fromkeys(("rays", "march", "composite"), "field"),
     )
 
-    def __init__(
-        self, teacher: Setup, training: PixelOptions, stop: float, name: str, steps: int | None
-    ) -> None:
-        check_stop(stop)
-        if steps is not None and steps < 1:
-            raise ValueError(f"steps: expected 1 or more, or none, got {steps}")
-        self.teacher, self.training, self.stop, self.name = teacher, training, stop, name
-        self.steps, self.train_s = steps, 0.0
+    def __post_init__(self) -> None:
+        check_stop(self.stop)
+        refuse_gpu(self.teacher.backend, self.name)
+        if self.steps is not None and self.steps < 1:
+            raise ValueError(f"steps: expected 1 or more, or none, got {self.steps}")
+        self.train_s = 0.0
 
-    @abstractmethod
     def model_settings(self) -> Mapping[str, object]:
         """The settings of the model that its training depends on."""
+        return {}
 
     @abstractmethod
-    def begin(self, teacher: TrainedField, scene: Scene, budget: Budget) -> loop.Training:
+    def begin(self, trained: TrainedField, scene: Scene, budget: Budget) -> loop.Training:
         """Make the training of the model, as it is before its first step."""
 
     @abstractmethod
@@ -72,6 +78,10 @@ class Student(ABC):
     @abstractmethod
     def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
         """The cells that may show anything, and what renders the pixels that may see them."""
+
+    @abstractmethod
+    def sizes(self) -> dict[str, int]:
+        """Bytes of what is rendered, by component."""
 
     @torch.no_grad()
     def render(self, camera: Camera, probe: Probe) -> Frame:
@@ -84,7 +94,7 @@ class Student(ABC):
         """Train the field and the model, or load their results if they were trained before."""
         budget = replace(budget, renderer_steps=self.steps or budget.renderer_steps)
         with torch_threads(budget.threads):
-            teacher = train_field(self.teacher, scene, budget, log)
+            trained = train_field(self.teacher, scene, budget, log)
             folder = log.stage_dir(self.kind, self._key(scene, budget))
             finished = folder / f"{self.kind}.safetensors"
             if finished.exists():
@@ -93,13 +103,13 @@ class Student(ABC):
                 log.info(f"trained {self.kind} found: {finished}")
             else:
                 begun = time.monotonic()
-                training = self.begin(teacher, scene, budget)
+                training = self.begin(trained, scene, budget)
                 training.seconds = time.monotonic() - begun
                 loop.train(training, finished, self.kind, log)
                 tensors, seconds = training.result(), training.seconds
             with checkpoint.restoring(finished):
                 self.restore(tensors)
-        self.train_s = teacher.train_s + seconds
+        self.train_s = trained.train_s + seconds
         self.background = scene.background.to(self.teacher.device)
 
     def _key(self, scene: Scene, budget: Budget) -> dict[str, object]:
@@ -116,5 +126,5 @@ class Student(ABC):
         """Do nothing: every frame stands alone."""
 
     def settings(self) -> dict[str, str]:
-        """See `bench.types.Method.settings`."""
+        """What a row says of how it ran."""
         return self.teacher.settings() | {"engine": "none"}

@@ -12,8 +12,8 @@ from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.composite import STOP
 from methods.kernels.encode import HashGrid
 from methods.kernels.types import Occupancy
-from methods.rendering.march import March
 from methods.rendering.occupancy import DensityGrid
+from methods.rendering.sampling import Sampling
 from methods.steernerf.options import Model, Rendering, Reprojection
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf_lean.lean_renderer import LeanRenderer
@@ -51,7 +51,7 @@ def shell() -> Occupancy:
 
 def trained_field(field: HashField) -> TrainedField:
     """In place of a trained field: `field`, around the surface of the ball."""
-    return TrainedField(field, DensityGrid(shell().cells), March(), train_s=0.0)
+    return TrainedField(field, DensityGrid(shell().cells), Sampling(), train_s=0.0)
 
 
 def misty_field(precision: str = "bf16", backend: str = "auto", channels: int = 4) -> HashField:

@@ -27,7 +27,8 @@ def defaults(name: str, node: Any) -> Iterator[tuple[str, Field, Any]]:
     target = get_object(node["_target_"]) if "_target_" in node else None
     if is_dataclass(target):
         for field in fields(target):
-            yield f"{name}.{field.name}", field, node[field.name]
+            if field.name != "name":  # of a method: that of its file, where it is not given
+                yield f"{name}.{field.name}", field, node[field.name]
     for key, value in node.items():
         yield from defaults(f"{name}.{key}", value)
 

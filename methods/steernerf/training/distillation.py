@@ -59,6 +59,6 @@ def _picture(trained: TrainedField, camera: Camera, background: Tensor) -> Tenso
     """Render one view: uint8 [H, W, 3]."""
     field, probe = trained.field, NullProbe()
     camera, background = place_camera(camera, field.device), background.to(field.device)
-    render = everywhere(field, trained.occupancy, probe, trained.march)
+    render = everywhere(field, trained.occupancy, probe, trained.sampling)
     frame = render_frame(camera, trained.occupancy, background, probe, render)
     return (frame.values.clamp(0, 1) * 255).round().to(torch.uint8).cpu()

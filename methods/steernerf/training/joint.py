@@ -206,7 +206,7 @@ class JointTraining(RendererTraining):
             self.field,
             every.take(some),
             pipeline.occupancy,
-            rendering.refined_march,
+            rendering.refined_sampling,
             background=pipeline.background,
             hidden=not compacts(wanted.device),
         )

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from methods.rendering.march import check_step
+from methods.rendering.sampling import check_step
 from methods.steernerf.training.sequences import MotionOptions
 
 

@@ -170,7 +170,7 @@ class PatchSource:
         found, rays, extent = self._rays(patches)
         chosen = _of_each(patches, found)
         field, occupancy = self.pipeline.field, self.pipeline.occupancy
-        how, jitter = self.rendering.march, self._jitter(len(rays.origins), self.generator)
+        how, jitter = self.rendering.sampling, self._jitter(len(rays.origins), self.generator)
         first = first_pass(field, rays, occupancy, how, jitter=jitter, extent=extent)
         samples, cells = self._visible(first, patches, chosen)
         with torch.set_grad_enabled(self.through != "none"):
@@ -198,7 +198,7 @@ class PatchSource:
         counts = sample_counts(
             rays,
             self.pipeline.occupancy,
-            self.rendering.march.step,
+            self.rendering.sampling.step,
             jitter=jitter,
             start=which.int() - 1,
             backend=self.pipeline.backend,

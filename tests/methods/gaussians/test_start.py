@@ -25,7 +25,7 @@ def test_points_come_from_all_pictures_alike(
 
     monkeypatch.setattr(start, "render_rays", render)
     field = SimpleNamespace(device=torch.device("cpu"))
-    trained: Any = SimpleNamespace(field=field, occupancy=None, march=None)
+    trained: Any = SimpleNamespace(field=field, occupancy=None, sampling=None)
     cameras = ball_scene.splits["train"].cameras
     each = 30
     generator = torch.Generator().manual_seed(0)

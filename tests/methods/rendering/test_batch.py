@@ -22,8 +22,8 @@ from methods.rendering.batch import (
     render_batch,
     second_pass,
 )
-from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
+from methods.rendering.sampling import Sampling
 from tests.methods.conftest import look_at_the_middle
 
 Thick = tuple[HashField, Occupancy, Rays]
@@ -49,7 +49,7 @@ def test_leaving_out_hidden_samples_changes_no_gradient(thick: Thick, device: st
     jitter = torch.rand(len(rays.origins), generator=torch.Generator().manual_seed(0)).to(device)
     white = torch.ones(3, device=device)
 
-    pixels, used = render_batch(field, rays, occupancy, March(), jitter=jitter, background=white)
+    pixels, used = render_batch(field, rays, occupancy, Sampling(), jitter=jitter, background=white)
     pixels.values.square().sum().backward()
     grads = [p.grad.clone() for p in field.parameters() if p.grad is not None]
     field.zero_grad()
@@ -75,7 +75,7 @@ def test_thin_samples_are_kept_in_turn_and_stand_for_the_others(
     camera = look_at_the_middle(0.1, 0.4)
     rays = cast(replace(camera, c2w=camera.c2w.to(device)))
     jitter = torch.full((len(rays.origins),), 0.5, device=device)
-    first = first_pass(field, rays, occupancy, March(), jitter=jitter)
+    first = first_pass(field, rays, occupancy, Sampling(), jitter=jitter)
     every = first.visible()
     depth = (field.density(every.positions)[0] * every.delta).median().item()
     thick = first.thinned(0.0, jitter)
@@ -130,7 +130,7 @@ def test_the_rounds_of_the_first_pass_change_no_sample(
     found = []
     for rounds in ((), (2,), (1, 3)):
         monkeypatch.setattr("methods.rendering.batch.FIRST_ROUNDS", rounds)
-        first = first_pass(field, rays, occupancy, March(), jitter=jitter)
+        first = first_pass(field, rays, occupancy, Sampling(), jitter=jitter)
         found.append((first.counts, first.visible(), first.thinned(1.0, jitter)))
     for counts, *chosen in found[1:]:
         assert torch.equal(counts, found[0][0])
@@ -146,7 +146,7 @@ def test_hidden_samples_may_be_evaluated_too(thick: Thick) -> None:
     field, occupancy, rays = thick
     grads, used = [], []
     for hidden in (False, True):
-        pixels, samples = render_batch(field, rays, occupancy, March(), hidden=hidden)
+        pixels, samples = render_batch(field, rays, occupancy, Sampling(), hidden=hidden)
         pixels.values.square().sum().backward()
         grads.append([p.grad.clone() for p in field.parameters() if p.grad is not None])
         used.append(samples)
@@ -170,9 +170,9 @@ def test_rays_are_opaque_where_any_of_their_samples_is(
     field.density = density  # type: ignore[method-assign]
     camera = look_at_the_middle(0.1, 0.4)
     rays = cast(replace(camera, c2w=camera.c2w.to(device)))
-    first = first_pass(field, rays, occupancy, March())
+    first = first_pass(field, rays, occupancy, Sampling())
     samples = march(rays, occupancy, STEP)
-    alpha = second_pass(field, rays, samples, March()).alpha
+    alpha = second_pass(field, rays, samples, Sampling()).alpha
     assert 0 < (alpha > 0).sum() < (samples.offsets.diff() > 0).sum()
     assert torch.equal(first.opaque(), alpha > 0)
 
@@ -193,12 +193,12 @@ def test_a_guide_tells_which_samples_are_hidden(
         def density(self, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
             return torch.full_like(positions[:, 0], self.sigma), positions
 
-    own, most = render_batch(field, rays, occupancy, March(stop=0))
-    clear, all_ = render_batch(field, rays, occupancy, March(stop=0), guide=Guide(0.0))  # type: ignore[arg-type]
+    own, most = render_batch(field, rays, occupancy, Sampling(stop=0))
+    clear, all_ = render_batch(field, rays, occupancy, Sampling(stop=0), guide=Guide(0.0))  # type: ignore[arg-type]
     assert all_ == most
     assert torch.equal(own.values, clear.values)
     # Opaque at once: only the first sample of every ray is seen.
-    wall, few = render_batch(field, rays, occupancy, March(), guide=Guide(1e6))  # type: ignore[arg-type]
+    wall, few = render_batch(field, rays, occupancy, Sampling(), guide=Guide(1e6))  # type: ignore[arg-type]
     offsets = march(rays, occupancy, STEP).offsets
     assert few == int((offsets.diff() > 0).sum())
     assert (wall.alpha <= own.alpha + 1e-6).all()

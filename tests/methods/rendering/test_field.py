@@ -13,9 +13,9 @@ from methods.instant_ngp.field import HashField
 from methods.kernels.types import Occupancy
 from methods.rendering.batch import render_batch
 from methods.rendering.field import BATCH_QUANTUM, Field, pad, query
-from methods.rendering.march import March
 from methods.rendering.occupancy import RESOLUTION, DensityGrid
 from methods.rendering.rays import render_rays
+from methods.rendering.sampling import Sampling
 from tests.methods.conftest import GRID, Work, look_at_the_middle
 from tests.methods.solids import DENSITY, Solid, ball
 
@@ -59,8 +59,8 @@ def test_a_field_answers_in_the_shapes_that_are_promised(make) -> None:
 def test_rays_of_a_solid_end_at_its_surface() -> None:
     field, rays = solid(), cast(look_at_the_middle(0.1, 0.4))
     work = Work()
-    pixels = render_rays(field, rays, EVERYWHERE, work, March())
-    batch, used = render_batch(field, rays, EVERYWHERE, March())
+    pixels = render_rays(field, rays, EVERYWHERE, work, Sampling())
+    batch, used = render_batch(field, rays, EVERYWHERE, Sampling())
     middle = (32 * 32 + 32) // 2
     for got in (pixels, batch):
         assert got.alpha[middle] > 0.99

@@ -13,9 +13,9 @@ from methods.instant_ngp.field import HashField
 from methods.kernels.march import march
 from methods.kernels.types import Occupancy
 from methods.rendering.frame import everywhere, rays_at_matter, render_frame
-from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
 from methods.rendering.rays import render_rays
+from methods.rendering.sampling import Sampling
 from tests.methods.conftest import Work, look_at_the_middle
 
 
@@ -48,10 +48,10 @@ def test_a_frame_is_its_rays_on_the_background(cloud: tuple[HashField, Occupancy
     camera = look_at_the_middle(0.1, 0.4)
     camera = replace(camera, c2w=camera.c2w.to(field.device), width=20)
     background, work = torch.tensor((0.25, 0.5, 1.0), device=field.device), Work()
-    render = everywhere(field, occupancy, work, March())
+    render = everywhere(field, occupancy, work, Sampling())
     frame = render_frame(camera, occupancy, background, work, render)
     assert frame.values.shape == (32, 20, 3)
-    pixels = render_rays(field, cast(camera), occupancy, NullProbe(), March())
+    pixels = render_rays(field, cast(camera), occupancy, NullProbe(), Sampling())
     # The same rays among others: sums of float32 in another order.
     alpha = pixels.alpha.view(32, 20)
     torch.testing.assert_close(frame.alpha, alpha, rtol=0, atol=1e-6)
@@ -75,7 +75,7 @@ def test_a_window_is_that_of_its_pixel(cloud: tuple[HashField, Occupancy]) -> No
     black, probe = torch.zeros(3, device=field.device), NullProbe()
     whole, half = (
         render_frame(camera, occupancy, black, probe, everywhere(field, occupancy, probe, how))
-        for how in (March(), March(window=window.view(-1, 2)))
+        for how in (Sampling(), Sampling(window=window.view(-1, 2)))
     )
     assert whole.alpha[:, :16].any()
     assert not half.alpha[:, :16].any()

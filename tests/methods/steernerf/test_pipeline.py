@@ -14,8 +14,8 @@ from bench.probes import StageClock
 from bench.types import Camera, NullProbe
 from methods.kernels.types import Occupancy
 from methods.rendering.frame import everywhere, render_frame
-from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
+from methods.rendering.sampling import Sampling
 from methods.steernerf.buffer import Cloud, Remembered, RenderingBuffer
 from methods.steernerf.options import SIZES, RangeReduction, Reprojection, Skips
 from methods.steernerf.unet import UNet
@@ -131,7 +131,7 @@ def test_where_every_cell_is_refined_the_picture_is_that_of_the_field(mode: Mode
     )
     pipeline, buffer, probe = new_pipeline(), RenderingBuffer(2), NullProbe()
     shown = pipeline.render(CAMERA, buffer, rendering, probe).rgb
-    render = everywhere(pipeline.field, pipeline.occupancy, probe, March(step=4.0 * STEP))
+    render = everywhere(pipeline.field, pipeline.occupancy, probe, Sampling(step=4.0 * STEP))
     field = render_frame(CAMERA, pipeline.occupancy, pipeline.background, probe, render)
     low = pipeline.features(pipeline.view(CAMERA), (), rendering, probe)
     drawn = cells_near(low.alpha > 0).flatten().nonzero().squeeze(1)

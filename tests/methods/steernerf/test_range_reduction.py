@@ -14,8 +14,8 @@ from bench.types import Camera
 from methods.kernels.types import Occupancy
 from methods.rendering.field import ROUND_SAMPLES
 from methods.rendering.frame import FeatureFrame, everywhere, render_frame
-from methods.rendering.march import March
 from methods.rendering.occupancy import STEP
+from methods.rendering.sampling import Sampling
 from methods.steernerf.buffer import Cloud
 from methods.steernerf.options import RangeReduction, Reprojection
 from methods.steernerf.range_reduction import depth_interval
@@ -50,7 +50,7 @@ def render(
     camera: Camera,
     where: DepthPrior | Tensor | None = None,
     occupancy: Occupancy = EVERYWHERE,
-    how: March = March(step=LONG),  # noqa: B008
+    how: Sampling = Sampling(step=LONG),  # noqa: B008
     background: Tensor = WHITE,
 ) -> tuple[FeatureFrame, int]:
     """The frame, and how many samples it took: where a depth prior says, in the interval [h, w, 2]
@@ -236,7 +236,7 @@ def test_a_faint_surface_that_was_faint_before_keeps_its_colour() -> None:
     found = seen_before(veil, camera, camera)
     assert is_known(found.window).all()
     black = torch.zeros(4)
-    frame, _ = render(veil, camera, found, how=March(stop=1e-2), background=black)
+    frame, _ = render(veil, camera, found, how=Sampling(stop=1e-2), background=black)
     assert frame.alpha.min() > 0.1
     torch.testing.assert_close(frame.values[..., 3], 0.25 * frame.alpha, rtol=0, atol=1e-6)
 

@@ -41,7 +41,7 @@ def blend(
         stop: Gaussians behind a transmittance of at most `stop` have no weight.
 
     Raises:
-        ValueError: wrong shapes, no pixel; backends "cpu" and "gpu": not float32.
+        ValueError: wrong shapes, no pixel; backend "cpu": not float32.
     """
     count = len(opacities)
     check_shape("opacities", opacities, None)

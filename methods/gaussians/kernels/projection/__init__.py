@@ -69,7 +69,7 @@ def project_gaussians(
         camera: on the device of the Gaussians.
 
     Raises:
-        ValueError: wrong shapes; backends "cpu" and "gpu": not float32.
+        ValueError: wrong shapes; backend "cpu": not float32.
     """
     count = len(means)
     check_shape("means", means, None, 3)

@@ -22,7 +22,7 @@ def ssim(picture: Tensor, target: Tensor, *, backend: str = "auto") -> Tensor:
     Differentiable in `picture`.
 
     Raises:
-        ValueError: wrong shapes; backends "cpu", "gpu": not float32, or `target` needs a gradient.
+        ValueError: wrong shapes; backend "cpu": not float32, or `target` needs a gradient.
     """
     check_shape("picture", picture, None, None, 3)
     check_shape("target", target, *picture.shape)

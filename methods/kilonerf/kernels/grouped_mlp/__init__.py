@@ -23,8 +23,6 @@ from methods.kernels.dispatch import implementation
 HIDDEN = 32
 """Outputs of every layer except density and colour."""
 
-LAYERS = ("in", "mid", "density", "feature", "direction", "colour")
-
 
 @dataclass(frozen=True)
 class Groups:
@@ -42,7 +40,7 @@ class Groups:
 
 @dataclass(frozen=True)
 class Networks:
-    """N networks with the layers `LAYERS`.
+    """N networks with the layers in, mid, density, feature, direction and colour.
 
     Attributes:
         weights: [N, I, O] for each layer, from I inputs to O outputs.
@@ -87,7 +85,7 @@ def locate(
         side: [] side of a cube.
 
     Raises:
-        ValueError: wrong shapes; backends "cpu", "gpu": not float32.
+        ValueError: wrong shapes; backend "cpu": not float32.
     """
     check_shape("positions", positions, None, 3)
     check_shape("cubes", cubes, None, None, None)
@@ -127,7 +125,7 @@ def encode_frequencies(inputs: Tensor, frequencies: int, *, backend: str = "auto
     backend="cpu" an input beyond +-16 loses digits.
 
     Raises:
-        ValueError: wrong shape, F < 1; backends "cpu", "gpu": not float32.
+        ValueError: wrong shape, F < 1; backend "cpu": not float32.
     """
     check_shape("inputs", inputs, None, 3)
     if frequencies < 1:
@@ -154,7 +152,7 @@ def grouped_linear(
         relu: whether to apply a ReLU to the outputs.
 
     Raises:
-        ValueError: wrong shapes; on a CPU, offsets that do not end at S; backends "cpu", "gpu":
+        ValueError: wrong shapes; on a CPU, offsets that do not end at S; backend "cpu":
             not float32.
     """
     check_shape("weights", weights, None, None, None)
@@ -185,7 +183,7 @@ def densities(
         numbers: [S] the network of each sample, as for `order`.
 
     Raises:
-        ValueError: wrong shapes; backends "cpu", "gpu": not float32.
+        ValueError: wrong shapes; backend "cpu": not float32.
     """
     check_shape("positions", positions, None, 3)
     check_shape("numbers", numbers, len(positions))
@@ -208,7 +206,7 @@ def colours(
         encoded: [S, D] encoded directions.
 
     Raises:
-        ValueError: wrong shapes; backends "cpu", "gpu": not float32.
+        ValueError: wrong shapes; backend "cpu": not float32.
     """
     check_shape("geometry", geometry, None, HIDDEN + 1)
     check_shape("encoded", encoded, len(geometry), networks.weights["direction"].shape[1] - HIDDEN)

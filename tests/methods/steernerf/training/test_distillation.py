@@ -57,7 +57,7 @@ def test_a_view_is_what_the_field_shows_at_full_resolution(
         assert view.picture.shape == (SIZE, SIZE, 3)
         assert view.picture.dtype == torch.uint8
         field, occupancy, probe = trained.field, trained.occupancy, NullProbe()
-        render = everywhere(field, occupancy, probe, trained.march)
+        render = everywhere(field, occupancy, probe, trained.sampling)
         white = ball_scene.background
         frame = render_frame(view.camera, occupancy, white, probe, render)
         assert (frame.alpha > 0.1).float().mean() > 0.1

@@ -7,15 +7,15 @@ from dataclasses import replace
 import pytest
 
 from bench.types import Budget
-from methods.instant_ngp.training import MarchOptions
-from methods.rendering.march import suitable_step
+from methods.instant_ngp.training import SamplingOptions
 from methods.rendering.occupancy import RESOLUTION, STEP
+from methods.rendering.sampling import suitable_step
 
 BUDGET = Budget("test", steps=20_000, samples=1, renderer_steps=1)
 
 
 def test_a_training_as_long_as_the_releases_has_its_step() -> None:
-    assert MarchOptions().march(BUDGET).step == STEP
+    assert SamplingOptions().sampling(BUDGET).step == STEP
 
 
 def test_eight_times_the_steps_are_half_as_long() -> None:
@@ -27,11 +27,11 @@ def test_it_is_no_longer_than_a_cell() -> None:
 
 
 def test_a_training_takes_the_step_that_it_is_told() -> None:
-    told = MarchOptions(march_step=3.0)
-    assert told.march(BUDGET) == told.march(replace(BUDGET, steps=5))
-    assert told.march(BUDGET).step == 3 * STEP
+    told = SamplingOptions(march_step=3.0)
+    assert told.sampling(BUDGET) == told.sampling(replace(BUDGET, steps=5))
+    assert told.sampling(BUDGET).step == 3 * STEP
 
 
 def test_a_step_that_leads_nowhere_is_refused() -> None:
     with pytest.raises(ValueError, match="march_step: expected a length of more than 0"):
-        MarchOptions(march_step=0.0)
+        SamplingOptions(march_step=0.0)

@@ -33,7 +33,7 @@ def check_step(name: str, length: float) -> None:
 
 
 @dataclass(frozen=True)
-class March:
+class Sampling:
     """How rays are marched.
 
     Attributes:
@@ -53,6 +53,6 @@ class March:
         """Weight of a sample below which its features are not evaluated."""
         return FAINT * self.stop if self.faint is None else self.faint
 
-    def within(self, window: Tensor | None) -> March:
+    def within(self, window: Tensor | None) -> Sampling:
         """The same within `window` [R, 2]."""
         return replace(self, window=window)
