@@ -182,7 +182,7 @@ class Bound:
 
 def uniform(generator: torch.Generator, shape: Sequence[int]) -> Tensor:
     """Random numbers from -1 to 1."""
-    return 2 * torch.rand(*shape, generator=generator) - 1
+    return 2 * torch.rand(tuple(shape), generator=generator) - 1
 
 
 @dataclass(frozen=True)
@@ -234,10 +234,10 @@ class Operation:
         ]
 
     def _outputs(self, make: Callable[[], Given], device: str) -> Computation:
-        return partial(self.compute, _placed(make(), device))
+        return partial(self.compute, placed(make(), device))
 
     def _both(self, make: Callable[[], Given], device: str) -> Computation:
-        given = _placed(make(), device)
+        given = placed(make(), device)
         wanted = [x.requires_grad_() for x in self._wanted(given)]
 
         @cache
@@ -276,17 +276,17 @@ def _several(value: Tensor | Iterable[Tensor]) -> Iterable[Tensor]:
     return [value] if isinstance(value, Tensor) else value
 
 
-def _placed(value: Any, device: str) -> Any:
+def placed(value: Any, device: str) -> Any:
     """The tensors in mappings, lists and dataclasses on `device`, detached."""
     if isinstance(value, Tensor):
         return value.detach().to(device)
     if isinstance(value, Mapping):
-        return {name: _placed(item, device) for name, item in value.items()}
+        return {name: placed(item, device) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_placed(item, device) for item in value]
+        return [placed(item, device) for item in value]
     if is_dataclass(value) and not isinstance(value, type):
         return replace(
-            value, **{f.name: _placed(getattr(value, f.name), device) for f in fields(value)}
+            value, **{f.name: placed(getattr(value, f.name), device) for f in fields(value)}
         )
     return value
 

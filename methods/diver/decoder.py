@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from methods.diver.kernels.corner_rendering import Layers
+from methods.diver.kernels.segments import Layers
 from methods.students.networks import positional
 
 CHANNELS = 32

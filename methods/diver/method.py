@@ -98,5 +98,4 @@ class Diver(Student):
         return self.baked.sizes()
 
     def settings(self) -> dict[str, str]:
-        """What a row says of how it ran."""
         return super().settings() | {"precision": self.stored}

@@ -9,8 +9,9 @@ from torch import Tensor, nn
 
 from bench.types import Rays
 from methods.diver.decoder import CHANNELS, Decoder
+from methods.diver.kernels.segments import segment_weights
 from methods.instant_ngp.stage1 import TrainedField
-from methods.kernels.corner_gather import gather, integral_along
+from methods.kernels.corner_gather import corner_gather
 from methods.kernels.encode import encode
 from methods.kernels.types import Intervals
 from methods.kernels.voxel_walk import Crossings, Voxels
@@ -79,11 +80,11 @@ class CornerModel(nn.Module):
 
     def weights(self, rays: Rays, crossings: Crossings) -> Tensor:
         """Weights [S, 8] of the corners in the integrals over `crossings` of `rays`."""
-        return integral_along(rays, crossings, self.voxels, backend=self.backend)
+        return segment_weights(rays, crossings, self.voxels, backend=self.backend)
 
     def features(self, voxel: Tensor, weights: Tensor, grad_buffer: Tensor | None = None) -> Tensor:
         """Integrals [S, 32] of features over segments in voxels [S]."""
-        return gather(
+        return corner_gather(
             self.table, self.corners, voxel, weights, grad_buffer=grad_buffer, backend=self.backend
         )
 

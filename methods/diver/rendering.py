@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from bench.types import Probe, Rays
 from methods.diver.decoder import Merged
-from methods.diver.kernels.corner_rendering import Corners, render_segments
+from methods.diver.kernels.segments import Corners, render_segments
 from methods.diver.model import CornerModel
 from methods.kernels.corner_gather import CORNERS
 from methods.kernels.types import Occupancy, Pixels

@@ -143,7 +143,6 @@ class DiverTraining(PixelTraining):
         return self.model.tensors()
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore what `result` returned."""
         self.model.load(tensors)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
@@ -153,7 +152,6 @@ class DiverTraining(PixelTraining):
         return tensors | checkpoint.optimiser_tensors(self.networks, "adam."), figures
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        """Restore what `result` and `state` returned."""
         super().restore(tensors, figures)
         self.moments = AdamState.of(tensors, "moments.", self.model.table.device)
         self.grad = torch.zeros_like(self.model.table)

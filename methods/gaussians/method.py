@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -29,21 +29,37 @@ from methods.rendering.frame import FeatureFrame
 from methods.training import loop
 
 
+@dataclass(kw_only=True, eq=False)
 class GaussianSplatting:
     """3D Gaussians, whose number is a setting. A training also writes them to a PLY file.
 
-    Args:
+    Attributes:
         grid, training, precision: of the field that they start from; all methods with the same
             options share it.
+        fitting: how they are trained, for `budget.renderer_steps` steps.
         count: number of Gaussians.
         degree: degree of the spherical harmonics of a colour, 0 to 3.
         start: "field": on the surfaces of a trained Instant-NGP field; "scratch": anywhere.
-        fitting: how they are trained, for `budget.renderer_steps` steps.
         checkpoint: a PLY file to show instead of training, in the coordinates of the data set.
         stored: "fp32", or "int8": rounded after training, means to 16 bits, everything else to 8.
         stop: transmittance at which a pixel ends, less than 1.
         name: as shown in result rows.
     """
+
+    grid: HashGrid
+    training: TrainingOptions
+    fitting: Fitting
+    count: int
+    degree: int = 3
+    start: Literal["field", "scratch"] = "field"
+    checkpoint: str | None = None
+    stored: Literal["fp32", "int8"] = "fp32"
+    stop: float = STOP
+    precision: Precision = "bf16"
+    name: str = "gaussians"
+    backend: str = "auto"
+    device: str = "auto"
+    seed: int = 0
 
     memory = 0
     study = Study(
@@ -58,32 +74,16 @@ class GaussianSplatting:
         axes={"N": Axis("{:,} Gaussians", "method.count", (20_000, 40_000, 80_000, 160_000))},
     )
 
-    def __init__(
-        self,
-        *,
-        grid: HashGrid,
-        training: TrainingOptions,
-        fitting: Fitting,
-        count: int,
-        degree: int = 3,
-        start: Literal["field", "scratch"] = "field",
-        checkpoint: str | None = None,
-        stored: Literal["fp32", "int8"] = "fp32",
-        stop: float = STOP,
-        precision: Precision = "bf16",
-        name: str = "gaussians",
-        backend: str = "auto",
-        device: str = "auto",
-        seed: int = 0,
-    ) -> None:
-        if count < 1 or degree not in range(4):
-            raise ValueError(f"expected count >= 1 and degree 0 to 3, got {count} and {degree}")
-        check_stop(stop)
-        refuse_gpu(backend, name)
-        self.setup = Setup.resolved(grid, training, precision, backend, device, seed)
-        self.fitting, self.count, self.degree, self.start = fitting, count, degree, start
-        self.stored, self.stop, self.name = stored, stop, name
-        self.reads = [] if checkpoint is None else [Path(checkpoint)]
+    def __post_init__(self) -> None:
+        if self.count < 1 or self.degree not in range(4):
+            raise ValueError(
+                f"expected count >= 1 and degree 0 to 3, got {self.count} and {self.degree}"
+            )
+        check_stop(self.stop)
+        refuse_gpu(self.backend, self.name)
+        where = self.backend, self.device, self.seed
+        self.setup = Setup.resolved(self.grid, self.training, self.precision, *where)
+        self.reads = [] if self.checkpoint is None else [Path(self.checkpoint)]
         self.train_s = 0.0
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
@@ -165,5 +165,4 @@ class GaussianSplatting:
         return {"gaussians": sum(4 * x.numel() for x in self.gaussians.parameters())}
 
     def settings(self) -> dict[str, str]:
-        """What a row says of how it ran."""
         return self.setup.settings() | {"precision": self.stored, "engine": "none"}

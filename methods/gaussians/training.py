@@ -150,15 +150,12 @@ class GaussianTraining:
         return place_camera(camera, device), picture
 
     def watched(self) -> dict[str, Tensor]:
-        """All parameters."""
         return dict(self.gaussians.named_parameters())
 
     def result(self) -> dict[str, Tensor]:
-        """All parameters."""
         return {name: value.detach() for name, value in self.gaussians.named_parameters()}
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore what `result` returned."""
         self.gaussians.load_state_dict({name: tensors[name] for name in self.result()})
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
@@ -170,7 +167,6 @@ class GaussianTraining:
         return checkpoint.optimiser_tensors(self.optimiser, "adam.") | more, {}
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        """Restore what `result` and `state` returned."""
         self.restore_result(tensors)
         checkpoint.restore_optimiser(self.optimiser, tensors, "adam.")
         self.generator.set_state(tensors["generator"].cpu())

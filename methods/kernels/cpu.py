@@ -69,6 +69,14 @@ def follow_torch_threads() -> None:
         torch.set_num_threads(threads)
 
 
+def check_float32(*tensors: Tensor) -> None:
+    """Raise ValueError unless all are of float32, in which these kernels compute."""
+    if wrong := {tensor.dtype for tensor in tensors} - {torch.float32}:
+        raise ValueError(
+            f"backend 'cpu' computes with float32, got {wrong}: use backend='reference'"
+        )
+
+
 def arrays(*tensors: Tensor) -> list[np.ndarray]:
     """The numbers of each tensor, as numpy sees them; contiguous, so a copy of one that is not."""
     return [tensor.detach().contiguous().numpy() for tensor in tensors]

@@ -86,7 +86,6 @@ class KiloField(StudentField):
         return colours(geometry, encoded, self._layers, backend=self.backend)
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
-        """Count products, of densities and of colours."""
         products = {name: inputs * outputs for name, (inputs, outputs) in SHAPES.items()}
         density = sum(products[name] for name in DENSITY_LAYERS)
         probe.count("products", density * samples + (sum(products.values()) - density) * shaded)

@@ -17,20 +17,16 @@ CHUNK_RAYS = 1 << 9
 """Rays whose samples are evaluated together: 200 MiB of outputs of a trunk of 256 channels."""
 
 
-def whole_cube(occupancy: Occupancy) -> Occupancy:
-    """An occupancy of the same resolution with all cells occupied."""
-    return Occupancy(torch.ones_like(occupancy.cells))
-
-
 def every_sample(
-    field: Field, occupancy: Occupancy, cube: Occupancy, probe: Probe, how: Sampling
-) -> Render:
-    """Make the argument `render` of `render_frame` that evaluates density and colour of all samples
-    in `cube`, the whole one.
+    field: Field, occupancy: Occupancy, probe: Probe, how: Sampling
+) -> tuple[Occupancy, Render]:
+    """The whole cube, and the argument `render` of `render_frame` that evaluates density and colour
+    of all samples in it.
 
     Samples outside the cells of `occupancy` then count as empty, so that the picture is that of
     `rendering.frame.everywhere`, except for the colours of samples too faint to be seen.
     """
+    cube = Occupancy(torch.ones_like(occupancy.cells))
 
     def render(_: Tensor, rays: Rays) -> Pixels:
         canvas = Pixels.blank(len(rays.origins), field.channels, field.device)
@@ -50,4 +46,4 @@ def every_sample(
                 canvas.put(part, pixels)
         return canvas
 
-    return render
+    return cube, render

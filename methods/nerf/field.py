@@ -106,11 +106,9 @@ class NerfField(StudentField):
         return self.view.forward_with(inputs, weight, bias)
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
-        """Count products, of densities and of colours."""
         density = products(self.trunk, self.opacity)
         colour = products(self.view, self.colour)
         probe.count("products", density * samples + colour * shaded)
 
     def sizes(self) -> dict[str, int]:
-        """Bytes of the parameters."""
         return {"network": parameter_bytes(self)}

@@ -8,7 +8,7 @@ import torch
 
 from bench.types import Probe
 from methods.kernels.types import Occupancy
-from methods.nerf.dense import every_sample, whole_cube
+from methods.nerf.dense import every_sample
 from methods.nerf.field import NerfField
 from methods.rendering.frame import Render
 from methods.students.fields import FieldStudent
@@ -40,5 +40,4 @@ class Nerf(FieldStudent):
         """The occupied cells and a march through them, or the whole cube and every sample."""
         if self.skip:
             return super().renderer(probe)
-        cube = whole_cube(self.occupancy)
-        return cube, every_sample(self.field, self.occupancy, cube, probe, self.how)
+        return every_sample(self.field, self.occupancy, probe, self.how)

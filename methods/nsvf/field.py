@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from bench.types import Probe
 from methods.instant_ngp.field import Precision
-from methods.kernels.corner_gather import CORNERS, gather, trilinear
+from methods.kernels.corner_gather import CORNERS, corner_gather, trilinear
 from methods.kernels.types import Occupancy
 from methods.students.fields import StudentField
 from methods.students.networks import (
@@ -129,10 +129,10 @@ class NsvfField(StudentField):
         scaled = positions * size
         cell = scaled.long().clamp(0, size - 1)
         voxel = self.index[cell[:, 0], cell[:, 1], cell[:, 2]]
-        weights = trilinear(scaled - cell, backend=self.backend)
+        weights = trilinear(scaled - cell)
         # Samples outside all voxels read some voxel: their density is set to 0.
         read = voxel.clamp(min=0)
-        return gather(
+        return corner_gather(
             self.embeddings, self.corners, read, weights, backend=self.backend
         ), voxel >= 0
 
@@ -148,12 +148,10 @@ class NsvfField(StudentField):
         return (torch.cat(shown).to(encoded.dtype) + 1) / 2
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
-        """Count products, of densities and of colours."""
         density, colour = products(self.trunk, self.opacity), products(self.colour)
         probe.count("table_reads", CORNERS * samples)
         probe.count("products", density * samples + colour * shaded)
 
     def sizes(self) -> dict[str, int]:
-        """Bytes of the parameters."""
         embeddings = self.embeddings.numel() * self.embeddings.element_size()
         return {"embeddings": embeddings, "network": parameter_bytes(self) - embeddings}

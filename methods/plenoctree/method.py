@@ -14,7 +14,7 @@ from bench.types import Budget, Probe, Rays, Scene
 from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import Occupancy, Pixels
-from methods.kernels.voxel_walk import render_voxels
+from methods.plenoctree.kernels.voxel_light import render_voxels
 from methods.plenoctree.octree import Octree
 from methods.plenoctree.start import Extraction, extract
 from methods.plenoctree.training import OctreeLessons, OctreeTraining
@@ -104,7 +104,6 @@ class PlenOctree(Student):
         return self.octree.sizes(2 if self.stored == "fp16" else 4)
 
     def settings(self) -> dict[str, str]:
-        """What a row says of how it ran."""
         return super().settings() | {"precision": self.stored}
 
 

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from methods.kernels.types import Occupancy
-from methods.kernels.voxel_walk import BRICK, Light, Voxels
+from methods.kernels.voxel_walk import BRICK, Voxels
+from methods.plenoctree.kernels.voxel_light import Light
 
 CELL = 4
 """Leaves along the side of a cell of the occupancy that selects the rays of a frame."""

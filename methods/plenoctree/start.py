@@ -15,7 +15,8 @@ from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.composite import STOP, weights
 from methods.kernels.spherical import spherical_harmonics
 from methods.kernels.types import Occupancy
-from methods.kernels.voxel_walk import BRICK, Crossings, Light, Voxels
+from methods.kernels.voxel_walk import BRICK, Crossings, Voxels
+from methods.plenoctree.kernels.voxel_light import Light
 from methods.plenoctree.octree import Octree
 from methods.rendering.field import Field, pad
 from methods.students.voxels import largest_weights

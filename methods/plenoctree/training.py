@@ -14,8 +14,8 @@ from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import STOP, composite, visible
 from methods.kernels.types import Pixels
-from methods.kernels.voxel_shading import shade_voxels
 from methods.kernels.voxel_walk import walk
+from methods.plenoctree.kernels.voxel_light import shade_voxels
 from methods.plenoctree.octree import Octree
 
 
@@ -117,7 +117,6 @@ class OctreeTraining(PixelTraining):
         return self.octree.tensors()
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore what `result` returned."""
         self._take(Octree.of(tensors, self.octree.light.density.device))
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
@@ -128,7 +127,6 @@ class OctreeTraining(PixelTraining):
         return tensors, figures
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        """Restore what `result` and `state` returned."""
         super().restore(tensors, figures)
         device = self.octree.light.density.device
         self.moments = {name: AdamState.of(tensors, f"{name}.", device) for name in self.tables}

@@ -4,7 +4,7 @@ then the photos."""
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -51,9 +51,8 @@ class FieldLessons(PixelOptions):
             )
 
 
-class StudentField(nn.Module, ABC):
-    """A trainable `methods.rendering.field.Field` whose features are colours, rendered by kernels
-    of `backend`."""
+class StudentField(nn.Module, Field):
+    """A trainable field whose features are colours, rendered by kernels of `backend`."""
 
     channels = 3
     round_samples = ROUND_SAMPLES
@@ -66,22 +65,6 @@ class StudentField(nn.Module, ABC):
     def device(self) -> torch.device:
         """The device of its parameters."""
         return next(self.parameters()).device
-
-    @abstractmethod
-    def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """Density [S] at `positions` [S, 3], and the geometry [S, G] that `features` needs."""
-
-    @abstractmethod
-    def encode_directions(self, directions: Tensor) -> Tensor:
-        """Encoding [R, D] of ray `directions` [R, 3] of any length."""
-
-    @abstractmethod
-    def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
-        """Colours [S, 3] of samples with `geometry` [S, G] and encoded directions [S, D]."""
-
-    @abstractmethod
-    def count(self, probe: Probe, samples: int, shaded: int) -> None:
-        """Count the work of `samples` densities and `shaded` colours."""
 
     @abstractmethod
     def sizes(self) -> dict[str, int]:
@@ -213,7 +196,6 @@ class StudentTraining(PixelTraining):
         step_at(self.optimiser, self.learning_rate())
 
     def watched(self) -> dict[str, Tensor]:
-        """All parameters."""
         return dict(self.field.named_parameters())
 
     def result(self) -> dict[str, Tensor]:
@@ -222,7 +204,6 @@ class StudentTraining(PixelTraining):
         return tensors | {"cells": self.occupancy.cells}
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore what `result` returned."""
         self.field.load_state_dict(checkpoint.part(tensors, "field."))
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
@@ -231,7 +212,6 @@ class StudentTraining(PixelTraining):
         return tensors | checkpoint.optimiser_tensors(self.optimiser, "adam."), figures
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        """Restore what `result` and `state` returned."""
         super().restore(tensors, figures)
         checkpoint.restore_optimiser(self.optimiser, tensors, "adam.")
 

@@ -47,16 +47,7 @@ def test_it_holds(case: Case, cell: Cell, device: str) -> None:
     assert row["status"] == "ok", row
 
 
-MANY_BLOCKS = {
-    kernel: names
-    for kernel, names in {
-        "methods.gaussians.kernels.blending": {"parts of tiles"},
-        "methods.gaussians.kernels.ssim": {"noise, 33 x 40"},
-        "methods.kernels.march": {"inside and outside"},
-        "methods.kernels.voxel_walk": {"inside and outside", "stop and faint"},
-    }.items()
-    if kernel in kernels("gpu")
-}
+MANY_BLOCKS = {"methods.kernels.march": {"inside and outside"}}
 """Kernels whose blocks are larger where they are interpreted, and cases of several small blocks."""
 
 
@@ -135,14 +126,13 @@ def test_every_kernel_has_cases_for_all_its_backends(kernel: str) -> None:
 
 NAMES = {
     "adam": "sparse_adam_ hash_adam_",
-    "corner_gather": "gather",
-    "corner_rendering": "render_segments",
+    "segments": "segment_weights render_segments",
     "blending": "blend",
     "projection": "project_gaussians",
     "grouped_mlp": "grouped_linear",
     "relu": "relu_",
     "spherical": "spherical_harmonics",
-    "voxel_shading": "shade_voxels",
+    "voxel_light": "render_voxels shade_voxels",
     "voxel_walk": "walk",
 }
 """What a kernel is called where it is not called as its folder."""

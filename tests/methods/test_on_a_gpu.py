@@ -122,7 +122,7 @@ def gaussians(**where: Any) -> GaussianSplatting:
     return GaussianSplatting(grid=GRID, training=STAGE1, count=40, fitting=Fitting(), **where)
 
 
-NETWORK = NetworkLessons(march_step=16.0, max_rays=64)
+NETWORK = NetworkLessons(max_rays=64)
 EXTRACTION = Extraction(resolution=128, degree=1, rays=200, points=1, directions=4)
 METHODS: Mapping[str, Callable[..., Method]] = {
     "ngp": partial(InstantNgp, grid=GRID, training=STAGE1),

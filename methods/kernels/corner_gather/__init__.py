@@ -2,7 +2,7 @@
 
 Corner c of a voxel is at +x if bit 0 of c is set, at +y for bit 1, at +z for bit 2. Local
 coordinates go from 0 to 1 along each axis of a voxel. With the weights of `trilinear`, the result
-is the trilinear interpolant at a point; with those of `integral`, its mean over a segment.
+is the trilinear interpolant at a point.
 """
 
 from __future__ import annotations
@@ -10,14 +10,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from bench.types import Rays, check_shape
+from bench.types import check_shape
 from methods.kernels.dispatch import implementation
-from methods.kernels.voxel_walk import Crossings, Voxels
 
 CORNERS = 8
 
 
-def gather(
+def corner_gather(
     table: Tensor,
     corners: Tensor,
     voxel: Tensor,
@@ -31,7 +30,7 @@ def gather(
     Differentiable in a float32 `table`; in `weights` only with backend="reference".
 
     Args:
-        table: [C, F] features of the corners; bfloat16 is read directly, but has no gradient.
+        table: [C, F] features of the corners.
         corners: [V, 8] int32 rows of `table` for each voxel's corners. Not checked.
         voxel: [S] int32 rows of `corners`.
         weights: [S, 8] weights of the corners; a NaN only affects the features of its sample.
@@ -39,8 +38,8 @@ def gather(
             from autograd, so that a training step neither allocates nor clears a second table.
 
     Raises:
-        ValueError: wrong shapes; on a CPU, a voxel that is not a row of `corners`; other types than
-            float32 for the backend "cpu".
+        ValueError: wrong shapes; on a CPU, a voxel that is not a row of `corners`; backend "cpu":
+            other types.
     """
     check_shape("table", table, None, None)
     check_shape("corners", corners, None, CORNERS)
@@ -56,60 +55,15 @@ def gather(
             raise ValueError(
                 f"voxel: expected rows of the {len(corners)} voxels, got {low} to {high}"
             )
-    return implementation(__name__, backend, table.device).gather(
+    return implementation(__name__, backend, table.device).corner_gather(
         table, corners, voxel, weights, grad_buffer=grad_buffer
     )
 
 
-def trilinear(local: Tensor, *, backend: str = "auto") -> Tensor:
-    """Weights [S, 8] of the corners at points with local coordinates `local` [S, 3].
-
-    Differentiable with backend="reference" only.
-
-    Raises:
-        ValueError: a shape other than this; backend "cpu": not float32.
-    """
+def trilinear(local: Tensor) -> Tensor:
+    """Weights [S, 8] of the corners at points with local coordinates `local` [S, 3], in plain
+    torch; differentiable."""
     check_shape("local", local, None, 3)
-    return implementation(__name__, backend, local.device).trilinear(local)
-
-
-def integral(entry: Tensor, leave: Tensor, *, backend: str = "auto") -> Tensor:
-    """Weights [S, 8] of the mean of the trilinear interpolant between two points of a voxel.
-
-    They give its integral along the segment, divided by the length of the segment (Wu et al. 2022,
-    Section 3.2). For a segment of length 0 they are those of the point. Differentiable with
-    backend="reference" only.
-
-    Args:
-        entry: [S, 3] local coordinates of one end.
-        leave: [S, 3] local coordinates of the other end.
-
-    Raises:
-        ValueError: a shape other than these; backend "cpu": not float32.
-    """
-    check_shape("entry", entry, None, 3)
-    check_shape("leave", leave, len(entry), 3)
-    return implementation(__name__, backend, entry.device).integral(entry, leave)
-
-
-def integral_along(
-    rays: Rays, crossings: Crossings, voxels: Voxels, *, backend: str = "auto"
-) -> Tensor:
-    """Weights [S, 8] of `integral` over the `crossings` of R `rays` through `voxels`.
-
-    Not differentiable.
-
-    Raises:
-        ValueError: rays or voxels do not belong to the crossings; backend "cpu": not
-            float32.
-    """
-    count = len(rays.origins)
-    check_shape("origins", rays.origins, count, 3)
-    check_shape("directions", rays.directions, count, 3)
-    if len(crossings.offsets) != count + 1:
-        raise ValueError(
-            f"crossings: expected those of the {count} rays, got of {len(crossings.offsets) - 1}"
-        )
-    return implementation(__name__, backend, rays.origins.device).integral_along(
-        rays, crossings, voxels
-    )
+    x, y, z = torch.stack((1 - local, local), dim=1).unbind(dim=2)  # [S, 2], below and above
+    across = z[:, :, None] * y[:, None]  # [S, 2, 2]
+    return (across[..., None] * x[:, None, None]).flatten(1)

@@ -1,4 +1,4 @@
-"""Walks rays through the voxels of a sparse grid, front to back, and renders them.
+"""Walks rays through the voxels of a sparse grid, front to back.
 
 The unit cube is divided into G^3 cells, some of which are voxels that hold something. A ray o + t d
 crosses the plane k of an axis at t = (k / G - o) / d, computed from the integer k alone, so that
@@ -16,10 +16,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench.types import Rays, check_shape
-from methods.kernels.composite import STOP, check_stop
 from methods.kernels.dispatch import implementation
-from methods.kernels.spherical import SIZES
-from methods.kernels.types import Intervals, Pixels
+from methods.kernels.types import Intervals
 
 BRICK = 8
 """Cells along the side of a brick."""
@@ -31,13 +29,14 @@ MAX_CLEARANCE = 32
 """Upper limit of a clearance in bricks; beyond it a ray takes another step."""
 
 
+@dataclass(frozen=True, eq=False)
 class Voxels:
     """The non-empty cells (voxels) of a grid of G^3 over the unit cube, with their numbers.
 
     A two-level tree with branching 8^3: a map of bricks of 8^3 cells, and the cells of the bricks
     that contain any voxel. Both hold int32 numbers, -1 for empty.
 
-    Args:
+    Attributes:
         coordinates: [V, 3] integers from 0 to G - 1, distinct (x, y, z) of the voxels; row v is
             voxel v.
         resolution: G, a multiple of 8, at most `MAX_RESOLUTION`.
@@ -46,36 +45,49 @@ class Voxels:
         ValueError: invalid resolution or coordinates.
     """
 
-    def __init__(self, coordinates: Tensor, resolution: int) -> None:
+    coordinates: Tensor
+    resolution: int
+
+    def __post_init__(self) -> None:
+        coordinates, size = self.coordinates, self.resolution
         check_shape("coordinates", coordinates, None, 3)
-        if resolution % BRICK or not 0 < resolution <= MAX_RESOLUTION:
+        if size % BRICK or not 0 < size <= MAX_RESOLUTION:
             raise ValueError(
                 f"resolution: expected a multiple of {BRICK} from {BRICK} to {MAX_RESOLUTION}, "
-                f"got {resolution}"
+                f"got {size}"
             )
         if coordinates.is_floating_point():
             raise ValueError(f"coordinates: expected integers, got {coordinates.dtype}")
-        if len(coordinates) and not 0 <= coordinates.min() <= coordinates.max() < resolution:
+        if len(coordinates) and not 0 <= coordinates.min() <= coordinates.max() < size:
             raise ValueError(
-                f"coordinates: expected 0 to {resolution - 1}, got {int(coordinates.min())} to "
+                f"coordinates: expected 0 to {size - 1}, got {int(coordinates.min())} to "
                 f"{int(coordinates.max())}"
             )
-        self.coordinates, self.resolution = coordinates, resolution
-        side, device = resolution // BRICK, coordinates.device
-        x, y, z = coordinates.long().unbind(dim=1)
+        if int((self.leaves >= 0).sum()) != len(coordinates):
+            raise ValueError("coordinates: expected every cell once, got some of them twice")
+
+    @cached_property
+    def _maps(self) -> tuple[Tensor, Tensor]:
+        side, device = self.resolution // BRICK, self.coordinates.device
+        x, y, z = self.coordinates.long().unbind(dim=1)
         brick = ((x // BRICK) * side + y // BRICK) * side + z // BRICK
         used, row = brick.unique(return_inverse=True)
         bricks = torch.full((side**3,), -1, dtype=torch.int32, device=device)
         bricks[used] = torch.arange(len(used), dtype=torch.int32, device=device)
-        self.bricks = bricks.view(side, side, side)
-        """Row of `leaves` of each brick: [G/8, G/8, G/8]."""
         cell = (x % BRICK * BRICK + y % BRICK) * BRICK + z % BRICK
         leaves = torch.full((len(used) * BRICK**3,), -1, dtype=torch.int32, device=device)
         leaves[row * BRICK**3 + cell] = torch.arange(len(x), dtype=torch.int32, device=device)
-        self.leaves = leaves.view(-1, BRICK**3)
+        return bricks.view(side, side, side), leaves.view(-1, BRICK**3)
+
+    @property
+    def bricks(self) -> Tensor:
+        """Row of `leaves` of each brick: [G/8, G/8, G/8]."""
+        return self._maps[0]
+
+    @property
+    def leaves(self) -> Tensor:
         """Voxel of each cell (x, y, z) of a brick, at (x * 8 + y) * 8 + z: [B, 512]."""
-        if int((leaves >= 0).sum()) != len(x):
-            raise ValueError("coordinates: expected every cell once, got some of them twice")
+        return self._maps[1]
 
     def __len__(self) -> int:
         return len(self.coordinates)
@@ -146,19 +158,6 @@ class Crossings(Intervals):
         )
 
 
-@dataclass(frozen=True)
-class Light:
-    """The contents of V voxels.
-
-    Attributes:
-        density: [V] 1 / scene unit, not negative.
-        harmonics: [V, C, 3] coefficients of the first C spherical harmonics, C of 1, 4, 9 or 16.
-    """
-
-    density: Tensor
-    harmonics: Tensor
-
-
 def walk(
     rays: Rays,
     voxels: Voxels,
@@ -192,42 +191,5 @@ def walk(
     if limit < 1:
         raise ValueError(f"limit: expected 1 or more, got {limit}")
     kernel = implementation(__name__, backend, origins.device)
-    found: Crossings = kernel.walk(rays, voxels, start, min(limit, most))
-    return found
-
-
-def render_voxels(
-    rays: Rays,
-    voxels: Voxels,
-    light: Light,
-    *,
-    stop: float = STOP,
-    faint: float = 0.0,
-    backend: str = "auto",
-) -> tuple[Pixels, Tensor, Tensor]:
-    """Render R `rays` without a background. Not differentiable.
-
-    A voxel has the opacity 1 - exp(-sigma delta) over a length delta, and shows
-    sigmoid(sum_k c_k Y_k(d)) in direction d (Yu et al. 2021, Eq. 1 to 3).
-
-    Returns the pixels and, for each ray, the numbers of crossed and of shaded voxels: [R] int32.
-
-    Args:
-        stop: transmittance at which a ray ends, less than 1.
-        faint: voxels with at most this weight count for opacity but are not shaded.
-
-    Raises:
-        ValueError: wrong shapes, a stop outside [0, 1); backend "cpu": not float32.
-    """
-    check_stop(stop)
-    check_shape("origins", rays.origins, None, 3)
-    check_shape("directions", rays.directions, len(rays.origins), 3)
-    check_shape("density", light.density, len(voxels))
-    check_shape("harmonics", light.harmonics, len(voxels), None, 3)
-    if light.harmonics.shape[1] not in SIZES:
-        raise ValueError(
-            f"harmonics: expected one of {SIZES} a colour, got {list(light.harmonics.shape)}"
-        )
-    kernel = implementation(__name__, backend, rays.origins.device)
-    found: tuple[Pixels, Tensor, Tensor] = kernel.render_voxels(rays, voxels, light, stop, faint)
-    return found
+    crossings: Crossings = kernel.walk(rays, voxels, start, min(limit, most))
+    return crossings

@@ -1,10 +1,10 @@
 """Cases of the voxel walk: bit-identical crossings by all backends; lengths against a slab test per
-voxel; rays that hit faces, edges and corners, or come from far; pixels, also in closed form."""
+voxel; rays that hit faces, edges and corners, or come from far."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -12,58 +12,73 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from bench.case import DTYPES, U32, Agreement, Case, Property
+from bench.case import DTYPES, Bound, Case, Given, Operation, Property, on_backends
 from bench.types import Rays
 from methods.kernels.dispatch import served
 from methods.kernels.march.cases import ALL, AXES
-from methods.kernels.voxel_walk import Light, Voxels, render_voxels, walk
+from methods.kernels.voxel_walk import Voxels, walk
 
 SIZE = 24
 """Resolution of the grids in most cases; not a power of two, so that planes are rounded."""
 
-LONGEST = 3 * SIZE
-"""Maximum number of voxels on a ray in these grids."""
+RESULTS = ("offsets", "ray", "voxel", "near", "far", "t", "delta", "resume")
 
-COLOUR = (16 * 50 * 6 + 16 * 16 * 6) / 4 + 8
-"""Error bound in u of a colour: a quarter (slope of the sigmoid) of the error of a sum of 16
-products of harmonics (below 2, error 48 u) and numbers below 6, plus the sigmoid's own error."""
+
+def _walk(given: Given, backend: str) -> tuple[Tensor, ...]:
+    crossings = walk(**given, backend=backend)
+    return tuple(getattr(crossings, name) for name in RESULTS)
+
+
+SAME = Bound("t of planes by the same operations, cells by comparing them: 0", 0.0)
+WALK = Operation("voxel_walk", served(__package__), _walk, dict.fromkeys(RESULTS, SAME))
 
 
 def cases() -> list[Case]:
     """Every kind of grid, ray, start and limit."""
-    return [*_agreements(), *_lengths(), *_pixels(), *_cubes()]
+    return [*_agreements(), *_lengths()]
 
 
-def _agreements() -> list[Case]:
-    kinds: list[tuple[str, int, dict[str, Any]]] = [
-        ("limit 1", 129, {"limit": 1, "grid": "full"}),
-        ("no ray", 0, {}),
-        ("one ray", 1, {}),
-        ("inside and outside", 129, {}),
-        ("more rays than are walked together", 5000, {"grid": "one"}),
-        ("no voxel", 65, {"grid": "empty"}),
-        ("all voxels", 65, {"grid": "full"}),
-        ("one voxel", 65, {"grid": "one"}),
-        ("limit 7", 129, {"limit": 7, "grid": "full"}),
-        ("begun on the way", 129, {"start": True, "grid": "full"}),
-        ("axes, planes, corners and what is not finite", 0, {"special": True, "grid": "full"}),
-        ("from 1e6 away", 129, {"away": 1e6, "grid": "full"}),
-    ]
-    kernel = Agreement(
-        "voxel_walk",
-        served(__package__),
-        "t of planes by the same operations, cells by comparing them: 0",
-    )
-    found = [kernel.case(name, partial(_prepare, rays, kind), 0.0) for name, rays, kind in kinds]
-    timed = partial(_prepare, 1 << 13, {"grid": "shell"})
-    return [*found, kernel.case("hollow sphere in 128^3", timed, 0.0, items=1 << 13)]
+def _agreements() -> Iterator[Case]:
+    kinds: dict[str, dict[str, Any]] = {
+        "limit 1": {"limit": 1, "grid": "full"},
+        "no ray": {"count": 0},
+        "one ray": {"count": 1},
+        "inside and outside": {},
+        "more rays than are walked together": {"count": 5000, "grid": "one"},
+        "no voxel": {"grid": "empty"},
+        "all voxels": {"count": 65, "grid": "full"},
+        "one voxel": {"grid": "one"},
+        "limit 7": {"limit": 7, "grid": "full"},
+        "begun on the way": {"begun": True, "grid": "full"},
+        "axes, planes, corners and what is not finite": {"count": None, "grid": "full"},
+        "from 1e6 away": {"away": 1e6, "grid": "full"},
+    }
+    for name, kind in kinds.items():
+        yield from WALK.cases(name, partial(_given, **kind))
+    many = 1 << 13
+    shell = partial(_given, count=many, grid="shell")
+    yield from WALK.cases("hollow sphere in 128^3", shell, items=many)
 
 
-def _grid(kind: str, device: str) -> Voxels:
+def _given(
+    count: int | None = 129,
+    grid: str = "dust",
+    away: float = 1.5,
+    begun: bool = False,
+    limit: int | None = None,
+) -> Given:
+    rays = _special_rays() if count is None else some_rays(count, away)
+    start = None
+    if begun:
+        generator = torch.Generator().manual_seed(4)
+        start = 2 * torch.rand(len(rays.origins), generator=generator) - 0.2
+        start[:4] = torch.tensor([torch.inf, -torch.inf, torch.nan, 1e30])
+    return {"rays": rays, "voxels": _grid(grid), "start": start, "limit": limit}
+
+
+def _grid(kind: str) -> Voxels:
     size = 128 if kind == "shell" else SIZE
-    axis = (torch.arange(size) + 0.5) / size - 0.5
-    cells = torch.cartesian_prod(*[torch.arange(size)] * 3)
-    radius = torch.cartesian_prod(axis, axis, axis).norm(dim=1)
+    cells, radius = all_cells(size)
     generator = torch.Generator().manual_seed(3)
     kept = {
         "empty": radius < 0,
@@ -73,11 +88,16 @@ def _grid(kind: str, device: str) -> Voxels:
         "dust": torch.rand(len(cells), generator=generator) < 0.05,
     }[kind]
     chosen = cells[kept]
-    mixed = chosen[torch.randperm(len(chosen), generator=generator)]
-    return Voxels(mixed.to(device), size)
+    return Voxels(chosen[torch.randperm(len(chosen), generator=generator)], size)
 
 
-def _rays(count: int, away: float) -> Rays:
+def all_cells(size: int) -> tuple[Tensor, Tensor]:
+    """The cells [G^3, 3] of a grid of G = `size`, and the distance of each from the middle."""
+    cells = torch.cartesian_prod(*[torch.arange(size)] * 3)
+    return cells, ((cells + 0.5) / size - 0.5).norm(dim=1)
+
+
+def some_rays(count: int, away: float = 1.5) -> Rays:
     """Rays towards the cube from a sphere around it, every fourth from inside."""
     generator = torch.Generator().manual_seed(count)
     outside = normalize(torch.randn(count, 3, generator=generator), dim=-1) * away + 0.5
@@ -100,83 +120,48 @@ def _special_rays() -> Rays:
     return Rays(origins, torch.cat((ahead, ahead, last)))
 
 
-def _prepare(count: int, kind: dict[str, Any], device: str) -> Callable[[str], tuple[Tensor, ...]]:
-    rays = _special_rays() if kind.get("special") else _rays(count, kind.get("away", 1.5))
-    count, generator = len(rays.origins), torch.Generator().manual_seed(4)
-    options: dict[str, Any] = {}
-    if kind.get("start"):
-        start = 2 * torch.rand(count, generator=generator) - 0.2
-        start[:4] = torch.tensor([torch.inf, -torch.inf, torch.nan, 1e30])
-        options["start"] = start.to(device)
-    if "limit" in kind:
-        options["limit"] = kind["limit"]
-    voxels = _grid(kind.get("grid", "dust"), device)
-    rays = Rays(rays.origins.to(device), rays.directions.to(device))
-
-    def call(backend: str) -> tuple[Tensor, ...]:
-        found = walk(rays, voxels, backend=backend, **options)
-        # Infinity minus infinity would be no number: where a ray has no more, -1.
-        resume = torch.where(found.resume.isinf(), -1, found.resume)
-        return (
-            found.offsets,
-            found.ray,
-            found.voxel,
-            found.near,
-            found.far,
-            found.t,
-            found.delta,
-            resume,
-        )
-
-    return call
+SOME = ALL[ALL.any(dim=1)]
+MIDDLE = torch.full((3,), 0.5)
+KINDS = {
+    "from all around": some_rays(60),
+    "along axes": Rays(MIDDLE + 0.01 - 2 * AXES, AXES),
+    "along diagonals": Rays(MIDDLE - 2 * SOME, SOME),
+    "through a corner of the cube": Rays(-2 * SOME, SOME),
+    "from inside": Rays(MIDDLE.expand(26, 3) + 0.01, SOME),
+    "from a face": Rays(torch.tensor([0.0, 0.49, 0.51]).expand(26, 3), SOME),
+    "past the cube": Rays(MIDDLE - 2 * AXES + 3 * AXES.roll(1, dims=1), AXES),
+    "without direction": Rays(MIDDLE.expand(1, 3), torch.zeros(1, 3)),
+    "of direction 1e-30": Rays(MIDDLE + 0.01 - 2 * SOME, 1e-30 * SOME),
+    "of direction 1e-40": Rays(MIDDLE - 2 * SOME, 1e-40 * SOME),
+    "of direction 1e30": Rays(MIDDLE + 0.01 - 2 * SOME, 1e30 * SOME),
+    "of directions 1 and 1e-40": Rays(
+        MIDDLE + 0.01 - 2 * AXES, AXES + 1e-40 * AXES.roll(1, dims=1)
+    ),
+}
 
 
-def _lengths() -> list[Case]:
+def _lengths() -> Iterator[Case]:
     """Every kind of ray through full, scattered, empty and one-voxel grids; also in rounds."""
-    some = ALL[ALL.any(dim=1)]
-    middle, corner = torch.full((3,), 0.5), torch.zeros(3)
-    kinds: dict[str, tuple[Tensor, Tensor]] = {
-        "from all around": (_rays(60, 1.5).origins, _rays(60, 1.5).directions),
-        "along axes": (middle + 0.01 - 2 * AXES, AXES),
-        "along diagonals": (middle - 2 * some, some),
-        "through a corner of the cube": (corner - 2 * some, some),
-        "from inside": (middle.expand(26, 3) + 0.01, some),
-        "from a face": (torch.tensor([0.0, 0.49, 0.51]).expand(26, 3), some),
-        "past the cube": (middle - 2 * AXES + 3 * AXES.roll(1, dims=1), AXES),
-        "without direction": (middle.expand(1, 3), torch.zeros(1, 3)),
-        "of direction 1e-30": (middle + 0.01 - 2 * some, 1e-30 * some),
-        "of direction 1e-40": (middle - 2 * some, 1e-40 * some),
-        "of direction 1e30": (middle + 0.01 - 2 * some, 1e30 * some),
-        "of directions 1 and 1e-40": (
-            middle + 0.01 - 2 * AXES,
-            AXES + 1e-40 * AXES.roll(1, dims=1),
-        ),
-    }
-    found = []
     for grid in ("full", "dust", "one", "empty"):
-        for kind, rays in kinds.items():
-            size = rays[0].abs().max().item() + 1
+        for kind, rays in KINDS.items():
+            size = rays.origins.abs().max().item() + 1
             each = Property(
                 "voxel_walk",
-                "the length in each voxel is that of its own slab test",
+                "a length is that of a slab test of the voxel; voxels that touch share their t",
                 "entry and exit of a voxel each rounded 4 times at the size of the origin, by a "
                 "direction at most √3 as long as its largest component, and where edges and "
                 "corners are cut as often again: 16 √3 |o| u",
-                {(b, "fp32"): 16 * math.sqrt(3) * size * U32 for b in ("reference", "cpu")},
+                on_backends(16 * math.sqrt(3) * size),
             )
             for limit in (None, 3) if kind == "from all around" else (None,):
                 name = f"{kind}, {grid}" + (f", {limit} at a time" if limit else "")
-                found.append(each.case(name, partial(_length_error, grid, Rays(*rays), limit)))
-    touching = Property(
-        "voxel_walk",
-        "voxels that touch share their t, and no voxel is crossed twice",
-        "one number, computed once: 0",
-        {(b, "fp32"): 0.0 for b in ("reference", "cpu")},
-    )
-    return found + [
-        touching.case(f"{kind}, all touch", partial(_gaps, Rays(*kinds[kind])))
-        for kind in ("from all around", "along diagonals", "from inside")
-    ]
+                yield each.case(name, partial(_length_error, grid, rays, limit))
+
+
+def _there(grid: str, rays: Rays, device: str, precision: str) -> tuple[Rays, Voxels]:
+    voxels, dtype = _grid(grid), DTYPES[precision]
+    there = Voxels(voxels.coordinates.to(device), voxels.resolution)
+    return Rays(rays.origins.to(device, dtype), rays.directions.to(device, dtype)), there
 
 
 def _length_error(
@@ -184,13 +169,11 @@ def _length_error(
 ) -> float:
     """Largest error of a ray's length in a voxel, walked in rounds of `limit`.
 
-    Infinite if crossings are not in order.
+    Infinite if crossings are not in order, or have gaps in the full grid.
     """
-    dtype = DTYPES[precision]
-    rays = Rays(given.origins.to(device, dtype), given.directions.to(device, dtype))
-    voxels, count = _grid(grid, device), len(given.origins)
-    lengths = torch.zeros(count, len(voxels) + 1, dtype=torch.float64)
-    start = torch.zeros(count, dtype=dtype, device=device)
+    rays, voxels = _there(grid, given, device, precision)
+    lengths = torch.zeros(len(rays.origins), len(voxels) + 1, dtype=torch.float64)
+    start = torch.zeros_like(rays.origins[:, 0])
     for _ in range(3 * SIZE if limit else 1):
         found = walk(rays, voxels, start=start, limit=limit, backend=backend)
         lengths.index_put_(
@@ -198,13 +181,13 @@ def _length_error(
         )
         start = found.resume
         same = found.ray[1:] == found.ray[:-1]
-        if (found.near[1:] < found.far[:-1])[same].any() or (found.delta <= 0).any():
+        gaps = (found.near[1:] - found.far[:-1])[same]
+        if (gaps < 0).any() or (grid == "full" and gaps.any()) or (found.delta <= 0).any():
             return math.inf
     if (start != torch.inf).any():
         return math.inf
-    return (
-        (lengths[:, :-1] - _exact_lengths(rays, voxels)).abs().amax().item() if len(voxels) else 0.0
-    )
+    errors = (lengths[:, :-1] - _exact_lengths(rays, voxels)).abs()
+    return errors.amax().item() if len(voxels) else 0.0
 
 
 def _exact_lengths(rays: Rays, voxels: Voxels) -> Tensor:
@@ -221,122 +204,3 @@ def _exact_lengths(rays: Rays, voxels: Voxels) -> Tensor:
     known = (o.abs().amax(dim=2) + 1) / d.abs().amax(dim=2) < largest
     length = (leave - enter).clamp(min=0) * d.norm(dim=2)
     return torch.where(between & known, length, 0)
-
-
-def _gaps(rays: Rays, backend: str, device: str, precision: str) -> float:
-    """Largest gap between crossings of a full grid; infinite if a voxel is crossed twice."""
-    dtype = DTYPES[precision]
-    rays = Rays(rays.origins.to(device, dtype), rays.directions.to(device, dtype))
-    found = walk(rays, _grid("full", device), backend=backend)
-    pairs = torch.stack((found.ray, found.voxel), dim=1)
-    if not len(found) or len(pairs.unique(dim=0)) < len(pairs):
-        return math.inf
-    same = found.ray[1:] == found.ray[:-1]
-    return (found.near[1:] - found.far[:-1])[same].abs().amax().item()
-
-
-def _scene(size: int, kind: str, device: str) -> tuple[Voxels, Light]:
-    """Voxels in a thick shell, every second one, of random density and light."""
-    generator = torch.Generator().manual_seed(size)
-    axis = (torch.arange(size) + 0.5) / size - 0.5
-    cells = torch.cartesian_prod(*[torch.arange(size)] * 3)
-    radius = torch.cartesian_prod(axis, axis, axis).norm(dim=1)
-    kept = (radius > 0.27) & (radius < 0.4) & (torch.rand(len(cells), generator=generator) < 0.5)
-    if kind == "nothing":
-        kept[:] = False
-    coordinates = cells[kept]
-    scale = {"clear": 0.0, "mist": 2.0, "stone": 1e4}.get(kind, 20.0)
-    density = scale * torch.rand(len(coordinates), generator=generator)
-    harmonics = torch.randn(len(coordinates), 9, 3, generator=generator).clamp(-6, 6)
-    return Voxels(coordinates.to(device), size), Light(density.to(device), harmonics.to(device))
-
-
-def _views(count: int, device: str) -> Rays:
-    generator = torch.Generator().manual_seed(count)
-    origins = normalize(torch.randn(count, 3, generator=generator), dim=1) * 1.5 + 0.5
-    targets = torch.rand(count, 3, generator=generator)
-    return Rays(origins.to(device), (targets - origins).to(device))
-
-
-def _pixels() -> list[Case]:
-    kernel = Agreement(
-        "render_voxels",
-        served(__package__),
-        "colours as `COLOUR` says; light rounded once or twice a voxel by u, at most 72 voxels, "
-        "and depths up to 3; where a weight next to `stop` or `faint` counts on one side only: 3 "
-        "(stop + 72 faint)",
-    )
-    rounding = (COLOUR + 3 * 4 * LONGEST) * U32
-    found = []
-    for name, rays, kind, stop, faint in (
-        ("one ray", 1, "cloud", 0.0, 0.0),
-        ("no ray", 0, "cloud", 0.0, 0.0),
-        ("cloud", 129, "cloud", 0.0, 0.0),
-        ("mist", 129, "mist", 0.0, 0.0),
-        ("stone", 129, "stone", 0.0, 0.0),
-        ("voxels without density", 129, "clear", 0.0, 0.0),
-        ("no voxel", 129, "nothing", 0.0, 0.0),
-        ("stop and faint", 129, "cloud", 1e-4, 1e-5),
-    ):
-        found.append(
-            kernel.case(
-                name,
-                partial(_rendered, 24, rays, kind, stop, faint),
-                rounding + 3 * (stop + LONGEST * faint),
-            )
-        )
-    # 128^3 voxels: at most 384 on a ray.
-    large = (COLOUR + 3 * 4 * 384) * U32 + 3 * (1e-4 + 384 * 1e-5)
-    timed = partial(_rendered, 128, 1 << 13, "cloud", 1e-4, 1e-5)
-    return [*found, kernel.case("a frame of 128^3", timed, large, items=1 << 13)]
-
-
-def _rendered(
-    size: int, count: int, kind: str, stop: float, faint: float, device: str
-) -> Callable[[str], tuple[Tensor, ...]]:
-    voxels, light = _scene(size, kind, device)
-    rays = _views(count, device)
-
-    def call(backend: str) -> tuple[Tensor, ...]:
-        pixels, _, _ = render_voxels(rays, voxels, light, stop=stop, faint=faint, backend=backend)
-        return pixels.values, pixels.depth_sum, pixels.alpha
-
-    return call
-
-
-def _cubes() -> list[Case]:
-    """A cube of equal voxels, whose pixels are known."""
-    known = Property(
-        "render_voxels",
-        "opacity is 1 - exp(-sigma chord), and colour is that opacity times that of the direction",
-        "a chord of at most 36 pieces, each off by 16 √3 (|o| + 1) u, at |o| of 2 and a density of "
-        "10, and what compositing rounds",
-        {
-            (b, "fp32"): (10 * 36 * 16 * 3 * math.sqrt(3) + COLOUR) * U32
-            for b in ("reference", "cpu")
-        },
-    )
-    return [known.case("a cube of 12^3 voxels", _cube_error)]
-
-
-def _cube_error(backend: str, device: str, precision: str) -> float:
-    dtype = DTYPES[precision]
-    rays = _views(200, device)
-    rays = Rays(rays.origins.to(dtype), rays.directions.to(dtype))
-    cells = torch.cartesian_prod(*[torch.arange(6, 18, device=device)] * 3)
-    # C of Y_1,-1 = sqrt(3 / 4 pi) y: the logit of red is the direction's y, of green 1.
-    harmonics = torch.zeros(len(cells), 4, 3, dtype=dtype, device=device)
-    harmonics[:, 1, 0] = math.sqrt(4 * math.pi / 3)
-    harmonics[:, 0, 1] = math.sqrt(4 * math.pi)
-    density = torch.full((len(cells),), 10.0, dtype=dtype, device=device)
-    light = Light(density, harmonics)
-    pixels, _, _ = render_voxels(rays, Voxels(cells, 24), light, stop=0.0, backend=backend)
-    o, d = rays.origins.double(), rays.directions.double()
-    ends = torch.stack(((0.25 - o) / d, (0.75 - o) / d))
-    chord = (ends.amax(0).amin(1) - ends.amin(0).amax(1).clamp(min=0)).clamp(min=0)
-    opacity = -torch.expm1(-10 * chord * d.norm(dim=1))
-    red = (d[:, 1] / d.norm(dim=1)).sigmoid()
-    green, blue = torch.full_like(red, 1.0).sigmoid(), torch.full_like(red, 0.5)
-    want = opacity[:, None] * torch.stack((red, green, blue), dim=1)
-    colours = (pixels.values.double() - want).abs().max()
-    return max(colours.item(), (pixels.alpha.double() - opacity).abs().max().item())

@@ -2,8 +2,7 @@
 bricks known to be empty in one step.
 
 As in the ray march, a chunk of rays writes its crossings into its own part of a scratch array; once
-all counts are known, they are moved to their final place. Rendering does not store crossings: each
-ray walks, shades and composites a few voxels at a time, which never leave the L1 cache.
+all counts are known, they are moved to their final place.
 """
 
 from __future__ import annotations
@@ -14,101 +13,49 @@ import numpy as np
 import torch
 from numba import njit, prange
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from bench.types import Rays
-from methods.kernels.cpu import f32, i32, prefetch, prefetch_row, sigmoid, slope
-from methods.kernels.spherical import spherical_harmonics
-from methods.kernels.types import Pixels
-from methods.kernels.voxel_shading.cpu import weighted_sum
-from methods.kernels.voxel_walk import Crossings, Light, Voxels
+from methods.kernels.cpu import arrays, check_float32, f32, i32, slope
+from methods.kernels.voxel_walk import Crossings, Voxels
 
 CHUNK = 64  # rays
-ROUND = 16
-"""Voxels that a ray finds at a time when rendering; few, so that few behind its end are wasted."""
+BLOCK = 1 << 12
+"""Rays walked at a time; the next ones reuse memory that is then already in the cache."""
 
 f64 = np.float64
 INF = f32(np.inf)
 
-BLOCK = 1 << 12
-"""Rays walked at a time; the next ones reuse memory that is then already in the cache."""
+
+def maps_of(voxels: Voxels) -> tuple[np.ndarray, ...]:
+    """What `walk_ray` looks up: bricks, masks, leaves, clearance."""
+    return tuple(arrays(voxels.bricks, voxels.masks, voxels.leaves, voxels.clearance))
 
 
 def walk(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> Crossings:
-    """See `methods.kernels.voxel_walk.walk`."""
-    if not rays.origins.dtype == rays.directions.dtype == start.dtype == torch.float32:
-        raise ValueError(
-            f"backend 'cpu' walks float32, got origins {rays.origins.dtype}, directions "
-            f"{rays.directions.dtype}, start {start.dtype}: use backend='reference'"
-        )
-    count, maps = len(start), (voxels.bricks, voxels.masks, voxels.leaves, voxels.clearance)
-    given = [x.detach().contiguous().numpy() for x in (rays.origins, rays.directions, start)]
+    check_float32(rays.origins, rays.directions, start)
+    count, maps = len(start), maps_of(voxels)
+    given = arrays(rays.origins, rays.directions, start)
     slots = -(-min(count, BLOCK) // CHUNK) * CHUNK * limit
-    scratch = tuple(
-        torch.empty(slots, dtype=kind).numpy() for kind in (torch.float, torch.float, torch.int32)
-    )
+    kinds = torch.float32, torch.float32, torch.int32  # of entry, exit and voxel
+    scratch = tuple(torch.empty(slots, dtype=kind).numpy() for kind in kinds)
     offsets, resume = torch.zeros(count + 1, dtype=torch.int64), torch.empty(count)
     parts = []
     for first in range(0, max(count, 1), BLOCK):
         origins, directions, begin = (x[first : first + BLOCK] for x in given)
         counts, again = offsets[1:][first : first + BLOCK], resume[first : first + BLOCK]
-        _find(
-            origins,
-            directions,
-            *(x.numpy() for x in maps),
-            begin,
-            limit,
-            *scratch,
-            counts.numpy(),
-            again.numpy(),
-        )
+        _find(origins, directions, maps, begin, limit, scratch, counts.numpy(), again.numpy())
         ends = counts.cumsum(dim=0)
         total = int(ends[-1]) if len(ends) else 0
-        floats = [torch.empty(total) for _ in range(4)]
-        numbers = [torch.empty(total, dtype=torch.int32) for _ in range(2)]
-        out = (x.numpy() for x in (*floats, *numbers))
-        _place(first, directions, *scratch, limit, counts.numpy(), ends.numpy(), *out)
-        parts.append((*floats, *numbers))
+        found = [torch.empty(total) for _ in range(4)]
+        found += [torch.empty(total, dtype=torch.int32) for _ in range(2)]
+        _place(first, directions, scratch, limit, *arrays(counts, ends), tuple(arrays(*found)))
+        parts.append(found)
     t, delta, near, far, ray, voxel = (torch.cat(column) for column in zip(*parts, strict=True))
     return Crossings(t, delta, offsets.cumsum(dim=0), near, far, ray, voxel, resume)
 
 
-def render_voxels(
-    rays: Rays, voxels: Voxels, light: Light, stop: float, faint: float
-) -> tuple[Pixels, Tensor, Tensor]:
-    """See `methods.kernels.voxel_walk.render_voxels`."""
-    dtypes = {x.dtype for x in (rays.origins, rays.directions, light.density, light.harmonics)}
-    if dtypes != {torch.float32}:
-        raise ValueError(f"backend 'cpu' renders float32, got {dtypes}: use backend='reference'")
-    count = len(rays.origins)
-    pixels = Pixels.blank(count, 3)
-    crossed, shaded = (torch.zeros(count, dtype=torch.int32) for _ in range(2))
-    basis = spherical_harmonics(normalize(rays.directions, dim=1), backend="cpu")
-    terms = light.harmonics.shape[1]
-    given = (
-        rays.origins,
-        rays.directions,
-        basis.view(-1),
-        light.density,
-        light.harmonics.reshape(-1),
-    )
-    _render(
-        *(x.detach().contiguous().numpy() for x in given),
-        terms,
-        *(x.numpy() for x in (voxels.bricks, voxels.masks, voxels.leaves, voxels.clearance)),
-        f64(f32(stop)),
-        f64(f32(faint)),
-        pixels.values.numpy(),
-        pixels.depth_sum.numpy(),
-        pixels.alpha.numpy(),
-        crossed.numpy(),
-        shaded.numpy(),
-    )
-    return pixels, crossed, shaded
-
-
 @njit(cache=True)
-def _length(dx, dy, dz):
+def length_of(dx, dy, dz):
     """Length of a direction."""
     return f32(math.sqrt(f64(dx) ** 2 + f64(dy) ** 2 + f64(dz) ** 2))
 
@@ -161,9 +108,11 @@ def _empty_cells(cell, free, size):
 
 
 @njit(cache=True, error_model="numpy")
-def walk_ray(origin, direction, bricks, masks, leaves, clearance, start, limit, nears, fars, found):
-    """Write entry, exit and voxel of at most `limit` crossings; return their count, and the t to
-    resume from."""
+def walk_ray(origin, direction, maps, start, limit, out):
+    """Write entry, exit and voxel of at most `limit` crossings into the three arrays of `out`;
+    return their count, and the t to resume from."""
+    bricks, masks, leaves, clearance = maps
+    nears, fars, found = out
     size = bricks.shape[0] << 3
     width = f32(1) / f32(size)
     ox, oy, oz = origin[0], origin[1], origin[2]
@@ -173,7 +122,7 @@ def walk_ray(origin, direction, bricks, masks, leaves, clearance, start, limit, 
     ay, by = _slab(oy, sy, size, width)
     az, bz = _slab(oz, sz, size, width)
     t, far = max(max(ax, f32(0)), max(ay, az)), min(bx, min(by, bz))
-    length = _length(dx, dy, dz)
+    length = length_of(dx, dy, dz)
     finite = abs(ox) + abs(oy) + abs(oz) < INF and f32(0) < length < INF
     if not (finite and t < far < INF and start < far):
         return 0, INF
@@ -230,136 +179,32 @@ def walk_ray(origin, direction, bricks, masks, leaves, clearance, start, limit, 
 
 
 @njit(cache=True, parallel=True)
-def _find(
-    origins,
-    directions,
-    bricks,
-    masks,
-    leaves,
-    clearance,
-    start,
-    limit,
-    nears,
-    fars,
-    voxels,
-    counts,
-    resume,
-):
+def _find(origins, directions, maps, start, limit, scratch, counts, resume):
     rays = len(start)
+    nears, fars, voxels = scratch
     for chunk in prange((rays + CHUNK - 1) // CHUNK):
         used = chunk * CHUNK * limit
         for ray in range(chunk * CHUNK, min(rays, (chunk + 1) * CHUNK)):
+            out = nears[used:], fars[used:], voxels[used:]
             counts[ray], resume[ray] = walk_ray(
-                origins[ray],
-                directions[ray],
-                bricks,
-                masks,
-                leaves,
-                clearance,
-                start[ray],
-                limit,
-                nears[used:],
-                fars[used:],
-                voxels[used:],
+                origins[ray], directions[ray], maps, start[ray], limit, out
             )
             used += counts[ray]
 
 
 @njit(cache=True, parallel=True)
-def _place(
-    first,
-    directions,
-    nears,
-    fars,
-    voxels,
-    limit,
-    counts,
-    ends,
-    t,
-    delta,
-    near,
-    far,
-    ray_of,
-    voxel,
-):
+def _place(first, directions, scratch, limit, counts, ends, out):
     rays = len(counts)
+    nears, fars, voxels = scratch
+    t, delta, near, far, ray_of, voxel = out
     for chunk in prange((rays + CHUNK - 1) // CHUNK):
         begin = chunk * CHUNK
         shift = begin * limit - (ends[begin] - counts[begin])
         for ray in range(begin, min(rays, begin + CHUNK)):
-            length = _length(directions[ray, 0], directions[ray, 1], directions[ray, 2])
+            length = length_of(directions[ray, 0], directions[ray, 1], directions[ray, 2])
             for i in range(ends[ray] - counts[ray], ends[ray]):
                 enter, leave = nears[i + shift], fars[i + shift]
                 near[i], far[i], voxel[i] = enter, leave, voxels[i + shift]
                 t[i] = (enter + leave) * f32(0.5)
                 delta[i] = (leave - enter) * length
                 ray_of[i] = first + ray
-
-
-@njit(cache=True, parallel=True)
-def _render(
-    origins,
-    directions,
-    basis,
-    density,
-    harmonics,
-    terms,
-    bricks,
-    masks,
-    leaves,
-    clearance,
-    stop,
-    faint,
-    values,
-    depth_sum,
-    alpha,
-    crossed,
-    shaded,
-):
-    rays = len(origins)
-    for chunk in prange((rays + CHUNK - 1) // CHUNK):
-        near, far = np.empty(ROUND, np.float32), np.empty(ROUND, np.float32)
-        voxel = np.empty(ROUND, np.int32)
-        for ray in range(chunk * CHUNK, min(rays, (chunk + 1) * CHUNK)):
-            origin, direction = origins[ray], directions[ray]
-            length = _length(direction[0], direction[1], direction[2])
-            red, green, blue, depth, transmittance = 0.0, 0.0, 0.0, 0.0, 1.0
-            start, steps, colours = f32(0), 0, 0
-            while start < np.inf and transmittance > stop:
-                count, start = walk_ray(
-                    origin,
-                    direction,
-                    bricks,
-                    masks,
-                    leaves,
-                    clearance,
-                    start,
-                    ROUND,
-                    near,
-                    far,
-                    voxel,
-                )
-                # All that may be read is asked for before anything is waited for.
-                for i in range(count):
-                    prefetch(density, np.int64(voxel[i]))
-                    prefetch_row(harmonics, voxel[i] * terms * 3, terms * 3)
-                for i in range(count):
-                    if transmittance <= stop:
-                        break
-                    steps += 1
-                    sigma = density[voxel[i]]
-                    if sigma <= 0:
-                        continue
-                    delta = (far[i] - near[i]) * length
-                    weight = transmittance * -math.expm1(-f64(sigma * delta))
-                    transmittance -= weight
-                    depth += weight * f64((near[i] + far[i]) * f32(0.5))
-                    if weight > faint:
-                        colours += 1
-                        r, g, b = weighted_sum(harmonics, voxel[i], basis, ray, terms)
-                        red += weight * f64(sigmoid(r))
-                        green += weight * f64(sigmoid(g))
-                        blue += weight * f64(sigmoid(b))
-            values[ray, 0], values[ray, 1], values[ray, 2] = red, green, blue
-            depth_sum[ray], alpha[ray] = depth, 1 - transmittance
-            crossed[ray], shaded[ray] = steps, colours

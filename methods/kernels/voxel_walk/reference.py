@@ -7,21 +7,16 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from bench.types import Rays
-from methods.kernels.composite import composite, visible, weights
 from methods.kernels.march import PARALLEL
-from methods.kernels.spherical import shade
-from methods.kernels.types import Pixels
-from methods.kernels.voxel_walk import BRICK, Crossings, Light, Voxels
+from methods.kernels.voxel_walk import BRICK, Crossings, Voxels
 
 BLOCK = 1 << 11
 """Rays that are processed at a time."""
 
 
 def walk(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> Crossings:
-    """See `methods.kernels.voxel_walk.walk`."""
     count = len(start)
     parts = [
         _walk_block(Rays(rays.origins[block], rays.directions[block]), voxels, start[block], limit)
@@ -37,70 +32,33 @@ def walk(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> Crossings:
     return Crossings(middle, delta, offsets, near, far, ray.int(), voxel, resume, longest=longest)
 
 
-@torch.no_grad()
-def render_voxels(
-    rays: Rays, voxels: Voxels, light: Light, stop: float, faint: float
-) -> tuple[Pixels, Tensor, Tensor]:
-    """See `methods.kernels.voxel_walk.render_voxels`."""
-    crossings = walk(rays, voxels, torch.zeros_like(rays.origins[:, 0]), 3 * voxels.resolution)
-    sigma = light.density[crossings.voxel.long()]
-    crossed, _ = visible(sigma, crossings, stop=stop, backend="reference")
-    weight = weights(sigma, crossings, stop=stop, backend="reference")
-    shown = weight > faint
-    seen = shown.nonzero().squeeze(1)
-    values = sigma.new_zeros(len(sigma), 3)
-    towards = normalize(rays.directions, dim=1)[crossings.ray[seen].long()]
-    coefficients = light.harmonics[crossings.voxel[seen].long()]
-    values[seen] = shade(coefficients, towards, backend="reference").sigmoid()
-    pixels = composite(sigma, values, crossings, stop=stop, backend="reference")
-    shaded = torch.zeros(len(rays.origins), dtype=torch.int32, device=sigma.device)
-    shaded.index_add_(0, crossings.ray.long(), shown.int())
-    return pixels, crossed.int(), shaded
-
-
 def length(directions: Tensor) -> Tensor:
     """Lengths [R] of directions [R, 3]; in float64, so all backends round to the same float32."""
     return directions.double().norm(dim=-1).to(directions.dtype)
-
-
-def slopes(directions: Tensor) -> Tensor:
-    """Change of t per length along each axis, [R, 3]; 0 for a ray that does not move along it."""
-    parallel = directions.abs() < PARALLEL
-    return torch.where(parallel, 0, 1 / torch.where(parallel, 1, directions))
-
-
-def clip(rays: Rays, resolution: int, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The range of t inside the cube from `start` on, and whether to walk at all, [R] each.
-
-    If there is nothing to walk, both t are 0.
-    """
-    origins, directions = rays.origins, rays.directions
-    parallel, slope = directions.abs() < PARALLEL, slopes(directions)
-    width = 1 / origins.new_full((), resolution)
-    low, high = ((plane * width - origins) * slope for plane in (0, resolution))
-    inside = (origins >= 0) & (origins <= 1)
-    outside = torch.where(inside, -torch.inf, torch.inf)
-    first = torch.where(parallel, outside, torch.minimum(low, high))
-    last = torch.where(parallel, -outside, torch.maximum(low, high))
-    near, far = first.amax(dim=1).clamp(min=0), last.amin(dim=1)
-    reach = length(directions)
-    finite = origins.isfinite().all(dim=1) & (reach > 0) & reach.isfinite()
-    alive = finite & (near < far) & far.isfinite() & (start < far)
-    near, far = (torch.where(alive, t, 0) for t in (torch.maximum(near, start), far))
-    return near, far, alive
 
 
 def _walk_block(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> tuple[Tensor, ...]:
     """near, far and voxel [S] of crossings, counts [R], resume [R]."""
     origins, directions = rays.origins, rays.directions
     size, rows = voxels.resolution, len(origins)
-    parallel, slope = directions.abs() < PARALLEL, slopes(directions)
+    parallel = directions.abs() < PARALLEL
+    # Change of t per length along each axis, 0 for a ray that does not move along it: [R, 3].
+    slope = torch.where(parallel, 0, 1 / torch.where(parallel, 1, directions))
     width = 1 / origins.new_full((), size)
     edges = torch.arange(size + 1, device=origins.device).to(origins) * width
     planes = (edges - origins[..., None]) * slope[..., None]  # [R, 3, G + 1]
+
+    inside = (origins >= 0) & (origins <= 1)
+    outside = torch.where(inside, -torch.inf, torch.inf)
+    low, high = planes[..., 0], planes[..., -1]
+    enter = torch.where(parallel, outside, torch.minimum(low, high)).amax(dim=1).clamp(min=0)
+    leave = torch.where(parallel, -outside, torch.maximum(low, high)).amin(dim=1)
+    reach = length(directions)
+    alive = origins.isfinite().all(dim=1) & (reach > 0) & reach.isfinite()
+    alive &= (enter < leave) & leave.isfinite() & (start < leave)
+    near, far = (torch.where(alive, t, 0)[:, None] for t in (torch.maximum(enter, start), leave))
+
     planes = planes.sort(dim=2).values  # in the order in which the ray meets them
-    near, far, alive = clip(rays, size, start)
-    near, far = near[:, None], far[:, None]
     crossed = torch.where(parallel[..., None] | ~alive[:, None, None], torch.inf, planes)
     t = torch.cat((near, crossed.flatten(1)), dim=1)
     t = torch.minimum(torch.maximum(t, near), far).sort(dim=1).values

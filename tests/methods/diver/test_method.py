@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
 from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene
 from methods.diver.method import Diver
-from methods.diver.training import DiverLessons, DiverTraining
+from methods.diver.training import DiverLessons
 from methods.instant_ngp.stage1 import TrainedField
-from tests.methods.trainings import GRID, TAUGHT, TEACHER, goes_on_after_a_kill, quality
+from tests.methods.trainings import GRID, TAUGHT, TEACHER, quality
 
 LESSONS = DiverLessons(prune_rays=1 << 13)
 
@@ -80,25 +79,6 @@ def test_pruning_leaves_what_shows(ball_scene: Scene, teacher: TrainedField) -> 
     training.advance()  # moments and gradients have the rows that are left
 
 
-@pytest.mark.parametrize("stop_at", [3, 25])
-def test_a_killed_training_goes_on_as_if_it_had_not_been(
-    ball_scene: Scene, teacher: TrainedField, tmp_path: Path, stop_at: int
-) -> None:
-    def training() -> DiverTraining:
-        return method_of().begin(teacher, ball_scene, TAUGHT)
-
-    goes_on_after_a_kill(training, stop_at, tmp_path)  # before and after the pruning
-
-
-def test_a_training_is_found_again(ball_scene: Scene, shared_log: Log) -> None:
-    first = fitted(ball_scene, shared_log)
-    again = fitted(ball_scene, shared_log)
-    assert again.train_s == first.train_s > 0
-    camera = ball_scene.splits["test"].cameras[0]
-    pictures = [method.render(camera, NullProbe()).rgb for method in (first, again)]
-    assert torch.equal(*pictures)
-
-
 def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, shared_log: Log) -> None:
     half, single = (fitted(ball_scene, shared_log, stored=kind) for kind in ("bf16", "fp32"))
     corners = len(half.baked.model.vertices)
@@ -108,27 +88,6 @@ def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, shared_log: Log) -
     assert (half.settings()["precision"], single.settings()["precision"]) == ("bf16", "fp32")
     # Features are rounded to 1/256 of themselves: far less than a picture's error of 1/16.
     assert abs(quality(half, ball_scene) - quality(single, ball_scene)) < 0.1
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"resolution": 100},
-        {"resolution": 1024},
-        {"stored": "int8"},
-        {"faint": 1.0},
-        {"stop": 1.0},
-    ],
-)
-def test_wrong_settings_are_refused(wrong: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match="expected"):
-        method_of(**wrong)
-
-
-@pytest.mark.parametrize("wrong", [{"corner_rate": 0.0}, {"prune_at": 2.0}, {"prune_below": 1.0}])
-def test_wrong_lessons_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="expected"):
-        DiverLessons(**wrong)
 
 
 def test_a_teacher_with_more_features_than_a_corner_is_refused(

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene, SteerbenchError
+from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene, SteerbenchError, Unavailable
 from methods.gaussians.method import GaussianSplatting
 from methods.gaussians.start import anywhere, on_surfaces, spacing
 from methods.gaussians.training import Fitting, GaussianTraining
@@ -37,20 +37,10 @@ def test_they_learn_a_ball(ball_scene: Scene, shared_log: Log) -> None:
 
 @pytest.mark.slow
 def test_they_learn_from_scratch(ball_scene: Scene, quiet_log: Log) -> None:
-    fast = Fitting(means=1e-3, size=1.0)
-    before = fitted(
-        ball_scene,
-        quiet_log,
-        Budget("test", 1, 64, renderer_steps=1),
-        start="scratch",
-        fitting=fast,
-    )
-    after = fitted(
-        ball_scene,
-        quiet_log,
-        Budget("test", 1, 64, renderer_steps=200),
-        start="scratch",
-        fitting=fast,
+    scratch = {"start": "scratch", "fitting": Fitting(means=1e-3, size=1.0)}
+    before, after = (
+        fitted(ball_scene, quiet_log, Budget("test", 1, 64, renderer_steps=steps), **scratch)
+        for steps in (1, 200)
     )
     assert quality(after, ball_scene) > quality(before, ball_scene) + 3
 
@@ -121,6 +111,11 @@ def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, shared_log: Log) -
 def test_a_missing_checkpoint_is_one_line(ball_scene: Scene, quiet_log: Log) -> None:
     with pytest.raises(SteerbenchError, match="there is none"):
         fitted(ball_scene, quiet_log, checkpoint="nowhere.ply")
+
+
+def test_by_triton_there_are_none() -> None:
+    with pytest.raises(Unavailable, match="gaussians has no Triton kernels: use backend=auto"):
+        GaussianSplatting(grid=GRID, training=QUICK, fitting=Fitting(), count=9, backend="gpu")
 
 
 @pytest.mark.parametrize("wrong", [{"count": 0}, {"degree": 4}, {"stop": 1.0}])

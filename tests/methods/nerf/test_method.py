@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import pytest
 import torch
 from torch import nn
 
-from bench.types import Log, NullProbe, Scene
-from methods.instant_ngp.stage1 import TrainedField, train_field
+from bench.types import Log, Scene
 from methods.kernels.composite import STOP
 from methods.nerf.field import NerfField
 from methods.nerf.method import Nerf
 from methods.rendering.sampling import Sampling
 from methods.students.networks import NetworkLessons
-from methods.training import loop
 from tests.methods.conftest import Work
-from tests.methods.trainings import EXACT_TEACHER, TAUGHT, goes_on_after_a_kill, quality
+from tests.methods.trainings import EXACT_TEACHER, TAUGHT
 
 BUDGET = replace(TAUGHT, steps=80, renderer_steps=4)
 LONG = EXACT_TEACHER.training.march_step
@@ -35,16 +31,6 @@ def fitted(scene: Scene, log: Log, steps: int, **options: Any) -> Nerf:
     method = new_method(**options)
     method.fit(scene, replace(BUDGET, renderer_steps=steps), log)
     return method
-
-
-def trained_teacher(scene: Scene, log: Log) -> TrainedField:
-    return train_field(new_method().teacher, scene, BUDGET, log)
-
-
-@pytest.mark.slow
-def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log) -> None:
-    method = fitted(ball_scene, shared_log, steps=60)
-    assert quality(method, ball_scene) > 16
 
 
 def test_skipping_changes_no_picture_and_saves_products(ball_scene: Scene, shared_log: Log) -> None:
@@ -70,40 +56,9 @@ def products_of_a_sample() -> int:
     return trunk + 256 + (256 + 27) * 128 + 128 * 3
 
 
-def test_a_killed_training_goes_on_as_if_it_had_not_been(
-    ball_scene: Scene, shared_log: Log, tmp_path: Path
-) -> None:
-    teacher = trained_teacher(ball_scene, shared_log)
-
-    def training() -> loop.Training:
-        return new_method().begin(teacher, ball_scene, BUDGET)
-
-    goes_on_after_a_kill(training, 3, tmp_path)  # points, then rays
-
-
-def test_a_training_is_found_again(ball_scene: Scene, shared_log: Log) -> None:
-    first = fitted(ball_scene, shared_log, steps=2)
-    again = fitted(ball_scene, shared_log, steps=2, skip=True)
-    assert again.train_s == first.train_s > 0
-    camera = ball_scene.splits["test"].cameras[0]
-    pictures = [method.render(camera, NullProbe()).rgb for method in (first, again)]
-    assert torch.equal(*pictures)
-
-
 def test_size_is_that_of_the_published_network(ball_scene: Scene, shared_log: Log) -> None:
     method = fitted(ball_scene, shared_log, steps=2)
     assert method.sizes() == {"network": 4 * 595_844, "occupancy": 128**3 // 8}
-
-
-def test_a_stop_at_which_rays_never_begin_is_refused() -> None:
-    with pytest.raises(ValueError, match="stop: expected"):
-        new_method(stop=1.0)
-
-
-@pytest.mark.parametrize("share", [0.0, 1.5])
-def test_a_share_of_the_samples_that_is_none_is_refused(share: float) -> None:
-    with pytest.raises(ValueError, match="share: expected more than 0, up to 1"):
-        NetworkLessons(share=share)
 
 
 class PaperNerf(nn.Module):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,21 +11,18 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from bench.types import Log, NullProbe, Scene
+from bench.types import Log, Scene
 from methods.instant_ngp.stage1 import train_field
 from methods.kernels.encode import encode
 from methods.kernels.types import Occupancy
 from methods.nsvf.field import NsvfField
 from methods.nsvf.method import Nsvf
 from methods.students.networks import NetworkLessons
-from methods.training import loop
 from tests.methods.trainings import (
     EXACT_GRID,
     EXACT_TEACHER,
     TAUGHT,
     TEACHER,
-    goes_on_after_a_kill,
-    quality,
 )
 
 BUDGET = replace(TAUGHT, steps=80, renderer_steps=4)
@@ -71,18 +67,6 @@ def test_embeddings_are_those_of_grid_sample() -> None:
     torch.testing.assert_close(found[inside], wanted[inside], rtol=0, atol=1e-12)
 
 
-def test_features_are_continuous_across_faces_of_voxels() -> None:
-    field = two_thirds()
-    both = (field.index[:-1] >= 0) & (field.index[1:] >= 0)
-    x, y, z = both.nonzero().unbind(dim=1)
-    face = torch.stack((x + 1, y + 0.3, z + 0.8), dim=1).double() / 16
-    nudge = torch.tensor([1e-9, 0, 0], dtype=torch.float64)
-    (below, _), (above, _) = field.embedding(face - nudge), field.embedding(face + nudge)
-    # Embeddings below 1 change by at most 2 a voxel: 2e-9 * 16 * 2.
-    assert len(face) > 100
-    torch.testing.assert_close(below, above, rtol=0, atol=1e-7)
-
-
 def test_density_is_zero_outside_voxels() -> None:
     field = two_thirds()
     nn.init.constant_(field.opacity[-1].bias, 10.0)
@@ -123,32 +107,8 @@ def test_the_network_is_that_of_the_publication() -> None:
     torch.testing.assert_close(2 * shown - 1, colour(torch.cat((feature, seen), dim=1)), **close)
 
 
-@pytest.mark.slow
-def test_it_learns_a_ball(ball_scene: Scene, shared_log: Log) -> None:
-    method = fitted(ball_scene, shared_log, steps=60, start="teacher")
-    assert quality(method, ball_scene) > 16
-
-
-def test_a_killed_training_goes_on_as_if_it_had_not_been(
-    ball_scene: Scene, shared_log: Log, tmp_path: Path
-) -> None:
-    teacher = train_field(new_method().teacher, ball_scene, BUDGET, shared_log)
-
-    def training() -> loop.Training:
-        return new_method().begin(teacher, ball_scene, BUDGET)
-
-    goes_on_after_a_kill(training, 3, tmp_path)  # points, then rays
-
-
-def test_a_training_is_found_again_and_depends_on_its_step(
-    ball_scene: Scene, shared_log: Log
-) -> None:
-    first, again = (fitted(ball_scene, shared_log, steps=2) for _ in range(2))
-    assert again.train_s == first.train_s > 0
-    camera = ball_scene.splits["test"].cameras[0]
-    pictures = [method.render(camera, NullProbe()).rgb for method in (first, again)]
-    assert torch.equal(*pictures)
-    assert first.how.step == 0.5 / 32
+def test_its_step_is_in_voxels(ball_scene: Scene, shared_log: Log) -> None:
+    assert fitted(ball_scene, shared_log, steps=2).how.step == 0.5 / 32
     assert new_method(step=0.25).sampling(BUDGET).step == 0.25 / 32
 
 
@@ -164,20 +124,6 @@ def test_embeddings_begin_as_the_teachers_features(ball_scene: Scene, shared_log
     # The same table, read by another backend, and a factor: some roundings.
     scale = 32**-0.5 / math.pi / learned.std()
     torch.testing.assert_close(embeddings, scale * learned, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"resolution": 40}, "resolution: expected a multiple of 16"),
-        ({"step": 0.0}, "step: expected a length"),
-        ({"start": "zero"}, "start: expected random or teacher"),
-        ({"stop": 1.0}, "stop: expected"),
-    ],
-)
-def test_wrong_settings_are_refused(wrong: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        new_method(**wrong)
 
 
 def test_a_teacher_of_other_channels_is_no_start() -> None:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
-from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene, SteerbenchError
+from bench.types import EMPTY_ALPHA, Log, NullProbe, Scene, SteerbenchError
 from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import Pixels
@@ -18,7 +17,7 @@ from methods.plenoctree.octree import Octree
 from methods.plenoctree.start import Extraction, extract, fibonacci_sphere
 from methods.plenoctree.training import OctreeLessons, OctreeTraining
 from tests.methods.conftest import Work
-from tests.methods.trainings import TAUGHT, TEACHER, goes_on_after_a_kill, quality
+from tests.methods.trainings import TAUGHT, TEACHER, quality
 
 SMALL = {"resolution": 128, "degree": 1, "rays": 20_000, "points": 2, "directions": 8}
 Y00 = (4 * math.pi) ** -0.5
@@ -133,25 +132,6 @@ def test_only_what_rays_meet_is_changed(ball_scene: Scene, teacher: TrainedField
     assert not ((octree.light.density != before[0]) & ~met).any()
 
 
-def test_a_killed_training_goes_on_as_if_it_had_not_been(
-    ball_scene: Scene, teacher: TrainedField, tmp_path: Path
-) -> None:
-    budget = Budget("test", steps=1, samples=4096, renderer_steps=20)
-
-    def training() -> OctreeTraining:
-        octree = extracted(teacher, ball_scene)
-        return OctreeTraining(octree, ball_scene, budget, OctreeLessons(samples=4096), seed=0)
-
-    goes_on_after_a_kill(training, 9, tmp_path)
-
-
-def test_a_training_is_found_again(ball_scene: Scene, shared_log: Log) -> None:
-    first, again = fitted(ball_scene, shared_log), fitted(ball_scene, shared_log)
-    assert again.train_s == first.train_s > 0
-    camera = ball_scene.splits["test"].cameras[0]
-    assert torch.equal(first.render(camera, NullProbe()).rgb, again.render(camera, NullProbe()).rgb)
-
-
 def test_what_is_stored_is_chosen_afterwards(ball_scene: Scene, shared_log: Log) -> None:
     half, full = fitted(ball_scene, shared_log), fitted(ball_scene, shared_log, stored="fp32")
     assert full.train_s == half.train_s  # the same training
@@ -181,31 +161,3 @@ def test_a_field_in_which_nothing_is_seen_is_refused(
 ) -> None:
     with pytest.raises(SteerbenchError, match="no leaf has a weight of 2"):
         extracted(teacher, ball_scene, least_weight=2.0)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"resolution": 100},
-        {"resolution": 4096},
-        {"degree": 4},
-        {"directions": 3},
-        {"rays": 0},
-        {"least_weight": float("nan")},
-    ],
-)
-def test_wrong_settings_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="expected"):
-        Extraction(**SMALL | wrong)
-
-
-def test_a_wrong_precision_or_rate_is_refused() -> None:
-    given = {"teacher": TEACHER, "extraction": Extraction(), "training": OctreeLessons()}
-    with pytest.raises(ValueError, match="stored: expected fp16 or fp32, got 'fp8'"):
-        PlenOctree(**given, stored="fp8")
-    with pytest.raises(ValueError, match="stop: expected"):
-        PlenOctree(**given, stop=1.0)
-    with pytest.raises(ValueError, match="density_rate: expected"):
-        OctreeLessons(density_rate=-1.0)
-    with pytest.raises(ValueError, match="samples: expected"):
-        OctreeLessons(samples=0)

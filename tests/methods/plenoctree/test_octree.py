@@ -10,7 +10,8 @@ import torch
 from bench.cameras import cast
 from bench.types import Rays
 from methods.kernels.spherical import spherical_harmonics
-from methods.kernels.voxel_walk import Light, Voxels, render_voxels
+from methods.kernels.voxel_walk import Voxels
+from methods.plenoctree.kernels.voxel_light import Light, render_voxels
 from methods.plenoctree.octree import Octree
 from methods.rendering.frame import rays_at_matter
 from tests.methods.conftest import look_at_the_middle
@@ -56,42 +57,6 @@ def test_the_picture_of_the_visible_leaves_is_that_of_a_plain_loop_over_all() ->
         # 24 leaves at most, densities below 35, entry and exit rounded as in the kernel's cases.
         assert (pixels.values[ray].double() - colour).abs().max() < 1e-4
         assert abs(pixels.alpha[ray].item() - (1 - light)) < 1e-4
-
-
-def test_colours_change_with_the_direction_as_the_harmonics_do() -> None:
-    harmonics = torch.zeros(1, 4, 3)
-    harmonics[0, 3, 0] = 2.0  # Y_1,1 = sqrt(3 / 4 pi) x
-    octree = Octree(Voxels(torch.tensor([[4, 4, 4]]), 8), Light(torch.tensor([1e6]), harmonics))
-    directions = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    centre = torch.full((3,), 4.5 / 8)
-    pixels, _, _ = render_voxels(
-        Rays(centre - 3 * directions, 2 * directions), octree.voxels, octree.light
-    )
-    size = 2 * math.sqrt(3 / (4 * math.pi))
-    want = torch.tensor([size, -size, 0.0]).sigmoid()
-    torch.testing.assert_close(pixels.values[:, 0], want)
-    torch.testing.assert_close(pixels.values[:, 1], torch.full((3,), 0.5))
-
-
-def test_a_ball_of_leaves_lets_through_what_its_chords_do() -> None:
-    size, sigma = 64, 8.0
-    axis = (torch.arange(size) + 0.5) / size - 0.5
-    inside = torch.cartesian_prod(axis, axis, axis).norm(dim=1) < 0.3
-    leaves = torch.cartesian_prod(*[torch.arange(size)] * 3)[inside]
-    light = Light(torch.full((len(leaves),), sigma), torch.zeros(len(leaves), 1, 3))
-    rays = cast(look_at_the_middle(0.3, 0.2))
-    pixels, _, _ = render_voxels(rays, Voxels(leaves, size), light, stop=0.0)
-    towards = torch.nn.functional.normalize(rays.directions, dim=1)
-    offset = 0.5 - rays.origins
-    apart = (offset - (offset * towards).sum(1, keepdim=True) * towards).norm(dim=1)
-
-    def opacity(radius: float) -> torch.Tensor:
-        return 1 - torch.exp(-2 * sigma * (radius**2 - apart**2).clamp(min=0).sqrt())
-
-    # Leaves are those whose centre is inside: the ball is known to half a leaf's diagonal.
-    half = math.sqrt(3) / 2 / size
-    assert (pixels.alpha >= opacity(0.3 - half) - 1e-5).all()
-    assert (pixels.alpha <= opacity(0.3 + half) + 1e-5).all()
 
 
 def test_the_occupancy_has_every_leaf() -> None:

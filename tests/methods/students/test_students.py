@@ -1,17 +1,21 @@
-"""What the methods that start from a trained field have in common."""
+"""What the methods that start from a trained field have in common: a training survives a kill and
+is found again; wrong settings are refused."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
-from bench.types import Unavailable
+from bench.types import Budget, Log, NullProbe, Scene, Unavailable
 from methods.diver.method import Diver
 from methods.diver.training import DiverLessons
-from methods.gaussians.method import GaussianSplatting
-from methods.gaussians.training import Fitting
+from methods.instant_ngp.stage1 import train_field
 from methods.kilonerf.method import KiloNerf
 from methods.kilonerf.training import KiloLessons
 from methods.nerf.method import Nerf
@@ -19,38 +23,146 @@ from methods.nsvf.method import Nsvf
 from methods.plenoctree.method import PlenOctree
 from methods.plenoctree.start import Extraction
 from methods.plenoctree.training import OctreeLessons
+from methods.students.method import Student
 from methods.students.networks import NetworkLessons
+from methods.training import loop
 from sweeps.overrides import composed
-from tests.methods.trainings import EXACT_TEACHER, GRID, QUICK
+from tests.methods.trainings import (
+    EXACT_TEACHER,
+    TAUGHT,
+    TEACHER,
+    goes_on_after_a_kill,
+    quality,
+)
 
-OWN: dict[Any, dict[str, Any]] = {
-    Diver: {"training": DiverLessons()},
-    KiloNerf: {"training": KiloLessons()},
-    Nerf: {"training": NetworkLessons()},
-    Nsvf: {"training": NetworkLessons()},
-    PlenOctree: {"training": OctreeLessons(), "extraction": Extraction()},
+LEAVES = {"resolution": 128, "degree": 1, "rays": 20_000, "points": 2, "directions": 8}
+SMALL: dict[str, Callable[..., Student]] = {
+    "diver": partial(
+        Diver, teacher=TEACHER, training=DiverLessons(prune_rays=1 << 13), resolution=32
+    ),
+    "kilonerf": partial(
+        KiloNerf, teacher=TEACHER, training=KiloLessons(points_each=64, rate=1e-2), networks=4
+    ),
+    "nerf": partial(Nerf, teacher=EXACT_TEACHER, training=NetworkLessons()),
+    "nsvf": partial(
+        Nsvf,
+        teacher=EXACT_TEACHER,
+        training=NetworkLessons(rate=2e-3),
+        resolution=32,
+        start="random",
+    ),
+    "plenoctree": partial(
+        PlenOctree,
+        teacher=TEACHER,
+        training=OctreeLessons(samples=8192),
+        extraction=Extraction(**LEAVES),
+    ),
 }
-names = pytest.mark.parametrize("kind", OWN, ids=lambda kind: kind.kind)
+names = pytest.mark.parametrize("name", SMALL)
+
+
+def budget(name: str, steps: int) -> Budget:
+    exact = name in ("nerf", "nsvf")
+    return replace(TAUGHT, steps=80 if exact else TAUGHT.steps, renderer_steps=steps)
+
+
+@pytest.mark.parametrize(
+    ("name", "steps", "killed_at"),
+    [
+        ("diver", 40, 3),
+        ("diver", 40, 25),  # after its voxels were pruned
+        ("kilonerf", 12, 8),  # of which six from points
+        ("nerf", 4, 3),  # points, then rays
+        ("nsvf", 4, 3),
+        ("plenoctree", 20, 9),
+    ],
+)
+def test_a_killed_training_goes_on_as_if_it_had_not_been(
+    name: str, steps: int, killed_at: int, ball_scene: Scene, shared_log: Log, tmp_path: Path
+) -> None:
+    given = budget(name, steps)
+    trained = train_field(SMALL[name]().teacher, ball_scene, given, shared_log)
+
+    def training() -> loop.Training:
+        return SMALL[name]().begin(trained, ball_scene, given)
+
+    goes_on_after_a_kill(training, killed_at, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["nerf", "nsvf"])
+def test_a_large_network_learns_a_ball(name: str, ball_scene: Scene, shared_log: Log) -> None:
+    method = SMALL[name](**{"start": "teacher"} if name == "nsvf" else {})
+    method.fit(ball_scene, budget(name, 60), shared_log)
+    assert quality(method, ball_scene) > 16
 
 
 @names
-def test_by_triton_there_is_none(kind: Any) -> None:
-    with pytest.raises(Unavailable, match=f"{kind.kind} has no Triton kernels: use backend=auto"):
-        kind(teacher=replace(EXACT_TEACHER, backend="gpu"), **OWN[kind])
-
-
-def test_by_triton_there_are_no_gaussians() -> None:
-    with pytest.raises(Unavailable, match="gaussians has no Triton kernels"):
-        GaussianSplatting(grid=GRID, training=QUICK, fitting=Fitting(), count=9, backend="gpu")
+def test_a_training_is_found_again(name: str, ball_scene: Scene, shared_log: Log) -> None:
+    first, again = SMALL[name](), SMALL[name](stop=1e-2)
+    for method in (first, again):
+        method.fit(ball_scene, budget(name, 2), shared_log)
+    assert again.train_s == first.train_s > 0
+    camera = ball_scene.splits["test"].cameras[0]
+    pictures = [method.render(camera, NullProbe()).rgb for method in (first, again)]
+    assert torch.equal(*pictures)
 
 
 @names
-@pytest.mark.parametrize("wrong", [{"stop": 1.0}, {"steps": 0}], ids=str)
-def test_wrong_settings_are_refused(kind: Any, wrong: dict[str, float]) -> None:
+def test_by_triton_there_is_none(name: str) -> None:
+    with pytest.raises(Unavailable, match=f"{name} has no Triton kernels: use backend=auto"):
+        SMALL[name](teacher=replace(EXACT_TEACHER, backend="gpu"))
+
+
+@names
+def test_a_step_of_the_full_budget_has_the_rays_of_the_release(name: str) -> None:
+    assert composed([f"method={name}", "budget=full"]).method.training.max_rays == 16_384
+
+
+REFUSED: list[tuple[str, dict[str, Any]]] = [
+    *((name, {"stop": 1.0}) for name in SMALL),
+    *((name, {"steps": 0}) for name in SMALL),
+    ("diver", {"resolution": 100}),
+    ("diver", {"resolution": 1024}),
+    ("diver", {"stored": "int8"}),
+    ("diver", {"faint": 1.0}),
+    ("kilonerf", {"networks": 0}),
+    ("kilonerf", {"networks": 33}),
+    ("nsvf", {"resolution": 40}),
+    ("nsvf", {"step": 0.0}),
+    ("nsvf", {"start": "zero"}),
+    ("plenoctree", {"stored": "fp8"}),
+]
+
+
+@pytest.mark.parametrize(("name", "wrong"), REFUSED, ids=str)
+def test_wrong_settings_are_refused(name: str, wrong: dict[str, Any]) -> None:
+    (setting,) = wrong
+    with pytest.raises(ValueError, match=f"{setting}: expected"):
+        SMALL[name](**wrong)
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrong"),
+    [
+        (DiverLessons, {"corner_rate": 0.0}),
+        (DiverLessons, {"prune_at": 2.0}),
+        (DiverLessons, {"prune_below": 1.0}),
+        (KiloLessons, {"points_each": 0}),
+        (KiloLessons, {"view_cost": -1.0}),
+        (KiloLessons, {"points": 2.0}),
+        (NetworkLessons, {"share": 0.0}),
+        (NetworkLessons, {"share": 1.5}),
+        (OctreeLessons, {"density_rate": -1.0}),
+        (OctreeLessons, {"samples": 0}),
+        (Extraction, LEAVES | {"resolution": 100}),
+        (Extraction, LEAVES | {"resolution": 4096}),
+        (Extraction, LEAVES | {"degree": 4}),
+        (Extraction, LEAVES | {"directions": 3}),
+        (Extraction, LEAVES | {"rays": 0}),
+        (Extraction, LEAVES | {"least_weight": float("nan")}),
+    ],
+)
+def test_wrong_lessons_are_refused(kind: Any, wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="expected"):
-        kind(teacher=EXACT_TEACHER, **OWN[kind] | wrong)
-
-
-@names
-def test_a_step_of_the_full_budget_has_the_rays_of_the_release(kind: Any) -> None:
-    assert composed([f"method={kind.kind}", "budget=full"]).method.training.max_rays == 16_384
+        kind(**wrong)

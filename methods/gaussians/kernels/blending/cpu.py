@@ -17,7 +17,7 @@ from torch import Tensor
 
 from methods.gaussians.kernels.blending import LARGEST_ALPHA
 from methods.gaussians.kernels.projection import LEAST_ALPHA, Ellipses
-from methods.kernels.cpu import f32, i32
+from methods.kernels.cpu import arrays, check_float32, f32, i32
 from methods.kernels.types import Pixels
 
 TILE = 16  # pixels, along both axes
@@ -35,13 +35,9 @@ LARGEST, LEAST = f32(LARGEST_ALPHA), f32(LEAST_ALPHA)
 ZERO, ONE, HALF = f32(0), f32(1), f32(0.5)
 LOG2_E = f32(math.log2(math.e))
 # 2^x on [0, 1], least-squares fit of the relative error: below 2e-9 before rounding.
-P0, P1, P2, P3 = (
-    f32(1.000000001815494),
-    f32(0.693146987057476),
-    f32(0.24022979581422),
-    f32(0.05548352472),
-)
-P4, P5, P6 = f32(0.009678472554120963), f32(0.001244308151184), f32(0.000216906091570)
+P0, P1, P2 = f32(1.000000001815494), f32(0.693146987057476), f32(0.24022979581422)
+P3, P4 = f32(0.05548352472), f32(0.009678472554120963)
+P5, P6 = f32(0.001244308151184), f32(0.000216906091570)
 
 
 def blend(
@@ -52,42 +48,25 @@ def blend(
     height: int,
     stop: float,
 ) -> Pixels:
-    """See `methods.gaussians.kernels.blending.blend`."""
-    if not opacities.dtype == colours.dtype == ellipses.centres.dtype == torch.float32:
-        raise ValueError("backend 'cpu' blends float32: use backend='reference'")
     given = ellipses.centres, ellipses.conics, opacities, colours
+    check_float32(*given)
     return Pixels(*_Blend.apply(*given, ellipses.depth, ellipses.extents, width, height, stop))
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx, centres, conics, opacities, colours, depth, extents, width, height, stop):
-        depth = depth.contiguous()
-        inputs = [x.detach().contiguous() for x in (centres, conics, opacities, colours, depth)]
-        extents = extents.contiguous()
-        order = torch.from_numpy(_by_depth(depth.numpy(), extents.numpy()))
+        given = arrays(centres, conics, opacities, colours, depth, extents)
+        order = torch.from_numpy(_by_depth(*given[4:]))
         packed = torch.empty(len(order), FIELDS)
         boxes = torch.empty(len(order), 4, dtype=torch.int32)
-        _pack(
-            order.numpy(),
-            *(x.numpy() for x in (*inputs, extents)),
-            width,
-            height,
-            packed.numpy(),
-            boxes.numpy(),
-        )
+        _pack(order.numpy(), *given, width, height, packed.numpy(), boxes.numpy())
         lists = _Lists(boxes, width, height)
         pixels = Pixels.blank(width * height, 3)
-        _forward(
-            packed.numpy(),
-            boxes.numpy(),
-            *lists.arrays,
-            f32(stop),
-            numba.get_num_threads(),
-            pixels.values.numpy().reshape(height, width, 3),
-            pixels.depth_sum.numpy().reshape(height, width),
-            pixels.alpha.numpy().reshape(height, width),
-        )
+        parts = pixels.values, pixels.depth_sum, pixels.alpha
+        out = arrays(*(x.view(height, width, *x.shape[1:]) for x in parts))
+        how = f32(stop), numba.get_num_threads()
+        _forward(packed.numpy(), boxes.numpy(), *lists.arrays, *how, *out)
         ctx.save_for_backward(order, packed, boxes, pixels.values, pixels.alpha)
         ctx.lists, ctx.size, ctx.stop, ctx.count = lists, (height, width), stop, len(depth)
         ctx.mark_non_differentiable(pixels.depth_sum)
@@ -100,25 +79,12 @@ class _Blend(torch.autograd.Function):
         gain = (grad_values * values).sum(dim=1) + grad_alpha * alpha
         tiles = ctx.lists
         sums = np.empty((len(tiles.ranks), SUMS), np.float32)
-        _backward(
-            packed.numpy(),
-            boxes.numpy(),
-            *tiles.arrays,
-            f32(ctx.stop),
-            numba.get_num_threads(),
-            grad.numpy().reshape(*ctx.size, 4),
-            gain.numpy().reshape(ctx.size),
-            sums,
-        )
+        light = grad.numpy().reshape(*ctx.size, 4), gain.numpy().reshape(ctx.size)
+        how = f32(ctx.stop), numba.get_num_threads()
+        _backward(packed.numpy(), boxes.numpy(), *tiles.arrays, *how, *light, sums)
         grads = [torch.zeros(ctx.count, n) for n in (2, 3, 1, 3)]
-        _collect(
-            order.numpy(),
-            packed.numpy(),
-            tiles.first,
-            tiles.slots,
-            sums,
-            *(x.numpy() for x in grads),
-        )
+        given = order.numpy(), packed.numpy(), tiles.first, tiles.slots, sums
+        _collect(*given, *arrays(*grads))
         centres, conics, opacities, colours = grads
         return centres, conics, opacities.squeeze(1), colours, None, None, None, None, None
 
@@ -314,17 +280,9 @@ def _backward(packed, boxes, offsets, ranks, stop, threads, grad, gain, sums):
                     state[PIXELS + at] = gain[row, column]
                     for k in range(4):
                         state[(2 + k) * PIXELS + at] = grad[row, column, k]
-            entries = offsets[tile], offsets[tile + 1]
-            _tile_backward(
-                packed,
-                boxes,
-                ranks[entries[0] : entries[1]],
-                stop,
-                top,
-                left,
-                state,
-                sums[entries[0] : entries[1]],
-            )
+            first, end = offsets[tile], offsets[tile + 1]
+            own, total = ranks[first:end], sums[first:end]
+            _tile_backward(packed, boxes, own, stop, top, left, state, total)
 
 
 @njit(cache=True, error_model="numpy")  # saves a branch at the division

@@ -22,7 +22,6 @@ def blend(
     height: int,
     stop: float,
 ) -> Pixels:
-    """See `methods.gaussians.kernels.blending.blend`."""
     order = ellipses.depth.argsort(stable=True)
     bands = []
     for top in range(0, height, BAND):

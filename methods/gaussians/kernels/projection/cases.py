@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from functools import partial
 
 import torch
@@ -11,14 +10,23 @@ from torch import Tensor
 from torch.func import jacrev, vmap
 
 from bench.cameras import project
-from bench.case import DTYPES, U32, Agreement, Case, Property, on_backends
+from bench.case import (
+    DTYPES,
+    U32,
+    Bound,
+    Case,
+    Given,
+    Operation,
+    Property,
+    largest_error,
+    on_backends,
+    placed,
+)
 from bench.cases import CAMERAS
-from bench.types import Camera
 from methods.gaussians.kernels.projection import (
     BLUR,
     FRUSTUM,
     LEAST_ALPHA,
-    Ellipses,
     covariances,
     project_gaussians,
 )
@@ -28,40 +36,60 @@ CAMERA = CAMERAS["looking at the cube"]
 FAR = 3.0
 """Bound on the variance of an ellipse over the least, `BLUR`; scales and depths ensure it."""
 
-Gaussians = tuple[Tensor, Tensor, Tensor, Tensor]
-"""Means, scales, rotations, opacities."""
+AREA = (
+    "conics, of an area that loses a factor of xx yy / area < 64, after 30 roundings of numbers "
+    "below 4: 8,000 u"
+)
+
+
+def _ellipses(given: Given, backend: str) -> tuple[Tensor, ...]:
+    ellipses, size = project_gaussians(**given, backend=backend), given["camera"].width
+    return ellipses.centres / size, ellipses.conics, ellipses.depth, ellipses.extents / size
+
+
+PROJECT = Operation(
+    "gaussian projection",
+    served(__package__),
+    _ellipses,
+    {
+        "centres": Bound("in widths of the picture, 30 roundings of numbers below 4", 240 * U32),
+        "conics": Bound(AREA, 8000 * U32),
+        "depths": Bound("10 roundings of numbers below 4, by both", 80 * U32),
+        "extents": Bound("in widths of the picture, 60 roundings of numbers below 4", 480 * U32),
+    },
+)
+
+
+def _gradients(given: Given, backend: str) -> tuple[Tensor, ...]:
+    """Of means, scales and rotations, in units of the largest of each kind."""
+    names = ("means", "scales", "rotations")
+    asked = {name: given[name].clone().requires_grad_() for name in names}
+    ellipses = project_gaussians(**{**given, **asked}, backend=backend)
+    results, generator = (ellipses.centres, ellipses.conics), torch.Generator().manual_seed(1)
+    towards = [torch.randn(*x.shape, generator=generator).to(x) for x in results]
+    grads = torch.autograd.grad(results, list(asked.values()), towards)
+    return tuple(grad / grad.abs().max() if len(grad) else grad for grad in grads)
+
+
+BACKWARD = Operation(
+    "gaussian projection backward",
+    served(__package__),
+    _gradients,
+    dict.fromkeys(
+        ("means", "scales", "rotations"),
+        Bound(f"relative to the largest of its kind, twice that of {AREA}", 16000 * U32),
+    ),
+)
 
 
 def cases() -> list[Case]:
     """No, one and many Gaussians, some behind the camera; circles; slopes by autograd."""
-    backends = served(__package__)
-    forward = Agreement(
-        "gaussian projection",
-        backends,
-        "centres in widths of the picture and conics, of an area that loses a factor of "
-        "xx yy / area < 64, after 30 roundings of numbers below 4: 8,000 u",
-    )
-    backward = Agreement(
-        "gaussian projection backward",
-        backends,
-        "relative to the largest gradient of its kind: conics, off by 8,000 u, twice",
-    )
     found = []
     for count in (0, 1, 1000, 1 << 16):
         name, items = f"{count:,} Gaussians", count if count > 1000 else None
-        found += [
-            forward.case(name, partial(_ellipses, count), 8000 * U32, items=items),
-            backward.case(name, partial(_gradients, count), 16000 * U32, items=items),
-        ]
-    circle = Property(
-        "gaussian projection",
-        "a round Gaussian on the axis is an ellipse of known axes, circles but for fx and fy",
-        "relative: 30 roundings, and twice that of its depth, which a place near 1 has to 2 u",
-        on_backends(30, backends=backends),
-    )
-    for scale, depth in ((1e-3, 0.5), (0.1, 1.0), (0.02, 5.0)):
-        name = f"scale {scale:g} at depth {depth:g}"
-        found.append(circle.case(name, partial(_circle_error, scale, depth)))
+        for operation in (PROJECT, BACKWARD):
+            found += operation.cases(name, partial(draw, count), items=items)
+    backends = served(__package__)
     slopes = Property(
         "gaussian projection",
         "the ellipse is that of the derivative of the projection, by autograd",
@@ -80,7 +108,7 @@ def cases() -> list[Case]:
     return found
 
 
-def draw(count: int, device: str = "cpu") -> Gaussians:
+def draw(count: int) -> Given:
     """Gaussians seen by `CAMERA`, one to four pixels wide, in and around its picture; an eighth of
     them are behind it."""
     generator = torch.Generator().manual_seed(count)
@@ -91,93 +119,38 @@ def draw(count: int, device: str = "cpu") -> Gaussians:
     half = torch.tensor((0.5 * CAMERA.width / CAMERA.fx, 0.5 * CAMERA.height / CAMERA.fy))
     depth[: count // 8] *= -1
     local = torch.cat((depth[:, None] * half * across, depth[:, None]), dim=1)
-    means = local @ CAMERA.c2w[:, :3].T + CAMERA.c2w[:, 3]
-    scales = torch.rand(count, 3, generator=generator) * 0.5 / CAMERA.fx + 1e-3
-    rotations = torch.randn(count, 4, generator=generator)
-    opacities = torch.rand(count, generator=generator)
-    return means.to(device), scales.to(device), rotations.to(device), opacities.to(device)
-
-
-def _projected(given: Sequence[Tensor], camera: Camera, backend: str) -> Ellipses:
-    means, scales, rotations, opacities = given
-    return project_gaussians(means, scales, rotations, opacities, camera, backend=backend)
-
-
-def _on(device: str) -> Camera:
-    return Camera(CAMERA.c2w.to(device), *(getattr(CAMERA, name) for name in INTRINSICS))
-
-
-INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height")
-
-
-def _ellipses(count: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
-    given, camera = draw(count, device), _on(device)
-
-    def call(backend: str) -> tuple[Tensor, ...]:
-        found, size = _projected(given, camera, backend), camera.width
-        return found.centres / size, found.conics, found.depth, found.extents / size
-
-    return call
-
-
-def _gradients(count: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
-    means, scales, rotations, opacities = draw(count, device)
-    camera, generator = _on(device), torch.Generator().manual_seed(1)
-    towards = [torch.randn(count, n, generator=generator).to(device) for n in (2, 3)]
-
-    def gradients(backend: str) -> tuple[Tensor, ...]:
-        given = [x.detach().requires_grad_() for x in (means, scales, rotations)]
-        found = _projected([*given, opacities], camera, backend)
-        return torch.autograd.grad((found.centres, found.conics), given, towards)
-
-    largest = [float(x.abs().max()) if count else 1.0 for x in gradients("reference")]
-    return lambda backend: tuple(
-        grad.div_(size) for grad, size in zip(gradients(backend), largest, strict=True)
-    )
-
-
-def _circle_error(scale: float, depth: float, backend: str, device: str, precision: str) -> float:
-    camera, dtype = _on(device), DTYPES[precision]
-    place = camera.c2w[:, 3] + depth * camera.c2w[:, 2]
-    turn = torch.randn(1, 4, generator=torch.Generator().manual_seed(0))
-    given = place[None], torch.full((1, 3), scale), turn, torch.tensor([1.0])
-    found = _projected([x.to(device, dtype) for x in given], camera, backend)
-    # The actual depth, because the position was rounded to float32.
-    z = float((place - camera.c2w[:, 3]).double() @ camera.c2w[:, 2].double())
-    size = float(given[1][0, 0].to(dtype)) / z
-    across, down = (camera.fx * size) ** 2 + BLUR, (camera.fy * size) ** 2 + BLUR
-    reach = 2 * math.log(1 / LEAST_ALPHA)
-    a, b, c = found.conics[0].tolist()
-    wide, tall = found.extents[0].tolist()
-    errors = (
-        a * across - 1,
-        b * math.sqrt(across * down),
-        c * down - 1,
-        wide / math.sqrt(reach * across) - 1,
-        tall / math.sqrt(reach * down) - 1,
-    )
-    return max(abs(error) for error in errors)
+    return {
+        "means": local @ CAMERA.c2w[:, :3].T + CAMERA.c2w[:, 3],
+        "scales": torch.rand(count, 3, generator=generator) * 0.5 / CAMERA.fx + 1e-3,
+        "rotations": torch.randn(count, 4, generator=generator),
+        "opacities": torch.rand(count, generator=generator),
+        "camera": CAMERA,
+    }
 
 
 def _slopes_error(backend: str, device: str, precision: str) -> float:
-    camera, dtype = _on(device), DTYPES[precision]
-    means, scales, rotations, opacities = (x.to(dtype) for x in draw(1000, device))
+    *drawn, camera = placed(draw(1000), device).values()
+    means, scales, rotations, opacities = (x.to(DTYPES[precision]) for x in drawn)
     pixels, depth = project(camera, means)
     size = pixels.new_tensor((camera.width, camera.height))
     seen = (depth > 0.1) & ((pixels > 0) & (pixels < size)).all(dim=1) & (opacities > 0.01)
     given = [x[seen] for x in (means, scales, rotations, opacities)]
-    found = _projected(given, camera, backend)
-    exact = [x.double().cpu() for x in given]
-    here = CAMERA
+    ellipses = project_gaussians(*given, camera, backend=backend)
+    means, scales, rotations, opacities = (x.double().cpu() for x in given)
 
     def centre(point: Tensor) -> Tensor:
-        return project(here, point[None])[0][0]
+        return project(CAMERA, point[None])[0][0]
 
-    slopes = vmap(jacrev(centre))(exact[0])  # [n, 2, 3]
-    spread = slopes @ covariances(*exact[1:3]) @ slopes.transpose(1, 2)
-    inverse = (spread + BLUR * torch.eye(2, dtype=torch.float64)).inverse()
+    slopes = vmap(jacrev(centre))(means)  # [n, 2, 3]
+    spread = slopes @ covariances(scales, rotations) @ slopes.transpose(1, 2)
+    spread += BLUR * torch.eye(2, dtype=torch.float64)
+    inverse = spread.inverse()
     conics = torch.stack((inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]), dim=1)
-    return (found.conics.double().cpu() - conics).abs().max().item()
+    reach = 2 * (opacities / LEAST_ALPHA).log()[:, None]
+    extents = (reach * spread.diagonal(dim1=1, dim2=2)).sqrt()
+    width, (exact, z) = camera.width, project(CAMERA, means)
+    got = ellipses.centres / width, ellipses.conics, ellipses.depth, ellipses.extents / width
+    return largest_error([x.cpu() for x in got], (exact / width, conics, z, extents / width))
 
 
 HIDDEN: dict[str, dict[str, float]] = {
@@ -192,7 +165,7 @@ HIDDEN: dict[str, dict[str, float]] = {
 
 
 def _shown(changed: dict[str, float], backend: str, device: str, precision: str) -> float:
-    camera, dtype = _on(device), DTYPES[precision]
+    camera, dtype = placed(CAMERA, device), DTYPES[precision]
     depth, scale = changed.get("depth", 1.0), changed.get("scale", 0.01)
     place = camera.c2w[:, 3] + depth * camera.c2w[:, 2]
     opacity = torch.tensor([changed.get("opacity", 0.5)])
@@ -200,7 +173,7 @@ def _shown(changed: dict[str, float], backend: str, device: str, precision: str)
         x.to(device, dtype).requires_grad_()
         for x in (place[None], torch.full((1, 3), scale), torch.tensor([[1.0, 0, 0, 0]]))
     ]
-    found = _projected([*given, opacity.to(device, dtype)], camera, backend)
+    found = project_gaussians(*given, opacity.to(device, dtype), camera, backend=backend)
     (found.centres.sum() + found.conics.sum()).backward()
     wrong = found.extents.count_nonzero().item()
     return float(

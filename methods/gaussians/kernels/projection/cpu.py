@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bench.types import Camera
 from methods.gaussians.kernels.projection import BLUR, FRUSTUM, LEAST_ALPHA, NEAR, Ellipses
-from methods.kernels.cpu import f32
+from methods.kernels.cpu import arrays, check_float32, f32
 
 ZERO, ONE, TWO = f32(0), f32(1), f32(2)
 BLUR32, NEAR32, INFINITE = f32(BLUR), f32(NEAR), f32(np.inf)
@@ -22,9 +22,7 @@ BLOCK = 256
 def project_gaussians(
     means: Tensor, scales: Tensor, rotations: Tensor, opacities: Tensor, camera: Camera
 ) -> Ellipses:
-    """See `methods.gaussians.kernels.projection.project_gaussians`."""
-    if means.dtype != torch.float32:
-        raise ValueError(f"backend 'cpu' projects float32, got {means.dtype}")
+    check_float32(means, scales, rotations)
     return Ellipses(*_Project.apply(means, scales, rotations, opacities, camera))
 
 
@@ -36,12 +34,7 @@ class _Project(torch.autograd.Function):
         count = len(means)
         found = [torch.empty(count, size) for size in (2, 3, 1, 2)]
         reach = 2 * (opacities.detach() / LEAST_ALPHA).log()  # NaN or below 0: too faint
-        _forward(
-            *(x.numpy() for x in inputs),
-            reach[:, None].numpy(),
-            *view,
-            *(x.numpy() for x in found),
-        )
+        _forward(*arrays(*inputs, reach[:, None]), *view, *arrays(*found))
         centres, conics, depth, extents = found
         depth = depth.squeeze(1)
         ctx.save_for_backward(*inputs, conics, extents)
@@ -53,13 +46,9 @@ class _Project(torch.autograd.Function):
     def backward(ctx, grad_centres, grad_conics, _depth, _extents):
         *inputs, conics, extents = ctx.saved_tensors
         grads = [torch.empty_like(x) for x in inputs]
-        _backward(
-            *(x.numpy() for x in (*inputs, conics, extents)),
-            *ctx.view,
-            grad_centres.contiguous().numpy(),
-            grad_conics.contiguous().numpy(),
-            *(x.numpy() for x in grads),
-        )
+        parts = inputs, (conics, extents), (grad_centres, grad_conics), grads
+        given, ellipses, asked, out = (tuple(arrays(*part)) for part in parts)
+        _backward(given, ellipses, *ctx.view, asked, out)
         return (*grads, None, None)
 
 
@@ -189,21 +178,11 @@ def _project(block, size, world, origin, view):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def _backward(
-    means,
-    scales,
-    rotations,
-    conics,
-    extents,
-    world,
-    origin,
-    view,
-    grad_centres,
-    grad_conics,
-    grad_means,
-    grad_scales,
-    grad_rotations,
-):
+def _backward(given, ellipses, world, origin, view, asked, grads):
+    means, scales, rotations = given
+    conics, extents = ellipses
+    grad_centres, grad_conics = asked
+    grad_means, grad_scales, grad_rotations = grads
     count = len(means)
     for chunk in prange((count + BLOCK - 1) // BLOCK):
         first, size = chunk * BLOCK, min(BLOCK, count - chunk * BLOCK)

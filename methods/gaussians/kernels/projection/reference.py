@@ -19,7 +19,6 @@ from methods.gaussians.kernels.projection import (
 def project_gaussians(
     means: Tensor, scales: Tensor, rotations: Tensor, opacities: Tensor, camera: Camera
 ) -> Ellipses:
-    """See `methods.gaussians.kernels.projection.project_gaussians`."""
     with torch.no_grad():
         centres, conics, depth, _ = _ellipses(means, scales, rotations, opacities, camera)
         shown = (depth > NEAR) & (opacities >= LEAST_ALPHA)

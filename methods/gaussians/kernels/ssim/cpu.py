@@ -12,7 +12,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from methods.gaussians.kernels.ssim import C1, C2, REACH, WINDOW
-from methods.kernels.cpu import f32
+from methods.kernels.cpu import check_float32, f32
 
 WEIGHTS = np.array(WINDOW, np.float32)
 MARGIN = 3 * REACH
@@ -20,9 +20,9 @@ ONE, TWO, C1_32, C2_32 = f32(1), f32(2), f32(C1), f32(C2)
 
 
 def ssim(picture: Tensor, target: Tensor) -> Tensor:
-    """See `methods.gaussians.kernels.ssim.ssim`."""
-    if not picture.dtype == target.dtype == torch.float32 or target.requires_grad:
-        raise ValueError("backend 'cpu' compares float32, with a gradient of the picture alone")
+    check_float32(picture, target)
+    if target.requires_grad:
+        raise ValueError("backend 'cpu' gives no gradient for target: use backend='reference'")
     return _Ssim.apply(picture, target.contiguous())
 
 

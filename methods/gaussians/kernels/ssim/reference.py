@@ -10,7 +10,6 @@ from methods.gaussians.kernels.ssim import C1, C2, REACH, WINDOW
 
 
 def ssim(picture: Tensor, target: Tensor) -> Tensor:
-    """See `methods.gaussians.kernels.ssim.ssim`."""
     x, y = picture.movedim(-1, 0), target.movedim(-1, 0)
     mean_x, mean_y, xx, yy, xy = _blur(torch.cat((x, y, x * x, y * y, x * y))).split(3)
     variances = xx - mean_x**2 + yy - mean_y**2

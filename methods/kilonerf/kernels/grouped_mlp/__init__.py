@@ -23,8 +23,6 @@ from methods.kernels.dispatch import implementation
 HIDDEN = 32
 """Outputs of every layer except density and colour."""
 
-LAYERS = ("in", "mid", "density", "feature", "direction", "colour")
-
 
 @dataclass(frozen=True)
 class Groups:
@@ -42,7 +40,7 @@ class Groups:
 
 @dataclass(frozen=True)
 class Networks:
-    """N networks with the layers `LAYERS`.
+    """N networks with the layers in, mid, density, feature, direction and colour.
 
     Attributes:
         weights: [N, I, O] for each layer, from I inputs to O outputs.

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from bench.case import U32, Agreement, Case
+from bench.case import U32, Bound, Case, Given, Operation
 from methods.kernels.dispatch import served
 from methods.kilonerf.kernels.grouped_mlp import (
     HIDDEN,
@@ -21,14 +20,11 @@ from methods.kilonerf.kernels.grouped_mlp import (
     order,
 )
 
-SIZES = {"in": (63, 32), "mid": (32, 32), "density": (32, 1)} | {
+SHAPES = {"in": (63, 32), "mid": (32, 32), "density": (32, 1)} | {
     "feature": (32, 32),
     "direction": (59, 32),
     "colour": (32, 3),
 }
-BOUND = 1 / 8
-"""Largest weight and bias in the cases, so that no sum exceeds 8 in any layer."""
-
 KINDS = {
     "some samples without a network": (1000, 7),
     "no sample": (0, 3),
@@ -38,12 +34,155 @@ KINDS = {
 }
 """Numbers of samples and networks."""
 
-MANY = 1_200_000, 2000
+MANY = 150_000, 250
+ANGLES = 188 * U32
+"""An angle of at most 512 is rounded by none, reduced with an error below 4 u, and its sine within
+4 u; each of 4 doublings doubles the error and adds 4 u: 16 x 8 u + 60 u."""
+
+EXACT = Bound("whole numbers: 0", 0.0)
+LOCATE = Operation(
+    "locate",
+    served(__package__),
+    lambda given, backend: locate(**given, backend=backend),
+    {
+        "networks": Bound("a quotient is rounded alike by all: 0", 0.0),
+        "positions": Bound("a quotient below 5 that is rounded once more: 8 u", 8 * U32),
+    },
+)
+
+
+def _ordered(given: Given, backend: str) -> tuple[Tensor, ...]:
+    groups = order(**given, backend=backend)
+    return groups.permutation, groups.offsets
+
+
+ORDER = Operation("order", served(__package__), _ordered, {"permutation": EXACT, "offsets": EXACT})
+ENCODE = Operation(
+    "encode frequencies",
+    served(__package__),
+    lambda given, backend: (encode_frequencies(**given, backend=backend),),
+    {"encoding": Bound("as `ANGLES` says", ANGLES)},
+)
+
+
+def _sums(inputs: Tensor, weights: Tensor, biases: Tensor, offsets: Tensor) -> Tensor:
+    """How far a layer's outputs may be off by its own roundings, for exact inputs: a sum of I
+    products and a bias by I + 1 u of the sum of their sizes, by both."""
+    sizes = (x.double().abs() for x in (inputs, weights, biases))
+    total = grouped_linear(*sizes, offsets, backend="reference")
+    return 2 * (weights.shape[1] + 1) * U32 * total
+
+
+def _of_network(given: Given) -> Tensor:
+    """The same for the sums over the n samples of a network, numbers of at most 1: 2 n independent
+    roundings of partial sums of at most n, 6 sqrt(n) (n + 1) u (Higham, Mary 2019)."""
+    counts = given["offsets"].diff().double()
+    return 6 * counts.sqrt() * (counts + 1) * U32
+
+
+LINEAR = Operation(
+    "grouped linear",
+    served(__package__),
+    lambda given, backend: (grouped_linear(**given, backend=backend),),
+    {
+        "outputs": Bound(
+            "a sum of I products and a bias, I + 1 u of the sum of their sizes, by both",
+            lambda given: _sums(*(given[x] for x in ("inputs", "weights", "biases", "offsets"))),
+        )
+    },
+    {
+        "inputs": Bound(
+            "sums of O products below 1 / 8, by both: 2 O x O / 8 u",
+            lambda given: given["weights"].shape[2] ** 2 / 4 * U32,
+        ),
+        "weights": Bound(
+            "sums over n samples of a network: 6 sqrt(n) (n + 1) u",
+            lambda given: _of_network(given)[:, None, None],
+        ),
+        "biases": Bound(
+            "sums over n samples of a network: 6 sqrt(n) (n + 1) u",
+            lambda given: _of_network(given)[:, None],
+        ),
+    },
+)
+
+
+def _grown(given: Given, first: Tensor, off: float, names: tuple[str, ...]) -> Tensor:
+    """How far the outputs of the last of some layers may be off, one after the other, if the inputs
+    `first` of the first one are `off`: each passes the errors of its inputs on, times the sizes of
+    its weights, and adds its own."""
+    networks: Networks = given["networks"]
+    numbers = given["numbers"] if "numbers" in given else given["geometry"][:, HIDDEN].int()
+    groups = order(numbers, networks.count, backend="reference")
+    place, offsets = groups.permutation, groups.offsets
+    x = first[place].double()
+    error = torch.full_like(x, off)
+    for name in names:
+        weights, biases = (tensor.double() for tensor in networks.layer(name))
+        if name == "direction":
+            seen = given["encoded"][place].double()
+            x, error = torch.cat((x, seen), dim=1), torch.cat((error, 0 * seen), dim=1)
+        sizes, relu = (weights.abs(), 0 * biases, offsets), name in ("in", "mid", "direction")
+        passed = grouped_linear(error, *sizes, backend="reference")
+        error = passed + _sums(x, weights, biases, offsets)
+        x = grouped_linear(x, weights, biases, offsets, relu=relu, backend="reference")
+    return error.new_zeros(len(first), error.shape[1]).index_copy(0, place, error)
+
+
+def _off_densities(given: Given, *names: str) -> Tensor:
+    encoded = encode_frequencies(given["positions"], 10, backend="reference")
+    return _grown(given, encoded, ANGLES, names)
+
+
+def _off_geometry(given: Given) -> Tensor:
+    hidden = _off_densities(given, "in", "mid")
+    return torch.cat((hidden, 0 * hidden[:, :1]), dim=1)  # the number is exact
+
+
+def _off_colours(given: Given) -> Tensor:
+    hidden, names = given["geometry"][:, :HIDDEN], ("feature", "direction", "colour")
+    return _grown(given, hidden, 0.0, names) / 4 + 8 * U32
+
+
+GROWN = "each layer passes the errors of its inputs on, times the sizes of its weights, and adds "
+GROWN += "I + 1 u of the sum of the sizes, by both"
+DENSITIES = Operation(
+    "densities of networks",
+    served(__package__),
+    lambda given, backend: densities(**given, backend=backend),
+    {
+        "densities": Bound(
+            f"angles off by 188 u; {GROWN}",
+            lambda given: _off_densities(given, "in", "mid", "density").squeeze(1),
+        ),
+        "geometry": Bound("the same, of two layers", _off_geometry),
+    },
+)
+COLOURS = Operation(
+    "colours of networks",
+    served(__package__),
+    lambda given, backend: (colours(**given, backend=backend),),
+    {"colours": Bound(f"{GROWN}; a sigmoid has a quarter of it and 8 u of its own", _off_colours)},
+)
 
 
 def cases() -> list[Case]:
     """Sorting, encoding, single layers forward and backward, and whole networks."""
-    return [*_places(), *_sorting(), *_encoding(), *_layers(), *_networks()]
+    found = []
+    for count in (0, 1, 1000, 1 << 18):
+        items = count if count > 1000 else None
+        found += LOCATE.cases(f"{count:,} positions", partial(_placed, count), items=items)
+        angles = partial(_angles, count)
+        found += ENCODE.cases(f"{count:,} samples", angles, items=items)
+    for name, size in (KINDS | {"150 thousand in 250": MANY}).items():
+        items = size[0] if size == MANY else None
+        found += ORDER.cases(name, partial(_sorted, *size), items=items)
+        found += DENSITIES.cases(name, partial(_in_cubes, *size), items=items)
+        found += COLOURS.cases(name, partial(_seen, *size), items=items)
+        for inputs, outputs in ((63, 32), (32, 1), (5, 50)) if items is None else ((63, 32),):
+            layer = partial(_layer, *size, inputs, outputs)
+            found += LINEAR.cases(f"{name}, {inputs} to {outputs}", layer, items=items)
+    return found
 
 
 def _numbers(count: int, networks: int) -> Tensor:
@@ -57,173 +196,53 @@ def _uniform(seed: int, *shape: int) -> Tensor:
     return 2 * torch.rand(*shape, generator=torch.Generator().manual_seed(seed)) - 1
 
 
-def _places() -> list[Case]:
-    kernel = Agreement(
-        "locate",
-        served(__package__),
-        "a quotient below 5 is rounded alike: the same network, and 8 u where it is rounded once "
-        "more",
-    )
-
-    def prepare(count: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
-        positions = 0.5 + 0.6 * _uniform(count, count, 3).to(device)  # some beyond the grid
-        positions[: count // 9] = torch.nan
-        cubes = torch.arange(60, dtype=torch.int16, device=device).view(3, 4, 5) - 20
-        corner = torch.tensor((0.1, 0.2, 0.0), device=device)
-        side = torch.tensor(0.2, device=device)
-
-        def call(backend: str) -> tuple[Tensor, ...]:
-            networks, local = locate(positions, cubes.clamp(min=-1), corner, side, backend=backend)
-            return networks, local
-
-        return call
-
-    return [
-        kernel.case(f"{count:,} positions", partial(prepare, count), 8 * U32, items=items)
-        for count, items in ((0, None), (1, None), (1000, None), (1 << 18, 1 << 18))
-    ]
+def _placed(count: int) -> Given:
+    positions = 0.5 + 0.6 * _uniform(count, count, 3)  # some beyond the grid
+    positions[: count // 9] = torch.nan
+    cubes = (torch.arange(60, dtype=torch.int16).view(3, 4, 5) - 20).clamp(min=-1)
+    corner, side = torch.tensor((0.1, 0.2, 0.0)), torch.tensor(0.2)
+    return {"positions": positions, "cubes": cubes, "corner": corner, "side": side}
 
 
-def _sorting() -> list[Case]:
-    exact = Agreement("order", served(__package__), "whole numbers: 0")
-
-    def prepare(count: int, networks: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
-        numbers = _numbers(count, networks).to(device)
-
-        def call(backend: str) -> tuple[Tensor, ...]:
-            groups = order(numbers, networks, backend=backend)
-            return groups.permutation, groups.offsets
-
-        return call
-
-    found = [exact.case(name, partial(prepare, *size), 0.0) for name, size in KINDS.items()]
-    return [*found, exact.case("1.2 million", partial(prepare, *MANY), 0.0, items=MANY[0])]
+def _sorted(count: int, networks: int) -> Given:
+    return {"networks": _numbers(count, networks), "count": networks}
 
 
-def _encoding() -> list[Case]:
-    kernel = Agreement(
-        "encode frequencies",
-        served(__package__),
-        "an angle of at most 512 is rounded by none, reduced with an error below 4 u, and its sine "
-        "within 4 u; each of 4 doublings doubles the error and adds 4 u: 16 x 8 u + 60 u",
-    )
-
-    def prepare(count: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
-        inputs = _uniform(count, count, 3).to(device)
-        return lambda backend: (encode_frequencies(inputs, 10, backend=backend),)
-
-    sizes = ((0, None), (1, None), (1000, None), (1 << 18, 1 << 18))
-    return [
-        kernel.case(f"{count:,} samples", partial(prepare, count), 188 * U32, items=items)
-        for count, items in sizes
-    ]
+def _angles(count: int) -> Given:
+    return {"inputs": _uniform(count, count, 3), "frequencies": 10}
 
 
-def _layers() -> list[Case]:
-    forward = Agreement(
-        "grouped linear",
-        served(__package__),
-        "sums of at most 64 products below 1/8, 65 roundings of numbers below 8, twice: 1040 u",
-    )
-    backward = Agreement(
-        "grouped linear backward",
-        served(__package__),
-        "sums of at most 1000 products below 1, as many roundings of numbers below 1000, in the "
-        "worst case: 2 x 10^6 u; most are of few samples",
-    )
-    found = []
-    for name, size in KINDS.items():
-        for shape in ((63, 32), (32, 1), (5, 50)):
-            text = f"{name}, {shape[0]} to {shape[1]}"
-            relu = shape[1] > 3
-            found += [
-                forward.case(text, partial(_forward, *size, *shape, relu), 1040 * U32),
-                backward.case(text, partial(_backward, *size, *shape, relu), 2e6 * U32),
-            ]
-    large = MANY[0] // 8, MANY[1] // 8
-    for text, shape in (("150 thousand", (63, 32)),):
-        found += [
-            forward.case(text, partial(_forward, *large, *shape, True), 1040 * U32, items=large[0]),
-            backward.case(
-                text, partial(_backward, *large, *shape, True), 2e6 * U32, items=large[0]
-            ),
-        ]
-    return found
-
-
-def _given(
-    count: int, networks: int, inputs: int, outputs: int, device: str
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _layer(count: int, networks: int, inputs: int, outputs: int) -> Given:
+    """With a ReLU, biases keep sums away from 0, where rounding would decide."""
     offsets = order(_numbers(count, networks), networks, backend="reference").offsets
-    x = _uniform(1, int(offsets[-1]), inputs)
-    weights = BOUND * _uniform(2, networks, inputs, outputs)
-    biases = BOUND * _uniform(3, networks, outputs)
-    return x.to(device), weights.to(device), biases.to(device), offsets.to(device)
+    relu, biases = outputs > 3, _uniform(3, networks, outputs)
+    return {
+        "inputs": _uniform(1, int(offsets[-1]), inputs),
+        "weights": _uniform(2, networks, inputs, outputs) / 8,
+        "biases": biases.sign() * 16 if relu else biases / 8,
+        "offsets": offsets,
+        "relu": relu,
+    }
 
 
-def _forward(
-    count: int, networks: int, inputs: int, outputs: int, relu: bool, device: str
-) -> Callable[[str], tuple[Tensor, ...]]:
-    given = _given(count, networks, inputs, outputs, device)
-    return lambda backend: (grouped_linear(*given, relu=relu, backend=backend),)
-
-
-def _backward(
-    count: int, networks: int, inputs: int, outputs: int, relu: bool, device: str
-) -> Callable[[str], tuple[Tensor, ...]]:
-    *tensors, offsets = _given(count, networks, inputs, outputs, device)
-    if relu:  # keeps sums away from 0, where rounding would decide
-        tensors[2] = tensors[2].sign() * 16
-    tensors = [tensor.requires_grad_() for tensor in tensors]
-    grad = _uniform(4, len(tensors[0]), outputs).to(device)
-
-    def call(backend: str) -> tuple[Tensor, ...]:
-        x, weights, biases = tensors
-        out = grouped_linear(x, weights, biases, offsets, relu=relu, backend=backend)
-        return torch.autograd.grad(out, tensors, grad)
-
-    return call
-
-
-def _networks() -> list[Case]:
-    density = Agreement(
-        "densities of networks",
-        served(__package__),
-        "inputs off by 188 u, three layers that multiply an error by at most 63/8, 4 and 4 and add "
-        "1040 u each, in the worst case: 3 x 10^4 + 2 x 10^4 u",
-    )
-    colour = Agreement(
-        "colours of networks",
-        served(__package__),
-        "three layers that multiply an error by at most 4, 59/8 and 4 and add 1040 u each: "
-        "4 x 10^4 u, a sigmoid divides it by 4",
-    )
-    found = []
-    for name, size in (KINDS | {"1.2 million in 2,000": MANY}).items():
-        items = size[0] if size == MANY else None
-        found += [
-            density.case(name, partial(_densities, *size), 5e4 * U32, items=items),
-            colour.case(name, partial(_colours, *size), 1e4 * U32, items=items),
-        ]
-    return found
-
-
-def _few(networks: int, device: str) -> Networks:
-    weights, biases = {}, {}
-    for n, (name, (inputs, outputs)) in enumerate(SIZES.items()):
-        weights[name] = BOUND * _uniform(10 + n, networks, inputs, outputs).to(device)
-        biases[name] = BOUND * _uniform(20 + n, networks, outputs).to(device)
+def _few(networks: int) -> Networks:
+    """Their weights are at most 1 / 8."""
+    layers = enumerate(SHAPES.items())
+    weights = {name: _uniform(10 + n, networks, *shape) / 8 for n, (name, shape) in layers}
+    layers = enumerate(SHAPES.items())
+    biases = {name: _uniform(20 + n, networks, shape[1]) / 8 for n, (name, shape) in layers}
     return Networks(weights, biases)
 
 
-def _densities(count: int, networks: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
-    few, numbers = _few(networks, device), _numbers(count, networks).to(device)
-    positions = _uniform(5, count, 3).to(device)
-    return lambda backend: densities(positions, numbers, few, backend=backend)
+def _in_cubes(count: int, networks: int) -> Given:
+    positions, numbers = _uniform(5, count, 3), _numbers(count, networks)
+    return {"positions": positions, "numbers": numbers, "networks": _few(networks)}
 
 
-def _colours(count: int, networks: int, device: str) -> Callable[[str], tuple[Tensor, ...]]:
-    few, numbers = _few(networks, device), _numbers(count, networks)
-    geometry = torch.cat((_uniform(6, count, HIDDEN), numbers[:, None].float()), dim=1).to(device)
-    encoded = _uniform(7, count, SIZES["direction"][0] - HIDDEN).to(device)
-    return lambda backend: (colours(geometry, encoded, few, backend=backend),)
+def _seen(count: int, networks: int) -> Given:
+    numbers = _numbers(count, networks)[:, None].float()
+    return {
+        "geometry": torch.cat((_uniform(6, count, HIDDEN), numbers), dim=1),
+        "encoded": _uniform(7, count, SHAPES["direction"][0] - HIDDEN),
+        "networks": _few(networks),
+    }

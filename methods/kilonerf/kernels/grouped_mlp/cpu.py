@@ -14,7 +14,17 @@ from numba import njit, prange
 from torch import Tensor
 from torch.nn import functional
 
-from methods.kernels.cpu import LANES, TALL, f32, multiply, prefetch, tall, tall_relu
+from methods.kernels.cpu import (
+    LANES,
+    TALL,
+    arrays,
+    check_float32,
+    f32,
+    multiply,
+    prefetch,
+    tall,
+    tall_relu,
+)
 from methods.kilonerf.kernels.grouped_mlp import HIDDEN, Groups, Networks
 
 SLOT = TALL + -TALL % 8
@@ -46,17 +56,15 @@ C0, C1, C2 = f32(0.04166664555668831), f32(-0.0013887342065572739), f32(2.443585
 
 
 def locate(positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
-    """See `methods.kilonerf.kernels.grouped_mlp.locate`."""
-    _check("locates", positions, corner, side)
+    check_float32(positions, corner, side)
     networks = torch.empty(len(positions), dtype=torch.int16)
     local = torch.empty(len(positions), 3)
-    given = _arrays(positions, cubes, corner)
+    given = arrays(positions, cubes, corner)
     _locate(*given, f32(side.item()), networks.numpy(), local.numpy())
     return networks, local
 
 
 def order(networks: Tensor, count: int) -> Groups:
-    """See `methods.kilonerf.kernels.grouped_mlp.order`."""
     offsets = torch.zeros(count + 1, dtype=torch.int64)
     places = torch.empty(len(networks), dtype=torch.int64)
     numbers = networks.contiguous().numpy()
@@ -65,8 +73,7 @@ def order(networks: Tensor, count: int) -> Groups:
 
 
 def encode_frequencies(inputs: Tensor, frequencies: int) -> Tensor:
-    """See `methods.kilonerf.kernels.grouped_mlp.encode_frequencies`."""
-    _check("encodes", inputs)
+    check_float32(inputs)
     out = torch.empty(len(inputs), 3 + 6 * frequencies)
     _encode_all(inputs.detach().contiguous().numpy(), frequencies, out.numpy())
     return out
@@ -75,54 +82,39 @@ def encode_frequencies(inputs: Tensor, frequencies: int) -> Tensor:
 def grouped_linear(
     inputs: Tensor, weights: Tensor, biases: Tensor, offsets: Tensor, relu: bool
 ) -> Tensor:
-    """See `methods.kilonerf.kernels.grouped_mlp.grouped_linear`."""
-    _check("multiplies", inputs, weights, biases)
+    check_float32(inputs, weights, biases)
     return _Linear.apply(inputs, weights, biases, offsets, relu)
 
 
 def densities(positions: Tensor, numbers: Tensor, networks: Networks) -> tuple[Tensor, Tensor]:
-    """See `methods.kilonerf.kernels.grouped_mlp.densities`."""
-    layers = [part for name in ("in", "mid", "density") for part in networks.layer(name)]
-    _check("computes", positions, *layers)
+    layers = _layers(networks, "in", "mid", "density")
+    check_float32(positions, *layers)
     groups = order(numbers, networks.count)
     raw = torch.empty(len(positions))
     geometry = torch.empty(len(positions), HIDDEN + 1)
     if len(groups.permutation) < len(positions):
         raw.zero_()
         geometry.zero_()
-    _densities(
-        *_arrays(positions, *layers, groups.permutation, groups.offsets),
-        networks.frequencies,
-        raw.numpy(),
-        geometry.numpy(),
-    )
+    parts = (positions,), layers, (groups.permutation, groups.offsets)
+    given = (tuple(arrays(*part)) for part in parts)
+    _densities(*given, networks.frequencies, raw.numpy(), geometry.numpy())
     geometry[:, HIDDEN] = numbers
     return raw, geometry
 
 
 def colours(geometry: Tensor, encoded: Tensor, networks: Networks) -> Tensor:
-    """See `methods.kilonerf.kernels.grouped_mlp.colours`."""
-    layers = [part for name in ("feature", "direction", "colour") for part in networks.layer(name)]
-    _check("computes", geometry, encoded, *layers)
+    layers = _layers(networks, "feature", "direction", "colour")
+    check_float32(geometry, encoded, *layers)
     groups = order(geometry[:, HIDDEN].int(), networks.count)
     raw = torch.full((len(geometry), 3), -torch.inf)  # whose sigmoid is 0
-    _colours(
-        *_arrays(geometry, encoded, *layers, groups.permutation, groups.offsets),
-        raw.numpy(),
-    )
+    parts = (geometry, encoded), layers, (groups.permutation, groups.offsets)
+    _colours(*(tuple(arrays(*part)) for part in parts), raw.numpy())
     return raw.sigmoid_()
 
 
-def _check(verb: str, *tensors: Tensor) -> None:
-    for tensor in tensors:
-        if tensor.dtype != torch.float32:
-            raise ValueError(
-                f"backend 'cpu' {verb} float32, got {tensor.dtype}: use backend='reference'"
-            )
-
-
-def _arrays(*tensors: Tensor) -> list[np.ndarray]:
-    return [tensor.detach().contiguous().numpy() for tensor in tensors]
+def _layers(networks: Networks, *names: str) -> list[Tensor]:
+    """Weights and biases of some layers, in turns."""
+    return [part for name in names for part in networks.layer(name)]
 
 
 def _whole_vectors(tensor: Tensor) -> Tensor:
@@ -139,7 +131,7 @@ class _Linear(torch.autograd.Function):
         outputs = weights.shape[2]
         weights, biases = _whole_vectors(weights), _whole_vectors(biases)
         out = torch.empty(len(inputs), weights.shape[2])
-        _linear(*_arrays(inputs, weights, biases, offsets), relu, out.numpy())
+        _linear(*arrays(inputs, weights, biases, offsets), relu, out.numpy())
         ctx.save_for_backward(inputs, weights, offsets, out)
         ctx.relu = relu
         return out[:, :outputs]
@@ -153,7 +145,7 @@ class _Linear(torch.autograd.Function):
         channels = inputs.shape[1]
         grad_inputs = torch.empty(len(inputs) if wanted else 0, channels + -channels % LANES)
         _backward(
-            *_arrays(inputs, weights, offsets, out, grad),
+            *arrays(inputs, weights, offsets, out, grad),
             ctx.relu,
             *(part.numpy() for part in (grad_inputs, *grads)),
         )
@@ -211,20 +203,9 @@ def _linear(inputs, weights, biases, offsets, relu, out):
     flat, flat_out = inputs.reshape(-1), out.reshape(-1)
     for chunk in prange(CHUNKS):
         for n in range(borders[chunk], borders[chunk + 1]):
-            multiply(
-                offsets[n + 1] - offsets[n],
-                flat,
-                offsets[n] * channels,
-                channels,
-                1,
-                weights[n].reshape(-1),
-                outputs,
-                biases[n],
-                flat_out,
-                offsets[n] * outputs,
-                channels,
-                relu,
-            )
+            rows, w, b = offsets[n + 1] - offsets[n], weights[n].reshape(-1), biases[n]
+            at, to = offsets[n] * channels, offsets[n] * outputs
+            multiply(rows, flat, at, channels, 1, w, outputs, b, flat_out, to, channels, relu)
 
 
 @njit(cache=True, parallel=True)
@@ -238,7 +219,7 @@ def _backward(inputs, weights, offsets, out, grad, relu, grad_inputs, grad_weigh
         through = np.empty(DEEP * outputs, np.float32)  # the part of `grad` that passes the ReLU
         turned = np.zeros(outputs * width, np.float32)  # the weights, transposed
         part = np.empty(channels * outputs, np.float32)
-        nothing = np.zeros(max(width, outputs), np.float32)
+        zeros = np.zeros(max(width, outputs), np.float32)
         for n in range(borders[chunk], borders[chunk + 1]):
             of_weights, of_biases = grad_weights[n].reshape(-1), grad_biases[n]
             of_weights[:] = ZERO
@@ -259,36 +240,14 @@ def _backward(inputs, weights, offsets, out, grad, relu, grad_inputs, grad_weigh
                         of_biases[o] += row[o]
                 at = first * channels  # inputs^T through
                 multiply(
-                    channels,
-                    flat,
-                    at,
-                    1,
-                    channels,
-                    through,
-                    outputs,
-                    nothing,
-                    part,
-                    0,
-                    count,
-                    False,
+                    channels, flat, at, 1, channels, through, outputs, zeros, part, 0, count, False
                 )
                 for j in range(len(part)):
                     of_weights[j] += part[j]
                 if len(grad_inputs):  # through weights^T
                     to, at = flat_inputs, first * width
                     multiply(
-                        count,
-                        through,
-                        0,
-                        outputs,
-                        1,
-                        turned,
-                        width,
-                        nothing,
-                        to,
-                        at,
-                        outputs,
-                        False,
+                        count, through, 0, outputs, 1, turned, width, zeros, to, at, outputs, False
                     )
 
 
@@ -360,20 +319,10 @@ def _block(a, a_row, a_step, w, bias, out, out_row, count, relu):
 
 
 @njit(cache=True, parallel=True, fastmath={"contract", "reassoc"})
-def _densities(
-    positions,
-    in_weights,
-    in_biases,
-    mid_weights,
-    mid_biases,
-    density_weights,
-    density_biases,
-    permutation,
-    offsets,
-    frequencies,
-    raw,
-    geometry,
-):
+def _densities(given, layers, groups, frequencies, raw, geometry):
+    positions = given[0]
+    permutation, offsets = groups
+    in_weights, in_biases, mid_weights, mid_biases, density_weights, density_biases = layers
     channels, end = in_weights.shape[1], len(permutation)
     borders = _borders(offsets)
     places, found = positions.reshape(-1), geometry.reshape(-1)
@@ -408,20 +357,13 @@ def _densities(
 
 
 @njit(cache=True, parallel=True)
-def _colours(
-    geometry,
-    directions,
-    feature_weights,
-    feature_biases,
-    direction_weights,
-    direction_biases,
-    colour_weights,
-    colour_biases,
-    permutation,
-    offsets,
-    raw,
-):
+def _colours(given, layers, groups, raw):
     """Colours before the sigmoid."""
+    geometry, directions = given
+    permutation, offsets = groups
+    feature_weights, feature_biases = layers[0], layers[1]
+    direction_weights, direction_biases = layers[2], layers[3]
+    colour_weights, colour_biases = layers[4], layers[5]
     seen = directions.shape[1]
     channels, end = HIDDEN + seen, len(permutation)
     borders = _borders(offsets)

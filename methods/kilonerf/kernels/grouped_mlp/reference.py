@@ -14,7 +14,6 @@ from methods.kilonerf.kernels.grouped_mlp import (
 
 
 def locate(positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
-    """See `methods.kilonerf.kernels.grouped_mlp.locate`."""
     scaled = (positions.detach() - corner) / side
     cell = scaled.floor()
     sizes = [cell.new_full((), size) for size in cubes.shape]  # filled: no wait for a GPU
@@ -24,7 +23,6 @@ def locate(positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor) -> tu
 
 
 def order(networks: Tensor, count: int) -> Groups:
-    """See `methods.kilonerf.kernels.grouped_mlp.order`."""
     sorted_, permutation = networks.long().sort(stable=True)
     numbers = torch.arange(count + 1, device=networks.device)
     offsets = torch.searchsorted(sorted_, numbers)
@@ -32,7 +30,6 @@ def order(networks: Tensor, count: int) -> Groups:
 
 
 def encode_frequencies(inputs: Tensor, frequencies: int) -> Tensor:
-    """See `methods.kilonerf.kernels.grouped_mlp.encode_frequencies`."""
     angles = [inputs * 2**k for k in range(frequencies)]
     return torch.cat((inputs, *(f(angle) for angle in angles for f in (torch.sin, torch.cos))), 1)
 
@@ -40,7 +37,6 @@ def encode_frequencies(inputs: Tensor, frequencies: int) -> Tensor:
 def grouped_linear(
     inputs: Tensor, weights: Tensor, biases: Tensor, offsets: Tensor, relu: bool
 ) -> Tensor:
-    """See `methods.kilonerf.kernels.grouped_mlp.grouped_linear`."""
     parts = inputs.split(offsets.diff().tolist())
     layers = zip(parts, weights, biases, strict=True)
     out = [torch.addmm(bias, part, weight) for part, weight, bias in layers]
@@ -49,10 +45,8 @@ def grouped_linear(
 
 
 def densities(positions: Tensor, numbers: Tensor, networks: Networks) -> tuple[Tensor, Tensor]:
-    """See `methods.kilonerf.kernels.grouped_mlp.densities`."""
     return composed_densities(positions, numbers, networks, "reference")
 
 
 def colours(geometry: Tensor, encoded: Tensor, networks: Networks) -> Tensor:
-    """See `methods.kilonerf.kernels.grouped_mlp.colours`."""
     return composed_colours(geometry, encoded, networks, "reference")

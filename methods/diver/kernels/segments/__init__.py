@@ -1,10 +1,9 @@
-"""Pixels of sparse voxels with features at their corners, which a small network decodes segment by
-segment (DIVeR: Wu et al. 2022, Sections 3.2 to 3.4).
+"""Segments, the parts of rays inside voxels that have features at their corners: the weights of the
+corners in the mean of the features, and pixels (DIVeR: Wu et al. 2022, Sections 3.2 to 3.4).
 
-A segment is the part of a ray inside a voxel. Its features are the mean of the trilinear
-interpolant along it, as in `corner_gather`. They pass a ReLU and a hidden layer. One output is the
-density, integrated over the segment already; the others, with the direction of the ray, give its
-colour.
+The features of a segment are the mean of their trilinear interpolant along it. A small network
+decodes them: they pass a ReLU and a hidden layer. One output is the density, integrated over the
+segment already; the others, with the direction of the ray, give its colour.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from methods.kernels.composite import check_stop
 from methods.kernels.corner_gather import CORNERS
 from methods.kernels.dispatch import implementation
 from methods.kernels.types import Pixels
-from methods.kernels.voxel_walk import Voxels
+from methods.kernels.voxel_walk import Crossings, Voxels
 
 
 @dataclass(frozen=True)
@@ -54,6 +53,29 @@ class Layers:
     geometry: Tensor
     colour: Tensor
     colour_bias: Tensor
+
+
+def segment_weights(
+    rays: Rays, crossings: Crossings, voxels: Voxels, *, backend: str = "auto"
+) -> Tensor:
+    """Weights [S, 8] of the corners in the means over the `crossings` of R `rays` through `voxels`.
+
+    A mean is the integral of the trilinear interpolant along the segment, divided by its length
+    (Section 3.2); of a segment of length 0 it is that of the point. Not differentiable.
+
+    Raises:
+        ValueError: rays or voxels do not belong to the crossings; backend "cpu": not float32.
+    """
+    count = len(rays.origins)
+    check_shape("origins", rays.origins, count, 3)
+    check_shape("directions", rays.directions, count, 3)
+    if len(crossings.offsets) != count + 1:
+        raise ValueError(
+            f"crossings: expected those of the {count} rays, got of {len(crossings.offsets) - 1}"
+        )
+    kernel = implementation(__name__, backend, rays.origins.device)
+    weights: Tensor = kernel.segment_weights(rays, crossings, voxels)
+    return weights
 
 
 def render_segments(
@@ -95,7 +117,7 @@ def render_segments(
     check_shape("colour_bias", layers.colour_bias, 3)
     check_shape("towards", towards, count, hidden)
     kernel = implementation(__name__, backend, rays.origins.device)
-    found: tuple[Pixels, Tensor, Tensor] = kernel.render_segments(
+    rendered: tuple[Pixels, Tensor, Tensor] = kernel.render_segments(
         rays, voxels, corners, layers, towards, stop, faint
     )
-    return found
+    return rendered

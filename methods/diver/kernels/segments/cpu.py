@@ -1,5 +1,5 @@
-"""Pixels of corner features with numba: a ray at a time, a few segments of it together, and nothing
-of them ever leaves the first-level cache.
+"""Segments with numba. Pixels: a ray at a time, a few segments of it together, and nothing of them
+ever leaves the first-level cache.
 
 The hidden layer is computed for `ROWS` segments at once, because that is what the registers hold:
 some lie behind the end of the ray, in vain. Segments that show wait until `BATCH` of them are
@@ -17,18 +17,33 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench.types import Rays
-from methods.diver.kernels.corner_rendering import Corners, Layers
-from methods.kernels.corner_gather.cpu import blended, eight_of, local_coordinate, mean_weights
-from methods.kernels.cpu import LANES, ROWS, f32, multiply, prefetch, sigmoid
+from methods.diver.kernels.segments import Corners, Layers
+from methods.kernels.corner_gather.cpu import FAST, blended, eight_of
+from methods.kernels.cpu import LANES, ROWS, arrays, check_float32, f32, multiply, prefetch, sigmoid
 from methods.kernels.types import Pixels
-from methods.kernels.voxel_walk import Voxels
-from methods.kernels.voxel_walk.cpu import walk_ray
+from methods.kernels.voxel_walk import Crossings, Voxels
+from methods.kernels.voxel_walk.cpu import maps_of, walk_ray
+
+SEGMENTS = 256
+"""Segments of a chunk whose weights are computed."""
 
 CHUNK = 64  # rays
 BATCH = 8 * ROWS
 """Segments whose colours are computed together."""
 
+GAUSS = f32(0.5 / math.sqrt(3))
+"""Distance of the two nodes of the Gauss-Legendre rule from the middle of a segment of length 1."""
+
 f64 = np.float64
+
+
+def segment_weights(rays: Rays, crossings: Crossings, voxels: Voxels) -> Tensor:
+    check_float32(rays.origins, rays.directions, crossings.near)
+    weights = torch.empty(len(crossings), 8)
+    given = rays.origins, rays.directions, crossings.ray, crossings.near, crossings.far
+    cells = voxels.coordinates, crossings.voxel
+    _segment_weights(*arrays(*given, *cells), f32(voxels.resolution), weights.numpy())
+    return weights
 
 
 def render_segments(
@@ -40,7 +55,6 @@ def render_segments(
     stop: float,
     faint: float,
 ) -> tuple[Pixels, Tensor, Tensor]:
-    """See `methods.diver.kernels.corner_rendering.render_segments`."""
     parts = [
         layers.hidden.T,
         layers.hidden_bias,
@@ -48,42 +62,32 @@ def render_segments(
         layers.geometry.T,
         *_whole_lanes(layers.colour, layers.colour_bias),
     ]
-    dtypes = {x.dtype for x in (rays.origins, rays.directions, towards, *parts)}
-    table = corners.table.detach().contiguous()
-    if dtypes != {torch.float32} or table.dtype not in (torch.float32, torch.bfloat16):
-        raise ValueError(
-            "backend 'cpu' renders float32 with a table of float32 or bfloat16, got "
-            f"{dtypes} with {table.dtype}: use backend='reference'"
-        )
+    given = rays.origins, rays.directions, towards
+    check_float32(*given, *parts)
     if any(size % LANES for size in layers.hidden.shape):
         raise ValueError(
             f"backend 'cpu' has layers of multiples of {LANES}, got {list(layers.hidden.shape)}: "
             "use backend='reference'"
         )
-    if table.dtype == torch.bfloat16:
-        features = table.view(torch.int16).numpy().view(np.uint16)
+    if corners.table.dtype == torch.bfloat16:
+        (words,) = arrays(corners.table.detach().contiguous().view(torch.int16))
+        table = words.view(np.uint16)
     else:
-        features = table.numpy()
+        check_float32(corners.table)
+        (table,) = arrays(corners.table)
     count = len(rays.origins)
     pixels = Pixels.blank(count, 3)
     crossed, shaded = (torch.zeros(count, dtype=torch.int32) for _ in range(2))
     _render(
-        rays.origins.detach().contiguous().numpy(),
-        rays.directions.detach().contiguous().numpy(),
-        towards.detach().contiguous().numpy(),
-        *(x.numpy() for x in (voxels.bricks, voxels.masks, voxels.leaves, voxels.clearance)),
-        voxels.coordinates.contiguous().numpy(),
+        tuple(arrays(*given)),
+        maps_of(voxels),
+        (*arrays(voxels.coordinates, corners.rows), table),
         f32(voxels.resolution),
-        corners.rows.contiguous().numpy(),
-        features,
-        *(x.detach().contiguous().numpy() for x in parts),
+        tuple(arrays(*parts)),
         f64(f32(stop)),
         f64(f32(faint)),
-        pixels.values.numpy(),
-        pixels.depth_sum.numpy(),
-        pixels.alpha.numpy(),
-        crossed.numpy(),
-        shaded.numpy(),
+        tuple(arrays(pixels.values, pixels.depth_sum, pixels.alpha)),
+        tuple(arrays(crossed, shaded)),
     )
     return pixels, crossed, shaded
 
@@ -92,6 +96,68 @@ def _whole_lanes(weights: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
     """A layer of fewer than `LANES` outputs with zeros for the others: [H, LANES], [LANES]."""
     idle = LANES - len(bias)
     return functional.pad(weights.T, (0, idle)), functional.pad(bias, (0, idle))
+
+
+@njit(cache=True, fastmath=FAST)
+def _corner_weights(x, y, z):
+    """Trilinear weights of the eight corners, x varying fastest."""
+    gx, gy, gz = f32(1) - x, f32(1) - y, f32(1) - z
+    w00, w10, w01, w11 = gy * gz, y * gz, gy * z, y * z
+    return gx * w00, x * w00, gx * w10, x * w10, gx * w01, x * w01, gx * w11, x * w11
+
+
+@njit(cache=True)
+def _put(weights, i, found):
+    """Store the eight weights of a sample."""
+    weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3] = found[0:4]
+    weights[i, 4], weights[i, 5], weights[i, 6], weights[i, 7] = found[4:8]
+
+
+@njit(cache=True, fastmath=FAST)
+def _mean_weights(ax, ay, az, bx, by, bz):
+    """A weight is a cubic along the segment, for which two Gauss-Legendre nodes are exact."""
+    half = f32(0.5)
+    mx, my, mz = (ax + bx) * half, (ay + by) * half, (az + bz) * half
+    hx, hy, hz = (bx - ax) * GAUSS, (by - ay) * GAUSS, (bz - az) * GAUSS
+    a = _corner_weights(mx - hx, my - hy, mz - hz)
+    b = _corner_weights(mx + hx, my + hy, mz + hz)
+    return (
+        half * (a[0] + b[0]),
+        half * (a[1] + b[1]),
+        half * (a[2] + b[2]),
+        half * (a[3] + b[3]),
+        half * (a[4] + b[4]),
+        half * (a[5] + b[5]),
+        half * (a[6] + b[6]),
+        half * (a[7] + b[7]),
+    )
+
+
+@njit(cache=True)
+def _local(origin, direction, t, resolution, corner):
+    """Local coordinate, along an axis, in the voxel that begins at `corner`."""
+    place = (origin + t * direction) * resolution - f32(corner)
+    return min(max(place, f32(0)), f32(1))
+
+
+@njit(cache=True, fastmath=FAST, parallel=True)
+def _segment_weights(origins, directions, ray, near, far, coordinates, voxel, resolution, weights):
+    total = len(near)
+    for chunk in prange((total + SEGMENTS - 1) // SEGMENTS):
+        for i in range(chunk * SEGMENTS, min(total, (chunk + 1) * SEGMENTS)):
+            r, v = ray[i], voxel[i]
+            ox, oy, oz = origins[r, 0], origins[r, 1], origins[r, 2]
+            dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
+            x, y, z = coordinates[v, 0], coordinates[v, 1], coordinates[v, 2]
+            found = _mean_weights(
+                _local(ox, dx, near[i], resolution, x),
+                _local(oy, dy, near[i], resolution, y),
+                _local(oz, dz, near[i], resolution, z),
+                _local(ox, dx, far[i], resolution, x),
+                _local(oy, dy, far[i], resolution, y),
+                _local(oz, dz, far[i], resolution, z),
+            )
+            _put(weights, i, found)
 
 
 @njit(cache=True)
@@ -128,33 +194,12 @@ def _shade(count, waiting, buffers, layers, sums, first):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def _render(
-    origins,
-    directions,
-    towards,
-    bricks,
-    masks,
-    leaves,
-    clearance,
-    coordinates,
-    resolution,
-    corners,
-    table,
-    hidden_weights,
-    hidden_bias,
-    density,
-    density_bias,
-    geometry,
-    colour,
-    colour_bias,
-    stop,
-    faint,
-    values,
-    depth_sum,
-    alpha,
-    crossed,
-    shaded,
-):
+def _render(given, maps, voxels, resolution, parts, stop, faint, pixels, counts):
+    origins, directions, towards = given
+    coordinates, corners, table = voxels
+    hidden_weights, hidden_bias, density, density_bias, geometry, colour, colour_bias = parts
+    values, depth_sum, alpha = pixels
+    crossed, shaded = counts
     rays = len(origins)
     inputs, size = hidden_weights.shape
     none = np.zeros(size, np.float32)
@@ -177,19 +222,8 @@ def _render(
             depth, transmittance = 0.0, 1.0
             start, steps, colours = f32(0), 0, 0
             while start < np.inf and not transmittance <= stop:
-                count, start = walk_ray(
-                    origins[ray],
-                    directions[ray],
-                    bricks,
-                    masks,
-                    leaves,
-                    clearance,
-                    start,
-                    ROWS,
-                    near,
-                    far,
-                    voxel,
-                )
+                out = near, far, voxel
+                count, start = walk_ray(origins[ray], directions[ray], maps, start, ROWS, out)
                 if not count:
                     break
                 # Corners and their features are asked for before any of them is waited for.
@@ -201,13 +235,13 @@ def _render(
                 for i in range(count):
                     v, near_t, far_t = voxel[i], near[i], far[i]
                     x, y, z = coordinates[v, 0], coordinates[v, 1], coordinates[v, 2]
-                    weights = mean_weights(
-                        local_coordinate(ox, dx, near_t, resolution, x),
-                        local_coordinate(oy, dy, near_t, resolution, y),
-                        local_coordinate(oz, dz, near_t, resolution, z),
-                        local_coordinate(ox, dx, far_t, resolution, x),
-                        local_coordinate(oy, dy, far_t, resolution, y),
-                        local_coordinate(oz, dz, far_t, resolution, z),
+                    weights = _mean_weights(
+                        _local(ox, dx, near_t, resolution, x),
+                        _local(oy, dy, near_t, resolution, y),
+                        _local(oz, dz, near_t, resolution, z),
+                        _local(ox, dx, far_t, resolution, x),
+                        _local(oy, dy, far_t, resolution, y),
+                        _local(oz, dz, far_t, resolution, z),
                     )
                     rows = eight_of(corners, v)
                     for k in range(inputs):

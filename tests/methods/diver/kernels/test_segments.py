@@ -8,15 +8,15 @@ import pytest
 import torch
 
 from bench.types import Rays
-from methods.diver.kernels.corner_rendering import Layers, cases, reference, render_segments
+from methods.diver.kernels.segments import Layers, cases, reference, render_segments
 
 RAYS = 40
 
 
 def given(**layers: torch.Tensor) -> tuple:
     """A small scene with some rays, and `layers` in place of its own."""
-    voxels, corners, own = cases.some_scene(cases.SIDE, torch.float32, "cpu")
-    rays, towards = cases.some_rays(RAYS, "cpu"), cases.some_towards(RAYS, "cpu")
+    voxels, corners, own = cases.some_scene(cases.SIDE, torch.float32)
+    rays, towards = cases.some_rays(RAYS)
     return rays, voxels, corners, replace(own, **layers), towards
 
 
@@ -50,7 +50,7 @@ def test_rays_that_are_rendered_in_chunks_have_the_same_pixels(
 def test_a_cpu_refuses_what_it_has_no_code_for() -> None:
     rays, *rest = given()
     wide = Rays(rays.origins.double(), rays.directions.double())
-    with pytest.raises(ValueError, match="renders float32 with a table of float32 or bfloat16"):
+    with pytest.raises(ValueError, match="computes with float32"):
         render_segments(wide, *rest, stop=0.0, backend="cpu")
     narrow = Layers(
         torch.zeros(8, 32),

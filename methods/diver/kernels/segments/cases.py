@@ -1,0 +1,249 @@
+"""Cases of segments: the weights of corners against the published monomials; pixels; NaN."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from bench.case import (
+    DTYPES,
+    U32,
+    Bound,
+    Case,
+    Given,
+    Operation,
+    Property,
+    largest_error,
+    on_backends,
+    placed,
+)
+from bench.types import Rays
+from methods.diver.kernels.segments import Corners, Layers, render_segments, segment_weights
+from methods.kernels.corner_gather import CORNERS
+from methods.kernels.dispatch import served
+from methods.kernels.voxel_walk import Crossings, Voxels, walk
+
+FEATURES = HIDDEN = 32
+SIDE = 16
+"""Voxels along the grid of the small cases."""
+
+DENSEST = 1 / 4
+"""Largest density of a segment: sums of 32 products of at most 1 / 128."""
+
+FARTHEST = 3
+"""Largest depth of a segment."""
+
+WEIGHTS = (
+    "ends of a segment, its middle and its nodes are off by 3 u along each of 3 axes, along which "
+    "a weight changes by 1 at most; 3 factors and 2 products of them: 5 u; a mean: 2 u: 16 u"
+)
+PLACE = (
+    "an end is off by its product, its sum, their product with G and the difference: 4 u of at "
+    "most 3 G, along each of 3 axes: 36 G u"
+)
+WEIGH = Operation(
+    "segment_weights",
+    served(__package__),
+    lambda given, backend: (segment_weights(**given, backend=backend),),
+    {"weights": Bound(f"{WEIGHTS}; {PLACE}; by both: 72 G + 32 u", (72 * SIDE + 32) * U32)},
+)
+
+
+def _pixels(given: Given, backend: str) -> tuple[Tensor, ...]:
+    pixels, _, _ = render_segments(**given, backend=backend)
+    return pixels.values, pixels.depth_sum, pixels.alpha
+
+
+def _light(given: Given) -> float:
+    """How far the opacity of a ray may be off: its n segments' densities, rounding; a weight beside
+    `stop` or `faint` may count on one side only, and few lie beside a `faint` of 1e-2."""
+    longest, faint = 3 * given["voxels"].resolution, given["faint"]
+    rounding = longest * (468 * DENSEST + 4) * U32
+    return rounding + given["stop"] + (longest * faint if faint < 1e-3 else 2 * faint)
+
+
+RENDER = Operation(
+    "render_segments",
+    served(__package__),
+    _pixels,
+    {
+        "values": Bound(
+            "as opacities, and colours by 540 / 4 u", lambda given: _light(given) + 540 / 4 * U32
+        ),
+        "depth sums": Bound(
+            "opacities times depths of at most 3", lambda given: FARTHEST * _light(given)
+        ),
+        "opacities": Bound(
+            "weights of the corners are off by 32 u, their sum of 8 by 144 u: 400 u; a layer whose "
+            "absolute weights add up to 1 keeps that and adds 34 u, twice; a density has a quarter "
+            "of it, and the opacity all of the n densities, 4 n u, stop and n faint",
+            _light,
+        ),
+    },
+)
+
+
+def cases() -> list[Case]:
+    """Segments of every kind; few and many rays, both types of tables, rays that end early, NaN."""
+    return [*_weights(), *_rendered(), _nan()]
+
+
+def _weights() -> Iterator[Case]:
+    corners = torch.tensor(list(itertools.product((0.0, 0.5, 1.0), repeat=3)))
+    pairs = torch.cartesian_prod(torch.arange(27), torch.arange(27))
+    generator = torch.Generator().manual_seed(1000)
+    kinds: dict[str, Callable[[], Given]] = {
+        "random segments": partial(_inside, *torch.rand(2, 1000, 3, generator=generator)),
+        "between corners, edges, faces and the middle": partial(_inside, *corners[pairs.T]),
+        "without length": partial(_inside, corners, corners),
+        "rays through a full grid": _through,
+    }
+    exact = Property(
+        "segment_weights",
+        "weights are those of the published monomials",
+        f"{WEIGHTS}; {PLACE}",
+        on_backends(36 * SIDE + 16, "fp64"),
+    )
+    for name, make in kinds.items():
+        yield from WEIGH.cases(name, make)
+        yield exact.case(name, partial(_moment_error, make))
+
+
+def _inside(entry: Tensor, leave: Tensor) -> Given:
+    """Segments in the first voxel, from `entry` to `leave` in its coordinates."""
+    count, rays = len(entry), Rays(entry / SIDE, (leave - entry) / SIDE)
+    number, zeros, ones = torch.arange(count), torch.zeros(count), torch.ones(count)
+    offsets, first = torch.arange(count + 1), torch.zeros(count, dtype=torch.int32)
+    crossings = Crossings(ones / 2, ones, offsets, zeros, ones, number.int(), first, ones)
+    voxels = Voxels(torch.zeros(1, 3, dtype=torch.int32), SIDE)
+    return {"rays": rays, "crossings": crossings, "voxels": voxels}
+
+
+def _through() -> Given:
+    """Rays through a full grid, and their crossings."""
+    ends = torch.rand(2, 100, 3, generator=torch.Generator().manual_seed(5))
+    rays = Rays(2 * ends[0] - ends[1], ends[1] - ends[0])
+    voxels = Voxels(torch.cartesian_prod(*[torch.arange(SIDE)] * 3), SIDE)
+    crossings = walk(rays, voxels, backend="reference")
+    return {"rays": rays, "crossings": crossings, "voxels": voxels}
+
+
+def _moment_error(make: Callable[[], Given], backend: str, device: str, precision: str) -> float:
+    given, dtype = placed(make(), device), DTYPES[precision]
+    rays, crossings, voxels = given.values()
+    ray, corner = crossings.ray.long(), voxels.coordinates[crossings.voxel.long()]
+    origins, directions = rays.origins[ray].double(), rays.directions[ray].double()
+    spans = crossings.near.double(), crossings.far.double()
+    ends = (((origins + t[:, None] * directions) * SIDE - corner).clamp(0, 1) for t in spans)
+    rays = Rays(rays.origins.to(dtype), rays.directions.to(dtype))
+    crossings = replace(crossings, near=crossings.near.to(dtype), far=crossings.far.to(dtype))
+    return largest_error(
+        (segment_weights(rays, crossings, voxels, backend=backend),), (_moments(*ends),)
+    )
+
+
+def _moments(a: Tensor, b: Tensor) -> Tensor:
+    """Weights [S, 8] from the means of the monomials 1, x, y, xy, ... over a segment, float64."""
+    means = {0: torch.ones_like(a[:, 0])}
+    for d in range(3):
+        means[1 << d] = (a[:, d] + b[:, d]) / 2
+    for d, e in itertools.combinations(range(3), 2):
+        same, crossed = a[:, d] * a[:, e] + b[:, d] * b[:, e], a[:, d] * b[:, e] + b[:, d] * a[:, e]
+        means[1 << d | 1 << e] = same / 3 + crossed / 6
+    means[7] = (a + b).prod(dim=1) / 12 + (a.prod(dim=1) + b.prod(dim=1)) / 6
+    weights = [
+        sum(
+            (-1) ** (monomial ^ corner).bit_count() * means[monomial]
+            for monomial in range(CORNERS)
+            if monomial & corner == corner
+        )
+        for corner in range(CORNERS)
+    ]
+    return torch.stack([torch.as_tensor(weight) for weight in weights], dim=1)
+
+
+def _rendered() -> Iterator[Case]:
+    for name, count, dtype, stop, faint in (
+        ("no ray", 0, torch.float32, 0.0, 0.0),
+        ("one ray", 1, torch.float32, 0.0, 0.0),
+        ("129 rays", 129, torch.float32, 0.0, 0.0),
+        ("129 rays, table of bfloat16", 129, torch.bfloat16, 0.0, 0.0),
+        ("129 rays, stop and faint", 129, torch.float32, 1e-4, 1e-5),
+    ):
+        yield from RENDER.cases(name, partial(_scene, SIDE, count, dtype, stop, faint))
+    many = partial(_scene, 64, 1 << 13, torch.bfloat16, 1e-2, 1e-2)
+    yield from RENDER.cases("8,192 rays in 64^3", many, items=1 << 13)
+
+
+def _scene(side: int, count: int, dtype: torch.dtype, stop: float, faint: float) -> Given:
+    voxels, corners, layers = some_scene(side, dtype)
+    rays, towards = some_rays(count)
+    given = {"rays": rays, "voxels": voxels, "corners": corners, "layers": layers}
+    return given | {"towards": towards, "stop": stop, "faint": faint}
+
+
+def some_scene(side: int, dtype: torch.dtype) -> tuple[Voxels, Corners, Layers]:
+    """Every third voxel of a grid, with features from -1 to 1."""
+    generator = torch.Generator().manual_seed(side)
+
+    def between(low: float, high: float, *shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator) * (high - low) + low
+
+    cells = torch.cartesian_prod(*[torch.arange(side)] * 3)
+    cells = cells[torch.rand(len(cells), generator=generator) < 1 / 3].int()
+    bits = torch.arange(CORNERS)[:, None] >> torch.arange(3) & 1
+    vertices = cells[:, None] + bits  # [V, 8, 3]
+    rows = (vertices * torch.tensor([(side + 1) ** 2, side + 1, 1])).sum(dim=2).int()
+    table = between(-1, 1, (side + 1) ** 3, FEATURES).to(dtype)
+    layers = Layers(
+        between(-1, 1, HIDDEN, FEATURES) / FEATURES,
+        between(0, 1, HIDDEN),
+        between(0, DENSEST, 1, HIDDEN) / HIDDEN,
+        between(0, 0.01, 1),
+        between(-1, 1, HIDDEN, HIDDEN) / HIDDEN,
+        between(-1, 1, 3, HIDDEN) / HIDDEN,
+        between(-1, 1, 3),
+    )
+    return Voxels(cells, side), Corners(rows, table), layers
+
+
+def some_rays(count: int) -> tuple[Rays, Tensor]:
+    """From all around into the cube, and what the direction of each adds."""
+    generator = torch.Generator().manual_seed(count)
+    origins = normalize(torch.randn(count, 3, generator=generator), dim=1) * 1.5 + 0.5
+    rays = Rays(origins, torch.rand(count, 3, generator=generator) - origins)
+    return rays, torch.rand(count, HIDDEN, generator=generator) - 0.5
+
+
+def _nan() -> Case:
+    kept = Property(
+        "render_segments",
+        "a NaN among the features spoils the rays through its voxels alone",
+        "exact",
+        on_backends(0),
+    )
+    return kept.case("NaN in a corner", _nan_error)
+
+
+def _nan_error(backend: str, device: str, precision: str) -> float:
+    """0 if it holds, else infinity."""
+    given = placed(_scene(SIDE, 129, DTYPES[precision], 0.0, 0.0), device)
+    corners = given["corners"]
+    whole, _, _ = render_segments(**given, backend=backend)
+    row = corners.rows[len(corners.rows) // 2, 0]
+    corners.table[row] = math.nan
+    spoilt, _, _ = render_segments(**given, backend=backend)
+    crossings = walk(given["rays"], given["voxels"], backend="reference")
+    touched = torch.zeros(len(whole.alpha), dtype=torch.bool, device=device)
+    at_corner = (corners.rows == row).any(dim=1)
+    touched[crossings.ray[at_corner[crossings.voxel.long()]].long()] = True
+    same = torch.equal(spoilt.values[~touched], whole.values[~touched])
+    spoils = torch.equal(spoilt.values.isnan().all(dim=1), touched)
+    return 0.0 if same and spoils and touched.any() else math.inf

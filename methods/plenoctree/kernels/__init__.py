@@ -1,0 +1,1 @@
+"""Operations that this method alone computes; see `methods.kernels`."""

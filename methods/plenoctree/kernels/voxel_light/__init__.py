@@ -1,0 +1,107 @@
+"""Colours of voxels that hold a density and spherical harmonics: pixels, and samples to train on.
+
+A voxel has the opacity 1 - exp(-sigma delta) over a length delta, and shows sigmoid(sum_k c_k
+Y_k(d)) in direction d (Yu et al. 2021, Eq. 1 to 3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from bench.types import Rays, check_shape
+from methods.kernels.composite import STOP, check_stop
+from methods.kernels.dispatch import implementation
+from methods.kernels.spherical import SIZES
+from methods.kernels.types import Pixels
+from methods.kernels.voxel_walk import Voxels
+
+
+@dataclass(frozen=True)
+class Light:
+    """The contents of V voxels.
+
+    Attributes:
+        density: [V] 1 / scene unit, not negative.
+        harmonics: [V, C, 3] coefficients of the first C spherical harmonics, C of 1, 4, 9 or 16.
+    """
+
+    density: Tensor
+    harmonics: Tensor
+
+
+def render_voxels(
+    rays: Rays,
+    voxels: Voxels,
+    light: Light,
+    *,
+    stop: float = STOP,
+    faint: float = 0.0,
+    backend: str = "auto",
+) -> tuple[Pixels, Tensor, Tensor]:
+    """Render R `rays` without a background. Not differentiable.
+
+    Returns the pixels and, for each ray, the numbers of crossed and of shaded voxels: [R] int32.
+
+    Args:
+        stop: transmittance at which a ray ends, less than 1.
+        faint: voxels with at most this weight count for opacity but are not shaded.
+
+    Raises:
+        ValueError: wrong shapes, a stop outside [0, 1); backend "cpu": not float32.
+    """
+    check_stop(stop)
+    check_shape("origins", rays.origins, None, 3)
+    check_shape("directions", rays.directions, len(rays.origins), 3)
+    check_shape("density", light.density, len(voxels))
+    _check_harmonics(light.harmonics, len(voxels))
+    kernel = implementation(__name__, backend, rays.origins.device)
+    rendered: tuple[Pixels, Tensor, Tensor] = kernel.render_voxels(rays, voxels, light, stop, faint)
+    return rendered
+
+
+def shade_voxels(
+    harmonics: Tensor,
+    voxel: Tensor,
+    ray: Tensor,
+    directions: Tensor,
+    *,
+    grad_buffer: Tensor | None = None,
+    backend: str = "auto",
+) -> Tensor:
+    """Colours [S, 3] of S voxels in the directions of their rays.
+
+    Differentiable in `harmonics`.
+
+    Args:
+        harmonics: [V, C, 3] coefficients of the first C harmonics in the order of `spherical`;
+            C is 1, 4, 9 or 16.
+        voxel: [S] int32 rows of `harmonics`; rows may repeat.
+        ray: [S] int32 rows of `directions`.
+        directions: [R, 3] unit vectors.
+        grad_buffer: [V, C, 3]; if given, the gradient of `harmonics` is added to it in place and
+            hidden from autograd.
+
+    Raises:
+        ValueError: wrong shapes; backend "cpu": not float32.
+    """
+    _check_harmonics(harmonics, None)
+    check_shape("voxel", voxel, None)
+    check_shape("ray", ray, len(voxel))
+    check_shape("directions", directions, None, 3)
+    if grad_buffer is not None:
+        check_shape("grad_buffer", grad_buffer, *harmonics.shape)
+        if not harmonics.requires_grad:
+            harmonics = harmonics.detach().requires_grad_()  # otherwise there is no backward pass
+    kernel = implementation(__name__, backend, harmonics.device)
+    colours: Tensor = kernel.shade_voxels(harmonics, voxel, ray, directions, grad_buffer)
+    return colours
+
+
+def _check_harmonics(harmonics: Tensor, count: int | None) -> None:
+    check_shape("harmonics", harmonics, count, None, 3)
+    if harmonics.shape[1] not in SIZES:
+        raise ValueError(
+            f"harmonics: expected one of {SIZES} coefficients a colour, got {list(harmonics.shape)}"
+        )

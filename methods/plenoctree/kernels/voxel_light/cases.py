@@ -1,0 +1,144 @@
+"""Cases of voxels with densities and harmonics: pixels, and shaded samples."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from bench.case import U32, Bound, Case, Given, Operation
+from bench.types import Rays
+from methods.kernels.dispatch import served
+from methods.kernels.voxel_walk import Voxels
+from methods.kernels.voxel_walk.cases import all_cells
+from methods.plenoctree.kernels.voxel_light import Light, render_voxels, shade_voxels
+
+COLOUR = (16 * 50 * 6 + 16 * 16 * 6) / 4 + 8
+"""Error bound in u of a colour: a quarter (slope of the sigmoid) of the error of a sum of 16
+products of harmonics (below 2, error 48 u) and numbers below 6, plus the sigmoid's own error."""
+
+FARTHEST = 3
+"""Largest depth of a voxel."""
+
+
+def _pixels(given: Given, backend: str) -> tuple[Tensor, ...]:
+    pixels, _, _ = render_voxels(**given, backend=backend)
+    return pixels.values, pixels.depth_sum, pixels.alpha
+
+
+def _light(given: Given) -> float:
+    """How far the opacity in front of a voxel may be off: rounded once or twice at each of at most
+    3 G voxels on both sides; a weight beside `stop` or `faint` may count on one side only."""
+    longest = 3 * given["voxels"].resolution
+    return 4 * longest * U32 + given["stop"] + longest * given["faint"]
+
+
+RENDER = Operation(
+    "render_voxels",
+    served(__package__),
+    _pixels,
+    {
+        "values": Bound(
+            "as opacities, and colours as `COLOUR` says", lambda given: _light(given) + COLOUR * U32
+        ),
+        "depth sums": Bound(
+            "opacities times depths of at most 3", lambda given: FARTHEST * _light(given)
+        ),
+        "opacities": Bound(
+            "light rounded twice by both at each of 3 G voxels: 12 G u; stop; 3 G faint", _light
+        ),
+    },
+)
+
+
+def _visits(given: Given) -> Tensor:
+    """How often each voxel is seen."""
+    voxels = len(given["harmonics"])
+    return torch.bincount(given["voxel"].long(), minlength=voxels).double()[:, None, None]
+
+
+SHADE = Operation(
+    "shade_voxels",
+    served(__package__),
+    lambda given, backend: (shade_voxels(**given, backend=backend),),
+    {
+        "colours": Bound(
+            "the sum of `shade`, of which the sigmoid passes on a quarter, and 8 u of its own",
+            COLOUR * U32,
+        )
+    },
+    {
+        "harmonics": Bound(
+            "n visits of a voxel: each a harmonic below 2, off by 48 u, times a slope of at most "
+            "1 / 4, off as colours are and by 4 u; n sums of at most n / 2: n (2 (COLOUR + 4) + "
+            "12 + n / 2) u",
+            lambda given: (n := _visits(given)) * (2 * (COLOUR + 4) + 12 + n / 2) * U32,
+        )
+    },
+)
+
+
+def cases() -> list[Case]:
+    """Rays of every kind of light; no, one and many samples of all degrees."""
+    return [*_rendered(), *_shaded()]
+
+
+def _rendered() -> Iterator[Case]:
+    for name, rays, kind, stop, faint in (
+        ("one ray", 1, "cloud", 0.0, 0.0),
+        ("no ray", 0, "cloud", 0.0, 0.0),
+        ("cloud", 129, "cloud", 0.0, 0.0),
+        ("mist", 129, "mist", 0.0, 0.0),
+        ("stone", 129, "stone", 0.0, 0.0),
+        ("voxels without density", 129, "clear", 0.0, 0.0),
+        ("no voxel", 129, "nothing", 0.0, 0.0),
+        ("stop and faint", 129, "cloud", 1e-4, 1e-5),
+    ):
+        yield from RENDER.cases(name, partial(_scene, 24, rays, kind, stop, faint))
+    many = 1 << 13
+    frame = partial(_scene, 128, many, "cloud", 1e-4, 1e-5)
+    yield from RENDER.cases("a frame of 128^3", frame, items=many)
+
+
+def _scene(size: int, rays: int, kind: str, stop: float, faint: float) -> Given:
+    """Voxels in a thick shell, every second one, of random density and light."""
+    generator = torch.Generator().manual_seed(size)
+    cells, radius = all_cells(size)
+    kept = (radius > 0.27) & (radius < 0.4) & (torch.rand(len(cells), generator=generator) < 0.5)
+    if kind == "nothing":
+        kept[:] = False
+    coordinates = cells[kept]
+    scale = {"clear": 0.0, "mist": 2.0, "stone": 1e4}.get(kind, 20.0)
+    density = scale * torch.rand(len(coordinates), generator=generator)
+    harmonics = torch.randn(len(coordinates), 9, 3, generator=generator).clamp(-6, 6)
+    light, voxels = Light(density, harmonics), Voxels(coordinates, size)
+    return {"rays": views(rays), "voxels": voxels, "light": light, "stop": stop, "faint": faint}
+
+
+def views(count: int) -> Rays:
+    """Rays from all around into the cube."""
+    generator = torch.Generator().manual_seed(count)
+    origins = normalize(torch.randn(count, 3, generator=generator), dim=1) * 1.5 + 0.5
+    return Rays(origins, torch.rand(count, 3, generator=generator) - origins)
+
+
+def _shaded() -> Iterator[Case]:
+    for count in (0, 1, 300, 1 << 16):
+        for size in (1, 4, 9, 16) if count == 300 else (9,):
+            name, items = f"{count:,} of {size} harmonics", count if count > 300 else None
+            yield from SHADE.cases(name, partial(_samples, count, size), items=items)
+
+
+def _samples(count: int, size: int) -> Given:
+    """Harmonics below 6, three samples of a voxel and five of a ray on average."""
+    generator = torch.Generator().manual_seed(count)
+    voxels, rays = count // 3 + 1, count // 5 + 1
+    return {
+        "harmonics": torch.randn(voxels, size, 3, generator=generator).clamp(-6, 6),
+        "voxel": torch.randint(voxels, (count,), generator=generator).int(),
+        "ray": torch.randint(rays, (count,), generator=generator).sort().values.int(),
+        "directions": normalize(torch.randn(rays, 3, generator=generator), dim=1),
+    }
