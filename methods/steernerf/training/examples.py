@@ -145,9 +145,10 @@ class ExamplePool:
 
     def _unpacked(self, tensors: Mapping[str, Tensor]) -> Cloud:
         device = self.pipeline.background.device
-        cameras = {
+        parts: dict[str, Any] = {name: x.to(device) for name, x in tensors.items()}
+        parts |= {
             name: place_camera(unpack_camera(x), device)
             for name, x in tensors.items()
             if x.dtype == torch.float64  # as nothing else in a cloud
         }
-        return self.pipeline.kept(**{name: x.to(device) for name, x in tensors.items()} | cameras)
+        return self.pipeline.kept(**parts)

@@ -134,9 +134,11 @@ def _slopes_error(backend: str, device: str, precision: str) -> float:
     pixels, depth = project(camera, means)
     size = pixels.new_tensor((camera.width, camera.height))
     seen = (depth > 0.1) & ((pixels > 0) & (pixels < size)).all(dim=1) & (opacities > 0.01)
-    given = [x[seen] for x in (means, scales, rotations, opacities)]
-    ellipses = project_gaussians(*given, camera, backend=backend)
-    means, scales, rotations, opacities = (x.double().cpu() for x in given)
+    means, scales, rotations, opacities = (x[seen] for x in (means, scales, rotations, opacities))
+    ellipses = project_gaussians(means, scales, rotations, opacities, camera, backend=backend)
+    means, scales, rotations, opacities = (
+        x.double().cpu() for x in (means, scales, rotations, opacities)
+    )
 
     def centre(point: Tensor) -> Tensor:
         return project(CAMERA, point[None])[0][0]
@@ -169,11 +171,12 @@ def _shown(changed: dict[str, float], backend: str, device: str, precision: str)
     depth, scale = changed.get("depth", 1.0), changed.get("scale", 0.01)
     place = camera.c2w[:, 3] + depth * camera.c2w[:, 2]
     opacity = torch.tensor([changed.get("opacity", 0.5)])
-    given = [
+    means, scales, rotations = given = [
         x.to(device, dtype).requires_grad_()
         for x in (place[None], torch.full((1, 3), scale), torch.tensor([[1.0, 0, 0, 0]]))
     ]
-    found = project_gaussians(*given, opacity.to(device, dtype), camera, backend=backend)
+    opacity = opacity.to(device, dtype)
+    found = project_gaussians(means, scales, rotations, opacity, camera, backend=backend)
     (found.centres.sum() + found.conics.sum()).backward()
     wrong = found.extents.count_nonzero().item()
     return float(

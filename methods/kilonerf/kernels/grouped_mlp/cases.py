@@ -68,8 +68,8 @@ ENCODE = Operation(
 def _sums(inputs: Tensor, weights: Tensor, biases: Tensor, offsets: Tensor) -> Tensor:
     """How far a layer's outputs may be off by its own roundings, for exact inputs: a sum of I
     products and a bias by I + 1 u of the sum of their sizes, by both."""
-    sizes = (x.double().abs() for x in (inputs, weights, biases))
-    total = grouped_linear(*sizes, offsets, backend="reference")
+    values, factors, added = (x.double().abs() for x in (inputs, weights, biases))
+    total = grouped_linear(values, factors, added, offsets, backend="reference")
     return 2 * (weights.shape[1] + 1) * U32 * total
 
 
