@@ -102,40 +102,33 @@ class PaperTable:
 
     @property
     def blocks(self) -> list[PaperTable]:
-        """The table, then the same for the method beyond the paper, if there is one."""
-        return [self, self._of_beyond()] if self.beyond else [self]
+        """The table, then the same for the method beyond the paper, if there is one.
 
-    def shown(self, measured: Container[str]) -> list[PaperTable]:
-        """The blocks to show if the lines with the labels `measured` exist.
-
-        A budget may leave out the method beyond the paper.
+        The latter has the lines of the paper's method, without published figures, and the trends.
         """
-        return [
-            block
-            for block in self.blocks
-            if block is self or any(line.label in measured for line in block.lines)
+        if self.beyond is None:
+            return [self]
+        of_paper = [line for line in self.lines if METHOD not in line.job]
+        names = {line.label: f"{line.label} ({self.beyond})" for line in of_paper}
+        trends = [
+            Trend(trend.metric, [names.get(label, label) for label in trend.rising])
+            for trend in self.trends
         ]
-
-    def _of_beyond(self) -> PaperTable:
-        """The table for the method `beyond`: the lines of the paper's method, and the trends."""
-        jobs = {
-            line.label: {**line.job, METHOD: str(self.beyond)}
-            for line in self.lines
-            if METHOD not in line.job
-        }
-        names = {label: f"{label} ({self.beyond})" for label in jobs}
-        return replace(
+        second = replace(
             self,
             title=f"Beyond the paper: {self.beyond}",
-            lines=[Line(names[label], job) for label, job in jobs.items()],
+            lines=[Line(names[line.label], {**line.job, METHOD: self.beyond}) for line in of_paper],
             notes=self.beyond_notes,
-            trends=[
-                replace(trend, rising=[names.get(label, label) for label in trend.rising])
-                for trend in self.trends
-            ],
+            trends=trends,
             beyond=None,
             curve=False,
         )
+        return [self, second]
+
+    def shown(self, measured: Container[str]) -> list[PaperTable]:
+        """The table, and its other block if any of the lines `measured` (labels) is there."""
+        first, *further = self.blocks
+        return [first, *(x for x in further if any(line.label in measured for line in x.lines))]
 
 
 def paper_tables(folder: Path) -> list[PaperTable]:
@@ -214,11 +207,11 @@ def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
 def section(table: PaperTable, lines: Sequence[Repeated]) -> list[str | Table]:
     """A table as parts of a page: the paper's lines, those of a method beyond it, each scene."""
     measured = {line.label: line for line in lines}
-    first, *further = table.shown(measured)
-    heading = f"## {table.number}: {table.title}"
-    parts: list[str | Table] = [heading, *_block(first, measured, f"Paper: {table.published_on}.")]
-    for block in further:
-        parts += [f"### {block.title}", *_block(block, measured)]
+    parts: list[str | Table] = []
+    for block in table.shown(measured):
+        first = block is table
+        parts.append(f"## {table.number}: {table.title}" if first else f"### {block.title}")
+        parts += _block(block, measured, f"Paper: {table.published_on}." if first else "")
     if table.scenes and len({scene for line in lines for scene in line.by_scene}) > 1:
         each = scene_table(table.scenes, lines)
         parts += [f"### {each.title}", each]
@@ -226,17 +219,14 @@ def section(table: PaperTable, lines: Sequence[Repeated]) -> list[str | Table]:
 
 
 def _block(
-    table: PaperTable, measured: Mapping[str, Repeated], published: str = ""
+    table: PaperTable, measured: Mapping[str, Repeated], published: str
 ) -> list[str | Table]:
     """Conditions of the measured and the published figures, then the figures, trends, notes."""
-    labels = [line.label for line in table.lines]
-    runs = [run for label in labels if label in measured for run in measured[label].runs]
-    where = f"Measured: {conditions_of(runs)}, {_origin(runs)}." if runs else ""
     figures = {line.label: line.published for line in table.lines}
-    found = [
-        difference for trend in table.trends for difference in differences(trend, measured, figures)
-    ]
-    trends = trend_table(found) if found else ""
+    runs = [run for label in figures if label in measured for run in measured[label].runs]
+    where = f"Measured: {conditions_of(runs)}, {_origin(runs)}." if runs else ""
+    grown = [each for trend in table.trends for each in differences(trend, measured, figures)]
+    trends = trend_table(grown) if grown else ""
     notes = dict.fromkeys((*table.notes, *missing_figures(runs)))
     listed = "\n".join(f"- {note}" for note in notes)
     shown = with_published(table, measured)
