@@ -137,7 +137,8 @@ def explain(error: Exception, words: Sequence[str]) -> SteerbenchError:
     if key := re.match(r"Could not override '([^']+)'", str(error)):
         if (CONFIGS / key[1]).is_dir():
             return SteerbenchError(
-                f"{key[1]}: each method brings its own, and takes no other; choose a method"
+                f"{key[1]}: each method brings its own, and takes no other; choose a method, or a "
+                "budget for its sizes"
             )
         return unknown("setting", key[1], _settings(words))
     causes = [error, error.__cause__] if error.__cause__ else [error]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from omegaconf import OmegaConf
 
 from bench.results import Store
 from reports.paper_tables import (
@@ -20,6 +21,7 @@ from reports.publish import markdown
 from reports.runs import Repeated, Run, load
 from reports.tables import QUALITY
 from reports.trends import Trend
+from sweeps.overrides import CONFIGS
 from sweeps.plan import chosen
 
 TABLES = chosen(None, [])
@@ -88,6 +90,15 @@ def test_the_block_beyond_the_paper_has_its_lines_and_trends_but_no_published_fi
     for one, other in zip(first.trends, second.trends, strict=True):
         assert set(other.rising) <= labels
         assert one.rising != other.rising
+
+
+@pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
+def test_the_lines_of_a_table_take_every_value_of_its_grid_and_no_other(table: PaperTable) -> None:
+    experiment = OmegaConf.load(CONFIGS / "experiment" / f"{table.name}.yaml")
+    jobs = [line.job for block in table.blocks for line in block.lines]
+    for name, values in experiment.hydra.sweeper.params.items():
+        usual, *others = values.split(",")
+        assert {usual, *(job[name] for job in jobs if name in job)} == {usual, *others}
 
 
 def test_weights_from_other_scenes_are_a_matter_of_the_block_beyond_the_paper() -> None:
