@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 from omegaconf import OmegaConf
 
@@ -50,7 +51,7 @@ class Outlier:
 
 def outliers(runs: Sequence[Run]) -> list[Outlier]:
     """The outliers among `runs`, by all rules."""
-    published = OmegaConf.load(REFERENCES)
+    published: Any = OmegaConf.load(REFERENCES)
     return [
         *far_from_other_scenes(runs),
         *far_from_reference(runs, published["psnr"], published["method"], published["resolution"]),

@@ -169,7 +169,7 @@ def _lines(
     for line, job in zip(declared, jobs, strict=True):
         published = zip(metrics, line.get("published", ()), strict="published" in line)
         figures = {metric: figure for metric, figure in published if figure is not None}
-        yield Line(line.get("label", label.format(*job.values())), job, figures)
+        yield Line(line.get("label") or label.format(*job.values()), job, figures)
 
 
 def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from omegaconf import OmegaConf
 
@@ -69,7 +70,7 @@ def find(path: str) -> DataSet:
 
 def _known() -> list[set[str]]:
     """The names of the scenes of each data set of the paper."""
-    content = OmegaConf.load(REFERENCES)
+    content: Any = OmegaConf.load(REFERENCES)
     return [set(content["psnr"]), set(content["tanks_and_temples"])]
 
 
