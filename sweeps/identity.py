@@ -35,7 +35,7 @@ def described(config: DictConfig) -> dict[str, Any]:
     except OmegaConfBaseException as error:  # a setting that others use was removed
         raise SteerbenchError(" ".join(str(error).split())) from error
     unused = () if "engine" in plain["method"] else ("engine", "precision")
-    left_out = ("split", "paper", *PLACES, *unused)
+    left_out = ("split", "tables", *PLACES, *unused)
     kept = {key: value for key, value in plain.items() if key not in left_out}
     kept["scene"] = {name: value for name, value in plain["scene"].items() if name != "root"}
     if "path" in kept["scene"]:

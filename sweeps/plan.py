@@ -28,7 +28,7 @@ REPEATED = "seed"
 
 @dataclass(frozen=True)
 class Repeats:
-    """How much of the tables is measured (`paper` in run.yaml).
+    """How much of the tables is measured (`tables` in run.yaml).
 
     Attributes:
         seeds: every cell of the paper's method is repeated with this many seeds, starting at 0.
@@ -100,7 +100,7 @@ def chosen(name: str | None, methods: Sequence[str]) -> list[PaperTable]:
 def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -> list[Planned]:
     """The jobs of `table` under the settings in `words`, for each line, seed and scene of `data`.
 
-    Seeds are those in `words`, otherwise the first `paper.seeds`, of which curves and methods other
+    Seeds are those in `words`, otherwise the first `tables.seeds`, of which curves and methods other
     than the paper's use only one. Settings that a line does not give are those of the experiment.
     Lines at a precision that the engine lacks are left out. On a GPU the engine is torch, unless
     `words` choose another.
@@ -115,7 +115,9 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     if on_gpu(str(experiment.get("device"))):
         fixed.insert(1, "engine=torch")  # Table 1 uses OpenVINO, which computes on a CPU
         experiment = composed(fixed)
-    repeats, _ = (build(experiment, name) for name in ("paper", "budget"))  # wrong ones are refused
+    repeats, _ = (
+        build(experiment, name) for name in ("tables", "budget")
+    )  # wrong ones are refused
     engine = experiment.engine
     precisions = target_of(engine).precisions
     usual = [str(seed) for seed in range(repeats.seeds)]

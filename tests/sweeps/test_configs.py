@@ -16,7 +16,7 @@ from sweeps.overrides import CONFIGS, choices, composed, leaves
 GROUPS = ("method", "scene", "trajectory", "protocol", "budget")
 CHOICES = [f"{group}={name}" for group in GROUPS for name in choices(group)]
 SIZES = sorted((CONFIGS / "size").glob("*/*.yaml"))
-USERS = {"field": "method=ngp", "unet": "method=steernerf", "paper": "method=ngp"}
+USERS = {"field": "method=ngp", "unet": "method=steernerf", "tables": "method=ngp"}
 """Of sizes that are not of one method: a word that chooses what takes them in."""
 
 
@@ -79,7 +79,7 @@ def test_a_size_changes_settings_that_are_there(path) -> None:
     assert path.stem in choices("budget")
     word = USERS.get(owner, f"method={owner}")
     before, after = (composed([word, of]) for of in ("budget=pretrain", budget))
-    group = "paper" if owner == "paper" else "method"
+    group = "tables" if owner == "tables" else "method"
     assert set(leaves(before[group])) == set(leaves(after[group]))
     assert before[group] != after[group]
 

@@ -65,7 +65,7 @@ def test_a_curve_has_the_lines_of_the_papers_method_at_several_shares_of_one_tra
         *(([f"budget={name}"], 1, [0]) for name in ("tiny", "full")),
         *(([f"budget={name}"], 3, [0]) for name in ("demo", "small")),
         (["budget=paper"], 3, []),
-        (["budget=demo", "paper.seeds=2"], 2, [0]),
+        (["budget=demo", "tables.seeds=2"], 2, [0]),
         (["budget=demo", "seed=7"], [7], [7]),
         (["budget=demo", "seed=1,2"], [1, 2], [1, 2]),
     ],
@@ -168,11 +168,11 @@ def test_what_the_figures_show_is_what_the_tables_measure(
 
 
 def test_no_seeds_are_refused() -> None:
-    with pytest.raises(SteerbenchError, match="paper: seeds: expected 1 or more"):
-        plan(TABLES["table5"], ["paper.seeds=0"])
+    with pytest.raises(SteerbenchError, match="tables: seeds: expected 1 or more"):
+        plan(TABLES["table5"], ["tables.seeds=0"])
 
 
-@pytest.mark.parametrize("word", ["paper.seeds=5", "paper.beyond=false"])
+@pytest.mark.parametrize("word", ["tables.seeds=5", "tables.beyond=false"])
 def test_what_only_the_tables_read_changes_no_key(word: str) -> None:
     assert described(composed([word])) == described(composed([]))
 

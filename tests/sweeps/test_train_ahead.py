@@ -79,7 +79,7 @@ def test_no_threads_are_refused(threads: int) -> None:
 SMALL = [
     *("scene=totem", "scene.width=24", "scene.train=3", "scene.test=1", "trajectory=test"),
     *("budget=tiny", "budget.steps=4", "budget.samples=512", "budget.renderer_steps=8"),
-    *("budget.threads=1", "paper.beyond=false", "method.joint.distilled_views=1"),
+    *("budget.threads=1", "tables.beyond=false", "method.joint.distilled_views=1"),
     *("protocol.name=quick", "protocol.lpips=[]", "protocol.warmup=0"),
 ]
 
