@@ -100,7 +100,7 @@ def chosen(name: str | None, methods: Sequence[str]) -> list[PaperTable]:
 def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -> list[Planned]:
     """The jobs of `table` under the settings in `words`, for each line, seed and scene of `data`.
 
-    Seeds are those in `words`, otherwise the first `tables.seeds`, of which curves and methods other
+    Seeds are those in `words`, otherwise the first `tables.seeds`, of which curves and other methods
     than the paper's use only one. Settings that a line does not give are those of the experiment.
     Lines at a precision that the engine lacks are left out. On a GPU the engine is torch, unless
     `words` choose another.
@@ -115,9 +115,8 @@ def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -
     if on_gpu(str(experiment.get("device"))):
         fixed.insert(1, "engine=torch")  # Table 1 uses OpenVINO, which computes on a CPU
         experiment = composed(fixed)
-    repeats, _ = (
-        build(experiment, name) for name in ("tables", "budget")
-    )  # wrong ones are refused
+    build(experiment, "budget")  # refuses a wrong one before anything runs
+    repeats = build(experiment, "tables")
     engine = experiment.engine
     precisions = target_of(engine).precisions
     usual = [str(seed) for seed in range(repeats.seeds)]
