@@ -100,10 +100,10 @@ def chosen(name: str | None, methods: Sequence[str]) -> list[PaperTable]:
 def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -> list[Planned]:
     """The jobs of `table` under the settings in `words`, for each line, seed and scene of `data`.
 
-    Seeds are those in `words`, otherwise the first `tables.seeds`, of which curves and other methods
-    than the paper's use only one. Settings that a line does not give are those of the experiment.
-    Lines at a precision that the engine lacks are left out. On a GPU the engine is torch, unless
-    `words` choose another.
+    Seeds are those in `words`, otherwise the first `tables.seeds`; curves and methods other than
+    the paper's use only one of them. Settings that a line lacks are those of the experiment. Lines
+    at a precision that the engine lacks are left out. On a GPU the engine is torch, unless `words`
+    choose another.
 
     Raises:
         SteerbenchError: a word cannot be read, names nothing, or gives several values to a setting
