@@ -149,8 +149,6 @@ class Budget:
             training may take a share of it.
         frames: at most this many test frames are rendered and scored (0: all).
         renderer_steps: optimiser steps of the second stage, for methods with a 2D renderer.
-        seeds: `steerbench paper` repeats a measurement with this many seeds, 0 to seeds - 1.
-        beyond: whether `steerbench paper` also varies the training of methods beyond the paper.
         threads: CPU threads of a training; None: as many as torch uses. On a CPU `steerbench paper`
             runs as many trainings in parallel as the cores have room for.
     """
@@ -160,15 +158,11 @@ class Budget:
     samples: int
     frames: int = 0
     renderer_steps: int = 1
-    seeds: int = 1
-    beyond: bool = True
     threads: int | None = None
 
     def __post_init__(self) -> None:
-        if min(self.steps, self.samples, self.renderer_steps, self.seeds) < 1 or self.frames < 0:
-            raise ValueError(
-                f"expected steps, samples, renderer_steps and seeds >= 1, frames >= 0: {self}"
-            )
+        if min(self.steps, self.samples, self.renderer_steps) < 1 or self.frames < 0:
+            raise ValueError(f"expected steps, samples, renderer_steps >= 1, frames >= 0: {self}")
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"threads: expected 1 or more, or none, got {self.threads}")
 

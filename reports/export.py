@@ -37,15 +37,12 @@ SETTING = re.compile(r"(?P<name>[A-Z]) = (?P<base>\d+)(\^(?P<power>\d+))?")
 MARKS = {1: r"\textbf{%s}", 2: r"\underline{%s}"}
 """LaTeX for the best and the second-best figure of a column."""
 
-PUBLISHED = r"$^\dagger$"
-
 
 def latex(tables: Sequence[PaperTable], measured: Lines) -> str:
     """All tables as LaTeX, for the package booktabs, with as many decimals as in the paper.
 
     Among figures under the same conditions, the best of a column is bold and, of at least three,
-    the second best is underlined; figures that look the same share a rank. Methods that cannot be
-    measured here show the paper's figures, with a dagger.
+    the second best is underlined; figures that look the same share a rank.
     """
     return "\n".join(_latex(table, measured.get(table.name, ())) for table in tables)
 
@@ -57,8 +54,6 @@ def _latex(table: PaperTable, lines: Sequence[Repeated]) -> str:
     rows = [row for block in blocks for row in _rows(block, known)]
     runs = [run for line in lines for run in line.runs]
     caption = f"{_escaped(table.title)}. " + (f"{_escaped(conditions_of(runs))}. " if runs else "")
-    if any(PUBLISHED in cell for row in rows for cell in row):
-        caption += f"{PUBLISHED}Published figures, of other conditions."
     text = pd.DataFrame(rows, columns=heads).to_latex(
         index=False,
         column_format="l" + "r" * len(table.metrics),
@@ -79,16 +74,13 @@ def _rows(block: PaperTable, known: Mapping[str, Repeated]) -> list[list[str]]:
         write = partial(_written, metric)
         places = {} if metric.startswith("stage_ms.") else ranks(lines, metric, write)
         cells = []
-        for number, (found, line) in enumerate(zip(lines, block.lines, strict=True)):
+        for number, found in enumerate(lines):
             mean, half = found.mean(metric), found.half(metric)
-            published = line.published.get(metric)
             if mean is not None:
                 text = write(mean) + (rf" $\pm$ {write(half)}" if half > 0 else "")
                 place = places.get(number, 0)
                 several = place == 1 or len(places) > 2
                 cells.append(MARKS[place] % text if place in MARKS and several else text)
-            elif published is not None and line.job is None:
-                cells.append(write(published) + PUBLISHED)
             else:
                 cells.append("--")
         columns.append(cells)

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from statistics import median
+from typing import Any
+
+from omegaconf import OmegaConf
 
 from bench.results import content_key
 from bench.trajectories import MIXED
 from reports.runs import Run
 from reports.tables import Table
 
-REFERENCES = Path(__file__).parent / "paper" / "scenes.toml"
+REFERENCES = Path(__file__).parent / "paper" / "scenes.yaml"
 """Published PSNR of well-known scenes."""
 
 OTHER_SCENES_DB = 12.0
@@ -49,7 +51,7 @@ class Outlier:
 
 def outliers(runs: Sequence[Run]) -> list[Outlier]:
     """The outliers among `runs`, by all rules."""
-    published = tomllib.loads(REFERENCES.read_text(encoding="utf-8"))
+    published: Any = OmegaConf.load(REFERENCES)
     return [
         *far_from_other_scenes(runs),
         *far_from_reference(runs, published["psnr"], published["method"], published["resolution"]),

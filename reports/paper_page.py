@@ -1,16 +1,17 @@
 """Writes the page about the paper's tables: measured and published figures, trends, pictures.
 
-Its texts, and the lines that its plots and images show, are in `paper/page.toml`.
+Its texts, and the lines that its plots and images show, are in `paper/page.yaml`.
 """
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+from omegaconf import OmegaConf
 
 from reports import figures
 from reports.images import frame_section, kept_frames
@@ -20,9 +21,7 @@ from reports.parts import Part, Plot
 from reports.publish import publish
 from reports.runs import Run
 
-PAGE: Mapping[str, Any] = tomllib.loads(
-    (Path(__file__).parent / "paper" / "page.toml").read_text(encoding="utf-8")
-)
+PAGE: Any = OmegaConf.to_container(OmegaConf.load(Path(__file__).parent / "paper" / "page.yaml"))
 
 
 def write_paper_page(
@@ -56,7 +55,7 @@ def write_paper_page(
         *([f"## Scenes that are left out\n\n{left_out}"] if left_out else []),
         *([f"## {listed.title}", listed] if listed.lines else []),
         *(part for table in tables for part in section(table, lines.get(table.name, ()))),
-        *(part for plot in PAGE["plot"] for part in _plot(plot, tables, lines)),
+        *(part for plot in PAGE["plots"] for part in _plot(plot, tables, lines)),
         *(part for images in PAGE["images"] for part in _images(images, lines)),
         f"## Runs\n\nTheir keys in the store, and the commands:\n\n```\n{sources}\n```",
     ]
@@ -93,7 +92,7 @@ def _curves(table: PaperTable, lines: Lines) -> Iterator[figures.Curve]:
     """The measured lines of `table` over the course of their training, if it has curves."""
     measured = {line.label: line for line in lines.get(table.name, ()) if line.runs}
     for line in table.lines if table.curve else ():
-        labels = {share: table.marks[line.label, share].label for share in SHARES if line.job}
+        labels = {share: table.marks[line.label, share].label for share in SHARES}
         marks = {share: measured[label] for share, label in labels.items() if label in measured}
         seeds = {run.facts["seed"] for mark in marks.values() for run in mark.runs}
         if whole := measured.get(line.label):  # end points, of the same trainings

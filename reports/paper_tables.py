@@ -1,12 +1,14 @@
-"""The paper's tables, read from `paper/table*.toml`, with measured figures beside the published."""
+"""The paper's tables, as experiments declare them: measured figures beside the published."""
 
 from __future__ import annotations
 
 import math
-import tomllib
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
 
 from reports.comparison import conditions_of, metric_format, ranks, written
 from reports.page import missing_figures
@@ -15,7 +17,6 @@ from reports.scenes import scene_table
 from reports.tables import Table
 from reports.trends import Trend, differences, trend_table
 
-FOLDER = Path(__file__).parent / "paper"
 METHOD = "method"
 AFTER, SHARES = "method.after", (0.125, 0.25, 0.5)
 """The setting for the share of the training after which a method is rendered, and the shares that
@@ -36,13 +37,13 @@ class Line:
 
     Attributes:
         label: its name.
-        job: the settings that measure it, beside those of all lines; None if no method here can.
-            Without a `method` it is a line of the paper's method.
+        job: the settings that measure it, beside those of all lines. Without a `method` it is a
+            line of the paper's method.
         published: the paper's figures by metric, in bytes, ms and dB as in our rows.
     """
 
     label: str
-    job: Mapping[str, str] | None = None
+    job: Mapping[str, str]
     published: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -71,7 +72,7 @@ class PaperTable:
     published_on: str
     metrics: Sequence[str]
     lines: Sequence[Line]
-    notes: Sequence[str]
+    notes: Sequence[str] = ()
     trends: Sequence[Trend] = ()
     beyond: str | None = None
     beyond_notes: Sequence[str] = ()
@@ -96,59 +97,79 @@ class PaperTable:
             )
             for line in self.lines
             for share in SHARES
-            if self.curve and line.job is not None
+            if self.curve
         }
 
     @property
     def blocks(self) -> list[PaperTable]:
-        """The table, then the same for the method beyond the paper, if there is one."""
-        return [self, self._of_beyond()] if self.beyond else [self]
+        """The table, then the same for the method beyond the paper, if there is one.
 
-    def shown(self, measured: Container[str]) -> list[PaperTable]:
-        """The blocks to show if the lines with the labels `measured` exist.
-
-        A budget may leave out the method beyond the paper.
+        The latter has the lines of the paper's method, without published figures, and the trends.
         """
-        return [
-            block
-            for block in self.blocks
-            if block is self or any(line.label in measured for line in block.lines)
+        if self.beyond is None:
+            return [self]
+        of_paper = [line for line in self.lines if METHOD not in line.job]
+        names = {line.label: f"{line.label} ({self.beyond})" for line in of_paper}
+        trends = [
+            Trend(trend.metric, [names.get(label, label) for label in trend.rising])
+            for trend in self.trends
         ]
-
-    def _of_beyond(self) -> PaperTable:
-        """The table for the method `beyond`: the lines of the paper's method, and the trends."""
-        jobs = {
-            line.label: {**line.job, METHOD: str(self.beyond)}
-            for line in self.lines
-            if line.job is not None and METHOD not in line.job
-        }
-        names = {label: f"{label} ({self.beyond})" for label in jobs}
-        return replace(
+        second = replace(
             self,
             title=f"Beyond the paper: {self.beyond}",
-            lines=[Line(names[label], job) for label, job in jobs.items()],
+            lines=[Line(names[line.label], {**line.job, METHOD: self.beyond}) for line in of_paper],
             notes=self.beyond_notes,
-            trends=[
-                replace(trend, rising=[names.get(label, label) for label in trend.rising])
-                for trend in self.trends
-            ],
+            trends=trends,
             beyond=None,
             curve=False,
         )
+        return [self, second]
+
+    def shown(self, measured: Container[str]) -> list[PaperTable]:
+        """The table, and its other block if any of the lines `measured` (labels) is there."""
+        first, *further = self.blocks
+        return [first, *(x for x in further if any(line.label in measured for line in x.lines))]
 
 
-def paper_tables() -> list[PaperTable]:
-    """All tables, in the paper's order."""
-    paths = sorted(FOLDER.glob("table*.toml"), key=lambda path: (len(path.stem), path.stem))
+def paper_tables(folder: Path) -> list[PaperTable]:
+    """The tables that the experiments in `folder` declare, in the paper's order."""
+    paths = sorted(folder.glob("table*.yaml"), key=lambda path: (len(path.stem), path.stem))
     return [_table(path) for path in paths]
 
 
 def _table(path: Path) -> PaperTable:
-    content = tomllib.loads(path.read_text(encoding="utf-8"))
-    lines = [Line(**line) for line in content.pop("line")]
-    trends = [Trend(**trend) for trend in content.pop("trend", [])]
-    notes = content.pop("notes", [])
-    return PaperTable(path.stem, lines=lines, notes=notes, trends=trends, **content)
+    """What an experiment declares below `table`; what its lines leave out follows from its grid.
+
+    The method beyond the paper is the one that the grid has besides that of the experiment and
+    those that lines name.
+    """
+    experiment: Any = OmegaConf.to_container(OmegaConf.load(path))
+    content = experiment["table"]
+    params = experiment["hydra"]["sweeper"]["params"]
+    grid = {name: str(values).split(",") for name, values in params.items()}
+    _, *further = grid.pop(METHOD, [""])
+    label = content.pop("label", "{}")
+    lines = list(_lines(content.pop("lines"), content["metrics"], label, grid))
+    trends = [Trend(metric, labels) for metric, labels in content.pop("rising").items()]
+    named = {line.job.get(METHOD) for line in lines}
+    beyond = next((method for method in further if method not in named), None)
+    return PaperTable(path.stem, lines=lines, trends=trends, beyond=beyond, **content)
+
+
+def _lines(
+    declared: Sequence[Mapping[str, Any]],
+    metrics: Sequence[str],
+    label: str,
+    grid: Mapping[str, Sequence[str]],
+) -> Iterator[Line]:
+    """The lines of a table. Without jobs of their own, there is one for each value of the grid."""
+    jobs = [line["job"] for line in declared if "job" in line] or [
+        {name: value} for name, values in grid.items() for value in values
+    ]
+    for line, job in zip(declared, jobs, strict=True):
+        published = zip(metrics, line.get("published", ()), strict="published" in line)
+        figures = {metric: figure for metric, figure in published if figure is not None}
+        yield Line(line.get("label") or label.format(*job.values()), job, figures)
 
 
 def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table:
@@ -186,11 +207,11 @@ def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
 def section(table: PaperTable, lines: Sequence[Repeated]) -> list[str | Table]:
     """A table as parts of a page: the paper's lines, those of a method beyond it, each scene."""
     measured = {line.label: line for line in lines}
-    first, *further = table.shown(measured)
-    heading = f"## {table.number}: {table.title}"
-    parts: list[str | Table] = [heading, *_block(first, measured, f"Paper: {table.published_on}.")]
-    for block in further:
-        parts += [f"### {block.title}", *_block(block, measured)]
+    parts: list[str | Table] = []
+    for block in table.shown(measured):
+        first = block is table
+        parts.append(f"## {table.number}: {table.title}" if first else f"### {block.title}")
+        parts += _block(block, measured, f"Paper: {table.published_on}." if first else "")
     if table.scenes and len({scene for line in lines for scene in line.by_scene}) > 1:
         each = scene_table(table.scenes, lines)
         parts += [f"### {each.title}", each]
@@ -198,17 +219,14 @@ def section(table: PaperTable, lines: Sequence[Repeated]) -> list[str | Table]:
 
 
 def _block(
-    table: PaperTable, measured: Mapping[str, Repeated], published: str = ""
+    table: PaperTable, measured: Mapping[str, Repeated], published: str
 ) -> list[str | Table]:
     """Conditions of the measured and the published figures, then the figures, trends, notes."""
-    labels = [line.label for line in table.lines]
-    runs = [run for label in labels if label in measured for run in measured[label].runs]
-    where = f"Measured: {conditions_of(runs)}, {_origin(runs)}." if runs else ""
     figures = {line.label: line.published for line in table.lines}
-    found = [
-        difference for trend in table.trends for difference in differences(trend, measured, figures)
-    ]
-    trends = trend_table(found) if found else ""
+    runs = [run for label in figures if label in measured for run in measured[label].runs]
+    where = f"Measured: {conditions_of(runs)}, {_origin(runs)}." if runs else ""
+    grown = [each for trend in table.trends for each in differences(trend, measured, figures)]
+    trends = trend_table(grown) if grown else ""
     notes = dict.fromkeys((*table.notes, *missing_figures(runs)))
     listed = "\n".join(f"- {note}" for note in notes)
     shown = with_published(table, measured)

@@ -32,45 +32,35 @@ class Trend:
 
 
 @dataclass(frozen=True)
-class Growth:
-    """The growth of a metric from one line to another.
+class Difference:
+    """The growth of a metric from one line of a trend to the next.
 
     Attributes:
-        by: the mean difference.
+        paper: the difference in the paper; nan if the paper does not give both figures.
+        by: the mean difference here.
         half: half its 95 % interval; nan if unknown.
         over: the samples that `by` averages, in words.
         proves: whether the interval accounts for differences between trainings.
-    """
-
-    by: float
-    half: float
-    over: str
-    proves: bool
-
-
-@dataclass(frozen=True)
-class Difference:
-    """The difference from one line of a trend to the next.
-
-    Attributes:
-        paper: growth of the metric in the paper; nan if the paper does not give both figures.
     """
 
     metric: str
     smaller: str
     larger: str
     paper: float
-    here: Growth
+    by: float
+    half: float
+    over: str
+    proves: bool
 
     @property
     def verdict(self) -> str:
         """Whether the metric grows here, shrinks, grows less than in the paper, or is undecided."""
-        low, high = self.here.by - self.here.half, self.here.by + self.here.half
+        low, high = self.by - self.half, self.by + self.half
         if low > 0:
-            return HOLDS if self.here.proves else SEEN
+            return HOLDS if self.proves else SEEN
         if high <= 0:
-            return FAILS if self.here.proves else REVERSED
-        return SMALLER if self.here.proves and high < self.paper else OPEN
+            return FAILS if self.proves else REVERSED
+        return SMALLER if self.proves and high < self.paper else OPEN
 
 
 def differences(
@@ -91,11 +81,11 @@ def differences(
             below, above = (
                 published.get(label, {}).get(trend.metric, math.nan) for label in (smaller, larger)
             )
-            yield Difference(trend.metric, smaller, larger, above - below, here)
+            yield Difference(trend.metric, smaller, larger, above - below, *here)
 
 
-def _growth(one: Repeated, other: Repeated, metric: str) -> Growth | None:
-    """The mean difference over pairs; None if there are no pairs.
+def _growth(one: Repeated, other: Repeated, metric: str) -> tuple[float, float, str, bool] | None:
+    """The last four fields of a `Difference`: the mean over pairs; None if there are no pairs.
 
     With several seeds, a pair has the same seed; with one seed, a pair is the same frame.
     """
@@ -114,33 +104,32 @@ def _growth(one: Repeated, other: Repeated, metric: str) -> Growth | None:
     by_seed = np.array([twin.values[metric] - run.values[metric] for run, twin in pairs])
     by = float(by_seed.mean())
     if metric.startswith("size_bytes"):
-        return Growth(by, 0.0, COMPUTED, proves=True)
+        return by, 0.0, COMPUTED, True
     if len(pairs) > 1:
-        return Growth(by, half_interval(by_seed), f"{len(pairs)} seeds", proves=True)
+        return by, half_interval(by_seed), f"{len(pairs)} seeds", True
     frames, others = (Figures.of(run).frames.get(metric, {}) for run in pairs[0])
     by_frame = np.array([others[name] - frames[name] for name in frames if name in others])
     if len(by_frame) > 1:
         over = f"{len(by_frame)} frames of one seed"
-        return Growth(float(by_frame.mean()), path_interval(by_frame), over, proves=False)
-    return Growth(by, math.nan, "one figure each", proves=False)
+        return float(by_frame.mean()), path_interval(by_frame), over, False
+    return by, math.nan, "one figure each", False
 
 
-def trend_table(found: Sequence[Difference]) -> Table:
-    """A table of the differences `found`, one line each."""
+def trend_table(differences: Sequence[Difference]) -> Table:
+    """A table of `differences`, one line each."""
     columns = ("difference", "paper", "here", "over", "verdict")
-    return Table("Trends", columns, tuple(map(_line, found)))
+    return Table("Trends", columns, tuple(map(_line, differences)))
 
 
-def _line(found: Difference) -> tuple[str, ...]:
-    label, write = metric_format(found.metric)
-    here = found.here
-    half = f" ± {write(here.half)}" if here.half > 0 else ""
+def _line(each: Difference) -> tuple[str, ...]:
+    label, write = metric_format(each.metric)
+    half = f" ± {write(each.half)}" if each.half > 0 else ""
     return (
-        f"{label.rstrip(' ↑↓')}: {found.smaller} < {found.larger}",
-        "" if math.isnan(found.paper) else _signed(found.paper, write),
-        _signed(here.by, write) + half,
-        here.over,
-        found.verdict,
+        f"{label.rstrip(' ↑↓')}: {each.smaller} < {each.larger}",
+        "" if math.isnan(each.paper) else _signed(each.paper, write),
+        _signed(each.by, write) + half,
+        each.over,
+        each.verdict,
     )
 
 

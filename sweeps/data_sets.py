@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
 
 from bench.errors import SteerbenchError
 from bench.scenes.blender import camera_file, picture_path
@@ -68,7 +70,7 @@ def find(path: str) -> DataSet:
 
 def _known() -> list[set[str]]:
     """The names of the scenes of each data set of the paper."""
-    content = tomllib.loads(REFERENCES.read_text(encoding="utf-8"))
+    content: Any = OmegaConf.load(REFERENCES)
     return [set(content["psnr"]), set(content["tanks_and_temples"])]
 
 

@@ -28,18 +28,15 @@ def described(config: DictConfig) -> dict[str, Any]:
     """The settings that determine a run; equal for equal jobs.
 
     Left out are: locations, except the last part of a scene's folder, which rows show; `split`,
-    which is in the trajectory, and `sizing`, which is in the method; the engine, if the method uses
-    none; and settings of the budget about other jobs.
+    which is in the trajectory; the engine, if the method uses none; and what only the tables read.
     """
     try:
         plain: Any = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException as error:  # a setting that others use was removed
         raise SteerbenchError(" ".join(str(error).split())) from error
     unused = () if "engine" in plain["method"] else ("engine", "precision")
-    left_out = ("split", "sizing", *PLACES, *unused)
+    left_out = ("split", "tables", *PLACES, *unused)
     kept = {key: value for key, value in plain.items() if key not in left_out}
-    of_sweep = ("seeds", "beyond")
-    kept["budget"] = {key: value for key, value in plain["budget"].items() if key not in of_sweep}
     kept["scene"] = {name: value for name, value in plain["scene"].items() if name != "root"}
     if "path" in kept["scene"]:
         kept["scene"]["path"] = Path(kept["scene"]["path"]).name

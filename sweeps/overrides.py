@@ -17,7 +17,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import MissingConfigException, OverrideParseException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from bench.errors import SteerbenchError
 from sweeps import plug_ins
@@ -36,10 +36,9 @@ def composed(words: Sequence[str], **options: bool) -> DictConfig:
     Raises:
         SteerbenchError: a setting or a choice does not exist, or cannot be read.
     """
-    overrides = _overrides(words)
-    if further := [str(folder).replace("'", r"\'") for folder in _typed(words)]:
-        paths = ",".join(f"'file://{folder}'" for folder in further)
-        overrides.append(f"hydra.searchpath=[{paths}]")
+    quoted = [str(folder).replace("'", r"\'") for folder in _typed(words)]
+    paths = ",".join(f"'file://{folder}'" for folder in quoted)
+    overrides = [*_overrides(words), *([f"hydra.searchpath=[{paths}]"] if paths else [])]
     try:
         with initialize_config_dir(str(CONFIGS), version_base="1.3"):
             return settled(compose("run", overrides=overrides, **options))
@@ -50,10 +49,13 @@ def composed(words: Sequence[str], **options: bool) -> DictConfig:
 
 
 def settled(config: DictConfig) -> DictConfig:
-    """Give `config` the validation trajectory if split=validation asks for it.
+    """`config` as a run needs it: without the declaration of a table, which only reports read, and
+    with the validation trajectory if split=validation asks for it.
 
     From here on only the trajectory determines which pictures are scored, hence held out.
     """
+    with open_dict(config):
+        config.pop("table", None)
     asked, there = (OmegaConf.select(config, name) for name in ("split", "trajectory.split"))
     if asked == VALIDATION and there != VALIDATION:
         node = OmegaConf.load(CONFIGS / "trajectory" / f"{VALIDATION}.yaml")
@@ -112,13 +114,12 @@ def swept(words: Sequence[str], loader: ConfigLoader | None = None) -> dict[str,
         if not of_hydra(error):
             raise
         raise explain(error, words) from error
-    values = {
-        override.get_key_element(): list(override.sweep_string_iterator())
+    last = {override.get_key_element(): override for override in parsed}
+    return {
+        name: list(override.sweep_string_iterator())
+        for name, override in last.items()
         if override.is_discrete_sweep()
-        else []
-        for override in parsed
     }
-    return {name: several for name, several in values.items() if several}
 
 
 def explain(error: Exception, words: Sequence[str]) -> SteerbenchError:
@@ -136,7 +137,8 @@ def explain(error: Exception, words: Sequence[str]) -> SteerbenchError:
     if key := re.match(r"Could not override '([^']+)'", str(error)):
         if (CONFIGS / key[1]).is_dir():
             return SteerbenchError(
-                f"{key[1]}: each method brings its own, and takes no other; choose a method"
+                f"{key[1]}: each method brings its own, and takes no other; choose a method, or a "
+                "budget for its sizes"
             )
         return unknown("setting", key[1], _settings(words))
     causes = [error, error.__cause__] if error.__cause__ else [error]

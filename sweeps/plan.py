@@ -11,16 +11,36 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from bench.errors import SteerbenchError
-from reports.paper_tables import AFTER, METHOD, OF_CURVES, Line, PaperTable, paper_tables
+from reports.paper_tables import METHOD, Line, PaperTable, paper_tables
 from sweeps.build import build, target_of
 from sweeps.data_sets import DataSet
 from sweeps.device_lock import on_gpu
 from sweeps.identity import described, job_key
 from sweeps.names import unknown
-from sweeps.overrides import changed, choices, composed, setting, swept
+from sweeps.overrides import CONFIGS, changed, choices, composed, setting, swept
+
+TABLES = CONFIGS / "experiment"
+"""The folder of the experiments that declare the tables."""
 
 REPEATED = "seed"
 """The only setting that may have several values; a cell then shows mean and interval."""
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """How much of the tables is measured (`tables` in run.yaml).
+
+    Attributes:
+        seeds: every cell of the paper's method is repeated with this many seeds, starting at 0.
+        beyond: whether tables that vary the training also cover the method beyond the paper.
+    """
+
+    seeds: int
+    beyond: bool
+
+    def __post_init__(self) -> None:
+        if self.seeds < 1:
+            raise ValueError(f"seeds: expected 1 or more, got {self.seeds}")
 
 
 @dataclass(frozen=True)
@@ -63,80 +83,66 @@ def chosen(name: str | None, methods: Sequence[str]) -> list[PaperTable]:
     Raises:
         SteerbenchError: there is no such table, or it compares no methods.
     """
-    tables = {table.name: table for table in paper_tables()}
+    tables = {table.name: table for table in paper_tables(TABLES)}
     if name is not None and name not in tables:
         raise unknown("table", name, tables)
-    further = [Line(method, {METHOD: method}) for method in methods]
-    found = []
-    for table in [tables[name]] if name else tables.values():
-        of_methods = any(METHOD in line.job for line in table.lines if line.job)
-        lines = [*table.lines, *further] if of_methods else table.lines
-        found.append(replace(table, lines=lines))
-    if methods and name and found[0].lines == tables[name].lines:
+    wanted = [tables[name]] if name else list(tables.values())
+    of_methods = [any(METHOD in line.job for line in table.lines) for table in wanted]
+    if methods and not any(of_methods):
         raise SteerbenchError(f"--with: {name} compares no methods; table1 does")
-    return found
+    further = [Line(method, {METHOD: method}) for method in methods]
+    return [
+        replace(table, lines=[*table.lines, *further]) if compares else table
+        for table, compares in zip(wanted, of_methods, strict=True)
+    ]
 
 
 def plan(table: PaperTable, words: Sequence[str], data: DataSet | None = None) -> list[Planned]:
-    """The jobs of the experiment of `table` under the settings in `words`.
+    """The jobs of `table` under the settings in `words`, for each line, seed and scene of `data`.
 
-    One for each line that has a job, each seed, and each scene of `data`. Seeds are those in
-    `words`, otherwise those of the budget; curves and methods other than the paper's then use only
-    the first one.
-
-    Settings that a line does not give are those of the experiment. Jobs of the sweep that no line
-    names are left out (Instant-NGP has no 2D renderer to compute in int8), and so are lines at a
-    precision that the engine lacks. On a GPU the engine is torch, unless `words` choose another.
+    Seeds are those in `words`, otherwise the first `tables.seeds`; curves and methods other than
+    the paper's use only one of them. Settings that a line lacks are those of the experiment. Lines
+    at a precision that the engine lacks are left out. On a GPU the engine is torch, unless `words`
+    choose another.
 
     Raises:
         SteerbenchError: a word cannot be read, names nothing, or gives several values to a setting
-            other than the seed; or the experiment does not have the job that a line asks for.
+            other than the seed.
     """
-    fixed, seeds = _seeds(words)
-    fixed += [f"scene={data.layout}"] if data else []
-    scenes = {name: str(folder) for name, folder in data.scenes.items()} if data else {"": ""}
-    experiment = composed([f"+experiment={table.name}", *fixed], return_hydra_config=True)
+    words, seeds = _seeds(words)
+    fixed = [f"+experiment={table.name}", *words, *([f"scene={data.layout}"] if data else [])]
+    experiment = composed(fixed)
     if on_gpu(str(experiment.get("device"))):
-        fixed = ["engine=torch", *fixed]  # Table 1 uses OpenVINO, which computes on a CPU
-        experiment = composed([f"+experiment={table.name}", *fixed], return_hydra_config=True)
+        fixed.insert(1, "engine=torch")  # Table 1 uses OpenVINO, which computes on a CPU
+        experiment = composed(fixed)
+    build(experiment, "budget")  # refuses a wrong one before anything runs
+    repeats = build(experiment, "tables")
     engine = experiment.engine
     precisions = target_of(engine).precisions
-    budget = build(experiment, "budget")
-    usual = [str(seed) for seed in range(budget.seeds)]
-    params = experiment.hydra.sweeper.params
-    grid = swept([f"{name}={values}" for name, values in params.items()])
+    usual = [str(seed) for seed in range(repeats.seeds)]
+    scenes = {name: str(folder) for name, folder in data.scenes.items()} if data else {"": ""}
 
     @cache  # values are set afterwards without composing again
     def with_choices(*groups: str) -> DictConfig:
-        return composed([f"+experiment={table.name}", *fixed, *groups])
+        return composed([*fixed, *groups])
 
-    besides = {AFTER, *OF_CURVES}  # settings of curves, which are in no experiment
     jobs = []
-    for block, line, repeated in _lines(table, budget.beyond):
-        if line.job is None or line.job.get("precision", engine.precision) not in precisions:
+    for block, line, repeated in _lines(table, repeats.beyond):
+        if line.job.get("precision", engine.precision) not in precisions:
             continue
-        added = line.job == {METHOD: line.label}
-        swept_here = {name: value for name, value in line.job.items() if name not in besides}
-        if not added and any(value not in grid.get(name, ()) for name, value in swept_here.items()):
-            there = "; ".join(f"{name}={','.join(some)}" for name, some in grid.items())
-            raise SteerbenchError(
-                f"{table.name}: no job of its experiment fills the line {line.label!r}; expected "
-                f"the settings of its job among {there}"
-            )
         settings = [f"{name}={value}" for name, value in line.job.items()]
         groups = [word for word in settings if choices(word.partition("=")[0], fixed)]
-        config = with_choices(*groups)
         values = [word for word in settings if word not in groups]
         of_line = seeds or (usual if repeated else usual[:1])
         for seed, (scene, folder) in product(of_line, scenes.items()):
             word = f"{REPEATED}={seed}"
-            job = changed(config, [*values, word])
+            job = changed(with_choices(*groups), [*values, word])
+            place = []
             if data:
                 job.scene.path = folder
+                place = [setting("scene.path", folder)]
             OmegaConf.resolve(job)  # once, or each build would resolve `${...}` again
-            place = [setting("scene.path", folder)] if data else []
-            given = [f"+experiment={table.name}", *fixed, *settings, *place, word]
-            command = ["steerbench", "run", *given, "hydra.mode=RUN"]
+            command = ["steerbench", "run", *fixed, *settings, *place, word, "hydra.mode=RUN"]
             turns = f"{table.name}, {block}, {seed}, {scene}" if table.in_turns else ""
             jobs.append(Planned(table.name, block, line.label, job, command, scene, turns))
     return jobs
@@ -150,7 +156,7 @@ def _lines(table: PaperTable, beyond: bool) -> Iterator[tuple[str, Line, bool]]:
     unless `beyond`.
     """
     for block in table.blocks if beyond or not table.curve else [table]:
-        yield from ((block.title, line, METHOD not in (line.job or {})) for line in block.lines)
+        yield from ((block.title, line, METHOD not in line.job) for line in block.lines)
     yield from (("curves", line, False) for line in table.marks.values())
 
 

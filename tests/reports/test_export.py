@@ -10,8 +10,9 @@ import pytest
 
 from bench.results import Store
 from reports import export
-from reports.paper_tables import Line, PaperTable, paper_tables
+from reports.paper_tables import Line, PaperTable
 from reports.runs import Repeated, Run, load
+from sweeps.plan import chosen
 
 TABLE = PaperTable(
     name="table9",
@@ -22,7 +23,6 @@ TABLE = PaperTable(
         Line("T = 2^19", {"method": "a"}, {"psnr": 33.0}),
         Line("K = 3", {"method": "b"}),
         Line("mine_1", {"method": "c"}),
-        Line("elsewhere", None, {"size_bytes.total": 5e6}),
         Line("not yet", {"method": "d"}, {"psnr": 30.0}),
     ],
     notes=[],
@@ -68,14 +68,9 @@ def test_latex_has_the_decimals_of_the_paper_and_marks_the_best(
     assert found[r"mine\_1"] == [r"\underline{29.00}", r"\underline{0.900}", r"\textbf{3.0}"]
 
 
-def test_latex_has_published_figures_only_of_what_nothing_here_measures(
-    lines: dict[str, list[Repeated]],
-) -> None:
-    text = export.latex([TABLE], lines)
-    found = cells(text)
-    assert found["elsewhere"] == ["--", "--", r"5.0$^\dagger$"]
+def test_latex_has_a_dash_for_what_was_not_measured(lines: dict[str, list[Repeated]]) -> None:
+    found = cells(export.latex([TABLE], lines))
     assert found["not yet"] == ["--", "--", "--"]
-    assert r"$^\dagger$Published figures" in text
 
 
 def test_latex_of_several_seeds_has_their_interval(lines: dict[str, list[Repeated]]) -> None:
@@ -95,7 +90,7 @@ def test_latex_is_escaped_and_of_booktabs(lines: dict[str, list[Repeated]]) -> N
 
 
 def test_a_rule_stands_before_what_is_beyond_the_paper(lines: dict[str, list[Repeated]]) -> None:
-    (table,) = (table for table in paper_tables() if table.name == "table5")
+    (table,) = (table for table in chosen(None, []) if table.name == "table5")
     run = lines["table9"][0].runs[0]
     labels = [line.label for block in table.blocks for line in block.lines]
     both = export.latex([table], {"table5": [Repeated(label, [run]) for label in labels]})

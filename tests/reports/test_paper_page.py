@@ -13,9 +13,11 @@ import pytest
 from reports import figures
 from reports.outliers import Outlier
 from reports.paper_page import PAGE, _curves, write_paper_page
-from reports.paper_tables import paper_tables
 from reports.parts import Plot
 from reports.runs import Repeated, Run, load
+from sweeps.plan import chosen
+
+TABLES = chosen(None, [])
 
 
 @pytest.fixture
@@ -32,22 +34,22 @@ def of(run: Run, label: str) -> Repeated:
 def test_every_line_that_is_shown_in_a_figure_is_one_of_the_tables() -> None:
     lines = {
         (table.name, line.label)
-        for table in paper_tables()
+        for table in TABLES
         for block in table.blocks
         for line in block.lines
     }
-    shown = [entry["lines"] for entry in (*PAGE["plot"], *PAGE["images"]) if "lines" in entry]
+    shown = [entry["lines"] for entry in (*PAGE["plots"], *PAGE["images"]) if "lines" in entry]
     assert shown
     assert {tuple(line) for entry in shown for line in entry.values()} <= lines
-    assert all(set(plot.get("tables", ())) <= {name for name, _ in lines} for plot in PAGE["plot"])
+    assert all(set(plot.get("tables", ())) <= {name for name, _ in lines} for plot in PAGE["plots"])
 
 
 def test_the_page_has_every_table_and_every_figure(run: Run, tmp_path: Path) -> None:
     lines = {
         table.name: [of(run, line.label) for block in table.blocks for line in block.lines]
-        for table in paper_tables()
+        for table in TABLES
     }
-    page = write_paper_page(paper_tables(), lines, [], tmp_path)
+    page = write_paper_page(TABLES, lines, [], tmp_path)
     text = page.read_text()
     shown = re.findall(r"!\[[^]]*\]\((.+?)\)", text)
     assert len(shown) == 6
@@ -63,7 +65,7 @@ def test_the_page_has_every_table_and_every_figure(run: Run, tmp_path: Path) -> 
 def test_points_of_a_curve_are_not_plotted_against_cost(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (table,) = (table for table in paper_tables() if table.name == "table6")
+    (table,) = (table for table in TABLES if table.name == "table6")
     lines = [of(run, line.label) for line in (*table.lines, *table.marks.values())]
     drawn: list[str] = []
     real = figures.quality_plot
@@ -79,7 +81,7 @@ def test_points_of_a_curve_are_not_plotted_against_cost(
 
 def test_a_page_of_nothing_still_says_what_is_missing(tmp_path: Path) -> None:
     lines = {"table5": [Repeated("with joint training", [], ["not measured yet"])]}
-    text = write_paper_page(paper_tables(), lines, [], tmp_path).read_text()
+    text = write_paper_page(TABLES, lines, [], tmp_path).read_text()
     assert "| with joint training: not measured yet | – / 33.05 |" in text
     assert "![" not in text
 
@@ -87,7 +89,7 @@ def test_a_page_of_nothing_still_says_what_is_missing(tmp_path: Path) -> None:
 def test_outliers_among_the_runs_of_the_page_are_listed(run: Run, tmp_path: Path) -> None:
     lines = {"table5": [of(run, "with joint training")]}
     found = [Outlier(run.key, "13 dB among 30s"), Outlier("another", "not of this page")]
-    text = write_paper_page(paper_tables(), lines, found, tmp_path).read_text()
+    text = write_paper_page(TABLES, lines, found, tmp_path).read_text()
     assert "## Outliers: runs that look broken" in text
     assert "13 dB among 30s" in text
     assert "not of this page" not in text
@@ -128,7 +130,7 @@ def test_a_curve_has_a_point_for_every_share_of_the_training_that_was_measured(
 ) -> None:
     drawn: list[figures.Figure] = []
     monkeypatch.setattr(figures.Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
-    (table,) = (table for table in paper_tables() if table.name == "table5")
+    (table,) = (table for table in TABLES if table.name == "table5")
     made_of = {"config": {"method": {"steps": of_method}}}
     budget = {"renderer_steps": of_budget}
     trained = replace(run, record={**run.record, "budget": budget, "made_of": made_of})

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from omegaconf import OmegaConf
 
 from bench.results import Store
 from reports.paper_tables import (
     ABSENT,
     Line,
     PaperTable,
-    paper_tables,
     section,
     with_published,
 )
@@ -21,6 +21,10 @@ from reports.publish import markdown
 from reports.runs import Repeated, Run, load
 from reports.tables import QUALITY
 from reports.trends import Trend
+from sweeps.overrides import CONFIGS
+from sweeps.plan import chosen
+
+TABLES = chosen(None, [])
 
 METRICS = {*QUALITY, "fps", "frame_ms", "size_bytes.total", "work.samples"}
 TABLE = PaperTable(
@@ -30,7 +34,7 @@ TABLE = PaperTable(
     ["psnr", "frame_ms", "size_bytes.total", "stage_ms.other"],
     [
         Line("here", {"method": "a"}, {"psnr": 31.0, "frame_ms": 9.98}),
-        Line("elsewhere", None, {"size_bytes.total": 5e6}),
+        Line("elsewhere", {"method": "b"}, {"size_bytes.total": 5e6}),
     ],
     ["Mind this."],
 )
@@ -55,10 +59,9 @@ def run(store: Store, stored_run: str) -> Run:
     return replace(found, rows=rows[rows["metric"].isin(figures)])
 
 
-def test_the_first_files_are_the_six_tables_of_the_paper() -> None:
-    tables = paper_tables()
-    assert [table.name for table in tables][:6] == [f"table{number}" for number in range(1, 7)]
-    for table in tables:
+def test_the_experiments_declare_the_six_tables_of_the_paper() -> None:
+    assert [table.name for table in TABLES] == [f"table{number}" for number in range(1, 7)]
+    for table in TABLES:
         labels = [line.label for line in table.lines]
         assert len(set(labels)) == len(labels)
         for line in table.lines:
@@ -69,12 +72,14 @@ def test_the_first_files_are_the_six_tables_of_the_paper() -> None:
             assert metric in METRICS or metric.startswith("stage_ms."), metric
 
 
-@pytest.mark.parametrize("table", paper_tables(), ids=lambda table: table.name)
+@pytest.mark.parametrize(
+    "table", [table for table in TABLES if table.beyond], ids=lambda table: table.name
+)
 def test_the_block_beyond_the_paper_has_its_lines_and_trends_but_no_published_figure(
     table: PaperTable,
 ) -> None:
     first, second = table.blocks
-    own = [line for line in first.lines if line.job is not None and "method" not in line.job]
+    own = [line for line in first.lines if "method" not in line.job]
     assert [line.job for line in second.lines] == [
         {**line.job, "method": "steernerf_lean"} for line in own
     ]
@@ -87,13 +92,22 @@ def test_the_block_beyond_the_paper_has_its_lines_and_trends_but_no_published_fi
         assert one.rising != other.rising
 
 
+@pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
+def test_the_lines_of_a_table_take_every_value_of_its_grid_and_no_other(table: PaperTable) -> None:
+    experiment = OmegaConf.load(CONFIGS / "experiment" / f"{table.name}.yaml")
+    jobs = [line.job for block in table.blocks for line in block.lines]
+    for name, values in experiment.hydra.sweeper.params.items():
+        usual, *others = values.split(",")
+        assert {usual, *(job[name] for job in jobs if name in job)} == {usual, *others}
+
+
 def test_weights_from_other_scenes_are_a_matter_of_the_block_beyond_the_paper() -> None:
-    for table in paper_tables()[1:]:
+    for table in TABLES[1:]:
         assert "other scenes" not in " ".join(table.notes)
 
 
 def test_a_section_shows_both_blocks_each_with_its_trends(run: Run, tmp_path: Path) -> None:
-    (table,) = (table for table in paper_tables() if table.name == "table5")
+    (table,) = (table for table in TABLES if table.name == "table5")
     labels = [line.label for block in table.blocks for line in block.lines]
     lines = [Repeated(label, [run]) for label in labels]
     text = markdown(section(table, lines), tmp_path)

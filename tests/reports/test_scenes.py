@@ -76,8 +76,8 @@ def test_one_seed_is_compared_over_the_frames_of_all_scenes(run: Run) -> None:
     other = over_scenes([of_scene(run, "a", 1.0), of_scene(run, "b", 2.0)])
     lines = {"one": Repeated("one", [one]), "two": Repeated("two", [other])}
     (found,) = differences(Trend("psnr", ["one", "two"]), lines, {})
-    assert (found.here.over, found.verdict) == ("12 frames of one seed", SEEN)
-    assert found.here.by == pytest.approx(1.5)
+    assert (found.over, found.verdict) == ("12 frames of one seed", SEEN)
+    assert found.by == pytest.approx(1.5)
 
 
 @pytest.mark.parametrize("scenes", ["ab", "a"])

@@ -15,18 +15,15 @@ from PIL import Image
 
 from bench.errors import SteerbenchError
 from bench.results import Store
-from reports import paper_tables
 from reports.runs import Run, load
 from sweeps import gather
 from sweeps.data_sets import DataSet, find
 from sweeps.identity import described
 from sweeps.overrides import composed, setting
 from sweeps.paper import data_set
-from sweeps.plan import Planned, plan
+from sweeps.plan import Planned, chosen, plan
 
-(TABLE,) = (
-    replace(table, curve=False) for table in paper_tables.paper_tables() if table.name == "table5"
-)
+(TABLE,) = (replace(table, curve=False) for table in chosen(None, []) if table.name == "table5")
 HERE = Path(__file__).parent
 POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
 
@@ -232,22 +229,16 @@ hydra:
   sweeper:
     params:
       method: grey,dark
-"""
-LINES = """\
-title = "Two greys"
-published_on = "paper"
-metrics = ["psnr"]
-scenes = ["psnr"]
-[[line]]
-label = "a grey"
-job = {}
-published = { psnr = 1.0 }
-[[line]]
-label = "a dark one"
-job = { method = "dark" }
-[[trend]]
-metric = "psnr"
-rising = ["a dark one", "a grey"]
+table:
+  title: Two greys
+  published_on: paper
+  metrics: [psnr]
+  scenes: [psnr]
+  lines:
+    - {label: a grey, job: {}, published: [1.0]}
+    - {label: a dark one, job: {method: dark}}
+  rising:
+    psnr: [a dark one, a grey]
 """
 
 
@@ -263,13 +254,11 @@ def test_the_page_of_a_data_set_has_its_means_its_scenes_and_what_is_missing(
     for name, value in values.items():
         blender(data / name, value)
     blender(data / "ship", pictures=False)
-    configs, tables = tmp_path / "configs", tmp_path / "tables"
-    (configs / "experiment").mkdir(parents=True)
-    tables.mkdir()
-    (configs / "experiment" / "table9.yaml").write_text(EXPERIMENT)
-    (tables / "table9.toml").write_text(LINES)
-    monkeypatch.setattr(paper_tables, "FOLDER", tables)
-    folders = [f"--config-dir={HERE / 'configs'}", f"--config-dir={configs}"]
+    tables = tmp_path / "configs" / "experiment"
+    tables.mkdir(parents=True)
+    (tables / "table9.yaml").write_text(EXPERIMENT)
+    monkeypatch.setattr("sweeps.plan.TABLES", tables)
+    folders = [f"--config-dir={folder / 'configs'}" for folder in (HERE, tmp_path)]
     words = [f"data={data}", "budget=none", "protocol=quick", "device=cpu"]
     outcome = steerbench("paper", *folders, *words, "seed=0,1")
     assert outcome.status == 0, outcome.err

@@ -19,7 +19,6 @@ import pytest
 from omegaconf import OmegaConf
 
 from bench import sources
-from reports import paper_tables
 from sweeps import arguments, cli, overrides
 from sweeps.overrides import choices, composed, swept
 from sweeps.plan import chosen, plan
@@ -128,12 +127,11 @@ def test_the_method_of_the_document_has_a_line_in_a_table(mine, monkeypatch):
 
 
 def test_the_table_of_the_document_is_planned(tmp_path, monkeypatch):
-    for part in (overrides.CONFIGS, paper_tables.FOLDER):
-        shutil.copytree(part, tmp_path / part.relative_to(ROOT))
-    tables = {name for name in write_files("extending.md", tmp_path) if "table7" in name}
-    assert len(tables) == 2
-    monkeypatch.setattr(overrides, "CONFIGS", tmp_path / "sweeps" / "configs")
-    monkeypatch.setattr(paper_tables, "FOLDER", tmp_path / "reports" / "paper")
+    configs = tmp_path / overrides.CONFIGS.relative_to(ROOT)
+    shutil.copytree(overrides.CONFIGS, configs)
+    assert "sweeps/configs/experiment/table7.yaml" in write_files("extending.md", tmp_path)
+    monkeypatch.setattr(overrides, "CONFIGS", configs)
+    monkeypatch.setattr("sweeps.plan.TABLES", configs / "experiment")
     (table,) = chosen("table7", [])
     assert [job.line for job in plan(table, ["seed=0"])] == [line.label for line in table.lines]
 

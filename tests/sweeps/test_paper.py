@@ -16,14 +16,13 @@ from omegaconf import DictConfig
 
 from bench.results import Store
 from bench.types import SteerbenchError, Unavailable
-from reports.paper_tables import paper_tables
 from sweeps import failures, jobs
 from sweeps.identity import described
 from sweeps.measurement import Obtained
 from sweeps.overrides import composed
-from sweeps.plan import Planned, plan
+from sweeps.plan import Planned, chosen, plan
 
-CURVED = {table.name: table for table in paper_tables()}
+CURVED = {table.name: table for table in chosen(None, [])}
 TABLES = {name: replace(table, curve=False) for name, table in CURVED.items()}
 """Their lines alone."""
 
@@ -37,9 +36,7 @@ def with_one_seed(name: str) -> tuple[Planned, ...]:
 @pytest.mark.parametrize("name", TABLES)
 def test_every_line_that_can_be_measured_has_its_job(name: str) -> None:
     jobs = with_one_seed(name)
-    lines = [
-        line.label for block in TABLES[name].blocks for line in block.lines if line.job is not None
-    ]
+    lines = [line.label for block in TABLES[name].blocks for line in block.lines]
     assert sorted(job.line for job in jobs) == sorted(lines)
     assert len({job.key for job in jobs}) == len(lines)
 
@@ -62,20 +59,27 @@ def test_a_curve_has_the_lines_of_the_papers_method_at_several_shares_of_one_tra
         assert one == other
 
 
-def test_methods_that_no_conclusion_is_about_have_one_seed() -> None:
-    lines = [line for line in TABLES["table1"].lines if line.label in ("NeRF", "SteerNeRF, fp32")]
-    jobs = plan(replace(TABLES["table1"], lines=lines, beyond=None), ["budget=demo"])
-    assert [(job.line, job.config.seed) for job in jobs] == [
-        ("NeRF", 0),
-        *(("SteerNeRF, fp32", seed) for seed in range(3)),
-    ]
-
-
-def test_ours_is_repeated_only_with_seeds_that_are_asked_for() -> None:
-    for words, seeds in ((["budget=demo"], [0]), (["budget=demo", "seed=1,2"], [1, 2])):
-        jobs = plan(TABLES["table5"], words)
-        ours = [job.config.seed for job in jobs if job.config.method.name == "steernerf_lean"]
-        assert ours == 2 * seeds
+@pytest.mark.parametrize(
+    ("words", "seeds", "of_ours"),
+    [
+        *(([f"budget={name}"], 1, [0]) for name in ("tiny", "full")),
+        *(([f"budget={name}"], 3, [0]) for name in ("demo", "small")),
+        (["budget=paper"], 3, []),
+        (["budget=demo", "tables.seeds=2"], 2, [0]),
+        (["budget=demo", "seed=7"], [7], [7]),
+        (["budget=demo", "seed=1,2"], [1, 2], [1, 2]),
+    ],
+)
+def test_only_the_papers_method_is_repeated_unless_seeds_are_asked_for(
+    words: list[str], seeds: int | list[int], of_ours: list[int]
+) -> None:
+    found: dict[str, list[int]] = {"steernerf_lean": []}
+    for job in plan(CURVED["table5"], words):
+        if job.block == "curves":
+            continue
+        found.setdefault(job.config.method.name, []).append(job.config.seed)
+    expected = list(range(seeds)) if isinstance(seeds, int) else seeds
+    assert found == {"steernerf": 2 * expected, "steernerf_lean": 2 * of_ours}
 
 
 def test_only_the_table_of_times_is_measured_in_turns() -> None:
@@ -86,7 +90,7 @@ def test_only_the_table_of_times_is_measured_in_turns() -> None:
         assert (turns == {""}) == (name != "table2")
         for turn in turns - {""}:
             together = [job for job in jobs if job.turns == turn]
-            assert len(together) == 3
+            assert len(together) == 2
             assert len({(job.config.method.name, job.config.seed) for job in together}) == 1
 
 
@@ -94,11 +98,11 @@ def test_settings_hold_for_every_job() -> None:
     for job in plan(TABLES["table3"], ["budget=tiny", "seed=3"]):
         assert job.config.budget.name == "tiny"
         assert job.config.seed == 3
-        assert job.line.partition(" (")[0] == f"L = {job.config.method.model.frames}"
+        assert job.line == f"L = {job.config.method.model.frames}"
         assert job.config.trajectory._target_ == "bench.trajectories.orbit"
 
 
-@pytest.mark.parametrize("name", TABLES)
+@pytest.mark.parametrize("name", [name for name in TABLES if name != "table3"])
 def test_a_table_is_of_the_papers_method_and_then_of_ours(name: str) -> None:
     configs = [job.config for job in with_one_seed(name)]
     methods = [
@@ -109,8 +113,8 @@ def test_a_table_is_of_the_papers_method_and_then_of_ours(name: str) -> None:
 
 
 def test_the_lines_of_table_3_differ_in_l_alone() -> None:
-    of_paper = with_one_seed("table3")[:4]
-    settings = [described(job.config) for job in of_paper]
+    settings = [described(job.config) for job in with_one_seed("table3")]
+    assert len(settings) == 4
     for number, setting in enumerate(settings):
         assert setting["method"]["rendering"]["range"]["mode"] == "off"
         of_training = setting["method"]["joint"]["motion"]  # has exactly L frames
@@ -163,25 +167,14 @@ def test_what_the_figures_show_is_what_the_tables_measure(
     assert described(shown) == described(job.config)
 
 
-@pytest.mark.parametrize(("budget", "seeds"), [("tiny", 1), ("demo", 3), ("small", 3), ("full", 1)])
-def test_without_seeds_the_budget_says_how_many(budget: str, seeds: int) -> None:
-    jobs = plan(replace(TABLES["table5"], beyond=None), [f"budget={budget}"])
-    assert [job.config.seed for job in jobs] == 2 * list(range(seeds))
-
-
-def test_a_seed_that_is_given_is_the_only_one() -> None:
-    jobs = plan(TABLES["table5"], ["budget=demo", "seed=7"])
-    assert {job.config.seed for job in jobs} == {7}
-
-
 def test_no_seeds_are_refused() -> None:
-    with pytest.raises(SteerbenchError, match="seeds >= 1"):
-        plan(TABLES["table5"], ["budget.seeds=0"])
+    with pytest.raises(SteerbenchError, match="tables: seeds: expected 1 or more"):
+        plan(TABLES["table5"], ["tables.seeds=0"])
 
 
-def test_how_many_seeds_a_budget_has_changes_no_key() -> None:
-    few, many = (composed(["budget=demo", f"budget.seeds={seeds}"]) for seeds in (1, 3))
-    assert described(few) == described(many)
+@pytest.mark.parametrize("word", ["tables.seeds=5", "tables.beyond=false"])
+def test_what_only_the_tables_read_changes_no_key(word: str) -> None:
+    assert described(composed([word])) == described(composed([]))
 
 
 @pytest.mark.parametrize(
@@ -230,9 +223,8 @@ def put(store: Store, source: str, config: DictConfig) -> str:
 
 
 def labels(page: Path) -> list[str]:
-    """The lines of Table 3 on a page, without those beyond the paper."""
-    paper, _, _ = page.read_text().partition("### Beyond")
-    lines = [line for line in paper.splitlines() if line.startswith("| L = ")]
+    """The lines of Table 3 on a page."""
+    lines = [line for line in page.read_text().splitlines() if line.startswith("| L = ")]
     return [line.split("|")[1].strip() for line in lines]
 
 
@@ -241,7 +233,7 @@ def test_a_job_that_fails_stands_in_its_line_and_the_others_run(
 ) -> None:
     outcome = steerbench("paper", "--table", "table3", "seed=0", f"outputs={store.folder.parent}")
     assert outcome.status == 1
-    assert len(measured) == 4 * (1 + 3 + 1)  # lines; thrice each for their curves; ours
+    assert len(measured) == 4 * (1 + 3)  # lines; thrice each for their curves
     assert "failed: table3: L = 3, seed 0: no room" in outcome.err
     assert "about 0:00:0" in outcome.err
     page = Path(re.search(r"report: (.*)", outcome.err)[1])
