@@ -47,10 +47,10 @@ from bench.types import (
 )
 from reports.runs import Run, load
 from sweeps import configured, measurement
-from sweeps.catalogue import described
+from sweeps.commands.list import described
+from sweeps.commands.score import scored
 from sweeps.deliver import write
 from sweeps.overrides import composed
-from sweeps.score import scored
 
 __all__ = [
     "Budget",

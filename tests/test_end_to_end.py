@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 
 from bench.results import Store
-from sweeps.studies.breakdown import DENSE
+from sweeps.commands.breakdown import DENSE
 
 pytestmark = pytest.mark.slow
 

@@ -17,12 +17,12 @@ MAY_IMPORT = {
     "sweeps": {"bench", "reports", "sweeps"},
 }
 REACHES = {
-    "sweeps/studies/accuracy.py": "methods.checks.",
-    "sweeps/studies/worth.py": "methods.kernels.",
-    "sweeps/compile.py": "methods.checks.",
-    "sweeps/kernels.py": ("methods.checks.", "methods.kernels."),
-    "sweeps/catalogue.py": "methods.kernels.",
-    "sweeps/stress.py": "methods.checks.",
+    "sweeps/commands/accuracy.py": "methods.checks.",
+    "sweeps/commands/compile.py": "methods.checks.",
+    "sweeps/commands/kernels.py": ("methods.checks.", "methods.kernels."),
+    "sweeps/commands/list.py": "methods.kernels.",
+    "sweeps/commands/stress.py": "methods.checks.",
+    "sweeps/worth.py": "methods.kernels.",
 }
 """What measures and lists parts of methods reaches them directly; methods only through
 `_target_`."""
@@ -113,7 +113,7 @@ def test_a_compiler_is_imported_only_by_the_kernels_made_for_it(library, home):
 
 def test_the_command_line_opens_without_loading_torch():
     """Help and completion answer at once because nothing they need imports torch."""
-    seen, pending = set(), {Path("sweeps/cli.py"), Path("sweeps/run.py")}
+    seen, pending = set(), {Path("sweeps/cli.py"), Path("sweeps/commands/run.py")}
     while pending:
         path = pending.pop()
         seen.add(path)

@@ -26,7 +26,9 @@ class Nerf(FieldStudent):
     """
 
     kind = "nerf"
-    study = replace(FieldStudent.study, skips={"empty cells": "method.skip"})
+    study = replace(
+        FieldStudent.study, skips={"empty cells": "method.skip"}, chosen=("skip", "stop")
+    )
 
     def __init__(
         self,

@@ -18,10 +18,10 @@ from bench.results import Store
 from reports import paper_tables
 from reports.runs import Run, load
 from sweeps import gather
+from sweeps.commands.paper import data_set
 from sweeps.data_sets import DataSet, find
 from sweeps.identity import described
 from sweeps.overrides import composed, setting
-from sweeps.paper import data_set
 from sweeps.plan import Planned, plan
 
 (TABLE,) = (

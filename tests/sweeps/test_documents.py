@@ -23,7 +23,7 @@ from reports import paper_tables
 from sweeps import arguments, cli, overrides
 from sweeps.overrides import choices, composed, swept
 from sweeps.plan import chosen, plan
-from sweeps.studies.variants import METHOD
+from sweeps.variants import METHOD
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

@@ -17,11 +17,11 @@ from bench.results import Store
 from bench.types import Scene
 from reports.paper_tables import paper_tables
 from sweeps import configured, failures
+from sweeps.commands.breakdown import with_engine
 from sweeps.gather import gather, newest
 from sweeps.identity import described
 from sweeps.overrides import composed
 from sweeps.plan import Planned, plan
-from sweeps.studies.breakdown import with_engine
 
 (TABLE,) = (
     replace(table, lines=table.lines[:1], curve=False, beyond=None)

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 from bench.study import Study, Variant
 from sweeps.overrides import choices, composed
-from sweeps.studies.variants import declared
+from sweeps.variants import declared
 
 METHODS = [name for name, path in choices("method").items() if "_target_" in OmegaConf.load(path)]
 """Those with a class of their own: the others declare what the method does that they vary."""

@@ -10,9 +10,9 @@ from bench.console import ConsoleLog
 from bench.study import Variant, study_of
 from bench.viewing import Painter
 from sweeps.build import build
+from sweeps.commands.render import words_of_run
 from sweeps.configured import scene_of, trained
 from sweeps.overrides import beside, composed
-from sweeps.render import words_of_run
 from sweeps.viewer import AS_GIVEN, Viewer
 
 

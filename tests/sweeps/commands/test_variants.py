@@ -9,7 +9,7 @@ import pytest
 from bench.errors import SteerbenchError, Unavailable
 from bench.trajectories import Step, Trajectory
 from sweeps.overrides import composed
-from sweeps.studies.variants import common_ground, fit_each, usable
+from sweeps.variants import common_ground, fit_each, usable
 
 SMALL = ("scene=totem", "scene.width=16", "scene.train=2", "scene.test=2", "trajectory=test")
 
@@ -24,7 +24,7 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
             raise Unavailable("it is not installed")
         return SimpleNamespace(memory=0, fit=lambda *arguments: names.append(config.engine))
 
-    monkeypatch.setattr("sweeps.studies.variants.build", build)
+    monkeypatch.setattr("sweeps.variants.build", build)
     return names
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bench.study import Study
-from sweeps.studies.variants import engines
+from sweeps.variants import engines
 from tests.sweeps.conftest import STAND_INS, Outcome
 
 FRAMES = ["--frames", "2", "--repeats", "1"]
@@ -111,7 +111,7 @@ def test_breakdown_says_which_lines_of_a_frame_wait_for_the_gpu(study, gpu, monk
     monkeypatch.setattr("stand_ins.Grey.render", asking)
     (row,) = rows(study("breakdown", "grey", "--device-waits"))
     assert row["waits"] == 1
-    assert row["line"].startswith("tests/sweeps/studies/test_studies.py:")
+    assert row["line"].startswith("tests/sweeps/commands/test_studies.py:")
     assert row["source"] == 'torch.ones(1, device="cuda").item()'
 
 

@@ -39,7 +39,9 @@ def main(options: argparse.Namespace) -> int:
 
     backends = [(name, why or "usable") for name, why in availability().items()]
     _show("Backends of the kernels", ("backend", "here"), backends)
-    engines = [(name, _state(name, kind)) for name, kind in engine_kinds(words).items()]
+    engines = [
+        (name, _state(name, kind)) for name, kind in engine_kinds(choices("engine", words)).items()
+    ]
     _show("Engines of the networks", ("engine", "here"), engines)
     return 0
 

@@ -5,40 +5,34 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from itertools import compress
-from pathlib import Path
-from typing import Any
 
 from bench.accuracy import steady_frames
 from bench.probes import OTHER
 from bench.study import Study, Variant
-from bench.trajectories import Trajectory
-from bench.types import Method, NullProbe
+from bench.types import NullProbe
 from bench.waits import Line, device_waits
 from reports.tables import Table, decimal, share
-from sweeps.configured import checked_settings
-from sweeps.device_lock import device_lock, on_gpu
+from sweeps.commands.skips import nothing_skipped
+from sweeps.device_lock import on_gpu
+from sweeps.execute import Launcher
 from sweeps.overrides import composed, folder_words, holds
-from sweeps.studies.skips import nothing_skipped
-from sweeps.studies.variants import (
+from sweeps.terminal import print_rows, show
+from sweeps.variants import (
     METHOD,
-    OnceLog,
     Rendered,
     Row,
-    common_ground,
     computes_with_engine,
     declared,
     engines,
-    fit_each,
-    print_rows,
+    fitted,
     range_text,
     render_variants,
+    settings,
     settings_of,
-    usable,
+    times,
 )
-from sweeps.terminal import show
-
-SETTINGS = (METHOD, "trajectory=smooth")
 
 DENSE = ", nothing skipped"
 """Suffix of a line whose method skips nothing."""
@@ -46,9 +40,10 @@ DENSE = ", nothing skipped"
 
 def main(options: argparse.Namespace) -> int:
     """Print two tables, then the rows of the first as JSON in the last line; or one of waits."""
-    words = with_engine([*SETTINGS, *options.overrides])
+    words, launcher = settings(options, METHOD, "trajectory=smooth")
+    words = with_engine(words)
     if options.device_waits:
-        return _print_waits(words, options.frames)
+        return _print_waits(words, options.frames, launcher)
     config = composed(words)
     study = declared(config)
     usual = _precisions(words) or [Variant("as it is")]
@@ -56,60 +51,57 @@ def main(options: argparse.Namespace) -> int:
     if study.skips:
         variants |= settings_of([*words, *nothing_skipped(study)], _ending(usual, DENSE))
     shared = _shared(words, study)
-    for name, settings in study.beside.items():
-        other = [*shared, *settings]
+    for name, of_method in study.beside.items():
+        other = [*shared, *of_method]
         variants |= settings_of(other, _ending(_precisions(other), f", {name}") or [Variant(name)])
-    found = render_variants(variants, options.frames, options.repeats)
-    rows = {one.name: _row(one, composed(variants[one.name]).budget == config.budget)
-            for one in found}  # fmt: skip
+    rendered = render_variants(variants, options, launcher)
+    rows = {
+        one.name: _row(one, composed(variants[one.name]).budget == config.budget)
+        for one in rendered
+    }
     parts = _parts(study, rows.values())
     columns = ("", *parts, "frame ↓", "of rounds", "p99 / p50 ↓", "FPS ↑", "PSNR, dB ↑")
-    title = f"ms of a frame, and what of it each part takes itself; {found[0].frames} frames"
+    title = f"ms of a frame, and what of it each part takes itself; {rendered[0].frames} frames"
     show(Table(title, columns, tuple(_line(row, parts) for row in rows.values())))
     if compared := _compared(rows, [variant.name for variant in usual], study):
         show(compared)
-    print_rows(rows.values())
+    print_rows(list(rows.values()))
     return 0
 
 
-def _print_waits(words: Sequence[str], frames: int) -> int:
-    """Print how often the host waits for the GPU in a steady frame, by the line that causes it.
-
-    The path is rendered once before, so that one-time set-up is not counted.
-    """
+def _print_waits(words: Sequence[str], frames: int, launcher: Launcher) -> int:
+    """Print how often the host waits for the GPU in a steady frame, by the line that causes it."""
     with device_waits():
         pass  # raises without a GPU before anything is trained
-    config = composed(words)
-    settings = checked_settings(config)
-    log = OnceLog(Path(settings.outputs))
-    methods = usable({"as it is": config}, log)
-    scene, path, _ = common_ground(config, frames)
-    with device_lock(settings.device, log):
-        fit_each(methods, {"as it is": config}, scene, path, log)
-        (method,) = methods.values()
-        times = [_waits(method, path) for _ in range(2)][1]
-    waits = sum(times, Counter[Line]())
+    (waits,) = launcher.run(partial(_waits, frames=frames), [words])
+    total = sum(waits, Counter[Line]())
     rows: list[Row] = [
-        {"waits": count / len(times), "line": line.place, "source": line.source}
-        for line, count in waits.most_common()
+        {"waits": count / len(waits), "line": line.place, "source": line.source}
+        for line, count in total.most_common()
     ]
     lines = tuple((decimal(row["waits"], 1), row["line"], row["source"]) for row in rows)
-    title = f"{decimal(waits.total() / len(times), 1)} waits a frame, mean of {len(times)}"
+    title = f"{decimal(total.total() / len(waits), 1)} waits a frame, mean of {len(waits)}"
     show(Table(title, ("waits", "line", "source"), lines, figures=False))
     print_rows(rows)
     return 0
 
 
-def _waits(method: Method, path: Trajectory) -> list[Counter[Line]]:
-    """Where the host waits in each steady frame of `path`."""
-    method.reset()
-    ready, _ = steady_frames([method], path)
-    found = []
-    for step in path.steps:
-        with device_waits() as waits:
-            method.render(step.camera, NullProbe())
-        found.append(waits)
-    return list(compress(found, ready))
+def _waits(words: Sequence[str], frames: int) -> list[Counter[Line]]:
+    """Where the host waits in each steady frame.
+
+    The path is rendered once before, so that one-time set-up is not counted.
+    """
+    with fitted({"as it is": words}, frames) as each:
+        (method,) = each.methods.values()
+        for _ in range(2):
+            method.reset()
+            counted = []
+            for step in each.trajectory.steps:
+                with device_waits() as waits:
+                    method.render(step.camera, NullProbe())
+                counted.append(waits)
+        ready, _ = steady_frames([method], each.trajectory)
+        return list(compress(counted, ready))
 
 
 def with_engine(words: Sequence[str]) -> list[str]:
@@ -152,8 +144,7 @@ def _row(one: Rendered, trained_alike: bool) -> Row:
         "line": one.name,
         "parts": parts,
         "network_ms": one.network_ms,
-        "frame_ms": one.values["ms"],
-        **{name: one.values[name] for name in ("ms_lo", "ms_hi", "p99_to_p50")},
+        **times(one),
         "psnr": one.values["psnr"] if trained_alike else None,
     }
 
@@ -191,17 +182,18 @@ def _compared(rows: Mapping[str, Row], names: Sequence[str], study: Study) -> Ta
 def _ratios(rows: Mapping[str, Row], name: str, first: str, study: Study) -> dict[str, str]:
     row, cells = rows[name], {}
 
-    def ratio(other: Mapping[str, Any], of: str, to: str) -> str:
-        known = other.get(of) and row[to]
-        return decimal(other[of] / row[to] if known else None, 1)
+    def ratio(method: str, of: str, to: str) -> None:
+        known = other.get(f"{of}_ms") and row[f"{to}_ms"]
+        value = other[f"{of}_ms"] / row[f"{to}_ms"] if known else None
+        cells[f"{of} of {method} / {to} ↑"] = decimal(value, 1)
 
     for method in study.beside:
         other = rows.get(f"{name}, {method}", rows.get(method, {}))
         if other.get("network_ms"):
-            cells[f"network of {method} / frame ↑"] = ratio(other, "network_ms", "frame_ms")
-            cells[f"network of {method} / network ↑"] = ratio(other, "network_ms", "network_ms")
+            ratio(method, "network", "frame")
+            ratio(method, "network", "network")
         else:
-            cells[f"frame of {method} / frame ↑"] = ratio(other, "frame_ms", "frame_ms")
+            ratio(method, "frame", "frame")
     if len(rows) > 1 and name != "as it is":
         cells[f"lost to {first}, dB ↓"] = decimal(rows[first]["psnr"] - row["psnr"], 3)
     if dense := rows.get(name + DENSE):

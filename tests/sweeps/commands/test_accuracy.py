@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 
 from bench.errors import SteerbenchError
 from bench.study import Study, Variant
-from sweeps.studies.accuracy import _last_words, decibels
+from sweeps.commands.accuracy import _last_words, decibels
 
-VARIANTS = "sweeps.studies.variants"
+VARIANTS = "sweeps.variants"
 EXACT = "method.rendering.skip.empty=false"
 
 ERROR = {"subject": "ramp", "knob": "step", "setting": 0.25, "error": 0.125, "order": None,
@@ -38,13 +38,13 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> None:
 
     ground = SimpleNamespace(name="totem"), SimpleNamespace(name="orbit", resolution="8x8"), None
     study = Study({"share": variants[:2], "length": variants[2:]}, exact=(EXACT,))
-    monkeypatch.setattr("sweeps.studies.accuracy.declared", lambda config: study)
-    monkeypatch.setattr("sweeps.studies.accuracy.computes_with_engine", lambda config: False)
+    monkeypatch.setattr("sweeps.commands.accuracy.declared", lambda config: study)
+    monkeypatch.setattr("sweeps.commands.accuracy.computes_with_engine", lambda config: False)
     monkeypatch.setattr(f"{VARIANTS}.common_ground", lambda *arguments: ground)
     monkeypatch.setattr(f"{VARIANTS}.usable", lambda configs, log: configs)
     monkeypatch.setattr(f"{VARIANTS}.fit_each", lambda *arguments: None)
     monkeypatch.setattr(f"{VARIANTS}.render_in_turns", rendered)
-    monkeypatch.setattr("sweeps.studies.accuracy.experiment_rows", lambda *arguments: [ERROR])
+    monkeypatch.setattr("sweeps.commands.accuracy.experiment_rows", lambda *arguments: [ERROR])
     monkeypatch.setattr("methods.checks.found", lambda name: [])
     monkeypatch.setattr("reports.tradeoff.frontier_plot", lambda rows, path: Figure().savefig(path))
 
