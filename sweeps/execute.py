@@ -13,7 +13,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
 from hydra.types import HydraContext
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from sweeps.overrides import CONFIGS, composed, setting
 from sweeps.processes import set_up
@@ -52,10 +52,12 @@ class Launcher:
             return []
         with initialize_config_dir(str(CONFIGS), version_base="1.3"):
             loader = GlobalHydra.instance().config_loader()
+        config = self._config()
+        join_cluster(config)
         launcher = Plugins.instance().instantiate_launcher(
             hydra_context=HydraContext(config_loader=loader, callbacks=Callbacks()),
             task_function=_Numbered(work, on),
-            config=self._config(),
+            config=config,
         )
         jobs = launcher.launch([[] for _ in on], initial_job_idx=0)
         results = [job.return_value for job in jobs]
@@ -67,6 +69,17 @@ class Launcher:
     def _config(self) -> DictConfig:
         words = [*self.words, setting("outputs", str(self.outputs))]
         return composed(words, return_hydra_config=True)
+
+
+def join_cluster(config: DictConfig) -> None:
+    """Let Ray's launcher join the cluster at the address in `config`, if there is one.
+
+    It would ask for memory of its own, which a cluster that exists already refuses.
+    """
+    init = OmegaConf.select(config, "hydra.launcher.ray.init")
+    if init and init.get("address"):
+        with open_dict(init):
+            init.setdefault("object_store_memory", None)
 
 
 def divided(words: Sequence[str]) -> tuple[list[str], list[str]]:

@@ -16,6 +16,7 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from sweeps.execute import join_cluster
 from sweeps.overrides import CONFIGS, explain, of_hydra, settled, swept
 
 if TYPE_CHECKING:
@@ -34,8 +35,9 @@ class SweepCallback(Callback):
     folder: ClassVar[Path | None] = None
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Record the folder of the sweep."""
+        """Record the folder of the sweep, before its launcher is made."""
         SweepCallback.folder = Path(config.hydra.sweep.dir)
+        join_cluster(config)
 
 
 def main(argv: Sequence[str]) -> int:

@@ -15,6 +15,9 @@ import pytest
 from sweeps import cli
 
 HERE = Path(__file__).parent
+PATH = os.pathsep.join((str(HERE), str(HERE.parents[1])))
+"""Where other processes find the stand-ins, and the code of this checkout."""
+
 QUICK = ["method=grey", "scene=white", "budget=none", "protocol=quick"]
 STAND_INS = ["--config-dir", str(HERE / "configs"), *QUICK]
 
@@ -62,7 +65,7 @@ def spawn(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
         process = subprocess.Popen(
             [Path(sys.executable).with_name("steerbench"), "run", *STAND_INS, *argv],
             cwd=tmp_path,
-            env={**os.environ, "PYTHONPATH": str(HERE), "OMP_NUM_THREADS": "1"},
+            env={**os.environ, "PYTHONPATH": PATH, "OMP_NUM_THREADS": "1"},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

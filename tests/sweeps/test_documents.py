@@ -198,7 +198,7 @@ def test_every_command_of_a_document_can_be_typed(document, words, monkeypatch, 
             return
     else:
         options = captured(monkeypatch, words)
-        studied = arguments.COMMANDS[words[0]].get("module", "").startswith("studies.")
+        studied = arguments.COMMANDS[words[0]]["group"] == "studies of a method"
         usual = [METHOD] if studied else []
         settings = [*usual, *getattr(options, "overrides", [])]
     settings = [word for word in settings if not word.startswith(ELSEWHERE)]

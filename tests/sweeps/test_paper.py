@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import pandas as pd
 import pytest
+from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 from omegaconf import DictConfig
 
 from bench.results import Store
@@ -19,7 +19,7 @@ from bench.types import SteerbenchError, Unavailable
 from reports.paper_tables import paper_tables
 from sweeps import failures, jobs
 from sweeps.identity import described
-from sweeps.measurement import Obtained
+from sweeps.measurement import Group, Obtained
 from sweeps.overrides import composed
 from sweeps.plan import Planned, plan
 
@@ -201,16 +201,14 @@ def measured(
     for."""
     asked: list[DictConfig] = []
 
-    def obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
+    def obtain(group: Group) -> list[Obtained]:
+        (config,) = [job.config for job in group.jobs]
         asked.append(config)
         if config.method.model.frames == 3:
             raise SteerbenchError("no room\nfor L = 3")
-        return Obtained(store, put(store, stored_run, config), measured=True)
+        return [Obtained(store, put(store, stored_run, config), measured=True)]
 
-    def in_turns(jobs: Sequence[tuple[DictConfig, Sequence[str]]], _: str) -> list[Obtained]:
-        return [obtain(*job) for job in jobs]
-
-    monkeypatch.setattr(jobs, "obtain_in_turns", in_turns)
+    monkeypatch.setattr(jobs, "obtain", obtain)
     monkeypatch.chdir(tmp_path)
     return asked
 
@@ -249,13 +247,31 @@ def test_a_job_that_fails_stands_in_its_line_and_the_others_run(
     assert "/ 33.14 /" in page.read_text()
 
 
+def test_the_jobs_go_where_hydras_launcher_puts_them(
+    steerbench, measured: list[DictConfig], store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    launched: list[int] = []
+    launch = BasicLauncher.launch
+
+    def noted(self, jobs, initial_job_idx: int):
+        assert self.config.hydra.launcher.queue == "gpu"
+        launched.append(len(jobs))
+        return launch(self, jobs, initial_job_idx)
+
+    monkeypatch.setattr(BasicLauncher, "launch", noted)
+    monkeypatch.setattr(BasicLauncher, "__init__", lambda self, queue: None)
+    words = ("seed=0", "+hydra.launcher.queue=gpu", f"outputs={store.folder.parent}")
+    assert steerbench("paper", "--table", "table5", *words).status == 0
+    assert launched == [len(measured)]
+
+
 def test_what_cannot_run_here_says_so_in_its_line_and_is_no_failure(
     steerbench, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def obtain(*_: object) -> list[Obtained]:
         raise Unavailable("no bfloat16 on this CPU")
 
-    monkeypatch.setattr(jobs, "obtain_in_turns", obtain)
+    monkeypatch.setattr(jobs, "obtain", obtain)
     outcome = steerbench("paper", "--table", "table3", "seed=0", f"outputs={store.folder.parent}")
     assert outcome.status == 0
     page = Path(re.search(r"report: (.*)", outcome.err)[1])

@@ -150,17 +150,17 @@ def test_other_studies_take_it(call, command):
 def only_mine(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Measure nothing but the plug-in; the methods of all jobs."""
     from sweeps import jobs
-    from sweeps.measurement import obtain_in_turns
+    from sweeps.measurement import obtain
 
     names = []
 
-    def some(asked, turns):
-        names.extend(config.method._target_ for config, _ in asked)
+    def some(group):
+        names.extend(job.config.method._target_ for job in group.jobs)
         if names[-1] != "mine.renderer.Mine":
             raise RuntimeError("not measured here")
-        return obtain_in_turns(asked, turns)
+        return obtain(group)
 
-    monkeypatch.setattr(jobs, "obtain_in_turns", some)
+    monkeypatch.setattr(jobs, "obtain", some)
     return names
 
 

@@ -142,7 +142,7 @@ def test_a_sweep_takes_flags_after_overrides_and_runs_every_combination(run, tmp
 def test_a_job_that_fails_does_not_take_the_sweep_along(run, tmp_path):
     outcome = run("-m", "method.level=0.5,7,0.25")
     assert outcome.status == 2
-    assert "method.level=7: method.level: expected 0 to 1, got 7" in outcome.err
+    assert "failed: grey (level=7): method.level: expected 0 to 1, got 7" in outcome.err
     assert len(stored(tmp_path)) == 2
 
 

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sweeps import cli, view
+from sweeps import cli
+from sweeps.commands import view
 from sweeps.viewer import AS_GIVEN, Viewer
 
 from .conftest import STAND_INS

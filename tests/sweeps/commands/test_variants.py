@@ -2,68 +2,69 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import pytest
 
 from bench.errors import SteerbenchError, Unavailable
-from bench.trajectories import Step, Trajectory
-from sweeps.overrides import composed
-from sweeps.variants import common_ground, fit_each, usable
+from sweeps.variants import fitted
+from tests.sweeps.conftest import HERE, QUICK
 
-SMALL = ("scene=totem", "scene.width=16", "scene.train=2", "scene.test=2", "trajectory=test")
+WORDS = [f"--config-dir={HERE / 'configs'}", *QUICK]
+ABSENT = 0.9
+"""The level of a grey that cannot be used."""
 
 
 @pytest.fixture
-def fitted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The engines that were fitted; those that are called "absent" cannot be used."""
-    names: list[str] = []
+def trained(monkeypatch: pytest.MonkeyPatch, tmp_path) -> list[float]:
+    """The levels of the greys that were fitted."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(HERE)
+    import stand_ins
 
-    def build(config: SimpleNamespace, group: str) -> object:
-        if group == "method" and config.engine == "absent":
+    levels: list[float] = []
+    make = stand_ins.Grey.__init__
+
+    def made(self, seed: int, device: str, backend: str, level: float) -> None:
+        if level == ABSENT:
             raise Unavailable("it is not installed")
-        return SimpleNamespace(memory=0, fit=lambda *arguments: names.append(config.engine))
+        make(self, seed, device, backend, level)
 
-    monkeypatch.setattr("sweeps.variants.build", build)
-    return names
-
-
-def configs(*engines: str) -> dict[str, SimpleNamespace]:
-    return {str(n): SimpleNamespace(seed=0, engine=engine) for n, engine in enumerate(engines)}
+    monkeypatch.setattr(stand_ins.Grey, "__init__", made)
+    monkeypatch.setattr(stand_ins.Grey, "fit", lambda self, *_: levels.append(self.level))
+    return levels
 
 
-def path(truth: int | None) -> Trajectory:
-    return Trajectory("path", "test", (Step(SimpleNamespace(), truth),))
+def greys(*levels: float, more: tuple[str, ...] = ()) -> dict[str, list[str]]:
+    return {str(level): [*WORDS, f"method.level={level}", *more] for level in levels}
 
 
-def test_what_cannot_be_used_is_left_out(fitted, quiet_log):
-    found = configs("one", "absent", "other")
-    methods = usable(found, quiet_log)
-    assert list(methods) == ["0", "2"]
-    fit_each(methods, found, None, path(0), quiet_log)
-    assert fitted == ["one", "other"]
+def test_what_cannot_be_used_is_left_out(trained):
+    with fitted(greys(0.1, ABSENT, 0.3), 2) as each:
+        assert list(each.methods) == ["0.1", "0.3"]
+    assert trained == [0.1, 0.3]
 
 
-def test_without_the_first_there_is_nothing_to_compare_with(fitted, quiet_log):
-    with pytest.raises(Unavailable):
-        usable(configs("absent", "other"), quiet_log)
+def test_without_the_first_there_is_nothing_to_compare_with(trained):
+    with pytest.raises(Unavailable), fitted(greys(ABSENT, 0.3), 2):
+        pass
 
 
-def test_a_path_without_truth_is_refused_before_anything_is_trained(fitted, quiet_log):
-    found = configs("one")
-    methods = usable(found, quiet_log)
-    with pytest.raises(SteerbenchError, match="give more frames"):
-        fit_each(methods, found, None, path(None), quiet_log)
-    assert fitted == []
+@pytest.mark.parametrize(
+    ("memory", "more", "message"),
+    [
+        (2, (), "give more frames"),
+        (0, ("+protocol.memory=cold", "protocol.name=cold"), r"protocol\.memory: expected steady"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused_before_anything_is_trained(
+    trained, monkeypatch, memory, more, message
+):
+    monkeypatch.setattr("stand_ins.Grey.memory", memory)
+    with pytest.raises(SteerbenchError, match=message), fitted(greys(0.1, more=more), 2):
+        pass
+    assert trained == []
 
 
-def test_a_protocol_that_forgets_between_frames_is_refused(tmp_path):
-    config = composed([*SMALL, f"outputs={tmp_path}", "protocol.memory=cold", "protocol.name=cold"])
-    with pytest.raises(SteerbenchError, match=r"protocol\.memory: expected steady"):
-        common_ground(config, 2)
-
-
-def test_pictures_too_small_for_lpips_are_not_refused_where_it_is_not_computed(tmp_path):
-    _, found, protocol = common_ground(composed([*SMALL, f"outputs={tmp_path}"]), 1)
-    assert len(found.steps) == 1
-    assert protocol.lpips == ()
+def test_pictures_too_small_for_lpips_are_not_refused_where_it_is_not_computed(trained):
+    with fitted(greys(0.1, more=("protocol=steerbench-1",)), 1) as each:
+        assert len(each.trajectory.steps) == 1
+        assert each.protocol.lpips == ()
