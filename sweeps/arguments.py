@@ -44,7 +44,7 @@ def port(text: str) -> int:
 
 
 def config_dir(text: str) -> str:
-    """`--config-dir=` and the folder `text`, which must exist: a word as `sweeps.overrides` reads."""
+    """`--config-dir=` and the folder `text`, which must exist; `sweeps.overrides` reads it."""
     if not Path(text).is_dir():
         raise argparse.ArgumentTypeError(f"expected a folder, there is none at {text}")
     return f"--config-dir={Path(text).resolve()}"

@@ -79,18 +79,13 @@ def obtain(group: Group) -> list[Obtained]:
     """
     log = ConsoleLog(group.outputs)
     ready = _ready(group, log)
-    measured = False
-    if not _stored(ready):
-        with device_lock(ready[0].method.settings()["device"], log):
-            if not _stored(ready):  # by another process meanwhile
-                _measure(ready, log)
-                measured = True
-    for each in ready:
-        if not measured:
-            each.say_stored(log)
-        failures.forget(group.outputs, described(each.job.config))
-        send(each.job.config, each.store, each.run, each.method.name)
-    return [Obtained(each.store, each.run, measured) for each in ready]
+    if _stored(ready):
+        return _told(ready, False, log)
+    with device_lock(ready[0].method.settings()["device"], log):
+        measured = not _stored(ready)  # by another process meanwhile
+        if measured:
+            _measure(ready, log)
+    return _told(ready, measured, log)
 
 
 def stored(group: Group) -> list[Obtained]:
@@ -100,12 +95,7 @@ def stored(group: Group) -> list[Obtained]:
     """
     log = ConsoleLog(group.outputs)
     ready = _ready(group, log)
-    if not _stored(ready):
-        return []
-    for each in ready:
-        each.say_stored(log)
-        failures.forget(group.outputs, described(each.job.config))
-    return [Obtained(each.store, each.run, measured=False) for each in ready]
+    return _told(ready, False, log) if _stored(ready) else []
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,9 +130,6 @@ class _Ready:
         """Its key in the store."""
         return self.store.key(self.parts)
 
-    def say_stored(self, log: Log) -> None:
-        log.info(f"already measured; to measure again, remove {self.store.folder / self.run}")
-
     def keep(self, measurement: Measurement) -> None:
         """Store the measurement, with its command and the folder of its scene."""
         command, place = shlex.join(self.job.command), scene_folder(self.job.config)
@@ -165,6 +152,17 @@ def _ready(group: Group, log: Log) -> list[_Ready]:
 
 def _stored(ready: Sequence[_Ready]) -> bool:
     return all(each.store.find(each.run) for each in ready)
+
+
+def _told(ready: Sequence[_Ready], measured: bool, log: Log) -> list[Obtained]:
+    """Forget earlier failures of runs that the store has now, and send them to their tracker."""
+    for each in ready:
+        config, store, run = each.job.config, each.store, each.run
+        if not measured:
+            log.info(f"already measured; to measure again, remove {store.folder / run}")
+        failures.forget(Path(config.outputs), described(config))
+        send(config, store, run, each.method.name)
+    return [Obtained(each.store, each.run, measured) for each in ready]
 
 
 def _measure(ready: Sequence[_Ready], log: Log) -> None:

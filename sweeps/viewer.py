@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from io import StringIO
@@ -86,7 +86,7 @@ class Viewer:
         painter: Painter,
         scene: Scene,
         first: Camera,
-        knobs: Sequence[Mapping[str, Sequence[str]]],
+        knobs: Sequence[Mapping[str, Iterable[str]]],
         turn: Callable[[int, str, str], None],
         folder: Path,
         log: Log,

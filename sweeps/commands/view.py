@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 
 from bench.console import ConsoleLog
-from bench.study import Variant, study_of
+from bench.study import study_of
 from bench.viewing import Painter
 from sweeps.build import build
 from sweeps.commands.render import words_of_run
 from sweeps.configured import scene_of, trained
 from sweeps.overrides import beside, composed
-from sweeps.viewer import AS_GIVEN, Viewer
+from sweeps.viewer import Viewer
 
 
 def main(options: argparse.Namespace) -> int:
@@ -33,46 +34,26 @@ def opened(options: argparse.Namespace) -> Viewer:
         SteerbenchError: a setting is wrong, the training failed, or viser is not installed.
     """
     words = [*words_of_run(options.run, options.overrides), *options.overrides]
-    others = [beside(options.beside, words)] if options.beside else []
-    wanted = [_Tuned(each) for each in (words, *others)]
-    config = composed(words)
-    log, scene = ConsoleLog(Path(config.outputs)), scene_of(config)
-    first = build(config, "trajectory", scene).steps[0].camera
-    configs = [config, *(composed(one.words()) for one in wanted[1:])]
+    wanted = [words, *([beside(options.beside, words)] if options.beside else [])]
+    configs = [composed(each) for each in wanted]
+    log, scene = ConsoleLog(Path(configs[0].outputs)), scene_of(configs[0])
+    first = build(configs[0], "trajectory", scene).steps[0].camera
     painter = Painter([trained(each, log) for each in configs])
-    for method, one in zip(painter.methods, wanted, strict=True):
-        one.knobs = dict(study_of(method).knobs)
-    names = [{name: [v.name for v in one.knobs[name]] for name in one.knobs} for one in wanted]
+    knobs = [
+        {
+            knob: {variant.name: variant.settings for variant in variants}
+            for knob, variants in study_of(method).knobs.items()
+        }
+        for method in painter.methods
+    ]
+    turned: list[dict[str, Sequence[str]]] = [{} for _ in wanted]
 
     def turn(place: int, knob: str, setting: str) -> None:
-        one = wanted[place]
-        before = dict(one.chosen)
-        one.chosen[knob] = setting
-        try:
-            painter.put(place, trained(composed(one.words()), log))
-        except Exception:
-            one.chosen = before
-            raise
+        now = {**turned[place], knob: knobs[place][knob].get(setting, ())}  # none: as given
+        painter.put(place, trained(composed([*wanted[place], *chain(*now.values())]), log))
+        turned[place] = now
 
-    address, folder = (options.host, options.port), Path(config.outputs) / "view"
-    viewer = Viewer(painter, scene, first, names, turn, folder, log, address)
+    address, folder = (options.host, options.port), Path(configs[0].outputs) / "view"
+    viewer = Viewer(painter, scene, first, knobs, turn, folder, log, address)
     log.info(f"open http://{options.host}:{viewer.port} in a browser; Ctrl-C ends it")
     return viewer
-
-
-class _Tuned:
-    """The words that describe a method, and the current settings of its knobs."""
-
-    def __init__(self, words: Sequence[str]) -> None:
-        self._words = words
-        self.knobs: dict[str, Sequence[Variant]] = {}
-        self.chosen: dict[str, str] = {}
-
-    def words(self) -> list[str]:
-        """The words of the method with its knobs as currently set."""
-        words = [*self._words]
-        for knob, setting in self.chosen.items():
-            if setting != AS_GIVEN:
-                (variant,) = [v for v in self.knobs[knob] if v.name == setting]
-                words += variant.settings
-        return words
