@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from bench import sources
 from reports import paper_tables
 from sweeps import arguments, cli, overrides
 from sweeps.overrides import choices, composed, swept
@@ -97,16 +96,6 @@ def test_the_method_and_the_scene_of_the_document_are_measured_from_outside_the_
     assert "paint" in measured.out
     refused = steerbench(*typed("run"), *WITHOUT_LPIPS, "method.shade=2.0")
     assert refused.err.endswith("method: shade: expected 0 to 1, got 2.0\n")
-
-
-@pytest.mark.parametrize("module", ["method.py", "average.py"])
-def test_a_change_in_any_module_of_the_document_is_a_new_run(steerbench, mine, module, monkeypatch):
-    steerbench(*typed("run"), *WITHOUT_LPIPS)
-    monkeypatch.setattr(sources, "_first", {})  # as in another process
-    with (mine / "mean_colour" / module).open("a") as file:
-        file.write("# changed\n")
-    steerbench(*typed("run"), *WITHOUT_LPIPS)
-    assert len(list(mine.glob("outputs/runs/*/record.json"))) == 2
 
 
 def test_the_method_of_the_document_is_listed(steerbench, mine):
