@@ -31,13 +31,13 @@ def newest(store: Store) -> dict[str, list[Run]]:
 
     A job has several if its settings fit scenes in different folders.
     """
-    found: dict[str, dict[str, Run]] = {}
+    of_jobs: dict[str, dict[str, Run]] = {}
     for run in reversed(readable(store)):
         parts = run.record["made_of"]
         if "config" in parts:
-            of_job = found.setdefault(job_key(parts["config"], parts.get("turns", "")), {})
+            of_job = of_jobs.setdefault(job_key(parts["config"], parts.get("turns", "")), {})
             of_job.setdefault(run.record["scene"]["digest"], run)
-    return {job: list(of_scenes.values()) for job, of_scenes in found.items()}
+    return {job: list(of_scenes.values()) for job, of_scenes in of_jobs.items()}
 
 
 def gather(
@@ -62,7 +62,7 @@ def gather(
 
 
 def _outcome(job: Planned, runs: Mapping[str, Sequence[Run]], outputs: Path) -> Outcome:
-    failure = failures.found(outputs, job.settings)
+    failure = failures.last(outputs, job.settings)
     shown = (run for run in runs.get(job.key, ()) if of_scene(run, job.config))
     if run := next(shown, None):
         why = failure and f"failed when it was tried again: {failure}"

@@ -236,20 +236,20 @@ COMPARED = (
 """The columns of `compared_cells`."""
 
 
-def compared(one: Rendered, first: Rendered) -> Row:
+def compared(variant: Rendered, first: Rendered) -> Row:
     """Error and time of a variant compared with the first one."""
     return {
-        "apart": one.values["psnr_to_first"],
-        "psnr": one.values["psnr"],
-        "lost": first.values["psnr"] - one.values["psnr"],
-        **times(one),
+        "apart": variant.values["psnr_to_first"],
+        "psnr": variant.values["psnr"],
+        "lost": first.values["psnr"] - variant.values["psnr"],
+        **times(variant),
     }
 
 
-def times(one: Rendered) -> Row:
+def times(variant: Rendered) -> Row:
     """The time of a variant's frame, its range over the rounds, and how far its tail reaches."""
-    of_rounds = {name: one.values[name] for name in ("ms_lo", "ms_hi", "p99_to_p50")}
-    return {"frame_ms": one.values["ms"], **of_rounds}
+    of_rounds = {name: variant.values[name] for name in ("ms_lo", "ms_hi", "p99_to_p50")}
+    return {"frame_ms": variant.values["ms"], **of_rounds}
 
 
 def compared_cells(row: Row) -> tuple[str, ...]:

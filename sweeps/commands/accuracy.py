@@ -131,20 +131,20 @@ def _setting_rows(
     lines = {variant.name: _last_words([*words, *variant.settings]) for _, variant in chosen}
     rendered = render_variants(lines, options, launcher)
     knob_of = {variant.name: knob for knob, variant in chosen}
-    values = [one.values for one in rendered]
+    values = [each.values for each in rendered]
     best = best_instead([row["ms"] for row in values], [-row["psnr"] for row in values])
     return [
         {
-            "scene": one.scene,
-            "trajectory": one.trajectory,
-            "resolution": one.resolution,
-            "knob": knob_of[one.name],
-            **one.values,
-            "lost": values[0]["psnr"] - one.values["psnr"],
+            "scene": each.scene,
+            "trajectory": each.trajectory,
+            "resolution": each.resolution,
+            "knob": knob_of[each.name],
+            **each.values,
+            "lost": values[0]["psnr"] - each.values["psnr"],
             "instead": values[instead]["setting"],
-            "overrides": shlex.join(lines[one.name]),
+            "overrides": shlex.join(lines[each.name]),
         }
-        for one, instead in zip(rendered, best, strict=True)
+        for each, instead in zip(rendered, best, strict=True)
     ]
 
 

@@ -56,8 +56,8 @@ def main(options: argparse.Namespace) -> int:
         variants |= settings_of(other, _ending(_precisions(other), f", {name}") or [Variant(name)])
     rendered = render_variants(variants, options, launcher)
     rows = {
-        one.name: _row(one, composed(variants[one.name]).budget == config.budget)
-        for one in rendered
+        each.name: _row(each, composed(variants[each.name]).budget == config.budget)
+        for each in rendered
     }
     parts = _parts(study, rows.values())
     columns = ("", *parts, "frame ↓", "of rounds", "p99 / p50 ↓", "FPS ↑", "PSNR, dB ↑")
@@ -133,19 +133,19 @@ def _shared(words: Sequence[str], study: Study) -> list[str]:
     return [word for word in words if holds(word, others)]
 
 
-def _row(one: Rendered, trained_alike: bool) -> Row:
+def _row(variant: Rendered, trained_alike: bool) -> Row:
     """One line; its PSNR is left out if it has another budget than the first line."""
     parts: dict[str, float] = {}
-    for metric, value in one.values.items():
+    for metric, value in variant.values.items():
         if metric.startswith("stage_ms."):
-            part = one.study.part_of(metric.removeprefix("stage_ms."))
+            part = variant.study.part_of(metric.removeprefix("stage_ms."))
             parts[part] = parts.get(part, 0.0) + value
     return {
-        "line": one.name,
+        "line": variant.name,
         "parts": parts,
-        "network_ms": one.network_ms,
-        **times(one),
-        "psnr": one.values["psnr"] if trained_alike else None,
+        "network_ms": variant.network_ms,
+        **times(variant),
+        "psnr": variant.values["psnr"] if trained_alike else None,
     }
 
 

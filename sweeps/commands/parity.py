@@ -38,13 +38,13 @@ def main(options: argparse.Namespace) -> int:
     first = rendered[0]
     rows = [
         {
-            "engine": one.name,
-            **compared(one, first),
-            "worst": one.values["worst"],
-            "network_ms": one.network_ms,
-            "bytes": one.bytes.get(one.study.network_size),
+            "engine": each.name,
+            **compared(each, first),
+            "worst": each.values["worst"],
+            "network_ms": each.network_ms,
+            "bytes": each.bytes.get(each.study.network_size),
         }
-        for one in rendered
+        for each in rendered
     ]
     lines = (
         (

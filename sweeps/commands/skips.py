@@ -41,7 +41,9 @@ def main(options: argparse.Namespace) -> int:
     first = rendered[0]
     work = first.work()
     none = dict.fromkeys(work, 0.0)
-    rows = [{"skipped": one.name, **compared(one, first), **none, **one.work()} for one in rendered]
+    rows = [
+        {"skipped": each.name, **compared(each, first), **none, **each.work()} for each in rendered
+    ]
     lines = (
         (
             row["skipped"],

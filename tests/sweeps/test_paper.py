@@ -302,10 +302,10 @@ def test_a_report_has_what_is_there_and_measures_nothing(
 def test_a_failure_is_forgotten_once_the_job_succeeds(tmp_path: Path) -> None:
     job = {"seed": 1}
     failures.keep(tmp_path, job, "no room")
-    assert failures.found(tmp_path, job) == "no room"
-    assert failures.found(tmp_path, {"seed": 2}) is None
+    assert failures.last(tmp_path, job) == "no room"
+    assert failures.last(tmp_path, {"seed": 2}) is None
     failures.forget(tmp_path, job)
-    assert failures.found(tmp_path, job) is None
+    assert failures.last(tmp_path, job) is None
 
 
 def test_a_check_names_the_broken_rows_of_the_store(
