@@ -12,10 +12,11 @@ from hydra._internal.callbacks import Callbacks
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
+from hydra.errors import InstantiationException
 from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from sweeps.overrides import CONFIGS, composed, setting
+from sweeps.overrides import CONFIGS, composed, explain, setting
 from sweeps.processes import set_up
 
 IN_PROCESS = "basic"
@@ -46,7 +47,9 @@ class Launcher:
     def run(self, work: Callable[[W], R], on: Sequence[W]) -> list[R]:
         """The results of `work` on each of the things in `on`.
 
-        Raises what `work` raised first, once all is done.
+        Raises:
+            SteerbenchError: a setting of the launcher is wrong.
+            Exception: what `work` raised first, once all is done.
         """
         if not on:
             return []
@@ -54,11 +57,14 @@ class Launcher:
             loader = GlobalHydra.instance().config_loader()
         config = self._config()
         join_cluster(config)
-        launcher = Plugins.instance().instantiate_launcher(
-            hydra_context=HydraContext(config_loader=loader, callbacks=Callbacks()),
-            task_function=_Numbered(work, on),
-            config=config,
-        )
+        try:
+            launcher = Plugins.instance().instantiate_launcher(
+                hydra_context=HydraContext(config_loader=loader, callbacks=Callbacks()),
+                task_function=_Numbered(work, on),
+                config=config,
+            )
+        except InstantiationException as error:
+            raise explain(error, self.words) from error
         jobs = launcher.launch([[] for _ in on], initial_job_idx=0)
         results = [job.return_value for job in jobs]
         for result in results:

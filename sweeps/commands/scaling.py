@@ -13,6 +13,7 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig
 
+from bench.accuracy import means
 from bench.cameras import frame_camera
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, explained
@@ -141,7 +142,6 @@ def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) 
         cameras = [frame_camera(camera, *point.size) for camera in cameras]
     with torch_threads(config.threads or torch.get_num_threads()):  # trained with the default
         records, peak_bytes = _render(method, cameras, log)
-    counters = dict.fromkeys(name for record in records for name in record.done)
     frame_ms = statistics.mean(record.total_ns for record in records) / 1e6
     return {
         "axis": point.axis,
@@ -151,10 +151,7 @@ def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) 
         "frame_ms": frame_ms,
         "fps": 1e3 / frame_ms,
         "p99_to_p50": p99_to_p50(records),
-        **{
-            f"work.{name}": statistics.mean(record.done.get(name, 0) for record in records)
-            for name in counters
-        },
+        **means("work", [record.done for record in records]),
         "peak_bytes": peak_bytes,
         "size_bytes": sum(method.sizes().values()),
     }

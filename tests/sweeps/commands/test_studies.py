@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 
 from bench.study import Study
 from sweeps.variants import engines
@@ -144,6 +145,22 @@ def test_parity_refuses_a_method_without_engine(study):
     outcome = study("parity", "grey")
     assert outcome.status == 2
     assert "expected a method with the setting method.engine" in outcome.err
+
+
+def test_a_study_is_computed_where_hydras_launcher_puts_it(study, monkeypatch):
+    launched = []
+    launch = BasicLauncher.launch
+
+    def noted(self, jobs, initial_job_idx):
+        launched.append(len(jobs))
+        return launch(self, jobs, initial_job_idx)
+
+    monkeypatch.setattr(BasicLauncher, "launch", noted)
+    assert study("parity", "shades").status == 0
+    assert launched == [1]  # in turns: one job
+    refused = study("parity", "shades", "+hydra.launcher.queue=gpu")
+    assert refused.status == 2
+    assert "queue" in refused.err
 
 
 def test_scaling_fits_the_axes_of_the_method(study):
