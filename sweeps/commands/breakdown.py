@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from itertools import compress
 
@@ -13,7 +13,7 @@ from bench.probes import OTHER
 from bench.study import Study, Variant
 from bench.types import NullProbe
 from bench.waits import Line, device_waits
-from reports.tables import Table, decimal, share
+from reports.tables import Table, decimal
 from sweeps.commands.skips import nothing_skipped
 from sweeps.device_lock import on_gpu
 from sweeps.execute import Launcher
@@ -39,7 +39,7 @@ DENSE = ", nothing skipped"
 
 
 def main(options: argparse.Namespace) -> int:
-    """Print two tables, then the rows of the first as JSON in the last line; or one of waits."""
+    """Print a table, then its rows as JSON in the last line; or the same of waits."""
     words, launcher = settings(options, METHOD, "trajectory=smooth")
     words = with_engine(words)
     if options.device_waits:
@@ -55,17 +55,12 @@ def main(options: argparse.Namespace) -> int:
         other = [*shared, *of_method]
         variants |= settings_of(other, _ending(_precisions(other), f", {name}") or [Variant(name)])
     rendered = render_variants(variants, options, launcher)
-    rows = {
-        each.name: _row(each, composed(variants[each.name]).budget == config.budget)
-        for each in rendered
-    }
-    parts = _parts(study, rows.values())
+    rows = [_row(each, composed(variants[each.name]).budget == config.budget) for each in rendered]
+    parts = _parts(study, rows)
     columns = ("", *parts, "frame ↓", "of rounds", "p99 / p50 ↓", "FPS ↑", "PSNR, dB ↑")
     title = f"ms of a frame, and what of it each part takes itself; {rendered[0].frames} frames"
-    show(Table(title, columns, tuple(_line(row, parts) for row in rows.values())))
-    if compared := _compared(rows, [variant.name for variant in usual], study):
-        show(compared)
-    print_rows(list(rows.values()))
+    show(Table(title, columns, tuple(_line(row, parts) for row in rows)))
+    print_rows(rows)
     return 0
 
 
@@ -166,37 +161,3 @@ def _line(row: Row, parts: Iterable[str]) -> tuple[str, ...]:
         decimal(1e3 / row["frame_ms"], 2),
         decimal(row["psnr"], 2),
     )
-
-
-def _compared(rows: Mapping[str, Row], names: Sequence[str], study: Study) -> Table | None:
-    """How the lines `names` compare with other methods, with the first precision and with no skips.
-
-    None if there is nothing to compare with.
-    """
-    lines = {name: _ratios(rows, name, names[0], study) for name in names if name in rows}
-    columns = tuple(next(iter(lines.values())))
-    cells = ((name, *ratios.values()) for name, ratios in lines.items())
-    return Table("Compared", ("", *columns), tuple(cells)) if columns else None
-
-
-def _ratios(rows: Mapping[str, Row], name: str, first: str, study: Study) -> dict[str, str]:
-    row, cells = rows[name], {}
-
-    def ratio(method: str, of: str, to: str) -> None:
-        known = other.get(f"{of}_ms") and row[f"{to}_ms"]
-        value = other[f"{of}_ms"] / row[f"{to}_ms"] if known else None
-        cells[f"{of} of {method} / {to} ↑"] = decimal(value, 1)
-
-    for method in study.beside:
-        other = rows.get(f"{name}, {method}", rows.get(method, {}))
-        if other.get("network_ms"):
-            ratio(method, "network", "frame")
-            ratio(method, "network", "network")
-        else:
-            ratio(method, "frame", "frame")
-    if len(rows) > 1 and name != "as it is":
-        cells[f"lost to {first}, dB ↓"] = decimal(rows[first]["psnr"] - row["psnr"], 3)
-    if dense := rows.get(name + DENSE):
-        cells["lost by skipping, dB ↓"] = decimal(dense["psnr"] - row["psnr"], 3)
-        cells["time, of nothing skipped ↓"] = share(row["frame_ms"], dense["frame_ms"])
-    return cells

@@ -156,17 +156,6 @@ def test_a_recorded_path_can_be_measured(
     assert outcome.status == 0, outcome.err
 
 
-def test_a_browser_that_leaves_takes_nothing_with_it(opened: Callable[..., Viewer]) -> None:
-    viewer = opened()
-    with browser(viewer) as page:
-        page.look()
-        page.until(lambda: len(viewer.browsers) == 1)
-        page.look(0.1)
-    with browser(viewer) as other:
-        other.look()
-        other.until(lambda: other.picture.size > 0 and len(viewer.browsers) == 1)
-
-
 def test_a_browser_that_leaves_in_the_middle_of_a_frame_takes_nothing_with_it(
     opened: Callable[..., Viewer], monkeypatch: pytest.MonkeyPatch
 ) -> None:

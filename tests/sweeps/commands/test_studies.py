@@ -81,8 +81,7 @@ def test_skips_refuses_a_method_that_declares_none(study):
 
 
 def test_breakdown_divides_the_frame_and_names_every_line(study):
-    outcome = study("breakdown", "shades", "method.level=0.3")
-    found = {row["line"]: row for row in rows(outcome)}
+    found = {row["line"]: row for row in rows(study("breakdown", "shades", "method.level=0.3"))}
     ends = ("", ", nothing skipped", ", a twin")
     lines = [variant.name + end for end in ends for variant in engines() if "torch" in variant.name]
     assert list(found) == [*lines, "plain grey"]
@@ -91,8 +90,6 @@ def test_breakdown_divides_the_frame_and_names_every_line(study):
     assert set(found["torch, fp32"]["parts"]) == {"painting", "varnish", "other"}
     assert set(found["plain grey"]["parts"]) == {"paint", "other"}
     assert len({row["psnr"] for row in found.values()}) == 1  # all have the level that was typed
-    for column in ("network of a twin / network", "frame of plain grey / frame", "by skipping"):
-        assert column in " ".join(outcome.out.split())
 
 
 def test_breakdown_of_a_method_without_engine_and_study_is_one_line(study):
