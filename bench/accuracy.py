@@ -222,12 +222,14 @@ def _costs(records: Sequence[FrameRecord], ready: Sequence[bool]) -> dict[str, f
         **_spread(means),
         "ms": ms,  # median_low: of an actual round, which the next lines describe
         "p99_to_p50": p99_to_p50(usual),
-        **means("stage_ms", [record.stages_ns for record in usual], 1e-6),
-        **means("work", [record.done for record in usual]),
+        **mean_figures("stage_ms", [record.stages_ns for record in usual], 1e-6),
+        **mean_figures("work", [record.done for record in usual]),
     }
 
 
-def means(kind: str, of_frames: Sequence[Mapping[str, int]], factor: float = 1) -> dict[str, float]:
+def mean_figures(
+    kind: str, of_frames: Sequence[Mapping[str, int]], factor: float = 1
+) -> dict[str, float]:
     """Mean over frames of every figure that any frame has; a missing figure counts as 0."""
     names = dict.fromkeys(name for figures in of_frames for name in figures)
     return {

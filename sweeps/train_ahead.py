@@ -39,9 +39,9 @@ def train_ahead(jobs: Sequence[Planned], measured: Collection[str]) -> None:
     for job in jobs:
         if job.key in measured:
             todo.pop(_training(job), None)
-    workers = room(jobs[0].config)
-    if min(workers, len(todo)) < 2:
+    if len(todo) < 2:
         return
+    workers = room(jobs[0].config)
     log = ConsoleLog(Path(jobs[0].config.outputs))
     log.info(f"training {len(todo)} models, {workers} at a time")
     begun = time.monotonic()

@@ -23,7 +23,7 @@ from sweeps.measurement import Group, Job, Obtained, stored
 from sweeps.overrides import composed
 from sweeps.plan import Planned, chosen, plan
 from sweeps.terminal import console, show
-from sweeps.train_ahead import train_ahead
+from sweeps.train_ahead import room, train_ahead
 
 DATA = "data="
 """Prefix of the word that names the folder of a data set."""
@@ -80,25 +80,26 @@ def data_set(words: Sequence[str]) -> tuple[list[str], DataSet | None]:
 def _run(jobs: Sequence[Planned], launcher: Launcher) -> int:
     """Run the jobs, equal ones only once; return how many of those that can run here failed.
 
-    What the store lacks is measured scene by scene, all lines of all tables with the first seed,
-    then with the next. In this process, the models are trained before, in parallel where possible;
-    elsewhere each job trains what it needs.
+    Goes scene by scene: measures all lines of all tables with the first seed, then with the next.
+    Where there is room in this process, the models that the store lacks are trained before, in
+    parallel; otherwise each job trains what it needs.
     """
     distinct = {job.key: job for job in reversed(jobs)}
     jobs = [job for job in jobs if distinct[job.key] is job]
     scenes, seeds = [job.scene for job in jobs], [job.config.seed for job in jobs]
     jobs.sort(key=lambda job: (scenes.index(job.scene), seeds.index(job.config.seed)))
-    groups, measured = _groups(jobs)
-    if launcher.in_process:
+    ahead = launcher.in_process and room(jobs[0].config) > 1
+    groups, measured = _groups(jobs, look_up=ahead)
+    if ahead:
         train_ahead(jobs, measured)
     total = sum(len(group.jobs) for group in groups)
     return sum(launcher.run(partial(_attempted, total=total), groups))
 
 
-def _groups(jobs: Sequence[Planned]) -> tuple[list[Group], set[str]]:
-    """The groups that the store lacks, and the keys of the jobs that it has.
+def _groups(jobs: Sequence[Planned], look_up: bool) -> tuple[list[Group], set[str]]:
+    """The groups of the jobs; those with the same `turns` are one.
 
-    Jobs with the same `turns` are a group.
+    With `look_up`, without the groups that the store has; and the keys of their jobs.
     """
     by_turns: dict[str, list[Planned]] = {}
     for job in jobs:
@@ -109,10 +110,10 @@ def _groups(jobs: Sequence[Planned]) -> tuple[list[Group], set[str]]:
         wanted = [Job(job.config, job.command, job.name) for job in planned]
         first = sum(len(group.jobs) for group in groups)
         group = Group(wanted, planned[0].turns, first)
-        if there := _stored(group):
+        if there := _stored(group) if look_up else []:
             measured |= {job.key for job in planned}
-            for job, obtained in zip(wanted, there, strict=True):
-                say(job, obtained)
+            for each, obtained in zip(wanted, there, strict=True):
+                say(each, obtained)
         else:
             groups.append(group)
     return groups, measured

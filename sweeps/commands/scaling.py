@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig
 
-from bench.accuracy import means
+from bench.accuracy import mean_figures
 from bench.cameras import frame_camera
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, explained
@@ -151,7 +151,7 @@ def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) 
         "frame_ms": frame_ms,
         "fps": 1e3 / frame_ms,
         "p99_to_p50": p99_to_p50(records),
-        **means("work", [record.done for record in records]),
+        **mean_figures("work", [record.done for record in records]),
         "peak_bytes": peak_bytes,
         "size_bytes": sum(method.sizes().values()),
     }
