@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from hydra.core.plugins import Plugins
 
 from sweeps import cli
 
@@ -54,6 +55,27 @@ def steerbench(
 def run(steerbench: Callable[..., Outcome]) -> Callable[..., Outcome]:
     """Call `steerbench run` with the stand-ins and further arguments."""
     return lambda *argv: steerbench("run", *STAND_INS, *argv)
+
+
+@pytest.fixture
+def launched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many jobs each launcher of Hydra's was handed."""
+    counts: list[int] = []
+    make = Plugins.instantiate_launcher
+
+    def made(self, **given):
+        launcher = make(self, **given)
+        launch = launcher.launch
+
+        def noted(jobs, initial_job_idx: int):
+            counts.append(len(jobs))
+            return launch(jobs, initial_job_idx)
+
+        monkeypatch.setattr(launcher, "launch", noted)
+        return launcher
+
+    monkeypatch.setattr(Plugins, "instantiate_launcher", made)
+    return counts
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 import torch
-from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 
 from bench.study import Study
 from sweeps.variants import engines
@@ -143,15 +142,7 @@ def test_what_cannot_be_studied_is_refused(study, argv, message):
     assert not outcome.out
 
 
-def test_a_study_is_computed_where_hydras_launcher_puts_it(study, monkeypatch):
-    launched = []
-    launch = BasicLauncher.launch
-
-    def noted(self, jobs, initial_job_idx):
-        launched.append(len(jobs))
-        return launch(self, jobs, initial_job_idx)
-
-    monkeypatch.setattr(BasicLauncher, "launch", noted)
+def test_a_study_is_computed_where_hydras_launcher_puts_it(study, launched):
     assert study("parity", "shades").status == 0
     assert launched == [1]  # in turns: one job
     refused = study("parity", "shades", "+hydra.launcher.queue=gpu")
