@@ -149,18 +149,7 @@ def fitted(variants: Mapping[str, Sequence[str]], frames: int) -> Iterator[Fitte
     settings = checked_settings(first)
     log = _OnceLog(Path(settings.outputs))
     methods = _usable(configs, log)
-    scene = scene_of(first)
-    path = build(first, "trajectory", scene)
-    steps = path.steps[:frames]
-    path = replace(path, name=f"{path.name}-first{len(steps)}", steps=steps)
-    protocol = build(first, "protocol")
-    protocol = replace(protocol, name=f"{protocol.name} without LPIPS", lpips=())
-    if protocol.memory != "steady":
-        raise SteerbenchError(
-            "protocol.memory: expected steady, where frames follow each other in turns, got "
-            f"{protocol.memory}"
-        )
-    protocol.check(scene, path)
+    scene, path, protocol = common_ground(first, frames)
     steady_frames(methods.values(), path)
     with device_lock(settings.device, log):
         with log.progress("variants", len(methods)) as progress:
@@ -169,6 +158,27 @@ def fitted(variants: Mapping[str, Sequence[str]], frames: int) -> Iterator[Fitte
                 method.fit(scene, build(configs[name], "budget"), log)
                 progress.advance(note=name)
         yield Fitted(configs, methods, scene, path, protocol, log)
+
+
+def common_ground(config: DictConfig, frames: int) -> tuple[Scene, Trajectory, EvaluationProtocol]:
+    """What all variants share: scene, first `frames` of the trajectory, protocol without LPIPS.
+
+    Raises:
+        SteerbenchError: a setting is wrong, or the scene does not fit the protocol.
+    """
+    scene = scene_of(config)
+    path = build(config, "trajectory", scene)
+    steps = path.steps[:frames]
+    path = replace(path, name=f"{path.name}-first{len(steps)}", steps=steps)
+    protocol = build(config, "protocol")
+    protocol = replace(protocol, name=f"{protocol.name} without LPIPS", lpips=())
+    if protocol.memory != "steady":
+        raise SteerbenchError(
+            "protocol.memory: expected steady, where frames follow each other in turns, got "
+            f"{protocol.memory}"
+        )
+    protocol.check(scene, path)
+    return scene, path, protocol
 
 
 def _usable(configs: Mapping[str, DictConfig], log: Log) -> dict[str, Method]:
