@@ -30,9 +30,7 @@ from pathlib import Path
 
 import pandas as pd
 
-import sweeps  # noqa: F401 (first: it sets what torch reads when it is loaded)
 from bench.console import ConsoleLog
-from bench.pictures import Match
 from bench.results import Store
 from bench.types import (
     Budget,
@@ -46,11 +44,12 @@ from bench.types import (
     SteerbenchError,
 )
 from reports.runs import Run, load
-from sweeps import configured, measurement
-from sweeps.catalogue import described
+from sweeps import configured
+from sweeps.commands.list import described
+from sweeps.commands.score import score
 from sweeps.deliver import write
+from sweeps.measurement import Group, Job, obtain
 from sweeps.overrides import composed
-from sweeps.score import scored
 
 __all__ = [
     "Budget",
@@ -84,11 +83,11 @@ def run(*settings: str) -> Run:
         SteerbenchError: a setting is wrong, or the measurement failed.
     """
     config = composed(settings)
-    obtained = measurement.obtain(config, ["steerbench", "run", *settings])
-    (found,) = load(obtained.store, {obtained.run: obtained.run})
-    label = str(found.facts["method"])
-    write(config, obtained.store, {obtained.run: label})
-    return replace(found, label=label)
+    (obtained,) = obtain(Group([Job(config, ["steerbench", "run", *settings])]))
+    (run,) = load(obtained.store, {obtained.run: obtained.run})
+    label = str(run.facts["method"])
+    write(config.report, obtained.store, {obtained.run: label})
+    return replace(run, label=label)
 
 
 def fit(*settings: str) -> Method:
@@ -110,35 +109,6 @@ def load_scene(*settings: str) -> Scene:
         SteerbenchError: the scene cannot be loaded.
     """
     return configured.scene_of(composed(settings))
-
-
-def score(
-    pictures: str | Path,
-    truth: str | Path | None = None,
-    *settings: str,
-    name: str | None = None,
-    match: Match = "name",
-    sequence: bool = False,
-) -> Run:
-    """Score a folder of pictures against true ones, as `steerbench score` does.
-
-    Args:
-        truth: the folder of true pictures; None: the split of the scene in `settings`.
-        name: name of the method in the rows; None: the name of the folder.
-        match: how pictures are matched to true ones: by "name" or by "order".
-        sequence: whether the pictures are consecutive frames, so that flicker is scored, too.
-
-    Raises:
-        SteerbenchError: pictures are missing, damaged or of another size.
-    """
-    return scored(
-        Path(pictures),
-        None if truth is None else Path(truth),
-        settings,
-        name=name,
-        match=match,
-        sequence=sequence,
-    )
 
 
 def results(outputs: str | Path = "outputs") -> pd.DataFrame:

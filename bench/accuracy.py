@@ -1,7 +1,7 @@
 """Run time against error, for computations with a known exact answer and for whole methods.
 
-The compared settings take turns, so that a drifting clock affects all of them alike. The times come
-from further rounds of the same computation that gave the errors.
+The compared settings take turns. The times come from further rounds of the same computation that
+gave the errors.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from bench.probes import FrameRecord, StageClock, p99_to_p50
 from bench.protocol import EvaluationProtocol
 from bench.scoring import check_frame
 from bench.trajectories import Trajectory
+from bench.turns import in_turns
 from bench.types import Log, Method, Scene, SteerbenchError
 
 
@@ -75,22 +76,21 @@ def experiment_rows(
             trials = experiment.trials
             errors = [_largest_error(trial) for trial in trials]  # and warms up
             order = _order(experiment, errors)
-            fitted = experiment.smooth or (None, None)
-            for trial, error, times in zip(
-                trials, errors, _times_ms([t.call for t in trials], repeats), strict=True
-            ):
-                rows.append(
-                    {
-                        "subject": experiment.subject,
-                        "knob": experiment.knob,
-                        "setting": trial.setting,
-                        "error": error,
-                        **_spread(times),
-                        "order": order,
-                        "order_from": fitted[0],
-                        "order_to": fitted[1],
-                    }
-                )
+            low, high = experiment.smooth or (None, None)
+            times = _times_ms([trial.call for trial in trials], repeats)
+            rows += [
+                {
+                    "subject": experiment.subject,
+                    "knob": experiment.knob,
+                    "setting": trial.setting,
+                    "error": error,
+                    **_spread(of_trial),
+                    "order": order,
+                    "order_from": low,
+                    "order_to": high,
+                }
+                for trial, error, of_trial in zip(trials, errors, times, strict=True)
+            ]
             progress.advance(note=experiment.subject)
     return rows
 
@@ -112,11 +112,10 @@ def _order(experiment: Experiment, errors: Sequence[float]) -> float | None:
 def _times_ms(calls: Sequence[Callable[[], Tensor]], repeats: int) -> list[list[float]]:
     """Milliseconds of `repeats` runs of each call; the calls take turns."""
     times: list[list[float]] = [[] for _ in calls]
-    for _ in range(repeats):
-        for call, of_call in zip(calls, times, strict=True):
-            begun = time.perf_counter()
-            call()
-            of_call.append(1e3 * (time.perf_counter() - begun))
+    for _, number in in_turns(range(len(calls)), repeats, block=1):
+        begun = time.perf_counter()
+        calls[number]()
+        times[number].append(1e3 * (time.perf_counter() - begun))
     return times
 
 
@@ -132,10 +131,10 @@ def render_in_turns(
     repeats: int,
     log: Log,
 ) -> list[dict[str, Any]]:
-    """Render the same trajectory with each of the fitted `methods` in turn, in several rounds.
+    """Render the same trajectory with all fitted `methods` in turns, in several rounds.
 
-    The first round warms up and is scored; `repeats` more are timed. A turn is a whole trajectory:
-    if methods alternated frame by frame, each would find the caches full of another model.
+    The first round warms up and is scored; `repeats` more are timed. For the turns see
+    `bench.turns`.
 
     Returns:
         One row for each method. Only steady frames count, see `steady_frames`. Times: setting (the
@@ -157,24 +156,27 @@ def render_in_turns(
         for name, method in methods.items()
     }
     first: dict[int, Tensor] = {}
-    found: dict[str, list[tuple[float, float, float]]] = {name: [] for name in methods}
-    with torch.no_grad(), log.progress("rendering", (repeats + 1) * len(methods)) as progress:
+    compared: dict[str, list[tuple[float, float, float]]] = {name: [] for name in methods}
+    steps = trajectory.steps
+    total = (repeats + 1) * len(methods) * len(steps)
+    with torch.no_grad(), log.progress("rendering", total) as progress:
         for round_ in range(repeats + 1):
-            for name, method in methods.items():
+            for method in methods.values():
                 method.reset()
-                for number, step in enumerate(trajectory.steps):
-                    with clocks[name].frame():
-                        frame = method.render(step.camera, clocks[name])
-                    check_frame(frame, step.camera, name, number)
-                    if round_ == 0 and number in scored and step.truth is not None:
-                        picture = protocol.rounded(frame.rgb).cpu()
-                        truth = composite(images[step.truth], scene.background)
-                        one = first.setdefault(number, picture)
-                        found[name].append(_compared(picture, one, truth))
+            for number, name in in_turns(list(methods), len(steps)):
+                step, clock = steps[number], clocks[name]
+                with clock.frame():
+                    frame = methods[name].render(step.camera, clock)
+                check_frame(frame, step.camera, name, number)
+                if round_ == 0 and number in scored and step.truth is not None:
+                    picture = protocol.rounded(frame.rgb).cpu()
+                    truth = composite(images[step.truth], scene.background)
+                    other = first.setdefault(number, picture)
+                    compared[name].append(_compared(picture, other, truth))
                 progress.advance(note=f"round {round_} of {repeats}" if round_ else "warming up")
     rows = []
     for name, clock in clocks.items():
-        scores, squares, largest = zip(*found[name], strict=True)
+        scores, squares, largest = zip(*compared[name], strict=True)
         figures = {
             "psnr": statistics.fmean(scores),
             "psnr_to_first": psnr_of_mse(statistics.fmean(squares)),
@@ -220,12 +222,12 @@ def _costs(records: Sequence[FrameRecord], ready: Sequence[bool]) -> dict[str, f
         **_spread(means),
         "ms": ms,  # median_low: of an actual round, which the next lines describe
         "p99_to_p50": p99_to_p50(usual),
-        **_means("stage_ms", [record.stages_ns for record in usual], 1e-6),
-        **_means("work", [record.done for record in usual]),
+        **mean_figures("stage_ms", [record.stages_ns for record in usual], 1e-6),
+        **mean_figures("work", [record.done for record in usual]),
     }
 
 
-def _means(
+def mean_figures(
     kind: str, of_frames: Sequence[Mapping[str, int]], factor: float = 1
 ) -> dict[str, float]:
     """Mean over frames of every figure that any frame has; a missing figure counts as 0."""

@@ -151,6 +151,13 @@ class Store:
             finally:
                 shutil.rmtree(partial, ignore_errors=True)
 
+    def remove(self, key: str) -> None:
+        """Remove the run `key`, if it is there."""
+        removed = self.folder / f"{PARTIAL}{key}-{uuid.uuid4().hex[:8]}"
+        with suppress(FileNotFoundError):
+            (self.folder / key).replace(removed)  # at once: nobody reads half of it
+            shutil.rmtree(removed, ignore_errors=True)
+
     def rows(
         self,
         report: Callable[[str], object] = warnings.warn,

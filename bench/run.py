@@ -24,6 +24,7 @@ from bench.protocol import EvaluationProtocol
 from bench.results import COLD, STEADY, WHOLE, Measurement
 from bench.scoring import ERROR_RANGE, PICTURES, Scoring, check_frame
 from bench.trajectories import Trajectory, spread
+from bench.turns import in_turns
 from bench.types import Budget, Log, Method, Scene
 
 QUANTILES = (50, 95, 99)
@@ -59,21 +60,15 @@ class Task:
     pictures: int = PICTURES
 
 
-def measure(method: Method, task: Task, log: Log) -> Measurement:
-    """Fit `method` to the scene of `task`, render its trajectory under the clock and score it.
+def measure(methods: Sequence[Method], task: Task, log: Log) -> list[Measurement]:
+    """Fit `methods` to the scene of `task`; render its trajectory under the clock and score it.
+
+    Several methods render in turns (see `bench.turns`), so that their times come from the same
+    minutes. Peak memory of the process is that of all methods together.
 
     Raises:
-        SteerbenchError: the scene does not fit the protocol, or the method rendered values that
-            are not finite.
-    """
-    return measure_in_turns([method], task, log)[0]
-
-
-def measure_in_turns(methods: Sequence[Method], task: Task, log: Log) -> list[Measurement]:
-    """`measure` several methods side by side: each frame is rendered by all before the next one.
-
-    So their times come from the same minutes. Peak memory of the process is that of all methods
-    together. Raises as `measure` does.
+        SteerbenchError: the scene does not fit the protocol, or a method rendered values that are
+            not finite.
     """
     lpips, missing = task.protocol.load_lpips(task.weights_dir, log)
     task.protocol.check(task.scene, task.trajectory)
@@ -158,24 +153,22 @@ def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
 
     Returns what other processes used meanwhile, not counting the warm-up.
     """
-    steps = task.trajectory.steps
+    steps, preceding = task.trajectory.steps, task.trajectory.preceding
     warmup = spread(len(steps), task.protocol.warmup)
     frames = len(takes) * (len(warmup) + len(steps))
     with torch.no_grad(), log.progress("rendering", frames) as progress:
         _reset(takes)
-        for count, index in enumerate(warmup, 1):
-            settled = count > 1 or len(warmup) == 1  # in the first, kernels may be compiled
-            for take in takes:
-                with take.metered(warm=True) if settled else nullcontext(), take.clock.frame():
-                    take.method.render(steps[index].camera, take.clock)
-                progress.advance(note="warming up")
+        for count, take in in_turns(takes, len(warmup)):
+            settled = count > 0 or len(warmup) == 1  # in the first, kernels may be compiled
+            with take.metered(warm=True) if settled else nullcontext(), take.clock.frame():
+                take.method.render(steps[warmup[count]].camera, take.clock)
+            progress.advance(note="warming up")
         _reset(takes)
         watch = Watch()
-        for index, before in enumerate(task.trajectory.preceding):
-            for take in takes:
-                _draw(take, task, index, before)
-                scores = [row["psnr"] for row in take.rows if "psnr" in row]
-                progress.advance(note=f"{np.mean(scores):.2f} dB" if scores else "")
+        for index, take in in_turns(takes, len(steps)):
+            _draw(take, task, index, preceding[index])
+            scores = [row["psnr"] for row in take.rows if "psnr" in row]
+            progress.advance(note=f"{np.mean(scores):.2f} dB" if scores else "")
         return watch.seen()
 
 

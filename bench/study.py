@@ -55,6 +55,8 @@ class Study:
         network_stage: the stage that the engine computes.
         network_size: the name of the network in `Method.sizes`.
         beside: by name, the settings of other methods to compare with.
+        chosen: the method's own settings that no training depends on; by default, it depends on
+            all.
     """
 
     knobs: Mapping[str, Sequence[Variant]] = field(default_factory=dict)
@@ -68,6 +70,7 @@ class Study:
     network_stage: str = ""
     network_size: str = ""
     beside: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    chosen: tuple[str, ...] = ()
 
     def part_of(self, stage: str) -> str:
         """The part of a frame that `stage` (for example "field/march") counts towards."""

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import inspect
 import pkgutil
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import is_dataclass
+from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -16,7 +17,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from bench.errors import SteerbenchError
 from sweeps.names import unknown
-from sweeps.overrides import choices
 
 STANDS_FOR = {"Path": str, "tuple": list, "Sequence": list, "Mapping": dict, "float": float | int}
 """By the name of a type in a signature: the type that a configuration holds instead."""
@@ -37,13 +37,8 @@ def target_of(node: Mapping[str, Any] | DictConfig) -> Any:
         ) from error
 
 
-def engine_kinds(words: Sequence[str] = ()) -> dict[str, Any]:
-    """The class of each engine by name; torch, the standard, comes first.
-
-    Args:
-        words: words of a command; they may name folders with further engines.
-    """
-    files = choices("engine", words)
+def engine_kinds(files: Mapping[str, Path]) -> dict[str, Any]:
+    """The class of each engine by name, from its file; torch, the standard, comes first."""
     names = sorted(files, key=lambda name: (name != "torch", name))
     return {name: target_of(OmegaConf.load(files[name])) for name in names}  # type: ignore[arg-type]
 

@@ -20,6 +20,7 @@ from typing import NoReturn
 from bench.errors import SteerbenchError
 from sweeps.arguments import COMMANDS, add_commands, overview
 from sweeps.names import unknown
+from sweeps.processes import set_up
 
 EXAMPLES = """\
 examples
@@ -48,6 +49,7 @@ class Parser(argparse.ArgumentParser):
 
 def main() -> None:
     """Run the command line and exit with its status."""
+    set_up()
     signal.signal(signal.SIGTERM, _terminate)
     sys.exit(guard(dispatch, sys.argv[1:]))
 
@@ -73,26 +75,32 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
 
 
 def dispatch(argv: Sequence[str]) -> int:
-    """Pass `argv` to its subcommand, which is imported only now."""
-    if argv[:1] == ["run"] or argv[:1] in (["-sc"], ["--shell-completion"]):
-        from sweeps import run
+    """Pass `argv` to the file of its command, which is imported only now.
 
-        return run.main(argv[1:] if argv[0] == "run" else argv)
-    options = parsed(argv)
-    if options.command is None:
+    Raises:
+        SteerbenchError: there is no such command or argument, or the command failed.
+    """
+    of_hydra = argv[:1] == ["run"] or argv[:1] in (["-sc"], ["--shell-completion"])
+    options = None if of_hydra else parsed(argv)
+    if options and options.command is None:
         options.parser.print_help()
         return 0
-    module = COMMANDS[options.command].get("module", options.command)
-    return importlib.import_module(f"sweeps.{module}").main(options)
+    name = options.command if options else "run"
+    file = COMMANDS[name].get("module", name)
+    command = importlib.import_module(f"sweeps.commands.{file}")
+    return command.main(options or argv[argv[0] == "run" :])
 
 
 def parsed(argv: Sequence[str]) -> argparse.Namespace:
-    """The arguments of a command other than `run`; see `sweeps.arguments`.
-
-    Raises:
-        SteerbenchError: there is no such command, or no such argument.
-    """
-    parser = _parser()
+    """The arguments of a command other than `run`."""
+    parser = Parser(
+        prog="steerbench",
+        usage="steerbench COMMAND [...]",
+        description=f"Benchmarks of radiance-field renderers.\n\n{overview()}",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_commands(parser)
     if argv and not argv[0].startswith("-") and argv[0] not in COMMANDS:
         raise unknown("command", argv[0], COMMANDS)
     options, unread = parser.parse_known_args(argv)
@@ -104,18 +112,6 @@ def parsed(argv: Sequence[str]) -> argparse.Namespace:
         known = re.findall(r"--[\w-]+", options.parser.format_help())
         raise unknown("argument", unread[0], set(known))
     return options
-
-
-def _parser() -> Parser:
-    parser = Parser(
-        prog="steerbench",
-        usage="steerbench COMMAND [...]",
-        description=f"Benchmarks of radiance-field renderers.\n\n{overview()}",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    add_commands(parser)
-    return parser
 
 
 def _terminate(signum: int, frame: object) -> NoReturn:

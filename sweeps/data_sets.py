@@ -56,16 +56,16 @@ def find(path: str) -> DataSet:
     for name, layout in layouts.items():
         if why := _lack(folders[name], layout):
             missing[name] = why
-    found = {name: folders[name] for name in sorted(layouts) if name not in missing}
-    used = {layouts[name] for name in found}
+    whole = {name: folders[name] for name in sorted(layouts) if name not in missing}
+    used = {layouts[name] for name in whole}
     if len(used) != 1:
-        got = f"scenes of both: {', '.join(found)}" if used else "none"
+        got = f"scenes of both: {', '.join(whole)}" if used else "none"
         reasons = "".join(f"; {name}: {why}" for name, why in sorted(missing.items()))
         raise SteerbenchError(
             f"data={path}: expected folders of scenes in the layout of NeRF-Synthetic or in NSVF's,"
             f" got {got}{reasons}; of a single scene the folder is scene.path"
         )
-    return DataSet(used.pop(), found, dict(sorted(missing.items())))
+    return DataSet(used.pop(), whole, dict(sorted(missing.items())))
 
 
 def _known() -> list[set[str]]:

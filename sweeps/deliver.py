@@ -1,7 +1,8 @@
-"""Where else a run in the store goes: to a tracker, and onto a page."""
+"""Where else runs in the store go: to a tracker, and onto a page."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -11,22 +12,25 @@ from bench.console import ConsoleLog
 from bench.results import Store
 from reports.runs import load
 from reports.trackers import tracker
-from sweeps import failures
+from sweeps.failures import reason
 
 
-def write(config: DictConfig, store: Store, labels: Mapping[str, str]) -> None:
-    """Write the page that `config` asks for, if it does, about the runs that `labels` has names of,
-    by key.
+def write(
+    report: str | None, store: Store, labels: Mapping[str, str], failed: Mapping[str, str] = {}
+) -> None:
+    """Write a page into the folder `report`, if there is to be one.
+
+    Args:
+        labels: the names of its runs, by key; without any, there is no page.
+        failed: why other jobs failed, by name.
 
     Raises:
         SteerbenchError: the page cannot be written.
     """
-    if not config.report:
-        return
-    from reports.page import write_page  # loads matplotlib, which only a page needs
+    if report and labels:
+        from reports.page import write_page  # loads matplotlib, which only a page needs
 
-    page = write_page(store, labels, Path(config.report))
-    ConsoleLog(Path(config.outputs)).info(f"report: {page}")
+        print(f"report: {write_page(store, labels, Path(report), failed)}", file=sys.stderr)
 
 
 def send(config: DictConfig, store: Store, run: str, label: str) -> None:
@@ -40,4 +44,4 @@ def send(config: DictConfig, store: Store, run: str, label: str) -> None:
         tracker(config.tracker).send(load(store, {run: label})[0], outputs)
         log.info(f"sent to {config.tracker}: {run}")
     except Exception as error:  # third-party library: any exception
-        log.info(f"not sent to {config.tracker}: {run}: {failures.reason(error)}")
+        log.info(f"not sent to {config.tracker}: {run}: {reason(error)}")

@@ -41,7 +41,7 @@ def forget(outputs: Path, job: Mapping[str, Any]) -> None:
     _path(outputs, job).unlink(missing_ok=True)
 
 
-def found(outputs: Path, job: Mapping[str, Any]) -> str | None:
+def last(outputs: Path, job: Mapping[str, Any]) -> str | None:
     """Why `job` failed in its last attempt; None if it did not."""
     path = _path(outputs, job)
     return path.read_text(encoding="utf-8").strip() if path.exists() else None

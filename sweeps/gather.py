@@ -6,11 +6,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from omegaconf import DictConfig
+
 from bench.results import Store
 from reports.runs import Repeated, Run, over_common_frames, readable
 from reports.scenes import over_scenes
 from sweeps import failures
-from sweeps.identity import job_key, of_scene
+from sweeps.configured import scene_digest, scene_folder
+from sweeps.identity import job_key
 from sweeps.plan import Planned
 
 
@@ -28,13 +31,13 @@ def newest(store: Store) -> dict[str, list[Run]]:
 
     A job has several if its settings fit scenes in different folders.
     """
-    found: dict[str, dict[str, Run]] = {}
+    of_jobs: dict[str, dict[str, Run]] = {}
     for run in reversed(readable(store)):
         parts = run.record["made_of"]
         if "config" in parts:
-            of_job = found.setdefault(job_key(parts["config"], parts.get("turns", "")), {})
+            of_job = of_jobs.setdefault(job_key(parts["config"], parts.get("turns", "")), {})
             of_job.setdefault(run.record["scene"]["digest"], run)
-    return {job: list(of_scenes.values()) for job, of_scenes in found.items()}
+    return {job: list(of_scenes.values()) for job, of_scenes in of_jobs.items()}
 
 
 def gather(
@@ -59,12 +62,24 @@ def gather(
 
 
 def _outcome(job: Planned, runs: Mapping[str, Sequence[Run]], outputs: Path) -> Outcome:
-    failure = failures.found(outputs, job.settings)
+    failure = failures.last(outputs, job.settings)
     shown = (run for run in runs.get(job.key, ()) if of_scene(run, job.config))
     if run := next(shown, None):
         why = failure and f"failed when it was tried again: {failure}"
         return Outcome(job, replace(run, label=job.line), why)
     return Outcome(job, None, f"failed: {failure}" if failure else "not measured yet")
+
+
+def of_scene(run: Run, config: DictConfig) -> bool:
+    """Whether `run`, which has the settings of `config`, also has its scene.
+
+    The settings do not tell apart folders with the same last name. If the folder does not exist
+    here, only this name counts.
+    """
+    folder = scene_folder(config)
+    if folder is None or run.record.get("scene_path") == folder or not Path(folder).is_dir():
+        return True
+    return run.record["scene"]["digest"] == scene_digest(config)
 
 
 def _lines(of_block: Mapping[str, Sequence[Outcome]]) -> list[Repeated]:

@@ -13,12 +13,10 @@ from omegaconf.errors import OmegaConfBaseException
 from bench.errors import SteerbenchError
 from bench.provenance import computed_by
 from bench.results import content_key
-from bench.run import measure_in_turns
+from bench.run import measure
 from bench.trajectories import Trajectory
 from bench.types import Method, Scene
-from reports.runs import Run
 from sweeps.build import target_of
-from sweeps.configured import scene_digest, scene_folder
 
 PLACES = ("outputs", "report", "tracker", "weights_dir")
 """Settings that are only locations and do not change a row."""
@@ -48,24 +46,12 @@ def job_key(settings: Mapping[str, Any], turns: str) -> str:
     return content_key({"settings": settings, "turns": turns} if turns else settings)
 
 
-def of_scene(run: Run, config: DictConfig) -> bool:
-    """Whether `run`, which has the settings of `config`, also has its scene.
-
-    The settings do not tell apart folders with the same last name. If the folder does not exist
-    here, only this name counts.
-    """
-    folder = scene_folder(config)
-    if folder is None or run.record.get("scene_path") == folder or not Path(folder).is_dir():
-        return True
-    return run.record["scene"]["digest"] == scene_digest(config)
-
-
 def run_parts(
     config: DictConfig, scene: Scene, method: Method, trajectory: Trajectory
 ) -> dict[str, Any]:
     """The parts of a run's key: everything that can change its rows, except the LPIPS weights."""
     settings = described(config)
-    things = [measure_in_turns, *_targets(settings)]
+    things = [measure, *_targets(settings)]
     files = (*getattr(method, "reads", ()), *trajectory.reads)
     read = [file for file in files if file.is_file()]
     return {

@@ -1,15 +1,17 @@
-"""One job among others: its line at the terminal, and its record in the folder of a sweep."""
+"""How jobs end: a line at the terminal, and a record in the folder that the jobs of a sweep share.
+
+The jobs may run in other processes, so they share only this folder and the store.
+"""
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass
-from datetime import timedelta
+import time
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from omegaconf import DictConfig
+from hydra.core.hydra_config import HydraConfig
 
 from bench.errors import explained
 from bench.sharing import whole
@@ -17,19 +19,18 @@ from reports.runs import load
 from reports.tables import decimal
 from sweeps import failures
 from sweeps.identity import described
-from sweeps.measurement import Obtained, obtain_in_turns
+from sweeps.measurement import Group, Job, Obtained, obtain
+from sweeps.terminal import time_left
 
 SUFFIX = ".job.json"
 
 
 @dataclass(frozen=True)
-class Job:
-    """How one job of a sweep ended.
+class Ended:
+    """How a job ended.
 
     Attributes:
         number: from 0, in the order of the sweep.
-        method: the chosen name of its method.
-        overrides: as Hydra passes them to the job, `key=value` each.
         outputs: the folder with its store.
         report: the folder of its page, or None.
         begun: when it started, in seconds since the epoch.
@@ -39,8 +40,7 @@ class Job:
     """
 
     number: int
-    method: str
-    overrides: tuple[str, ...]
+    name: str
     outputs: str
     report: str | None
     begun: float
@@ -48,78 +48,66 @@ class Job:
     run: str | None = None
     failure: str | None = None
 
+    @classmethod
+    def of(cls, group: Group, begun: float) -> list[Ended]:
+        """The records of the jobs of a group, all but how they ended."""
+        return [
+            cls(number, job.name, str(job.config.outputs), job.config.report, begun)
+            for number, job in enumerate(group.jobs, group.first)
+        ]
+
     def write(self, folder: Path) -> None:
-        """Write the job to `folder`, atomically."""
+        """Write the record to `folder`, atomically."""
         with explained(folder), whole(folder / f"{self.number}{SUFFIX}") as new:
             new.write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
 
-    def label(self, names: Collection[str]) -> str:
-        """The label of the job among others: its method, and its values of the settings `names`.
 
-        A name is shortened to its last part unless that is ambiguous.
-        """
-        ends = [name.rpartition(".")[2] for name in names]
-        shown = [
-            f"{end if ends.count(end) == 1 else name}={self.settings[name]}"
-            for name, end in zip(names, ends, strict=True)
-            if name in self.settings
-        ]
-        return f"{self.method} ({', '.join(shown)})" if shown else self.method
-
-    @property
-    def settings(self) -> dict[str, str]:
-        """The overrides by name, except the method."""
-        pairs = (override.split("=", 1) for override in self.overrides if "=" in override)
-        return {name: value for name, value in pairs if name != "method"}
-
-
-def read(folder: Path) -> list[Job]:
-    """Read every job that has ended, in the order of the sweep."""
+def read(folder: Path) -> list[Ended]:
+    """Read the records of all jobs that have ended, in the order of the sweep."""
     texts = (path.read_text(encoding="utf-8") for path in folder.glob(f"*{SUFFIX}"))
-    jobs = [
-        Job(**fields | {"overrides": tuple(fields["overrides"])})
-        for fields in map(json.loads, texts)
-    ]
-    return sorted(jobs, key=lambda job: job.number)
+    return sorted((Ended(**json.loads(text)) for text in texts), key=lambda job: job.number)
 
 
-def varying(jobs: Sequence[Job]) -> list[str]:
-    """Names of the settings that differ between jobs."""
-    names = dict.fromkeys(name for job in jobs for name in job.settings)
-    return [name for name in names if len({job.settings.get(name) for job in jobs}) > 1]
+def attempt(group: Group, total: int) -> None:
+    """Obtain the runs of `group`, in a job of Hydra's; print and record how each job ended.
 
+    Args:
+        total: the number of jobs in the sweep; 0: not known.
 
-def attempt(config: DictConfig, command: Sequence[str], name: str) -> Obtained:
-    """Obtain the run that `config` describes; print a failure at once and keep it for reports.
-
-    Raises as `obtain` does.
+    Raises as `obtain` does. The failure is printed, and kept for reports.
     """
-    return attempt_in_turns([(config, command, name)])[0]
-
-
-def attempt_in_turns(
-    jobs: Sequence[tuple[DictConfig, Sequence[str], str]], turns: str = ""
-) -> list[Obtained]:
-    """`attempt` several jobs in turns, see `obtain_in_turns`; if one fails, all fail."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    jobs = Ended.of(group, time.time())
     try:
-        return obtain_in_turns([(config, command) for config, command, _ in jobs], turns)
+        results = obtain(group)
     except Exception as error:
-        for config, _, name in jobs:
-            print(f"steerbench: failed: {name}: {error}", file=sys.stderr)
+        why = failures.reason(error)
+        for job, ended in zip(group.jobs, jobs, strict=True):
+            print(f"steerbench: failed: {job.name}: {error}", file=sys.stderr)
             with failures.printed():
-                failures.keep(Path(config.outputs), described(config), failures.reason(error))
+                failures.keep(group.outputs, described(job.config), why)
+            with failures.printed():
+                replace(ended, failure=why).write(folder)
         raise
+    for ended, result in zip(jobs, results, strict=True):
+        replace(ended, run=result.run, measured=result.measured).write(folder)
+    for job, result in zip(group.jobs, results, strict=True):
+        say(job, result, _progress(folder, total))
 
 
-def say(obtained: Obtained, name: str, more: str) -> None:
+def say(job: Job, obtained: Obtained, more: str = "") -> None:
     """Print the figures of a job in one line, and `more` after them."""
-    (run,) = load(obtained.store, {obtained.run: name})
+    (run,) = load(obtained.store, {obtained.run: job.name})
     psnr, ms = decimal(run.values.get("psnr"), 2), decimal(run.values["frame_ms"], 1)
-    print(f"{name}: {psnr} dB, {ms} ms a frame{more}", file=sys.stderr)
+    print(f"{job.name}: {psnr} dB, {ms} ms a frame{more}", file=sys.stderr)
 
 
-def time_left(seconds: float, measured: int, jobs: int) -> str:
-    """Estimated time for `jobs` if `measured` ones took `seconds`; empty if none was measured."""
-    if not (measured and jobs):
+def _progress(folder: Path, total: int) -> str:
+    """How many jobs are done, and an estimate of the remaining time from the measured ones."""
+    ended = read(folder)
+    if len(ended) > total:
         return ""
-    return f", about {timedelta(seconds=round(seconds / measured * jobs))} left"
+    seconds = time.time() - min(job.begun for job in ended)
+    measured = sum(job.measured for job in ended)
+    left = time_left(seconds, measured, total - len(ended))
+    return f"; {len(ended)} of {total} jobs done{left}"

@@ -43,7 +43,7 @@ def installed() -> tuple[PlugIn, ...]:
 
 def folders() -> list[Path]:
     """The folders of all usable plug-ins."""
-    return [one.folder for one in installed() if one.folder]
+    return [each.folder for each in installed() if each.folder]
 
 
 def _found(entry: metadata.EntryPoint) -> PlugIn:

@@ -1,14 +1,23 @@
-"""Prints tables at the terminal."""
+"""What commands print: tables, rows, figures of a run, and how long the rest takes."""
 
 from __future__ import annotations
 
+import json
+import math
 import sys
+from collections.abc import Iterable, Mapping
+from datetime import timedelta
+from typing import TYPE_CHECKING, Any
 
+from rich.columns import Columns
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
 
-from reports.tables import Table
+from reports.tables import Table, run_tables
+
+if TYPE_CHECKING:  # it loads torch, which `steerbench list` does without
+    from reports.runs import Run
 
 PIPE_WIDTH = 200
 """Width of text without a terminal: wide enough for every table."""
@@ -29,6 +38,40 @@ def show(*tables: Table) -> None:
     """Print `tables`, one below the other."""
     for table in tables:
         console().print(rich_table(table))
+
+
+def show_run(run: Run, heading: str) -> None:
+    """Print the tables of one run below a heading."""
+    out = console()
+    out.print(f"{heading}: run {run.key}", style="bold", markup=False)
+    out.print(Columns([rich_table(table) for table in run_tables(run.rows)]))
+
+
+def say_missing(runs: Iterable[Run]) -> None:
+    """Print why figures of `runs` are missing, each reason once."""
+    reasons = (f"{name}: n/a. {why}" for run in runs for name, why in run.record["missing"].items())
+    for reason in dict.fromkeys(reasons):
+        console().print(reason, markup=False, soft_wrap=True)
+
+
+def print_rows(rows: Any) -> None:
+    """Print `rows` as one line of JSON, with null for figures that are not finite."""
+    print(json.dumps(_finite(rows)))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def time_left(seconds: float, measured: int, jobs: int) -> str:
+    """Estimated time for `jobs` if `measured` ones took `seconds`; empty if none was measured."""
+    if not (measured and jobs):
+        return ""
+    return f", about {timedelta(seconds=round(seconds / measured * jobs))} left"
 
 
 def rich_table(table: Table) -> RichTable:

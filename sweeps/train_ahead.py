@@ -14,19 +14,17 @@ from omegaconf import DictConfig
 
 from bench.console import ConsoleLog
 from bench.results import content_key
-from sweeps.build import build
+from bench.study import study_of
+from sweeps.build import build, target_of
 from sweeps.configured import trained
 from sweeps.device_lock import device_lock, on_gpu
 from sweeps.failures import reason
-from sweeps.jobs import time_left
 from sweeps.plan import Planned
 from sweeps.processes import processes
+from sweeps.terminal import time_left
 
-CHOSEN_AFTERWARDS = {
-    *("engine", "precision", "protocol", "pictures"),
-    *("rendering", "after", "stored", "stop", "faint", "skip"),
-}
-"""Settings of a run and of its method that no training depends on."""
+OF_MEASUREMENT = ("engine", "precision", "protocol", "pictures")
+"""Settings of run.yaml that no training depends on."""
 
 
 def train_ahead(jobs: Sequence[Planned], measured: Collection[str]) -> None:
@@ -64,12 +62,15 @@ def room(config: DictConfig) -> int:
 
 def _training(job: Planned) -> str:
     """A key of all settings that a training may depend on; equal for jobs that share it."""
-    settings = _kept(job.settings)
-    return content_key(settings | {"method": _kept(settings["method"])})
+    method = job.settings["method"]
+    chosen = study_of(target_of(method)).chosen
+    return content_key(
+        {**_without(job.settings, OF_MEASUREMENT), "method": _without(method, chosen)}
+    )
 
 
-def _kept(settings: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in settings.items() if name not in CHOSEN_AFTERWARDS}
+def _without(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+    return {name: value for name, value in settings.items() if name not in names}
 
 
 def _train(config: DictConfig) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from io import StringIO
@@ -86,7 +86,7 @@ class Viewer:
         painter: Painter,
         scene: Scene,
         first: Camera,
-        knobs: Sequence[Mapping[str, Sequence[str]]],
+        knobs: Sequence[Mapping[str, Iterable[str]]],
         turn: Callable[[int, str, str], None],
         folder: Path,
         log: Log,
@@ -111,12 +111,12 @@ class Viewer:
 
     def draw(self, timeout: float | None = None) -> bool:
         """Render for the browser that has waited longest; False if none waits for `timeout` s."""
-        found = self.turns.next(timeout)
+        waiting = self.turns.next(timeout)
         while self._turned:
             self._turn(*self._turned.pop(0))
-        if found is None:
+        if waiting is None:
             return False
-        who, ask = found
+        who, ask = waiting
         browser = self.browsers.get(who)
         if browser is not None:  # it is still connected
             try:
@@ -289,9 +289,14 @@ def _figures(painter: Painter, drawn: Sequence[Drawn], truth: Tensor | None) -> 
     """Frame times, times of stages and PSNR of each method, as Markdown."""
     height, width = drawn[0].rgb.shape[:2]
     lines = [f"{width} x {height} pixels", ""]
-    for method, one in zip(painter.methods, drawn, strict=True):
-        quality = "" if truth is None else f", {psnr(one.rgb, truth):.2f} dB"
-        lines += [f"**{method.name}** {one.ms:.0f} ms{quality}", "", "| stage | ms |", "|---|---|"]
-        lines += [f"| {stage} | {ms:.1f} |" for stage, ms in one.stages_ms.items()]
+    for method, picture in zip(painter.methods, drawn, strict=True):
+        quality = "" if truth is None else f", {psnr(picture.rgb, truth):.2f} dB"
+        lines += [
+            f"**{method.name}** {picture.ms:.0f} ms{quality}",
+            "",
+            "| stage | ms |",
+            "|---|---|",
+        ]
+        lines += [f"| {stage} | {ms:.1f} |" for stage, ms in picture.stages_ms.items()]
         lines.append("")
     return "\n".join(lines)

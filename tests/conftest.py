@@ -233,7 +233,7 @@ def store(tmp_path: Path, offset_method, tiny_scene, quiet_log) -> Store:
     protocol = EvaluationProtocol(name="quick", lpips=())
     budget = Budget("none", steps=1, samples=1)
     task = Task(tiny_scene, from_split(tiny_scene), protocol, budget, seed=5)
-    measurement = measure(offset_method, task, quiet_log)
+    (measurement,) = measure([offset_method], task, quiet_log)
     record = {
         **measurement.record,
         "command": "steerbench run method=offset",

@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 
 from bench.results import Store
-from sweeps.studies.breakdown import DENSE
+from sweeps.commands.breakdown import DENSE
 
 pytestmark = pytest.mark.slow
 
@@ -24,16 +24,22 @@ MEASURED_ANEW = ("frame_ms", "fps", "stage_ms", "train_s", "peak_bytes")
 """Metrics that differ from one run to the next on any machine."""
 
 
+def called(folder: Path, *words: str | Path) -> subprocess.CompletedProcess[str]:
+    """`steerbench` with these words, called in a folder."""
+    command = [Path(sys.executable).with_name("steerbench"), *words]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
 def demo(folder: Path, weights: Path, *more: str) -> subprocess.CompletedProcess[str]:
-    steerbench = Path(sys.executable).with_name("steerbench")
-    command = [steerbench, "run", "+experiment=demo", *SMALL]
-    return subprocess.run(
-        [*command, f"weights_dir={weights}", *more],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    return called(folder, "run", "+experiment=demo", *SMALL, f"weights_dir={weights}", *more)
+
+
+def study(folder: Path, command: str, *words: str) -> tuple[dict[str, dict], str]:
+    """The rows of a study by their first column, and what else it said."""
+    done = called(folder, command, "--repeats", "1", *words)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(done.stdout.splitlines()[-1])
+    return {next(iter(row.values())): row for row in rows}, done.stderr
 
 
 def rows(folder: Path) -> pd.DataFrame:
@@ -155,13 +161,9 @@ def test_wherever_it_is_killed_again_and_again_a_sweep_ends_with_the_same_rows(
 
 
 def test_parity_compares_every_engine_with_torch_in_fp32(tmp_path: Path) -> None:
-    steerbench = Path(sys.executable).with_name("steerbench")
-    command = [steerbench, "parity", "--repeats", "1", "--frames", "4", *SMALLEST]
-    command += ["scene.test=3", "budget.frames=0"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "frames to build the network on: found in" in done.stderr  # made for another engine
-    found = {row["engine"]: row for row in json.loads(done.stdout.splitlines()[-1])}
+    words = ("--frames", "4", *SMALLEST, "scene.test=3", "budget.frames=0")
+    found, said = study(tmp_path, "parity", *words)
+    assert "frames to build the network on: found in" in said  # made for another engine
     standard = found["torch, fp32"]
     assert standard["lost"] == 0
     assert standard["apart"] is None  # there is no difference
@@ -176,11 +178,7 @@ def test_parity_compares_every_engine_with_torch_in_fp32(tmp_path: Path) -> None
 def test_skips_lists_the_work_of_a_frame_with_and_without_each_switch(
     first: tuple[Path, str],
 ) -> None:
-    steerbench = Path(sys.executable).with_name("steerbench")
-    command = [steerbench, "skips", "--repeats", "1", "--frames", "3", "scene=totem", *SMALL]
-    done = subprocess.run(command, cwd=first[0], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    found = {row["skipped"]: row for row in json.loads(done.stdout.splitlines()[-1])}
+    found, _ = study(first[0], "skips", "--frames", "3", "scene=totem", *SMALL)
     dense = found.pop("nothing")
     assert dense["cells"] == 16 * 16
     assert found["empty space"]["samples"] < dense["samples"]
@@ -189,13 +187,9 @@ def test_skips_lists_the_work_of_a_frame_with_and_without_each_switch(
 
 
 def test_breakdown_divides_the_frame_and_names_every_line(first: tuple[Path, str]) -> None:
-    steerbench = Path(sys.executable).with_name("steerbench")
-    command = [steerbench, "breakdown", "--repeats", "1", "--frames", "3", "engine=torch"]
-    command += ["device=cpu", "scene=totem", *SMALL, "budget.renderer_steps=9"]  # others train 8
-    done = subprocess.run(command, cwd=first[0], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "torch, fp16: " in done.stderr  # and why it cannot be had
-    found = {row["line"]: row for row in json.loads(done.stdout.splitlines()[-1])}
+    words = ("--frames", "3", "engine=torch", "device=cpu", "scene=totem", *SMALL)
+    found, said = study(first[0], "breakdown", *words, "budget.renderer_steps=9")  # others train 8
+    assert "torch, fp16: " in said  # and why it cannot be had
     precisions = ("torch, fp32", "torch, bf16")
     endings = ("", DENSE, ", the paper's")
     lines = [f"{precision}{ending}" for ending in endings for precision in precisions]

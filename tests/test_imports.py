@@ -17,12 +17,12 @@ MAY_IMPORT = {
     "sweeps": {"bench", "reports", "sweeps"},
 }
 REACHES = {
-    "sweeps/studies/accuracy.py": "methods.checks.",
-    "sweeps/studies/worth.py": "methods.kernels.",
-    "sweeps/compile.py": "methods.checks.",
-    "sweeps/kernels.py": ("methods.checks.", "methods.kernels."),
-    "sweeps/catalogue.py": "methods.kernels.",
-    "sweeps/stress.py": "methods.checks.",
+    "sweeps/commands/accuracy.py": "methods.checks.",
+    "sweeps/commands/compile.py": "methods.checks.",
+    "sweeps/commands/kernels.py": ("methods.checks.", "methods.kernels."),
+    "sweeps/commands/list.py": "methods.kernels.",
+    "sweeps/commands/stress.py": "methods.checks.",
+    "sweeps/worth.py": "methods.kernels.",
 }
 """What measures and lists parts of methods reaches them directly; methods only through
 `_target_`."""
@@ -111,9 +111,24 @@ def test_a_compiler_is_imported_only_by_the_kernels_made_for_it(library, home):
     assert all("kernels" in path.parts[1:3] for path in users)
 
 
+def test_sweeps_has_six_floors_and_no_circle():
+    """A file's floor is one above the highest it imports; the commands together are one file."""
+    below: dict[str, set[str]] = {}
+    for path in (path for path in SOURCES if path.parts[0] == "sweeps"):
+        names = {name.split(".")[1] for name, _ in imports(path) if name.startswith("sweeps.")}
+        below.setdefault(path.with_suffix("").parts[1], set()).update(names)
+
+    def floor(file: str, above: tuple[str, ...] = ()) -> int:
+        assert file not in above, f"a circle: {' -> '.join((*above, file))}"
+        others = below[file] - {file} & below.keys()
+        return 1 + max((floor(other, (*above, file)) for other in others), default=0)
+
+    assert max(map(floor, below)) <= 6
+
+
 def test_the_command_line_opens_without_loading_torch():
     """Help and completion answer at once because nothing they need imports torch."""
-    seen, pending = set(), {Path("sweeps/cli.py"), Path("sweeps/run.py")}
+    seen, pending = set(), {Path("sweeps/cli.py"), Path("sweeps/commands/run.py")}
     while pending:
         path = pending.pop()
         seen.add(path)

@@ -101,3 +101,16 @@ def test_the_tour_uses_what_the_door_has() -> None:
     }
     assert used <= set(steerbench.__all__)
     assert len(used) >= 6
+
+
+def test_the_import_changes_nothing_of_the_process() -> None:
+    """The command line sets variables and the allocator for itself, not for who imports."""
+    program = """
+import os, torch, numba  # both set variables of their own
+import bench.allocator
+bench.allocator.keep_freed = None  # a call would fail
+before = dict(os.environ)
+import steerbench
+assert dict(os.environ) == before, dict(os.environ).items() ^ before.items()
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)

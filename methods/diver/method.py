@@ -51,6 +51,7 @@ class Diver(Student):
         exact=("method.stop=1e-4", "method.faint=0", "method.stored=fp32"),
         parts=dict.fromkeys(("rays", "segments"), "field"),
         axes={"G": Axis("{} voxels a side", "method.resolution", (128, 192, 256))},
+        chosen=("stored", "faint", "stop"),
     )
 
     def __post_init__(self) -> None:

@@ -72,6 +72,7 @@ class GaussianSplatting:
         },
         exact=("method.stop=1e-4", "method.stored=fp32"),
         axes={"N": Axis("{:,} Gaussians", "method.count", (20_000, 40_000, 80_000, 160_000))},
+        chosen=("stored", "stop"),
     )
 
     def __post_init__(self) -> None:

@@ -40,6 +40,7 @@ class InstantNgp:
         },
         exact=("method.stop=1e-4",),
         parts=dict.fromkeys(("rays", "march", "composite"), "field"),
+        chosen=("stop",),
     )
 
     def __init__(

@@ -28,7 +28,9 @@ class Nerf(FieldStudent):
     skip: bool = True
 
     kind = "nerf"
-    study = replace(FieldStudent.study, skips={"empty cells": "method.skip"})
+    study = replace(
+        FieldStudent.study, skips={"empty cells": "method.skip"}, chosen=("skip", "stop")
+    )
 
     def new_field(self) -> NerfField:
         """Make the published network."""

@@ -54,6 +54,7 @@ class PlenOctree(Student):
         exact=("method.stop=1e-4", "method.stored=fp32"),
         parts=dict.fromkeys(("rays", "render"), "field"),
         axes={"G": Axis("{}³ leaves", "method.extraction.resolution", (128, 256, 512))},
+        chosen=("stored", "stop"),
     )
 
     def __post_init__(self) -> None:

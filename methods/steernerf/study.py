@@ -60,4 +60,5 @@ STUDY = Study(
     network_stage="renderer2d/network",
     network_size="renderer2d",
     beside={"Instant-NGP": ("method=ngp",)},
+    chosen=("rendering", "after", "engine"),
 )

@@ -54,6 +54,7 @@ class Student(ABC):
         knobs={"stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3"))},
         exact=("method.stop=1e-4",),
         parts=dict.fromkeys(("rays", "march", "composite"), "field"),
+        chosen=("stop",),
     )
 
     def __post_init__(self) -> None:

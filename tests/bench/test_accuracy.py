@@ -93,7 +93,7 @@ def in_turns(tiny_scene, quiet_log):
 def test_methods_take_turns_in_every_round_and_are_reset_in_each(in_turns, tiny_scene):
     _, turns = in_turns(0, 8)
     count = len(tiny_scene.splits["test"])
-    round_ = [(levels, turn) for levels in (0, 8) for turn in ("reset", *range(count))]
+    round_ = [(levels, turn) for turn in ("reset", *range(count)) for levels in (0, 8)]
     assert turns == 3 * round_  # one that warms up, two that are timed
 
 

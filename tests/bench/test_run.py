@@ -16,7 +16,7 @@ from bench.intervals import path_interval
 from bench.metrics import psnr, quantise
 from bench.protocol import EvaluationProtocol
 from bench.results import COLUMNS, Store
-from bench.run import Task, measure, measure_in_turns
+from bench.run import Task, measure
 from bench.trajectories import from_split
 from bench.types import Budget, SteerbenchError
 
@@ -30,7 +30,7 @@ def run(tiny_scene, quiet_log):
 
     def measured(method, **changes):
         task = Task(tiny_scene, from_split(tiny_scene), QUICK, BUDGET, seed=5)
-        return measure(method, replace(task, **changes), quiet_log)
+        return measure([method], replace(task, **changes), quiet_log)[0]
 
     return measured
 
@@ -357,7 +357,7 @@ def test_methods_in_turns_draw_each_frame_one_after_the_other_as_they_would_alon
             return type(method).render(method, camera, probe)
 
         method.render = watched
-    both = measure_in_turns([offset_method, other], task, quiet_log)
+    both = measure([offset_method, other], task, quiet_log)
     assert drawn == ["one", "other"] * (QUICK.warmup + 6)
     for method, measured in zip((offset_method, other), both, strict=True):
         assert measured.frames["psnr"].tolist() == run(method).frames["psnr"].tolist()

@@ -208,7 +208,7 @@ def rows(method: Method, scene: Scene, folder: Path) -> pd.DataFrame:
     """All but times and peak memory."""
     protocol = EvaluationProtocol(name="quick", lpips=(), warmup=0)
     task = Task(scene, from_split(scene), protocol, BUDGET, seed=0)
-    found = measure(method, task, ConsoleLog(folder, quiet=True)).rows
+    found = measure([method], task, ConsoleLog(folder, quiet=True))[0].rows
     timed = found["metric"].str.startswith(("frame_ms", "fps", "stage_ms", "train_s", "peak"))
     assert timed.any()
     return found[~timed]

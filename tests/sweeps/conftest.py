@@ -11,10 +11,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from hydra.core.plugins import Plugins
 
 from sweeps import cli
 
 HERE = Path(__file__).parent
+PATH = os.pathsep.join((str(HERE), str(HERE.parents[1])))
+"""Where other processes find the stand-ins, and the code of this checkout."""
+
 QUICK = ["method=grey", "scene=white", "budget=none", "protocol=quick"]
 STAND_INS = ["--config-dir", str(HERE / "configs"), *QUICK]
 
@@ -54,6 +58,27 @@ def run(steerbench: Callable[..., Outcome]) -> Callable[..., Outcome]:
 
 
 @pytest.fixture
+def launched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many jobs each launcher of Hydra's was handed."""
+    counts: list[int] = []
+    make = Plugins.instantiate_launcher
+
+    def made(self, **given):
+        launcher = make(self, **given)
+        launch = launcher.launch
+
+        def noted(jobs, initial_job_idx: int):
+            counts.append(len(jobs))
+            return launch(jobs, initial_job_idx)
+
+        monkeypatch.setattr(launcher, "launch", noted)
+        return launcher
+
+    monkeypatch.setattr(Plugins, "instantiate_launcher", made)
+    return counts
+
+
+@pytest.fixture
 def spawn(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
     """Start `steerbench run` with the stand-ins as a process of its own in `tmp_path`; what still
     runs after the test is killed."""
@@ -62,7 +87,7 @@ def spawn(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
         process = subprocess.Popen(
             [Path(sys.executable).with_name("steerbench"), "run", *STAND_INS, *argv],
             cwd=tmp_path,
-            env={**os.environ, "PYTHONPATH": str(HERE), "OMP_NUM_THREADS": "1"},
+            env={**os.environ, "PYTHONPATH": PATH, "OMP_NUM_THREADS": "1"},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

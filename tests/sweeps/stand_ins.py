@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -54,6 +55,20 @@ class Grey:
 
     def settings(self) -> dict[str, str]:
         return {"device": "cpu", "backend": "none", "engine": "torch", "precision": "fp32"}
+
+
+class Gated(Grey):
+    """A grey whose training waits at the FIFO `gate` in the outputs, while there is one.
+
+    Before, it writes its parent process into the FIFO `waiting`.
+    """
+
+    def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
+        outputs = log.stage_dir("grey", {"level": self.level}).parents[1]
+        if (outputs / "gate").exists():
+            (outputs / "waiting").write_text(f"{os.getppid()}\n")
+            (outputs / "gate").read_text()
+        super().fit(scene, budget, log)
 
 
 class Shades(Grey):

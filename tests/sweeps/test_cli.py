@@ -81,23 +81,13 @@ def test_list_says_how_to_get_an_engine_that_is_not_installed(steerbench, monkey
         (["skips", "--frames", "0"], "--frames: expected 1 or more, got 0"),
         (["parity", "--frames", "many"], "--frames: expected 1 or more, got many"),
         (["scenes", "verfy", "x"], "invalid choice: 'verfy'"),
-    ],
-)
-def test_a_wrong_word_is_answered_with_what_there_is(steerbench, argv, message):
-    outcome = steerbench(*argv)
-    assert outcome.status == 2
-    assert message in outcome.err
-
-
-@pytest.mark.parametrize(
-    ("argv", "message"),
-    [
+        # Options and settings are read in any order.
         (["scaling", "scene=totem", "--frames", "0", "budget=demo"], "--frames: expected 1"),
         (["report", "budget=tiny", "--table", "table3", "sed=1"], "unknown setting 'sed'"),
         (["report", "seed=0", "--tabl3", "table3", "seed=1"], "Did you mean --table?"),
     ],
 )
-def test_options_and_settings_are_read_in_any_order(steerbench, argv, message):
+def test_a_wrong_word_is_answered_with_what_there_is(steerbench, argv, message):
     outcome = steerbench(*argv)
     assert outcome.status == 2
     assert message in outcome.err

@@ -9,7 +9,7 @@ import pytest
 
 from bench.case import Case, Cell
 from bench.errors import Unavailable
-from sweeps.compile import compiled
+from sweeps.commands.compile import compiled
 
 CPU = ("cpu", "fp32")
 TOLERANCES = {CPU: 0.1, ("reference", "fp32"): 0.1}

@@ -17,10 +17,10 @@ from bench.errors import SteerbenchError
 from bench.results import Store
 from reports.runs import Run, load
 from sweeps import gather
+from sweeps.commands.paper import data_set
 from sweeps.data_sets import DataSet, find
 from sweeps.identity import described
 from sweeps.overrides import composed, setting
-from sweeps.paper import data_set
 from sweeps.plan import Planned, chosen, plan
 
 (TABLE,) = (replace(table, curve=False) for table in chosen(None, []) if table.name == "table5")

@@ -18,11 +18,10 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from bench import sources
 from sweeps import arguments, cli, overrides
 from sweeps.overrides import choices, composed, swept
 from sweeps.plan import chosen, plan
-from sweeps.studies.variants import METHOD
+from sweeps.variants import METHOD
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -96,16 +95,6 @@ def test_the_method_and_the_scene_of_the_document_are_measured_from_outside_the_
     assert "paint" in measured.out
     refused = steerbench(*typed("run"), *WITHOUT_LPIPS, "method.shade=2.0")
     assert refused.err.endswith("method: shade: expected 0 to 1, got 2.0\n")
-
-
-@pytest.mark.parametrize("module", ["method.py", "average.py"])
-def test_a_change_in_any_module_of_the_document_is_a_new_run(steerbench, mine, module, monkeypatch):
-    steerbench(*typed("run"), *WITHOUT_LPIPS)
-    monkeypatch.setattr(sources, "_first", {})  # as in another process
-    with (mine / "mean_colour" / module).open("a") as file:
-        file.write("# changed\n")
-    steerbench(*typed("run"), *WITHOUT_LPIPS)
-    assert len(list(mine.glob("outputs/runs/*/record.json"))) == 2
 
 
 def test_the_method_of_the_document_is_listed(steerbench, mine):
@@ -196,7 +185,7 @@ def test_every_command_of_a_document_can_be_typed(document, words, monkeypatch, 
             return
     else:
         options = captured(monkeypatch, words)
-        studied = arguments.COMMANDS[words[0]].get("module", "").startswith("studies.")
+        studied = arguments.COMMANDS[words[0]]["group"] == "studies of a method"
         usual = [METHOD] if studied else []
         settings = [*usual, *getattr(options, "overrides", [])]
     settings = [word for word in settings if not word.startswith(ELSEWHERE)]

@@ -37,7 +37,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], int]]:
         return Case(subject, "view", "", "", {}, lambda *cell: 0.0)
 
     monkeypatch.setattr("methods.checks.found", lambda name: [case("encode"), case("march")])
-    monkeypatch.setattr("sweeps.kernels.timed_rows", timed_rows)
+    monkeypatch.setattr("sweeps.commands.kernels.timed_rows", timed_rows)
     return calls
 
 

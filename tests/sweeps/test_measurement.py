@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import pytest
-from omegaconf import DictConfig
 
-from sweeps.measurement import Obtained, obtain_in_turns, stored
+from sweeps.measurement import Group, Job, Obtained, obtain, stored
 from sweeps.overrides import composed
 from tests.sweeps.conftest import HERE, QUICK
-
-
-def asked(*words: str) -> tuple[DictConfig, Sequence[str]]:
-    config = composed([f"--config-dir={HERE / 'configs'}", *QUICK, *words])
-    return config, ["steerbench", "run", *words]
 
 
 @pytest.fixture(autouse=True)
@@ -23,21 +15,37 @@ def elsewhere(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(HERE)
 
 
-def measured(found: Sequence[Obtained]) -> list[bool]:
-    return [one.measured for one in found]
+def group(*levels: float, turns: str = "table") -> Group:
+    words = [[*QUICK, f"method.level={level}"] for level in levels]
+    configs = [composed([f"--config-dir={HERE / 'configs'}", *each]) for each in words]
+    return Group([Job(config, []) for config in configs], turns)
+
+
+def measured(runs: list[Obtained]) -> list[bool]:
+    return [each.measured for each in runs]
 
 
 def test_lines_that_are_measured_in_turns_are_found_together_or_not_at_all() -> None:
     """A table of times must not have one line of today beside one of last week."""
-    grey, light, dark = (asked(f"method.level={level}") for level in (0.5, 0.75, 0.25))
-    assert measured(obtain_in_turns([grey, light], "table")) == [True, True]
-    assert measured(stored([grey, light], "table")) == [False, False]
-    assert stored([grey, dark], "table") == []
-    assert measured(obtain_in_turns([grey, dark], "table")) == [True, True]
-    assert measured(obtain_in_turns([light, grey], "table")) == [False, False]
+    assert measured(obtain(group(0.5, 0.75))) == [True, True]
+    assert measured(stored(group(0.5, 0.75))) == [False, False]
+    assert stored(group(0.5, 0.25)) == []
+    assert measured(obtain(group(0.5, 0.25))) == [True, True]
+    assert measured(obtain(group(0.75, 0.5))) == [False, False]
 
 
-def test_a_line_alone_is_found_whatever_was_measured_beside_it() -> None:
-    grey, light = asked("method.level=0.5"), asked("method.level=0.75")
-    obtain_in_turns([grey, light])
-    assert len(stored([grey])) == len(stored([light])) == 1
+def test_what_an_interruption_left_of_a_group_is_measured_again_with_the_rest() -> None:
+    first, second = obtain(group(0.5, 0.75))
+    mark = first.store.folder / first.run / "of yesterday"
+    mark.touch()
+    second.store.remove(second.run)
+    assert stored(group(0.5, 0.75)) == []
+    assert measured(obtain(group(0.5, 0.75))) == [True, True]
+    assert not mark.exists()
+    assert measured(stored(group(0.5, 0.75))) == [False, False]
+
+
+def test_a_line_alone_is_another_run_than_the_same_in_turns() -> None:
+    (alone,) = obtain(group(0.5, turns=""))
+    assert alone.run not in {run.run for run in obtain(group(0.5, 0.75))}
+    assert measured(obtain(group(0.5, turns=""))) == [False]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -18,7 +17,7 @@ from bench.results import Store
 from bench.types import SteerbenchError, Unavailable
 from sweeps import failures, jobs
 from sweeps.identity import described
-from sweeps.measurement import Obtained
+from sweeps.measurement import Group, Obtained
 from sweeps.overrides import composed
 from sweeps.plan import Planned, chosen, plan
 
@@ -194,16 +193,14 @@ def measured(
     for."""
     asked: list[DictConfig] = []
 
-    def obtain(config: DictConfig, command: Sequence[str]) -> Obtained:
+    def obtain(group: Group) -> list[Obtained]:
+        (config,) = [job.config for job in group.jobs]
         asked.append(config)
         if config.method.model.frames == 3:
             raise SteerbenchError("no room\nfor L = 3")
-        return Obtained(store, put(store, stored_run, config), measured=True)
+        return [Obtained(store, put(store, stored_run, config), measured=True)]
 
-    def in_turns(jobs: Sequence[tuple[DictConfig, Sequence[str]]], _: str) -> list[Obtained]:
-        return [obtain(*job) for job in jobs]
-
-    monkeypatch.setattr(jobs, "obtain_in_turns", in_turns)
+    monkeypatch.setattr(jobs, "obtain", obtain)
     monkeypatch.chdir(tmp_path)
     return asked
 
@@ -241,13 +238,21 @@ def test_a_job_that_fails_stands_in_its_line_and_the_others_run(
     assert "/ 33.14 /" in page.read_text()
 
 
+def test_the_jobs_go_where_hydras_launcher_puts_them(
+    steerbench, measured: list[DictConfig], launched: list[int], store: Store
+) -> None:
+    words = ("seed=0", f"outputs={store.folder.parent}")
+    assert steerbench("paper", "--table", "table5", *words).status == 0
+    assert launched == [len(measured)]
+
+
 def test_what_cannot_run_here_says_so_in_its_line_and_is_no_failure(
     steerbench, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def obtain(*_: object) -> list[Obtained]:
         raise Unavailable("no bfloat16 on this CPU")
 
-    monkeypatch.setattr(jobs, "obtain_in_turns", obtain)
+    monkeypatch.setattr(jobs, "obtain", obtain)
     outcome = steerbench("paper", "--table", "table3", "seed=0", f"outputs={store.folder.parent}")
     assert outcome.status == 0
     page = Path(re.search(r"report: (.*)", outcome.err)[1])
@@ -278,10 +283,10 @@ def test_a_report_has_what_is_there_and_measures_nothing(
 def test_a_failure_is_forgotten_once_the_job_succeeds(tmp_path: Path) -> None:
     job = {"seed": 1}
     failures.keep(tmp_path, job, "no room")
-    assert failures.found(tmp_path, job) == "no room"
-    assert failures.found(tmp_path, {"seed": 2}) is None
+    assert failures.last(tmp_path, job) == "no room"
+    assert failures.last(tmp_path, {"seed": 2}) is None
     failures.forget(tmp_path, job)
-    assert failures.found(tmp_path, job) is None
+    assert failures.last(tmp_path, job) is None
 
 
 def test_a_check_names_the_broken_rows_of_the_store(

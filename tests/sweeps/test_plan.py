@@ -15,11 +15,11 @@ import torch
 from bench.results import Store
 from bench.types import Scene
 from sweeps import configured, failures
+from sweeps.commands.breakdown import with_engine
 from sweeps.gather import gather, newest
 from sweeps.identity import described
 from sweeps.overrides import composed
 from sweeps.plan import Planned, chosen, plan
-from sweeps.studies.breakdown import with_engine
 
 (TABLE,) = (
     replace(table, lines=table.lines[:1], curve=False, beyond=None)

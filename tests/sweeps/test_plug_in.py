@@ -99,13 +99,6 @@ def test_a_change_in_either_module_is_a_new_run_of_a_new_process(
         assert len(keys(tmp_path)) == number
 
 
-def test_it_is_listed_with_what_it_is(call):
-    lines = [line for line in call("list").out.splitlines() if "method=mine" in line]
-    assert len(lines) == 1
-    assert "Mine." in lines[0]
-    assert "method=ngp" in call("list").out
-
-
 def test_a_folder_that_is_not_there_is_named(steerbench):
     for command in ("list", "report"):
         refused = steerbench(command, "--config-dir", "nowhere")
@@ -138,29 +131,21 @@ def test_accuracy_renders_it_as_it_is(call):
     assert "--config-dir=" in row["overrides"]
 
 
-@pytest.mark.parametrize("command", ["breakdown", "scaling"])
-def test_other_studies_take_it(call, command):
-    axis = ["--axis", "threads"] if command == "scaling" else []
-    outcome = call(command, "method=mine", "--frames", "1", *axis, *SMALL)
-    assert outcome.status == 0, outcome.err
-    assert rows(outcome.out)
-
-
 @pytest.fixture
 def only_mine(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Measure nothing but the plug-in; the methods of all jobs."""
     from sweeps import jobs
-    from sweeps.measurement import obtain_in_turns
+    from sweeps.measurement import obtain
 
     names = []
 
-    def some(asked, turns):
-        names.extend(config.method._target_ for config, _ in asked)
+    def some(group):
+        names.extend(job.config.method._target_ for job in group.jobs)
         if names[-1] != "mine.renderer.Mine":
             raise RuntimeError("not measured here")
-        return obtain_in_turns(asked, turns)
+        return obtain(group)
 
-    monkeypatch.setattr(jobs, "obtain_in_turns", some)
+    monkeypatch.setattr(jobs, "obtain", some)
     return names
 
 

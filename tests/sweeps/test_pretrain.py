@@ -31,7 +31,7 @@ class Recorder:
 def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
     """What `steerbench pretrain` has built and trained."""
     recorder = Recorder()
-    monkeypatch.setattr("sweeps.pretrain.build", recorder.build)
+    monkeypatch.setattr("sweeps.commands.pretrain.build", recorder.build)
     return recorder
 
 

@@ -12,7 +12,8 @@ import pytest
 from bench.errors import SteerbenchError
 from sweeps import train_ahead
 from sweeps.overrides import composed
-from sweeps.plan import chosen, plan
+from sweeps.plan import Planned, chosen, plan
+from tests.sweeps.conftest import HERE
 
 TABLES = {table.name: replace(table, curve=False) for table in chosen(None, [])}
 
@@ -39,10 +40,18 @@ def test_what_is_chosen_afterwards_is_no_training_of_its_own() -> None:
 def test_nothing_is_trained_for_a_line_whose_fellow_is_measured(monkeypatch) -> None:
     """Say one that fails each time, at a precision that this CPU does not have."""
     jobs = plan(replace(TABLES["table5"], beyond=None), ["budget=paper", "seed=0,1"])
-    todo: list[str] = []
-    monkeypatch.setattr(train_ahead, "room", lambda config: todo.append(config) or 1)
+    monkeypatch.setattr(train_ahead, "room", lambda config: 2)
+    monkeypatch.setattr(train_ahead, "processes", None)  # it would be called
     train_ahead.train_ahead(jobs, {job.key for job in jobs})
-    assert not todo
+
+
+def test_a_method_that_declares_nothing_is_trained_for_each_of_its_settings(monkeypatch) -> None:
+    """A plug-in may train with a setting that others choose afterwards."""
+    monkeypatch.syspath_prepend(HERE)
+    words = [f"--config-dir={HERE / 'configs'}", "method=grey", "scene=white"]
+    configs = [composed([*words, f"+method.stop={stop}"]) for stop in (0.1, 0.2)]
+    jobs = [Planned("table1", "", "grey", config, []) for config in configs]
+    assert len({train_ahead._training(job) for job in jobs}) == 2
 
 
 @pytest.mark.parametrize(("name", "lines"), [("table3", 4), ("table4", 3), ("table5", 2)])

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sweeps import cli, view
+from sweeps import cli
+from sweeps.commands import view
 from sweeps.viewer import AS_GIVEN, Viewer
 
 from .conftest import STAND_INS
@@ -153,17 +154,6 @@ def test_a_recorded_path_can_be_measured(
     words = ("trajectory=path", f"trajectory.path={file}")
     outcome = steerbench("run", *STAND_INS, *words)
     assert outcome.status == 0, outcome.err
-
-
-def test_a_browser_that_leaves_takes_nothing_with_it(opened: Callable[..., Viewer]) -> None:
-    viewer = opened()
-    with browser(viewer) as page:
-        page.look()
-        page.until(lambda: len(viewer.browsers) == 1)
-        page.look(0.1)
-    with browser(viewer) as other:
-        other.look()
-        other.until(lambda: other.picture.size > 0 and len(viewer.browsers) == 1)
 
 
 def test_a_browser_that_leaves_in_the_middle_of_a_frame_takes_nothing_with_it(

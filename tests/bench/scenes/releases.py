@@ -9,7 +9,7 @@ import pytest
 
 from bench.scenes import integrity
 from bench.scenes.published import Published
-from sweeps import scenes
+from sweeps.commands import scenes
 
 
 def publish(monkeypatch: pytest.MonkeyPatch, files: Mapping[str, bytes], **where: str) -> Published:

@@ -7,11 +7,13 @@ import math
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
 from omegaconf import DictConfig
 
+from bench.accuracy import mean_figures
 from bench.cameras import frame_camera
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, explained
@@ -27,18 +29,11 @@ from sweeps.configured import checked_settings, scene_of
 from sweeps.device_lock import device_lock
 from sweeps.names import unknown
 from sweeps.overrides import composed
-from sweeps.studies.variants import (
-    METHOD,
-    Row,
-    amount,
-    computes_with_engine,
-    declared,
-    print_rows,
-)
-from sweeps.terminal import show
+from sweeps.terminal import print_rows, show
+from sweeps.variants import METHOD, Row, amount, computes_with_engine, declared, settings
 
-SETTINGS = (METHOD, "trajectory=smooth", "++budget.renderer_steps=8")
-"""Few `renderer_steps`, because a 2D renderer costs the same however long it was trained."""
+FEW_STEPS = "++budget.renderer_steps=8"
+"""A 2D renderer costs the same however long it was trained."""
 
 SIZES = ((200, 200), (400, 400), (800, 800), (1920, 1080), (3840, 2160))
 
@@ -49,7 +44,7 @@ class Point:
 
     Attributes:
         axis: what is varied.
-        value: the size that the power is fitted to; see `bench.study.Axis.size`.
+        value: the size that the power is fitted to, as `bench.study.Axis` has it.
         label: the value as it is shown.
         settings: the words for `steerbench run` that set it.
         size: width and height of the frames; None: those of the trajectory.
@@ -60,6 +55,30 @@ class Point:
     label: str
     settings: tuple[str, ...] = ()
     size: tuple[int, int] | None = None
+
+
+def main(options: argparse.Namespace) -> int:
+    """Print a table with the fitted exponents, then its rows as JSON in the last line."""
+    if options.plot is not None and options.plot.suffix != ".png":
+        raise SteerbenchError(f"--plot: expected a name that ends in .png, got {options.plot}")
+    words, launcher = settings(options, METHOD, "trajectory=smooth", FEW_STEPS)
+    config = composed(words, return_hydra_config=True)
+    points = _chosen(config, options.axis)
+    for point in points:
+        composed([*words, *point.settings])  # refused before anything is measured
+    work = partial(_rows, words, frames=options.frames)
+    (rows,) = launcher.run(work, [points])
+    axes: dict[str, list[Row]] = {}
+    for row in rows:
+        axes.setdefault(row["axis"], []).append(row)
+    scene = rows[0]["scene"]
+    title = f"{config.method.get('name', scene)} on {scene}, {rows[0]['frames']} frames"
+    show(_table(title, axes))
+    print_rows(rows)
+    if options.plot is not None:
+        _plot(axes, options.plot)
+        ConsoleLog(launcher.outputs).info(f"plot: {options.plot}")
+    return 0
 
 
 def _points(study: Study) -> Iterator[Point]:
@@ -73,31 +92,17 @@ def _points(study: Study) -> Iterator[Point]:
             yield Point(name, size, axis.label.format(value), (f"{axis.setting}={value}",))
 
 
-def main(options: argparse.Namespace) -> int:
-    """Print a table with the fitted exponents, then its rows as JSON in the last line."""
-    if options.plot is not None and options.plot.suffix != ".png":
-        raise SteerbenchError(f"--plot: expected a name that ends in .png, got {options.plot}")
-    words = [*SETTINGS, *options.overrides]
-    config = composed(words, return_hydra_config=True)
-    log = ConsoleLog(Path(checked_settings(config).outputs))
-    points = _chosen(config, options.axis)
-    scene = scene_of(config)
-    configs = [composed([*words, *point.settings]) for point in points]
+def _rows(words: Sequence[str], points: Sequence[Point], frames: int) -> list[Row]:
+    """Measure the points one after the other."""
+    config = composed(words)
+    log, scene = ConsoleLog(Path(checked_settings(config).outputs)), scene_of(config)
     rows = []
     with log.progress("scaling", len(points)) as progress, device_lock(config.device, log):
-        for point, made in zip(points, configs, strict=True):
-            rows.append(_row(point, made, scene, options.frames, log))
+        for point in points:
+            row = _row(point, composed([*words, *point.settings]), scene, frames, log)
+            rows.append({"scene": scene.name, **row})
             progress.advance(note=point.label)
-    axes: dict[str, list[Row]] = {}
-    for row in rows:
-        axes.setdefault(row["axis"], []).append(row)
-    title = f"{config.method.get('name', scene.name)} on {scene.name}, {rows[0]['frames']} frames"
-    show(_table(title, axes))
-    print_rows(rows)
-    if options.plot is not None:
-        _plot(axes, options.plot)
-        log.info(f"plot: {options.plot}")
-    return 0
+    return rows
 
 
 def _chosen(config: DictConfig, names: Sequence[str] | None) -> list[Point]:
@@ -137,7 +142,6 @@ def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) 
         cameras = [frame_camera(camera, *point.size) for camera in cameras]
     with torch_threads(config.threads or torch.get_num_threads()):  # trained with the default
         records, peak_bytes = _render(method, cameras, log)
-    counters = dict.fromkeys(name for record in records for name in record.done)
     frame_ms = statistics.mean(record.total_ns for record in records) / 1e6
     return {
         "axis": point.axis,
@@ -147,10 +151,7 @@ def _row(point: Point, config: DictConfig, scene: Scene, frames: int, log: Log) 
         "frame_ms": frame_ms,
         "fps": 1e3 / frame_ms,
         "p99_to_p50": p99_to_p50(records),
-        **{
-            f"work.{name}": statistics.mean(record.done.get(name, 0) for record in records)
-            for name in counters
-        },
+        **mean_figures("work", [record.done for record in records]),
         "peak_bytes": peak_bytes,
         "size_bytes": sum(method.sizes().values()),
     }

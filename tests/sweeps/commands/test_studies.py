@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bench.study import Study
-from sweeps.studies.variants import engines
+from sweeps.variants import engines
 from tests.sweeps.conftest import STAND_INS, Outcome
 
 FRAMES = ["--frames", "2", "--repeats", "1"]
@@ -73,15 +73,8 @@ def test_skips_shows_the_work_with_each_skip_alone(study):
     assert found["and half as bright"]["lost"] > 0
 
 
-def test_skips_refuses_a_method_that_declares_none(study):
-    outcome = study("skips", "grey")
-    assert outcome.status == 2
-    assert "stand_ins.Grey declares nothing in `study.skips`" in outcome.err
-
-
 def test_breakdown_divides_the_frame_and_names_every_line(study):
-    outcome = study("breakdown", "shades", "method.level=0.3")
-    found = {row["line"]: row for row in rows(outcome)}
+    found = {row["line"]: row for row in rows(study("breakdown", "shades", "method.level=0.3"))}
     ends = ("", ", nothing skipped", ", a twin")
     lines = [variant.name + end for end in ends for variant in engines() if "torch" in variant.name]
     assert list(found) == [*lines, "plain grey"]
@@ -90,8 +83,6 @@ def test_breakdown_divides_the_frame_and_names_every_line(study):
     assert set(found["torch, fp32"]["parts"]) == {"painting", "varnish", "other"}
     assert set(found["plain grey"]["parts"]) == {"paint", "other"}
     assert len({row["psnr"] for row in found.values()}) == 1  # all have the level that was typed
-    for column in ("network of a twin / network", "frame of plain grey / frame", "by skipping"):
-        assert column in " ".join(outcome.out.split())
 
 
 def test_breakdown_of_a_method_without_engine_and_study_is_one_line(study):
@@ -111,16 +102,8 @@ def test_breakdown_says_which_lines_of_a_frame_wait_for_the_gpu(study, gpu, monk
     monkeypatch.setattr("stand_ins.Grey.render", asking)
     (row,) = rows(study("breakdown", "grey", "--device-waits"))
     assert row["waits"] == 1
-    assert row["line"].startswith("tests/sweeps/studies/test_studies.py:")
+    assert row["line"].startswith("tests/sweeps/commands/test_studies.py:")
     assert row["source"] == 'torch.ones(1, device="cuda").item()'
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="for a machine without a GPU")
-def test_breakdown_needs_a_gpu_to_say_where_a_frame_waits_for_it(study):
-    outcome = study("breakdown", "grey", "--device-waits")
-    assert outcome.status == 2
-    assert "a GPU is needed" in outcome.err
-    assert not outcome.out
 
 
 def test_a_line_of_another_budget_has_no_quality(study, monkeypatch):
@@ -140,10 +123,31 @@ def test_parity_compares_every_engine_with_torch_in_fp32(study):
         assert 0 < row["network_ms"] < row["frame_ms"]
 
 
-def test_parity_refuses_a_method_without_engine(study):
-    outcome = study("parity", "grey")
+NO_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="for a machine without a GPU")
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (("skips", "grey"), "stand_ins.Grey declares nothing in `study.skips`"),
+        (("parity", "grey"), "expected a method with the setting method.engine"),
+        pytest.param(("breakdown", "grey", "--device-waits"), "a GPU is needed", marks=NO_GPU),
+    ],
+    ids=lambda x: x[0],
+)
+def test_what_cannot_be_studied_is_refused(study, argv, message):
+    outcome = study(*argv)
     assert outcome.status == 2
-    assert "expected a method with the setting method.engine" in outcome.err
+    assert message in outcome.err
+    assert not outcome.out
+
+
+def test_a_study_is_computed_where_hydras_launcher_puts_it(study, launched):
+    assert study("parity", "shades").status == 0
+    assert launched == [1]  # in turns: one job
+    refused = study("parity", "shades", "+hydra.launcher.queue=gpu")
+    assert refused.status == 2
+    assert "queue" in refused.err
 
 
 def test_scaling_fits_the_axes_of_the_method(study):

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 import math
-from types import SimpleNamespace
 
 import pytest
 from matplotlib.figure import Figure
 
 from bench.errors import SteerbenchError
 from bench.study import Study, Variant
-from sweeps.studies.accuracy import _last_words, decibels
+from sweeps.commands.accuracy import _last_words, decibels
+from sweeps.variants import Rendered
 
-VARIANTS = "sweeps.studies.variants"
 EXACT = "method.rendering.skip.empty=false"
 
 ERROR = {"subject": "ramp", "knob": "step", "setting": 0.25, "error": 0.125, "order": None,
@@ -33,18 +32,18 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> None:
         for index, (name, (ms, psnr)) in enumerate(FIGURES.items())
     ]  # fmt: skip
 
-    def rendered(methods: dict[str, object], *arguments: object) -> list[dict[str, object]]:
-        return [row for row in rows if row["setting"] in methods]
+    def rendered(lines: dict[str, object], *_: object) -> list[Rendered]:
+        there = [row for row in rows if row["setting"] in lines]
+        return [
+            Rendered(row["setting"], "grey", "totem", "orbit", "8x8", 2, study, {}, row)
+            for row in there
+        ]
 
-    ground = SimpleNamespace(name="totem"), SimpleNamespace(name="orbit", resolution="8x8"), None
     study = Study({"share": variants[:2], "length": variants[2:]}, exact=(EXACT,))
-    monkeypatch.setattr("sweeps.studies.accuracy.declared", lambda config: study)
-    monkeypatch.setattr("sweeps.studies.accuracy.computes_with_engine", lambda config: False)
-    monkeypatch.setattr(f"{VARIANTS}.common_ground", lambda *arguments: ground)
-    monkeypatch.setattr(f"{VARIANTS}.usable", lambda configs, log: configs)
-    monkeypatch.setattr(f"{VARIANTS}.fit_each", lambda *arguments: None)
-    monkeypatch.setattr(f"{VARIANTS}.render_in_turns", rendered)
-    monkeypatch.setattr("sweeps.studies.accuracy.experiment_rows", lambda *arguments: [ERROR])
+    monkeypatch.setattr("sweeps.commands.accuracy.declared", lambda config: study)
+    monkeypatch.setattr("sweeps.commands.accuracy.computes_with_engine", lambda config: False)
+    monkeypatch.setattr("sweeps.commands.accuracy.render_variants", rendered)
+    monkeypatch.setattr("sweeps.commands.accuracy.experiment_rows", lambda *arguments: [ERROR])
     monkeypatch.setattr("methods.checks.found", lambda name: [])
     monkeypatch.setattr("reports.tradeoff.frontier_plot", lambda rows, path: Figure().savefig(path))
 
@@ -113,7 +112,7 @@ def test_a_filter_leaves_the_knobs_with_it_in_their_name_and_what_they_are_compa
 
 
 def test_the_kernels_alone_train_and_render_nothing(steerbench, measured, monkeypatch):
-    monkeypatch.setattr(f"{VARIANTS}.common_ground", None)
+    monkeypatch.setattr("sweeps.commands.accuracy.render_variants", None)
     outcome = steerbench("accuracy", "--kernels")
     assert json.loads(outcome.out.splitlines()[-1]) == {"kernels": [ERROR], "settings": []}
 

@@ -9,24 +9,25 @@ from bench.errors import SteerbenchError
 from bench.study import Study, Variant
 from reports.tables import Table, share
 from sweeps.overrides import composed
-from sweeps.studies.variants import (
+from sweeps.terminal import print_rows, show
+from sweeps.variants import (
     COMPARED,
     METHOD,
-    Row,
     amount,
     compared,
     compared_cells,
     declared,
-    print_rows,
     render_variants,
+    settings,
     settings_of,
 )
-from sweeps.terminal import show
+
+USUAL = (METHOD, "trajectory=smooth")
 
 
 def main(options: argparse.Namespace) -> int:
     """Print a table, then its rows as JSON in the last line."""
-    words = [METHOD, "trajectory=smooth", *options.overrides]
+    words, launcher = settings(options, *USUAL)
     config = composed(words)
     study = declared(config)
     if not study.skips:
@@ -35,15 +36,25 @@ def main(options: argparse.Namespace) -> int:
             "(bench/study.py); expected a method that does, for example method=steernerf_lean"
         )
     # The user's words come last, so that they take precedence.
-    words = [*words[:2], *study.skips_with, *options.overrides]
-    found = render_variants(settings_of(words, _variants(study)), options.frames, options.repeats)
-    work = found[0].work()
+    words = [*USUAL, *study.skips_with, *words[len(USUAL) :]]
+    rendered = render_variants(settings_of(words, _variants(study)), options, launcher)
+    first = rendered[0]
+    work = first.work()
     none = dict.fromkeys(work, 0.0)
-    rows = [{"skipped": one.name, **compared(one, found[0]), **none, **one.work()} for one in found]
-    title = f"{found[0].method.name}, {found[0].frames} frames: mean work of a frame, and its share"
+    rows = [
+        {"skipped": each.name, **compared(each, first), **none, **each.work()} for each in rendered
+    ]
+    lines = (
+        (
+            row["skipped"],
+            *compared_cells(row),
+            *(f"{amount(row[name])} ({share(row[name], work[name])})" for name in work),
+        )
+        for row in rows
+    )
+    title = f"{first.method}, {first.frames} frames: mean work of a frame, and its share"
     columns = ("skipped", *COMPARED, *(name.replace("_", " ") for name in work))
-    lines = tuple(_line(row, rows[0], list(work)) for row in rows)
-    show(Table(title, columns, lines))
+    show(Table(title, columns, tuple(lines)))
     print_rows(rows)
     return 0
 
@@ -61,8 +72,3 @@ def _variants(study: Study) -> Iterator[Variant]:
         yield Variant(name, tuple(line for other, line in off.items() if other != name))
     yield Variant("all of these")
     yield from study.savings
-
-
-def _line(row: Row, dense: Row, work: list[str]) -> tuple[str, ...]:
-    shares = (f"{amount(row[name])} ({share(row[name], dense[name])})" for name in work)
-    return row["skipped"], *compared_cells(row), *shares

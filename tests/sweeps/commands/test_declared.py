@@ -10,13 +10,10 @@ from omegaconf import OmegaConf
 
 from bench.study import Study, Variant
 from sweeps.overrides import choices, composed
-from sweeps.studies.variants import declared
+from sweeps.variants import declared
 
 METHODS = [name for name, path in choices("method").items() if "_target_" in OmegaConf.load(path)]
 """Those with a class of their own: the others declare what the method does that they vary."""
-
-AFTERWARDS = ("rendering", "engine", "stop", "stored", "faint", "skip")
-"""Settings of a method that a training does not depend on."""
 
 
 @cache
@@ -26,10 +23,10 @@ def study(name: str) -> Study:
 
 @cache
 def trained(name: str, *settings: str) -> dict[str, Any]:
-    """What the training of a method depends on."""
+    """What the training of a method depends on, by what it says itself."""
     config = composed([f"method={name}", *settings])
     node: Any = OmegaConf.to_container(config.method, resolve=True)
-    return {key: value for key, value in node.items() if key not in AFTERWARDS}
+    return {key: value for key, value in node.items() if key not in study(name).chosen}
 
 
 def variants(name: str) -> tuple[list[Variant], list[Variant]]:
@@ -64,6 +61,11 @@ def test_other_knobs_need_a_training_each(name: str) -> None:
     for variant in variants(name)[1]:
         trainings.append(trained(name, *variant.settings))
         assert trainings.count(trainings[-1]) == 1, variant.name
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_what_is_chosen_afterwards_is_a_setting_of_the_method(name: str) -> None:
+    assert set(study(name).chosen) <= composed([f"method={name}"]).method.keys()
 
 
 @pytest.mark.parametrize("name", METHODS)

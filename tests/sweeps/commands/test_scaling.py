@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from bench.errors import SteerbenchError
 from sweeps.cli import dispatch
-from sweeps.studies.scaling import growth
+from sweeps.commands.scaling import growth
 
 
 @given(power=st.floats(-3, 3), factor=st.floats(1e-3, 1e3))

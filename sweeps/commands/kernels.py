@@ -27,7 +27,7 @@ def main(options: argparse.Namespace) -> int:
     from methods.kernels import compiled
 
     if options.worth:
-        from sweeps.studies.worth import worth
+        from sweeps.worth import worth
 
         return worth(options.overrides, options.frames, options.repeats)
     log, device = ConsoleLog(Path()), "cuda" if torch.cuda.is_available() else "cpu"

@@ -25,8 +25,8 @@ from sweeps.build import build
 from sweeps.configured import checked_settings
 from sweeps.device_lock import device_lock
 from sweeps.overrides import choices, composed, swept
-from sweeps.studies.variants import Row, common_ground, print_rows
-from sweeps.terminal import show
+from sweeps.terminal import print_rows, show
+from sweeps.variants import Row, common_ground
 
 SETTINGS = ("scene=totem", "scene.width=100", "trajectory=orbit", "budget=tiny")
 

@@ -39,7 +39,9 @@ def main(options: argparse.Namespace) -> int:
 
     backends = [(name, why or "usable") for name, why in availability().items()]
     _show("Backends of the kernels", ("backend", "here"), backends)
-    engines = [(name, _state(name, kind)) for name, kind in engine_kinds(words).items()]
+    engines = [
+        (name, _state(name, kind)) for name, kind in engine_kinds(choices("engine", words)).items()
+    ]
     _show("Engines of the networks", ("engine", "here"), engines)
     return 0
 
@@ -55,18 +57,18 @@ def described(group: str, words: Sequence[str] = ()) -> dict[str, str]:
 
 
 def _plug_ins(words: Sequence[str]) -> list[tuple[str, str]]:
-    return [(one.name, _brings(one, words)) for one in installed()]
+    return [(each.name, _brings(each, words)) for each in installed()]
 
 
 def _brings(plug_in: PlugIn, words: Sequence[str]) -> str:
     """The choices of a plug-in, or why it has none."""
     if plug_in.folder is None:
         return f"cannot be used: {plug_in.fault}"
-    found = []
+    brought = []
     for path in plug_in.files():
         group, hidden = path.parent.name, choices(path.parent.name, words)[path.stem] != path
-        found.append(f"{group}={path.stem}" + (" (hidden: the name is taken)" if hidden else ""))
-    return ", ".join(found) or f"nothing: there are no GROUP/NAME.yaml in {plug_in.folder}"
+        brought.append(f"{group}={path.stem}" + (" (hidden: the name is taken)" if hidden else ""))
+    return ", ".join(brought) or f"nothing: there are no GROUP/NAME.yaml in {plug_in.folder}"
 
 
 def _state(name: str, kind: Any) -> str:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 from omegaconf import DictConfig
 
@@ -18,23 +16,21 @@ from bench.errors import SteerbenchError
 from bench.frontier import best_instead, cheapest_within
 from bench.study import Variant
 from reports.tradeoff import experiment_table, setting_table, write_tradeoff
-from sweeps.configured import checked_settings
 from sweeps.device_lock import device_lock
+from sweeps.execute import Launcher
 from sweeps.overrides import composed
-from sweeps.studies.variants import (
+from sweeps.terminal import print_rows, show
+from sweeps.variants import (
     METHOD,
     Row,
     computes_with_engine,
     declared,
     engines,
-    finite,
     render_variants,
+    settings,
 )
-from sweeps.terminal import show
 
 Knobs = Mapping[str, Sequence[Variant]]
-
-SETTINGS = (METHOD, "scene=totem", "budget=demo", "trajectory=orbit")
 
 AS_IT_IS = Variant("as it is")
 """The settings as typed, with which every knob is compared."""
@@ -43,31 +39,31 @@ AS_IT_IS = Variant("as it is")
 def main(options: argparse.Namespace) -> int:
     """Print both tables and the recommended setting, then all rows as JSON in the last line."""
     limit = None if options.within is None else decibels(options.within)
-    words = _last_words([*SETTINGS, *options.overrides])
-    config = composed(words)
-    outputs = Path(checked_settings(config).outputs)
-    log = ConsoleLog(outputs)
-    settings: list[Row] = []
+    words, launcher = settings(options, METHOD, "scene=totem", "budget=demo", "trajectory=orbit")
+    words = _last_words(words)
+    log = ConsoleLog(launcher.outputs)
+    rows: list[Row] = []
     if not options.kernels:
+        config = composed(words)
         knobs = _knobs(config, words, options.trained)
         if len(knobs) == 1:
             log.info(
                 f"{config.method._target_} declares no knobs in `study` (bench/study.py): it is "
                 "rendered as it is"
             )
-        settings = _setting_rows(words, _chosen(knobs, options.filter), options)
-        show(setting_table(settings))
+        rows = _setting_rows(words, _chosen(knobs, options.filter), options, launcher)
+        show(setting_table(rows))
     from methods.checks import found
 
     with device_lock("cpu", log):
         experiments = experiment_rows(found("experiments"), options.repeats, log)
     show(experiment_table(experiments))
     command = shlex.join(["steerbench", *sys.argv[1:]])
-    page = write_tradeoff(experiments, settings, outputs / "accuracy", command)
+    page = write_tradeoff(experiments, rows, launcher.outputs / "accuracy", command)
     log.info(f"report: {page}")
-    if settings and limit is not None:
-        print(_recommended(settings, limit))
-    print(json.dumps({"kernels": experiments, "settings": [finite(row) for row in settings]}))
+    if rows and limit is not None:
+        print(_recommended(rows, limit))
+    print_rows({"kernels": experiments, "settings": rows})
     return 0
 
 
@@ -111,18 +107,21 @@ def _chosen(knobs: Knobs, parts: Sequence[str] | None) -> list[tuple[str, Varian
     chosen = set(list(knobs)[: list(knobs).index(AS_IT_IS.name) + 1])
     turned = [knob for knob in knobs if knob not in chosen]
     for part in parts or [""]:
-        found = {knob for knob in turned if part in knob}
-        if parts and not found:
+        matching = {knob for knob in turned if part in knob}
+        if parts and not matching:
             raise SteerbenchError(
                 f"--filter: no knob has {part!r} in its name; expected part of one of "
                 f"{', '.join(turned)}"
             )
-        chosen |= found
+        chosen |= matching
     return [(knob, variant) for knob, some in knobs.items() if knob in chosen for variant in some]
 
 
 def _setting_rows(
-    words: Sequence[str], chosen: Sequence[tuple[str, Variant]], options: argparse.Namespace
+    words: Sequence[str],
+    chosen: Sequence[tuple[str, Variant]],
+    options: argparse.Namespace,
+    launcher: Launcher,
 ) -> list[Row]:
     """One row per setting: its knob, overrides, costs and errors, `lost` and `instead`.
 
@@ -130,22 +129,22 @@ def _setting_rows(
     dominates it. For the rest see `bench.accuracy.render_in_turns`.
     """
     lines = {variant.name: _last_words([*words, *variant.settings]) for _, variant in chosen}
-    found = render_variants(lines, options.frames, options.repeats)
-    scene, path, rendered = found[0].scene, found[0].path, [one.values for one in found]
+    rendered = render_variants(lines, options, launcher)
     knob_of = {variant.name: knob for knob, variant in chosen}
-    best = best_instead([row["ms"] for row in rendered], [-row["psnr"] for row in rendered])
+    values = [each.values for each in rendered]
+    best = best_instead([row["ms"] for row in values], [-row["psnr"] for row in values])
     return [
         {
-            "scene": scene.name,
-            "trajectory": path.name,
-            "resolution": path.resolution,
-            "knob": knob_of[row["setting"]],
-            **row,
-            "lost": rendered[0]["psnr"] - row["psnr"],
-            "instead": rendered[instead]["setting"],
-            "overrides": shlex.join(lines[row["setting"]]),
+            "scene": each.scene,
+            "trajectory": each.trajectory,
+            "resolution": each.resolution,
+            "knob": knob_of[each.name],
+            **each.values,
+            "lost": values[0]["psnr"] - each.values["psnr"],
+            "instead": values[instead]["setting"],
+            "overrides": shlex.join(lines[each.name]),
         }
-        for row, instead in zip(rendered, best, strict=True)
+        for each, instead in zip(rendered, best, strict=True)
     ]
 
 

@@ -26,21 +26,21 @@ def main(options: argparse.Namespace) -> int:
     """Compare the store with a baseline, or write one; 1 if anything is worse or missing."""
     if options.command == "compare":
         return _compare(options)
-    found = _by_command(Store(options.outputs))
+    stored = _by_command(Store(options.outputs))
     if options.record:
-        _record(options.baseline, found)
+        _record(options.baseline, stored)
         return 0
     runs, limits = _read(options.baseline)
     failed = 0
     for command, old in runs.items():
-        if missing := old.keys() - found.get(command, {}):
-            seeds = f" with seed={','.join(sorted(missing))}" if command in found else ""
+        if missing := old.keys() - stored.get(command, {}):
+            seeds = f" with seed={','.join(sorted(missing))}" if command in stored else ""
             text = f"{command}: no such run{seeds} below {options.outputs}"
             console().print(text, markup=False)
             failed += 1
             continue
         try:
-            new = [Figures.of(found[command][seed], limits) for seed in old]
+            new = [Figures.of(stored[command][seed], limits) for seed in old]
             rows = list(changes(list(old.values()), new, limits))
         except SteerbenchError as error:
             text = f"{command}: {error}; `steerbench check --record` takes the new ones"
@@ -65,11 +65,11 @@ def _compare(options: argparse.Namespace) -> int:
 
 def _by_command(store: Store) -> dict[str, dict[str, Run]]:
     """Every run, by what was typed for it and by its seed; of several, the last that was stored."""
-    found: dict[str, dict[str, Run]] = {}
+    stored: dict[str, dict[str, Run]] = {}
     for run in readable(store):
-        seeds = found.setdefault(_command(str(run.record["command"])), {})
+        seeds = stored.setdefault(_command(str(run.record["command"])), {})
         seeds[str(run.facts["seed"])] = run
-    return found
+    return stored
 
 
 def _command(typed: str) -> str:
@@ -79,20 +79,22 @@ def _command(typed: str) -> str:
     return shlex.join(sorted(word for word in words if word.partition("=")[0] not in others))
 
 
-def _record(path: Path, found: Mapping[str, Mapping[str, Run]]) -> None:
-    """Write the figures of `found` to `path`; limits and choice of runs of a baseline that is there
-    stay."""
+def _record(path: Path, stored: Mapping[str, Mapping[str, Run]]) -> None:
+    """Write the figures of `stored` to `path`.
+
+    A baseline that is there keeps its limits and its choice of runs.
+    """
     limits: Mapping[str, Limit] = LIMITS
     if path.exists():
         known, limits = _read(path)
-        if missing := known.keys() - found.keys():
+        if missing := known.keys() - stored.keys():
             raise SteerbenchError(f"{path}: no such run in the store: {sorted(missing)[0]}")
-        found = {command: found[command] for command in known}
-    if not found:
+        stored = {command: stored[command] for command in known}
+    if not stored:
         raise SteerbenchError("there are no runs to record: `steerbench run` makes one")
     runs = {
         command: {seed: asdict(Figures.of(run, limits)) for seed, run in seeds.items()}
-        for command, seeds in found.items()
+        for command, seeds in stored.items()
     }
     plain = {metric: asdict(limit) for metric, limit in limits.items()}
     text = json.dumps({"schema": SCHEMA, "limits": plain, "runs": runs}, indent=1)

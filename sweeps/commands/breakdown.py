@@ -1,0 +1,163 @@
+"""`steerbench breakdown`: the time of a frame by its parts, for each precision."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from functools import partial
+from itertools import compress
+
+from bench.accuracy import steady_frames
+from bench.probes import OTHER
+from bench.study import Study, Variant
+from bench.types import NullProbe
+from bench.waits import Line, device_waits
+from reports.tables import Table, decimal
+from sweeps.commands.skips import nothing_skipped
+from sweeps.device_lock import on_gpu
+from sweeps.execute import Launcher
+from sweeps.overrides import composed, folder_words, holds
+from sweeps.terminal import print_rows, show
+from sweeps.variants import (
+    METHOD,
+    Rendered,
+    Row,
+    computes_with_engine,
+    declared,
+    engines,
+    fitted,
+    range_text,
+    render_variants,
+    settings,
+    settings_of,
+    times,
+)
+
+DENSE = ", nothing skipped"
+"""Suffix of a line whose method skips nothing."""
+
+
+def main(options: argparse.Namespace) -> int:
+    """Print a table, then its rows as JSON in the last line; or the same of waits."""
+    words, launcher = settings(options, METHOD, "trajectory=smooth")
+    words = with_engine(words)
+    if options.device_waits:
+        return _print_waits(words, options.frames, launcher)
+    config = composed(words)
+    study = declared(config)
+    usual = _precisions(words) or [Variant("as it is")]
+    variants = settings_of(words, usual)
+    if study.skips:
+        variants |= settings_of([*words, *nothing_skipped(study)], _ending(usual, DENSE))
+    shared = _shared(words, study)
+    for name, of_method in study.beside.items():
+        other = [*shared, *of_method]
+        variants |= settings_of(other, _ending(_precisions(other), f", {name}") or [Variant(name)])
+    rendered = render_variants(variants, options, launcher)
+    rows = [_row(each, composed(variants[each.name]).budget == config.budget) for each in rendered]
+    parts = _parts(study, rows)
+    columns = ("", *parts, "frame ↓", "of rounds", "p99 / p50 ↓", "FPS ↑", "PSNR, dB ↑")
+    title = f"ms of a frame, and what of it each part takes itself; {rendered[0].frames} frames"
+    show(Table(title, columns, tuple(_line(row, parts) for row in rows)))
+    print_rows(rows)
+    return 0
+
+
+def _print_waits(words: Sequence[str], frames: int, launcher: Launcher) -> int:
+    """Print how often the host waits for the GPU in a steady frame, by the line that causes it."""
+    with device_waits():
+        pass  # raises without a GPU before anything is trained
+    (waits,) = launcher.run(partial(_waits, frames=frames), [words])
+    total = sum(waits, Counter[Line]())
+    rows: list[Row] = [
+        {"waits": count / len(waits), "line": line.place, "source": line.source}
+        for line, count in total.most_common()
+    ]
+    lines = tuple((decimal(row["waits"], 1), row["line"], row["source"]) for row in rows)
+    title = f"{decimal(total.total() / len(waits), 1)} waits a frame, mean of {len(waits)}"
+    show(Table(title, ("waits", "line", "source"), lines, figures=False))
+    print_rows(rows)
+    return 0
+
+
+def _waits(words: Sequence[str], frames: int) -> list[Counter[Line]]:
+    """Where the host waits in each steady frame.
+
+    The path is rendered once before, so that one-time set-up is not counted.
+    """
+    with fitted({"as it is": words}, frames) as each:
+        (method,) = each.methods.values()
+        for _ in range(2):
+            method.reset()
+            counted = []
+            for step in each.trajectory.steps:
+                with device_waits() as waits:
+                    method.render(step.camera, NullProbe())
+                counted.append(waits)
+        ready, _ = steady_frames([method], each.trajectory)
+        return list(compress(counted, ready))
+
+
+def with_engine(words: Sequence[str]) -> list[str]:
+    """`words`, preceded by the fastest engine for the device that they name."""
+    device = str(composed(words).get("device"))
+    return ["engine=torch" if on_gpu(device) else "engine=openvino", *words]
+
+
+def _precisions(words: Sequence[str]) -> list[Variant]:
+    """The chosen engine at each of its precisions; empty if the method uses no engine."""
+    config = composed(words, return_hydra_config=True)
+    if not computes_with_engine(config):
+        return []
+    chosen = f"engine={config.hydra.runtime.choices.engine}"
+    return [variant for variant in engines(words) if chosen in variant.settings]
+
+
+def _ending(variants: Iterable[Variant], ending: str) -> list[Variant]:
+    return [Variant(variant.name + ending, variant.settings) for variant in variants]
+
+
+def _shared(words: Sequence[str], study: Study) -> list[str]:
+    """The `words` that also apply to all methods compared with.
+
+    These are all words except `method=` and settings of the method that one of the others lacks.
+    """
+    folders = folder_words(words)
+    others = [composed([*folders, *settings]) for settings in study.beside.values()]
+    return [word for word in words if holds(word, others)]
+
+
+def _row(variant: Rendered, trained_alike: bool) -> Row:
+    """One line; its PSNR is left out if it has another budget than the first line."""
+    parts: dict[str, float] = {}
+    for metric, value in variant.values.items():
+        if metric.startswith("stage_ms."):
+            part = variant.study.part_of(metric.removeprefix("stage_ms."))
+            parts[part] = parts.get(part, 0.0) + value
+    return {
+        "line": variant.name,
+        "parts": parts,
+        "network_ms": variant.network_ms,
+        **times(variant),
+        "psnr": variant.values["psnr"] if trained_alike else None,
+    }
+
+
+def _parts(study: Study, rows: Iterable[Row]) -> list[str]:
+    """The parts that occur in any line: first those that the method declares, `other` last."""
+    there = dict.fromkeys(part for row in rows for part in row["parts"])
+    named = [part for part in dict.fromkeys(study.parts.values()) if part in there]
+    return [*named, *(part for part in there if part not in (*named, OTHER)), OTHER]
+
+
+def _line(row: Row, parts: Iterable[str]) -> tuple[str, ...]:
+    return (
+        row["line"],
+        *(decimal(row["parts"].get(part, 0.0), 1) for part in parts),
+        decimal(row["frame_ms"], 1),
+        range_text(row),
+        decimal(row["p99_to_p50"], 2),
+        decimal(1e3 / row["frame_ms"], 2),
+        decimal(row["psnr"], 2),
+    )

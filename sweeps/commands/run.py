@@ -1,0 +1,193 @@
+"""`steerbench run`: Hydra composes the configuration of every job and runs it."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Collection, Sequence
+from math import prod
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import hydra
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+
+from sweeps.execute import join_cluster
+from sweeps.overrides import CONFIGS, explain, of_hydra, settled, swept
+
+if TYPE_CHECKING:
+    from sweeps.jobs import Ended
+
+
+class SweepCallback(Callback):
+    """Records that a sweep starts; run.yaml lists it among Hydra's callbacks.
+
+    Hydra creates the object and never hands it out, so the record is kept on the class.
+
+    Attributes:
+        folder: where jobs record how they ended; None without a sweep.
+    """
+
+    folder: ClassVar[Path | None] = None
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Record the folder of the sweep, before its launcher is made."""
+        SweepCallback.folder = Path(config.hydra.sweep.dir)
+        join_cluster(config)
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run one job, a sweep, or Hydra's own help, as the overrides and flags in `argv` say.
+
+    In a sweep, a failed job is reported at once and the others still run; the table at the end
+    lists all of them.
+
+    Raises:
+        SteerbenchError: a setting or a choice does not exist, or a job failed.
+    """
+    # Hydra's parser accepts overrides only in one contiguous block, so flags go first.
+    sys.argv = [sys.argv[0], *sorted(argv, key=_is_override)]
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors instead of printing them
+    _hide_subcommand_from_completion()
+    SweepCallback.folder = None
+    error = _launch(argv)
+    if SweepCallback.folder is not None:
+        _finish(SweepCallback.folder)
+    if error is not None:
+        raise error
+    return 0
+
+
+def _launch(argv: Sequence[str]) -> Exception | None:
+    """Let Hydra run every job; return the error of a job or of a wrong setting, if any."""
+    failures: list[Exception] = []
+
+    def job(config: DictConfig) -> None:
+        command = ["steerbench", "run", *_config_dir(), *HydraConfig.get().overrides.task]
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            _one_of_many(settled(config), command)
+            return
+        try:
+            _alone(settled(config), command)
+        except Exception as error:
+            failures.append(error)  # bypasses Hydra, which would print it in its own way
+
+    try:
+        hydra.main(str(CONFIGS), "run", version_base="1.3")(job)()
+    except Exception as error:
+        if not of_hydra(error):
+            return error
+        explained = explain(error, argv)
+        explained.__cause__ = error
+        return explained
+    return failures[0] if failures else None
+
+
+# These load torch, which --help and completion do not need.
+
+
+def _alone(config: DictConfig, command: Sequence[str]) -> None:
+    """Obtain the run that `config` describes, print its tables, write the page it asks for."""
+    from reports.runs import load
+    from sweeps.deliver import write
+    from sweeps.measurement import Group, Job, obtain
+    from sweeps.terminal import say_missing, show_run
+
+    (obtained,) = obtain(Group([Job(config, command)]))
+    label = HydraConfig.get().runtime.choices["method"]
+    (run,) = load(obtained.store, {obtained.run: label})
+    what = run.facts[["method", "scene", "trajectory", "resolution", "budget", "protocol"]]
+    show_run(run, f"{', '.join(what)}, seed {run.facts['seed']}")
+    if not obtained.measured:
+        say_missing([run])
+    write(config.report, obtained.store, {obtained.run: label})
+
+
+def _one_of_many(config: DictConfig, command: Sequence[str]) -> None:
+    """Attempt the current job of a sweep."""
+    from sweeps.jobs import attempt
+    from sweeps.measurement import Group, Job
+    from sweeps.processes import set_up
+
+    set_up()  # the launcher may have started this process
+    present = HydraConfig.get()
+    sizes = _sizes(Path(present.runtime.output_dir) / "multirun.yaml")
+    name = label(present.runtime.choices["method"], present.overrides.task, sizes or ())
+    total = 0 if sizes is None else prod(sizes.values())
+    attempt(Group([Job(config, command, name)], first=present.job.num), total)
+
+
+def _sizes(file: Path) -> dict[str, int] | None:
+    """The number of values, for each setting with several, in the sweep that `file` describes.
+
+    Hydra's own sweeper writes it; None with another one.
+    """
+    if not file.exists():
+        return None
+    sweep = OmegaConf.load(file).hydra
+    params = sweep.sweeper.get("params") or {}
+    words = [*(f"{name}={values}" for name, values in params.items()), *sweep.overrides.task]
+    values = swept(words, GlobalHydra.instance().config_loader())
+    return {name: len(several) for name, several in values.items()}
+
+
+def label(method: str, overrides: Sequence[str], names: Collection[str]) -> str:
+    """The label of a job among others: its method, and its values of the settings `names`.
+
+    A name is shortened to its last part unless that is ambiguous.
+    """
+    settings = dict(word.split("=", 1) for word in overrides if "=" in word)
+    names = [name for name in names if name in settings and name != "method"]
+    ends = [name.rpartition(".")[2] for name in names]
+    shown = [
+        f"{end if ends.count(end) == 1 else name}={settings[name]}"
+        for name, end in zip(names, ends, strict=True)
+    ]
+    return f"{method} ({', '.join(shown)})" if shown else method
+
+
+def _finish(folder: Path) -> None:
+    """Print one table of all jobs that have ended, and write the pages that they requested."""
+    from bench.results import Store
+    from reports.comparison import comparison
+    from reports.runs import load, over_common_frames
+    from sweeps.deliver import write
+    from sweeps.jobs import read
+    from sweeps.terminal import say_missing, show
+
+    ended = read(folder)
+    for outputs in dict.fromkeys(job.outputs for job in ended):
+        store, there = Store(Path(outputs)), [job for job in ended if job.outputs == outputs]
+        labels, failed = _labels(there)
+        runs = over_common_frames(load(store, labels))
+        show(comparison(runs, failed))
+        say_missing(runs)
+        for report in dict.fromkeys(job.report for job in there):
+            write(report, store, *_labels([job for job in there if job.report == report]))
+
+
+def _labels(jobs: Sequence[Ended]) -> tuple[dict[str, str], dict[str, str]]:
+    """Names of the runs by key, and reasons of failed jobs by name."""
+    runs = {job.run: job.name for job in jobs if job.run}
+    return runs, {job.name: job.failure for job in jobs if job.failure}
+
+
+def _config_dir() -> list[str]:
+    """The folder of further choices from the command line, as one word, for the job's command."""
+    sources = HydraConfig.get().runtime.config_sources
+    return [f"--config-dir={x.path}" for x in sources if x.provider == "command-line"]
+
+
+def _is_override(argument: str) -> bool:
+    return argument.startswith("~") or ("=" in argument and not argument.startswith("-"))
+
+
+def _hide_subcommand_from_completion() -> None:
+    """Hydra's completion knows no subcommands: show it `steerbench run a=b` as `steerbench a=b`."""
+    program, _, rest = os.environ.get("COMP_LINE", "").lstrip().partition(" ")
+    if rest.lstrip().startswith("run "):
+        os.environ["COMP_LINE"] = f"{program} {rest.lstrip().removeprefix('run ')}"

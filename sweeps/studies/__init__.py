@@ -1,1 +1,0 @@
-"""Studies of one method, driven by its declared `bench.study.Study`, not by its name."""
