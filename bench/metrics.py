@@ -17,10 +17,10 @@ import torch
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
-from bench.lpips_weights import load_features
+from bench.published import load_features
 from bench.types import Log, SteerbenchError, Unavailable, check_shape
 
-SMALLEST_SIDE = {"ssim": 11, "lpips_alex": 31, "lpips_vgg": 16, "lpips_squeeze": 17}
+SMALLEST_SIDE = {"psnr": 1, "ssim": 11, "lpips_alex": 31, "lpips_vgg": 16, "lpips_squeeze": 17}
 """Smallest side in pixels: SSIM needs room for its window, LPIPS for one feature at its deepest."""
 
 
@@ -100,7 +100,7 @@ def ssim(image: Tensor, reference: Tensor, window: str = "gaussian") -> float:
 class Lpips:
     """LPIPS v0.1 (Zhang et al. 2018) with a named backbone; a lower value is more similar.
 
-    The linear layers come with the `lpips` package, the backbone from `bench.lpips_weights`.
+    The linear layers come with the `lpips` package, the backbone from `bench.published`.
     Runs in float32 on the device of the pictures, which are mapped to [-1, 1] as published.
 
     Args:

@@ -16,14 +16,14 @@ import torch
 from torch import Tensor
 
 from bench.compositing import composite
+from bench.errors import unexpected
 from bench.metrics import Lpips, check_size
 from bench.protocol import EvaluationProtocol
 from bench.results import STEADY, Measurement
 from bench.run import UNITS, mean_row
-from bench.scenes.files import unexpected
 from bench.scenes.images import contents, decode_bytes
 from bench.scoring import PICTURES, Flicker, kept_pictures
-from bench.trajectories import MIXED, spread
+from bench.trajectories import resolution, spread
 from bench.types import BACKGROUNDS, Log, Split, SteerbenchError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -151,7 +151,8 @@ def score(
     shown = spread(len(pairs), kept)
     frames: list[dict[str, Any]] = []
     images: dict[str, np.ndarray] = {}
-    sizes, alphas = set(), 0
+    sizes: list[tuple[int, int]] = []
+    alphas = 0
     seen, truths, blinking = hashlib.sha256(), hashlib.sha256(), Flicker()
     with log.progress("scoring", len(pairs)) as progress:
         for index, pair in enumerate(pairs):
@@ -167,7 +168,7 @@ def score(
             if sequence:
                 figures |= blinking.since_last(now)
             frames.append({"frame": index, "name": pair.name, "phase": STEADY, **figures})
-            sizes.add(f"{rgb.shape[1]}x{rgb.shape[0]}")
+            sizes.append((rgb.shape[1], rgb.shape[0]))
             if index in shown:
                 images |= kept_pictures(index, rgb, now[1])
             progress.advance()
@@ -178,7 +179,7 @@ def score(
     rows = pd.DataFrame([mean_row(metric, table[metric]) for metric in metrics]).assign(
         unit=lambda of: [UNITS.get(name, "1") for name in of["metric"]],
         phase=STEADY,
-        resolution=sizes.pop() if len(sizes) == 1 else MIXED,
+        resolution=resolution(sizes),
         protocol=protocol.name,
         **facts,
     )
@@ -195,12 +196,11 @@ def _check(pair: Pair, picture: Tensor, truth: Tensor, protocol: EvaluationProto
     if picture.shape[:2] != truth.shape[:2]:
         wanted, got = (f"{image.shape[1]} x {image.shape[0]}" for image in (truth, picture))
         raise unexpected(pair.picture, f"{wanted} pixels, as {pair.name} has", got)
-    for metric in protocol.metric_names:
-        if metric != "psnr":
-            try:
-                check_size(metric, picture.shape[1], picture.shape[0])
-            except SteerbenchError as error:
-                raise SteerbenchError(f"{pair.picture}: {error}") from error
+    try:
+        for metric in protocol.metric_names:
+            check_size(metric, picture.shape[1], picture.shape[0])
+    except SteerbenchError as error:
+        raise SteerbenchError(f"{pair.picture}: {error}") from error
 
 
 def _repeated(names: Sequence[str]) -> list[str]:

@@ -18,13 +18,14 @@ from PIL import Image
 from torch import Tensor
 
 from bench.cameras import look_at, move_camera
+from bench.errors import unexpected
 from bench.scenes import blender
-from bench.scenes.files import opengl_to_opencv, unexpected, whole_number
+from bench.scenes.files import opengl_to_opencv, whole_number
 from bench.scenes.medley import medley
 from bench.scenes.models import MODELS
-from bench.scenes.parallel import in_parallel
 from bench.scenes.raytrace import Model, render
 from bench.sources import digest
+from bench.threads import in_parallel
 from bench.types import Camera, Log, Scene, SteerbenchError, Unavailable
 
 ANGLE_X = 0.69

@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from bench.cameras import scale_camera
-from bench.errors import Unavailable, install_command
+from bench.errors import Unavailable, install_command, unexpected
 from bench.scenes.assemble import assemble, describe_splits, every_nth, leave_out
 from bench.scenes.bounds import MARGIN, Box, parse_box
 from bench.scenes.distortion import Lens
-from bench.scenes.files import data_folder, inside, rigid_pose, unexpected
+from bench.scenes.files import data_folder, inside, rigid_pose
 from bench.scenes.images import View, image_size
 from bench.types import Camera, Log, Scene
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from bench.cameras import crop_camera, pixel_grid
-from bench.scenes.files import unexpected
+from bench.errors import unexpected
 from bench.types import Camera
 
 Lens = Callable[[Tensor], Tensor]

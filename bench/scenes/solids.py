@@ -287,6 +287,11 @@ def sum_of_products(first: Sequence, second: Sequence) -> Tensor:
     return sum((a * b for a, b in zip(first[1:], second[1:], strict=True)), first[0] * second[0])
 
 
+def box_corners(half: Triple) -> Tensor:
+    """Corners [8, 3] of a centred box with half sizes `half`."""
+    return torch.cartesian_prod(*(torch.tensor((-1.0, 1.0)),) * 3) * torch.tensor(half)
+
+
 def unit(vectors: Tensor) -> Tensor:
     """[N, 3] scaled to length 1; a zero vector stays zero."""
     return torch.nn.functional.normalize(vectors, dim=1)

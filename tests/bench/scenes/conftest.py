@@ -1,42 +1,14 @@
-"""A log that keeps its messages, and a small NeRF-Synthetic folder to break."""
+"""Pictures, poses, and a small NeRF-Synthetic folder to break."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
-
-
-class RememberingLog:
-    """`messages` are the lines said, `done` the steps counted by all progress bars."""
-
-    def __init__(self) -> None:
-        self.messages: list[str] = []
-        self.done = 0
-
-    def info(self, message: str) -> None:
-        self.messages.append(message)
-
-    @contextmanager
-    def progress(self, label: str, total: int) -> Iterator[RememberingLog]:
-        yield self
-
-    def advance(self, steps: int = 1, note: str = "") -> None:
-        self.done += steps
-
-    def stage_dir(self, kind: str, key: Mapping[str, object]) -> Path:
-        raise AssertionError("loading a scene trains nothing")
-
-
-@pytest.fixture
-def log() -> RememberingLog:
-    """A log that keeps its messages."""
-    return RememberingLog()
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from bench.scenes.held_out import hold_out
+from bench.scenes.assemble import hold_out
 from bench.types import Scene, Split, SteerbenchError
 
 
