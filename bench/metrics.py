@@ -78,8 +78,7 @@ def ssim(image: Tensor, reference: Tensor, window: str = "gaussian") -> float:
     "uniform" (7 x 7, sample covariance; the default of scikit-image, used by NSVF and KiloNeRF).
     The mean is taken over the valid region, where the window lies inside the picture.
 
-    Raises:
-        SteerbenchError: a side is shorter than 11 pixels.
+    Raises SteerbenchError if a side is shorter than 11 pixels.
     """
     _check_pair(image, reference)
     check_size("ssim", image.shape[1], image.shape[0])
@@ -108,8 +107,8 @@ class Lpips:
         weights_dir: folder to search first, or None.
         log: shows a download.
 
-    Raises:
-        Unavailable: the backbone weights cannot be found or downloaded, or do not fit the network.
+    Raises Unavailable if the backbone weights cannot be found or downloaded, or do not fit the
+    network.
     """
 
     def __init__(self, net: str, weights_dir: Path | None, log: Log) -> None:

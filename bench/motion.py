@@ -48,8 +48,7 @@ def between(first: Camera, second: Camera, turn: Tensor, share: float) -> Camera
     `turn` [3] is their `rotation_between`. On an orbit the centre follows the chord: at 4 degrees
     it is off by 0.06 % of the distance.
 
-    Raises:
-        SteerbenchError: the pictures differ in size.
+    Raises SteerbenchError if the pictures differ in size.
     """
     camera = lens_between(first, second, share)
     rotation = first.c2w[:, :3].double() @ _rotation(share * turn)
@@ -60,8 +59,7 @@ def between(first: Camera, second: Camera, turn: Tensor, share: float) -> Camera
 def lens_between(first: Camera, second: Camera, share: float) -> Camera:
     """The `first` camera with its intrinsics interpolated at `share` of the way to `second`.
 
-    Raises:
-        SteerbenchError: the pictures differ in size.
+    Raises SteerbenchError if the pictures differ in size.
     """
     if (first.width, first.height) != (second.width, second.height):
         raise SteerbenchError(
@@ -89,8 +87,8 @@ def preceding(
     frame to frame; the distance changes slightly, too. `target` keeps its place in the picture, and
     the intrinsics are constant.
 
-    Raises:
-        ValueError: `target` is not [3], `count` is negative, or `degrees` is not a range from 0 up.
+    Raises ValueError if `target` is not [3], `count` is negative, or `degrees` is not a range from
+    0 up.
     """
     check_shape("target", target, 3)
     if count < 0 or not 0 <= degrees[0] <= degrees[1]:

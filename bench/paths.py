@@ -55,8 +55,7 @@ def follow(scene: Scene, path: str, limit: int = 0) -> Trajectory:
         path: the file.
         limit: if > 0, keep only the first `limit` cameras.
 
-    Raises:
-        SteerbenchError: the file is damaged or has no cameras; a pose is not rigid.
+    Raises SteerbenchError if the file is damaged or has no cameras, or a pose is not rigid.
     """
     file = Path(path).expanduser().resolve()
     record = read_json(file.parent, file.name)
@@ -159,9 +158,8 @@ def leading(keys: Sequence[Camera], target: Tensor, degrees: float) -> list[list
     as seen from `target` [3], whichever is larger. The cameras of a segment are evenly spaced, by
     at most `degrees`.
 
-    Raises:
-        SteerbenchError: fewer than two keys, two consecutive keys with the same pose, or keys
-            whose pictures differ in size.
+    Raises SteerbenchError if there are fewer than two keys, two consecutive keys with the same
+    pose, or keys whose pictures differ in size.
     """
     poses = torch.stack([camera.c2w.double() for camera in keys]).numpy()
     turns, centres = Rotation.from_matrix(poses[:, :, :3]), poses[:, :, 3]

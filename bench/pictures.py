@@ -53,24 +53,20 @@ class Pair:
 def pairs_with_folder(pictures: Path, truth: Path, match: Match = "name") -> list[Pair]:
     """Pair each picture of the folder `truth` with its counterpart in the folder `pictures`.
 
-    Raises:
-        SteerbenchError: they do not match, see `matched`.
+    Raises SteerbenchError as `matched` does.
     """
-    files = {path.stem: path for path in listed(truth)}
-    found = matched(pictures, list(files), match)
-    pairs = zip(found, files.values(), strict=True)
-    return [Pair(picture, path.name, path) for picture, path in pairs]
+    true = listed(truth)
+    files = matched(pictures, [path.stem for path in true], match)
+    return [Pair(file, path.name, path) for file, path in zip(files, true, strict=True)]
 
 
 def pairs_with_split(pictures: Path, split: Split, match: Match = "name") -> list[Pair]:
     """Pair each picture of a scene's `split` with its counterpart in the folder `pictures`.
 
-    Raises:
-        SteerbenchError: they do not match, see `matched`.
+    Raises SteerbenchError as `matched` does.
     """
-    found = matched(pictures, [Path(name).stem for name in split.names], match)
-    known = zip(found, split.names, split.images, strict=True)
-    return [Pair(picture, name, image) for picture, name, image in known]
+    files = matched(pictures, [Path(name).stem for name in split.names], match)
+    return [Pair(*pair) for pair in zip(files, split.names, split.images, strict=True)]
 
 
 def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
@@ -78,9 +74,8 @@ def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
 
     Files are ordered by name, numbers in names counting as numbers.
 
-    Raises:
-        SteerbenchError: a picture is missing, one belongs to none of `names`, or `names` has
-            duplicates.
+    Raises SteerbenchError if a picture is missing, one belongs to none of `names`, or `names` has
+    duplicates.
     """
     files = listed(folder)
     if match == "order":
@@ -104,8 +99,7 @@ def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
 def listed(folder: Path) -> list[Path]:
     """The pictures in a folder, sorted by name with 10 after 9.
 
-    Raises:
-        SteerbenchError: there are none, or the names of two differ only in the ending.
+    Raises SteerbenchError if there are none, or the names of two differ only in the ending.
     """
     if not folder.is_dir():
         raise unexpected(folder, "a folder", "a file" if folder.exists() else "nothing there")
@@ -121,8 +115,7 @@ def listed(folder: Path) -> list[Path]:
 def read(path: Path) -> Tensor:
     """Read a picture file as uint8 [H, W, 3 or 4].
 
-    Raises:
-        SteerbenchError: not a picture, damaged, or more than 8 bits per channel.
+    Raises SteerbenchError if it is not a picture, is damaged, or has more than 8 bits per channel.
     """
     return decode_bytes(contents(path), path)
 
@@ -144,8 +137,7 @@ def score(
         sequence: whether the pictures are consecutive frames, so that flicker is scored, too.
         kept: number of pictures that are kept, with their truth and error map.
 
-    Raises:
-        SteerbenchError: a picture cannot be read, or differs in size from its true picture.
+    Raises SteerbenchError if a picture cannot be read, or differs in size from its true picture.
     """
     background = torch.full((3,), BACKGROUNDS[protocol.background])
     shown = spread(len(pairs), kept)
@@ -210,9 +202,8 @@ def _repeated(names: Sequence[str]) -> list[str]:
 
 def _natural(name: str) -> list[tuple[int, str]]:
     """A sort key that orders numbers in names as numbers."""
-    return [
-        (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)
-    ]
+    parts = re.split(r"(\d+)", name)
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
 def _some(names: Sequence[str]) -> str:

@@ -85,9 +85,8 @@ class EvaluationProtocol:
     def check(self, scene: Scene, trajectory: Trajectory) -> None:
         """Raise before any training if the frames could not be scored afterwards.
 
-        Raises:
-            SteerbenchError: the scene is composited on another background, has no exact pictures
-                for the flicker, or a frame is smaller than a metric's window.
+        Raises SteerbenchError if the scene is composited on another background, has no exact
+        pictures for the flicker, or a frame is smaller than a metric's window.
         """
         if self.flicker == "exact" and scene.exact is None:
             raise SteerbenchError(

@@ -48,7 +48,7 @@ BACKBONES = {
     "squeeze": Backbone("squeezenet1_1-b8a52dc0.pth", "squeezenet1_1_features.pth"),
 }
 
-_unreachable: list[str] = []  # why a download of weights failed: each process tries only once
+_unreachable: list[str] = []  # why a download of weights failed
 
 
 @dataclass(frozen=True)
@@ -266,13 +266,23 @@ def locate(net: str, weights_dir: Path | None, log: Log) -> Path:
     for path in (folder / file for folder in folders for file in (features, name)):
         if path.is_file():
             return _verified(path)
-    try:
-        return _download_weights(name, cache, log)
-    except Unavailable as error:
-        raise Unavailable(
-            f"{name} is not on this machine, and {error}; "
-            "name a folder that has it as weights_dir=DIR or in $STEERBENCH_WEIGHTS"
-        ) from error
+    # After one failure no process tries again: every backbone would wait for the same connection.
+    if not _unreachable:
+        try:
+            cache.mkdir(parents=True, exist_ok=True)
+            with locked(cache / f".{name}.lock", f"waits for another download of {name}", log):
+                path = fetch(WEIGHTS_ADDRESS + name, cache / name, None, log)
+                try:
+                    return _verified(path)
+                except Unavailable:
+                    path.unlink()
+                    raise
+        except (OSError, SteerbenchError) as error:
+            _unreachable.append(str(error))
+    raise Unavailable(
+        f"{name} is not on this machine, and {_unreachable[0]}; "
+        "name a folder that has it as weights_dir=DIR or in $STEERBENCH_WEIGHTS"
+    )
 
 
 def load_features(net: str, weights_dir: Path | None, log: Log) -> tuple[Path, dict[str, Tensor]]:
@@ -300,21 +310,3 @@ def _verified(path: Path) -> Path:
             "the file is damaged: delete it and fetch it again"
         )
     return path
-
-
-def _download_weights(name: str, folder: Path, log: Log) -> Path:
-    """Download a file into `folder`; after one failure in this process, without trying again."""
-    if _unreachable:
-        raise Unavailable(_unreachable[0])
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with locked(folder / f".{name}.lock", f"waits for another download of {name}", log):
-            path = fetch(WEIGHTS_ADDRESS + name, folder / name, None, log)
-            try:
-                return _verified(path)
-            except Unavailable:
-                path.unlink()
-                raise
-    except (OSError, SteerbenchError) as error:
-        _unreachable.append(str(error))
-        raise Unavailable(str(error)) from error

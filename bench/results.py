@@ -89,8 +89,7 @@ class Store:
     def whole_key(self, beginning: str) -> str:
         """The key of the only run whose key starts with `beginning`.
 
-        Raises:
-            SteerbenchError: there is none, or several.
+        Raises SteerbenchError if there is none, or several.
         """
         wanted = Path(beginning).name  # the key may be given as the path of its folder
         folders = self.folder.iterdir() if self.folder.is_dir() else ()
@@ -129,8 +128,7 @@ class Store:
 
         If another process has finished the same run in the meantime, its result is kept.
 
-        Raises:
-            SteerbenchError: no space, no permission, or `outputs` is no folder.
+        Raises SteerbenchError if there is no space or no permission, or `outputs` is no folder.
         """
         with explained(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)

@@ -27,9 +27,8 @@ CHECKS = ("cases.py", "experiments.py")
 def digest(*things: Any) -> str:
     """SHA-256 of the names and bytes of the `sources` of `things`.
 
-    Raises:
-        SteerbenchError: a file changed after this process first hashed it. The process may still
-            run the old code, and would store its results under the key of the new code.
+    Raises SteerbenchError if a file changed after this process first hashed it. The process may
+    still run the old code, and would store its results under the key of the new code.
     """
     total = hashlib.sha256()
     for name, path in sorted(sources(*things).items()):
@@ -79,8 +78,8 @@ def sources(*things: Any) -> dict[str, Path]:
     """
     known = _known.get((ROOT, things))
     if known is None or _times(known[0]) != known[1]:
-        found = _found(*things)
-        known = _known[ROOT, things] = found, _times(found)
+        files = _collected(*things)
+        known = _known[ROOT, things] = files, _times(files)
     return known[0]
 
 
@@ -94,20 +93,20 @@ def _times(files: dict[str, Path]) -> list[int]:
     return [path.stat().st_mtime_ns if path.exists() else 0 for path in sorted(places)]
 
 
-def _found(*things: Any) -> dict[str, Path]:
-    found: dict[str, Path] = {}
+def _collected(*things: Any) -> dict[str, Path]:
+    collected: dict[str, Path] = {}
     seen: set[str] = set()
     pending = {
         name: path for thing in things for name, path in _files(thing.__module__, home=True).items()
     }
     while pending:
         name, path = pending.popitem()
-        found[name] = path
+        collected[name] = path
         for imported in set(_imports(path)) - seen:
             seen.add(imported)
             files = _files(imported)
-            pending |= {name: files[name] for name in files.keys() - found.keys()}
-    return found
+            pending |= {name: files[name] for name in files.keys() - collected.keys()}
+    return collected
 
 
 def _files(name: str, home: bool = False) -> dict[str, Path]:

@@ -35,8 +35,7 @@ def every_nth(views: Sequence[View], step: int, where: Path) -> dict[str, list[V
 def leave_out(missing: Sequence[str], views: Sequence[View], where: str, log: Log) -> None:
     """Log the names of `missing` pictures; the scene is made from the other `views`.
 
-    Raises:
-        SteerbenchError: there are no other views.
+    Raises SteerbenchError if there are no other views.
     """
     if not views:
         raise unexpected(where, "pictures", f"none of {len(missing)} files is there")
@@ -119,8 +118,7 @@ def hold_out(scene: Scene, split: str, every: int) -> Scene:
     pictures lie between training pictures. An existing split of that name is replaced. The digest
     changes, so that trainings with and without these pictures are not confused.
 
-    Raises:
-        SteerbenchError: there are fewer than `every` training pictures.
+    Raises SteerbenchError if there are fewer than `every` training pictures.
     """
     train = scene.splits["train"]
     if len(train) < every:

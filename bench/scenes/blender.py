@@ -46,8 +46,8 @@ def load(
     Raises SteerbenchError, naming file and field, if the data are not as described.
     """
     root = data_folder(path)
-    found = {split: read_split(root, split, log) for split in ("train", "val", "test")}
-    views = {split: of_split for split, of_split in found.items() if of_split}
+    read = ((split, read_split(root, split, log)) for split in ("train", "val", "test"))
+    views = {split: of_split for split, of_split in read if of_split}
     pictures = describe_splits(views, downscale, log)
     box = scene_box(bounds, pictures["train"], log)
     files = [root / camera_file(split) for split in views]

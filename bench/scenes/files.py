@@ -10,6 +10,7 @@ import math
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -90,7 +91,7 @@ def frames_of(record: Mapping, path: Path) -> list[tuple[str, dict]]:
     return frames
 
 
-def number(value: object, where: str, low: float = -math.inf, high: float = math.inf) -> float:
+def number(value: Any, where: str, low: float = -math.inf, high: float = math.inf) -> float:
     """A finite number with low < value < high."""
     real = isinstance(value, int | float) and not isinstance(value, bool)
     # Compare before converting: an integer of hundreds of digits overflows a float.
@@ -106,7 +107,7 @@ def focal_length(angle: object, size: float, where: str) -> float:
     return size / 2 / math.tan(number(angle, where, SMALLEST_ANGLE, math.pi) / 2)
 
 
-def whole_number(value: object, where: str, low: int) -> int:
+def whole_number(value: Any, where: str, low: int) -> int:
     """A whole number, at least `low`; 3.0 is one, too."""
     real = isinstance(value, int | float) and not isinstance(value, bool)
     if real and low <= value < math.inf and value == int(value):

@@ -58,8 +58,7 @@ class Pictures(Sequence[Tensor]):
 
     Decoded on first access and kept. Iteration decodes all of them in parallel.
 
-    Raises:
-        SteerbenchError: a file is damaged, or has changed since it was described.
+    Raises SteerbenchError if a file is damaged, or has changed since it was described.
     """
 
     def __init__(self, described: Sequence[Picture], log: Log) -> None:
@@ -71,7 +70,7 @@ class Pictures(Sequence[Tensor]):
 
     def __getitem__(self, place: Any) -> Any:
         index = range(len(self))[place]
-        return self._at(index) if isinstance(index, int) else [self._at(one) for one in index]
+        return self._at(index) if isinstance(index, int) else [self._at(i) for i in index]
 
     def __iter__(self) -> Iterator[Tensor]:
         missing = [index for index in range(len(self)) if index not in self._decoded]
@@ -89,8 +88,8 @@ class Pictures(Sequence[Tensor]):
 def opened(source: Path | io.BytesIO, where: Path) -> Iterator[Image.Image]:
     """The picture in `source`, with only its header read.
 
-    Raises:
-        SteerbenchError: not a picture, too large, or found to be damaged while it is used.
+    Raises SteerbenchError if it is not a picture, is too large, or turns out to be damaged while it
+    is used.
     """
     try:
         with Image.open(source) as image:
@@ -111,8 +110,7 @@ def image_size(path: Path) -> tuple[int, int]:
 def describe(view: View, downscale: int) -> Picture:
     """Describe a view as a pinhole picture at 1 / downscale of its resolution, without decoding it.
 
-    Raises:
-        SteerbenchError: not a picture, not of the expected size, or too small.
+    Raises SteerbenchError if it is not a picture, not of the expected size, or too small.
     """
     content, camera = contents(view.path), view.camera
     with opened(io.BytesIO(content), view.path) as image:
@@ -193,8 +191,7 @@ def shrink(image: Tensor, factor: int) -> Tensor:
 def shrunk_camera(camera: Camera, factor: int, where: Path) -> Camera:
     """The exact camera of a picture after `shrink`.
 
-    Raises:
-        SteerbenchError: the picture is smaller than a block.
+    Raises SteerbenchError if the picture is smaller than a block.
     """
     if factor == 1:
         return camera

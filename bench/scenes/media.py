@@ -59,9 +59,9 @@ class Cloud:
         speed = torch.stack([d[met] for d in directions]).norm(dim=0)  # length per unit of t
         density = speed.new_tensor([ball.density for ball in balls])
         colour = speed.new_tensor([ball.colour for ball in balls])
-        found = integrate(enter[:, met], leave[:, met], speed, density, colour)
+        seen = integrate(enter[:, met], leave[:, met], speed, density, colour)
         rgb, (alpha, depth) = speed.new_zeros(*shape, 3), speed.new_zeros(2, *shape)
-        rgb[met], alpha[met], depth[met] = found
+        rgb[met], alpha[met], depth[met] = seen
         return Traced(rgb, alpha, depth)
 
 

@@ -79,10 +79,10 @@ class Solids:
             part, columns = self.parts[number], slice(first, last)
             frame = part.frame.to(depth)
             x, y, z = ((band.origin - depth.new_tensor(part.centre)) @ frame).tolist()
-            found = part.shape.hit((x, y, z), band.directions(frame, columns))
+            t = part.shape.hit((x, y, z), band.directions(frame, columns))
             nearest = depth[:, columns]
-            owner[:, columns].masked_fill_(found < nearest, number)
-            torch.minimum(nearest, found, out=nearest)
+            owner[:, columns].masked_fill_(t < nearest, number)
+            torch.minimum(nearest, t, out=nearest)
         seen = owner >= 0
         rgb = depth.new_zeros(*shape, 3)
         for number, first, last in spans:

@@ -194,11 +194,10 @@ class Common(Convex):
 
     def extent(self) -> Triple:
         x, y, z = map(min, self.first.extent(), self.second.extent())
-        return (x, y, z)
+        return x, y, z
 
     def interval(self, origin: Origin, directions: Directions) -> Interval:
-        first, second = (x.interval(origin, directions) for x in (self.first, self.second))
-        return overlap(first, second)
+        return overlap(*(x.interval(origin, directions) for x in (self.first, self.second)))
 
     def distance(self, points: Tensor) -> Tensor:
         return torch.maximum(self.first.distance(points), self.second.distance(points))

@@ -133,9 +133,8 @@ def focal(settings: ChainMap, axis: str, size: float, where: str) -> float | Non
 def read_lens(settings: Mapping, where: str) -> Lens | None:
     """The lens of a frame; None for a pinhole. instant-ngp's `is_fisheye` means OPENCV_FISHEYE.
 
-    Raises:
-        SteerbenchError: the model is not in `LENSES`, or the file has a term that it does not
-            support. k4 of the model OPENCV means different things in nerfstudio and OpenCV.
+    Raises SteerbenchError if the model is not in `LENSES`, or the file has a term that it does not
+    support. k4 of the model OPENCV means different things in nerfstudio and OpenCV.
     """
     model = settings.get("camera_model", "OPENCV")
     if settings.get("is_fisheye"):

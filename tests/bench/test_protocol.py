@@ -35,11 +35,10 @@ def test_a_changed_protocol_may_not_keep_the_name():
     assert EvaluationProtocol(name="nsvf", ssim="uniform").ssim == "uniform"
 
 
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [("rounding", "floor"), ("ssim", "ms"), ("background", "grey"), ("memory", "warm")]
-    + [("flicker", "no"), ("warmup", -1)],
-)
+CHOICES = {"rounding": "floor", "ssim": "ms", "background": "grey", "memory": "warm"}
+
+
+@pytest.mark.parametrize(("option", "value"), [*CHOICES.items(), ("flicker", "no"), ("warmup", -1)])
 def test_an_unknown_choice_names_the_option_and_what_is_allowed(option, value):
     with pytest.raises(SteerbenchError, match=f"protocol.{option}: expected .* got '?{value}"):
         EvaluationProtocol(**{"name": "mine", option: value})

@@ -108,17 +108,12 @@ def test_text_stays_text(store, text):
     assert (row["method"], row["precision"]) == (text, text)
 
 
-def test_the_rows_of_several_runs_stand_below_each_other(store):
+def test_the_rows_of_several_runs_stand_below_each_other_under_all_columns(store):
+    assert list(store.rows().columns) == COLUMNS
     keys = {store.save({"seed": seed}, measurement([seed, 2.0])) for seed in range(3)}
     rows = store.rows()
     assert len(rows) == 6
     assert set(rows["run"]) == keys
-
-
-def test_an_empty_store_has_no_rows_but_all_columns(store):
-    rows = store.rows()
-    assert rows.empty
-    assert list(rows.columns) == COLUMNS
 
 
 def test_a_run_cannot_be_seen_before_it_is_whole(store):
@@ -201,11 +196,10 @@ def test_a_run_of_another_schema_is_reported_and_left_out(store):
         store.rows()
 
 
-def test_an_unknown_run_is_a_clear_error(store):
+@pytest.mark.parametrize("read", [Store.frames, Store.record])
+def test_an_unknown_run_is_a_clear_error(store, read):
     with pytest.raises(SteerbenchError, match="no run 'abc' in"):
-        store.frames("abc")
-    with pytest.raises(SteerbenchError, match="no run 'abc' in"):
-        store.record("abc")
+        read(store, "abc")
 
 
 def test_outputs_that_is_a_file_is_a_clear_error(tmp_path):

@@ -70,28 +70,17 @@ def test_a_file_that_is_not_ended_leaves_the_earlier_one_and_nothing_else(tmp_pa
     assert [path.name for path in tmp_path.iterdir()] == ["page.md"]
 
 
-def test_of_two_processes_the_second_waits_and_finds_what_the_first_made(maker):
-    with maker() as first, maker_after(first, maker) as second:
-        assert "waits for another process that makes the same" in second.stdout.readline()
-        first.communicate("go on\n")
-        assert second.stdout.readline() == "there\n"
-        second.communicate("go on\n")
-
-
-def test_a_killed_process_has_no_lock(maker):
-    with maker() as first, maker_after(first, maker) as second:
-        assert "waits" in second.stdout.readline()
-        first.kill()
-        assert second.stdout.readline() == "to make\n"
-        second.communicate("go on\n")
-
-
-def maker_after(
-    first: subprocess.Popen[str], maker: Callable[[], subprocess.Popen[str]]
-) -> subprocess.Popen[str]:
-    """Another one, started when the first has the lock."""
-    assert first.stdout.readline() == "to make\n"
-    return maker()
+@pytest.mark.parametrize(("killed", "then"), [(False, "there"), (True, "to make")])
+def test_of_two_processes_the_second_waits_for_what_the_first_makes_or_for_its_end(
+    maker, killed, then
+):
+    with maker() as first:
+        assert first.stdout.readline() == "to make\n"
+        with maker() as second:
+            assert "waits for another process that makes the same" in second.stdout.readline()
+            first.kill() if killed else first.communicate("go on\n")
+            assert second.stdout.readline() == f"{then}\n"
+            second.communicate("go on\n")
 
 
 def test_every_user_can_open_a_lock_whatever_the_umask(tmp_path, log):

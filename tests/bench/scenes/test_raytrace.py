@@ -8,23 +8,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.cameras import cast, look_at, scale_camera
+from bench.cameras import cast, scale_camera
 from bench.scenes import raytrace
 from bench.scenes.models import totem, wires
 from bench.scenes.opaque import LIGHT, Part, Solids
 from bench.scenes.raytrace import ProjectedBoxes, render, sample_offsets
 from bench.scenes.solids import Capsule, Ellipsoid
 from bench.scenes.textures import plain
-from bench.types import EMPTY_ALPHA, Camera, SteerbenchError
+from bench.types import EMPTY_ALPHA, SteerbenchError
+from tests.bench.scenes.conftest import camera_at
 
 RED = plain((1.0, 0.0, 0.0))
 CELL = math.sqrt(2) / 4
 """Diagonal of the quarter-pixel cell that each of 16 samples stands for."""
-
-
-def camera_at(eye: tuple[float, float, float], size: int = 96, device: str = "cpu") -> Camera:
-    c2w = look_at(torch.tensor(eye), torch.zeros(3), torch.tensor((0.0, 0.0, 1.0)))
-    return Camera(c2w.to(device), 1.3 * size, 1.3 * size, size / 2, size / 2, size, size)
 
 
 def sphere(radius: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Part:
@@ -37,9 +33,6 @@ def test_16_samples_stand_for_the_16_quarter_pixel_cells() -> None:
     assert sorted(cells) == [[a, b] for a in range(4) for b in range(4)]
     assert len(set(offsets[:, 0].tolist())) == len(set(offsets[:, 1].tolist())) == 16
     assert offsets.mean(0).tolist() == [0.5, 0.5]
-
-
-def test_one_sample_is_the_centre() -> None:
     assert sample_offsets(1).tolist() == [[0.5, 0.5]]
 
 
