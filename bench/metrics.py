@@ -86,14 +86,8 @@ def ssim(image: Tensor, reference: Tensor, window: str = "gaussian") -> float:
         "gaussian": {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False},
         "uniform": {"win_size": 7},
     }
-    value = structural_similarity(
-        image.double().cpu().numpy(),
-        reference.double().cpu().numpy(),
-        data_range=1.0,
-        channel_axis=-1,
-        **variants[window],
-    )
-    return float(value)
+    pair = (picture.double().cpu().numpy() for picture in (image, reference))
+    return float(structural_similarity(*pair, data_range=1.0, channel_axis=-1, **variants[window]))
 
 
 class Lpips:

@@ -115,10 +115,7 @@ class EvaluationProtocol:
     def load_lpips(
         self, weights_dir: Path | None, log: Log
     ) -> tuple[dict[str, metrics.Lpips], dict[str, str]]:
-        """LPIPS by backbone; and by metric, the reason why one is missing.
-
-        Each reason is also logged, once in a process.
-        """
+        """LPIPS by backbone; by metric, why it is missing, which is also logged once a process."""
         loaded, missing = {}, {}
         for net in self.lpips:
             try:
@@ -135,11 +132,7 @@ class EvaluationProtocol:
         return metrics.quantise(rgb.float()) if self.rounding == "8bit" else rgb.float()
 
     def score(
-        self,
-        rgb: Tensor,
-        reference: Tensor,
-        background: Tensor,
-        lpips: Mapping[str, metrics.Lpips],
+        self, rgb: Tensor, reference: Tensor, background: Tensor, lpips: Mapping[str, metrics.Lpips]
     ) -> dict[str, float]:
         """Every metric of a prediction `rgb` [H, W, 3] against its ground truth.
 
@@ -148,10 +141,7 @@ class EvaluationProtocol:
         """
         image = self.rounded(rgb)
         truth = composite(reference.to(rgb.device), background)
-        scores = {
-            "psnr": metrics.psnr(image, truth),
-            "ssim": metrics.ssim(image, truth, self.ssim),
-        }
+        scores = {"psnr": metrics.psnr(image, truth), "ssim": metrics.ssim(image, truth, self.ssim)}
         for net in self.lpips:
             scores[f"lpips_{net}"] = lpips[net](image, truth) if net in lpips else math.nan
         return scores

@@ -144,9 +144,7 @@ class Store:
                 shutil.rmtree(partial, ignore_errors=True)
 
     def rows(
-        self,
-        report: Callable[[str], object] = warnings.warn,
-        keys: Collection[str] | None = None,
+        self, report: Callable[[str], object] = warnings.warn, keys: Collection[str] | None = None
     ) -> pd.DataFrame:
         """Every row of all runs, or only of those in `keys`, with `COLUMNS`.
 
@@ -201,10 +199,9 @@ class Store:
                     shutil.rmtree(folder, ignore_errors=True)
 
     def _existing(self, run: str) -> Path:
-        folder = self.find(run)
-        if folder is None:
-            raise SteerbenchError(f"no run {run!r} in {self.folder}: see `steerbench results`")
-        return folder
+        if folder := self.find(run):
+            return folder
+        raise SteerbenchError(f"no run {run!r} in {self.folder}: see `steerbench results`")
 
 
 def unreadable(schema: object) -> str:

@@ -96,9 +96,8 @@ def read_model(folder: Path) -> Any:
     try:
         import pycolmap
     except ImportError as error:
-        raise Unavailable(
-            f"{folder}: models of COLMAP need pycolmap: {install_command('colmap')}"
-        ) from error
+        how = install_command("colmap")
+        raise Unavailable(f"{folder}: models of COLMAP need pycolmap: {how}") from error
     for name in LISTS:
         check_length(folder / f"{name}.bin")
     try:

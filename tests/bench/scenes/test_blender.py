@@ -154,7 +154,9 @@ def test_bad_camera_file_names_file_and_field(
     blender_folder, edit_json, log, change, message
 ) -> None:
     edit_json(blender_folder / "transforms_train.json", change)
-    with pytest.raises(SteerbenchError, match=r"transforms_train\.json: " + message):
+    with pytest.raises(
+        SteerbenchError, match=r"transforms_train\.json: (frames\[1\]\.)?" + message
+    ):
         blender.load(blender_folder, log=log)
 
 
