@@ -49,9 +49,8 @@ def sphere(count: int) -> list[Camera]:
     """Cameras between 2 and 2.5 units from the target, on every side but straight above."""
     generator = seeded(7)
     offsets = torch.randn(count, 3, generator=generator)
-    offsets *= (2 + torch.rand(count, 1, generator=generator) / 2) / offsets.norm(
-        dim=1, keepdim=True
-    )
+    distances = 2 + torch.rand(count, 1, generator=generator) / 2
+    offsets *= distances / offsets.norm(dim=1, keepdim=True)
     return [camera_at(offset.tolist()) for offset in offsets]
 
 

@@ -77,9 +77,8 @@ def test_a_thin_wire_covers_its_width() -> None:
 
 def test_nothing_seen_is_the_background_at_infinity() -> None:
     background = torch.tensor((0.2, 0.4, 0.6))
-    frame = render(
-        Solids([sphere(0.1, (9.0, 9.0, 0.0))]), camera_at((0.0, -4.0, 0.0)), background, 4
-    )
+    beside = Solids([sphere(0.1, (9.0, 9.0, 0.0))])
+    frame = render(beside, camera_at((0.0, -4.0, 0.0)), background, 4)
     assert (frame.rgb == background).all()
     assert frame.depth.isinf().all()
     assert (frame.alpha == 0).all()
@@ -116,9 +115,8 @@ def test_shadow_of_a_sphere_is_the_closed_form() -> None:
     caster, ground = sphere(0.3, (0.2, -0.1, 0.8)), sphere(0.01, (0.0, 0.0, -0.5))
     model = Solids([ground, caster])
     generator = torch.Generator().manual_seed(0)
-    points = torch.cat(
-        (3 * torch.rand(4000, 2, generator=generator) - 1.5, torch.zeros(4000, 1)), 1
-    )
+    flat = 3 * torch.rand(4000, 2, generator=generator) - 1.5
+    points = torch.cat((flat, torch.zeros(4000, 1)), 1)
     offset = torch.tensor(caster.centre) - points
     light = torch.tensor(LIGHT)
     ahead = offset @ light
@@ -151,13 +149,9 @@ def test_highlights_move_with_the_viewer() -> None:
     places = []
     for eye in ((0.0, -4.0, 0.0), (1.5, -3.7, 0.0)):
         camera = camera_at(eye)
-        extra = (
-            render(glossy, camera, torch.zeros(3), 4).rgb
-            - render(top, camera, torch.zeros(3), 4).rgb
-        )[..., 1]
-        place = extra.argmax().item()
-        row, column = divmod(place, camera.width)
-        depth = render(top, camera, torch.zeros(3), 4).depth[row, column]
+        shiny, matt = (render(model, camera, torch.zeros(3), 4) for model in (glossy, top))
+        row, column = divmod((shiny.rgb - matt.rgb)[..., 1].argmax().item(), camera.width)
+        depth = matt.depth[row, column]
         ray = cast(camera, torch.tensor([[column + 0.5, row + 0.5]]))
         places.append(ray.origins[0] + depth * ray.directions[0])
     assert (places[0] - places[1]).norm() > 0.05
