@@ -18,6 +18,11 @@ class Unavailable(SteerbenchError):
     """Something asked for by name cannot be used here; the message says why and how to get it."""
 
 
+def unexpected(where: str | Path, expected: str, got: object) -> SteerbenchError:
+    """The error that says what was expected at `where` (an option; a file and its field)."""
+    return SteerbenchError(f"{where}: expected {expected}, got {got}")
+
+
 def install_command(extra: str) -> str:
     """The command that installs an `extra` of this project from its folder."""
     return f'pip install -c constraints.txt -e ".[{extra}]"'

@@ -17,10 +17,10 @@ import torch
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
-from bench.lpips_weights import load_features
+from bench.published import load_features
 from bench.types import Log, SteerbenchError, Unavailable, check_shape
 
-SMALLEST_SIDE = {"ssim": 11, "lpips_alex": 31, "lpips_vgg": 16, "lpips_squeeze": 17}
+SMALLEST_SIDE = {"psnr": 1, "ssim": 11, "lpips_alex": 31, "lpips_vgg": 16, "lpips_squeeze": 17}
 """Smallest side in pixels: SSIM needs room for its window, LPIPS for one feature at its deepest."""
 
 
@@ -78,8 +78,7 @@ def ssim(image: Tensor, reference: Tensor, window: str = "gaussian") -> float:
     "uniform" (7 x 7, sample covariance; the default of scikit-image, used by NSVF and KiloNeRF).
     The mean is taken over the valid region, where the window lies inside the picture.
 
-    Raises:
-        SteerbenchError: a side is shorter than 11 pixels.
+    Raises SteerbenchError if a side is shorter than 11 pixels.
     """
     _check_pair(image, reference)
     check_size("ssim", image.shape[1], image.shape[0])
@@ -87,20 +86,14 @@ def ssim(image: Tensor, reference: Tensor, window: str = "gaussian") -> float:
         "gaussian": {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False},
         "uniform": {"win_size": 7},
     }
-    value = structural_similarity(
-        image.double().cpu().numpy(),
-        reference.double().cpu().numpy(),
-        data_range=1.0,
-        channel_axis=-1,
-        **variants[window],
-    )
-    return float(value)
+    pair = (picture.double().cpu().numpy() for picture in (image, reference))
+    return float(structural_similarity(*pair, data_range=1.0, channel_axis=-1, **variants[window]))
 
 
 class Lpips:
     """LPIPS v0.1 (Zhang et al. 2018) with a named backbone; a lower value is more similar.
 
-    The linear layers come with the `lpips` package, the backbone from `bench.lpips_weights`.
+    The linear layers come with the `lpips` package, the backbone from `bench.published`.
     Runs in float32 on the device of the pictures, which are mapped to [-1, 1] as published.
 
     Args:
@@ -108,8 +101,8 @@ class Lpips:
         weights_dir: folder to search first, or None.
         log: shows a download.
 
-    Raises:
-        Unavailable: the backbone weights cannot be found or downloaded, or do not fit the network.
+    Raises Unavailable if the backbone weights cannot be found or downloaded, or do not fit the
+    network.
     """
 
     def __init__(self, net: str, weights_dir: Path | None, log: Log) -> None:

@@ -15,9 +15,10 @@ from kornia.geometry.conversions import (
     axis_angle_to_rotation_matrix,
     rotation_matrix_to_axis_angle,
 )
-from torch import Tensor
+from torch import Generator, Tensor
 
-from bench.types import Camera, Scene, SteerbenchError, check_shape
+from bench.errors import unexpected
+from bench.types import Camera, Scene, check_shape
 
 BEND_DEG = 2.0
 """The rotation axis of a random motion turns by at most this much from frame to frame."""
@@ -48,8 +49,7 @@ def between(first: Camera, second: Camera, turn: Tensor, share: float) -> Camera
     `turn` [3] is their `rotation_between`. On an orbit the centre follows the chord: at 4 degrees
     it is off by 0.06 % of the distance.
 
-    Raises:
-        SteerbenchError: the pictures differ in size.
+    Raises SteerbenchError if the pictures differ in size.
     """
     camera = lens_between(first, second, share)
     rotation = first.c2w[:, :3].double() @ _rotation(share * turn)
@@ -60,14 +60,12 @@ def between(first: Camera, second: Camera, turn: Tensor, share: float) -> Camera
 def lens_between(first: Camera, second: Camera, share: float) -> Camera:
     """The `first` camera with its intrinsics interpolated at `share` of the way to `second`.
 
-    Raises:
-        SteerbenchError: the pictures differ in size.
+    Raises SteerbenchError if the pictures differ in size.
     """
-    if (first.width, first.height) != (second.width, second.height):
-        raise SteerbenchError(
-            "cameras: expected pictures of one size to interpolate between, got "
-            f"{first.width}x{first.height} and {second.width}x{second.height}"
-        )
+    sizes = [f"{camera.width}x{camera.height}" for camera in (first, second)]
+    if sizes[0] != sizes[1]:
+        expected = "pictures of one size to interpolate between"
+        raise unexpected("cameras", expected, " and ".join(sizes))
     inner = {
         name: (1 - share) * getattr(first, name) + share * getattr(second, name)
         for name in ("fx", "fy", "cx", "cy")
@@ -76,11 +74,7 @@ def lens_between(first: Camera, second: Camera, share: float) -> Camera:
 
 
 def preceding(
-    camera: Camera,
-    target: Tensor,
-    count: int,
-    degrees: tuple[float, float],
-    generator: torch.Generator,
+    camera: Camera, target: Tensor, count: int, degrees: tuple[float, float], generator: Generator
 ) -> list[Camera]:
     """The `count` cameras that precede `camera` on a random smooth motion, oldest first.
 
@@ -89,8 +83,8 @@ def preceding(
     frame to frame; the distance changes slightly, too. `target` keeps its place in the picture, and
     the intrinsics are constant.
 
-    Raises:
-        ValueError: `target` is not [3], `count` is negative, or `degrees` is not a range from 0 up.
+    Raises ValueError if `target` is not [3], `count` is negative, or `degrees` is not a range from
+    0 up.
     """
     check_shape("target", target, 3)
     if count < 0 or not 0 <= degrees[0] <= degrees[1]:
@@ -109,7 +103,7 @@ def preceding(
     return [replace(frame, c2w=frame.c2w.to(camera.c2w)) for frame in path[:0:-1]]
 
 
-def novel_view(cameras: Sequence[Camera], target: Tensor, generator: torch.Generator) -> Camera:
+def novel_view(cameras: Sequence[Camera], target: Tensor, generator: Generator) -> Camera:
     """A random camera from the region in which `cameras` view `target` [3].
 
     It lies between a camera and one of its nearest neighbours by direction, at a distance between

@@ -1,6 +1,6 @@
-"""Reads camera paths from nerfstudio's viewer and from a `transforms.json`; writes the former.
+"""Camera paths: from files of nerfstudio's viewer and `transforms.json`, and through key cameras.
 
-Poses are camera-to-world in the coordinates of the data set, OpenGL axes (y up, z backward).
+Poses in files are camera-to-world, in the coordinates of the data set, with OpenGL axes.
 """
 
 from __future__ import annotations
@@ -10,28 +10,35 @@ import math
 from collections import ChainMap
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
 from bench.cameras import move_camera
-from bench.motion import viewing_target
+from bench.errors import unexpected
+from bench.motion import lens_between, viewing_target
 from bench.scenes.files import (
     describe,
+    entries_of,
     number,
     opengl_pose,
     opengl_to_opencv,
     read_json,
     rigid_pose,
-    unexpected,
     whole_number,
 )
-from bench.scenes.transforms import focal
-from bench.splines import leading
+from bench.scenes.transforms import read_camera
 from bench.trajectories import Step, Trajectory, from_split
-from bench.types import Camera, Scene, SteerbenchError
+from bench.types import Camera, Scene
+
+SAMPLES = 65
+"""Poses per segment for measuring its length: 64 chords of half a circle are 0.01 % too short."""
 
 KEYFRAMES = "camera_path"
 """The name under which a file of nerfstudio's viewer lists its cameras."""
@@ -48,8 +55,7 @@ def follow(scene: Scene, path: str, limit: int = 0) -> Trajectory:
         path: the file.
         limit: if > 0, keep only the first `limit` cameras.
 
-    Raises:
-        SteerbenchError: the file is damaged or has no cameras; a pose is not rigid.
+    Raises SteerbenchError if the file is damaged or has no cameras, or a pose is not rigid.
     """
     file = Path(path).expanduser().resolve()
     record = read_json(file.parent, file.name)
@@ -64,7 +70,7 @@ def follow(scene: Scene, path: str, limit: int = 0) -> Trajectory:
 def spline(
     scene: Scene, path: str | None, split: str = "test", keys: int = 6, degrees: float = 1.0
 ) -> Trajectory:
-    """A smooth path through a few key cameras; see `splines.leading`.
+    """A smooth path through a few key cameras; see `leading`.
 
     Args:
         path: a file of cameras, as `follow` reads it; all of them are keys. None: the keys are
@@ -78,7 +84,7 @@ def spline(
             keys, two consecutive keys with the same pose, or their pictures differ in size.
     """
     if not degrees > 0:
-        raise SteerbenchError(f"trajectory.degrees: expected more than 0, got {degrees}")
+        raise unexpected("trajectory.degrees", "more than 0", degrees)
     whole_number(keys, "trajectory.keys", 2)
     through = follow(scene, path) if path else from_split(scene, split, keys)
     first, *others = through.steps
@@ -118,53 +124,67 @@ def _keyframe(camera: Camera, scene: Scene) -> dict[str, Any]:
 
 def _of_viewer(record: dict, file: Path) -> list[Camera]:
     """The cameras of nerfstudio's file: square pixels, principal point at the centre."""
-    width, height = (whole_number(record.get(k), f"{file}: {k}", 1) for k in _SIZE)
-    found = []
-    for where, entry in _entries(record, KEYFRAMES, file):
+    width, height = (
+        whole_number(record.get(k), f"{file}: {k}", 1) for k in ("render_width", "render_height")
+    )
+    cameras = []
+    for where, entry in entries_of(record, KEYFRAMES, file):
         flat = entry.get("camera_to_world")
         if not isinstance(flat, list) or len(flat) != 16:
             raise unexpected(f"{where}.camera_to_world", "16 numbers", describe(flat))
         rows = [flat[row : row + 4] for row in range(0, 16, 4)]
         pose = opengl_to_opencv(rigid_pose(rows, f"{where}.camera_to_world"))
         angle = number(entry.get("fov", record.get("default_fov")), f"{where}.fov", 0, 180)
-        length = height / 2 / math.tan(math.radians(angle) / 2)
-        found.append(_camera(pose, length, length, width, height))
-    return found
-
-
-_SIZE = ("render_width", "render_height")
+        focal = height / 2 / math.tan(math.radians(angle) / 2)
+        cameras.append(Camera(pose, focal, focal, width / 2, height / 2, width, height))
+    return cameras
 
 
 def _of_frames(record: dict, file: Path, scene: Scene) -> list[Camera]:
     """The cameras of a `transforms.json`, with or without pictures."""
     usual = scene.splits["test"].cameras[0]
-    found = []
-    for where, frame in _entries(record, "frames", file):
-        settings = ChainMap(frame, record)
-        width = whole_number(settings.get("w", usual.width), f"{where}.w", 1)
-        height = whole_number(settings.get("h", usual.height), f"{where}.h", 1)
-        given = focal(settings, "x", width, where)
-        fx = given or usual.fx * width / usual.width
-        fy = focal(settings, "y", height, where) or given or usual.fy * height / usual.height
-        centre = usual.cx * width / usual.width, usual.cy * height / usual.height
-        cx, cy = (
-            number(settings.get(name, value), f"{where}.{name}", 0, most)
-            for name, value, most in zip(("cx", "cy"), centre, (width, height), strict=True)
-        )
-        found.append(Camera(opengl_pose(frame, where), fx, fy, cx, cy, width, height))
-    return found
+    return [
+        read_camera(ChainMap(frame, record), opengl_pose(frame, where), usual, where)
+        for where, frame in entries_of(record, "frames", file)
+    ]
 
 
-def _entries(record: dict, name: str, file: Path) -> list[tuple[str, dict]]:
-    """The objects of the list `name` in the file, each with its position for error messages."""
-    entries = record.get(name)
-    if not isinstance(entries, list) or not entries:
-        raise unexpected(f"{file}: {name}", "a list with at least one camera", describe(entries))
-    for index, entry in enumerate(entries):
-        if not isinstance(entry, dict):
-            raise unexpected(f"{file}: {name}[{index}]", "an object", describe(entry))
-    return [(f"{file}: {name}[{index}]", entry) for index, entry in enumerate(entries)]
+def leading(keys: Sequence[Camera], target: Tensor, degrees: float) -> list[list[Camera]]:
+    """A smooth path through `keys`, one segment for each key but the first.
+
+    A segment holds the cameras after the previous key, up to and including its own key. Centres
+    follow a cubic spline, rotations a spline with continuous angular acceleration. Both are
+    parametrised by length, measured as an angle: the camera's rotation, or the motion of its centre
+    as seen from `target` [3], whichever is larger. The cameras of a segment are evenly spaced, by
+    at most `degrees`.
+
+    Raises SteerbenchError if there are fewer than two keys, two consecutive keys with the same
+    pose, or keys whose pictures differ in size.
+    """
+    poses = torch.stack([camera.c2w.double() for camera in keys]).numpy()
+    turns, centres = Rotation.from_matrix(poses[:, :, :3]), poses[:, :, 3]
+    lengths = _lengths(turns, centres, target)
+    if not (len(lengths) and lengths.min() > 0):
+        raise unexpected("spline", "two cameras or more", "fewer, or one at the pose before it")
+    knots = np.concatenate(([0.0], lengths.cumsum()))
+    turning, moving = RotationSpline(knots, turns), CubicSpline(knots, centres)
+    pieces = []
+    for (first, second), (start, end) in zip(pairwise(keys), pairwise(knots), strict=True):
+        fine = np.linspace(start, end, SAMPLES)
+        gone = np.concatenate(([0.0], _lengths(turning(fine), moving(fine), target).cumsum()))
+        count = max(math.ceil(math.degrees(gone[-1]) / degrees - 1e-3), 1)
+        at = np.interp(np.linspace(0, gone[-1], count + 1)[1:-1], gone, fine)
+        piece = []
+        for time in at:
+            camera = lens_between(first, second, float((time - start) / (end - start)))
+            pose = np.column_stack((turning(time).as_matrix(), moving(time)))
+            piece.append(replace(camera, c2w=torch.from_numpy(pose).to(first.c2w)))
+        pieces.append([*piece, second])
+    return pieces
 
 
-def _camera(pose: Tensor, fx: float, fy: float, width: int, height: int) -> Camera:
-    return Camera(pose, fx, fy, width / 2, height / 2, width, height)
+def _lengths(turns: Rotation, centres: np.ndarray, target: Tensor) -> np.ndarray:
+    """The length [N - 1] in radians from each of N poses to the next; see `leading`."""
+    moved = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    far = np.linalg.norm(centres - target.double().numpy(), axis=1)
+    return np.maximum((turns[:-1].inv() * turns[1:]).magnitude(), np.arctan2(moved, far[:-1]))

@@ -16,14 +16,14 @@ import torch
 from torch import Tensor
 
 from bench.compositing import composite
+from bench.errors import unexpected
 from bench.metrics import Lpips, check_size
 from bench.protocol import EvaluationProtocol
 from bench.results import STEADY, Measurement
 from bench.run import UNITS, mean_row
-from bench.scenes.files import unexpected
 from bench.scenes.images import contents, decode_bytes
 from bench.scoring import PICTURES, Flicker, kept_pictures
-from bench.trajectories import MIXED, spread
+from bench.trajectories import resolution, spread
 from bench.types import BACKGROUNDS, Log, Split, SteerbenchError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -53,24 +53,20 @@ class Pair:
 def pairs_with_folder(pictures: Path, truth: Path, match: Match = "name") -> list[Pair]:
     """Pair each picture of the folder `truth` with its counterpart in the folder `pictures`.
 
-    Raises:
-        SteerbenchError: they do not match, see `matched`.
+    Raises SteerbenchError as `matched` does.
     """
-    files = {path.stem: path for path in listed(truth)}
-    found = matched(pictures, list(files), match)
-    pairs = zip(found, files.values(), strict=True)
-    return [Pair(picture, path.name, path) for picture, path in pairs]
+    true = listed(truth)
+    files = matched(pictures, [path.stem for path in true], match)
+    return [Pair(file, path.name, path) for file, path in zip(files, true, strict=True)]
 
 
 def pairs_with_split(pictures: Path, split: Split, match: Match = "name") -> list[Pair]:
     """Pair each picture of a scene's `split` with its counterpart in the folder `pictures`.
 
-    Raises:
-        SteerbenchError: they do not match, see `matched`.
+    Raises SteerbenchError as `matched` does.
     """
-    found = matched(pictures, [Path(name).stem for name in split.names], match)
-    known = zip(found, split.names, split.images, strict=True)
-    return [Pair(picture, name, image) for picture, name, image in known]
+    files = matched(pictures, [Path(name).stem for name in split.names], match)
+    return [Pair(*pair) for pair in zip(files, split.names, split.images, strict=True)]
 
 
 def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
@@ -78,9 +74,8 @@ def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
 
     Files are ordered by name, numbers in names counting as numbers.
 
-    Raises:
-        SteerbenchError: a picture is missing, one belongs to none of `names`, or `names` has
-            duplicates.
+    Raises SteerbenchError if a picture is missing, one belongs to none of `names`, or `names` has
+    duplicates.
     """
     files = listed(folder)
     if match == "order":
@@ -104,8 +99,7 @@ def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
 def listed(folder: Path) -> list[Path]:
     """The pictures in a folder, sorted by name with 10 after 9.
 
-    Raises:
-        SteerbenchError: there are none, or the names of two differ only in the ending.
+    Raises SteerbenchError if there are none, or the names of two differ only in the ending.
     """
     if not folder.is_dir():
         raise unexpected(folder, "a folder", "a file" if folder.exists() else "nothing there")
@@ -121,8 +115,7 @@ def listed(folder: Path) -> list[Path]:
 def read(path: Path) -> Tensor:
     """Read a picture file as uint8 [H, W, 3 or 4].
 
-    Raises:
-        SteerbenchError: not a picture, damaged, or more than 8 bits per channel.
+    Raises SteerbenchError if it is not a picture, is damaged, or has more than 8 bits per channel.
     """
     return decode_bytes(contents(path), path)
 
@@ -144,14 +137,14 @@ def score(
         sequence: whether the pictures are consecutive frames, so that flicker is scored, too.
         kept: number of pictures that are kept, with their truth and error map.
 
-    Raises:
-        SteerbenchError: a picture cannot be read, or differs in size from its true picture.
+    Raises SteerbenchError if a picture cannot be read, or differs in size from its true picture.
     """
     background = torch.full((3,), BACKGROUNDS[protocol.background])
     shown = spread(len(pairs), kept)
     frames: list[dict[str, Any]] = []
     images: dict[str, np.ndarray] = {}
-    sizes, alphas = set(), 0
+    sizes: list[tuple[int, int]] = []
+    alphas = 0
     seen, truths, blinking = hashlib.sha256(), hashlib.sha256(), Flicker()
     with log.progress("scoring", len(pairs)) as progress:
         for index, pair in enumerate(pairs):
@@ -167,7 +160,7 @@ def score(
             if sequence:
                 figures |= blinking.since_last(now)
             frames.append({"frame": index, "name": pair.name, "phase": STEADY, **figures})
-            sizes.add(f"{rgb.shape[1]}x{rgb.shape[0]}")
+            sizes.append((rgb.shape[1], rgb.shape[0]))
             if index in shown:
                 images |= kept_pictures(index, rgb, now[1])
             progress.advance()
@@ -178,7 +171,7 @@ def score(
     rows = pd.DataFrame([mean_row(metric, table[metric]) for metric in metrics]).assign(
         unit=lambda of: [UNITS.get(name, "1") for name in of["metric"]],
         phase=STEADY,
-        resolution=sizes.pop() if len(sizes) == 1 else MIXED,
+        resolution=resolution(sizes),
         protocol=protocol.name,
         **facts,
     )
@@ -195,12 +188,11 @@ def _check(pair: Pair, picture: Tensor, truth: Tensor, protocol: EvaluationProto
     if picture.shape[:2] != truth.shape[:2]:
         wanted, got = (f"{image.shape[1]} x {image.shape[0]}" for image in (truth, picture))
         raise unexpected(pair.picture, f"{wanted} pixels, as {pair.name} has", got)
-    for metric in protocol.metric_names:
-        if metric != "psnr":
-            try:
-                check_size(metric, picture.shape[1], picture.shape[0])
-            except SteerbenchError as error:
-                raise SteerbenchError(f"{pair.picture}: {error}") from error
+    try:
+        for metric in protocol.metric_names:
+            check_size(metric, picture.shape[1], picture.shape[0])
+    except SteerbenchError as error:
+        raise SteerbenchError(f"{pair.picture}: {error}") from error
 
 
 def _repeated(names: Sequence[str]) -> list[str]:
@@ -210,9 +202,8 @@ def _repeated(names: Sequence[str]) -> list[str]:
 
 def _natural(name: str) -> list[tuple[int, str]]:
     """A sort key that orders numbers in names as numbers."""
-    return [
-        (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)
-    ]
+    parts = re.split(r"(\d+)", name)
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
 def _some(names: Sequence[str]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import resource
 import sys
 import time
@@ -61,11 +62,7 @@ class StageClock:
     """
 
     def __init__(
-        self,
-        device: str,
-        clock: Callable[[], int] = time.perf_counter_ns,
-        *,
-        stages: bool = True,
+        self, device: str, clock: Callable[[], int] = time.perf_counter_ns, *, stages: bool = True
     ) -> None:
         self.frames: list[FrameRecord] = []
         self._device = torch.device(device)
@@ -162,11 +159,8 @@ class MemoryMeter:
             torch.cuda.reset_peak_memory_stats(self._device)
 
     def __exit__(self, *exception: object) -> None:
-        peak = (
-            _process_peak_bytes()
-            if self.of_process
-            else torch.cuda.max_memory_allocated(self._device)
-        )
+        of_device = torch.cuda.max_memory_allocated
+        peak = _process_peak_bytes() if self.of_process else of_device(self._device)
         self.peak_bytes = max(self.peak_bytes, peak)
 
 
@@ -182,9 +176,8 @@ def _reset_high_water_mark() -> bool:
 def _process_peak_bytes() -> int:
     """Peak resident memory since the last reset, or since the process started."""
     status = Path("/proc/self/status")
-    lines = status.read_text().splitlines() if status.exists() else []
-    for line in lines:
-        if line.startswith("VmHWM"):  # some sandboxes have no such line
-            return int(line.split()[1]) * 1024
+    peak_kib = re.search(r"VmHWM:\s*(\d+)", status.read_text() if status.exists() else "")
+    if peak_kib:  # some sandboxes have no such line
+        return int(peak_kib[1]) * 1024
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024

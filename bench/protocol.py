@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields
-from functools import cache
 from pathlib import Path
 
 import torch
@@ -14,7 +13,9 @@ from torch import Tensor
 
 from bench import metrics
 from bench.compositing import composite
-from bench.lpips_weights import locate
+from bench.errors import unexpected
+from bench.published import locate
+from bench.sources import sha256
 from bench.trajectories import Trajectory
 from bench.types import BACKGROUNDS, Log, Scene, SteerbenchError, Unavailable
 
@@ -64,12 +65,10 @@ class EvaluationProtocol:
         }
         for option, allowed in choices.items():
             if getattr(self, option) not in allowed:
-                raise SteerbenchError(
-                    f"protocol.{option}: expected {' or '.join(allowed)}, "
-                    f"got {getattr(self, option)!r}"
-                )
+                got = repr(getattr(self, option))
+                raise unexpected(f"protocol.{option}", " or ".join(allowed), got)
         if self.warmup < 0:
-            raise SteerbenchError(f"protocol.warmup: expected 0 or more, got {self.warmup}")
+            raise unexpected("protocol.warmup", "0 or more", self.warmup)
         default = {field.name: field.default for field in fields(self)}
         changed = [key for key, value in default.items() if getattr(self, key) != value]
         if changed and self.name == default["name"]:
@@ -86,9 +85,8 @@ class EvaluationProtocol:
     def check(self, scene: Scene, trajectory: Trajectory) -> None:
         """Raise before any training if the frames could not be scored afterwards.
 
-        Raises:
-            SteerbenchError: the scene is composited on another background, has no exact pictures
-                for the flicker, or a frame is smaller than a metric's window.
+        Raises SteerbenchError if the scene is composited on another background, has no exact
+        pictures for the flicker, or a frame is smaller than a metric's window.
         """
         if self.flicker == "exact" and scene.exact is None:
             raise SteerbenchError(
@@ -102,22 +100,22 @@ class EvaluationProtocol:
                 f"protocol {self.name} scores on {self.background}, but scene {scene.name} has "
                 f"background [{got}]: change scene.background, or use another protocol"
             )
-        for camera in (step.camera for step in trajectory.steps):
-            metrics.check_size("ssim", camera.width, camera.height)
-            for net in self.lpips:
-                metrics.check_size(f"lpips_{net}", camera.width, camera.height)
+        for width, height in {(s.camera.width, s.camera.height) for s in trajectory.steps}:
+            for metric in self.metric_names:
+                metrics.check_size(metric, width, height)
 
     def find_lpips(self, weights_dir: Path | None, log: Log) -> dict[str, str | None]:
         """SHA-256 of each backbone's weight file, None if missing: part of the run's key."""
-        return {net: _weights_digest(net, weights_dir, log) for net in self.lpips}
+        digests: dict[str, str | None] = dict.fromkeys(self.lpips)
+        for net in self.lpips:
+            with suppress(Unavailable):
+                digests[net] = sha256(locate(net, weights_dir, log))
+        return digests
 
     def load_lpips(
         self, weights_dir: Path | None, log: Log
     ) -> tuple[dict[str, metrics.Lpips], dict[str, str]]:
-        """LPIPS by backbone; and by metric, the reason why one is missing.
-
-        Each reason is also logged, once in a process.
-        """
+        """LPIPS by backbone; by metric, why it is missing, which is also logged once a process."""
         loaded, missing = {}, {}
         for net in self.lpips:
             try:
@@ -134,11 +132,7 @@ class EvaluationProtocol:
         return metrics.quantise(rgb.float()) if self.rounding == "8bit" else rgb.float()
 
     def score(
-        self,
-        rgb: Tensor,
-        reference: Tensor,
-        background: Tensor,
-        lpips: Mapping[str, metrics.Lpips],
+        self, rgb: Tensor, reference: Tensor, background: Tensor, lpips: Mapping[str, metrics.Lpips]
     ) -> dict[str, float]:
         """Every metric of a prediction `rgb` [H, W, 3] against its ground truth.
 
@@ -147,25 +141,7 @@ class EvaluationProtocol:
         """
         image = self.rounded(rgb)
         truth = composite(reference.to(rgb.device), background)
-        scores = {
-            "psnr": metrics.psnr(image, truth),
-            "ssim": metrics.ssim(image, truth, self.ssim),
-        }
+        scores = {"psnr": metrics.psnr(image, truth), "ssim": metrics.ssim(image, truth, self.ssim)}
         for net in self.lpips:
             scores[f"lpips_{net}"] = lpips[net](image, truth) if net in lpips else math.nan
         return scores
-
-
-def _weights_digest(net: str, weights_dir: Path | None, log: Log) -> str | None:
-    try:
-        path = locate(net, weights_dir, log)
-    except Unavailable:
-        return None
-    return _digest(path, path.stat().st_mtime_ns)
-
-
-@cache
-def _digest(path: Path, changed: int) -> str:
-    """SHA-256 of a file; its time of change, `changed`, only serves as a key of the cache."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -47,8 +47,8 @@ def machine() -> dict[str, object]:
 
 def decisive() -> dict[str, object]:
     """The part of `machine` that can change a result; for libraries see `bench.sources`."""
-    found = machine()
-    return {name: found[name] for name in ("cpu", "instructions", "gpus", "python")}
+    record = machine()
+    return {name: record[name] for name in ("cpu", "instructions", "gpus", "python")}
 
 
 def computed_by(*things: Any) -> dict[str, object]:

@@ -11,7 +11,6 @@ import hashlib
 import io
 import json
 import os
-import re
 import shutil
 import time
 import uuid
@@ -29,12 +28,7 @@ from bench.errors import SteerbenchError, explained
 from bench.provenance import commit, machine
 
 SCHEMA_VERSION = 3
-"""The version in which record.json and rows.csv are written."""
-
-READABLE = (2, SCHEMA_VERSION)
-"""The versions that can be read; folders of other versions are reported and skipped.
-
-Version 2 stores the libraries of a run with its machine, and has other names for two methods."""
+"""The version of record.json and rows.csv; folders of other versions are reported and skipped."""
 
 COLUMNS = [
     *("run", "method", "scene", "split", "trajectory", "resolution", "protocol", "budget"),
@@ -95,8 +89,7 @@ class Store:
     def whole_key(self, beginning: str) -> str:
         """The key of the only run whose key starts with `beginning`.
 
-        Raises:
-            SteerbenchError: there is none, or several.
+        Raises SteerbenchError if there is none, or several.
         """
         wanted = Path(beginning).name  # the key may be given as the path of its folder
         folders = self.folder.iterdir() if self.folder.is_dir() else ()
@@ -135,8 +128,7 @@ class Store:
 
         If another process has finished the same run in the meantime, its result is kept.
 
-        Raises:
-            SteerbenchError: no space, no permission, or `outputs` is no folder.
+        Raises SteerbenchError if there is no space or no permission, or `outputs` is no folder.
         """
         with explained(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -159,37 +151,29 @@ class Store:
             shutil.rmtree(removed, ignore_errors=True)
 
     def rows(
-        self,
-        report: Callable[[str], object] = warnings.warn,
-        keys: Collection[str] | None = None,
+        self, report: Callable[[str], object] = warnings.warn, keys: Collection[str] | None = None
     ) -> pd.DataFrame:
         """Every row of all runs, or only of those in `keys`, with `COLUMNS`.
 
-        Methods have their present names. `report` is called with a message for each run that
-        cannot be read.
+        `report` is called with a message for each run that cannot be read.
         """
         header = ",".join(COLUMNS)
-        bodies, old = [], []
+        bodies = []
         for folder in sorted(self.folder.glob("[!.]*")):
             if keys is not None and folder.name not in keys:
                 continue
             schema = _schema_version(folder)
             first, _, body = _text(folder / "rows.csv").partition("\n")
-            if schema in READABLE and first == header:
+            if schema == SCHEMA_VERSION and first == header:
                 bodies.append(body)
-                old += [folder.name] if schema == 2 else []
             else:
                 report(f"{folder}: left out, {unreadable(schema)}")
-        rows = pd.read_csv(
+        return pd.read_csv(
             io.StringIO("\n".join((header, "".join(bodies)))),
             dtype={column: FIGURES.get(column, "str") for column in COLUMNS},
             keep_default_na=False,
             na_values={column: ["", "nan"] for column in ("value", "lo", "hi")},
         )
-        rows["method"] = rows["method"].mask(
-            rows["run"].isin(old), rows["method"].map(present_name)
-        )
-        return rows
 
     def frames(self, run: str) -> pd.DataFrame:
         """Every frame of a run."""
@@ -197,16 +181,8 @@ class Store:
         return pd.read_csv(path, dtype={"name": "str"}, keep_default_na=False, na_values=[""])
 
     def record(self, run: str) -> dict[str, object]:
-        """The record of a run: what it was made of, and on which machine.
-
-        Versions of libraries are in `record["made_of"]["libraries"]` for every schema.
-        """
-        record = json.loads((self._existing(run) / RECORD).read_text(encoding="utf-8"))
-        if record.get("schema_version") == 2:
-            machine = record["machine"]
-            versions = machine.pop("versions", {}) | machine.pop("engines", {})
-            record["made_of"].setdefault("libraries", versions)
-        return record
+        """The record of a run: what it was made of, and on which machine."""
+        return json.loads((self._existing(run) / RECORD).read_text(encoding="utf-8"))
 
     def _publish(self, partial: Path, key: str) -> None:
         folder = self.folder / key
@@ -230,26 +206,14 @@ class Store:
                     shutil.rmtree(folder, ignore_errors=True)
 
     def _existing(self, run: str) -> Path:
-        folder = self.find(run)
-        if folder is None:
-            raise SteerbenchError(f"no run {run!r} in {self.folder}: see `steerbench results`")
-        return folder
-
-
-def present_name(method: str) -> str:
-    """The present name of the method that schema 2 calls `method`.
-
-    "steernerf" was the lean method and "steernerf_paper" the paper's; variants have a suffix.
-    """
-    return re.sub(
-        r"^steernerf(_paper)?(?=_|$)", lambda old: f"steernerf{'' if old[1] else '_lean'}", method
-    )
+        if folder := self.find(run):
+            return folder
+        raise SteerbenchError(f"no run {run!r} in {self.folder}: see `steerbench results`")
 
 
 def unreadable(schema: object) -> str:
     """Why a run of this schema cannot be read."""
-    known = " and ".join(map(str, READABLE))
-    return f"its rows have schema {schema}; this version reads schema {known}"
+    return f"its rows have schema {schema}; this version reads schema {SCHEMA_VERSION}"
 
 
 def _schema_version(folder: Path) -> object:

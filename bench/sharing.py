@@ -40,8 +40,7 @@ def locked(path: Path, waiting: str, log: Log) -> Iterator[None]:
     `waiting` is logged while another process holds it. If the file system has no locks, that is
     logged and the body runs anyway; at worst, work is then done twice.
 
-    Raises:
-        SteerbenchError: `path` cannot be opened for writing.
+    Raises SteerbenchError if `path` cannot be opened for writing.
     """
     with explained(path.parent):
         handle = _opened(path)
@@ -59,8 +58,7 @@ def locked(path: Path, waiting: str, log: Log) -> Iterator[None]:
 def missing(path: Path, log: Log) -> Iterator[bool]:
     """Whether `path` must still be made: if so, the body makes it while other processes wait.
 
-    Raises:
-        SteerbenchError: the folder of `path` cannot be written to.
+    Raises SteerbenchError if the folder of `path` cannot be written to.
     """
     if path.exists():
         yield False

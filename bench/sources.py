@@ -27,13 +27,12 @@ CHECKS = ("cases.py", "experiments.py")
 def digest(*things: Any) -> str:
     """SHA-256 of the names and bytes of the `sources` of `things`.
 
-    Raises:
-        SteerbenchError: a file changed after this process first hashed it. The process may still
-            run the old code, and would store its results under the key of the new code.
+    Raises SteerbenchError if a file changed after this process first hashed it. The process may
+    still run the old code, and would store its results under the key of the new code.
     """
     total = hashlib.sha256()
     for name, path in sorted(sources(*things).items()):
-        content = _hashed(path, path.stat().st_mtime_ns)
+        content = sha256(path)
         if _first.setdefault(path, content) != content:
             raise SteerbenchError(f"{name} was changed while this process runs: start it again")
         total.update(f"{name} {content}\n".encode())
@@ -44,10 +43,15 @@ _first: dict[Path, str] = {}
 """The first hash that this process took of each file."""
 
 
+def sha256(path: Path) -> str:
+    """SHA-256 of a file, read again only if its time of change differs."""
+    return _sha256(path, path.stat().st_mtime_ns)
+
+
 @cache
-def _hashed(path: Path, changed: int) -> str:
-    """SHA-256 of a file; its time of change, `changed`, only serves as a key of the cache."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def _sha256(path: Path, changed: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def libraries(*things: Any) -> dict[str, str]:
@@ -70,15 +74,12 @@ def sources(*things: Any) -> dict[str, Path]:
     An imported package counts with all files beside its `__init__`, because backends are loaded by
     name, and with the weights in its folder. For a thing from another project: its whole top-level
     package, and what that imports from this project or from packages outside any installed
-    distribution.
-
-    Returns:
-        Paths by name. A name starts at the top-level package, wherever that is on the disk.
+    distribution. Returns paths by name, which starts at the top-level package.
     """
     known = _known.get((ROOT, things))
     if known is None or _times(known[0]) != known[1]:
-        found = _found(*things)
-        known = _known[ROOT, things] = found, _times(found)
+        files = _collected(*things)
+        known = _known[ROOT, things] = files, _times(files)
     return known[0]
 
 
@@ -92,20 +93,20 @@ def _times(files: dict[str, Path]) -> list[int]:
     return [path.stat().st_mtime_ns if path.exists() else 0 for path in sorted(places)]
 
 
-def _found(*things: Any) -> dict[str, Path]:
-    found: dict[str, Path] = {}
+def _collected(*things: Any) -> dict[str, Path]:
+    collected: dict[str, Path] = {}
     seen: set[str] = set()
     pending = {
         name: path for thing in things for name, path in _files(thing.__module__, home=True).items()
     }
     while pending:
         name, path = pending.popitem()
-        found[name] = path
+        collected[name] = path
         for imported in set(_imports(path)) - seen:
             seen.add(imported)
             files = _files(imported)
-            pending |= {name: files[name] for name in files.keys() - found.keys()}
-    return found
+            pending |= {name: files[name] for name in files.keys() - collected.keys()}
+    return collected
 
 
 def _files(name: str, home: bool = False) -> dict[str, Path]:
@@ -134,15 +135,14 @@ def _files(name: str, home: bool = False) -> dict[str, Path]:
 
 def _ours(name: str) -> list[Path]:
     """The files of this project that `name` refers to."""
-    parts = name.split(".")
-    while parts:
-        path = ROOT.joinpath(*parts)
+    path = ROOT.joinpath(*name.split("."))
+    while path != ROOT:
         if (path / "__init__.py").exists():
             files = [file for file in path.glob("*.py") if file.name not in CHECKS]
             return files + _weights(path)
         if path.with_suffix(".py").exists():
             return [path.with_suffix(".py"), *_weights(path.parent)]
-        parts.pop()
+        path = path.parent
     return []
 
 

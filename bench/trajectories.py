@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from bench.errors import unexpected
 from bench.motion import between, preceding, rotation_between, viewing_target
 from bench.types import Camera, Scene, SteerbenchError
 
@@ -56,8 +57,7 @@ class Trajectory:
     @property
     def resolution(self) -> str:
         """`WIDTHxHEIGHT` of the frames, or `MIXED`."""
-        sizes = {f"{step.camera.width}x{step.camera.height}" for step in self.steps}
-        return sizes.pop() if len(sizes) == 1 else MIXED
+        return resolution((step.camera.width, step.camera.height) for step in self.steps)
 
     @property
     def preceding(self) -> list[int]:
@@ -66,6 +66,12 @@ class Trajectory:
         for step in self.steps:
             counts.append(counts[-1] + 1 if counts and not step.cut else 0)
         return counts
+
+
+def resolution(sizes: Iterable[tuple[int, int]]) -> str:
+    """`WIDTHxHEIGHT` of pictures with these widths and heights, or `MIXED`."""
+    names = {f"{width}x{height}" for width, height in sizes}
+    return names.pop() if len(names) == 1 else MIXED
 
 
 def spread(total: int, count: int) -> list[int]:
@@ -78,28 +84,22 @@ def from_split(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:
 
     A kept frame whose predecessor was dropped comes after a cut.
 
-    Raises:
-        SteerbenchError: the scene has no such split, it is empty, or `limit` is negative.
+    Raises SteerbenchError if the scene has no such split, it is empty, or `limit` is negative.
     """
-    cameras = _cameras(scene, split, limit)
-    kept = spread(len(cameras), limit or len(cameras))
-    name = split if len(kept) == len(cameras) else f"{split}-{len(kept)}of{len(cameras)}"
+    cameras, kept, part = _kept(scene, split, limit, spaced=True)
     cuts = [False, *(after != before + 1 for before, after in pairwise(kept))]
     steps = (Step(cameras[index], index, cut) for index, cut in zip(kept, cuts, strict=True))
-    return Trajectory(name, split, tuple(steps))
+    return Trajectory(f"{split}{part}", split, tuple(steps))
 
 
 def orbit(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:
     """The cameras of a split in order, without gaps; `limit` > 0 keeps only the first `limit`.
 
     If the split was recorded along a path, preceding frames are true neighbours on that path.
-
-    Raises:
-        SteerbenchError: as `from_split`.
+    Raises SteerbenchError as `from_split` does.
     """
-    kept, part = _first(scene, split, limit)
-    steps = tuple(Step(camera, index) for index, camera in enumerate(kept))
-    return Trajectory(f"{split}-orbit{part}", split, steps)
+    cameras, kept, part = _kept(scene, split, limit)
+    return Trajectory(f"{split}-orbit{part}", split, tuple(Step(cameras[k], k) for k in kept))
 
 
 def smooth(scene: Scene, split: str = "test", degrees: float = 1.0, limit: int = 0) -> Trajectory:
@@ -108,8 +108,7 @@ def smooth(scene: Scene, split: str = "test", degrees: float = 1.0, limit: int =
     Frames between two cameras have no ground truth: they are rendered and timed, not scored.
     `limit` > 0 keeps only the first `limit` cameras, so that the path has no gaps.
 
-    Raises:
-        SteerbenchError: as `from_split`; `degrees` is not positive, or picture sizes differ.
+    Raises SteerbenchError as `from_split` does, or if `degrees` is not positive or sizes differ.
     """
     steps, part = _smooth_steps(scene, split, degrees, limit)
     return Trajectory(f"{split}-smooth{degrees:g}deg{part}", split, tuple(steps))
@@ -122,15 +121,13 @@ def jump(
 
     The order is the same every time, and no piece follows its predecessor on the path.
 
-    Raises:
-        SteerbenchError: as `smooth`; `every` is less than 1, or the path has no second piece.
+    Raises SteerbenchError as `smooth` does, or if the path has no second piece of `every` >= 1.
     """
     steps, part = _smooth_steps(scene, split, degrees, limit)
     if not 1 <= every < len(steps):
-        raise SteerbenchError(
-            f"trajectory.every: expected 1 to {len(steps) - 1}, fewer than the {len(steps)} "
-            f"frames of the path, got {every}; trajectory.limit=0 takes all cameras"
-        )
+        allowed = f"1 to {len(steps) - 1}, fewer than the {len(steps)} frames of the path"
+        got = f"{every}; trajectory.limit=0 takes all cameras"
+        raise unexpected("trajectory.every", allowed, got)
     pieces = [steps[start : start + every] for start in range(0, len(steps), every)]
     jumps = [
         replace(step, cut=position == 0)
@@ -148,10 +145,9 @@ def loop(
     Every round revisits exactly the same cameras, so that drift over a long sequence shows in the
     scores of the same pictures.
 
-    Raises:
-        SteerbenchError: as `smooth`; `frames` is less than 1.
+    Raises SteerbenchError as `smooth` does, or if `frames` is less than 1.
     """
-    _at_least_one("frames", frames)
+    _check(frames >= 1, "frames", "1 or more", frames)
     there, part = _smooth_steps(scene, split, degrees, limit)
     round_trip = there + there[-2:0:-1]
     steps = tuple(round_trip[index % len(round_trip)] for index in range(frames))
@@ -161,16 +157,12 @@ def loop(
 def static(scene: Scene, split: str = "test", view: int = 0, frames: int = 60) -> Trajectory:
     """A still camera: camera `view` of a split, repeated for `frames` frames.
 
-    Raises:
-        SteerbenchError: as `from_split`; there is no such view, or `frames` is less than 1.
+    Raises SteerbenchError as `from_split` does, or if there is no such view or frame.
     """
-    cameras = _cameras(scene, split, 0)
-    if not 0 <= view < len(cameras):
-        raise SteerbenchError(
-            f"trajectory.view: expected 0 to {len(cameras) - 1}, the cameras of {split!r}, "
-            f"got {view}"
-        )
-    _at_least_one("frames", frames)
+    cameras, kept, _ = _kept(scene, split, 0)
+    allowed = f"0 to {len(cameras) - 1}, the cameras of {split!r}"
+    _check(view in kept, "view", allowed, view)
+    _check(frames >= 1, "frames", "1 or more", frames)
     return Trajectory(f"{split}-static{view}", split, (Step(cameras[view], view),) * frames)
 
 
@@ -183,55 +175,49 @@ def approached(
     From frame to frame the camera turns by `degrees` about what it looks at (`motion.preceding`).
     `seed` seeds the motions; `limit` > 0 keeps only that many cameras, evenly spread.
 
-    Raises:
-        SteerbenchError: as `from_split`; `lead` is negative, or `degrees` not from 0 to 180.
+    Raises SteerbenchError as `from_split` does, or if `lead` or `degrees` is out of range.
     """
-    if lead < 0:
-        raise SteerbenchError(f"trajectory.lead: expected 0 or more, got {lead}")
-    if not 0 < degrees <= 180:
-        raise SteerbenchError(f"trajectory.degrees: expected more than 0, up to 180, got {degrees}")
-    cameras = _cameras(scene, split, limit)
-    kept = spread(len(cameras), limit or len(cameras))
+    _check(lead >= 0, "lead", "0 or more", lead)
+    _check(0 < degrees <= 180, "degrees", "more than 0, up to 180", degrees)
+    cameras, kept, part = _kept(scene, split, limit, spaced=True)
     target, generator = viewing_target(scene), torch.Generator().manual_seed(seed)
     steps: list[Step] = []
     for index in kept:
         before = preceding(cameras[index], target, lead, (degrees, degrees), generator)
         steps += [Step(camera, None, cut=n == 0) for n, camera in enumerate(before)]
         steps.append(Step(cameras[index], index, cut=not before))
-    part = "" if len(kept) == len(cameras) else f"-{len(kept)}of{len(cameras)}"
     return Trajectory(f"{split}-approached{lead}-{degrees:g}deg{part}", split, tuple(steps))
 
 
-def _cameras(scene: Scene, split: str, limit: int) -> Sequence[Camera]:
+def _kept(
+    scene: Scene, split: str, limit: int, *, spaced: bool = False
+) -> tuple[Sequence[Camera], list[int], str]:
+    """The cameras of a split; the indices of the first, or evenly `spaced`, `limit` (0: all) of
+    them; and the part of the trajectory's name that says how many these are."""
     if split not in scene.splits or not len(scene.splits[split]):
+        others = ", ".join(name for name, frames in scene.splits.items() if len(frames))
         raise SteerbenchError(
-            f"trajectory.split: scene {scene.name} has no frames in {split!r}; "
-            f"it has {', '.join(name for name, frames in scene.splits.items() if len(frames))}"
+            f"trajectory.split: scene {scene.name} has no frames in {split!r}; it has {others}"
         )
-    if limit < 0:
-        raise SteerbenchError(f"trajectory.limit: expected 0 (all) or more, got {limit}")
-    return scene.splits[split].cameras
-
-
-def _first(scene: Scene, split: str, limit: int) -> tuple[Sequence[Camera], str]:
-    """The first `limit` cameras of a split (0: all), and the part of the name that says so."""
-    cameras = _cameras(scene, split, limit)
-    kept = cameras[: limit or len(cameras)]
-    return kept, "" if len(kept) == len(cameras) else f"-{len(kept)}of{len(cameras)}"
+    _check(limit >= 0, "limit", "0 (all) or more", limit)
+    cameras = scene.splits[split].cameras
+    count = min(limit or len(cameras), len(cameras))
+    kept = spread(len(cameras), count) if spaced else list(range(count))
+    return cameras, kept, "" if count == len(cameras) else f"-{count}of{len(cameras)}"
 
 
 def _smooth_steps(scene: Scene, split: str, degrees: float, limit: int) -> tuple[list[Step], str]:
     """The steps of the smooth path through the first `limit` cameras, and its name's ending."""
-    if not degrees > 0:
-        raise SteerbenchError(f"trajectory.degrees: expected more than 0, got {degrees}")
-    kept, part = _first(scene, split, limit)
-    steps = [Step(kept[0], 0)]
-    for index, (first, second) in enumerate(pairwise(kept), 1):
-        turn = rotation_between(first, second)
+    _check(degrees > 0, "degrees", "more than 0", degrees)
+    cameras, kept, part = _kept(scene, split, limit)
+    steps = [Step(cameras[0], 0)]
+    for first, second in pairwise(kept):
+        turn = rotation_between(cameras[first], cameras[second])
         # 1e-3: cameras that are `degrees` apart need no frame between them, despite rounding.
         count = max(math.ceil(math.degrees(turn.norm().item()) / degrees - 1e-3), 1)
-        steps += [Step(between(first, second, turn, k / count), None) for k in range(1, count)]
-        steps.append(Step(second, index))
+        shares = (k / count for k in range(1, count))
+        steps += [Step(between(cameras[first], cameras[second], turn, s), None) for s in shares]
+        steps.append(Step(cameras[second], second))
     return steps, part
 
 
@@ -244,6 +230,6 @@ def _shuffled(count: int) -> list[int]:
             return order
 
 
-def _at_least_one(option: str, value: int) -> None:
-    if value < 1:
-        raise SteerbenchError(f"trajectory.{option}: expected 1 or more, got {value}")
+def _check(holds: bool, option: str, expected: str, got: object) -> None:
+    if not holds:
+        raise unexpected(f"trajectory.{option}", expected, got)

@@ -48,11 +48,10 @@ DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?")
 
 def check_shape(name: str, value: Tensor, *shape: int | None) -> None:
     """Raise `ValueError` unless `value` has `shape`; None stands for any size along that axis."""
-    if value.dim() != len(shape) or any(
-        want is not None and want != got for want, got in zip(shape, value.shape, strict=True)
-    ):
-        want_text = ", ".join("any" if size is None else str(size) for size in shape)
-        raise ValueError(f"{name}: expected shape [{want_text}], got {list(value.shape)}")
+    got = list(value.shape)
+    if len(got) != len(shape) or any(s not in (None, g) for s, g in zip(shape, got, strict=True)):
+        want = ", ".join("any" if size is None else str(size) for size in shape)
+        raise ValueError(f"{name}: expected shape [{want}], got {got}")
 
 
 @dataclass(frozen=True)
@@ -78,10 +77,8 @@ class Rays:
     @classmethod
     def joined(cls, parts: Sequence[Rays]) -> Rays:
         """The rays of all `parts`, one part after the other."""
-        return cls(
-            torch.cat([rays.origins for rays in parts]),
-            torch.cat([rays.directions for rays in parts]),
-        )
+        origins, directions = zip(*((rays.origins, rays.directions) for rays in parts), strict=True)
+        return cls(torch.cat(origins), torch.cat(directions))
 
     def take(self, index: Tensor | slice) -> Rays:
         """The rays at `index`."""

@@ -37,15 +37,11 @@ def recorded(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
             stream = container.add_stream("h264", rate=Fraction(fps).limit_denominator(1000))
             stream.pix_fmt, stream.options = "yuv420p", {"crf": QUALITY}
 
-            sized = False
-
             def take(picture: np.ndarray) -> None:
-                nonlocal sized
                 height, width = picture.shape[:2]
                 even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-                if not sized:
+                if not stream.codec_context.is_open:
                     stream.height, stream.width = even.shape[:2]
-                    sized = True
                 frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
                 container.mux(stream.encode(frame))
 

@@ -84,8 +84,7 @@ class Drawn:
 class Painter:
     """Renders the pictures that several browsers want, each with all methods.
 
-    Methods are reset when the browser or the picture size changes, because their preceding frames
-    then belong to another sequence.
+    Methods are reset when the browser or the picture size changes: another sequence begins.
     """
 
     def __init__(self, methods: Sequence[Method]) -> None:
@@ -111,8 +110,7 @@ class Painter:
     def draw(self, who: Hashable, camera: Camera) -> list[Drawn]:
         """Render `camera` with each method.
 
-        Raises:
-            SteerbenchError: a method rendered values that are not finite.
+        Raises SteerbenchError if a method rendered values that are not finite.
         """
         sequence = (who, camera.width, camera.height)
         if sequence != self._sequence:
@@ -120,7 +118,7 @@ class Painter:
                 method.reset()
             self._sequence = sequence
         drawn = [_drawn(method, camera) for method in self.methods]
-        self._full_ms[camera.width * camera.height] = sum(one.ms for one in drawn)
+        self._full_ms[camera.width * camera.height] = sum(picture.ms for picture in drawn)
         return drawn
 
 
@@ -146,9 +144,9 @@ def divided(left: Tensor, right: Tensor, at: float) -> Tensor:
     return both
 
 
-def difference(one: Tensor, other: Tensor, gain: float = 4.0) -> Tensor:
-    """|one - other|, amplified by `gain` to make it visible; [H, W, 3] in [0, 1]."""
-    return (gain * (one - other).abs()).clamp(0, 1)
+def difference(first: Tensor, second: Tensor, gain: float = 4.0) -> Tensor:
+    """|first - second|, amplified by `gain` to make it visible; [H, W, 3] in [0, 1]."""
+    return (gain * (first - second).abs()).clamp(0, 1)
 
 
 def seen_from(

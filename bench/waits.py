@@ -17,7 +17,7 @@ import torch
 from bench.errors import Unavailable
 
 TORCH = str(Path(torch.__file__).parent)
-ROOT = Path(__file__).parent.parent
+ROOT = f"{Path(__file__).parent.parent}/"
 
 
 class Line(NamedTuple):
@@ -29,8 +29,7 @@ class Line(NamedTuple):
     @property
     def place(self) -> str:
         """File and line number; the path is relative to the repository if the file is inside it."""
-        path = Path(self.path)
-        return f"{path.relative_to(ROOT) if path.is_relative_to(ROOT) else path}:{self.number}"
+        return f"{self.path.removeprefix(ROOT)}:{self.number}"
 
     @property
     def source(self) -> str:
@@ -45,8 +44,7 @@ def device_waits() -> Iterator[Counter[Line]]:
     Torch reports the waits (`torch.cuda.set_sync_debug_mode`), except explicit synchronisation as
     by a clock.
 
-    Raises:
-        Unavailable: there is no GPU.
+    Raises Unavailable if there is no GPU.
     """
     if not torch.cuda.is_available():
         raise Unavailable("to count how often the host waits for the device, a GPU is needed")

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, Unavailable
-from bench.scenes.held_out import hold_out
+from bench.scenes.assemble import hold_out
 from bench.types import DEVICE, Log, Method, Scene
 from reports.trackers import tracker
 from sweeps.build import build, check_settings

@@ -22,9 +22,9 @@ from torch import Tensor
 
 from bench import neighbours
 from bench.console import ConsoleLog
-from bench.lpips_weights import BACKBONES
 from bench.metrics import _lpips_package
 from bench.protocol import EvaluationProtocol
+from bench.published import BACKBONES
 from bench.results import Store
 from bench.run import Task, measure
 from bench.trajectories import from_split

@@ -1,4 +1,4 @@
-"""A web server on the loopback address, and the ways in which a download goes wrong."""
+"""A web server on the loopback address, and a way in which a download goes wrong."""
 
 from __future__ import annotations
 
@@ -14,29 +14,25 @@ class Web:
     Attributes:
         files: their contents by their paths.
         breaks_after: of every answer, so many bytes arrive; None: all.
-        continues: whether it can begin in the middle of a file.
-        asked: path and first byte of every request.
+        asked: the path of every request.
     """
 
     def __init__(self) -> None:
         self.files: dict[str, bytes] = {}
         self.breaks_after: int | None = None
-        self.continues = True
-        self.asked: list[tuple[str, int]] = []
+        self.asked: list[str] = []
         self.address = ""
 
     def answer(self, request: BaseHTTPRequestHandler) -> None:
         content = self.files.get(request.path)
-        begin = int(request.headers.get("Range", "bytes=0-")[6:-1]) if self.continues else 0
-        self.asked.append((request.path, begin))
-        if content is None or begin >= len(content):
-            request.send_error(404 if content is None else 416)
+        self.asked.append(request.path)
+        if content is None:
+            request.send_error(404)
             return
-        rest = content[begin:]
-        request.send_response(206 if begin else 200)
-        request.send_header("Content-Length", str(len(rest)))
+        request.send_response(200)
+        request.send_header("Content-Length", str(len(content)))
         request.end_headers()
-        request.wfile.write(rest[: self.breaks_after])
+        request.wfile.write(content[: self.breaks_after])
 
 
 @contextmanager

@@ -18,13 +18,14 @@ from PIL import Image
 from torch import Tensor
 
 from bench.cameras import look_at, move_camera
+from bench.errors import unexpected
 from bench.scenes import blender
-from bench.scenes.files import opengl_to_opencv, unexpected, whole_number
+from bench.scenes.files import opengl_to_opencv, whole_number
 from bench.scenes.medley import medley
 from bench.scenes.models import MODELS
-from bench.scenes.parallel import in_parallel
 from bench.scenes.raytrace import Model, render
 from bench.sources import digest
+from bench.threads import in_parallel
 from bench.types import Camera, Log, Scene, SteerbenchError, Unavailable
 
 ANGLE_X = 0.69
@@ -71,14 +72,10 @@ def load(
         name = f"medley-{whole_number(variant, 'variant', 0)}"
     elif variant is not None:
         raise unexpected("variant", f"none, {name} has no variants", variant)
-    settings = {
-        "name": name,
-        "width": whole_number(width, "width", 1),
-        "height": whole_number(width if height is None else height, "height", 1),
-        "train": whole_number(train, "train", 1),
-        "test": whole_number(test, "test", 1),
-        "seed": whole_number(seed, "seed", 0),
-    }
+    sizes = {"width": width, "height": width if height is None else height, "train": train}
+    numbers = {**sizes, "test": test, "seed": seed}
+    checked = {key: whole_number(x, key, int(key != "seed")) for key, x in numbers.items()}
+    settings = {"name": name, **checked}
     model = find(name)
     key = f"{json.dumps(settings, sort_keys=True)} {digest(write)}"
     folder = Path(root) / f"{name}-{hashlib.sha256(key.encode()).hexdigest()[:12]}"
@@ -119,25 +116,20 @@ def write(folder: Path, settings: dict, log: Log) -> None:
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as temporary:
-            scene = Path(temporary) / "scene"
-            _write_pictures(scene, settings, log)
-            try:
-                scene.rename(folder)
-            except OSError:
-                if not folder.is_dir():  # otherwise another process was faster
-                    raise
+            _write_pictures(Path(temporary) / "scene", settings, log)
+            (Path(temporary) / "scene").rename(folder)
     except OSError as error:
+        if folder.is_dir():  # another process was faster
+            return
         raise SteerbenchError(f"{folder}: the scene cannot be written: {error}") from error
 
 
 def _write_pictures(folder: Path, settings: dict, log: Log) -> None:
     model, width, height = find(settings["name"]), settings["width"], settings["height"]
     focal = width / 2 / math.tan(ANGLE_X / 2)
+    train = train_poses(settings["train"], settings["seed"])
     jobs = []
-    for split, poses in {
-        "train": train_poses(settings["train"], settings["seed"]),
-        "test": orbit_poses(settings["test"]),
-    }.items():
+    for split, poses in (("train", train), ("test", orbit_poses(settings["test"]))):
         (folder / split).mkdir(parents=True)
         frames = []
         for number, pose in enumerate(poses):
@@ -160,13 +152,8 @@ def train_poses(count: int, seed: int) -> list[Tensor]:
     phase, shift = torch.rand(2, generator=torch.Generator().manual_seed(seed)).tolist()
     low, high = math.sin(math.radians(-10)), math.sin(math.radians(80))
     golden = math.pi * (3 - math.sqrt(5))
-    return [
-        pose_on_sphere(
-            2 * math.pi * phase + golden * k,
-            math.asin(low + (high - low) * (k + shift) / count),
-        )
-        for k in range(count)
-    ]
+    heights = (math.asin(low + (high - low) * (k + shift) / count) for k in range(count))
+    return [pose_on_sphere(2 * math.pi * phase + golden * k, h) for k, h in enumerate(heights)]
 
 
 def orbit_poses(count: int) -> list[Tensor]:

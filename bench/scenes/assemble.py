@@ -1,21 +1,21 @@
-"""Makes a Scene from described views: the last step of every loader."""
+"""Makes a Scene from described views, the last step of every loader; holds pictures out of it."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from bench.cameras import move_camera
+from bench.errors import unexpected
 from bench.scenes.bounds import Box
-from bench.scenes.files import unexpected, whole_number
-from bench.scenes.images import Pictures, View, describe_all
-from bench.types import BACKGROUNDS, Log, Scene, Split, SteerbenchError
-
-SMALLEST, LARGEST = torch.finfo(torch.float32).tiny, torch.finfo(torch.float32).max
-"""Range of lengths that float32 holds at full precision."""
+from bench.scenes.files import whole_number
+from bench.scenes.images import Pictures, View, describe
+from bench.threads import in_parallel
+from bench.types import BACKGROUNDS, Log, Scene, Split
 
 
 def every_nth(views: Sequence[View], step: int, where: Path) -> dict[str, list[View]]:
@@ -35,8 +35,7 @@ def every_nth(views: Sequence[View], step: int, where: Path) -> dict[str, list[V
 def leave_out(missing: Sequence[str], views: Sequence[View], where: str, log: Log) -> None:
     """Log the names of `missing` pictures; the scene is made from the other `views`.
 
-    Raises:
-        SteerbenchError: there are no other views.
+    Raises SteerbenchError if there are no other views.
     """
     if not views:
         raise unexpected(where, "pictures", f"none of {len(missing)} files is there")
@@ -50,8 +49,11 @@ def describe_splits(
 ) -> dict[str, Pictures]:
     """The pictures of every split, each file read once; pixels are decoded on demand."""
     whole_number(downscale, "downscale", 1)
-    found = iter(describe_all([view for split in views.values() for view in split], downscale, log))
-    return {name: Pictures([next(found) for _ in split], log) for name, split in views.items()}
+    every = [view for split in views.values() for view in split]
+    described = iter(
+        in_parallel(lambda view: describe(view, downscale), every, "read pictures", log)
+    )
+    return {name: Pictures([next(described) for _ in split], log) for name, split in views.items()}
 
 
 def assemble(
@@ -69,24 +71,18 @@ def assemble(
     Raises SteerbenchError if the box, or a camera in its units, exceeds the range of float32.
     """
     if background not in BACKGROUNDS:
-        names = " or ".join(BACKGROUNDS)
-        raise SteerbenchError(f"background: expected {names}, got {background!r}")
+        raise unexpected("background", " or ".join(BACKGROUNDS), repr(background))
     _check_float32("bounds", [box.side], box.origin.tolist())
-    splits = {
-        split: Split(
-            cameras=[
-                move_camera(picture.camera, 1 / box.side, -box.origin / box.side)
-                for picture in of_split.described
-            ],
-            images=of_split,
-            names=[picture.view.name for picture in of_split.described],
-        )
-        for split, of_split in pictures.items()
-    }
-    for part in splits.values():
-        for view, camera in zip(part.names, part.cameras, strict=True):
+    splits = {}
+    for split, of_split in pictures.items():
+        shown = of_split.described
+        scale, offset = 1 / box.side, -box.origin / box.side
+        cameras = [move_camera(picture.camera, scale, offset) for picture in shown]
+        names = [picture.view.name for picture in shown]
+        for view, camera in zip(names, cameras, strict=True):
             others = [camera.cx, camera.cy, *camera.c2w.flatten().tolist()]
             _check_float32(view, [camera.fx, camera.fy], others)
+        splits[split] = Split(cameras, of_split, names)
     corners = box.lower.tolist(), box.upper.tolist()
     digest = hashlib.sha256(repr((background, corners)).encode())
     for path in camera_files:
@@ -108,9 +104,37 @@ def assemble(
 
 def _check_float32(where: str, lengths: Sequence[float], others: Sequence[float]) -> None:
     """Raise unless all numbers fit into float32 and `lengths` stay positive in it."""
-    good = all(SMALLEST <= x <= LARGEST for x in lengths) and all(abs(x) <= LARGEST for x in others)
-    if not good:
-        raise SteerbenchError(
-            f"{where}: expected lengths that float32 has, {SMALLEST:.0e} to {LARGEST:.0e}, once "
-            f"the box is the unit cube; got {[*lengths, *others]}: look at the poses and the bounds"
-        )
+    low, high = torch.finfo(torch.float32).tiny, torch.finfo(torch.float32).max
+    if not all(low <= x <= high for x in lengths) or not all(abs(x) <= high for x in others):
+        expected = f"lengths of {low:.0e} to {high:.0e} once the box is the unit cube"
+        got = f"{[*lengths, *others]}: look at the poses and the bounds"
+        raise unexpected(where, expected, got)
+
+
+def hold_out(scene: Scene, split: str, every: int) -> Scene:
+    """Move the middle one of every `every` training pictures to a split called `split`.
+
+    In a capture along a path, the first and last picture stay in the training, so that held-out
+    pictures lie between training pictures. An existing split of that name is replaced. The digest
+    changes, so that trainings with and without these pictures are not confused.
+
+    Raises SteerbenchError if there are fewer than `every` training pictures.
+    """
+    train = scene.splits["train"]
+    if len(train) < every:
+        expected = f"at least {every} training pictures, of which one in {every} is held out"
+        raise unexpected(f"split={split}", expected, f"{len(train)} of {scene.name}")
+    held = range(every // 2, len(train), every)
+    kept = [index for index in range(len(train)) if index not in held]
+    splits = {**scene.splits, "train": _taken(train, kept), split: _taken(train, held)}
+    digest = hashlib.sha256(f"{scene.digest}, {split}: {list(held)}".encode()).hexdigest()
+    return replace(scene, splits=splits, digest=digest)
+
+
+def _taken(split: Split, indices: Sequence[int]) -> Split:
+    images = list(split.images)  # decode all in parallel, which is faster than one by one
+    return Split(
+        [split.cameras[index] for index in indices],
+        [images[index] for index in indices],
+        [split.names[index] for index in indices],
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from bench.errors import unexpected
 from bench.scenes.assemble import assemble, describe_splits
 from bench.scenes.bounds import Box, cube, hull_box, parse_box
 from bench.scenes.files import (
@@ -13,7 +14,6 @@ from bench.scenes.files import (
     inside,
     opengl_pose,
     read_json,
-    unexpected,
 )
 from bench.scenes.images import Pictures, View, image_size
 from bench.types import Camera, Log, Scene
@@ -46,8 +46,8 @@ def load(
     Raises SteerbenchError, naming file and field, if the data are not as described.
     """
     root = data_folder(path)
-    found = {split: read_split(root, split, log) for split in ("train", "val", "test")}
-    views = {split: of_split for split, of_split in found.items() if of_split}
+    read = ((split, read_split(root, split, log)) for split in ("train", "val", "test"))
+    views = {split: of_split for split, of_split in read if of_split}
     pictures = describe_splits(views, downscale, log)
     box = scene_box(bounds, pictures["train"], log)
     files = [root / camera_file(split) for split in views]
@@ -69,15 +69,13 @@ def read_split(root: Path, split: str, log: Log) -> list[View]:
     record = read_json(root, path.name)
     frames = frames_of(record, path)
     files = [picture_path(root, frame["file_path"], f"{at}.file_path") for at, frame in frames]
-    missing = [
-        (at, file) for (at, _), file in zip(frames, files, strict=True) if not file.is_file()
-    ]
+    missing = [number for number, file in enumerate(files) if not file.is_file()]
     if optional and len(missing) == len(files):
         log.info(f"{path.name}: none of its {len(files)} pictures are there, split left out")
         return []
     if missing:
-        at, file = missing[0]
-        raise unexpected(f"{at}.file_path", "a picture", f"no file {file}")
+        where = f"{frames[missing[0]][0]}.file_path"
+        raise unexpected(where, "a picture", f"no file {files[missing[0]]}")
     width, height = image_size(files[0])
     focal = focal_length(record.get("camera_angle_x"), width, f"{path}: camera_angle_x")
     views = []
@@ -103,6 +101,6 @@ def scene_box(bounds: str | list, train: Pictures, log: Log) -> Box:
         return parse_box(bounds)
     hull = hull_box([picture.camera for picture in train.described], train, space)
     if hull is None:
-        taken = f"[-{HALF_EXTENT}, {HALF_EXTENT}]^3"
-        log.info(f"bounds: the training pictures hold no masks, taking {taken}")
+        half = HALF_EXTENT
+        log.info(f"bounds: the training pictures hold no masks, taking [-{half}, {half}]^3")
     return hull or space

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from bench.cameras import project
+from bench.errors import unexpected
 from bench.threads import torch_threads
-from bench.types import Camera, SteerbenchError
+from bench.types import Camera
 
 MARGIN = 0.05
 """The box of a visual hull is enlarged by this share of its longest side, half at each end."""
@@ -58,16 +59,13 @@ def cube(half: float) -> Box:
 
 def parse_box(value: object) -> Box:
     """A box from a user's [[x0, y0, z0], [x1, y1, z1]]."""
+    expected = "auto, full or a lower and an upper corner [x, y, z]"
     try:
         corners = torch.tensor(value, dtype=torch.float64)
     except (TypeError, ValueError) as error:
-        raise SteerbenchError(
-            f"bounds: expected auto, full or two corners, got {value!r}"
-        ) from error
+        raise unexpected("bounds", expected, repr(value)) from error
     if corners.shape != (2, 3) or not corners.isfinite().all() or (corners[1] <= corners[0]).any():
-        raise SteerbenchError(
-            f"bounds: expected a lower and an upper corner [x, y, z], got {value!r}"
-        )
+        raise unexpected("bounds", expected, repr(value))
     return Box(corners[0], corners[1])
 
 
@@ -78,9 +76,7 @@ def hull_box(cameras: Sequence[Camera], images: Sequence[Tensor], space: Box) ->
     Conservative: a cell is dropped only if its whole projection, plus one pixel around it, lies
     inside a picture and shows nothing. None if the pictures are opaque or no cell is left.
     """
-    if any(image.shape[2] < 4 for image in images):
-        return None
-    if all((image[..., 3] == 255).all() for image in images):
+    if any(image.shape[2] < 4 for image in images) or all((x[..., 3] == 255).all() for x in images):
         return None
     size = (space.upper - space.lower) / CELLS
     views = list(zip(cameras, images, strict=True))

@@ -13,16 +13,16 @@ import torch
 from torch import Tensor
 
 from bench.cameras import scale_camera
-from bench.errors import Unavailable, install_command
+from bench.errors import Unavailable, install_command, unexpected
 from bench.scenes.assemble import assemble, describe_splits, every_nth, leave_out
 from bench.scenes.bounds import MARGIN, Box, parse_box
 from bench.scenes.distortion import Lens
-from bench.scenes.files import data_folder, inside, rigid_pose, unexpected
+from bench.scenes.files import data_folder, inside, rigid_pose
 from bench.scenes.images import View, image_size
 from bench.types import Camera, Log, Scene
 
 MODELS = ("sparse/0", "colmap/sparse/0", "sparse", ".")
-"""Where the model may be in a capture's folder; the first one found is used."""
+"""Where the model may be in a capture's folder; the first that holds one is used."""
 
 LISTS = {"frames": (64, "<I", 16), "images": (64, "<Q", 24), "points3D": (43, "<Q", 8)}
 """Layout of an entry in each binary list: bytes before the count of its parts (for an image, plus a
@@ -68,9 +68,9 @@ def load(
     """
     root = data_folder(path)
     folder = model_folder(root, model)
-    found = read_model(folder)
-    splits = every_nth(read_views(root, images, folder, found, log), split_every, folder)
-    box = points_box(found, folder) if bounds == "auto" else parse_box(bounds)
+    reconstruction = read_model(folder)
+    splits = every_nth(read_views(root, images, folder, reconstruction, log), split_every, folder)
+    box = points_box(reconstruction, folder) if bounds == "auto" else parse_box(bounds)
     pictures = describe_splits(splits, downscale, log)
     files = sorted(folder.glob(f"*{_kind(folder)}"))
     return assemble(root.name, pictures, box, background=background, camera_files=files)
@@ -96,9 +96,8 @@ def read_model(folder: Path) -> Any:
     try:
         import pycolmap
     except ImportError as error:
-        raise Unavailable(
-            f"{folder}: models of COLMAP need pycolmap: {install_command('colmap')}"
-        ) from error
+        how = install_command("colmap")
+        raise Unavailable(f"{folder}: models of COLMAP need pycolmap: {how}") from error
     for name in LISTS:
         check_length(folder / f"{name}.bin")
     try:
@@ -132,11 +131,11 @@ def check_length(file: Path) -> None:
         raise unexpected(file.parent, "a whole model of COLMAP", f"{file.name} cut short")
 
 
-def read_views(root: Path, images: str, folder: Path, found: Any, log: Log) -> list[View]:
+def read_views(root: Path, images: str, folder: Path, reconstruction: Any, log: Log) -> list[View]:
     """The views of all registered images whose picture exists."""
     pictures = inside(root, images, "scene.images")
     views, missing = [], []
-    for image in found.images.values():
+    for image in reconstruction.images.values():
         if not image.has_pose:
             continue
         where = f"{folder}: {image.name}"
@@ -155,23 +154,13 @@ def read_camera(image: Any, file: Path, where: str) -> tuple[Camera, Lens | None
     of_image = image.camera
     if not of_image.focal_length_idxs():
         raise unexpected(where, "a camera model with a focal length", of_image.model_name)
-    pose = image.cam_from_world().inverse().matrix().tolist()
-    camera = Camera(
-        rigid_pose([*pose, [0, 0, 0, 1]], where),
-        of_image.focal_length_x,
-        of_image.focal_length_y,
-        of_image.principal_point_x,
-        of_image.principal_point_y,
-        of_image.width,
-        of_image.height,
-    )
+    pose = rigid_pose(image.cam_from_world().inverse().matrix().tolist(), where)
+    (fx, _, cx), (_, fy, cy), _ = of_image.calibration_matrix().tolist()
+    camera = Camera(pose, fx, fy, cx, cy, of_image.width, of_image.height)
     width, height = image_size(file)
-    stretched = (width / camera.width) / (height / camera.height)
-    if abs(stretched - 1) > ASPECT:
-        expected = (
-            f"a picture of {camera.width} x {camera.height} pixels, or as wide for its height"
-        )
-        raise unexpected(file, expected, f"{width} x {height}")
+    if abs((width / camera.width) / (height / camera.height) - 1) > ASPECT:
+        expected = f"{camera.width} x {camera.height} pixels, or as wide for its height"
+        raise unexpected(file, f"a picture of {expected}", f"{width} x {height}")
     pinhole = of_image.is_perspective_pinhole() and of_image.is_undistorted()
     lens = None if pinhole else ColmapLens(of_image.model_name, tuple(of_image.params))
     return scale_camera(camera, width, height), lens
@@ -192,16 +181,14 @@ class ColmapLens:
 
     def __call__(self, points: Tensor) -> Tensor:
         camera = self._camera
-        rays = np.column_stack((points.numpy(), np.ones(len(points))))
-        seen = camera.img_from_cam(rays)
-        centre = camera.principal_point_x, camera.principal_point_y
-        focal = camera.focal_length_x, camera.focal_length_y
-        return (torch.from_numpy(seen) - points.new_tensor(centre)) / points.new_tensor(focal)
+        seen = camera.img_from_cam(np.column_stack((points.numpy(), np.ones(len(points)))))
+        matrix = torch.from_numpy(camera.calibration_matrix())
+        return (torch.from_numpy(seen) - matrix[:2, 2]) / matrix.diagonal()[:2]
 
 
-def points_box(found: Any, folder: Path) -> Box:
+def points_box(reconstruction: Any, folder: Path) -> Box:
     """The box of a model's points, without the share `STRAY` at either end of each axis."""
-    if not found.num_points3D():
+    if not reconstruction.num_points3D():
         raise unexpected(folder, "points, or scene.bounds=[[x,y,z],[x,y,z]]", "no point")
-    box = found.compute_bounding_box(STRAY, 1 - STRAY)
+    box = reconstruction.compute_bounding_box(STRAY, 1 - STRAY)
     return Box(torch.tensor(box.min), torch.tensor(box.max)).grown(MARGIN)

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from bench.cameras import crop_camera, pixel_grid
-from bench.scenes.files import unexpected
+from bench.errors import unexpected
 from bench.types import Camera
 
 Lens = Callable[[Tensor], Tensor]
@@ -47,14 +47,10 @@ class Fisheye:
 
 
 def undistort(image: Tensor, camera: Camera, lens: Lens, where: Path) -> Tensor:
-    """Undistort `image` to the pinhole picture of `undistorted_camera`.
+    """Undistort `image`, uint8 [H, W, C], to the pinhole picture of `undistorted_camera`.
 
-    Args:
-        image: uint8 [H, W, C].
-        camera: intrinsics of the distorted picture, which the pinhole keeps.
-        lens: the lens that the picture was taken with.
-        where: the picture, for messages.
-
+    `camera` has the intrinsics of the distorted picture, which the pinhole keeps; `where` names the
+    picture in messages.
     Raises SteerbenchError if the lens folds the picture over itself.
     """
     source, _, _ = _window(camera, lens, where)
@@ -79,23 +75,21 @@ def undistorted_camera(camera: Camera, lens: Lens, where: Path) -> Camera:
 
 
 def _window(camera: Camera, lens: Lens, where: Path) -> tuple[Tensor, int, int]:
-    """`pinhole_window` of `camera`; an error names the picture."""
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     try:
         return pinhole_window(camera.width, camera.height, intrinsics, lens)
     except ValueError as error:
-        expected = "a lens distortion that can be undone"
-        raise unexpected(where, expected, f"{lens}: {error}") from error
+        raise unexpected(
+            where, "a lens distortion that can be undone", f"{lens}: {error}"
+        ) from error
 
 
 @lru_cache(maxsize=2)  # most captures have one lens
 def pinhole_window(
     width: int, height: int, intrinsics: tuple[float, float, float, float], lens: Lens
 ) -> tuple[Tensor, int, int]:
-    """Positions in the distorted picture of those pinhole pixels that lie inside it.
-
-    Returns [h, w, 2] as (u, v), and the column and row of the first of these pixels.
-    """
+    """Positions [h, w, 2] as (u, v) in the distorted picture of the pinhole pixels inside it, and
+    the column and row of the first of these; ValueError if the distortion cannot be undone."""
     focal, centre = torch.tensor(intrinsics, dtype=torch.float64).split(2)
     points = lens((pixel_grid(width, height).double() - centre) / focal)
     source = (points * focal + centre).reshape(height, width, 2).float()

@@ -10,22 +10,18 @@ import math
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from bench.types import SteerbenchError
+from bench.errors import unexpected
 
 SMALLEST_ANGLE = 1e-9
 """Smallest angle of view in radians: below any telescope's, but its tangent is not 0."""
 
 ORTHONORMAL_TOLERANCE = 1e-3
 """Largest entry of R^T R - I. Poses are stored with at least three digits."""
-
-
-def unexpected(where: str | Path, expected: str, got: object) -> SteerbenchError:
-    """The error that says what was expected at `where` and what was found."""
-    return SteerbenchError(f"{where}: expected {expected}, got {got}")
 
 
 def data_folder(path: str | Path) -> Path:
@@ -74,27 +70,33 @@ def read_json(root: Path, relative: str) -> dict:
     return value
 
 
+def entries_of(record: Mapping, name: str, path: Path) -> list[tuple[str, dict]]:
+    """The objects in the list `name` as (position for messages, object); at least one."""
+    entries = record.get(name)
+    if not isinstance(entries, list) or not entries:
+        raise unexpected(f"{path}: {name}", "a list with at least one entry", describe(entries))
+    placed = [(f"{path}: {name}[{index}]", entry) for index, entry in enumerate(entries)]
+    for where, entry in placed:
+        if not isinstance(entry, dict):
+            raise unexpected(where, "an object", describe(entry))
+    return placed
+
+
 def frames_of(record: Mapping, path: Path) -> list[tuple[str, dict]]:
-    """The frames of a `transforms*.json` as (position for messages, object); at least one."""
-    frames = record.get("frames")
-    if not isinstance(frames, list) or not frames:
-        raise unexpected(f"{path}: frames", "a list with at least one frame", describe(frames))
-    named = [(f"{path}: frames[{index}]", frame) for index, frame in enumerate(frames)]
-    for where, frame in named:
-        if not isinstance(frame, dict):
-            raise unexpected(where, "an object", describe(frame))
+    """The frames of a `transforms*.json` as from `entries_of`, each with a `file_path`."""
+    frames = entries_of(record, "frames", path)
+    for where, frame in frames:
         if not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
             raise unexpected(f"{where}.file_path", "a path", describe(frame.get("file_path")))
-    return named
+    return frames
 
 
-def number(value: object, where: str, low: float = -math.inf, high: float = math.inf) -> float:
+def number(value: Any, where: str, low: float = -math.inf, high: float = math.inf) -> float:
     """A finite number with low < value < high."""
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        # Compare before converting: an integer of hundreds of digits overflows a float.
-        fits = low < value < high and abs(value) < sys.float_info.max
-        if fits:
-            return float(value)
+    real = isinstance(value, int | float) and not isinstance(value, bool)
+    # Compare before converting: an integer of hundreds of digits overflows a float.
+    if real and low < value < high and abs(value) < sys.float_info.max:
+        return float(value)
     limits = [f"above {low:g}"] * (low > -math.inf) + [f"below {high:g}"] * (high < math.inf)
     expected = f"a finite number {' and '.join(limits)}".rstrip()
     raise unexpected(where, expected, describe(value))
@@ -105,19 +107,19 @@ def focal_length(angle: object, size: float, where: str) -> float:
     return size / 2 / math.tan(number(angle, where, SMALLEST_ANGLE, math.pi) / 2)
 
 
-def whole_number(value: object, where: str, low: int) -> int:
-    """An integer, at least `low`."""
-    if isinstance(value, int) and not isinstance(value, bool) and value >= low:
-        return value
+def whole_number(value: Any, where: str, low: int) -> int:
+    """A whole number, at least `low`; 3.0 is one, too."""
+    real = isinstance(value, int | float) and not isinstance(value, bool)
+    if real and low <= value < math.inf and value == int(value):
+        return int(value)
     raise unexpected(where, f"a whole number from {low} on", describe(value))
 
 
 def numbers(text: str, where: str | Path) -> list[list[float]]:
     """The numbers of a text, line by line, without empty lines."""
     try:
-        return [
-            [float(word) for word in line.split()] for line in text.splitlines() if line.split()
-        ]
+        lines = (line.split() for line in text.splitlines())
+        return [[float(word) for word in words] for words in lines if words]
     except ValueError as error:
         raise unexpected(where, "numbers", error) from error
 
@@ -145,8 +147,7 @@ def rigid_pose(value: object, where: str) -> Tensor:
 
 def opengl_pose(frame: Mapping, where: str) -> Tensor:
     """The pose in a frame of a `transforms*.json`, as from `rigid_pose` but with OpenCV axes."""
-    matrix = rigid_pose(frame.get("transform_matrix"), f"{where}.transform_matrix")
-    return opengl_to_opencv(matrix)
+    return opengl_to_opencv(rigid_pose(frame.get("transform_matrix"), f"{where}.transform_matrix"))
 
 
 def opengl_to_opencv(pose: Tensor) -> Tensor:

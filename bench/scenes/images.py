@@ -16,14 +16,14 @@ from PIL import Image
 from torch import Tensor
 
 from bench.cameras import crop_camera, scale_camera
+from bench.errors import unexpected
 from bench.scenes.distortion import Lens, undistort, undistorted_camera
-from bench.scenes.files import unexpected
-from bench.scenes.parallel import in_parallel
+from bench.threads import in_parallel
 from bench.types import Camera, Log
 
 MOST_PIXELS = 1 << 26
-"""Upper limit for a picture. Decoding, converting and copying take 12 bytes per pixel: 0.8 GB. A
-header of a few bytes can announce more than any machine can hold."""
+"""Upper limit for a picture: decoding takes 12 bytes per pixel, and a header of a few bytes can
+announce more than any machine can hold."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,7 @@ class Pictures(Sequence[Tensor]):
 
     Decoded on first access and kept. Iteration decodes all of them in parallel.
 
-    Raises:
-        SteerbenchError: a file is damaged, or has changed since it was described.
+    Raises SteerbenchError if a file is damaged, or has changed since it was described.
     """
 
     def __init__(self, described: Sequence[Picture], log: Log) -> None:
@@ -71,7 +70,7 @@ class Pictures(Sequence[Tensor]):
 
     def __getitem__(self, place: Any) -> Any:
         index = range(len(self))[place]
-        return self._at(index) if isinstance(index, int) else [self._at(one) for one in index]
+        return self._at(index) if isinstance(index, int) else [self._at(i) for i in index]
 
     def __iter__(self) -> Iterator[Tensor]:
         missing = [index for index in range(len(self)) if index not in self._decoded]
@@ -89,8 +88,8 @@ class Pictures(Sequence[Tensor]):
 def opened(source: Path | io.BytesIO, where: Path) -> Iterator[Image.Image]:
     """The picture in `source`, with only its header read.
 
-    Raises:
-        SteerbenchError: not a picture, too large, or found to be damaged while it is used.
+    Raises SteerbenchError if it is not a picture, is too large, or turns out to be damaged while it
+    is used.
     """
     try:
         with Image.open(source) as image:
@@ -108,16 +107,10 @@ def image_size(path: Path) -> tuple[int, int]:
         return image.size
 
 
-def describe_all(views: Sequence[View], downscale: int, log: Log) -> list[Picture]:
-    """`describe` all views in parallel, in the given order."""
-    return in_parallel(lambda view: describe(view, downscale), views, "read pictures", log)
-
-
 def describe(view: View, downscale: int) -> Picture:
     """Describe a view as a pinhole picture at 1 / downscale of its resolution, without decoding it.
 
-    Raises:
-        SteerbenchError: not a picture, not of the expected size, or too small.
+    Raises SteerbenchError if it is not a picture, not of the expected size, or too small.
     """
     content, camera = contents(view.path), view.camera
     with opened(io.BytesIO(content), view.path) as image:
@@ -143,7 +136,7 @@ def decode(picture: Picture) -> Tensor:
 
 
 def contents(path: Path) -> bytes:
-    """The bytes of a picture's file."""
+    """The bytes of a picture's file; SteerbenchError if it cannot be read."""
     try:
         return path.read_bytes()
     except OSError as error:
@@ -180,21 +173,25 @@ def shrink(image: Tensor, factor: int) -> Tensor:
     height, width = image.shape[0] // factor, image.shape[1] // factor
     blocks = image[: height * factor, : width * factor].long()
     blocks = blocks.reshape(height, factor, width, factor, -1)
+    whole = torch.tensor(factor**2)
+
+    def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
+        return (2 * numerator + denominator) // (2 * denominator)  # rounded, halves up
+
     if image.shape[2] == 3:
-        small = rounded_ratio(blocks.sum((1, 3)), torch.tensor(factor**2))
+        small = ratio(blocks.sum((1, 3)), whole)
     else:
         alpha = blocks[..., 3:]
         mass = alpha.sum((1, 3))
-        colour = rounded_ratio((blocks[..., :3] * alpha).sum((1, 3)), mass.clamp(min=1))
-        small = torch.cat((colour, rounded_ratio(mass, torch.tensor(factor**2))), dim=-1)
+        colour = ratio((blocks[..., :3] * alpha).sum((1, 3)), mass.clamp(min=1))
+        small = torch.cat((colour, ratio(mass, whole)), dim=-1)
     return small.to(torch.uint8)
 
 
 def shrunk_camera(camera: Camera, factor: int, where: Path) -> Camera:
     """The exact camera of a picture after `shrink`.
 
-    Raises:
-        SteerbenchError: the picture is smaller than a block.
+    Raises SteerbenchError if the picture is smaller than a block.
     """
     if factor == 1:
         return camera
@@ -203,8 +200,3 @@ def shrunk_camera(camera: Camera, factor: int, where: Path) -> Camera:
         got = f"{camera.width} x {camera.height}"
         raise unexpected(where, f"at least {factor} x {factor} pixels for this downscale", got)
     return scale_camera(crop_camera(camera, 0, 0, width * factor, height * factor), width, height)
-
-
-def rounded_ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
-    """numerator / denominator of integers, rounded to the nearest integer, halves up."""
-    return (2 * numerator + denominator) // (2 * denominator)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bench.scenes.raytrace import Band, Span, Traced
-from bench.scenes.solids import ball_interval
+from bench.scenes.solids import ball_interval, box_corners
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,8 @@ class Cloud:
 
     def boxes(self) -> Tensor:
         """Corners of a box around each ball, [P, 8, 3]."""
-        signs = torch.cartesian_prod(*(torch.tensor((-1.0, 1.0)),) * 3)
-        centres = torch.tensor([ball.centre for ball in self.balls])[:, None]
-        return centres + signs * torch.tensor([ball.radius for ball in self.balls])[:, None, None]
+        balls = self.balls
+        return torch.stack([torch.tensor(b.centre) + box_corners((b.radius,) * 3) for b in balls])
 
     def trace(self, band: Band, spans: Sequence[Span]) -> Traced:
         """Integrate all balls in `spans` together, for the rays that hit any of them."""
@@ -60,9 +59,9 @@ class Cloud:
         speed = torch.stack([d[met] for d in directions]).norm(dim=0)  # length per unit of t
         density = speed.new_tensor([ball.density for ball in balls])
         colour = speed.new_tensor([ball.colour for ball in balls])
-        found = integrate(enter[:, met], leave[:, met], speed, density, colour)
+        seen = integrate(enter[:, met], leave[:, met], speed, density, colour)
         rgb, (alpha, depth) = speed.new_zeros(*shape, 3), speed.new_zeros(2, *shape)
-        rgb[met], alpha[met], depth[met] = found
+        rgb[met], alpha[met], depth[met] = seen
         return Traced(rgb, alpha, depth)
 
 

@@ -59,8 +59,8 @@ class Draw:
         """A whole number from `low` to `high`, both included."""
         return low + int((high + 1 - low) * self.share())
 
-    def one(self, items: Sequence[Item]) -> Item:
-        """One of the items."""
+    def pick(self, items: Sequence[Item]) -> Item:
+        """A random one of the items."""
         return items[self.whole(0, len(items) - 1)]
 
     def deck(self, items: Sequence[Item], count: int) -> list[Item]:
@@ -109,7 +109,7 @@ def place(draw: Draw, shape: Shape, core: Sequence[Part]) -> Triple:
     """
     if not core:
         return (0.0, 0.0, 0.0)
-    ground = draw.one(core) if len(core) == CORE else core[0]
+    ground = draw.pick(core) if len(core) == CORE else core[0]
     outward = ground.centre
     if len(core) in (2, 4):  # opposite to the previous part
         outward = scaled(core[-1].centre, -1)
@@ -237,7 +237,7 @@ def palette(draw: Draw) -> list[Colour]:
 
 def pair(draw: Draw, colours: list[Colour]) -> tuple[Colour, Colour]:
     """A light and a dark colour, in random order."""
-    light, dark = draw.one(colours[::2]), draw.one(colours[1::2])
+    light, dark = draw.pick(colours[::2]), draw.pick(colours[1::2])
     return (light, dark) if draw.share() < 0.5 else (dark, light)
 
 
@@ -286,7 +286,7 @@ PATTERNS: tuple[Painter, ...] = (
 )
 PAINTERS: tuple[Painter, ...] = (
     *PATTERNS,
-    lambda draw, colours, size: textures.plain(draw.one(colours)),
-    lambda draw, colours, size: textures.eye(draw.one(colours)),
+    lambda draw, colours, size: textures.plain(draw.pick(colours)),
+    lambda draw, colours, size: textures.eye(draw.pick(colours)),
 )
 """Functions that make a texture from some of the colours, for a part of the given size."""

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from bench.errors import unexpected
 from bench.scenes.assemble import assemble, describe_splits
 from bench.scenes.bounds import MARGIN, Box
 from bench.scenes.files import (
@@ -16,7 +17,6 @@ from bench.scenes.files import (
     numbers,
     read_text,
     rigid_pose,
-    unexpected,
 )
 from bench.scenes.images import View, image_size
 from bench.types import Camera, Log, Scene

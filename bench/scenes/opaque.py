@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from bench.scenes.raytrace import Band, Span, Traced
-from bench.scenes.solids import Carved, Shape, unit
+from bench.scenes.solids import Carved, Shape, box_corners, unit
 from bench.scenes.textures import Texture
 
 LIGHT = (0.48, -0.6, 0.64)
@@ -49,9 +49,7 @@ class Part:
 
     def box(self) -> Tensor:
         """Corners of a box around the part, [8, 3]."""
-        signs = torch.cartesian_prod(*(torch.tensor((-1.0, 1.0)),) * 3)
-        corners = signs * torch.tensor(self.shape.extent())
-        return corners @ self.frame.T + torch.tensor(self.centre)
+        return box_corners(self.shape.extent()) @ self.frame.T + torch.tensor(self.centre)
 
 
 class Solids:
@@ -81,10 +79,10 @@ class Solids:
             part, columns = self.parts[number], slice(first, last)
             frame = part.frame.to(depth)
             x, y, z = ((band.origin - depth.new_tensor(part.centre)) @ frame).tolist()
-            found = part.shape.hit((x, y, z), band.directions(frame, columns))
+            t = part.shape.hit((x, y, z), band.directions(frame, columns))
             nearest = depth[:, columns]
-            owner[:, columns].masked_fill_(found < nearest, number)
-            torch.minimum(nearest, found, out=nearest)
+            owner[:, columns].masked_fill_(t < nearest, number)
+            torch.minimum(nearest, t, out=nearest)
         seen = owner >= 0
         rgb = depth.new_zeros(*shape, 3)
         for number, first, last in spans:

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from bench.cameras import project
-from bench.types import EMPTY_ALPHA, Camera, Frame, SteerbenchError
+from bench.errors import unexpected
+from bench.types import EMPTY_ALPHA, Camera, Frame
 
 BAND_RAYS = 1 << 18
 """Rays per band: enough to hide the cost of calls, few enough to stay in the cache."""
@@ -98,7 +99,7 @@ def render(model: Model, camera: Camera, background: Tensor, samples: int) -> Fr
 def sample_offsets(samples: int) -> Tensor:
     """Hammersley points [samples, 2] in a pixel, one in each of `samples` rows and columns."""
     if samples < 1 or samples & (samples - 1):
-        raise SteerbenchError(f"samples: expected a power of two, got {samples}")
+        raise unexpected("samples", "a power of two", samples)
     bits = samples.bit_length() - 1
     index, mirrored = torch.arange(samples), torch.zeros(samples, dtype=torch.int64)
     for bit in range(bits):

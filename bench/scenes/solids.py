@@ -194,11 +194,10 @@ class Common(Convex):
 
     def extent(self) -> Triple:
         x, y, z = map(min, self.first.extent(), self.second.extent())
-        return (x, y, z)
+        return x, y, z
 
     def interval(self, origin: Origin, directions: Directions) -> Interval:
-        first, second = (x.interval(origin, directions) for x in (self.first, self.second))
-        return overlap(first, second)
+        return overlap(*(x.interval(origin, directions) for x in (self.first, self.second)))
 
     def distance(self, points: Tensor) -> Tensor:
         return torch.maximum(self.first.distance(points), self.second.distance(points))
@@ -285,6 +284,11 @@ def slab(origin: float | Tensor, direction: Tensor, half: float) -> Interval:
 def sum_of_products(first: Sequence, second: Sequence) -> Tensor:
     """Dot product of vectors given as components."""
     return sum((a * b for a, b in zip(first[1:], second[1:], strict=True)), first[0] * second[0])
+
+
+def box_corners(half: Triple) -> Tensor:
+    """Corners [8, 3] of a centred box with half sizes `half`."""
+    return torch.cartesian_prod(*(torch.tensor((-1.0, 1.0)),) * 3) * torch.tensor(half)
 
 
 def unit(vectors: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from typing import Concatenate, ParamSpec
 
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample, pad
 
 Colour = tuple[float, float, float]
 Texture = Callable[[Tensor], Tensor]
@@ -38,12 +39,10 @@ def checker(points: Tensor, first: Colour, second: Colour, size: float) -> Tenso
 
 
 @texture
-def polar_checker(
-    points: Tensor, first: Colour, second: Colour, sectors: int, ring: float
-) -> Tensor:
-    """Sectors around z and rings (or levels) of width `ring`, alternating."""
+def polar_checker(points: Tensor, first: Colour, second: Colour, count: int, ring: float) -> Tensor:
+    """`count` sectors around z and rings (or levels) of width `ring`, alternating."""
     x, y, z = points.unbind(1)
-    sector = (torch.atan2(y, x) * sectors / (2 * math.pi)).floor()
+    sector = (torch.atan2(y, x) * count / (2 * math.pi)).floor()
     level = ((x * x + y * y).sqrt() / ring + 0.29).floor() + (z / ring + 0.29).floor()
     return pick((sector + level) % 2 < 1, first, second)
 
@@ -112,17 +111,15 @@ def noise(points: Tensor) -> Tensor:
     # Trilinear at smoothstep coordinates, which avoids creases at the borders of cells.
     place = (cell + part * part * (3 - 2 * part)) / (table.shape[-1] - 1)
     place = (place - place.floor()) * 2 - 1  # [-1, 1] spans the table from first to last vertex
-    values = torch.nn.functional.grid_sample(
-        table[None, None], place[None, None, None], align_corners=True
-    )
-    return values.reshape(-1)
+    sampled = grid_sample(table[None, None], place[None, None, None], align_corners=True)
+    return sampled.reshape(-1)
 
 
 @cache
 def lattice() -> Tensor:
     """[33, 33, 33] random values; the last planes repeat the first ones."""
     values = torch.rand(32, 32, 32, generator=torch.Generator().manual_seed(1))
-    return torch.nn.functional.pad(values[None, None], (0, 1) * 3, mode="circular")[0, 0]
+    return pad(values[None, None], (0, 1) * 3, mode="circular")[0, 0]
 
 
 def pick(condition: Tensor, first: Colour, second: Colour) -> Tensor:

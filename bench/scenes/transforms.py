@@ -7,7 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
+from bench.cameras import scale_camera
+from bench.errors import unexpected
 from bench.scenes.assemble import assemble, describe_splits, every_nth, leave_out
 from bench.scenes.bounds import Box
 from bench.scenes.distortion import Fisheye, Lens, RadialTangential
@@ -20,14 +23,14 @@ from bench.scenes.files import (
     number,
     opengl_pose,
     read_json,
-    unexpected,
+    whole_number,
 )
 from bench.scenes.images import View, image_size
 from bench.types import Camera, Log, Scene
 
 CAMERA_FILE = "transforms.json"
 
-NGP_SCALE, NGP_OFFSET = 0.33, (0.5, 0.5, 0.5)
+NGP_SCALE, NGP_OFFSET = 0.33, [0.5, 0.5, 0.5]
 """instant-ngp maps the file's coordinates x to scale * x + offset in its unit cube."""
 
 USUAL = ("k1", "k2", "p1", "p2", "k3")
@@ -85,29 +88,32 @@ def read_views(root: Path, record: dict, log: Log) -> list[View]:
         if not file.is_file():
             missing.append(frame["file_path"])
             continue
-        settings = ChainMap(frame, record)
-        camera = read_camera(settings, opengl_pose(frame, where), file, where)
+        settings, pose = ChainMap(frame, record), opengl_pose(frame, where)
+        width, height = image_size(file)
+        usual = Camera(pose, 0, 0, width / 2, height / 2, width, height)  # without a focal length
+        camera = read_camera(settings, pose, usual, where)
         lens = read_lens(settings, where)
         views.append(View(str(file.relative_to(root)), file, camera, lens))
     leave_out(missing, views, f"{path}: frames", log)
     return views
 
 
-def read_camera(settings: ChainMap, pose: torch.Tensor, file: Path, where: str) -> Camera:
-    """The pinhole camera of a frame; a missing size is read from the picture's header.
+def read_camera(settings: ChainMap, pose: Tensor, usual: Camera, where: str) -> Camera:
+    """The pinhole camera of a frame; what is not given is that of `usual`, scaled to its size.
 
     Focal lengths come from fl_x and fl_y or from camera_angle_x and camera_angle_y. A missing
-    vertical one equals the horizontal one; a missing principal point is the centre.
+    vertical one equals the horizontal one.
     """
-    size = dict(zip(("w", "h"), image_size(file), strict=True))
-    width, height = (number(settings.get(k, size[k]), f"{where}.{k}", 0) for k in ("w", "h"))
-    fx = focal(settings, "x", width, where)
-    if fx is None:
+    width = whole_number(settings.get("w", usual.width), f"{where}.w", 1)
+    height = whole_number(settings.get("h", usual.height), f"{where}.h", 1)
+    usual = scale_camera(usual, width, height)
+    given = focal(settings, "x", width, where)
+    fx, fy = given or usual.fx, focal(settings, "y", height, where) or given or usual.fy
+    if not fx:
         raise unexpected(f"{where}.fl_x", "a focal length, or camera_angle_x", "neither")
-    fy = focal(settings, "y", height, where) or fx
-    cx = number(settings.get("cx", width / 2), f"{where}.cx", 0, width)
-    cy = number(settings.get("cy", height / 2), f"{where}.cy", 0, height)
-    return Camera(pose, fx, fy, cx, cy, int(width), int(height))
+    cx = number(settings.get("cx", usual.cx), f"{where}.cx", 0, width)
+    cy = number(settings.get("cy", usual.cy), f"{where}.cy", 0, height)
+    return Camera(pose, fx, fy, cx, cy, width, height)
 
 
 def focal(settings: ChainMap, axis: str, size: float, where: str) -> float | None:
@@ -127,9 +133,8 @@ def focal(settings: ChainMap, axis: str, size: float, where: str) -> float | Non
 def read_lens(settings: Mapping, where: str) -> Lens | None:
     """The lens of a frame; None for a pinhole. instant-ngp's `is_fisheye` means OPENCV_FISHEYE.
 
-    Raises:
-        SteerbenchError: the model is not in `LENSES`, or the file has a term that it does not
-            support. k4 of the model OPENCV means different things in nerfstudio and OpenCV.
+    Raises SteerbenchError if the model is not in `LENSES`, or the file has a term that it does not
+    support. k4 of the model OPENCV means different things in nerfstudio and OpenCV.
     """
     model = settings.get("camera_model", "OPENCV")
     if settings.get("is_fisheye"):
@@ -147,13 +152,12 @@ def read_lens(settings: Mapping, where: str) -> Lens | None:
 def capture_box(path: Path, record: dict, aabb_scale: float | None) -> Box:
     """The cube `aabb_scale` times as large as instant-ngp's unit cube, in the file's units."""
     scale = number(record.get("scale", NGP_SCALE), f"{path}: scale", 0)
-    offset = record.get("offset", list(NGP_OFFSET))
+    offset = record.get("offset", NGP_OFFSET)
     if not isinstance(offset, list) or len(offset) != 3:
         raise unexpected(f"{path}: offset", "three numbers", describe(offset))
     offset = [number(x, f"{path}: offset[{i}]") for i, x in enumerate(offset)]
-    if aabb_scale is None:
-        sides = number(record.get("aabb_scale", 1), f"{path}: aabb_scale", 0)
-    else:
-        sides = number(aabb_scale, "aabb_scale", 0)
+    given = aabb_scale is not None
+    sides = aabb_scale if given else record.get("aabb_scale", 1)
+    half = number(sides, "aabb_scale" if given else f"{path}: aabb_scale", 0) / scale / 2
     middle = (0.5 - torch.tensor(offset, dtype=torch.float64)) / scale
-    return Box(middle - sides / scale / 2, middle + sides / scale / 2)
+    return Box(middle - half, middle + half)

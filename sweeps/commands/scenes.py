@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bench.console import ConsoleLog
-from bench.scenes.integrity import verify
-from bench.scenes.published import Published, get, published
+from bench.published import Published, get, published, verify
 from sweeps.names import unknown
 
 SHOWN = 5

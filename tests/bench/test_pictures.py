@@ -125,28 +125,24 @@ def test_another_number_has_no_order(tmp_path: Path) -> None:
         pictures.pairs_with_folder(ours, true, "order")
 
 
-def test_another_size_is_refused_with_both_names(tmp_path: Path, quiet_log: Log) -> None:
-    ours = write(tmp_path / "ours", {"a.png": noise(size=(8, 10))})
-    true = write(tmp_path / "true", {"a.jpg": noise()})
-    pairs = pictures.pairs_with_folder(ours, true)
-    with pytest.raises(SteerbenchError, match=r"ours/a.png: expected 20 x 16 .* a.jpg .* 10 x 8"):
+@pytest.mark.parametrize(
+    ("ours", "true", "message"),
+    [
+        (noise(size=(8, 10)), noise(), r"ours/a.png: expected 20 x 16 .* a.png .* 10 x 8"),
+        (noise(size=(8, 10)), noise(size=(8, 10)), r"ours/a.png: ssim needs"),
+        (None, noise(), r"ours/a.png: expected a whole picture"),
+    ],
+)
+def test_a_picture_that_cannot_be_scored_is_named(
+    tmp_path: Path, quiet_log: Log, ours: Tensor | None, true: Tensor, message: str
+) -> None:
+    theirs = write(tmp_path / "ours", {"a.png": noise() if ours is None else ours})
+    if ours is None:  # a file cut in half
+        whole = (theirs / "a.png").read_bytes()
+        (theirs / "a.png").write_bytes(whole[: len(whole) // 2])
+    pairs = pictures.pairs_with_folder(theirs, write(tmp_path / "true", {"a.png": true}))
+    with pytest.raises(SteerbenchError, match=message):
         pictures.score(pairs, QUICK, {}, FACTS, quiet_log)
-
-
-def test_a_picture_too_small_for_a_metric_is_named(tmp_path: Path, quiet_log: Log) -> None:
-    tiny = {"a.png": noise(size=(8, 10))}
-    pairs = pictures.pairs_with_folder(write(tmp_path / "x", tiny), write(tmp_path / "y", tiny))
-    with pytest.raises(SteerbenchError, match=r"x/a.png: ssim needs"):
-        pictures.score(pairs, QUICK, {}, FACTS, quiet_log)
-
-
-def test_a_picture_that_is_cut_is_named(tmp_path: Path, quiet_log: Log) -> None:
-    ours = write(tmp_path / "ours", {"a.png": noise()})
-    true = write(tmp_path / "true", {"a.png": noise()})
-    whole = (ours / "a.png").read_bytes()
-    (ours / "a.png").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(SteerbenchError, match=r"ours/a.png: expected a whole picture"):
-        pictures.score(pictures.pairs_with_folder(ours, true), QUICK, {}, FACTS, quiet_log)
 
 
 def test_what_a_run_rendered_has_its_figures_to_the_last_digit(

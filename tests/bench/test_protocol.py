@@ -35,24 +35,13 @@ def test_a_changed_protocol_may_not_keep_the_name():
     assert EvaluationProtocol(name="nsvf", ssim="uniform").ssim == "uniform"
 
 
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [
-        ("rounding", "floor"),
-        ("ssim", "ms"),
-        ("background", "grey"),
-        ("memory", "warm"),
-        ("flicker", "no"),
-    ],
-)
+CHOICES = {"rounding": "floor", "ssim": "ms", "background": "grey", "memory": "warm"}
+
+
+@pytest.mark.parametrize(("option", "value"), [*CHOICES.items(), ("flicker", "no"), ("warmup", -1)])
 def test_an_unknown_choice_names_the_option_and_what_is_allowed(option, value):
-    with pytest.raises(SteerbenchError, match=f"protocol.{option}: expected .* got '{value}'"):
+    with pytest.raises(SteerbenchError, match=f"protocol.{option}: expected .* got '?{value}"):
         EvaluationProtocol(**{"name": "mine", option: value})
-
-
-def test_a_negative_warmup_is_refused():
-    with pytest.raises(SteerbenchError, match=r"protocol\.warmup"):
-        EvaluationProtocol(name="mine", warmup=-1)
 
 
 def test_a_picture_is_composited_with_its_straight_alpha(device):
@@ -86,32 +75,22 @@ def test_every_metric_is_scored_and_a_missing_backbone_is_nan():
     assert scores["lpips_vgg"] == 0.5
 
 
-def test_backbones_that_cannot_be_had_are_named_with_the_reason(
-    monkeypatch, tmp_path, quiet_log, lpips_weights
+def test_backbones_that_cannot_be_had_are_named_with_the_reason_once_in_a_process(
+    monkeypatch, tmp_path, log, lpips_weights
 ):
-    monkeypatch.setattr("bench.lpips_weights._unreachable", ["no network"])
+    monkeypatch.setattr("bench.protocol._named", set())
+    monkeypatch.setattr("bench.published._unreachable", ["no network"])
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     monkeypatch.delenv("STEERBENCH_WEIGHTS", raising=False)
     (tmp_path / "alexnet_features.pth").symlink_to(lpips_weights / "alexnet_features.pth")
-    protocol = EvaluationProtocol()
     weights = (tmp_path / "alexnet_features.pth").read_bytes()
-    found = protocol.find_lpips(tmp_path, quiet_log)
+    found = EvaluationProtocol().find_lpips(tmp_path, log)
     assert found == {"alex": hashlib.sha256(weights).hexdigest(), "vgg": None}
-    loaded, missing = protocol.load_lpips(tmp_path, quiet_log)
-    assert list(loaded) == ["alex"]
-    assert list(missing) == ["lpips_vgg"]
-    assert "no network" in missing["lpips_vgg"]
-
-
-def test_a_missing_backbone_is_logged_once_in_a_process(monkeypatch, tmp_path, quiet_log):
-    monkeypatch.setattr("bench.protocol._named", set())
-    monkeypatch.setattr("bench.lpips_weights._unreachable", ["no network"])
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    monkeypatch.delenv("STEERBENCH_WEIGHTS", raising=False)
-    said: list[str] = []
-    monkeypatch.setattr(quiet_log, "info", said.append)
-    reasons = [EvaluationProtocol().load_lpips(None, quiet_log)[1] for _ in range(2)]
-    assert [line.split(":")[0] for line in said] == ["lpips_alex", "lpips_vgg"] == list(reasons[1])
+    for _ in range(2):
+        loaded, missing = EvaluationProtocol().load_lpips(tmp_path, log)
+        assert (list(loaded), list(missing)) == (["alex"], ["lpips_vgg"])
+        assert "no network" in missing["lpips_vgg"]
+    assert [message.split(":")[0] for message in log.messages] == ["lpips_vgg"]
 
 
 def test_a_scene_on_another_background_is_refused(tiny_scene):

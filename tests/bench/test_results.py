@@ -108,17 +108,12 @@ def test_text_stays_text(store, text):
     assert (row["method"], row["precision"]) == (text, text)
 
 
-def test_the_rows_of_several_runs_stand_below_each_other(store):
+def test_the_rows_of_several_runs_stand_below_each_other_under_all_columns(store):
+    assert list(store.rows().columns) == COLUMNS
     keys = {store.save({"seed": seed}, measurement([seed, 2.0])) for seed in range(3)}
     rows = store.rows()
     assert len(rows) == 6
     assert set(rows["run"]) == keys
-
-
-def test_an_empty_store_has_no_rows_but_all_columns(store):
-    rows = store.rows()
-    assert rows.empty
-    assert list(rows.columns) == COLUMNS
 
 
 def test_a_run_cannot_be_seen_before_it_is_whole(store):
@@ -188,48 +183,6 @@ def test_what_vanishes_while_the_store_is_cleaned_loses_no_run(store):
     assert store.find(key) is not None
 
 
-def as_schema_2(store: Store, key: str, versions: dict, engines: dict) -> None:
-    """Make the record of a run what the version before this one wrote."""
-    path = store.folder / key / "record.json"
-    record = json.loads(path.read_text()) | {"schema_version": 2}
-    record["machine"] |= {"versions": versions, "engines": engines}
-    path.write_text(json.dumps(record))
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("steernerf", "steernerf_lean"),
-        ("steernerf_frozen", "steernerf_lean_frozen"),
-        ("steernerf_k3", "steernerf_lean_k3"),
-        ("steernerf_paper", "steernerf"),
-        ("steernerf_paper_k3", "steernerf_k3"),
-        ("steernerfs", "steernerfs"),
-        ("my_steernerf", "my_steernerf"),
-        ("ngp", "ngp"),
-    ],
-)
-def test_a_method_of_schema_2_is_read_under_its_present_name(store, old, new):
-    key, present = (store.save({"seed": i}, measurement([1.0, 2.0], old)) for i in range(2))
-    as_schema_2(store, key, {}, {})
-    rows = store.rows().set_index("run")
-    assert rows.loc[key, "method"].tolist() == [new, new]
-    assert rows.loc[key, "scene"].tolist() == [old, old]
-    assert rows.loc[present, "method"].tolist() == [old, old]
-
-
-def test_the_libraries_of_a_run_stand_in_one_place_whatever_its_schema(store):
-    old = store.save({"seed": 0}, measurement([1.0]))
-    as_schema_2(store, old, {"torch": "2.13"}, {"openvino": "2026.1"})
-    new = store.save({"libraries": {"torch": "2.14"}}, measurement([1.0]))
-    assert store.record(old)["made_of"] == {
-        "seed": 0,
-        "libraries": {"torch": "2.13", "openvino": "2026.1"},
-    }
-    assert not {"versions", "engines"} & store.record(old)["machine"].keys()
-    assert store.record(new)["made_of"] == {"libraries": {"torch": "2.14"}}
-
-
 def test_a_run_of_another_schema_is_reported_and_left_out(store):
     kept, foreign, damaged = (store.save({"seed": i}, measurement([1.0])) for i in range(3))
     record = store.folder / foreign / "record.json"
@@ -243,11 +196,10 @@ def test_a_run_of_another_schema_is_reported_and_left_out(store):
         store.rows()
 
 
-def test_an_unknown_run_is_a_clear_error(store):
+@pytest.mark.parametrize("read", [Store.frames, Store.record])
+def test_an_unknown_run_is_a_clear_error(store, read):
     with pytest.raises(SteerbenchError, match="no run 'abc' in"):
-        store.frames("abc")
-    with pytest.raises(SteerbenchError, match="no run 'abc' in"):
-        store.record("abc")
+        read(store, "abc")
 
 
 def test_outputs_that_is_a_file_is_a_clear_error(tmp_path):

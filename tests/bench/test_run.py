@@ -265,7 +265,7 @@ def test_flicker_has_a_row_in_the_phases_that_have_a_pair(run, offset_method, ti
 def test_a_backbone_that_cannot_be_had_leaves_nan_and_its_reason(
     run, offset_method, monkeypatch, tmp_path, lpips_weights
 ):
-    monkeypatch.setattr("bench.lpips_weights._unreachable", ["no network"])
+    monkeypatch.setattr("bench.published._unreachable", ["no network"])
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     monkeypatch.delenv("STEERBENCH_WEIGHTS", raising=False)
     (tmp_path / "alexnet_features.pth").symlink_to(lpips_weights / "alexnet_features.pth")

@@ -191,12 +191,9 @@ def test_a_single_file_counts_with_the_module_beside_it_that_it_imports(
     assert digest(thing) != before
 
 
-def test_libraries_are_those_that_the_sources_import(tree):
+def test_libraries_are_those_that_the_sources_import_and_a_class_lists(tree):
     assert libraries(METHOD) == {"numpy": metadata.version("numpy")}
     assert libraries(defined_in("bench.unused")) == {}
-
-
-def test_libraries_that_are_loaded_by_name_are_those_that_a_class_lists(tree):
     thing = defined_in("bench.unused", libraries=("scipy", "not-installed"))
     assert libraries(thing) == {"scipy": metadata.version("scipy")}
 

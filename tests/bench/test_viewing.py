@@ -71,12 +71,8 @@ def test_a_still_picture_gives_way_to_a_camera_that_moves() -> None:
     assert turns.next(0) == ("a", moving)
     turns.offer("a", still)
     assert turns.next(0) == ("a", still)
-
-
-def test_who_has_gone_waits_no_longer() -> None:
-    turns = Turns()
-    turns.want("a", Ask(CAMERA))
-    turns.forget("a")
+    turns.want("a", moving)
+    turns.forget("a")  # it has gone
     turns.forget("nobody")
     assert turns.next(0) is None
 

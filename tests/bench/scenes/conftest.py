@@ -1,42 +1,37 @@
-"""A log that keeps its messages, and a small NeRF-Synthetic folder to break."""
+"""Pictures, poses, and a small NeRF-Synthetic folder to break."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+import struct
+import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
-
-class RememberingLog:
-    """`messages` are the lines said, `done` the steps counted by all progress bars."""
-
-    def __init__(self) -> None:
-        self.messages: list[str] = []
-        self.done = 0
-
-    def info(self, message: str) -> None:
-        self.messages.append(message)
-
-    @contextmanager
-    def progress(self, label: str, total: int) -> Iterator[RememberingLog]:
-        yield self
-
-    def advance(self, steps: int = 1, note: str = "") -> None:
-        self.done += steps
-
-    def stage_dir(self, kind: str, key: Mapping[str, object]) -> Path:
-        raise AssertionError("loading a scene trains nothing")
+from bench.cameras import look_at
+from bench.types import Camera
 
 
-@pytest.fixture
-def log() -> RememberingLog:
-    """A log that keeps its messages."""
-    return RememberingLog()
+def camera_at(
+    eye: tuple[float, float, float], size: int = 96, device: str | torch.device = "cpu"
+) -> Camera:
+    """A camera of size x size pixels that looks at the origin, z up."""
+    c2w = look_at(torch.tensor(eye), torch.zeros(3), torch.tensor((0.0, 0.0, 1.0)))
+    return Camera(c2w.to(device), 1.3 * size, 1.3 * size, size / 2, size / 2, size, size)
+
+
+def png(header: bytes, data: bytes) -> bytes:
+    """A PNG of a header and compressed rows that need not suit one another."""
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(data)), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        for kind, body in chunks
+    )
 
 
 @pytest.fixture

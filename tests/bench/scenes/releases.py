@@ -7,8 +7,8 @@ from collections.abc import Mapping
 
 import pytest
 
-from bench.scenes import integrity
-from bench.scenes.published import Published
+from bench import published
+from bench.published import Published
 from sweeps.commands import scenes
 
 
@@ -17,6 +17,6 @@ def publish(monkeypatch: pytest.MonkeyPatch, files: Mapping[str, bytes], **where
     data = Published("release", "blender", "free", **where)
     hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
     data.__dict__["hashes"] = hashes  # as if they had been read
-    for module in (integrity, scenes):
+    for module in (published, scenes):
         monkeypatch.setattr(module, "published", lambda: [data])
     return data

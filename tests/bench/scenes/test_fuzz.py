@@ -9,8 +9,8 @@ import math
 import resource
 import struct
 import warnings
-import zlib
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from bench.console import ConsoleLog
 from bench.scenes import blender, nsvf, transforms
 from bench.scenes.images import decode_bytes
 from bench.types import Scene, SteerbenchError
+from tests.bench.scenes.conftest import png
 
 QUIET = ConsoleLog(Path(), quiet=True)
 IN_ONE_FOLDER = settings(
@@ -71,10 +72,7 @@ def records(draw: st.DrawFn) -> Any:
     for _ in range(draw(st.integers(0, 3))):
         inside = [place for place in places(record) if place]
         if draw(st.booleans()) or not inside:
-            target = record
-            if not isinstance(record, dict):
-                return record
-            target[draw(st.sampled_from(KEYS))] = draw(NUMBERS | VALUES)
+            record[draw(st.sampled_from(KEYS))] = draw(NUMBERS | VALUES)
             continue
         *way, last = draw(st.sampled_from(inside))
         parent = record
@@ -125,12 +123,7 @@ def headers(draw: st.DrawFn) -> bytes:
     header = struct.pack(
         ">IIBBBBB", draw(size), draw(size), *(draw(st.integers(0, 17)) for _ in range(5))
     )
-    data = zlib.compress(draw(st.binary(max_size=64)) + bytes(draw(st.sampled_from([0, 200]))))
-    chunks = ((b"IHDR", header), (b"IDAT", data), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-        for kind, body in chunks
-    )
+    return png(header, draw(st.binary(max_size=64)) + bytes(draw(st.sampled_from([0, 200]))))
 
 
 @pytest.fixture(autouse=True)
@@ -182,25 +175,18 @@ def loads_or_refuses(load: Callable[[], Scene]) -> None:
             assert image.dtype == torch.uint8
 
 
+FILES = {
+    "transforms.json": transforms.load,
+    "transforms_train.json": partial(blender.load, bounds="full"),
+}
+
+
+@pytest.mark.parametrize("file", FILES)
 @IN_ONE_FOLDER
-@given(records(), st.sampled_from([1, 2]))
-def test_a_capture_of_any_structure(folder: Path, record: Any, downscale: int) -> None:
-    (folder / "transforms.json").write_text(json.dumps(record))
-    loads_or_refuses(lambda: transforms.load(folder, downscale=downscale, log=QUIET))
-
-
-@IN_ONE_FOLDER
-@given(records())
-def test_a_synthetic_scene_of_any_structure(folder: Path, record: Any) -> None:
-    (folder / "transforms_train.json").write_text(json.dumps(record))
-    loads_or_refuses(lambda: blender.load(folder, bounds="full", log=QUIET))
-
-
-@IN_ONE_FOLDER
-@given(changed(json.dumps(RECORD).encode()))
-def test_a_capture_of_any_bytes(folder: Path, content: bytes) -> None:
-    (folder / "transforms.json").write_bytes(content)
-    loads_or_refuses(lambda: transforms.load(folder, log=QUIET))
+@given(records().map(json.dumps).map(str.encode) | changed(json.dumps(RECORD).encode()))
+def test_a_camera_file_of_any_structure_or_bytes(folder: Path, file: str, content: bytes) -> None:
+    (folder / file).write_bytes(content)
+    loads_or_refuses(lambda: FILES[file](folder, downscale=len(content) % 2 + 1, log=QUIET))
 
 
 @st.composite

@@ -7,18 +7,14 @@ import math
 import pytest
 import torch
 
-from bench.cameras import cast, look_at
+from bench.cameras import cast
 from bench.scenes.media import Ball, Cloud
 from bench.scenes.models import cloud
 from bench.scenes.raytrace import render
 from bench.types import Camera
+from tests.bench.scenes.conftest import camera_at
 
 BLACK = torch.zeros(3)
-
-
-def camera_at(eye: tuple[float, float, float], size: int, device: str = "cpu") -> Camera:
-    c2w = look_at(torch.tensor(eye), torch.zeros(3), torch.tensor((0.0, 0.0, 1.0)))
-    return Camera(c2w.to(device), 1.3 * size, 1.3 * size, size / 2, size / 2, size, size)
 
 
 @pytest.mark.parametrize("density", [0.01, 1.0, 30.0])
@@ -69,14 +65,6 @@ def test_overlapping_balls_against_quadrature(eye) -> None:
     assert (got - depth[seen]).abs().max() <= 4 * error
     # And on average far closer, for errors at the surfaces have both signs.
     assert (frame.alpha.flatten() - alpha).abs().mean() <= error / 20
-
-
-def test_balls_in_a_different_order_give_the_same_picture() -> None:
-    camera = camera_at((0.5, -3.0, 1.0), 16)
-    forward = render(cloud(), camera, BLACK, samples=1)
-    backward = render(Cloud(cloud().balls[::-1]), camera, BLACK, samples=1)
-    torch.testing.assert_close(forward.rgb, backward.rgb, rtol=0, atol=1e-5)
-    torch.testing.assert_close(forward.alpha, backward.alpha, rtol=0, atol=1e-5)
 
 
 def test_a_ball_cut_into_two_halves_of_its_density_is_the_same() -> None:

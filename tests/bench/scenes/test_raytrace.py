@@ -8,23 +8,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.cameras import cast, look_at, scale_camera
+from bench.cameras import cast, scale_camera
 from bench.scenes import raytrace
 from bench.scenes.models import totem, wires
 from bench.scenes.opaque import LIGHT, Part, Solids
 from bench.scenes.raytrace import ProjectedBoxes, render, sample_offsets
 from bench.scenes.solids import Capsule, Ellipsoid
 from bench.scenes.textures import plain
-from bench.types import EMPTY_ALPHA, Camera, SteerbenchError
+from bench.types import EMPTY_ALPHA, SteerbenchError
+from tests.bench.scenes.conftest import camera_at
 
 RED = plain((1.0, 0.0, 0.0))
 CELL = math.sqrt(2) / 4
 """Diagonal of the quarter-pixel cell that each of 16 samples stands for."""
-
-
-def camera_at(eye: tuple[float, float, float], size: int = 96, device: str = "cpu") -> Camera:
-    c2w = look_at(torch.tensor(eye), torch.zeros(3), torch.tensor((0.0, 0.0, 1.0)))
-    return Camera(c2w.to(device), 1.3 * size, 1.3 * size, size / 2, size / 2, size, size)
 
 
 def sphere(radius: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Part:
@@ -37,9 +33,6 @@ def test_16_samples_stand_for_the_16_quarter_pixel_cells() -> None:
     assert sorted(cells) == [[a, b] for a in range(4) for b in range(4)]
     assert len(set(offsets[:, 0].tolist())) == len(set(offsets[:, 1].tolist())) == 16
     assert offsets.mean(0).tolist() == [0.5, 0.5]
-
-
-def test_one_sample_is_the_centre() -> None:
     assert sample_offsets(1).tolist() == [[0.5, 0.5]]
 
 
@@ -84,9 +77,8 @@ def test_a_thin_wire_covers_its_width() -> None:
 
 def test_nothing_seen_is_the_background_at_infinity() -> None:
     background = torch.tensor((0.2, 0.4, 0.6))
-    frame = render(
-        Solids([sphere(0.1, (9.0, 9.0, 0.0))]), camera_at((0.0, -4.0, 0.0)), background, 4
-    )
+    beside = Solids([sphere(0.1, (9.0, 9.0, 0.0))])
+    frame = render(beside, camera_at((0.0, -4.0, 0.0)), background, 4)
     assert (frame.rgb == background).all()
     assert frame.depth.isinf().all()
     assert (frame.alpha == 0).all()
@@ -123,9 +115,8 @@ def test_shadow_of_a_sphere_is_the_closed_form() -> None:
     caster, ground = sphere(0.3, (0.2, -0.1, 0.8)), sphere(0.01, (0.0, 0.0, -0.5))
     model = Solids([ground, caster])
     generator = torch.Generator().manual_seed(0)
-    points = torch.cat(
-        (3 * torch.rand(4000, 2, generator=generator) - 1.5, torch.zeros(4000, 1)), 1
-    )
+    flat = 3 * torch.rand(4000, 2, generator=generator) - 1.5
+    points = torch.cat((flat, torch.zeros(4000, 1)), 1)
     offset = torch.tensor(caster.centre) - points
     light = torch.tensor(LIGHT)
     ahead = offset @ light
@@ -158,13 +149,9 @@ def test_highlights_move_with_the_viewer() -> None:
     places = []
     for eye in ((0.0, -4.0, 0.0), (1.5, -3.7, 0.0)):
         camera = camera_at(eye)
-        extra = (
-            render(glossy, camera, torch.zeros(3), 4).rgb
-            - render(top, camera, torch.zeros(3), 4).rgb
-        )[..., 1]
-        place = extra.argmax().item()
-        row, column = divmod(place, camera.width)
-        depth = render(top, camera, torch.zeros(3), 4).depth[row, column]
+        shiny, matt = (render(model, camera, torch.zeros(3), 4) for model in (glossy, top))
+        row, column = divmod((shiny.rgb - matt.rgb)[..., 1].argmax().item(), camera.width)
+        depth = matt.depth[row, column]
         ray = cast(camera, torch.tensor([[column + 0.5, row + 0.5]]))
         places.append(ray.origins[0] + depth * ray.directions[0])
     assert (places[0] - places[1]).norm() > 0.05

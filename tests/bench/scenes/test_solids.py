@@ -58,6 +58,14 @@ def hits(shape: Shape, origins: torch.Tensor, directions: torch.Tensor) -> torch
     return shape.hit(tuple(origins.unbind(1)), tuple(directions.unbind(1)))
 
 
+def met(shape: Shape, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where rays hit the shape, and the directions of these rays, [N, 3]."""
+    origins, directions = rays(count)
+    found = hits(shape, origins, directions)
+    hit = found.isfinite()
+    return origins[hit] + found[hit, None] * directions[hit], directions[hit]
+
+
 def test_the_hit_is_the_first_change_of_sign(shape) -> None:
     origins, directions = rays(300)
     found = hits(shape, origins, directions)
@@ -73,12 +81,9 @@ def test_the_hit_is_the_first_change_of_sign(shape) -> None:
 
 
 def test_the_sign_changes_at_the_hit(shape) -> None:
-    origins, directions = rays(300)
-    found = hits(shape, origins, directions)
-    met = found.isfinite()
-    points = origins[met] + found[met, None] * directions[met]
+    points, directions = met(shape, 300)
     assert shape.distance(points).abs().max() < 1e-9
-    step = 1e-5 * directions[met] / directions[met].norm(dim=1, keepdim=True)
+    step = 1e-5 * directions / directions.norm(dim=1, keepdim=True)
     across = (shape.normal(points) * step).sum(1).abs() > 1e-7  # not along the surface
     before, after = shape.distance(points - step), shape.distance(points + step)
     edges = (before * after > 0) & across
@@ -87,29 +92,17 @@ def test_the_sign_changes_at_the_hit(shape) -> None:
 
 
 def test_normals_are_the_gradient_of_the_distance(shape) -> None:
-    origins, directions = rays(300)
-    found = hits(shape, origins, directions)
-    met = found.isfinite()
-    points = origins[met] + found[met, None] * directions[met]
-    step = 1e-6
-    gradient = torch.stack(
-        [
-            (shape.distance(points + step * axis) - shape.distance(points - step * axis))
-            / (2 * step)
-            for axis in torch.eye(3, dtype=torch.float64)
-        ],
-        dim=1,
-    )
+    points, _ = met(shape, 300)
+    steps = 1e-6 * torch.eye(3, dtype=torch.float64)
+    rise = [shape.distance(points + step) - shape.distance(points - step) for step in steps]
+    gradient = torch.stack(rise, dim=1) / 2e-6
     smooth = (gradient.norm(dim=1) - 1).abs() < 1e-3  # else an edge lies within the step
     assert smooth.float().mean() > 0.98
     torch.testing.assert_close(shape.normal(points)[smooth], gradient[smooth], rtol=0, atol=1e-3)
 
 
 def test_the_extent_holds_every_hit(shape) -> None:
-    origins, directions = rays(2000)
-    found = hits(shape, origins, directions)
-    met = found.isfinite()
-    points = origins[met] + found[met, None] * directions[met]
+    points, _ = met(shape, 2000)
     assert (points.abs() <= torch.tensor(shape.extent(), dtype=torch.float64) + 1e-9).all()
 
 

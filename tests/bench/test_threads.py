@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bench.scenes.parallel import WORKERS, in_parallel
+from bench.threads import WORKERS, in_parallel
 
 
 def test_results_keep_their_order_and_are_counted(log) -> None:

@@ -1,0 +1,312 @@
+"""What others publish: data sets, and backbones of LPIPS. Downloads them with pooch, checks them.
+
+`scenes/published.toml` describes the data sets; the SHA-256 of each file is in a pooch registry.
+Weights are searched in `weights_dir`, `$STEERBENCH_WEIGHTS` and torch's hub cache, in this order.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import re
+import tempfile
+import tomllib
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from bench.errors import unexpected
+from bench.scenes.files import data_folder
+from bench.sharing import locked
+from bench.threads import in_parallel
+from bench.types import Log, SteerbenchError, Unavailable
+
+LISTS = Path(__file__).parent / "scenes"
+GROUND_TRUTH = ("_depth_", "_normal_")
+"""Marks in the names of pictures that no loader reads; an archive may lack these pictures."""
+
+WEIGHTS_ADDRESS = "https://download.pytorch.org/models/"
+TIMEOUT_S = 10.0
+
+
+class Backbone(NamedTuple):
+    """File names of a backbone: torchvision's own, and one with only its `features.*`."""
+
+    published: str
+    features: str
+
+
+BACKBONES = {
+    "alex": Backbone("alexnet-owt-7be5be79.pth", "alexnet_features.pth"),
+    "vgg": Backbone("vgg16-397923af.pth", "vgg16_features.pth"),
+    "squeeze": Backbone("squeezenet1_1-b8a52dc0.pth", "squeezenet1_1_features.pth"),
+}
+
+_unreachable: list[str] = []  # why a download of weights failed
+
+
+@dataclass(frozen=True)
+class Published:
+    """A data set, as `published.toml` describes it.
+
+    Attributes:
+        archive: URL of a zip file with the folder of one `{scene}`; or
+        folder: URL of the folder with all files.
+        layout: the value of `scene=` that reads its scenes.
+        licence: the licence of the data.
+    """
+
+    name: str
+    layout: str
+    licence: str
+    archive: str | None = None
+    folder: str | None = None
+
+    @cached_property
+    def hashes(self) -> Mapping[str, str]:
+        """SHA-256 of each file, by its path, which starts with the scene's name."""
+        import pooch  # imported here and below: it takes 0.1 s, and few commands need it
+
+        registry = pooch.create(LISTS, "")
+        registry.load_registry(LISTS / f"{self.name}.registry.txt")
+        return registry.registry
+
+    @property
+    def scenes(self) -> set[str]:
+        """The names of the scenes."""
+        return {name.split("/")[0] for name in self.hashes}
+
+    def of(self, scene: str) -> dict[str, str]:
+        """The part of `hashes` that belongs to `scene`."""
+        return {name: d for name, d in self.hashes.items() if name.split("/")[0] == scene}
+
+
+def published() -> list[Published]:
+    """All known published data sets."""
+    content = tomllib.loads((LISTS / "published.toml").read_text(encoding="utf-8"))
+    return [Published(name, **about) for name, about in content.items()]
+
+
+def get(data: Published, scene: str, folder: Path, log: Log) -> Path:
+    """Download a scene of `data` into `folder` / `scene`, keeping correct existing files.
+
+    Raises:
+        Unavailable: no answer, the connection breaks off, or files have other content.
+        OSError: `folder` cannot be written to.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    wanted = data.of(scene)
+    with locked(folder / ".lock", f"waits for another process that fills {folder}", log):
+        if data.folder is not None:
+            with log.progress(f"downloading {scene}", len(wanted)) as progress:
+                for name, digest in wanted.items():
+                    fetch(data.folder + name, folder / name, digest, log)
+                    progress.advance()
+        elif data.archive is not None and _wrong(folder, wanted):
+            archive = fetch(data.archive.format(scene=scene), folder / f"{scene}.zip", None, log)
+            try:
+                _unpack(archive, wanted, folder)
+            finally:  # no longer needed, or damaged
+                archive.unlink()
+    return folder / scene
+
+
+def fetch(address: str, target: Path, sha256: str | None, log: Log) -> Path:
+    """Download `address` to `target` unless it is there already and correct; returns `target`.
+
+    A download that breaks off leaves nothing. `sha256` None: the content is not checked.
+
+    Raises:
+        Unavailable: no answer, the connection breaks off, or the content has another hash.
+        OSError: `target` cannot be written.
+    """
+    import pooch
+    import requests
+
+    def download(address: str, output_file: str, pooch: object) -> None:
+        with requests.get(address, stream=True, timeout=TIMEOUT_S) as answer:
+            answer.raise_for_status()
+            total = int(answer.headers.get("Content-Length", 0))
+            with (
+                Path(output_file).open("wb") as file,
+                log.progress(f"downloading {target.name}", total) as progress,
+            ):
+                for chunk in answer.iter_content(1 << 16):
+                    file.write(chunk)
+                    progress.advance(len(chunk))
+
+    pooch.get_logger().setLevel("WARNING")
+    try:
+        pooch.retrieve(address, sha256, target.name, target.parent, downloader=download)
+    except requests.RequestException as error:
+        # The message of a lost connection is that of four nested exceptions.
+        offline = type(error) in (requests.ConnectionError, requests.ConnectTimeout)
+        why = "no connection" if offline else error
+        raise Unavailable(f"the download of {address} failed ({why})") from error
+    except ValueError as error:  # from pooch, which has deleted the file
+        raise Unavailable(f"the download of {address} is damaged: {error}") from error
+    return target
+
+
+def _unpack(archive: Path, wanted: Mapping[str, str], folder: Path) -> None:
+    """Extract the `wanted` files, if they are correct, from the zip file into `folder`."""
+    with tempfile.TemporaryDirectory(dir=folder) as new:
+        try:
+            with zipfile.ZipFile(archive) as file:
+                there = [name for name in file.namelist() if name in wanted]
+                file.extractall(new, there)
+        except (zipfile.BadZipFile, EOFError) as error:
+            raise Unavailable(f"{archive.name}: expected a zip file, {error}; try again") from error
+        if wrong := _wrong(Path(new), wanted):
+            raise Unavailable(
+                f"{archive.name}: expected the published files, {len(wrong)} of {len(wanted)} are "
+                f"missing or have another SHA-256, {wrong[0]} the first of them"
+            )
+        for name in there:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (Path(new) / name).replace(folder / name)
+
+
+def _wrong(folder: Path, wanted: Mapping[str, str]) -> list[str]:
+    """The `wanted` files that are present but differ, or missing although a loader needs them."""
+    needed = {n for n in wanted if (folder / n).exists() or not any(m in n for m in GROUND_TRUTH)}
+    return [name for name in wanted if name in needed and _sha256(folder / name) != wanted[name]]
+
+
+def _sha256(path: Path) -> str | None:
+    """SHA-256 of a file's content; None if it cannot be read."""
+    import pooch
+
+    try:
+        return pooch.file_hash(str(path))
+    except OSError:
+        return None
+
+
+@dataclass(frozen=True)
+class VerifyReport:
+    """A copy of a data set, compared with its registry: files by their path in the release.
+
+    Attributes:
+        ok: present, with the official content.
+        wrong: present, but with other content or unreadable.
+        missing: on the list, but not present.
+        extra: present, but not on the list.
+    """
+
+    ok: Sequence[str]
+    wrong: Sequence[str]
+    missing: Sequence[str]
+    extra: Sequence[str]
+
+    @property
+    def passed(self) -> bool:
+        """Whether no file is wrong. Missing files do not count: perhaps they were never copied."""
+        return bool(self.ok) and not self.wrong
+
+    def __str__(self) -> str:
+        return ", ".join(f"{len(names)} {kind}" for kind, names in vars(self).items())
+
+
+def verify(path: str | Path, log: Log) -> VerifyReport:
+    """Check the whole release, or one scene of it; folder names tell which.
+
+    Raises SteerbenchError if `path` looks like neither.
+    """
+    root = data_folder(path)
+    base, expected = _expected(root)
+    files = (file for file in root.rglob("*") if file.is_file())
+    inside = (file for file in files if file.resolve().is_relative_to(root))
+    present = {file.relative_to(base).as_posix() for file in inside}
+    known = sorted(present & expected.keys())
+    digests = in_parallel(_sha256, [base / name for name in known], "verify", log)
+    right = {name for name, digest in zip(known, digests, strict=True) if digest == expected[name]}
+    return VerifyReport(
+        ok=[name for name in known if name in right],
+        wrong=[name for name in known if name not in right],
+        missing=sorted(expected.keys() - present),
+        extra=sorted(present - expected.keys()),
+    )
+
+
+def _expected(root: Path) -> tuple[Path, Mapping[str, str]]:
+    """The folder that the listed paths are relative to, and the list of hashes."""
+    known = published()
+    for data in known:
+        if root.name in data.scenes:
+            return root.parent, data.of(root.name)
+        if any((root / scene).is_dir() for scene in data.scenes):
+            return root, data.hashes
+    folders = sorted(scene for data in known for scene in data.scenes)
+    raise unexpected(root, f"a folder {' or '.join(folders)}, or one above", "none of these names")
+
+
+def locate(net: str, weights_dir: Path | None, log: Log) -> Path:
+    """The weight file of backbone `net`, downloaded into torch's hub cache if need be.
+
+    A file with a SHA-256 in its name is checked against it.
+
+    Raises:
+        SteerbenchError: `net` is unknown, or `weights_dir` is not a folder.
+        Unavailable: there is no file and the download failed, or the file is damaged.
+    """
+    if net not in BACKBONES:
+        raise SteerbenchError(f"LPIPS net: expected one of {', '.join(BACKBONES)}, got {net!r}")
+    if weights_dir is not None and not weights_dir.is_dir():
+        raise SteerbenchError(f"weights_dir: expected a folder, got {weights_dir}")
+    name, features = BACKBONES[net]
+    cache = Path(torch.hub.get_dir()) / "checkpoints"
+    folders = [Path(f) for f in (weights_dir, os.environ.get("STEERBENCH_WEIGHTS"), cache) if f]
+    for path in (folder / file for folder in folders for file in (features, name)):
+        if path.is_file():
+            return _verified(path)
+    # After one failure no process tries again: every backbone would wait for the same connection.
+    if not _unreachable:
+        try:
+            cache.mkdir(parents=True, exist_ok=True)
+            with locked(cache / f".{name}.lock", f"waits for another download of {name}", log):
+                path = fetch(WEIGHTS_ADDRESS + name, cache / name, None, log)
+                try:
+                    return _verified(path)
+                except Unavailable:
+                    path.unlink()
+                    raise
+        except (OSError, SteerbenchError) as error:
+            _unreachable.append(str(error))
+    raise Unavailable(
+        f"{name} is not on this machine, and {_unreachable[0]}; "
+        "name a folder that has it as weights_dir=DIR or in $STEERBENCH_WEIGHTS"
+    )
+
+
+def load_features(net: str, weights_dir: Path | None, log: Log) -> tuple[Path, dict[str, Tensor]]:
+    """The weight file of backbone `net` and the tensors in it; raises as `locate` does."""
+    path = locate(net, weights_dir, log)
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError):
+        state = None
+    if not isinstance(state, dict):
+        raise Unavailable(
+            f"{path}: expected a torch state dict, could not read one; fetch the file again "
+            f"from {WEIGHTS_ADDRESS}{BACKBONES[net].published}"
+        )
+    return path, state
+
+
+def _verified(path: Path) -> Path:
+    """Return `path`; raise if its name holds a SHA-256 that its content does not match."""
+    promised = re.search(r"-([0-9a-f]{8})\.pth$", path.name)
+    got = _sha256(path) if promised else None
+    if promised and not (got or "").startswith(promised[1]):
+        raise Unavailable(
+            f"{path}: expected a SHA-256 that begins with {promised[1]}, got {got}; "
+            "the file is damaged: delete it and fetch it again"
+        )
+    return path

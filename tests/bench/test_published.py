@@ -1,0 +1,282 @@
+"""Data sets and weights of others: downloads that break off or lie, copies that differ.
+
+The publisher is a server on the loopback address.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import socket
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+
+from bench import published
+from bench.published import BACKBONES, Backbone, fetch, get, load_features, locate, verify
+from bench.types import SteerbenchError, Unavailable
+from tests.bench.scenes.releases import publish
+from tests.web import Web
+
+CONTENT = bytes(range(256)) * 600
+FILES = {"mic/train/r_0.png": b"a", "mic/test/r_0.png": b"b", "mic/test/r_0_depth_0000.png": b"c"}
+STATE = {"features.0.weight": torch.ones(2), "classifier.1.weight": torch.zeros(3)}
+
+
+def found(folder: Path) -> dict[str, bytes]:
+    """All files but locks, by their paths."""
+    paths = [path for path in folder.rglob("*") if path.is_file() and path.name != ".lock"]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
+
+
+def zipped(files: dict[str, bytes]) -> bytes:
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return content.getvalue()
+
+
+def download(web: Web, folder: Path, log) -> bytes:
+    digest = hashlib.sha256(CONTENT).hexdigest()
+    return fetch(web.address + "file", folder / "file", digest, log).read_bytes()
+
+
+def test_what_is_there_and_right_is_not_downloaded_again(web, tmp_path, quiet_log):
+    web.files["/file"] = CONTENT
+    assert download(web, tmp_path, quiet_log) == CONTENT
+    assert download(web, tmp_path, quiet_log) == CONTENT
+    assert web.asked == ["/file"]
+    assert found(tmp_path) == {"file": CONTENT}
+
+
+@pytest.mark.parametrize(
+    ("content", "breaks_after", "message"),
+    [
+        (CONTENT, 100_000, r"the download of http://127.0.0.1:\d+/file failed"),
+        (CONTENT[::-1], None, "is damaged"),
+        (None, None, r"/file failed \(404"),
+    ],
+    ids=["broken off", "another content", "not there"],
+)
+def test_a_download_that_fails_says_why_and_leaves_nothing(
+    web, tmp_path, quiet_log, content, breaks_after, message
+):
+    if content is not None:
+        web.files["/file"] = content
+    web.breaks_after = breaks_after
+    with pytest.raises(Unavailable, match=message):
+        download(web, tmp_path, quiet_log)
+    assert found(tmp_path) == {}
+
+
+def test_without_a_connection_the_message_says_so_in_two_words(tmp_path, quiet_log):
+    nobody = socket.create_server(("127.0.0.1", 0))
+    address = f"http://127.0.0.1:{nobody.getsockname()[1]}/file"
+    nobody.close()
+    with pytest.raises(Unavailable, match=r"/file failed \(no connection\)$"):
+        fetch(address, tmp_path / "file", None, quiet_log)
+
+
+def test_the_list_of_nerf_synthetic_is_the_whole_release() -> None:
+    official = next(data for data in published.published() if data.name == "nerf_synthetic")
+    scenes = {"chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship"}
+    assert official.scenes == scenes
+    for scene in scenes:
+        for split, count in (("train", 100), ("val", 100), ("test", 200)):
+            pictures = {f"{scene}/{split}/r_{k}.png" for k in range(count)}
+            assert pictures | {f"{scene}/transforms_{split}.json"} <= official.of(scene).keys()
+    assert all(len(digest) == 64 for digest in official.hashes.values())
+
+
+def test_a_copy_of_fox_has_the_checksums_of_its_list(shared_data, quiet_log) -> None:
+    if shared_data is None:
+        pytest.skip("no data")
+    report = verify(shared_data / "fox", quiet_log)
+    assert (report.passed, report.wrong, report.missing, report.extra) == (True, [], [], [])
+
+
+def test_a_scene_is_unpacked_and_only_what_is_on_the_list(monkeypatch, web, tmp_path, quiet_log):
+    data = publish(monkeypatch, FILES, archive=web.address + "{scene}.zip")
+    web.files["/mic.zip"] = zipped(FILES | {"../evil": b"!", "mic/notes.txt": b"mine"})
+    for _ in range(2):
+        assert get(data, "mic", tmp_path / "data", quiet_log) == tmp_path / "data" / "mic"
+        assert found(tmp_path) == {f"data/{name}": content for name, content in FILES.items()}
+    assert len(web.asked) == 1
+
+
+def test_an_archive_may_lack_depths(monkeypatch, web, tmp_path, quiet_log) -> None:
+    data = publish(monkeypatch, FILES, archive=web.address + "{scene}.zip")
+    pictures = {name: content for name, content in FILES.items() if "depth" not in name}
+    web.files["/mic.zip"] = zipped(pictures)
+    get(data, "mic", tmp_path, quiet_log)
+    assert found(tmp_path) == pictures
+
+
+@pytest.mark.parametrize(
+    "archive",
+    [
+        b"not a zip file",
+        zipped(FILES | {"mic/train/r_0.png": b"other"}),
+        zipped({"mic/test/r_0.png": b"b"}),
+    ],
+    ids=["no archive", "another picture", "a picture missing"],
+)
+def test_a_wrong_archive_leaves_nothing_behind(monkeypatch, web, tmp_path, quiet_log, archive):
+    data = publish(monkeypatch, FILES, archive=web.address + "{scene}.zip")
+    web.files["/mic.zip"] = archive
+    with pytest.raises(Unavailable, match=r"mic.zip: expected"):
+        get(data, "mic", tmp_path, quiet_log)
+    assert found(tmp_path) == {}
+
+
+def test_of_single_files_the_wrong_ones_are_fetched_again(monkeypatch, web, tmp_path, quiet_log):
+    data = publish(monkeypatch, FILES, folder=web.address)
+    web.files = {f"/{name}": content for name, content in FILES.items()}
+    get(data, "mic", tmp_path, quiet_log)
+    assert found(tmp_path) == FILES
+    (tmp_path / "mic/train/r_0.png").write_bytes(b"damaged")
+    web.asked.clear()
+    get(data, "mic", tmp_path, quiet_log)
+    assert found(tmp_path) == FILES
+    assert web.asked == ["/mic/train/r_0.png"]
+
+
+@pytest.fixture
+def release(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of a release of two scenes, with nothing wrong."""
+    files = {"chair/a.png": b"a", "chair/b.png": b"b", "mic/c.png": b"c"}
+    for name, content in files.items():
+        path = tmp_path / "release" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    publish(monkeypatch, files)
+    return tmp_path / "release"
+
+
+@pytest.mark.parametrize(("part", "count"), [(".", 3), ("chair", 2)])
+def test_a_true_copy_of_a_release_or_a_scene_passes(release, quiet_log, part, count) -> None:
+    report = verify(release / part, quiet_log)
+    assert str(report) == f"{count} ok, 0 wrong, 0 missing, 0 extra"
+    assert report.passed
+
+
+def test_every_difference_is_named_and_links_out_of_the_copy_are_not_followed(
+    release, tmp_path, quiet_log
+) -> None:
+    (release / "chair/a.png").write_bytes(b"other")
+    (release / "chair/b.png").unlink()
+    (release / "mic/notes.txt").write_text("mine")
+    report = verify(release, quiet_log)
+    assert (report.ok, report.wrong) == (["mic/c.png"], ["chair/a.png"])
+    assert (report.missing, report.extra) == (["chair/b.png"], ["mic/notes.txt"])
+    assert not report.passed
+    (release / "mic/c.png").rename(tmp_path / "outside.png")
+    (release / "mic/c.png").symlink_to(tmp_path / "outside.png")
+    assert verify(release, quiet_log).missing == ["chair/b.png", "mic/c.png"]
+
+
+def test_another_folder_is_refused(tmp_path, quiet_log) -> None:
+    with pytest.raises(SteerbenchError, match=r"expected a folder chair"):
+        verify(tmp_path, quiet_log)
+
+
+@pytest.fixture
+def publisher(monkeypatch, tmp_path, web) -> Web:
+    """An empty cache, no environment, and a publisher of weights with no file."""
+    monkeypatch.setattr(published, "WEIGHTS_ADDRESS", web.address)
+    monkeypatch.setattr(published, "_unreachable", [])
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.delenv("STEERBENCH_WEIGHTS", raising=False)
+    return web
+
+
+@pytest.fixture
+def weights(publisher, monkeypatch) -> tuple[str, bytes]:
+    """Name and bytes of a file whose name tells the beginning of its SHA-256."""
+    buffer = io.BytesIO()
+    torch.save(STATE, buffer)
+    name = f"alexnet-owt-{hashlib.sha256(buffer.getvalue()).hexdigest()[:8]}.pth"
+    monkeypatch.setitem(BACKBONES, "alex", Backbone(name, BACKBONES["alex"].features))
+    return name, buffer.getvalue()
+
+
+def cache(tmp_path: Path) -> Path:
+    return tmp_path / "torch" / "hub" / "checkpoints"
+
+
+def test_weights_dir_comes_before_the_environment_and_that_before_the_cache(
+    publisher, monkeypatch, tmp_path, quiet_log
+):
+    folders = [tmp_path / "given", tmp_path / "environment", cache(tmp_path)]
+    for folder in folders:
+        folder.mkdir(parents=True)
+        torch.save(STATE, folder / "alexnet_features.pth")
+    monkeypatch.setenv("STEERBENCH_WEIGHTS", str(folders[1]))
+    for folder in folders:
+        assert locate("alex", folders[0], quiet_log) == folder / "alexnet_features.pth"
+        (folder / "alexnet_features.pth").unlink()
+
+
+def test_a_file_with_its_published_name_is_read(tmp_path, weights, quiet_log):
+    name, content = weights
+    (tmp_path / name).write_bytes(content)
+    path, features = load_features("alex", tmp_path, quiet_log)
+    assert path == tmp_path / name
+    assert torch.equal(features["features.0.weight"], STATE["features.0.weight"])
+
+
+def test_damaged_weights_are_refused(tmp_path, weights, quiet_log):
+    name, content = weights
+    (tmp_path / name).write_bytes(content[:-1] + b"?")
+    with pytest.raises(Unavailable, match=f"{name}: expected a SHA-256 that begins with"):
+        locate("alex", tmp_path, quiet_log)
+    (tmp_path / "alexnet_features.pth").write_bytes(content[:100])
+    with pytest.raises(Unavailable, match=r"alexnet_features.pth: expected a torch state dict"):
+        load_features("alex", tmp_path, quiet_log)
+
+
+def test_a_file_that_would_run_code_is_refused_and_runs_none(tmp_path, quiet_log):
+    class Attack:
+        def __reduce__(self):
+            return Path.touch, (tmp_path / "attacked",)
+
+    torch.save({"features.0.weight": Attack()}, tmp_path / "alexnet_features.pth")
+    with pytest.raises(Unavailable):
+        load_features("alex", tmp_path, quiet_log)
+    assert not (tmp_path / "attacked").exists()
+
+
+def test_weights_that_cannot_be_had_are_asked_for_once_and_the_message_says_what_to_do(
+    publisher, quiet_log
+):
+    for net in ("vgg", "alex", "vgg"):
+        with pytest.raises(Unavailable) as caught:
+            locate(net, None, quiet_log)
+    assert publisher.asked == ["/vgg16-397923af.pth"]
+    for part in (f"{publisher.address}vgg16-397923af.pth", "404", "weights_dir=", "STEERBENCH_WE"):
+        assert part in str(caught.value)
+
+
+def test_downloaded_weights_are_kept_in_the_cache_if_they_are_right(
+    tmp_path, publisher, weights, quiet_log, monkeypatch
+):
+    name, content = weights
+    publisher.files[f"/{name}"] = content[:-1]
+    with pytest.raises(Unavailable, match="SHA-256"):
+        locate("alex", None, quiet_log)
+    assert not (cache(tmp_path) / name).exists()
+    monkeypatch.setattr(published, "_unreachable", [])
+    publisher.files[f"/{name}"] = content
+    assert locate("alex", None, quiet_log) == cache(tmp_path) / name
+    assert locate("alex", None, quiet_log).read_bytes() == content
+    assert len(publisher.asked) == 2
+
+
+def test_an_unknown_network_and_a_missing_folder_are_errors_not_gaps(tmp_path, quiet_log):
+    with pytest.raises(SteerbenchError, match="expected one of alex, vgg, squeeze, got 'resnet'"):
+        locate("resnet", None, quiet_log)
+    with pytest.raises(SteerbenchError, match=r"weights_dir: expected a folder, got .*nowhere"):
+        locate("alex", tmp_path / "nowhere", quiet_log)
