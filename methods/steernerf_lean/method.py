@@ -91,4 +91,5 @@ class SteerNerfLean(SteerNerf):
         self, scenes: Sequence[Scene], budget: Budget, output: Path, log: Log
     ) -> None:
         """Train a 2D renderer on many scenes, as a start for others."""
+        assert isinstance(self.stage2, LeanStage2)
         pretrain_renderer(self.setup, self.stage2, scenes, budget, output, log)
