@@ -58,10 +58,8 @@ def cases() -> list[Case]:
     for count, network, precision in kinds:
         inputs, widths = (", ".join(map(str, channels)) for channels in network)
         name = f"{count:,} of {inputs} to {widths}" + ", bf16" * (precision == "bf16")
-        make, items = (
-            partial(_network, count, *network, precision),
-            count if count == MANY else None,
-        )
+        make = partial(_network, count, network, precision)
+        items = count if count == MANY else None
         found += MLP.cases(name, make, precision=precision, items=items)
     return [*found, *MLP.cases("a sample of NaN", _with_nan)]
 
