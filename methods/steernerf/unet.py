@@ -45,8 +45,10 @@ class UNet(Renderer2d):
     def base(self, observations: Sequence[Observation]) -> Tensor:
         """The pictures [B, H, W, 3] that the network corrects: the present RGB, enlarged."""
         rgb = torch.stack([o.frame.values[..., :3] for o in observations]).permute(0, 3, 1, 2)
-        how = {"mode": "bilinear", "align_corners": not self.aligned}
-        return functional.interpolate(rgb, scale_factor=self.scale, **how).permute(0, 2, 3, 1)
+        enlarged = functional.interpolate(
+            rgb, scale_factor=self.scale, mode="bilinear", align_corners=not self.aligned
+        )
+        return enlarged.permute(0, 2, 3, 1)
 
     def _inputs(self, observation: Observation) -> Tensor:
         """[K (L + 1), H, W]: the RGB of all frames, then their other features."""

@@ -145,9 +145,8 @@ class ExamplePool:
 
     def _unpacked(self, tensors: Mapping[str, Tensor]) -> Cloud:
         device = self.pipeline.background.device
-        cameras = {
-            name: place_camera(unpack_camera(x), device)
-            for name, x in tensors.items()
-            if x.dtype == torch.float64  # as nothing else in a cloud
-        }
-        return self.pipeline.kept(**{name: x.to(device) for name, x in tensors.items()} | cameras)
+        parts: dict[str, Any] = {name: x.to(device) for name, x in tensors.items()}
+        for name, x in tensors.items():
+            if x.dtype == torch.float64:  # as nothing in a cloud but cameras
+                parts[name] = place_camera(unpack_camera(x), device)
+        return self.pipeline.kept(**parts)
