@@ -48,6 +48,7 @@ class SteerNerfLean(SteerNerf):
     """SteerNeRF with a lean 2D renderer, the preceding picture, and refinement."""
 
     kind = LeanStage2
+    stage2: LeanStage2
     study = replace(
         STUDY,
         knobs={

@@ -146,9 +146,7 @@ class ExamplePool:
     def _unpacked(self, tensors: Mapping[str, Tensor]) -> Cloud:
         device = self.pipeline.background.device
         parts: dict[str, Any] = {name: x.to(device) for name, x in tensors.items()}
-        parts |= {
-            name: place_camera(unpack_camera(x), device)
-            for name, x in tensors.items()
-            if x.dtype == torch.float64  # as nothing else in a cloud
-        }
+        for name, x in tensors.items():
+            if x.dtype == torch.float64:  # as nothing in a cloud but cameras
+                parts[name] = place_camera(unpack_camera(x), device)
         return self.pipeline.kept(**parts)

@@ -100,9 +100,7 @@ class JointTraining:
 
     def watched(self) -> dict[str, Tensor]:
         """Renderer, and the table and networks of a field that learns."""
-        watched: dict[str, Tensor] = {
-            f"renderer.{name}": x for name, x in self.renderer.named_parameters()
-        }
+        watched = _named("renderer.", dict(self.renderer.named_parameters()))
         if self.trained:
             watched |= {"table": self.trained.field.table, **self.trained.field.layers}
         return watched

@@ -118,10 +118,8 @@ class Patches:
         """Compute the input of the 2D renderer for `patches`, and the opacities of their rays."""
         rendered = [part for patch in patches for part in patch.rendered]
         chosen = indices_where([mask for _, mask in rendered])
-        field, jitter = self.pipeline.field, None
-        rays = Rays.joined(
-            [_rays_of(camera, some) for (camera, _), some in zip(rendered, chosen, strict=True)]
-        )
+        each = [_rays_of(camera, some) for (camera, _), some in zip(rendered, chosen, strict=True)]
+        rays, field, jitter = Rays.joined(each), self.pipeline.field, None
         if self.options.jitter:
             jitter = torch.rand(len(rays.origins), generator=self.generator)
             jitter = jitter.to(field.device, non_blocking=True)
