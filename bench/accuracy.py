@@ -1,16 +1,14 @@
 """Run time against error, for computations with a known exact answer and for whole methods.
 
-The compared settings take turns. The times come from further rounds of the same computation that
-gave the errors.
+The compared settings take turns; times come from further rounds of what gave the errors.
 """
 
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import compress
+from itertools import compress, product
 from typing import Any
 
 import torch
@@ -19,11 +17,10 @@ from torch import Tensor
 from bench.compositing import composite
 from bench.frontier import observed_order
 from bench.metrics import psnr, psnr_of_mse
-from bench.probes import FrameRecord, StageClock, p99_to_p50
+from bench.probes import FrameRecord, StageClock, p99_to_p50, times_ms
 from bench.protocol import EvaluationProtocol
 from bench.scoring import check_frame
 from bench.trajectories import Trajectory
-from bench.turns import in_turns
 from bench.types import Log, Method, Scene, SteerbenchError
 
 
@@ -74,10 +71,11 @@ def experiment_rows(
     with log.progress("experiments", len(experiments)) as progress:
         for experiment in experiments:
             trials = experiment.trials
-            errors = [_largest_error(trial) for trial in trials]  # and warms up
+            apart = ((trial.call().double() - trial.exact).abs() for trial in trials)
+            errors = [float(difference.max()) for difference in apart]  # and warms up
             order = _order(experiment, errors)
             low, high = experiment.smooth or (None, None)
-            times = _times_ms([trial.call for trial in trials], repeats)
+            times = times_ms([trial.call for trial in trials], repeats)
             rows += [
                 {
                     "subject": experiment.subject,
@@ -95,10 +93,6 @@ def experiment_rows(
     return rows
 
 
-def _largest_error(trial: Trial) -> float:
-    return float((trial.call().double() - trial.exact).abs().max())
-
-
 def _order(experiment: Experiment, errors: Sequence[float]) -> float | None:
     if experiment.smooth is None:
         return None
@@ -107,16 +101,6 @@ def _order(experiment: Experiment, errors: Sequence[float]) -> float | None:
     pairs = zip(settings, errors, strict=True)
     fitted = [(setting, error) for setting, error in pairs if low <= setting <= high]
     return observed_order(*zip(*fitted, strict=True))
-
-
-def _times_ms(calls: Sequence[Callable[[], Tensor]], repeats: int) -> list[list[float]]:
-    """Milliseconds of `repeats` runs of each call; the calls take turns."""
-    times: list[list[float]] = [[] for _ in calls]
-    for _, number in in_turns(range(len(calls)), repeats, block=1):
-        begun = time.perf_counter()
-        calls[number]()
-        times[number].append(1e3 * (time.perf_counter() - begun))
-    return times
 
 
 def _spread(times: Sequence[float]) -> dict[str, float]:
@@ -133,8 +117,8 @@ def render_in_turns(
 ) -> list[dict[str, Any]]:
     """Render the same trajectory with all fitted `methods` in turns, in several rounds.
 
-    The first round warms up and is scored; `repeats` more are timed. For the turns see
-    `bench.turns`.
+    Each frame is rendered by one method after the other. The first round warms up and is scored;
+    `repeats` more are timed.
 
     Returns:
         One row for each method. Only steady frames count, see `steady_frames`. Times: setting (the
@@ -163,8 +147,7 @@ def render_in_turns(
         for round_ in range(repeats + 1):
             for method in methods.values():
                 method.reset()
-            for number, name in in_turns(list(methods), len(steps)):
-                step, clock = steps[number], clocks[name]
+            for (number, step), (name, clock) in product(enumerate(steps), clocks.items()):
                 with clock.frame():
                     frame = methods[name].render(step.camera, clock)
                 check_frame(frame, step.camera, name, number)

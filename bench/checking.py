@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import product
 from typing import Any
 
-import torch
-
 from bench.case import Case, Timed
+from bench.probes import times_ms
 from bench.types import Log
 
 
@@ -58,7 +57,9 @@ def timed_rows(
                 if names := wrong.get((case.subject, check["backend"])):
                     check["status"] = f"wrong: {', '.join(names)}"
             correct = [check["backend"] for check in checks if check["status"] == "ok"]
-            times = _times_ms(timed, correct, repeats, device)
+            compute = timed.prepare(device)
+            of_each = times_ms([partial(compute, name) for name in correct], repeats, device)
+            times = dict(zip(correct, map(statistics.median, of_each), strict=True))
             rows += [_row(case.name, timed, check, times) for check in checks]
             progress.advance(note=f"timed: {case.subject}, {case.name}")
     return rows
@@ -81,22 +82,3 @@ def _row(
         if "reference" in times:
             row["ratio"] = times["reference"] / times[backend]
     return row
-
-
-def _times_ms(timed: Timed, backends: Sequence[str], repeats: int, device: str) -> dict[str, float]:
-    """Median milliseconds of each backend; they take turns, so clock drift affects all alike."""
-    compute = timed.prepare(device)
-    times: dict[str, list[float]] = {name: [] for name in backends}
-    for _ in range(repeats):
-        for name in backends:
-            _synchronise(device)
-            begun = time.perf_counter()
-            compute(name)
-            _synchronise(device)
-            times[name].append(1e3 * (time.perf_counter() - begun))
-    return {name: statistics.median(values) for name, values in times.items()}
-
-
-def _synchronise(device: str) -> None:
-    if device == "cuda":
-        torch.cuda.synchronize()

@@ -11,10 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from kornia.geometry.conversions import (
-    axis_angle_to_rotation_matrix,
-    rotation_matrix_to_axis_angle,
-)
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
 from torch import Generator, Tensor
 
 from bench.errors import unexpected

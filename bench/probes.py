@@ -127,6 +127,21 @@ class StageClock:
         self._last = now
 
 
+def times_ms(
+    calls: Sequence[Callable[[], object]], repeats: int, device: str = "cpu"
+) -> list[list[float]]:
+    """Milliseconds of `repeats` runs of each call.
+
+    The calls take turns, so that a drifting clock affects all alike.
+    """
+    clocks = [StageClock(device) for _ in calls]
+    for _ in range(repeats):
+        for clock, call in zip(clocks, calls, strict=True):
+            with clock.frame():
+                call()
+    return [[frame.total_ns / 1e6 for frame in clock.frames] for clock in clocks]
+
+
 class MemoryMeter:
     """Measures peak memory over regions of code: `with meter: ...`, as often as needed.
 

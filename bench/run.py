@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,11 @@ import torch
 from bench.intervals import path_interval
 from bench.metrics import Lpips
 from bench.neighbours import Neighbours, Watch
-from bench.probes import FrameRecord, MemoryMeter, StageClock
+from bench.probes import MemoryMeter, StageClock
 from bench.protocol import EvaluationProtocol
 from bench.results import COLD, STEADY, WHOLE, Measurement
 from bench.scoring import ERROR_RANGE, PICTURES, Scoring, check_frame
 from bench.trajectories import Trajectory, spread
-from bench.turns import in_turns
 from bench.types import Budget, Log, Method, Scene
 
 QUANTILES = (50, 95, 99)
@@ -63,7 +63,7 @@ class Task:
 def measure(methods: Sequence[Method], task: Task, log: Log) -> list[Measurement]:
     """Fit `methods` to the scene of `task`; render its trajectory under the clock and score it.
 
-    Several methods render in turns (see `bench.turns`), so that their times come from the same
+    Several methods render each frame one after the other, so that their times come from the same
     minutes. Peak memory of the process is that of all methods together.
 
     Raises:
@@ -117,8 +117,9 @@ def _measurement(
     scene, trajectory, protocol, budget = task.scene, task.trajectory, task.protocol, task.budget
     method, meter, scoring = take.method, take.meter, take.scoring
     frames = _frame_table(take.rows, protocol)
+    of_phases = ((phase, frames[frames["phase"] == phase]) for phase in (STEADY, COLD))
     summary = [
-        *_frame_rows(frames),
+        *(row | {"phase": phase} for phase, of in of_phases if len(of) for row in phase_rows(of)),
         *(_single(f"size_bytes.{part}", size) for part, size in method.sizes().items()),
         _single("size_bytes.total", sum(method.sizes().values())),
         _single("peak_bytes", meter.peak_bytes),
@@ -158,14 +159,14 @@ def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
     frames = len(takes) * (len(warmup) + len(steps))
     with torch.no_grad(), log.progress("rendering", frames) as progress:
         _reset(takes)
-        for count, take in in_turns(takes, len(warmup)):
-            settled = count > 0 or len(warmup) == 1  # in the first, kernels may be compiled
+        for number, take in product(warmup, takes):
+            settled = number > 0 or len(warmup) == 1  # in the first, kernels may be compiled
             with take.metered(warm=True) if settled else nullcontext(), take.clock.frame():
-                take.method.render(steps[warmup[count]].camera, take.clock)
+                take.method.render(steps[number].camera, take.clock)
             progress.advance(note="warming up")
         _reset(takes)
         watch = Watch()
-        for index, take in in_turns(takes, len(steps)):
+        for index, take in product(range(len(steps)), takes):
             _draw(take, task, index, preceding[index])
             scores = [row["psnr"] for row in take.rows if "psnr" in row]
             progress.advance(note=f"{np.mean(scores):.2f} dB" if scores else "")
@@ -190,18 +191,16 @@ def _draw(take: _Take, task: Task, index: int, before: int) -> None:
         frame = method.render(step.camera, take.clock)
     check_frame(frame, step.camera, method.name, index)
     phase = COLD if before < method.memory else STEADY
-    figures = {"frame": index, "phase": phase} | _times_and_work(take.clock.frames[-1])
-    take.rows.append(figures | take.scoring.score(index, step, frame.rgb))
-
-
-def _times_and_work(record: FrameRecord) -> dict[str, Any]:
-    """One frame's columns: its time, the times of its stages, its work."""
-    return {
+    record = take.clock.frames[-1]
+    figures = {
+        "frame": index,
+        "phase": phase,
         "frame_ms": record.total_ns / 1e6,
         **{f"stage_ms.{name}": ns / 1e6 for name, ns in record.stages_ns.items()},
         **{f"work.{name}": done for name, done in record.done.items()},
         **{f"work.{name}.dense": dense for name, dense in record.dense.items()},
     }
+    take.rows.append(figures | take.scoring.score(index, step, frame.rgb))
 
 
 def _frame_table(table: list[dict[str, Any]], protocol: EvaluationProtocol) -> pd.DataFrame:
@@ -212,16 +211,6 @@ def _frame_table(table: list[dict[str, Any]], protocol: EvaluationProtocol) -> p
     scores = (*protocol.metric_names, "flicker")
     columns = ["frame", "name", "phase", *scores, "frame_ms", *touched]
     return frames.reindex(columns=columns).fillna(dict.fromkeys(touched, 0))
-
-
-def _frame_rows(frames: pd.DataFrame) -> list[dict[str, Any]]:
-    """The rows of the steady frames, then those of the cold frames, if there are any."""
-    return [
-        row | {"phase": phase}
-        for phase in (STEADY, COLD)
-        if len(of_phase := frames[frames["phase"] == phase])
-        for row in phase_rows(of_phase)
-    ]
 
 
 def phase_rows(frames: pd.DataFrame) -> list[dict[str, Any]]:
@@ -241,7 +230,9 @@ def phase_rows(frames: pd.DataFrame) -> list[dict[str, Any]]:
         *(mean_row(name, frames[name]) for name in (*scores, *blink)),
         ms,
         *(_single(f"frame_ms.p{part}", np.percentile(times, part)) for part in QUANTILES),
-        {"metric": "fps", "n": ms["n"]} | _rate(ms),
+        # No upper end if the interval of the time reaches 0.
+        {"metric": "fps", "n": ms["n"], "value": 1000 / ms["value"], "lo": 1000 / ms["hi"]}
+        | {"hi": 1000 / ms["lo"] if ms["lo"] > 0 else math.nan},
         *(mean_row(name, frames[name]) for name in parts),
     ]
 
@@ -256,12 +247,6 @@ def mean_row(metric: str, values: pd.Series) -> dict[str, Any]:
     half = path_interval(known)
     figures = {"value": value, "n": len(known), "lo": value - half, "hi": value + half}
     return {"metric": metric} | figures
-
-
-def _rate(ms: dict) -> dict[str, float]:
-    """Frames per second from a mean time; no upper end if the interval of the time reaches 0."""
-    slowest, fastest = ms["hi"], ms["lo"] if ms["lo"] > 0 else math.nan
-    return {"value": 1000 / ms["value"], "lo": 1000 / slowest, "hi": 1000 / fastest}
 
 
 def _single(metric: str, value: float) -> dict[str, Any]:

@@ -7,14 +7,7 @@ from pathlib import Path
 from bench.errors import unexpected
 from bench.scenes.assemble import assemble, describe_splits
 from bench.scenes.bounds import Box, cube, hull_box, parse_box
-from bench.scenes.files import (
-    data_folder,
-    focal_length,
-    frames_of,
-    inside,
-    opengl_pose,
-    read_json,
-)
+from bench.scenes.files import data_folder, focal_length, frames_of, inside, opengl_pose, read_json
 from bench.scenes.images import Pictures, View, image_size
 from bench.types import Camera, Log, Scene
 

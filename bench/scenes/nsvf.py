@@ -10,14 +10,7 @@ import torch
 from bench.errors import unexpected
 from bench.scenes.assemble import assemble, describe_splits
 from bench.scenes.bounds import MARGIN, Box
-from bench.scenes.files import (
-    data_folder,
-    inside,
-    number,
-    numbers,
-    read_text,
-    rigid_pose,
-)
+from bench.scenes.files import data_folder, inside, number, numbers, read_text, rigid_pose
 from bench.scenes.images import View, image_size
 from bench.types import Camera, Log, Scene
 

@@ -13,16 +13,7 @@ import torch
 from bench.cameras import look_at
 from bench.metrics import as_bytes
 from bench.types import Camera, Frame, NullProbe, Probe
-from bench.viewing import (
-    COARSE,
-    FLUENT_MS,
-    Ask,
-    Painter,
-    Turns,
-    difference,
-    divided,
-    seen_from,
-)
+from bench.viewing import COARSE, FLUENT_MS, Ask, Painter, Turns, difference, divided, seen_from
 
 CAMERA = Camera(torch.eye(3, 4), 40.0, 40.0, 16.0, 12.0, 32, 24)
 

@@ -7,16 +7,7 @@ import math
 import pytest
 import torch
 
-from bench.scenes.solids import (
-    Box,
-    Capsule,
-    Carved,
-    Common,
-    Cylinder,
-    Ellipsoid,
-    Shape,
-    Shifted,
-)
+from bench.scenes.solids import Box, Capsule, Carved, Common, Cylinder, Ellipsoid, Shape, Shifted
 
 SHAPES: dict[str, Shape] = {
     "ellipsoid": Ellipsoid((0.9, 0.4, 0.6)),
