@@ -64,8 +64,8 @@ def experiment_rows(
     """Run the experiments; one row for each trial.
 
     A row holds subject, knob, setting, error (largest absolute), ms (median of `repeats`), ms_lo
-    and ms_hi (the extremes), the observed order of the experiment, and order_from and order_to,
-    the range of settings it was fitted on. The last three are None where no order is expected.
+    and ms_hi (the extremes), and order, the observed one, fitted on the settings from order_from to
+    order_to; these three are None where no order is expected.
     """
     rows = []
     with log.progress("experiments", len(experiments)) as progress:
@@ -121,13 +121,12 @@ def render_in_turns(
     `repeats` more are timed.
 
     Returns:
-        One row for each method. Only steady frames count, see `steady_frames`. Times: setting (the
-        method's name), ms (mean frame time of the median round, the lower median), ms_lo and ms_hi
-        (extremes over the rounds), and for the median round p99_to_p50, stage_ms.* and work.* as
-        in the rows of `bench.run.measure`. Quality, over the frames with a ground truth: psnr
-        (mean over frames), psnr_to_first (against the pictures of the first method, from the MSE
-        over all frames; inf if equal) and worst (largest difference of any channel from the first
-        method, on a scale of 1). Pictures are rounded as `protocol` says.
+        One row for each method, of the steady frames (`steady_frames`): setting (its name), ms
+        (mean frame time of the lower median round), ms_lo and ms_hi (extremes over the rounds), and
+        for the median round p99_to_p50, stage_ms.* and work.* as in `bench.run.measure`. Of the
+        frames with a ground truth, rounded as `protocol` says: psnr (mean over frames),
+        psnr_to_first (against the first method, from the MSE over all frames; inf if equal) and
+        worst (largest difference of any channel from the first method, on a scale of 1).
 
     Raises:
         SteerbenchError: no frame is both steady and has a ground truth, or a method rendered
@@ -154,16 +153,17 @@ def render_in_turns(
                 if round_ == 0 and number in scored and step.truth is not None:
                     picture = protocol.rounded(frame.rgb).cpu()
                     truth = composite(images[step.truth], scene.background)
-                    other = first.setdefault(number, picture)
-                    compared[name].append(_compared(picture, other, truth))
+                    apart = picture.double() - first.setdefault(number, picture).double()
+                    square, largest = apart.square().mean().item(), apart.abs().max().item()
+                    compared[name].append((psnr(picture, truth), square, largest))
                 progress.advance(note=f"round {round_} of {repeats}" if round_ else "warming up")
     rows = []
     for name, clock in clocks.items():
-        scores, squares, largest = zip(*compared[name], strict=True)
+        scores, squares, worst = zip(*compared[name], strict=True)
         figures = {
             "psnr": statistics.fmean(scores),
             "psnr_to_first": psnr_of_mse(statistics.fmean(squares)),
-            "worst": max(largest),
+            "worst": max(worst),
         }
         rows.append({"setting": name, **_costs(clock.frames, ready), **figures})
     return rows
@@ -219,9 +219,3 @@ def mean_figures(
         f"{kind}.{name}": factor * statistics.fmean(figures.get(name, 0) for figures in of_frames)
         for name in names
     }
-
-
-def _compared(picture: Tensor, first: Tensor, truth: Tensor) -> tuple[float, float, float]:
-    """PSNR against `truth`, then mean squared and largest difference from `first`."""
-    apart = picture.double() - first.double()
-    return psnr(picture, truth), apart.square().mean().item(), apart.abs().max().item()

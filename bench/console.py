@@ -66,7 +66,8 @@ class ConsoleLog:
             yield bar
             bar.report_done()
         finally:
-            bar.remove()
+            self._bars.remove_task(bar.id)
+            self._bars.refresh()
             if not self._bars.tasks:
                 self._bars.stop()
 
@@ -85,11 +86,11 @@ class _Bar:
         self, say: Callable[[str], None], bars: progress.Progress, label: str, total: int
     ) -> None:
         self._say, self._bars, self._label, self._clock = say, bars, label, bars.get_time
-        self._id = bars.add_task(label, total=total, note="")
+        self.id = bars.add_task(label, total=total, note="")
         self._begun = self._shown = self._clock()
 
     def advance(self, steps: int = 1, note: str = "") -> None:
-        self._bars.update(self._id, advance=steps, note=note)
+        self._bars.update(self.id, advance=steps, note=note)
         plain = self._bars.disable
         now = self._clock()
         if now - self._shown < (PLAIN_INTERVAL_S if plain else DRAW_INTERVAL_S):
@@ -109,17 +110,12 @@ class _Bar:
         if elapsed > WORTH_A_LINE_S:
             self._line(f"done in {_duration(elapsed)}")
 
-    def remove(self) -> None:
-        """Remove the bar from the screen."""
-        self._bars.remove_task(self._id)
-        self._bars.refresh()
-
     def _line(self, text: str) -> None:
         note = self._task().fields["note"]
         self._say(f"{self._label}: {text}" + (f", {note}" if note else ""))
 
     def _task(self) -> progress.Task:
-        return next(task for task in self._bars.tasks if task.id == self._id)
+        return next(task for task in self._bars.tasks if task.id == self.id)
 
 
 def _duration(seconds: float) -> str:

@@ -30,10 +30,7 @@ def path_interval(values: np.ndarray) -> float:
     cosine transform, B = 0.4 n^(2/3) rounded up. They are nearly independent, each with a variance
     near n times that of the mean, so their mean square gives a t-interval with B degrees of freedom
     (Lazarus et al. 2018, "HAR Inference: Recommendations for Practice"). All n - 1 coefficients
-    would give `half_interval`.
-
-    A block bootstrap needs more frames than a path has: for autocorrelated series as short as ours
-    its intervals covered the mean less often (docs/log.md).
+    would give `half_interval`. A block bootstrap needs more frames than a path has (docs/log.md).
     """
     if len(values) < 2 or not np.isfinite(values).all():
         return math.nan

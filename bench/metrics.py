@@ -60,8 +60,7 @@ def flicker(
 ) -> float:
     """Change of the error from one frame to the next, as the RMS over pixels and channels.
 
-    A constant error scores 0, like no error at all. Wrong colours are the business of the other
-    metrics; this one detects what blinks, swims or shimmers.
+    A constant error scores 0: this detects what blinks, swims or shimmers.
     """
     _check_pair(image, reference)
     _check_pair(previous_image, previous_reference)
@@ -93,16 +92,11 @@ def ssim(image: Tensor, reference: Tensor, window: str = "gaussian") -> float:
 class Lpips:
     """LPIPS v0.1 (Zhang et al. 2018) with a named backbone; a lower value is more similar.
 
-    The linear layers come with the `lpips` package, the backbone from `bench.published`.
-    Runs in float32 on the device of the pictures, which are mapped to [-1, 1] as published.
+    The linear layers come with the `lpips` package, the backbone ("alex", "vgg" or "squeeze") from
+    `bench.published`, which searches `weights_dir` first. Runs in float32 on the device of the
+    pictures, which are mapped to [-1, 1] as published.
 
-    Args:
-        net: "alex", "vgg" or "squeeze".
-        weights_dir: folder to search first, or None.
-        log: shows a download.
-
-    Raises Unavailable if the backbone weights cannot be found or downloaded, or do not fit the
-    network.
+    Raises Unavailable if the weights cannot be found or downloaded, or do not fit the network.
     """
 
     def __init__(self, net: str, weights_dir: Path | None, log: Log) -> None:
@@ -140,8 +134,8 @@ _torchvision_operators: torch.library.Library | None = None
 def _lpips_package() -> ModuleType:
     """Import `lpips`, which needs torchvision only for its network definitions.
 
-    Torchvision's binary does not load beside a torch built for another device; its import then
-    fails because two operators are undeclared. Declaring them makes the definitions importable.
+    Torchvision's binary does not load beside a torch built for another device: two operators are
+    then undeclared. Declaring them makes the definitions importable.
     """
     global _torchvision_operators
     try:

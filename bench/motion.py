@@ -44,9 +44,7 @@ def between(first: Camera, second: Camera, turn: Tensor, share: float) -> Camera
     """The camera at `share` of the way: rotation at constant speed, everything else linear.
 
     `turn` [3] is their `rotation_between`. On an orbit the centre follows the chord: at 4 degrees
-    it is off by 0.06 % of the distance.
-
-    Raises SteerbenchError if the pictures differ in size.
+    it is off by 0.06 % of the distance. Raises SteerbenchError if the pictures differ in size.
     """
     camera = lens_between(first, second, share)
     rotation = first.c2w[:, :3].double() @ _rotation(share * turn)
@@ -75,13 +73,11 @@ def preceding(
 ) -> list[Camera]:
     """The `count` cameras that precede `camera` on a random smooth motion, oldest first.
 
-    Each frame turns the camera rigidly about `target` [3]. The angle per frame is drawn once from
-    the range `degrees`; the axis is perpendicular to the viewing direction and bends slightly from
-    frame to frame; the distance changes slightly, too. `target` keeps its place in the picture, and
-    the intrinsics are constant.
+    Each frame turns the camera rigidly about `target` [3], which keeps its place in the picture.
+    The angle per frame is drawn once from the range `degrees`; the axis is perpendicular to the
+    viewing direction; it and the distance change slightly from frame to frame.
 
-    Raises ValueError if `target` is not [3], `count` is negative, or `degrees` is not a range from
-    0 up.
+    Raises ValueError if `target` is not [3], `count` is negative, or `degrees` no range from 0 up.
     """
     check_shape("target", target, 3)
     if count < 0 or not 0 <= degrees[0] <= degrees[1]:

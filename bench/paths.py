@@ -59,7 +59,14 @@ def follow(scene: Scene, path: str, limit: int = 0) -> Trajectory:
     """
     file = Path(path).expanduser().resolve()
     record = read_json(file.parent, file.name)
-    cameras = _of_viewer(record, file) if KEYFRAMES in record else _of_frames(record, file, scene)
+    if KEYFRAMES in record:
+        cameras = _of_viewer(record, file)
+    else:
+        usual = scene.splits["test"].cameras[0]
+        cameras = [
+            read_camera(ChainMap(frame, record), opengl_pose(frame, where), usual, where)
+            for where, frame in entries_of(record, "frames", file)
+        ]
     whole_number(limit, "trajectory.limit", 0)
     scale, offset = 1 / scene.unit_length, -scene.origin.double() / scene.unit_length
     moved = [move_camera(camera, scale, offset) for camera in cameras[: limit or None]]
@@ -140,23 +147,13 @@ def _of_viewer(record: dict, file: Path) -> list[Camera]:
     return cameras
 
 
-def _of_frames(record: dict, file: Path, scene: Scene) -> list[Camera]:
-    """The cameras of a `transforms.json`, with or without pictures."""
-    usual = scene.splits["test"].cameras[0]
-    return [
-        read_camera(ChainMap(frame, record), opengl_pose(frame, where), usual, where)
-        for where, frame in entries_of(record, "frames", file)
-    ]
-
-
 def leading(keys: Sequence[Camera], target: Tensor, degrees: float) -> list[list[Camera]]:
     """A smooth path through `keys`, one segment for each key but the first.
 
-    A segment holds the cameras after the previous key, up to and including its own key. Centres
-    follow a cubic spline, rotations a spline with continuous angular acceleration. Both are
-    parametrised by length, measured as an angle: the camera's rotation, or the motion of its centre
-    as seen from `target` [3], whichever is larger. The cameras of a segment are evenly spaced, by
-    at most `degrees`.
+    A segment holds the cameras after the previous key, up to and including its own, evenly spaced
+    by at most `degrees`. Centres follow a cubic spline, rotations one with continuous angular
+    acceleration, both by length: the angle of the camera's rotation or of its centre's motion as
+    seen from `target` [3], whichever is larger.
 
     Raises SteerbenchError if there are fewer than two keys, two consecutive keys with the same
     pose, or keys whose pictures differ in size.

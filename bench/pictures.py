@@ -51,20 +51,14 @@ class Pair:
 
 
 def pairs_with_folder(pictures: Path, truth: Path, match: Match = "name") -> list[Pair]:
-    """Pair each picture of the folder `truth` with its counterpart in the folder `pictures`.
-
-    Raises SteerbenchError as `matched` does.
-    """
+    """Pair each picture of the folder `truth` with its counterpart in `pictures`; see `matched`."""
     true = listed(truth)
     files = matched(pictures, [path.stem for path in true], match)
     return [Pair(file, path.name, path) for file, path in zip(files, true, strict=True)]
 
 
 def pairs_with_split(pictures: Path, split: Split, match: Match = "name") -> list[Pair]:
-    """Pair each picture of a scene's `split` with its counterpart in the folder `pictures`.
-
-    Raises SteerbenchError as `matched` does.
-    """
+    """Pair each picture of a scene's `split` with its counterpart in `pictures`; see `matched`."""
     files = matched(pictures, [Path(name).stem for name in split.names], match)
     return [Pair(*pair) for pair in zip(files, split.names, split.images, strict=True)]
 
@@ -72,10 +66,8 @@ def pairs_with_split(pictures: Path, split: Split, match: Match = "name") -> lis
 def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
     """The file of `folder` for each of `names`, matched by name without the ending, or by order.
 
-    Files are ordered by name, numbers in names counting as numbers.
-
-    Raises SteerbenchError if a picture is missing, one belongs to none of `names`, or `names` has
-    duplicates.
+    Raises SteerbenchError if a picture is missing, one belongs to none of `names`, or two names are
+    equal.
     """
     files = listed(folder)
     if match == "order":

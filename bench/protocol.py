@@ -83,11 +83,8 @@ class EvaluationProtocol:
         return ("psnr", "ssim", *(f"lpips_{net}" for net in self.lpips))
 
     def check(self, scene: Scene, trajectory: Trajectory) -> None:
-        """Raise before any training if the frames could not be scored afterwards.
-
-        Raises SteerbenchError if the scene is composited on another background, has no exact
-        pictures for the flicker, or a frame is smaller than a metric's window.
-        """
+        """Raise SteerbenchError before any training if the frames could not be scored afterwards:
+        another background, no exact pictures for the flicker, a frame smaller than a window."""
         if self.flicker == "exact" and scene.exact is None:
             raise SteerbenchError(
                 f"protocol.flicker=exact: scene {scene.name} has no exact pictures, expected an "

@@ -45,23 +45,15 @@ def machine() -> dict[str, object]:
     }
 
 
-def decisive() -> dict[str, object]:
-    """The part of `machine` that can change a result; for libraries see `bench.sources`."""
-    record = machine()
-    return {name: record[name] for name in ("cpu", "instructions", "gpus", "python")}
-
-
 def computed_by(*things: Any) -> dict[str, object]:
-    """Everything that decides what `things` (classes or functions) compute, beside their inputs.
-
-    A part of every key.
-    """
+    """What decides the results of `things` (classes or functions) beside their inputs, for keys."""
     import torch
 
+    record = machine()
     return {
         "code": digest(*things),
         "libraries": libraries(*things),
-        "machine": decisive(),
+        "machine": {name: record[name] for name in ("cpu", "instructions", "gpus", "python")},
         "threads": torch.get_num_threads(),
         "kernel_threads": os.environ.get("NUMBA_NUM_THREADS", ""),  # upper limit
     }

@@ -193,11 +193,7 @@ def _sha256(path: Path) -> str | None:
 class VerifyReport:
     """A copy of a data set, compared with its registry: files by their path in the release.
 
-    Attributes:
-        ok: present, with the official content.
-        wrong: present, but with other content or unreadable.
-        missing: on the list, but not present.
-        extra: present, but not on the list.
+    `wrong` files have other content or cannot be read; `extra` ones are not on the list.
     """
 
     ok: Sequence[str]
@@ -301,7 +297,7 @@ def load_features(net: str, weights_dir: Path | None, log: Log) -> tuple[Path, d
 
 
 def _verified(path: Path) -> Path:
-    """Return `path`; raise if its name holds a SHA-256 that its content does not match."""
+    """`path`; raises Unavailable if its name holds a SHA-256 that its content does not match."""
     promised = re.search(r"-([0-9a-f]{8})\.pth$", path.name)
     got = _sha256(path) if promised else None
     if promised and not (got or "").startswith(promised[1]):

@@ -113,7 +113,6 @@ class _Take:
 def _measurement(
     take: _Take, task: Task, missing: Mapping[str, str], neighbours: Neighbours
 ) -> Measurement:
-    """The measurement of a method that has rendered all frames."""
     scene, trajectory, protocol, budget = task.scene, task.trajectory, task.protocol, task.budget
     method, meter, scoring = take.method, take.meter, take.scoring
     frames = _frame_table(take.rows, protocol)
@@ -150,10 +149,7 @@ def _measurement(
 
 
 def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
-    """Warm up, then render the sequence in order; each frame is scored and discarded.
-
-    Returns what other processes used meanwhile, not counting the warm-up.
-    """
+    """Warm up, then render the sequence in order; what other processes used in the second part."""
     steps, preceding = task.trajectory.steps, task.trajectory.preceding
     warmup = spread(len(steps), task.protocol.warmup)
     frames = len(takes) * (len(warmup) + len(steps))
@@ -216,9 +212,8 @@ def _frame_table(table: list[dict[str, Any]], protocol: EvaluationProtocol) -> p
 def phase_rows(frames: pd.DataFrame) -> list[dict[str, Any]]:
     """Mean and interval of every column, quantiles of the frame time, frames per second.
 
-    Args:
-        frames: at least one, in path order. Columns: `frame`, `name` and `phase`, scores up to
-            `flicker`, times, work.
+    `frames` are at least one, in path order, with columns `frame`, `name` and `phase`, scores up to
+    `flicker`, times, work.
     """
     columns = list(map(str, frames))
     scores = columns[columns.index("phase") + 1 : columns.index("flicker")]
@@ -238,10 +233,7 @@ def phase_rows(frames: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def mean_row(metric: str, values: pd.Series) -> dict[str, Any]:
-    """The row of a metric: its mean over the frames that have a value, with the interval.
-
-    `values` are in path order.
-    """
+    """The row of a metric: mean and interval over the frames, in path order, that have a value."""
     known = values.dropna().to_numpy(dtype=float)
     value = known.mean() if len(known) else math.nan
     half = path_interval(known)

@@ -87,24 +87,18 @@ class Scoring:
     def score(self, index: int, step: Step, rgb: Tensor) -> dict[str, Any]:
         """Name and metrics of frame `index`, rendered as `rgb` [H, W, 3]; none without truth."""
         figures: dict[str, Any] = {}
+        background, pair, truth = self._scene.background, None, None
         if step.truth is not None:
-            truth, background = self._split.images[step.truth], self._scene.background
+            truth = self._split.images[step.truth]
             figures["name"] = self._split.names[step.truth]
             figures |= self._protocol.score(rgb, truth, background, self._lpips)
             if index in self._shown:
                 self.images |= kept_pictures(index, rgb, composite(truth, background))
-        return figures | self._flicker.since_last(self._with_truth(step, rgb), step.cut)
-
-    def _with_truth(self, step: Step, rgb: Tensor) -> tuple[Tensor, Tensor] | None:
-        """The frame, rounded as for scoring, and its true picture, both [H, W, 3]."""
-        if step.truth is not None:
-            truth = self._split.images[step.truth]
         elif self._protocol.flicker == "exact" and self._scene.exact is not None:
             truth = self._scene.exact(step.camera)
-        else:
-            return None
-        background = self._scene.background
-        return self._protocol.rounded(rgb), composite(truth.to(rgb.device), background)
+        if truth is not None:
+            pair = self._protocol.rounded(rgb), composite(truth.to(rgb.device), background)
+        return figures | self._flicker.since_last(pair, step.cut)
 
 
 def kept_pictures(index: int, rgb: Tensor, truth: Tensor) -> dict[str, np.ndarray]:

@@ -27,8 +27,8 @@ CHECKS = ("cases.py", "experiments.py")
 def digest(*things: Any) -> str:
     """SHA-256 of the names and bytes of the `sources` of `things`.
 
-    Raises SteerbenchError if a file changed after this process first hashed it. The process may
-    still run the old code, and would store its results under the key of the new code.
+    Raises SteerbenchError if a file changed after this process first hashed it: it may still run
+    the old code, and would store its results under the key of the new one.
     """
     total = hashlib.sha256()
     for name, path in sorted(sources(*things).items()):

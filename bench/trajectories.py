@@ -1,6 +1,8 @@
 """Trajectories: the ordered cameras of a measurement, and which of them have ground truth.
 
-`bench.motion` computes the motion from one pose to the next.
+Functions that make one raise SteerbenchError, which names the option, if a setting is out of its
+range or the split is missing or empty; those along a smooth path, if pictures differ in size.
+`limit` 0 keeps all cameras of the split. `bench.motion` computes the motion between two poses.
 """
 
 from __future__ import annotations
@@ -83,8 +85,6 @@ def from_split(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:
     """The cameras of a split in order; `limit` > 0 keeps only that many, evenly spread.
 
     A kept frame whose predecessor was dropped comes after a cut.
-
-    Raises SteerbenchError if the scene has no such split, it is empty, or `limit` is negative.
     """
     cameras, kept, part = _kept(scene, split, limit, spaced=True)
     cuts = [False, *(after != before + 1 for before, after in pairwise(kept))]
@@ -96,7 +96,6 @@ def orbit(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:
     """The cameras of a split in order, without gaps; `limit` > 0 keeps only the first `limit`.
 
     If the split was recorded along a path, preceding frames are true neighbours on that path.
-    Raises SteerbenchError as `from_split` does.
     """
     cameras, kept, part = _kept(scene, split, limit)
     return Trajectory(f"{split}-orbit{part}", split, tuple(Step(cameras[k], k) for k in kept))
@@ -107,8 +106,6 @@ def smooth(scene: Scene, split: str = "test", degrees: float = 1.0, limit: int =
 
     Frames between two cameras have no ground truth: they are rendered and timed, not scored.
     `limit` > 0 keeps only the first `limit` cameras, so that the path has no gaps.
-
-    Raises SteerbenchError as `from_split` does, or if `degrees` is not positive or sizes differ.
     """
     steps, part = _smooth_steps(scene, split, degrees, limit)
     return Trajectory(f"{split}-smooth{degrees:g}deg{part}", split, tuple(steps))
@@ -120,8 +117,6 @@ def jump(
     """The smooth path cut into pieces of `every` frames and shuffled, so the camera jumps between.
 
     The order is the same every time, and no piece follows its predecessor on the path.
-
-    Raises SteerbenchError as `smooth` does, or if the path has no second piece of `every` >= 1.
     """
     steps, part = _smooth_steps(scene, split, degrees, limit)
     if not 1 <= every < len(steps):
@@ -144,8 +139,6 @@ def loop(
 
     Every round revisits exactly the same cameras, so that drift over a long sequence shows in the
     scores of the same pictures.
-
-    Raises SteerbenchError as `smooth` does, or if `frames` is less than 1.
     """
     _check(frames >= 1, "frames", "1 or more", frames)
     there, part = _smooth_steps(scene, split, degrees, limit)
@@ -155,10 +148,7 @@ def loop(
 
 
 def static(scene: Scene, split: str = "test", view: int = 0, frames: int = 60) -> Trajectory:
-    """A still camera: camera `view` of a split, repeated for `frames` frames.
-
-    Raises SteerbenchError as `from_split` does, or if there is no such view or frame.
-    """
+    """A still camera: camera `view` of a split, repeated for `frames` frames."""
     cameras, kept, _ = _kept(scene, split, 0)
     allowed = f"0 to {len(cameras) - 1}, the cameras of {split!r}"
     _check(view in kept, "view", allowed, view)
@@ -174,8 +164,6 @@ def approached(
     The `lead` frames before a camera have no ground truth; the first of them comes after a cut.
     From frame to frame the camera turns by `degrees` about what it looks at (`motion.preceding`).
     `seed` seeds the motions; `limit` > 0 keeps only that many cameras, evenly spread.
-
-    Raises SteerbenchError as `from_split` does, or if `lead` or `degrees` is out of range.
     """
     _check(lead >= 0, "lead", "0 or more", lead)
     _check(0 < degrees <= 180, "degrees", "more than 0, up to 180", degrees)

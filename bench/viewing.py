@@ -108,10 +108,7 @@ class Painter:
 
     @torch.no_grad()
     def draw(self, who: Hashable, camera: Camera) -> list[Drawn]:
-        """Render `camera` with each method.
-
-        Raises SteerbenchError if a method rendered values that are not finite.
-        """
+        """Render `camera` with each method; SteerbenchError if values are not finite."""
         sequence = (who, camera.width, camera.height)
         if sequence != self._sequence:
             for method in self.methods:
@@ -134,19 +131,16 @@ def _drawn(method: Method, camera: Camera) -> Drawn:
 
 
 def divided(left: Tensor, right: Tensor, at: float) -> Tensor:
-    """`left` and `right` in one picture, split by a line at share `at` of the width.
-
-    All are [H, W, 3].
-    """
+    """`left` and `right` [H, W, 3] in one picture, split by a line at share `at` of the width."""
     column = round(at * left.shape[1])
     both = torch.cat((left[:, :column], right[:, column:]), dim=1)
     both[:, max(column - 1, 0) : column + 1] = 0.5
     return both
 
 
-def difference(first: Tensor, second: Tensor, gain: float = 4.0) -> Tensor:
-    """|first - second|, amplified by `gain` to make it visible; [H, W, 3] in [0, 1]."""
-    return (gain * (first - second).abs()).clamp(0, 1)
+def difference(first: Tensor, second: Tensor) -> Tensor:
+    """|first - second|, amplified by 4 to make it visible; [H, W, 3] in [0, 1]."""
+    return (4 * (first - second).abs()).clamp(0, 1)
 
 
 def seen_from(

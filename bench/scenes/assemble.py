@@ -21,8 +21,7 @@ from bench.types import BACKGROUNDS, Log, Scene, Split
 def every_nth(views: Sequence[View], step: int, where: Path) -> dict[str, list[View]]:
     """Split views, sorted by name: 0, step, 2 * step ... are the test split, the others train.
 
-    Raises:
-        SteerbenchError, which names `where`: `step` is less than 2, or nothing is left to train on.
+    Raises SteerbenchError if `step` is less than 2, or nothing is left to train on.
     """
     whole_number(step, "split_every", 2)
     views = sorted(views, key=lambda view: view.name)
@@ -33,10 +32,7 @@ def every_nth(views: Sequence[View], step: int, where: Path) -> dict[str, list[V
 
 
 def leave_out(missing: Sequence[str], views: Sequence[View], where: str, log: Log) -> None:
-    """Log the names of `missing` pictures; the scene is made from the other `views`.
-
-    Raises SteerbenchError if there are no other views.
-    """
+    """Log the names of `missing` pictures; raises SteerbenchError if there are no other `views`."""
     if not views:
         raise unexpected(where, "pictures", f"none of {len(missing)} files is there")
     if missing:
@@ -114,9 +110,8 @@ def _check_float32(where: str, lengths: Sequence[float], others: Sequence[float]
 def hold_out(scene: Scene, split: str, every: int) -> Scene:
     """Move the middle one of every `every` training pictures to a split called `split`.
 
-    In a capture along a path, the first and last picture stay in the training, so that held-out
-    pictures lie between training pictures. An existing split of that name is replaced. The digest
-    changes, so that trainings with and without these pictures are not confused.
+    In a capture along a path, held-out pictures so lie between training pictures. An existing split
+    of that name is replaced. The digest changes, as trainings without these pictures differ.
 
     Raises SteerbenchError if there are fewer than `every` training pictures.
     """

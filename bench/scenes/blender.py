@@ -36,7 +36,6 @@ def load(
         name: the scene's name in result rows; by default the folder's name.
 
     A split other than train and test is left out if none of its pictures exist.
-    Raises SteerbenchError, naming file and field, if the data are not as described.
     """
     root = data_folder(path)
     read = ((split, read_split(root, split, log)) for split in ("train", "val", "test"))

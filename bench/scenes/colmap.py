@@ -60,11 +60,7 @@ def load(
 
     Lens distortion is undone for every COLMAP camera model that has a focal length, and pictures
     are cropped to what the lens saw. Pictures that COLMAP did not register are ignored. Registered
-    pictures that are missing are logged and left out.
-
-    Raises:
-        Unavailable: pycolmap is not installed.
-        SteerbenchError: the data are not as described; names the file.
+    pictures that are missing are logged and left out. Raises Unavailable without pycolmap.
     """
     root = data_folder(path)
     folder = model_folder(root, model)
@@ -107,10 +103,7 @@ def read_model(folder: Path) -> Any:
 
 
 def check_length(file: Path) -> None:
-    """Raise if a binary list is shorter than its counts say.
-
-    pycolmap would keep reading for minutes and take gigabytes.
-    """
+    """Raise if a binary list is shorter than its counts say: pycolmap would read on for minutes."""
     if not file.is_file():
         return
     content = file.read_bytes()

@@ -49,8 +49,7 @@ class Fisheye:
 def undistort(image: Tensor, camera: Camera, lens: Lens, where: Path) -> Tensor:
     """Undistort `image`, uint8 [H, W, C], to the pinhole picture of `undistorted_camera`.
 
-    `camera` has the intrinsics of the distorted picture, which the pinhole keeps; `where` names the
-    picture in messages.
+    `camera` has the intrinsics of both pictures; `where` names the picture in messages.
     Raises SteerbenchError if the lens folds the picture over itself.
     """
     source, _, _ = _window(camera, lens, where)
@@ -79,9 +78,8 @@ def _window(camera: Camera, lens: Lens, where: Path) -> tuple[Tensor, int, int]:
     try:
         return pinhole_window(camera.width, camera.height, intrinsics, lens)
     except ValueError as error:
-        raise unexpected(
-            where, "a lens distortion that can be undone", f"{lens}: {error}"
-        ) from error
+        expected = "a lens distortion that can be undone"
+        raise unexpected(where, expected, f"{lens}: {error}") from error
 
 
 @lru_cache(maxsize=2)  # most captures have one lens
@@ -93,16 +91,12 @@ def pinhole_window(
     focal, centre = torch.tensor(intrinsics, dtype=torch.float64).split(2)
     points = lens((pixel_grid(width, height).double() - centre) / focal)
     source = (points * focal + centre).reshape(height, width, 2).float()
-    if not (area_of_cells(source) > 0).all():  # also False for NaN
+    across, down = source[:-1, 1:] - source[:-1, :-1], source[1:, :-1] - source[:-1, :-1]
+    area = across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0]  # of distorted cells
+    if not (area > 0).all():  # also False for NaN
         raise ValueError("it folds the picture over itself")
     left, top, right, bottom = seen_rectangle(source)
     return source[top:bottom, left:right], left, top
-
-
-def area_of_cells(source: Tensor) -> Tensor:
-    """Signed area of the distorted cells between neighbouring pixels: [height - 1, width - 1]."""
-    across, down = source[:-1, 1:] - source[:-1, :-1], source[1:, :-1] - source[:-1, :-1]
-    return across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0]
 
 
 def seen_rectangle(source: Tensor) -> tuple[int, int, int, int]:

@@ -42,10 +42,7 @@ class View:
 
 @dataclass(frozen=True)
 class Picture:
-    """A view at 1 / `downscale` of its resolution, not decoded yet.
-
-    Has its pinhole `camera` and the hash of its file.
-    """
+    """A view at 1 / `downscale` of its resolution, not decoded: its pinhole, its file's hash."""
 
     view: View
     downscale: int
@@ -56,9 +53,8 @@ class Picture:
 class Pictures(Sequence[Tensor]):
     """The pixels of the `described` pictures, uint8 [H, W, 3 or 4] each.
 
-    Decoded on first access and kept. Iteration decodes all of them in parallel.
-
-    Raises SteerbenchError if a file is damaged, or has changed since it was described.
+    Decoded on first access and kept; iteration decodes all in parallel. Raises SteerbenchError if a
+    file is damaged, or has changed since it was described.
     """
 
     def __init__(self, described: Sequence[Picture], log: Log) -> None:
@@ -88,8 +84,7 @@ class Pictures(Sequence[Tensor]):
 def opened(source: Path | io.BytesIO, where: Path) -> Iterator[Image.Image]:
     """The picture in `source`, with only its header read.
 
-    Raises SteerbenchError if it is not a picture, is too large, or turns out to be damaged while it
-    is used.
+    Raises SteerbenchError if it is no picture, too large, or found to be damaged while it is used.
     """
     try:
         with Image.open(source) as image:
@@ -108,10 +103,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def describe(view: View, downscale: int) -> Picture:
-    """Describe a view as a pinhole picture at 1 / downscale of its resolution, without decoding it.
-
-    Raises SteerbenchError if it is not a picture, not of the expected size, or too small.
-    """
+    """Describe a view as a `Picture`; raises if it is none, of another size, or too small."""
     content, camera = contents(view.path), view.camera
     with opened(io.BytesIO(content), view.path) as image:
         check_mode(image, view.path)
@@ -163,10 +155,9 @@ def check_mode(image: Image.Image, path: Path) -> None:
 
 
 def shrink(image: Tensor, factor: int) -> Tensor:
-    """Average blocks of `factor` x `factor` pixels; colours are weighted by alpha.
+    """Average blocks of `factor` x `factor` pixels, colours weighted by alpha, rounded to 8 bits.
 
-    Columns and rows at the right and bottom that do not fill a block are dropped. Means are
-    rounded to the nearest 8-bit value.
+    Columns and rows at the right and bottom that do not fill a block are dropped.
     """
     if factor == 1:
         return image
@@ -189,10 +180,7 @@ def shrink(image: Tensor, factor: int) -> Tensor:
 
 
 def shrunk_camera(camera: Camera, factor: int, where: Path) -> Camera:
-    """The exact camera of a picture after `shrink`.
-
-    Raises SteerbenchError if the picture is smaller than a block.
-    """
+    """The exact camera of a picture after `shrink`; raises if it is smaller than a block."""
     if factor == 1:
         return camera
     width, height = camera.width // factor, camera.height // factor

@@ -48,7 +48,6 @@ class Draw:
         self.share = random.Random(variant).random
 
     def between(self, low: float, high: float) -> float:
-        """A uniform number from `low` to `high`."""
         return low + (high - low) * self.share()
 
     def small(self, low: float, high: float) -> float:
@@ -60,7 +59,6 @@ class Draw:
         return low + int((high + 1 - low) * self.share())
 
     def pick(self, items: Sequence[Item]) -> Item:
-        """A random one of the items."""
         return items[self.whole(0, len(items) - 1)]
 
     def deck(self, items: Sequence[Item], count: int) -> list[Item]:
@@ -71,7 +69,6 @@ class Draw:
         return drawn[:count]
 
     def direction(self) -> Triple:
-        """A vector of length 1."""
         x, y, z = (self.between(-1, 1) for _ in range(3))
         length = max(math.sqrt(x * x + y * y + z * z), 1e-3)
         return (x / length, y / length, z / length)
@@ -128,17 +125,14 @@ def place(draw: Draw, shape: Shape, core: Sequence[Part]) -> Triple:
 
 
 def dot(first: Sequence[float], second: Sequence[float]) -> float:
-    """The dot product."""
     return sum(a * b for a, b in zip(first, second, strict=True))
 
 
 def norm(vector: Triple) -> float:
-    """The length of a vector."""
     return math.sqrt(dot(vector, vector))
 
 
 def scaled(vector: Sequence[float], factor: float) -> Triple:
-    """A vector times a factor."""
     x, y, z = vector
     return x * factor, y * factor, z * factor
 

@@ -34,7 +34,6 @@ def load(path: str | Path, *, downscale: int = 1, background: str = "white", log
     Pictures and poses are named 0_* (train), 1_* (val) and 2_* (test); poses have OpenCV axes.
     If there are no 2_*, the 1_* are the test split, as in Tanks & Temples. The box of `bbox.txt`,
     with a margin of 5 % of its longest side, fills the unit cube.
-    Raises SteerbenchError, naming file and field, if the data are not as described.
     """
     root = data_folder(path)
     box = read_box(root)

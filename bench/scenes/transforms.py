@@ -69,7 +69,6 @@ def load(
 
     Intrinsics of a frame take precedence over those of the file. Lens distortion is undone, and
     pictures are cropped to what the lens saw. Frames without a picture are logged and left out.
-    Raises SteerbenchError, naming file and field, if the data are not as described.
     """
     root = data_folder(path)
     record, path = read_json(root, CAMERA_FILE), root / CAMERA_FILE

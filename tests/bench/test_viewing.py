@@ -117,7 +117,7 @@ def test_a_difference_shows_where_pictures_differ() -> None:
     one = torch.full((2, 2, 3), 0.5)
     other = one.clone()
     other[0, 0] += 0.1
-    shown = difference(one, other, gain=4.0)
+    shown = difference(one, other)
     torch.testing.assert_close(shown[0, 0], torch.full((3,), 0.4))
     assert (shown[1] == 0).all()
     assert as_bytes(shown).dtype == np.uint8
