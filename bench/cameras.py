@@ -104,13 +104,11 @@ def place_camera(camera: Camera, device: torch.device | str) -> Camera:
     return replace(camera, c2w=camera.c2w.to(device, non_blocking=not waits))
 
 
-INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height")
-
-
 def pack_camera(camera: Camera) -> Tensor:
     """`camera` as one [18] float64 tensor on the CPU: `c2w` row by row, then the intrinsics."""
-    inside = torch.tensor([getattr(camera, name) for name in INTRINSICS], dtype=torch.float64)
-    return torch.cat((camera.c2w.double().cpu().flatten(), inside))
+    sizes = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
+    pose = camera.c2w.double().cpu().flatten()
+    return torch.cat((pose, pose.new_tensor(sizes)))
 
 
 def unpack_camera(packed: Tensor) -> Camera:

@@ -52,13 +52,10 @@ def p99_to_p50(frames: Sequence[FrameRecord]) -> float:
 class StageClock:
     """The probe of a measurement: charges every nanosecond of a frame to exactly one stage.
 
-    The clock is read only when a stage begins or ends, after the device has finished its work.
-    The time since the last reading goes to the innermost open stage, so that the stages and
-    `other` add up to the frame by construction.
-
-    Args:
-        stages: whether to time stages. Each reading of the clock waits for the GPU. Without stages
-            this happens only at the beginning and end of a frame, and all its time is `other`.
+    The clock is read when a stage begins or ends, after the device has finished its work. The time
+    since the last reading goes to the innermost open stage, so that the stages and `other` add up
+    to the frame by construction. Without `stages` the clock is read, and the GPU waited for, only
+    at the beginning and end of a frame, and all its time is `other`.
     """
 
     def __init__(

@@ -94,12 +94,7 @@ def published() -> list[Published]:
 
 
 def get(data: Published, scene: str, folder: Path, log: Log) -> Path:
-    """Download a scene of `data` into `folder` / `scene`, keeping correct existing files.
-
-    Raises:
-        Unavailable: no answer, the connection breaks off, or files have other content.
-        OSError: `folder` cannot be written to.
-    """
+    """Download a scene of `data` into `folder` / `scene`, keeping correct files; see `fetch`."""
     folder.mkdir(parents=True, exist_ok=True)
     wanted = data.of(scene)
     with locked(folder / ".lock", f"waits for another process that fills {folder}", log):
@@ -211,10 +206,7 @@ class VerifyReport:
 
 
 def verify(path: str | Path, log: Log) -> VerifyReport:
-    """Check the whole release, or one scene of it; folder names tell which.
-
-    Raises SteerbenchError if `path` looks like neither.
-    """
+    """Check the whole release, or one scene of it, by its name; raises if `path` is neither."""
     root = data_folder(path)
     base, expected = _expected(root)
     files = (file for file in root.rglob("*") if file.is_file())
@@ -246,11 +238,8 @@ def _expected(root: Path) -> tuple[Path, Mapping[str, str]]:
 def locate(net: str, weights_dir: Path | None, log: Log) -> Path:
     """The weight file of backbone `net`, downloaded into torch's hub cache if need be.
 
-    A file with a SHA-256 in its name is checked against it.
-
-    Raises:
-        SteerbenchError: `net` is unknown, or `weights_dir` is not a folder.
-        Unavailable: there is no file and the download failed, or the file is damaged.
+    A file with a SHA-256 in its name is checked against it. Raises SteerbenchError if `net` is
+    unknown or `weights_dir` no folder, and Unavailable if no sound file can be had.
     """
     if net not in BACKBONES:
         raise SteerbenchError(f"LPIPS net: expected one of {', '.join(BACKBONES)}, got {net!r}")

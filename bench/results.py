@@ -87,10 +87,7 @@ class Store:
         return folder if (folder / RECORD).is_file() else None
 
     def whole_key(self, beginning: str) -> str:
-        """The key of the only run whose key starts with `beginning`.
-
-        Raises SteerbenchError if there is none, or several.
-        """
+        """The key of the only run whose key starts with `beginning`; raises unless there is one."""
         wanted = Path(beginning).name  # the key may be given as the path of its folder
         folders = self.folder.iterdir() if self.folder.is_dir() else ()
         keys = [p.name for p in folders if p.name.startswith(wanted) and self.find(p.name)]
@@ -126,9 +123,8 @@ class Store:
     def write(self, key: str) -> Iterator[Path]:
         """A temporary folder that becomes the run `key` if the body ends without an exception.
 
-        If another process has finished the same run in the meantime, its result is kept.
-
-        Raises SteerbenchError if there is no space or no permission, or `outputs` is no folder.
+        A result that another process has finished in the meantime is kept. Raises SteerbenchError
+        if there is no space or no permission, or `outputs` is no folder.
         """
         with explained(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -153,10 +149,7 @@ class Store:
     def rows(
         self, report: Callable[[str], object] = warnings.warn, keys: Collection[str] | None = None
     ) -> pd.DataFrame:
-        """Every row of all runs, or only of those in `keys`, with `COLUMNS`.
-
-        `report` is called with a message for each run that cannot be read.
-        """
+        """Every row of all runs, or of those in `keys`; `report` gets a line on unreadable ones."""
         header = ",".join(COLUMNS)
         bodies = []
         for folder in sorted(self.folder.glob("[!.]*")):
@@ -196,11 +189,8 @@ class Store:
         _sync(self.folder)
 
     def _sweep(self) -> None:
-        """Delete what killed processes left behind: partial folders older than a day.
-
-        What other processes publish or delete meanwhile is ignored.
-        """
-        with suppress(OSError):
+        """Delete what killed processes left behind: partial folders older than a day."""
+        with suppress(OSError):  # other processes publish and delete meanwhile
             for folder in self.folder.glob(f"{PARTIAL}*"):
                 if time.time() - folder.stat().st_mtime > STALE_S:
                     shutil.rmtree(folder, ignore_errors=True)

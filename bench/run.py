@@ -76,29 +76,22 @@ def measure(methods: Sequence[Method], task: Task, log: Log) -> list[Measurement
         list(split.images)  # decode now, so damaged files raise here, not during training or timing
     for method in methods:
         method.fit(task.scene, task.budget, log)
-    takes = [_Take.of(method, task, lpips) for method in methods]
+    takes = [_Take(method, task, lpips) for method in methods]
     neighbours = _render(takes, task, log)
     if neighbours.notable:
         log.info(f"{neighbours} while frames were timed: times are longer than they need be")
     return [_measurement(take, task, missing, neighbours) for take in takes]
 
 
-@dataclass(frozen=True)
 class _Take:
     """A method being measured: its clock, memory meter, scoring, and a row per rendered frame."""
 
-    method: Method
-    clock: StageClock
-    meter: MemoryMeter
-    scoring: Scoring
-    rows: list[dict[str, Any]]
-
-    @classmethod
-    def of(cls, method: Method, task: Task, lpips: Mapping[str, Lpips]) -> _Take:
-        device = method.settings()["device"]
-        scoring = Scoring(task.scene, task.trajectory, task.protocol, lpips, task.pictures)
-        clock = StageClock(device, stages=task.protocol.stages)
-        return cls(method, clock, MemoryMeter(device), scoring, [])
+    def __init__(self, method: Method, task: Task, lpips: Mapping[str, Lpips]) -> None:
+        self.method, device = method, method.settings()["device"]
+        self.clock = StageClock(device, stages=task.protocol.stages)
+        self.meter = MemoryMeter(device)
+        self.scoring = Scoring(task.scene, task.trajectory, task.protocol, lpips, task.pictures)
+        self.rows: list[dict[str, Any]] = []
 
     def metered(self, *, warm: bool = False) -> AbstractContextManager[object]:
         """The meter, around a frame whose memory counts; around others, nothing.
@@ -154,24 +147,21 @@ def _render(takes: Sequence[_Take], task: Task, log: Log) -> Neighbours:
     warmup = spread(len(steps), task.protocol.warmup)
     frames = len(takes) * (len(warmup) + len(steps))
     with torch.no_grad(), log.progress("rendering", frames) as progress:
-        _reset(takes)
+        for take in takes:
+            take.method.reset()
         for number, take in product(warmup, takes):
             settled = number > 0 or len(warmup) == 1  # in the first, kernels may be compiled
             with take.metered(warm=True) if settled else nullcontext(), take.clock.frame():
                 take.method.render(steps[number].camera, take.clock)
             progress.advance(note="warming up")
-        _reset(takes)
+        for take in takes:
+            take.method.reset()
         watch = Watch()
         for index, take in product(range(len(steps)), takes):
             _draw(take, task, index, preceding[index])
             scores = [row["psnr"] for row in take.rows if "psnr" in row]
             progress.advance(note=f"{np.mean(scores):.2f} dB" if scores else "")
         return watch.seen()
-
-
-def _reset(takes: Sequence[_Take]) -> None:
-    for take in takes:
-        take.method.reset()
 
 
 def _draw(take: _Take, task: Task, index: int, before: int) -> None:

@@ -21,10 +21,7 @@ if TYPE_CHECKING:  # loads torch; a lock should not wait for that
 
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """A temporary file beside `path`; it becomes `path` if the body ends without an exception.
-
-    Its name is unique and has the ending of `path`.
-    """
+    """A temporary file beside `path`, with its ending; it becomes `path` unless the body raises."""
     new = path.with_name(f".{path.stem}-{uuid.uuid4().hex}{path.suffix}")
     try:
         yield new
@@ -38,9 +35,8 @@ def locked(path: Path, waiting: str, log: Log) -> Iterator[None]:
     """Hold an exclusive lock on the file `path`, which is created if missing and never removed.
 
     `waiting` is logged while another process holds it. If the file system has no locks, that is
-    logged and the body runs anyway; at worst, work is then done twice.
-
-    Raises SteerbenchError if `path` cannot be opened for writing.
+    logged and the body runs anyway; at worst, work is then done twice. Raises SteerbenchError if
+    `path` cannot be opened for writing.
     """
     with explained(path.parent):
         handle = _opened(path)
@@ -56,10 +52,7 @@ def locked(path: Path, waiting: str, log: Log) -> Iterator[None]:
 
 @contextmanager
 def missing(path: Path, log: Log) -> Iterator[bool]:
-    """Whether `path` must still be made: if so, the body makes it while other processes wait.
-
-    Raises SteerbenchError if the folder of `path` cannot be written to.
-    """
+    """Whether `path` must still be made: if so, the body does, while others wait; see `locked`."""
     if path.exists():
         yield False
         return

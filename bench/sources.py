@@ -70,11 +70,11 @@ def libraries(*things: Any) -> dict[str, str]:
 def sources(*things: Any) -> dict[str, Path]:
     """The files that decide what `things` (classes or functions) compute.
 
-    In this project: the module that defines each thing, and everything it imports, directly or not.
-    An imported package counts with all files beside its `__init__`, because backends are loaded by
-    name, and with the weights in its folder. For a thing from another project: its whole top-level
-    package, and what that imports from this project or from packages outside any installed
-    distribution. Returns paths by name, which starts at the top-level package.
+    In this project: the module that defines each thing, and all that it imports, directly or not;
+    packages with all files beside their `__init__`, because backends are loaded by name, and with
+    their weights. For a thing from another project: its whole top-level package, and what that
+    imports from here or from outside any installed distribution. Returns paths by name, which
+    starts at the top-level package.
     """
     known = _known.get((ROOT, things))
     if known is None or _times(known[0]) != known[1]:

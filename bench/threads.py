@@ -38,17 +38,10 @@ def in_parallel(
     work: Callable[[Item], Result], items: Sequence[Item], label: str, log: Log
 ) -> list[Result]:
     """[work(item) for item in items], in parallel with a progress bar; the first error stops it."""
-    with (
-        torch_threads(1),
-        log.progress(label, len(items)) as bar,
-        ThreadPoolExecutor(WORKERS) as pool,
-    ):
-        futures = [pool.submit(work, item) for item in items]
-        results = []
-        try:
-            for future in futures:
-                results.append(future.result())
-                bar.advance()
-        finally:  # after an error, waiting items are not started
-            pool.shutdown(wait=False, cancel_futures=True)
+    results = []
+    pool = ThreadPoolExecutor(WORKERS)
+    with torch_threads(1), log.progress(label, len(items)) as bar, pool:
+        for result in pool.map(work, items):  # after an error, waiting items are not started
+            results.append(result)
+            bar.advance()
     return results

@@ -42,9 +42,7 @@ def device_waits() -> Iterator[Counter[Line]]:
     """Count how often the host waits for the GPU inside the context, by the line that caused it.
 
     Torch reports the waits (`torch.cuda.set_sync_debug_mode`), except explicit synchronisation as
-    by a clock.
-
-    Raises Unavailable if there is no GPU.
+    by a clock. Raises Unavailable if there is no GPU.
     """
     if not torch.cuda.is_available():
         raise Unavailable("to count how often the host waits for the device, a GPU is needed")

@@ -26,8 +26,8 @@ class Ball:
 class Cloud:
     """Balls whose densities add where they overlap; their colours are averaged, density-weighted.
 
-    Between two consecutive crossings of sphere surfaces the density k (per unit of t) and the
-    colour c are constant. With transmittance T at the start of such a piece [a, b]
+    Between two crossings of surfaces the density k (per unit of t) and the colour c are constant.
+    With transmittance T at the start of such a piece [a, b]
 
         opacity += T (1 - e^-x),    rgb += T (1 - e^-x) c,    x = k (b - a),
         depth   += T ((1 - e^-x) a + (1 - e^-x - x e^-x) / k),

@@ -68,9 +68,9 @@ class Model(Protocol):
 def render(model: Model, camera: Camera, background: Tensor, samples: int) -> Frame:
     """Render `model`, averaged over `samples` rays per pixel (a power of two).
 
-    `camera` is in the model's units; rays that hit nothing show `background` [3]. Over the rays of
-    a pixel, alpha is the mean opacity, depth the mean z-depth weighted by opacity (+inf where alpha
-    is below EMPTY_ALPHA), and rgb the mean colour. A single sample is at the centre.
+    `camera` is in the model's units; rays that hit nothing show `background` [3]. A pixel's alpha
+    and rgb are means over its rays, depth the mean z-depth weighted by opacity (+inf where alpha is
+    below EMPTY_ALPHA). A single sample is at the centre.
     """
     device, width, height = camera.c2w.device, camera.width, camera.height
     offsets = sample_offsets(samples).to(device)

@@ -34,20 +34,15 @@ def cubic(step: float) -> Trial:
 
 def test_an_experiment_has_a_row_a_setting_with_its_largest_error_and_its_order(quiet_log):
     steps = [0.5, 0.25, 0.125, 0.0625]
-    experiment = Experiment("cube", "step", [cubic(step) for step in steps], (0.1, 0.3))
+    trials = [Trial(1.0, lambda: torch.zeros(2), 1e6 * torch.ones(2).double()), *map(cubic, steps)]
+    experiment = Experiment("cube", "step", trials, (0.1, 0.3))  # the first, wrong, counts not
     rows = experiment_rows([experiment], 3, quiet_log)
-    assert [row["setting"] for row in rows] == steps
-    assert [row["error"] for row in rows] == pytest.approx([step**3 for step in steps])
+    assert [row["setting"] for row in rows] == [1.0, *steps]
+    assert [row["error"] for row in rows] == pytest.approx([1e6, *(step**3 for step in steps)])
     for row in rows:
         assert row["order"] == pytest.approx(3)
         assert (row["order_from"], row["order_to"]) == (0.1, 0.3)
         assert 0 <= row["ms_lo"] <= row["ms"] <= row["ms_hi"]
-
-
-def test_settings_outside_the_smooth_range_do_not_count_for_the_order(quiet_log):
-    wrong = Trial(1.0, lambda: torch.zeros(2), torch.full((2,), 1e6, dtype=torch.float64))
-    experiment = Experiment("cube", "step", [wrong, cubic(0.2), cubic(0.1)], (0.1, 0.2))
-    assert experiment_rows([experiment], 1, quiet_log)[0]["order"] == pytest.approx(3)
 
 
 def test_settings_in_words_have_no_order(quiet_log):
@@ -128,35 +123,17 @@ def test_the_costs_are_those_of_the_median_round_without_the_first_and_what_is_n
     assert costs["stage_ms.network"] == 2.0  # one of the two frames has none
     assert costs["work.rays"] == 7.0
     assert costs["p99_to_p50"] == 1.0  # both took 14
+    assert _costs([frame(9.0), frame(3.0), frame(5.0)], [True])["ms"] == 3.0  # the lower of two
 
 
-def test_of_two_rounds_the_lower_counts():
-    assert _costs([frame(9.0), frame(3.0), frame(5.0)], [True])["ms"] == 3.0
-
-
-def test_frames_without_a_ground_truth_are_not_scored(in_turns, tiny_scene):
+def test_frames_without_a_ground_truth_are_timed_and_not_scored(in_turns, tiny_scene):
     cameras = tiny_scene.splits["test"].cameras
     between = Trajectory("between", "test", (Step(cameras[0], 0), Step(cameras[1], None)))
     alone = Trajectory("alone", "test", (Step(cameras[0], 0),))
     (row,), _ = in_turns(0, trajectory=between)
     (known,), _ = in_turns(0, trajectory=alone)
     assert row["psnr"] == known["psnr"]
-
-
-def test_frames_without_a_ground_truth_are_timed(tiny_scene):
-    cameras = tiny_scene.splits["test"].cameras
-    between = Trajectory("between", "test", (Step(cameras[0], 0), Step(cameras[1], None)))
     assert steady_frames([Brighter(tiny_scene, 0, [])], between) == ([True, True], [0])
-
-
-def test_only_frames_that_every_method_has_enough_before_are_scored(in_turns, tiny_scene):
-    cameras = tiny_scene.splits["test"].cameras
-    steps = [Step(cameras[0], 1), Step(cameras[1], 1)]  # the truth of the first is another frame's
-    path = Trajectory("two", "test", tuple(steps))
-    warm = Trajectory("one", "test", (Step(cameras[1], 1),))
-    rows, _ = in_turns(0, memory=1, trajectory=path)
-    alone, _ = in_turns(0, trajectory=warm)
-    assert rows[0]["psnr"] == alone[0]["psnr"]
 
 
 def test_a_frame_soon_after_a_cut_is_not_scored(in_turns, tiny_scene):

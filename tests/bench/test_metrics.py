@@ -18,8 +18,6 @@ from bench.metrics import SMALLEST_SIDE, Lpips, flicker, psnr, quantise, ssim
 from bench.scoring import Flicker
 from bench.types import SteerbenchError, Unavailable
 
-UNIT = st.floats(0.0, 1.0)
-
 
 def noise(height: int, width: int, seed: int = 0, device: str = "cpu") -> Tensor:
     generator = torch.Generator().manual_seed(seed)
@@ -33,12 +31,6 @@ def test_quantise_keeps_the_256_levels_and_clips_the_rest(device):
     assert quantise(beyond).tolist() == [0, 0, 1, 1]
     halves = torch.tensor([0.5, 1.5, 2.5], dtype=torch.float64, device=device) / 255
     assert (quantise(halves) * 255).round().tolist() == [0, 2, 2]
-
-
-@given(UNIT)
-def test_quantise_moves_a_value_by_at_most_half_a_level(value):
-    moved = quantise(torch.tensor(value, dtype=torch.float64)).item() - value
-    assert abs(moved) <= 0.5 / 255 + 1e-15
 
 
 @given(st.floats(1e-4, 1.0))
@@ -96,7 +88,7 @@ def plain_ssim(a: Tensor, b: Tensor, weights: Tensor, correction: float) -> floa
     return (luminance * structure).mean().item()
 
 
-def test_gaussian_ssim_is_the_plain_computation_over_the_valid_region(device):
+def test_ssim_is_the_plain_computation_over_the_valid_region(device):
     a = noise(19, 23, 3, device)
     b = (0.7 * a + 0.3 * noise(19, 23, 4, device)).clamp(0, 1)
     x = torch.arange(11, dtype=torch.float64, device=device) - 5
@@ -104,20 +96,9 @@ def test_gaussian_ssim_is_the_plain_computation_over_the_valid_region(device):
     weights = torch.outer(line, line) / line.sum() ** 2
     # Two orders of summing 121 products in float64, divided by numbers no smaller than c2.
     assert ssim(a, b) == pytest.approx(plain_ssim(a, b, weights, 1.0), abs=1e-10)
-
-
-def test_uniform_ssim_is_the_plain_computation_with_sample_covariance():
-    a = noise(16, 13, 5)
-    b = (0.7 * a + 0.3 * noise(16, 13, 6)).clamp(0, 1)
-    weights = torch.full((7, 7), 1 / 49, dtype=torch.float64)
-    assert ssim(a, b, "uniform") == pytest.approx(plain_ssim(a, b, weights, 49 / 48), abs=1e-10)
-
-
-@given(UNIT, UNIT)
-def test_ssim_of_constant_pictures_is_the_luminance_term(a, b):
-    pictures = [torch.full((11, 11, 3), value, dtype=torch.float64) for value in (a, b)]
-    c1 = 0.01**2
-    assert ssim(*pictures) == pytest.approx((2 * a * b + c1) / (a * a + b * b + c1), abs=1e-9)
+    uniform = torch.full((7, 7), 1 / 49, dtype=torch.float64, device=device)
+    of_samples = plain_ssim(a, b, uniform, 49 / 48)  # with sample covariance
+    assert ssim(a, b, "uniform") == pytest.approx(of_samples, abs=1e-10)
 
 
 READ = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}

@@ -72,16 +72,6 @@ def test_a_key_frame_of_the_viewer_is_read_as_nerfstudio_means_it(
     torch.testing.assert_close(camera.c2w, expected)  # (3, 0, 8) of the data set
 
 
-def test_a_transforms_file_needs_no_pictures(scene: Scene, tmp_path: Path) -> None:
-    pose = [[1.0, 0, 0, 3], [0, 1, 0, 0], [0, 0, 1, 8], [0, 0, 0, 1]]
-    record = {"camera_angle_x": math.pi / 2, "w": 20, "frames": [{"transform_matrix": pose}] * 3}
-    trajectory = follow(scene, stored(tmp_path, record), limit=2)
-    assert len(trajectory.steps) == 2
-    camera = trajectory.steps[0].camera
-    assert (camera.width, camera.height) == (20, 24)  # the height is that of the test camera
-    assert camera.fx == pytest.approx(10)
-
-
 def test_a_transforms_file_gives_intrinsics_or_leaves_them_to_the_test_camera(
     scene: Scene, tmp_path: Path
 ) -> None:
@@ -95,10 +85,11 @@ def test_a_transforms_file_gives_intrinsics_or_leaves_them_to_the_test_camera(
         ({}, (40, 44, 15, 12)),
         ({"w": 64, "h": 48}, (80, 88, 30, 24)),  # of twice the size
         ({"fl_x": 30.0}, (30, 30, 15, 12)),  # pixels are square where one length is given
+        ({"camera_angle_x": 2 * math.atan(1), "w": 20}, (10, 10, 9.375, 12)),
     ):
-        path = stored(tmp_path, record | {"frames": [{"transform_matrix": pose}]})
-        camera = follow(scene, path).steps[0].camera
-        assert (camera.fx, camera.fy, camera.cx, camera.cy) == wanted
+        path = stored(tmp_path, record | {"frames": [{"transform_matrix": pose}] * 3})
+        first, _ = (step.camera for step in follow(scene, path, limit=2).steps)
+        assert (first.fx, first.fy, first.cx, first.cy) == pytest.approx(wanted)
 
 
 @pytest.mark.parametrize(
@@ -120,9 +111,6 @@ def test_a_damaged_path_is_named_with_what_was_expected(
 ) -> None:
     with pytest.raises(SteerbenchError, match=message):
         follow(scene, stored(tmp_path, record))
-
-
-def test_a_path_that_is_not_there_is_named(scene: Scene, tmp_path: Path) -> None:
     with pytest.raises(SteerbenchError, match=r"gone\.json: expected a file, got nothing there"):
         follow(scene, str(tmp_path / "gone.json"))
 

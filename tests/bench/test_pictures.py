@@ -93,36 +93,31 @@ def test_by_order_the_tenth_comes_after_the_ninth(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("names", "said"),
+    ("match", "names", "said"),
     [
-        (["a.png"], "none for b"),
-        (["a.png", "b.png", "c.png"], "also c"),
-        (["c.png", "d.png"], "none for a, b, also c, d; --match order"),
-        (["a.png", "a.jpg", "b.png"], "several of a"),
-        ([], "none"),
+        ("name", ["a.png"], "none for b"),
+        ("name", ["a.png", "b.png", "c.png"], "also c"),
+        ("name", ["c.png", "d.png"], "none for a, b, also c, d; --match order"),
+        ("name", ["a.png", "a.jpg", "b.png"], "several of a"),
+        ("name", [], "none"),
+        ("order", ["a.png"], "2 pictures, as many as true ones, got 1"),
     ],
 )
-def test_pictures_that_do_not_match_are_named(tmp_path: Path, names: list[str], said: str) -> None:
+def test_pictures_that_do_not_match_are_named(tmp_path: Path, match, names, said) -> None:
     ours = write(tmp_path / "ours", dict.fromkeys(names, noise()))
     true = write(tmp_path / "true", dict.fromkeys(["a.png", "b.png"], noise()))
     with pytest.raises(SteerbenchError, match=said):
-        pictures.pairs_with_folder(ours, true)
+        pictures.pairs_with_folder(ours, true, match)
+    with pytest.raises(SteerbenchError, match="expected a folder, got nothing there"):
+        pictures.listed(tmp_path / "nowhere")
 
 
 def test_two_truths_of_one_name_have_no_picture_of_their_own(tmp_path: Path) -> None:
     ours = write(tmp_path / "ours", {"0001.png": noise(), "0002.png": noise()})
-    with pytest.raises(
-        SteerbenchError, match="--match order takes both in their order, got several of 0001"
-    ):
+    said = "--match order takes both in their order, got several of 0001"
+    with pytest.raises(SteerbenchError, match=said):
         pictures.matched(ours, ["0001", "0001"], "name")
     assert len(pictures.matched(ours, ["0001", "0001"], "order")) == 2
-
-
-def test_another_number_has_no_order(tmp_path: Path) -> None:
-    ours = write(tmp_path / "ours", {"a.png": noise()})
-    true = write(tmp_path / "true", {"a.png": noise(), "b.png": noise()})
-    with pytest.raises(SteerbenchError, match="2 pictures, as many as true ones, got 1"):
-        pictures.pairs_with_folder(ours, true, "order")
 
 
 @pytest.mark.parametrize(
@@ -162,8 +157,3 @@ def test_what_a_run_rendered_has_its_figures_to_the_last_digit(
     found = pictures.score(pairs, QUICK, {}, FACTS, quiet_log).frames
     for metric in ("psnr", "ssim"):
         assert found[metric].tolist() == measured[metric].tolist()
-
-
-def test_no_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SteerbenchError, match="expected a folder, got nothing there"):
-        pictures.listed(tmp_path / "nowhere")

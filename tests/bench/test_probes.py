@@ -93,10 +93,8 @@ def test_a_frame_that_raises_leaves_no_record_and_the_clock_usable():
 
 def test_a_stage_outside_a_frame_a_frame_in_a_frame_and_a_stage_named_other_are_refused():
     clock = clock_reading(itertools.count())
-    with (
-        pytest.raises(RuntimeError, match="'field' was entered outside a frame"),
-        clock.stage("field"),
-    ):
+    outside = pytest.raises(RuntimeError, match="'field' was entered outside a frame")
+    with outside, clock.stage("field"):
         pass
     with clock.frame():
         with pytest.raises(RuntimeError, match="inside a frame"), clock.frame():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -84,16 +83,6 @@ def test_the_exact_picture_of_a_scene_serves_flicker_when_the_protocol_asks(tiny
     assert known(scores(tiny_scene, unscored, protocol)) == []  # a scene that does not know
     scores(scene, from_split(scene), protocol)
     assert len(asked) == 6  # ground truth is there
-
-
-def test_a_prediction_equal_to_the_truth_does_not_flicker(tiny_scene):
-    trajectory = from_split(tiny_scene)
-    scoring = Scoring(tiny_scene, trajectory, replace(QUICK, rounding="none"), {})
-    for index, step in enumerate(trajectory.steps):
-        truth = composite(tiny_scene.splits["test"].images[index], WHITE)
-        figures = scoring.score(index, step, truth)
-        assert figures["psnr"] == math.inf
-        assert figures.get("flicker", 0.0) == 0
 
 
 @pytest.mark.parametrize(("pictures", "kept"), [(0, []), (2, [0, 5]), (99, [0, 1, 2, 3, 4, 5])])

@@ -118,13 +118,10 @@ def test_without_locks_in_the_file_system_the_work_is_done_all_the_same(tmp_path
     assert re.search("not locked.*No locks available", log.messages[0])
 
 
-def test_what_is_there_needs_no_lock(tmp_path, log):
+def test_what_is_there_needs_no_lock_and_a_folder_that_cannot_be_written_is_named(tmp_path, log):
     (tmp_path / "made").touch()
     with missing(tmp_path / "made", log) as to_make:
         assert not to_make
     assert [path.name for path in tmp_path.iterdir()] == ["made"]
-
-
-def test_a_folder_that_cannot_be_written_is_named(tmp_path, log):
     with pytest.raises(SteerbenchError, match="gone"), missing(tmp_path / "gone" / "x", log):
         pass

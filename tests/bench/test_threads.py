@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import pytest
 import torch
 
@@ -35,10 +37,7 @@ def test_torch_has_its_threads_back(log, fails) -> None:
             raise ValueError("stop")
 
     try:
-        if fails:
-            with pytest.raises(ValueError, match="stop"):
-                in_parallel(work, range(WORKERS), "work", log)
-        else:
+        with pytest.raises(ValueError, match="stop") if fails else nullcontext():
             in_parallel(work, range(WORKERS), "work", log)
         assert set(inside) == {1}
         assert torch.get_num_threads() == 2

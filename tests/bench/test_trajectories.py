@@ -49,6 +49,9 @@ def test_a_whole_split_is_rendered_in_its_order_with_its_ground_truth(tiny_scene
     assert [step.camera for step in trajectory.steps] == list(test.cameras)
     assert [step.truth for step in trajectory.steps] == list(range(6))
     assert (trajectory.name, trajectory.split, trajectory.resolution) == ("test", "test", "40x32")
+    cameras = [scale_camera(test.cameras[0], 20, 16), *test.cameras[1:]]
+    mixed = replace(tiny_scene, splits={"test": Split(cameras, test.images, test.names)})
+    assert from_split(mixed).resolution == "mixed"
 
 
 def test_a_limit_stands_in_the_name_unless_it_keeps_everything(tiny_scene):
@@ -67,19 +70,11 @@ def test_a_frame_that_is_kept_without_the_one_before_it_comes_after_a_cut(tiny_s
     assert from_split(tiny_scene, limit=2).preceding == [0, 0]
 
 
-def test_frames_of_different_size_are_called_mixed(tiny_scene):
-    test = tiny_scene.splits["test"]
-    cameras = [scale_camera(test.cameras[0], 20, 16), *test.cameras[1:]]
-    mixed = replace(tiny_scene, splits={"test": Split(cameras, test.images, test.names)})
-    assert from_split(mixed).resolution == "mixed"
-
-
 def test_a_split_that_is_not_there_or_empty_is_named_with_those_that_are(tiny_scene):
-    with pytest.raises(SteerbenchError, match="no frames in 'val'; it has train, test"):
-        from_split(tiny_scene, "val")
     empty = replace(tiny_scene, splits={**tiny_scene.splits, "val": Split([], [], [])})
-    with pytest.raises(SteerbenchError, match="no frames in 'val'; it has train, test"):
-        from_split(empty, "val")
+    for scene in (tiny_scene, empty):
+        with pytest.raises(SteerbenchError, match="no frames in 'val'; it has train, test"):
+            from_split(scene, "val")
 
 
 def orbit_of(degrees: list[float]) -> Scene:
@@ -135,14 +130,10 @@ def test_a_smooth_path_needs_pictures_of_one_size():
         smooth(mixed)
 
 
-def test_a_static_path_stays_where_it_is():
-    scene = orbit_of([0, 4])
+def test_a_static_path_stays_where_it_is_and_an_orbit_takes_the_first_cameras():
+    scene = orbit_of([0, 4, 8, 12])
     path = static(scene, view=1, frames=3)
     assert path.steps == (Step(scene.splits["test"].cameras[1], 1),) * 3
-
-
-def test_an_orbit_takes_the_first_cameras_without_gaps():
-    scene = orbit_of([0, 4, 8, 12])
     path = orbit(scene, limit=3)
     assert path.steps == tuple(Step(scene.splits["test"].cameras[i], i) for i in range(3))
     assert (path.name, orbit(scene).name) == ("test-orbit-3of4", "test-orbit")
@@ -205,9 +196,6 @@ def test_a_loop_goes_there_and_back_until_its_frames_are_used_up():
     turns = [turn_deg(a.camera, b.camera) for a, b in pairwise(path.steps)]
     assert turns == pytest.approx([1.0] * 10, abs=0.05)
     assert path.name == "test-loop11-1deg"
-
-
-def test_a_loop_of_two_cameras_and_of_one():
     scene = orbit_of([0, 1, 2])
     assert [step.truth for step in loop(scene, frames=5, limit=2).steps] == [0, 1, 0, 1, 0]
     assert [step.truth for step in loop(scene, frames=3, limit=1).steps] == [0, 0, 0]
@@ -234,26 +222,16 @@ def test_each_camera_is_approached_once_after_a_cut_from_a_motion_of_its_own(tin
     starts = [turn_deg(step.camera, path.steps[0].camera) for step in path.steps[::3]]
     assert len({round(start, 1) for start in starts}) == 6
 
-
-@pytest.mark.parametrize("degrees", [0.5, 3.3, 30])
-def test_an_approach_turns_by_the_same_angle_from_frame_to_frame(tiny_scene, degrees):
-    path = approached(tiny_scene, "test", lead=3, degrees=degrees, seed=0, limit=0)
     turns = [turn_deg(a.camera, b.camera) for a, b in pairwise(path.steps) if not b.cut]
-    assert turns == pytest.approx([degrees] * 18, abs=0.05)
+    assert turns == pytest.approx([3.3] * 12, abs=0.05)
 
 
-def test_without_a_lead_each_camera_is_reached_by_a_cut(tiny_scene):
+def test_approaches_depend_on_lead_limit_and_seed(tiny_scene):
     path = approached(tiny_scene, "test", lead=0, degrees=3.3, seed=0, limit=0)
     assert [(step.truth, step.cut) for step in path.steps] == [(n, True) for n in range(6)]
-
-
-def test_approaches_are_the_same_each_time_and_others_with_another_seed(tiny_scene):
+    limited = approached(tiny_scene, "test", lead=1, degrees=3.3, seed=0, limit=3)
+    assert [step.truth for step in limited.steps] == [None, 0, None, 2, None, 5]
+    assert limited.name == "test-approached1-3.3deg-3of6"
     first, again, other = (approached(tiny_scene, "test", 1, 3.3, seed, 0) for seed in (0, 0, 1))
     poses = [[step.camera.c2w.tolist() for step in path.steps] for path in (first, again, other)]
     assert poses[0] == poses[1] != poses[2]
-
-
-def test_a_limit_keeps_evenly_spread_cameras_to_approach(tiny_scene):
-    path = approached(tiny_scene, "test", lead=1, degrees=3.3, seed=0, limit=3)
-    assert [step.truth for step in path.steps] == [None, 0, None, 2, None, 5]
-    assert path.name == "test-approached1-3.3deg-3of6"

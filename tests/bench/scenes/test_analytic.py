@@ -15,7 +15,7 @@ from bench.scenes import analytic
 from bench.scenes.analytic import find, orbit_poses, train_poses
 from bench.scenes.models import MODELS
 from bench.scenes.raytrace import render
-from bench.types import Camera, Frame, Scene, SteerbenchError, Unavailable
+from bench.types import Camera, SteerbenchError, Unavailable
 
 SMALL = {"width": 24, "height": 18, "train": 4, "test": 2}
 
@@ -32,28 +32,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("scenes")
 
 
-def exact_frame(scene: Scene, camera: Camera, samples: int) -> Frame:
-    """What is really there, with `camera` and depth in scene units."""
-    in_model = move_camera(camera, scene.unit_length, scene.origin)
-    frame = render(find(scene.name), in_model, scene.background, samples)
-    return Frame(frame.rgb, frame.depth / scene.unit_length, frame.alpha)
-
-
-def test_the_layout_is_that_of_nerf_synthetic(tmp_path, log) -> None:
-    analytic.load("void", **SMALL, root=tmp_path, log=log)
-    (folder,) = tmp_path.iterdir()
-    assert folder.name.startswith("void-")
-    files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*"))
-    assert files == sorted(
-        ["transforms_train.json", "transforms_test.json"]
-        + [f"train/r_{k}.png" for k in range(4)]
-        + [f"test/r_{k}.png" for k in range(2)]
-    )
-    record = json.loads((folder / "transforms_train.json").read_text())
-    assert record["scene"] == {"name": "void", "seed": 0, **SMALL}
-
-
-def test_a_scene_is_written_once(tmp_path, log) -> None:
+def test_a_scene_is_written_once_in_the_layout_of_nerf_synthetic(tmp_path, log) -> None:
     options = {**SMALL, "bounds": "full", "root": tmp_path}
     first = analytic.load("void", **options, log=log)
     written = log.done
@@ -61,6 +40,13 @@ def test_a_scene_is_written_once(tmp_path, log) -> None:
     second = analytic.load("void", **options, log=log)
     assert log.done == written + 6
     assert second.digest == first.digest
+    (folder,) = tmp_path.iterdir()
+    assert folder.name.startswith("void-")
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*.*")}
+    pictures = {f"train/r_{k}.png" for k in range(4)} | {"test/r_0.png", "test/r_1.png"}
+    assert files == pictures | {"transforms_train.json", "transforms_test.json"}
+    record = json.loads((folder / "transforms_train.json").read_text())
+    assert record["scene"] == {"name": "void", "seed": 0, **SMALL}
 
 
 def test_who_finishes_second_accepts_the_scene_of_the_first(tmp_path, log, monkeypatch) -> None:
@@ -84,10 +70,8 @@ def test_every_parameter_has_its_own_folder(tmp_path, log) -> None:
 
 
 def test_two_writes_are_equal_byte_for_byte(tmp_path, log) -> None:
-    digests = {
-        analytic.load("totem", **SMALL, root=tmp_path / place, log=log).digest for place in "ab"
-    }
-    assert len(digests) == 1
+    one, other = (analytic.load("totem", **SMALL, root=tmp_path / p, log=log) for p in "ab")
+    assert one.digest == other.digest
 
 
 def test_cameras_come_back_as_they_were_made(drawn, log) -> None:
@@ -116,15 +100,14 @@ def test_a_scene_knows_its_picture_at_any_camera_as_its_splits_have_it(drawn, lo
 def test_no_surface_point_is_outside_the_bounds(drawn, log, name) -> None:
     scene = analytic.load(name, **SMALL, root=drawn, log=log)
     for camera in scene.splits["test"].cameras:
-        frame = exact_frame(scene, camera, samples=1)
+        in_model = move_camera(camera, scene.unit_length, scene.origin)
+        frame = render(find(name), in_model, scene.background, samples=1)
         seen = (frame.alpha > 0).nonzero()
         pixels = seen.flip(1) + 0.5
-        points = unproject(camera, pixels, frame.depth[seen[:, 0], seen[:, 1]])
+        depth = frame.depth[seen[:, 0], seen[:, 1]] / scene.unit_length
+        points = unproject(camera, pixels, depth)
         assert (points >= scene.bounds[0]).all()
         assert (points <= scene.bounds[1]).all()
-
-
-def test_models_lie_in_their_cube(name) -> None:
     assert find(name).boxes().abs().max() <= 1.2
 
 
@@ -154,9 +137,6 @@ def test_training_poses_look_at_the_middle_from_one_distance() -> None:
     assert math.sin(math.radians(-10)) <= height.min() < 0
     assert 0.9 < height.max() <= math.sin(math.radians(80))
     torch.testing.assert_close(poses[:, :, 2], -eyes / analytic.DISTANCE)
-
-
-def test_seeds_change_the_training_poses() -> None:
     first, again, other = train_poses(5, 0), train_poses(5, 0), train_poses(5, 1)
     assert all(map(torch.equal, first, again))
     assert not any(map(torch.equal, first, other))
@@ -198,11 +178,9 @@ def test_bad_options(tmp_path, log, options, message) -> None:
 
 
 def test_unknown_names_are_refused(tmp_path, log) -> None:
+    known = "one of totem, wires, cloud, void, medley-0, medley-1 and so on"
     for name in ("tower", "medley-", "medley--1", "medley-07", "medley-1.5"):
-        with pytest.raises(
-            Unavailable,
-            match=f"one of totem, wires, cloud, void, medley-0, medley-1 and so on, got '{name}'",
-        ):
+        with pytest.raises(Unavailable, match=f"{known}, got '{name}'"):
             analytic.load(name, root=tmp_path, log=log)
     assert list(tmp_path.iterdir()) == []
 

@@ -67,21 +67,13 @@ def test_downscale_scales_the_camera(blender_folder, log) -> None:
     assert (camera.fx, camera.cx, camera.cy) == (full.fx / 2, full.cx / 2, full.cy / 2)
 
 
-def with_validation(folder) -> None:
-    text = (folder / "transforms_train.json").read_text().replace("./train", "./val")
-    (folder / "transforms_val.json").write_text(text)
-
-
-def test_validation_split_without_pictures_is_left_out(blender_folder, log) -> None:
-    with_validation(blender_folder)
+def test_a_validation_split_has_all_its_pictures_or_none(blender_folder, log) -> None:
+    text = (blender_folder / "transforms_train.json").read_text().replace("./train", "./val")
+    (blender_folder / "transforms_val.json").write_text(text)
     scene = blender.load(blender_folder, bounds="full", log=log)
     assert set(scene.splits) == {"train", "test"}
     assert log.messages == ["transforms_val.json: none of its 3 pictures are there, split left out"]
-
-
-def test_validation_split_with_some_pictures_is_an_error(blender_folder, log) -> None:
     shutil.copytree(blender_folder / "train", blender_folder / "val")
-    with_validation(blender_folder)
     (blender_folder / "val" / "r_1.png").unlink()
     with pytest.raises(SteerbenchError, match=r"transforms_val.json: frames\[1\].file_path"):
         blender.load(blender_folder, log=log)
@@ -111,10 +103,6 @@ def frame(record: dict) -> dict:
     return record["frames"][1]
 
 
-def named(path: str):
-    return lambda record: frame(record).update(file_path=path)
-
-
 def placed(place: tuple[int, int], value: float):
     """Put a pose into a frame: the identity with one entry replaced."""
     matrix = np.eye(4)
@@ -131,10 +119,7 @@ def placed(place: tuple[int, int], value: float):
         (lambda r: frame(r).pop("file_path"), r"frames\[1\].file_path: expected a path"),
         (lambda r: frame(r).pop("transform_matrix"), r"frames\[1\].transform_matrix: .* 4x4"),
         (placed((0, 3), math.nan), r"frames\[1\].transform_matrix\[0\]\[3\]: .* got nan"),
-        (
-            placed((0, 0), 1.1),
-            r"transform_matrix: expected an orthonormal rotation, .* off by 0.21",
-        ),
+        (placed((0, 0), 1.1), r"transform_matrix: expected an orthonormal .* off by 0.21"),
         (placed((0, 0), -1), r"transform_matrix: .* right-handed .* mirrored"),
         (placed((3, 2), 0.5), r"transform_matrix\[3\]: expected \[0, 0, 0, 1\]"),
         (lambda r: r.pop("camera_angle_x"), r"camera_angle_x: .* got nothing"),
@@ -142,12 +127,14 @@ def placed(place: tuple[int, int], value: float):
         (lambda r: r.update(camera_angle_x=3.2), r"camera_angle_x: .* got 3.2"),
         (lambda r: r.update(camera_angle_x="0.7"), r"camera_angle_x: .* got '0.7'"),
         (lambda r: r.update(camera_angle_x=10**400), r"camera_angle_x: expected a finite number"),
-        (
-            named("../../etc/passwd"),
-            r"file_path: expected a path inside .*, got '../../etc/passwd'",
+        *(
+            (lambda r, path=path: frame(r).update(file_path=path), f"file_path: expected {said}")
+            for path, said in (
+                ("../../etc/passwd", r"a path inside .*, got '../../etc/passwd'"),
+                ("/etc/passwd", "a path inside"),
+                ("./train/none", "a picture, got no file .*train/none.png"),
+            )
         ),
-        (named("/etc/passwd"), r"frames\[1\].file_path: expected a path inside"),
-        (named("./train/none"), r"file_path: expected a picture, got no file .*train/none.png"),
     ],
 )
 def test_bad_camera_file_names_file_and_field(
@@ -160,9 +147,9 @@ def test_bad_camera_file_names_file_and_field(
         blender.load(blender_folder, log=log)
 
 
-def encoded(image: np.ndarray) -> bytes:
+def encoded(*shape: int, dtype: str = "uint8") -> bytes:
     file = io.BytesIO()
-    Image.fromarray(image).save(file, "png")
+    Image.fromarray(np.ones(shape, dtype)).save(file, "png")
     return file.getvalue()
 
 
@@ -178,18 +165,10 @@ DEEP = png(struct.pack(">2I5B", 8, 6, 16, 2, 0, 0, 0), bytes(6 * (1 + 6 * 8)))
         ("transforms_test.json", b"[" * 100_000, r": expected JSON, got"),
         ("transforms_test.json", b"\xff\xfe\x00{", r": .* readable text file"),
         ("transforms_test.json", None, r": expected a file"),
-        (
-            "train/r_2.png",
-            encoded(np.ones((6, 8, 3), np.uint8))[:-40],
-            r": expected a whole picture",
-        ),
+        ("train/r_2.png", encoded(6, 8, 3)[:-40], r": expected a whole picture"),
         ("train/r_0.png", b"not a picture", r": expected a whole picture"),
-        (
-            "train/r_1.png",
-            encoded(np.ones((6, 7), np.uint8)),
-            r": expected 8 x 6 pixels, got 7 x 6",
-        ),
-        ("train/r_1.png", encoded(np.ones((6, 8), np.uint16)), r": expected 8 bits a channel"),
+        ("train/r_1.png", encoded(6, 7), r": expected 8 x 6 pixels, got 7 x 6"),
+        ("train/r_1.png", encoded(6, 8, dtype="uint16"), r": expected 8 bits a channel"),
         ("train/r_1.png", DEEP, r": expected 8 bits a channel"),
     ],
 )
@@ -202,11 +181,6 @@ def test_a_file_that_is_damaged_or_missing_is_named(
         list(blender.load(blender_folder, log=log).splits["train"].images)
 
 
-def test_missing_folder(tmp_path, log) -> None:
-    with pytest.raises(SteerbenchError, match=r"nowhere: expected a folder, got nothing there"):
-        blender.load(tmp_path / "nowhere", log=log)
-
-
 @pytest.mark.parametrize("what", ["train/r_1.png", "transforms_train.json"])
 def test_link_out_of_the_folder_is_refused(blender_folder, tmp_path, log, what) -> None:
     inside = blender_folder / what
@@ -215,6 +189,8 @@ def test_link_out_of_the_folder_is_refused(blender_folder, tmp_path, log, what) 
     inside.symlink_to(outside)
     with pytest.raises(SteerbenchError, match=r"expected a path inside"):
         blender.load(blender_folder, log=log)
+    with pytest.raises(SteerbenchError, match=r"nowhere: expected a folder, got nothing there"):
+        blender.load(tmp_path / "nowhere", log=log)
 
 
 @pytest.mark.parametrize(

@@ -73,12 +73,8 @@ def test_cells_that_leave_the_picture_are_kept() -> None:
     assert box is not None
     assert (box.lower <= -1.5).all()
     assert (box.upper >= 1.5).all()
-
-
-def test_a_camera_inside_the_space_rules_nothing_behind_it_out() -> None:
-    pose = torch.eye(4)[:3]
-    inside = Camera(pose, 16.0, 16.0, 16, 16, SIZE, SIZE)
-    nothing = torch.zeros(SIZE, SIZE, 4, dtype=torch.uint8)
+    # A camera inside the space rules nothing out behind it.
+    inside = Camera(torch.eye(4)[:3], 16.0, 16.0, 16, 16, SIZE, SIZE)
     box = hull_box([inside], [nothing], cube(1.5))
     assert box is not None
     assert box.lower[2] <= -1.5

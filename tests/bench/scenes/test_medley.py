@@ -71,8 +71,9 @@ def test_the_core_touches_its_first_part() -> None:
             assert first.shape.distance(local[None]) <= 1e-5
 
 
-def test_every_solid_and_every_texture_occurs() -> None:
+def test_every_solid_and_every_texture_occurs_fine_and_coarse() -> None:
     parts = [part for variant in FIRST for part in medley(variant).parts]
+    assert {*BULKY, *SMALLER} == SHAPES.keys()
     shapes = {type(part.shape) for part in parts}
     assert shapes == {Box, Capsule, Carved, Common, Cylinder, Ellipsoid}
     makers = {  # of all functions of that module, those that were made to give a texture
@@ -83,17 +84,9 @@ def test_every_solid_and_every_texture_occurs() -> None:
     assert {part.texture.__name__ for part in parts} == makers
     assert len(makers) == 10
     assert {part.gloss > 0 for part in parts} == {True, False}
-
-
-def test_there_is_fine_and_coarse() -> None:
-    parts = [part for variant in FIRST for part in medley(variant).parts]
     thickness = [min(part.shape.extent()) for part in parts]
     assert min(thickness) < 0.01
     assert max(thickness) > 0.3
-
-
-def test_every_kind_of_solid_is_drawn() -> None:
-    assert {*BULKY, *SMALLER} == SHAPES.keys()
 
 
 @pytest.mark.parametrize("kind", SHAPES)
@@ -110,17 +103,12 @@ def test_solids_have_about_the_size_they_are_made_with(kind) -> None:
             assert shape.distance(directions * torch.tensor(shape.extent())).max() <= 1e-5
 
 
-def test_a_deck_repeats_nothing_before_all_have_come() -> None:
+def test_a_deck_repeats_nothing_and_draws_keep_their_range() -> None:
     cards = Draw(1).deck("abcde", 12)
     assert len(cards) == 12
     assert sorted(cards[:5]) == sorted(cards[5:10]) == list("abcde")
     assert len(set(cards[10:])) == 2
-
-
-def test_draws_keep_their_range() -> None:
     draw = Draw(3)
     assert {draw.whole(2, 4) for _ in range(200)} == {2, 3, 4}
     assert all(1 <= draw.between(1, 2) <= 2 and 1 <= draw.small(1, 2) <= 2 for _ in range(200))
-    assert all(
-        sum(x * x for x in draw.direction()) == pytest.approx(1, rel=1e-12) for _ in range(200)
-    )
+    assert math.hypot(*draw.direction()) == pytest.approx(1, rel=1e-12)

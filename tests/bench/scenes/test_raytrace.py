@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.cameras import cast, scale_camera
+from bench.cameras import cast
 from bench.scenes import raytrace
 from bench.scenes.models import totem, wires
 from bench.scenes.opaque import LIGHT, Part, Solids
@@ -34,12 +34,9 @@ def test_16_samples_stand_for_the_16_quarter_pixel_cells() -> None:
     assert len(set(offsets[:, 0].tolist())) == len(set(offsets[:, 1].tolist())) == 16
     assert offsets.mean(0).tolist() == [0.5, 0.5]
     assert sample_offsets(1).tolist() == [[0.5, 0.5]]
-
-
-@pytest.mark.parametrize("samples", [0, -4, 3, 12])
-def test_other_sample_counts_are_refused(samples) -> None:
-    with pytest.raises(SteerbenchError, match="samples: expected a power of two"):
-        sample_offsets(samples)
+    for samples in (0, -4, 3, 12):
+        with pytest.raises(SteerbenchError, match="samples: expected a power of two"):
+            sample_offsets(samples)
 
 
 def test_depth_of_a_sphere_is_the_closed_form(device) -> None:
@@ -119,6 +116,7 @@ def test_shadow_of_a_sphere_is_the_closed_form() -> None:
     points = torch.cat((flat, torch.zeros(4000, 1)), 1)
     offset = torch.tensor(caster.centre) - points
     light = torch.tensor(LIGHT)
+    assert math.hypot(*LIGHT) == pytest.approx(1, abs=1e-6)
     ahead = offset @ light
     gap = (offset - ahead[:, None] * light).norm(dim=1) - 0.3
     certain = gap.abs() > 1e-4
@@ -139,10 +137,6 @@ def test_culling_of_shadow_casters_changes_nothing(monkeypatch) -> None:
     assert torch.equal(render(model, camera, torch.ones(3), 4).rgb, culled)
 
 
-def test_the_light_is_a_unit_vector() -> None:
-    assert math.hypot(*LIGHT) == pytest.approx(1, abs=1e-6)
-
-
 def test_highlights_move_with_the_viewer() -> None:
     glossy = Solids([Part(Ellipsoid((0.7, 0.7, 0.7)), RED, gloss=0.9)])
     top = Solids([sphere(0.7)])
@@ -155,14 +149,3 @@ def test_highlights_move_with_the_viewer() -> None:
         ray = cast(camera, torch.tensor([[column + 0.5, row + 0.5]]))
         places.append(ray.origins[0] + depth * ray.directions[0])
     assert (places[0] - places[1]).norm() > 0.05
-
-
-def test_resolutions_agree() -> None:
-    camera = camera_at((1.0, -3.5, 1.5), size=32)
-    low = render(totem(), camera, torch.ones(3), samples=16)
-    high = render(totem(), scale_camera(camera, 128, 128), torch.ones(3), samples=16)
-    mean = high.rgb.reshape(32, 4, 32, 4, 3).mean((1, 3))
-    # 16 and 256 samples of one footprint: the error of 16 is at most that of a random draw on
-    # average, 1 / (2 sqrt 16), where two colours meet.
-    assert (mean - low.rgb).abs().mean() <= 1 / 8
-    assert (mean - low.rgb).abs().mean() <= 0.25 * (low.rgb[1:] - low.rgb[:-1]).abs().mean()

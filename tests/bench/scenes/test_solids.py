@@ -16,7 +16,7 @@ SHAPES: dict[str, Shape] = {
     "capsule": Capsule(0.3, 0.5),
     "common": Common(Box((0.6, 0.6, 0.6)), Ellipsoid((0.8, 0.8, 0.8))),
     "common of a shifted": Common(
-        Cylinder(0.6, 0.6), Shifted(Ellipsoid((0.7, 0.7, 0.7)), (0.3, 0.0, 0.2))
+        Cylinder(0.6, 0.6), Shifted(Ellipsoid((0.7,) * 3), (0.3, 0, 0.2))
     ),
     "carved": Carved(
         Box((0.6, 0.6, 0.4)),
@@ -116,13 +116,10 @@ def test_rays_along_an_axis_meet_box_and_cylinder(axis) -> None:
     directions[axis] = torch.ones(1)
     origin = [0.1, 0.1, 0.1]
     origin[axis] = -2.0
-    assert Box((0.5, 0.6, 0.7)).hit(tuple(origin), tuple(directions)).item() == pytest.approx(
-        2 - (0.5, 0.6, 0.7)[axis]
-    )
     wall = math.sqrt(0.25 - 0.01)
-    assert Cylinder(0.5, 0.7).hit(tuple(origin), tuple(directions)).item() == pytest.approx(
-        2 - (wall, wall, 0.7)[axis]
-    )
-    origin[(axis + 1) % 3] = 1.0
-    assert Box((0.5, 0.6, 0.7)).hit(tuple(origin), tuple(directions)).isinf().all()
-    assert Cylinder(0.5, 0.7).hit(tuple(origin), tuple(directions)).isinf().all()
+    aside = list(origin)
+    aside[(axis + 1) % 3] = 1.0
+    for shape, reach in ((Box((0.5, 0.6, 0.7)), (0.5, 0.6)), (Cylinder(0.5, 0.7), (wall, wall))):
+        met = shape.hit(tuple(origin), tuple(directions)).item()
+        assert met == pytest.approx(2 - (*reach, 0.7)[axis])
+        assert shape.hit(tuple(aside), tuple(directions)).isinf().all()
