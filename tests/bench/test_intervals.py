@@ -28,6 +28,7 @@ def test_independent_values_have_the_interval_of_student() -> None:
     values = np.array([1.0, 2.0, 4.0, 9.0])
     low, high = stats.t.interval(0.95, 3, loc=4.0, scale=stats.sem(values))
     assert half_interval(values) == pytest.approx((high - low) / 2)
+    assert path_interval(values[:2]) == pytest.approx(half_interval(values[:2]))  # and two frames
 
 
 @BOTH
@@ -46,11 +47,6 @@ def test_what_has_no_interval_is_nan(half, values: list[float]) -> None:
 def test_the_interval_has_the_unit_of_the_values_and_no_place_or_direction(half) -> None:
     values = paths(0.8, 1, 24)[0]
     assert half(-3 * values[::-1] + 50) == pytest.approx(3 * half(values))
-
-
-def test_two_frames_of_a_path_have_the_interval_of_student() -> None:
-    values = np.array([1.0, 3.0])
-    assert path_interval(values) == pytest.approx(half_interval(values))
 
 
 @pytest.mark.parametrize("frames", [24, 200])

@@ -29,6 +29,7 @@ def accounts(monkeypatch):
     monkeypatch.setattr(psutil, "cpu_count", lambda: 4)
     monkeypatch.setattr(time, "monotonic", lambda: now["passed"])
     monkeypatch.setattr(time, "process_time", lambda: now["own"])
+    monkeypatch.setattr(neighbours, "NOTABLE_SHARE", 0.1)
     return now
 
 
@@ -40,19 +41,14 @@ def test_work_of_others_is_all_work_less_our_own(accounts):
     assert str(watch.seen()) == "other programs kept 1.4 of 4 cores busy"
 
 
-def test_alone_there_is_nothing_to_warn_of(accounts, monkeypatch):
-    monkeypatch.setattr(neighbours, "NOTABLE_SHARE", 0.1)
+def test_alone_there_is_nothing_to_warn_of(accounts):
     watch = Watch()
     assert watch.seen().busy == 0.0
     accounts |= {"passed": 10.0, "own": 20.0, "times": Times(20, 3, 17, 0, 0, 0)}
     assert not watch.seen().notable
     accounts["times"] = Times(23, 3, 14, 0, 0, 0)
     assert watch.seen().notable
-
-
-def test_what_is_shorter_than_the_accounts_can_tell_is_not_warned_of(accounts, monkeypatch):
-    monkeypatch.setattr(neighbours, "NOTABLE_SHARE", 0.1)
-    watch = Watch()
+    # Nor of a time that is shorter than the accounts can tell.
     accounts |= {"passed": 0.05, "own": 0.0, "times": Times(0.2, 0, 0, 0, 0, 0)}
     assert watch.seen().busy == 4.0
     assert not watch.seen().notable

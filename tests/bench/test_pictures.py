@@ -31,18 +31,14 @@ def noise(channels: int = 3, size: tuple[int, int] = (16, 20), seed: int = 0) ->
     return torch.randint(256, (*size, channels), dtype=torch.uint8, generator=generator)
 
 
-def brighter(levels: int) -> tuple[Tensor, Tensor]:
-    """A grey picture, and one that is so many levels brighter."""
-    grey = torch.full((16, 20, 3), 100, dtype=torch.uint8)
-    return grey, grey + levels
+GREY = torch.full((16, 20, 3), 100, dtype=torch.uint8)
 
 
 def test_the_psnr_is_that_of_the_difference_and_equal_pictures_have_none(
     tmp_path: Path, quiet_log: Log
 ) -> None:
-    truth, picture = brighter(10)
-    ours = write(tmp_path / "ours", {"a.png": picture, "b.png": truth})
-    true = write(tmp_path / "true", {"a.png": truth, "b.png": truth})
+    ours = write(tmp_path / "ours", {"a.png": GREY + 10, "b.png": GREY})
+    true = write(tmp_path / "true", {"a.png": GREY, "b.png": GREY})
     pairs = pictures.pairs_with_folder(ours, true)
     found = pictures.score(pairs, QUICK, {}, FACTS, quiet_log)
     assert found.frames["psnr"][0] == pytest.approx(20 * math.log10(255 / 10), abs=1e-5)
@@ -52,9 +48,9 @@ def test_the_psnr_is_that_of_the_difference_and_equal_pictures_have_none(
 
 
 def test_a_sequence_has_a_flicker_where_the_error_changes(tmp_path: Path, quiet_log: Log) -> None:
-    truth, picture = brighter(51)  # 0.2
-    ours = write(tmp_path / "ours", {"1.png": picture, "2.png": picture, "10.png": truth})
-    true = write(tmp_path / "true", {f"{number}.png": truth for number in (1, 2, 10)})
+    shown = {"1.png": GREY + 51, "2.png": GREY + 51, "10.png": GREY}  # off by 0.2, then not
+    ours = write(tmp_path / "ours", shown)
+    true = write(tmp_path / "true", dict.fromkeys(shown, GREY))
     pairs = pictures.pairs_with_folder(ours, true)
     found = pictures.score(pairs, QUICK, {}, FACTS, quiet_log, sequence=True)
     assert math.isnan(found.frames["flicker"][0])

@@ -93,25 +93,18 @@ def test_backbones_that_cannot_be_had_are_named_with_the_reason_once_in_a_proces
     assert [message.split(":")[0] for message in log.messages] == ["lpips_vgg"]
 
 
-def test_a_scene_on_another_background_is_refused(tiny_scene):
-    QUICK.check(tiny_scene, from_split(tiny_scene))
+def test_what_cannot_be_scored_is_refused(tiny_scene):
+    trajectory = from_split(tiny_scene)
+    QUICK.check(tiny_scene, trajectory)
     black = replace(tiny_scene, background=torch.zeros(3))
     with pytest.raises(SteerbenchError, match=r"scores on white, but scene tiny .* \[0, 0, 0\]"):
-        QUICK.check(black, from_split(black))
-
-
-def test_frames_too_small_for_a_metric_are_refused(tiny_scene):
-    trajectory = from_split(tiny_scene)
+        QUICK.check(black, trajectory)
     small = replace(trajectory.steps[0], camera=scale_camera(trajectory.steps[0].camera, 20, 16))
     shrunk = replace(trajectory, steps=(*trajectory.steps, small))
     QUICK.check(tiny_scene, shrunk)
     with pytest.raises(SteerbenchError, match=r"lpips_alex needs .* 31 x 31 pixels, got 20 x 16"):
         EvaluationProtocol().check(tiny_scene, shrunk)
-
-
-def test_flicker_against_exact_pictures_is_refused_where_there_are_none(tiny_scene):
-    protocol = replace(QUICK, name="exact", flicker="exact")
-    path = from_split(tiny_scene)
+    exact = replace(QUICK, name="exact", flicker="exact")
     with pytest.raises(SteerbenchError, match=r"protocol\.flicker=exact: scene .* has no exact"):
-        protocol.check(tiny_scene, path)
-    protocol.check(replace(tiny_scene, exact=lambda camera: torch.zeros(0)), path)
+        exact.check(tiny_scene, trajectory)
+    exact.check(replace(tiny_scene, exact=lambda camera: torch.zeros(0)), trajectory)

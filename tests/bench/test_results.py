@@ -31,19 +31,10 @@ PARTS = st.dictionaries(st.text(), JSON, max_size=4)
 
 def measurement(values: list[float], text: str = "plain") -> Measurement:
     """One row per value; `text` stands in the columns of text."""
-    words = ("method", "scene", "split", "trajectory", "resolution", "protocol", "budget")
-    kind = ("phase", "unit", "device", "backend", "engine", "precision")
-    rows = pd.DataFrame(
-        {
-            **dict.fromkeys((*words, *kind), text),
-            "metric": [f"metric_{i}" for i in range(len(values))],
-            "value": values,
-            "n": 1,
-            "lo": math.nan,
-            "hi": math.nan,
-            "seed": 0,
-        }
-    )
+    metrics = [f"metric_{i}" for i in range(len(values))]
+    figures = {"n": 1, "lo": math.nan, "hi": math.nan, "seed": 0}
+    words = dict.fromkeys(set(COLUMNS) - {"run", "commit", "metric", "value", *figures}, text)
+    rows = pd.DataFrame({"metric": metrics, "value": values, **figures, **words})
     frames = pd.DataFrame({"frame": [0, 1], "name": ["007", "NA"], "psnr": [30.25, math.nan]})
     picture = np.arange(60, dtype=np.uint8).reshape(4, 5, 3)
     return Measurement(rows, frames, {"0000-truth": picture}, {"note": "as measured"})

@@ -83,7 +83,7 @@ def test_of_two_processes_the_second_waits_for_what_the_first_makes_or_for_its_e
             second.communicate("go on\n")
 
 
-def test_every_user_can_open_a_lock_whatever_the_umask(tmp_path, log):
+def test_every_user_can_open_a_lock_whatever_the_umask(tmp_path, monkeypatch, log):
     before = os.umask(0o077)
     try:
         with locked(tmp_path / "lock", "", log):
@@ -91,14 +91,10 @@ def test_every_user_can_open_a_lock_whatever_the_umask(tmp_path, log):
     finally:
         os.umask(before)
     assert (tmp_path / "lock").stat().st_mode & 0o777 == 0o666
-
-
-def test_a_lock_that_is_there_is_opened_as_that_of_another_user(tmp_path, monkeypatch, log):
-    """For which the system refuses O_CREAT in a folder for everybody."""
-    (tmp_path / "lock").touch()
     system_open = os.open
 
     def opened(path: Path, flags: int, *mode: int) -> int:
+        """As for another user, whom the system refuses O_CREAT in a folder for everybody."""
         if flags & os.O_CREAT and not flags & os.O_EXCL:
             raise PermissionError(13, "Permission denied", str(path))
         return system_open(path, flags, *mode)

@@ -54,14 +54,11 @@ def test_a_whole_split_is_rendered_in_its_order_with_its_ground_truth(tiny_scene
     assert from_split(mixed).resolution == "mixed"
 
 
-def test_a_limit_stands_in_the_name_unless_it_keeps_everything(tiny_scene):
+def test_a_limit_stands_in_the_name_and_cuts_before_a_frame_whose_predecessor_is_out(tiny_scene):
     thinned = from_split(tiny_scene, limit=3)
     assert [step.truth for step in thinned.steps] == [0, 2, 5]
     assert thinned.name == "test-3of6"
     assert from_split(tiny_scene, limit=99).name == "test"
-
-
-def test_a_frame_that_is_kept_without_the_one_before_it_comes_after_a_cut(tiny_scene):
     assert [step.cut for step in from_split(tiny_scene, limit=2).steps] == [False, True]
     steps = from_split(tiny_scene, limit=5).steps
     assert [step.truth for step in steps] == [0, 1, 2, 4, 5]

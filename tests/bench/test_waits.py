@@ -14,7 +14,7 @@ from bench.waits import device_waits
 from tests.pretended_gpu import PretendedGpu
 
 
-def test_the_line_that_waits_is_named(gpu: PretendedGpu) -> None:
+def test_the_line_that_waits_or_calls_what_waits_in_torch_is_named(gpu: PretendedGpu) -> None:
     x = torch.ones(3, device="cuda")
     with device_waits() as waits:
         for _ in range(2):
@@ -22,9 +22,6 @@ def test_the_line_that_waits_is_named(gpu: PretendedGpu) -> None:
     ((line, count),) = waits.items()
     assert (line.path, count) == (__file__, 2)
     assert linecache.getline(*line).strip() == "torch.unique(x)"
-
-
-def test_of_a_wait_in_torch_the_line_that_called_torch_is_named(gpu: PretendedGpu) -> None:
     scope: dict[str, Any] = {}
     text = "def wait():\n import warnings\n warnings.warn('called a synchronizing CUDA operation')"
     exec(compile(text, torch.functional.__file__, "exec"), scope)

@@ -46,18 +46,14 @@ def test_every_nth_picture_by_name_is_a_test(folder, picture, log) -> None:
     assert np.array_equal(scene.splits["test"].images[1].numpy(), picture(4, channels=3))
 
 
-def test_intrinsics_of_a_frame_go_first(folder, edit_json, log) -> None:
-    edit_json(folder / "transforms.json", of_picture(8, fl_x=7.0, cx=4.0))
+@pytest.mark.parametrize(
+    ("focal", "fx"), [({"fl_x": 7.0}, 7), ({"camera_angle_x": 2 * np.arctan(0.25)}, 8 / 2 / 0.25)]
+)
+def test_intrinsics_of_a_frame_go_first(folder, edit_json, log, focal, fx) -> None:
+    edit_json(folder / "transforms.json", of_picture(8, cx=4.0, **focal))
     first, second = transforms.load(folder, log=log).splits["test"].cameras
     assert (first.fx, first.fy, first.cx, first.cy) == (9, 8, 4.5, 2.5)
-    assert (second.fx, second.fy, second.cx, second.cy) == (7, 8, 4, 2.5)
-
-
-def test_the_angle_of_a_frame_goes_before_the_length_of_the_file(folder, edit_json, log) -> None:
-    edit_json(folder / "transforms.json", of_picture(8, camera_angle_x=2 * np.arctan(0.25)))
-    first, second = transforms.load(folder, log=log).splits["test"].cameras
-    assert first.fx == 9
-    assert second.fx == pytest.approx(8 / 2 / 0.25)
+    assert (second.fx, second.fy, second.cx, second.cy) == pytest.approx((fx, 8, 4, 2.5))
 
 
 def test_pictures_of_several_sizes(folder, picture, edit_json, log) -> None:
