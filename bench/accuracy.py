@@ -26,13 +26,7 @@ from bench.types import Log, Method, Scene, SteerbenchError
 
 @dataclass(frozen=True)
 class Trial:
-    """One setting of a knob.
-
-    Attributes:
-        setting: the value of the knob; a word where it is not a number.
-        call: computes an approximation of `exact`; its inputs are ready.
-        exact: the answer, float64.
-    """
+    """One setting of a knob, a number or a word; `call` approximates `exact`, float64, with it."""
 
     setting: float | str
     call: Callable[[], Tensor]

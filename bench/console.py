@@ -54,7 +54,6 @@ class ConsoleLog:
         )
 
     def info(self, message: str) -> None:
-        """Print one line, above the progress bars."""
         self._console.print(message, markup=False, highlight=False, soft_wrap=True)
 
     @contextmanager
@@ -105,7 +104,7 @@ class _Bar:
             self._bars.refresh()
 
     def report_done(self) -> None:
-        """Leave a line on the screen if the work took long enough; see `WORTH_A_LINE_S`."""
+        """Leave a line on the screen if the work took long enough."""
         elapsed = self._clock() - self._begun
         if elapsed > WORTH_A_LINE_S:
             self._line(f"done in {_duration(elapsed)}")

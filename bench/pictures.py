@@ -37,13 +37,7 @@ Match = Literal["name", "order"]
 
 @dataclass(frozen=True)
 class Pair:
-    """A picture to score and its true picture.
-
-    Attributes:
-        picture: the file to score.
-        name: the name of the true picture.
-        truth: its file, or its pixels as uint8 [H, W, 3 or 4].
-    """
+    """A file to score; `name` and `truth` of its true picture, a file or uint8 [H, W, 3 or 4]."""
 
     picture: Path
     name: str

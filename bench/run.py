@@ -45,10 +45,8 @@ UNITS = {
 class Task:
     """What a method is measured on.
 
-    Attributes:
-        seed: the seed that the method was made with; only written into the rows.
-        weights_dir: folder to search first for the LPIPS backbones.
-        pictures: number of scored frames whose pictures are kept.
+    `seed`, that of the method, is only written into the rows. LPIPS backbones are searched in
+    `weights_dir` first. Of so many scored frames the `pictures` are kept.
     """
 
     scene: Scene

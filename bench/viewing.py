@@ -70,10 +70,8 @@ class Turns:
 class Drawn:
     """A picture rendered by a method.
 
-    Attributes:
-        rgb: [H, W, 3] in [0, 1], on the CPU, rounded to 8 bits.
-        ms: the frame time.
-        stages_ms: time of each stage without nested stages, longest first.
+    `rgb` [H, W, 3] in [0, 1] is on the CPU, rounded to 8 bits; `ms` is the frame time, `stages_ms`
+    that of each stage without nested stages, longest first.
     """
 
     rgb: Tensor

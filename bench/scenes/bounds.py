@@ -73,8 +73,8 @@ def parse_box(value: object) -> Box:
 def hull_box(cameras: Sequence[Camera], images: Sequence[Tensor], space: Box) -> Box | None:
     """The box of the visual hull of the pictures' masks (alpha > 0) inside `space`.
 
-    Conservative: a cell is dropped only if its whole projection, plus one pixel around it, lies
-    inside a picture and shows nothing. None if the pictures are opaque or no cell is left.
+    A cell is dropped only if its whole projection, plus one pixel around it, lies inside a picture
+    and shows nothing. None if the pictures are opaque or no cell is left.
     """
     if any(image.shape[2] < 4 for image in images) or all((x[..., 3] == 255).all() for x in images):
         return None

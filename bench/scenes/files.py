@@ -125,10 +125,7 @@ def numbers(text: str, where: str | Path) -> list[list[float]]:
 
 
 def rigid_pose(value: object, where: str) -> Tensor:
-    """A camera-to-world matrix [3, 4] float64 from nested lists, 4x4 or 3x4.
-
-    Raises unless the rotation is orthonormal and right-handed and the last row is (0, 0, 0, 1).
-    """
+    """A rigid, right-handed camera-to-world matrix [3, 4] float64 from nested lists, 4x4 or 3x4."""
     rows = value if isinstance(value, list) else []
     if len(rows) not in (3, 4) or any(not isinstance(r, list) or len(r) != 4 for r in rows):
         raise unexpected(where, "a 4x4 matrix", describe(value))

@@ -38,7 +38,6 @@ class Cloud:
     balls: Sequence[Ball]
 
     def boxes(self) -> Tensor:
-        """Corners of a box around each ball, [P, 8, 3]."""
         balls = self.balls
         return torch.stack([torch.tensor(b.centre) + box_corners((b.radius,) * 3) for b in balls])
 

@@ -53,10 +53,7 @@ class Part:
 
 
 class Solids:
-    """A model of opaque parts: the nearest surface is seen, with opacity 1.
-
-    The light is a point at infinity, so shadows are hard and exact.
-    """
+    """A model of opaque parts, lit by a point at infinity: shadows are hard and exact."""
 
     def __init__(self, parts: Sequence[Part]) -> None:
         self.parts = parts
@@ -67,7 +64,6 @@ class Solids:
         self.low, self.high = boxes.amin(1), boxes.amax(1)
 
     def boxes(self) -> Tensor:
-        """Corners of a box around each part, [P, 8, 3]."""
         return torch.stack([part.box() for part in self.parts])
 
     def trace(self, band: Band, spans: Sequence[Span]) -> Traced:

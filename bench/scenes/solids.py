@@ -170,7 +170,6 @@ class Shifted(Convex):
     offset: Triple
 
     def extent(self) -> Triple:
-        """Half sizes of a centred box that contains the moved shape."""
         x, y, z = (abs(o) + e for o, e in zip(self.offset, self.shape.extent(), strict=True))
         return x, y, z
 
