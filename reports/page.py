@@ -19,10 +19,7 @@ from reports.tables import Table, run_tables
 
 
 def write_page(
-    store: Store,
-    labels: Mapping[str, str],
-    folder: Path,
-    failures: Mapping[str, str] | None = None,
+    store: Store, labels: Mapping[str, str], folder: Path, failures: Mapping[str, str] | None = None
 ) -> Path:
     """Write `folder/report.md` with its pictures, and the same as `report.html`; return the former.
 

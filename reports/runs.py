@@ -64,7 +64,7 @@ class Run:
 
     def _repr_markdown_(self) -> str:
         """The run's tables, for display in a notebook."""
-        tables = "\n\n".join(table.section(level=4) for table in run_tables(self.rows))
+        tables = "\n\n".join(f"#### {x.title}\n\n{x.markdown()}" for x in run_tables(self.rows))
         return f"### {self.label}\n\n{tables}"
 
     @cached_property

@@ -90,9 +90,7 @@ def _lines(of_block: Mapping[str, Sequence[Outcome]]) -> list[Repeated]:
     return [_line(label, outcomes, common) for label, outcomes in of_block.items()]
 
 
-def _over_common_frames(
-    of_block: Mapping[str, Sequence[Outcome]],
-) -> dict[str, list[Outcome]]:
+def _over_common_frames(of_block: Mapping[str, Sequence[Outcome]]) -> dict[str, list[Outcome]]:
     every = [each for line in of_block.values() for each in line]
     runs = iter(over_common_frames([each.run for each in every if each.run]))
     return {

@@ -21,7 +21,7 @@ from bench.protocol import EvaluationProtocol
 from bench.study import Study, Variant, study_of
 from bench.trajectories import Trajectory
 from bench.types import Log, Method, Scene
-from reports.tables import decimal
+from reports.tables import decimal, spread
 from sweeps.build import build, engine_kinds, target_of
 from sweeps.configured import checked_settings, scene_of
 from sweeps.device_lock import device_lock
@@ -236,13 +236,7 @@ def engines(words: Sequence[str] = ()) -> list[Variant]:
     ]
 
 
-COMPARED = (
-    "PSNR to the first, dB ↑",
-    "PSNR, dB ↑",
-    "lost, dB ↓",
-    "frame, ms ↓",
-    "of rounds",
-)
+COMPARED = ("PSNR to the first, dB ↑", "PSNR, dB ↑", "lost, dB ↓", "frame, ms ↓", "of rounds")
 """The columns of `compared_cells`."""
 
 
@@ -270,13 +264,8 @@ def compared_cells(row: Row) -> tuple[str, ...]:
         decimal(row["psnr"], 2),
         decimal(row["lost"], 3),
         decimal(row["frame_ms"], 1),
-        range_text(row),
+        spread(row["ms_lo"], row["ms_hi"]),
     )
-
-
-def range_text(values: Mapping[str, Any]) -> str:
-    """Mean frame times of the fastest and the slowest round, as text."""
-    return f"{decimal(values['ms_lo'], 1)} – {decimal(values['ms_hi'], 1)}"
 
 
 def amount(value: float) -> str:

@@ -21,15 +21,7 @@ from bench.compositing import composite
 from bench.errors import SteerbenchError, Unavailable, install_command
 from bench.metrics import as_bytes, psnr
 from bench.types import Camera, Log, Scene
-from bench.viewing import (
-    Ask,
-    Drawn,
-    Painter,
-    Turns,
-    difference,
-    divided,
-    seen_from,
-)
+from bench.viewing import Ask, Drawn, Painter, Turns, difference, divided, seen_from
 
 if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle, ViserServer
@@ -169,7 +161,8 @@ class Viewer:
     def _turner(self, place: int, knob: str, choice: Any) -> Callable[[Any], None]:
         def turned(_: Any) -> None:
             self._turned.append((place, knob, choice.value))
-            self._redraw()
+            for who in list(self.browsers):
+                self._want(who)
 
         return turned
 
@@ -187,10 +180,6 @@ class Viewer:
         for browser in list(self.browsers.values()):
             browser.client.add_notification(what, str(error), color="red")
 
-    def _redraw(self) -> None:
-        for who in list(self.browsers):
-            self._want(who)
-
     def _join(self, client: ClientHandle) -> None:
         gui, names = client.gui, [method.name for method in self.painter.methods]
         two = len(names) == 2
@@ -205,9 +194,8 @@ class Viewer:
             record=gui.add_checkbox("record a path", False),
             figures=gui.add_markdown("drawing the first picture ..."),
         )
-        controls = browser.shown, browser.split, browser.height, browser.exact, browser.record
-        for control in controls:
-            control.on_update(lambda _: self._want(client.client_id))
+        for name in ("shown", "split", "height", "exact", "record"):
+            getattr(browser, name).on_update(lambda _: self._want(client.client_id))
         gui.add_button("first view").on_click(lambda _: self._look(client.camera, self.first))
         self.browsers[client.client_id] = browser
         client.camera.on_update(lambda _: self._want(client.client_id))
@@ -291,12 +279,8 @@ def _figures(painter: Painter, drawn: Sequence[Drawn], truth: Tensor | None) -> 
     lines = [f"{width} x {height} pixels", ""]
     for method, picture in zip(painter.methods, drawn, strict=True):
         quality = "" if truth is None else f", {psnr(picture.rgb, truth):.2f} dB"
-        lines += [
-            f"**{method.name}** {picture.ms:.0f} ms{quality}",
-            "",
-            "| stage | ms |",
-            "|---|---|",
-        ]
+        lines += [f"**{method.name}** {picture.ms:.0f} ms{quality}", ""]
+        lines += ["| stage | ms |", "|---|---|"]
         lines += [f"| {stage} | {ms:.1f} |" for stage, ms in picture.stages_ms.items()]
         lines.append("")
     return "\n".join(lines)

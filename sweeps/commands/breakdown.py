@@ -13,7 +13,7 @@ from bench.probes import OTHER
 from bench.study import Study, Variant
 from bench.types import NullProbe
 from bench.waits import Line, device_waits
-from reports.tables import Table, decimal
+from reports.tables import Table, decimal, spread
 from sweeps.commands.skips import nothing_skipped
 from sweeps.device_lock import on_gpu
 from sweeps.execute import Launcher
@@ -27,7 +27,6 @@ from sweeps.variants import (
     declared,
     engines,
     fitted,
-    range_text,
     render_variants,
     settings,
     settings_of,
@@ -156,7 +155,7 @@ def _line(row: Row, parts: Iterable[str]) -> tuple[str, ...]:
         row["line"],
         *(decimal(row["parts"].get(part, 0.0), 1) for part in parts),
         decimal(row["frame_ms"], 1),
-        range_text(row),
+        spread(row["ms_lo"], row["ms_hi"]),
         decimal(row["p99_to_p50"], 2),
         decimal(1e3 / row["frame_ms"], 2),
         decimal(row["psnr"], 2),

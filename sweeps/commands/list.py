@@ -30,7 +30,8 @@ def main(options: argparse.Namespace) -> int:
         for name, about in described(group, words).items()
     ]
     _show("Choices", ("choice", "what it is"), files)
-    _show("Installed plug-ins", ("plug-in", "what it brings"), _plug_ins(words))
+    plug_ins = [(each.name, _brings(each, words)) for each in installed()]
+    _show("Installed plug-ins", ("plug-in", "what it brings"), plug_ins)
     if not options.here:
         console().print("Backends and engines that this machine can use: steerbench list --here")
         return 0
@@ -54,10 +55,6 @@ def _show(title: str, columns: tuple[str, str], lines: Sequence[tuple[str, str]]
 def described(group: str, words: Sequence[str] = ()) -> dict[str, str]:
     """Every choice of `group`, including folders named in `words`, with its description."""
     return {name: _comment(path.read_text()) for name, path in choices(group, words).items()}
-
-
-def _plug_ins(words: Sequence[str]) -> list[tuple[str, str]]:
-    return [(each.name, _brings(each, words)) for each in installed()]
 
 
 def _brings(plug_in: PlugIn, words: Sequence[str]) -> str:

@@ -36,16 +36,12 @@ def baseline(outputs: Path, tmp_path: Path) -> Path:
     return path
 
 
-def test_a_store_is_as_good_as_itself(
-    baseline: Path, outputs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_store_is_as_good_as_itself(baseline, outputs, capsys):
     assert check(baseline, outputs) == 0
     assert "as good as the baseline" in capsys.readouterr().out
 
 
-def test_a_figure_that_became_worse_is_shown_and_fails(
-    baseline: Path, outputs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_figure_that_became_worse_is_shown_and_fails(baseline, outputs, capsys):
     held = json.loads(baseline.read_text())
     ((figures,),) = (seeds.values() for seeds in held["runs"].values())
     figures["values"]["psnr"] += 1
@@ -57,16 +53,12 @@ def test_a_figure_that_became_worse_is_shown_and_fails(
     assert "worse" in line
 
 
-def test_a_run_is_known_by_what_was_typed_in_any_order_but_for_places(
-    baseline: Path, outputs: Path
-) -> None:
+def test_a_run_is_known_by_what_was_typed_in_any_order_but_for_places(baseline, outputs):
     held = json.loads(baseline.read_text())
     assert list(held["runs"]) == ["method=offset scene=tiny"]
 
 
-def test_a_baseline_that_is_recorded_anew_keeps_its_limits_and_its_runs(
-    baseline: Path, outputs: Path
-) -> None:
+def test_a_baseline_that_is_recorded_anew_keeps_its_limits_and_its_runs(baseline, outputs):
     held = json.loads(baseline.read_text())
     held["limits"] = {"psnr": {"better": 1, "absolute": 0.5}}
     baseline.write_text(json.dumps(held))
@@ -77,9 +69,7 @@ def test_a_baseline_that_is_recorded_anew_keeps_its_limits_and_its_runs(
     assert list(again["runs"]["method=offset scene=tiny"]["5"]["values"]) == ["psnr"]
 
 
-def test_a_run_that_is_missing_fails(
-    baseline: Path, outputs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_is_missing_fails(baseline, outputs, capsys):
     held = json.loads(baseline.read_text())
     (seeds,) = held["runs"].values()
     held["runs"] = {"method=other": seeds}
@@ -88,9 +78,7 @@ def test_a_run_that_is_missing_fails(
     assert "method=other: no such run" in capsys.readouterr().out
 
 
-def test_a_run_of_other_frames_fails_and_the_others_are_still_compared(
-    baseline: Path, outputs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_of_other_frames_fails_and_the_others_are_still_compared(baseline, outputs, capsys):
     held = json.loads(baseline.read_text())
     ((command, seeds),) = held["runs"].items()
     others = {"5": {**seeds["5"], "views": "others"}}
@@ -103,9 +91,7 @@ def test_a_run_of_other_frames_fails_and_the_others_are_still_compared(
 
 
 @pytest.mark.parametrize("text", [None, "", "{}", '{"schema": 99}'])
-def test_what_is_no_baseline_is_refused_with_the_way_to_make_one(
-    text: str | None, outputs: Path, tmp_path: Path
-) -> None:
+def test_what_is_no_baseline_is_refused_with_the_way_to_make_one(text, outputs, tmp_path):
     path = tmp_path / "none.json"
     if text is not None:
         path.write_text(text)
@@ -113,9 +99,7 @@ def test_what_is_no_baseline_is_refused_with_the_way_to_make_one(
         check(path, outputs)
 
 
-def test_two_runs_are_compared_by_the_beginning_of_their_keys(
-    outputs: Path, stored_run: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_runs_are_compared_by_the_beginning_of_their_keys(outputs, stored_run, capsys):
     assert dispatch(["compare", stored_run[:6], stored_run, "--outputs", str(outputs)]) == 0
     assert "psnr" in capsys.readouterr().out
     with pytest.raises(SteerbenchError, match="expected the beginning of one key, 0 runs"):
@@ -143,7 +127,7 @@ def second_seed(outputs: Path, stored_run: str) -> str:
     return key
 
 
-def test_all_seeds_of_a_run_are_one_entry(outputs: Path, second_seed: str, tmp_path: Path) -> None:
+def test_all_seeds_of_a_run_are_one_entry(outputs, second_seed, tmp_path):
     path = tmp_path / "baseline.json"
     assert check(path, outputs, "--record") == 0
     (seeds,) = json.loads(path.read_text())["runs"].values()
@@ -152,9 +136,7 @@ def test_all_seeds_of_a_run_are_one_entry(outputs: Path, second_seed: str, tmp_p
     assert check(path, outputs) == 0
 
 
-def test_a_seed_that_is_missing_fails(
-    outputs: Path, second_seed: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_seed_that_is_missing_fails(outputs, second_seed, tmp_path, capsys):
     path = tmp_path / "baseline.json"
     check(path, outputs, "--record")
     shutil.rmtree(outputs / "runs" / second_seed)
@@ -162,15 +144,11 @@ def test_a_seed_that_is_missing_fails(
     assert "scene=tiny: no such run with seed=6 below" in capsys.readouterr().out
 
 
-def test_a_run_of_another_schema_is_left_out(
-    baseline: Path, outputs: Path, stored_run: str, unread: str
-) -> None:
+def test_a_run_of_another_schema_is_left_out(baseline, outputs, stored_run, unread):
     assert check(baseline, outputs) == 0
     assert [run.key for run in readable(Store(outputs))] == [stored_run]
 
 
-def test_a_run_of_another_schema_cannot_be_compared(
-    outputs: Path, stored_run: str, unread: str
-) -> None:
+def test_a_run_of_another_schema_cannot_be_compared(outputs, stored_run, unread):
     with pytest.raises(SteerbenchError, match=f"{unread}: its rows have schema 1; this version"):
         dispatch(["compare", unread, stored_run, "--outputs", str(outputs)])

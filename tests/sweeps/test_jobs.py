@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -40,9 +39,7 @@ def test_a_label_has_the_method_and_what_varies_with_the_whole_name_of_what_ends
     assert label("ngp", words, names) == expected
 
 
-def test_a_failure_that_cannot_be_kept_is_printed_all_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_failure_that_cannot_be_kept_is_printed_all_the_same(tmp_path, monkeypatch, capsys):
     def obtain(group: Group) -> None:
         raise SteerbenchError("the cause")
 

@@ -86,33 +86,27 @@ def test_a_report_is_written_where_it_is_asked_for(run, tmp_path):
     assert "6.05" in (tmp_path / "pages/first/report.md").read_text()
 
 
-class Broken:
-    """A tracker that cannot be reached."""
-
-    package = "sys"
-
-    def send(self, run, outputs):
-        raise ConnectionError("no route to host")
+@pytest.fixture
+def tracked(monkeypatch):
+    """Puts a function in place of what sends a run to W&B."""
+    monkeypatch.setattr("reports.trackers.find_spec", lambda name: name)
+    return lambda send: monkeypatch.setitem(TRACKERS, "wandb", send)
 
 
-def test_a_run_is_stored_and_then_sent_and_a_stored_one_is_sent_again(run, tmp_path, monkeypatch):
+def test_a_run_is_stored_and_then_sent_and_a_stored_one_is_sent_again(run, tmp_path, tracked):
     sent = []
-
-    class Remembering(Broken):
-        def send(self, run, outputs):
-            sent.append((run.key, run.label, outputs / "runs" / run.key))
-
-    monkeypatch.setitem(TRACKERS, "wandb", Remembering())
+    tracked(lambda run, outputs: sent.append((run.key, run.label, outputs / "runs" / run.key)))
     for _ in range(2):
         assert run("tracker=wandb").status == 0
     (folder,) = stored(tmp_path)
     assert sent == [(folder.name, "grey", Path("outputs/runs") / folder.name)] * 2
 
 
-def test_a_tracker_that_cannot_be_reached_is_one_line_and_the_run_stands(
-    run, tmp_path, monkeypatch
-):
-    monkeypatch.setitem(TRACKERS, "wandb", Broken())
+def test_a_tracker_that_cannot_be_reached_is_one_line_and_the_run_stands(run, tmp_path, tracked):
+    def unreachable(run, outputs):
+        raise ConnectionError("no route to host")
+
+    tracked(unreachable)
     outcome = run("tracker=wandb")
     assert outcome.status == 0
     (folder,) = stored(tmp_path)
@@ -124,11 +118,7 @@ def test_nothing_but_outputs_is_left_behind(run, tmp_path):
     run()
     run("-m", "seed=0,1")
     assert [path.name for path in tmp_path.iterdir()] == ["outputs"]
-    assert {path.name for path in (tmp_path / "outputs").iterdir()} == {
-        "runs",
-        "stages",
-        "sweeps",
-    }
+    assert {path.name for path in (tmp_path / "outputs").iterdir()} == {"runs", "stages", "sweeps"}
 
 
 def test_a_sweep_takes_flags_after_overrides_and_runs_every_combination(run, tmp_path):
