@@ -67,7 +67,6 @@ def _latex(table: PaperTable, lines: Sequence[Repeated]) -> str:
 
 
 def _rows(block: PaperTable, known: Mapping[str, Repeated]) -> list[list[str]]:
-    """The label and the figures of each line."""
     lines = [known.get(line.label, Repeated(line.label, ())) for line in block.lines]
     columns = []
     for metric in block.metrics:

@@ -255,7 +255,6 @@ def _circle(axes: Axes, rows: Sequence[Row], column: str) -> None:
 
 
 def _error_against_time(axes: Axes, rows: Sequence[Row], column: str) -> None:
-    """Draw the points of one panel; each knob has its colour and marker."""
     for number, knob in enumerate(dict.fromkeys(row["knob"] for row in rows)):
         some = [row for row in rows if row["knob"] == knob and math.isfinite(row[column])]
         low = [row["ms"] - row["ms_lo"] for row in some]

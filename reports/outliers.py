@@ -152,7 +152,6 @@ def _pixels(run: Run) -> int:
 
 
 def _grouped(runs: Sequence[Run], key: Callable[[Run], object]) -> list[list[Run]]:
-    """Groups of runs that have the same `key`."""
     groups: dict[object, list[Run]] = {}
     for run in runs:
         groups.setdefault(key(run), []).append(run)

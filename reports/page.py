@@ -119,7 +119,6 @@ def _pictures(runs: Sequence[Run]) -> Iterator[Part]:
 
 
 def _figures(run: Run) -> Iterator[Part]:
-    """All figures of one run."""
     yield f"## {run.label}, run {run.key}"
     for table in run_tables(run.rows):
         yield f"### {table.title}"

@@ -111,7 +111,6 @@ def _steps(run: Run) -> int:
 
 
 def _images(images: Mapping[str, Any], lines: Lines) -> Iterator[Part]:
-    """Images of the middle one of the frames that all runs kept."""
     runs = _chosen(images["lines"], lines, one_scene=True)
     runs = [run for run in runs if run.views == runs[0].views]
     if runs and (frames := kept_frames(runs)):

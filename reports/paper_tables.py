@@ -234,7 +234,6 @@ def _block(
 
 
 def _origin(runs: Sequence[Run]) -> str:
-    """Methods, seeds, commits and processors of `runs`."""
     machines = [run.record["machine"] for run in runs]
     origin = {
         "method": [run.facts["method"] for run in runs],
@@ -246,7 +245,6 @@ def _origin(runs: Sequence[Run]) -> str:
 
 
 def _marked(found: Repeated, metric: str, mark: str) -> str:
-    """A measured figure, enclosed in `mark`."""
     shown = written(found, metric)
     return f"{mark}{shown}{mark}" if shown else ABSENT
 

@@ -69,7 +69,6 @@ def find(path: str) -> DataSet:
 
 
 def _known() -> list[set[str]]:
-    """The names of the scenes of each data set of the paper."""
     content: Any = OmegaConf.load(REFERENCES)
     return [set(content["psnr"]), set(content["tanks_and_temples"])]
 

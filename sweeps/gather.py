@@ -83,7 +83,6 @@ def of_scene(run: Run, config: DictConfig) -> bool:
 
 
 def _lines(of_block: Mapping[str, Sequence[Outcome]]) -> list[Repeated]:
-    """The lines of a block, made from the outcomes of their jobs over common frames."""
     of_block = _over_common_frames(of_block)
     measured = [{each.job.scene for each in line if each.run} for line in of_block.values()]
     common = set.intersection(*filter(None, measured)) if any(measured) else set()

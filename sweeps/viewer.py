@@ -175,7 +175,6 @@ class Viewer:
             browser.drawn = None
 
     def _refuse(self, what: str, error: SteerbenchError) -> None:
-        """Report, here and in all browsers, what did not work."""
         self.log.info(f"{what}: {error}")
         for browser in list(self.browsers.values()):
             browser.client.add_notification(what, str(error), color="red")
@@ -210,7 +209,6 @@ class Viewer:
             self.turns.want(who, Ask(_camera(browser.client.camera, int(browser.height.value))))
 
     def _save(self, browser: Browser) -> None:
-        """Write the recorded path to a file and discard it."""
         last = browser.path[-1]
         cameras = [c for c in browser.path if (c.width, c.height) == (last.width, last.height)]
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -274,7 +272,6 @@ def _three(vector: Tensor) -> tuple[float, float, float]:
 
 
 def _figures(painter: Painter, drawn: Sequence[Drawn], truth: Tensor | None) -> str:
-    """Frame times, times of stages and PSNR of each method, as Markdown."""
     height, width = drawn[0].rgb.shape[:2]
     lines = [f"{width} x {height} pixels", ""]
     for method, picture in zip(painter.methods, drawn, strict=True):

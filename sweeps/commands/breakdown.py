@@ -105,7 +105,6 @@ def with_engine(words: Sequence[str]) -> list[str]:
 
 
 def _precisions(words: Sequence[str]) -> list[Variant]:
-    """The chosen engine at each of its precisions; empty if the method uses no engine."""
     config = composed(words, return_hydra_config=True)
     if not computes_with_engine(config):
         return []

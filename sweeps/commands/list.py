@@ -69,7 +69,6 @@ def _brings(plug_in: PlugIn, words: Sequence[str]) -> str:
 
 
 def _state(name: str, kind: Any) -> str:
-    """Whether an engine can be used here, or why not."""
     try:
         kind(kind.precisions[0])
     except (Unavailable, SteerbenchError) as reason:

@@ -108,7 +108,6 @@ def _alone(config: DictConfig, command: Sequence[str]) -> None:
 
 
 def _one_of_many(config: DictConfig, command: Sequence[str]) -> None:
-    """Attempt the current job of a sweep."""
     from sweeps.jobs import attempt
     from sweeps.measurement import Group, Job
     from sweeps.processes import set_up

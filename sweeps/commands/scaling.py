@@ -87,7 +87,6 @@ def _points(study: Study) -> Iterator[Point]:
 
 
 def _rows(words: Sequence[str], points: Sequence[Point], frames: int) -> list[Row]:
-    """Measure the points one after the other."""
     config = composed(words)
     log, scene = ConsoleLog(Path(checked_settings(config).outputs)), scene_of(config)
     rows = []
