@@ -182,11 +182,7 @@ def common_ground(config: DictConfig, frames: int) -> tuple[Scene, Trajectory, E
 
 
 def _usable(configs: Mapping[str, DictConfig], log: Log) -> dict[str, Method]:
-    """The methods that can be used here; the log says why others cannot.
-
-    Raises:
-        Unavailable: the first method cannot be used.
-    """
+    """The methods that can be used here, of which the first is one; the log says why not others."""
     methods: dict[str, Method] = {}
     for name, config in configs.items():
         torch.manual_seed(config.seed)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
+from functools import partial
 from io import StringIO
 from itertools import count
 from pathlib import Path
@@ -156,15 +157,12 @@ class Viewer:
             with gui.add_folder(f"knobs of {method.name}", order=LAST, expand_by_default=False):
                 for knob, settings in knobs.items():
                     choice = gui.add_dropdown(knob, (AS_GIVEN, *settings))
-                    choice.on_update(self._turner(place, knob, choice))
+                    choice.on_update(partial(self._note, place, knob))
 
-    def _turner(self, place: int, knob: str, choice: Any) -> Callable[[Any], None]:
-        def turned(_: Any) -> None:
-            self._turned.append((place, knob, choice.value))
-            for who in list(self.browsers):
-                self._want(who)
-
-        return turned
+    def _note(self, place: int, knob: str, event: Any) -> None:
+        self._turned.append((place, knob, event.target.value))
+        for who in list(self.browsers):
+            self._want(who)
 
     def _turn(self, place: int, knob: str, setting: str) -> None:
         try:

@@ -49,7 +49,8 @@ def main(options: argparse.Namespace) -> int:
     variants = settings_of(words, usual)
     if study.skips:
         variants |= settings_of([*words, *nothing_skipped(study)], _ending(usual, DENSE))
-    shared = _shared(words, study)
+    configs = [composed([*folder_words(words), *of]) for of in study.beside.values()]
+    shared = [word for word in words if holds(word, configs)]  # settings that all of them have
     for name, of_method in study.beside.items():
         other = [*shared, *of_method]
         variants |= settings_of(other, _ending(_precisions(other), f", {name}") or [Variant(name)])
@@ -81,10 +82,7 @@ def _print_waits(words: Sequence[str], frames: int, launcher: Launcher) -> int:
 
 
 def _waits(words: Sequence[str], frames: int) -> list[Counter[Line]]:
-    """Where the host waits in each steady frame.
-
-    The path is rendered once before, so that one-time set-up is not counted.
-    """
+    """Where the host waits in each steady frame of a second round: the first sets things up."""
     with fitted({"as it is": words}, frames) as each:
         (method,) = each.methods.values()
         for _ in range(2):
@@ -114,16 +112,6 @@ def _precisions(words: Sequence[str]) -> list[Variant]:
 
 def _ending(variants: Iterable[Variant], ending: str) -> list[Variant]:
     return [Variant(variant.name + ending, variant.settings) for variant in variants]
-
-
-def _shared(words: Sequence[str], study: Study) -> list[str]:
-    """The `words` that also apply to all methods compared with.
-
-    These are all words except `method=` and settings of the method that one of the others lacks.
-    """
-    folders = folder_words(words)
-    others = [composed([*folders, *settings]) for settings in study.beside.values()]
-    return [word for word in words if holds(word, others)]
 
 
 def _row(variant: Rendered, trained_alike: bool) -> Row:

@@ -62,7 +62,7 @@ def _brings(plug_in: PlugIn, words: Sequence[str]) -> str:
     if plug_in.folder is None:
         return f"cannot be used: {plug_in.fault}"
     brought = []
-    for path in plug_in.files():
+    for path in sorted(plug_in.folder.glob("*/*.yaml")):
         group, hidden = path.parent.name, choices(path.parent.name, words)[path.stem] != path
         brought.append(f"{group}={path.stem}" + (" (hidden: the name is taken)" if hidden else ""))
     return ", ".join(brought) or f"nothing: there are no GROUP/NAME.yaml in {plug_in.folder}"

@@ -99,11 +99,7 @@ def _rows(words: Sequence[str], points: Sequence[Point], frames: int) -> list[Ro
 
 
 def _chosen(config: DictConfig, names: Sequence[str] | None) -> list[Point]:
-    """The points of the axes `names`; by default, of all axes.
-
-    Raises:
-        SteerbenchError: the method has no such axis, or the engine has a fixed number of threads.
-    """
+    """The points of the axes `names`; by default, of all axes."""
     study = declared(config)
     axes = ("pixels", "threads", *study.axes)
     for name in names or ():

@@ -59,12 +59,8 @@ def test_latex_has_the_decimals_of_the_paper_and_marks_the_best(lines):
     # 0.9512 and 0.9514 are both .951: they share the first place.
     assert found["$T = 2^{19}$"] == [r"\textbf{30.46}", r"\textbf{0.951}", "25.2"]
     assert found["$K = 3$"] == [r"\textbf{30.46}", r"\textbf{0.951}", r"\underline{25.0}"]
+    assert found["not yet"] == ["--", "--", "--"]  # not measured
     assert found[r"mine\_1"] == [r"\underline{29.00}", r"\underline{0.900}", r"\textbf{3.0}"]
-
-
-def test_latex_has_a_dash_for_what_was_not_measured(lines):
-    found = cells(export.latex([TABLE], lines))
-    assert found["not yet"] == ["--", "--", "--"]
 
 
 def test_latex_of_several_seeds_has_their_interval(lines):

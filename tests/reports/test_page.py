@@ -80,9 +80,7 @@ def test_a_page_is_written_over_an_earlier_one_and_leaves_nothing_else(page, sto
     assert after == before
 
 
-def test_a_page_that_is_interrupted_leaves_the_earlier_one_with_its_pictures(
-    page, several, monkeypatch
-):
+def test_an_interrupted_page_leaves_the_earlier_one_with_its_pictures(page, several, monkeypatch):
     before = {path: path.read_bytes() for path in linked(page)}
 
     def killed(*_: object) -> None:

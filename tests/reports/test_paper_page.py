@@ -104,9 +104,7 @@ def test_a_mark_stands_where_its_line_is_in_quality_and_cost(run, tmp_path, draw
 
 
 @pytest.mark.parametrize(("of_method", "of_budget"), [(None, 80), (80, 7)])
-def test_a_curve_has_a_point_for_every_share_of_the_training_that_was_measured(
-    of_method, of_budget, run, tmp_path, drawn
-):
+def test_a_curve_has_a_point_for_every_measured_share(of_method, of_budget, run, tmp_path, drawn):
     (table,) = (table for table in TABLES if table.name == "table5")
     made_of = {"config": {"method": {"steps": of_method}}}
     budget = {"renderer_steps": of_budget}

@@ -88,11 +88,6 @@ def test_the_lines_of_a_table_take_every_value_of_its_grid_and_no_other(table):
         assert {usual, *(job[name] for job in jobs if name in job)} == {usual, *others}
 
 
-def test_weights_from_other_scenes_are_a_matter_of_the_block_beyond_the_paper():
-    for table in TABLES[1:]:
-        assert "other scenes" not in " ".join(table.notes)
-
-
 def test_a_section_shows_both_blocks_each_with_its_trends(run, tmp_path):
     (table,) = (table for table in TABLES if table.name == "table5")
     labels = [line.label for block in table.blocks for line in block.lines]

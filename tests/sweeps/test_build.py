@@ -153,9 +153,7 @@ def test_a_target_that_cannot_be_imported_is_named(name):
         (["method.joint.opacity_entropy=-1"], "joint.opacity_entropy: expected 0 or more, got -1"),
     ],
 )
-def test_what_field_and_renderer_cannot_do_is_refused_before_anything_is_trained(
-    overrides, message
-):
+def test_what_field_and_renderer_cannot_do_is_refused_before_any_training(overrides, message):
     config = composed(["method=steernerf_lean", *overrides])
     with pytest.raises(SteerbenchError, match=rf"^method.*{re.escape(message)}"):
         build(config, "method")

@@ -246,9 +246,7 @@ def decibels(difference: float) -> float:
     return -20 * math.log10(difference)
 
 
-def test_the_page_of_a_data_set_has_its_means_its_scenes_and_what_is_missing(
-    steerbench, tmp_path, monkeypatch
-):
+def test_the_page_of_a_data_set_has_means_scenes_and_gaps(steerbench, tmp_path, monkeypatch):
     data = tmp_path / "data"
     values = {"chair": 255, "mic": 204}
     for name, value in values.items():

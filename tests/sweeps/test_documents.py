@@ -86,9 +86,7 @@ def typed(command: str) -> list[str]:
 WITHOUT_LPIPS = ("protocol.lpips=[]", "protocol.name=quick")
 
 
-def test_the_method_and_the_scene_of_the_document_are_measured_from_outside_the_package(
-    steerbench, mine
-):
+def test_method_and_scene_of_the_document_are_measured_from_outside_the_package(steerbench, mine):
     measured = steerbench(*typed("run"), *WITHOUT_LPIPS)
     assert measured.status == 0, measured.err
     assert "19.83" in measured.out  # 20 log10(255 / 26)

@@ -32,9 +32,7 @@ def test_jobs_are_read_as_they_were_written_in_the_order_of_the_sweep(tmp_path):
         (["scene.seed", "elsewhere"], "ngp (seed=1)"),
     ],
 )
-def test_a_label_has_the_method_and_what_varies_with_the_whole_name_of_what_ends_alike(
-    names, expected
-):
+def test_a_label_has_method_and_what_varies_by_whole_names_where_ends_are_alike(names, expected):
     words = ("+experiment=demo", "scene.seed=1", "seed=2", "method=ngp")
     assert label("ngp", words, names) == expected
 

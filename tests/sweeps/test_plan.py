@@ -81,9 +81,7 @@ def test_a_scene_that_lies_where_it_was_measured_is_not_loaded(measured, tmp_pat
 
 
 @pytest.mark.parametrize(("digest", "found"), [("a", ["a"]), ("c", [])])
-def test_a_scene_that_lies_elsewhere_is_known_by_its_content(
-    measured, tmp_path, content, digest, found
-):
+def test_a_scene_elsewhere_is_known_by_its_content(measured, tmp_path, content, digest, found):
     (tmp_path / "c" / "mic").mkdir(parents=True)
     content(digest)
     assert shown(measured, tmp_path / "c" / "mic") == found

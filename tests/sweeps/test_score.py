@@ -54,9 +54,7 @@ def test_the_same_pictures_are_the_same_run_and_others_are_another(steerbench, f
     assert len(set(keys)) == 3
 
 
-def test_as_many_pictures_are_kept_as_asked_for_and_the_run_is_sent_to_a_tracker(
-    steerbench, folders, monkeypatch
-):
+def test_pictures_asked_for_are_kept_and_a_tracker_has_the_run(steerbench, folders, monkeypatch):
     sent = []
     monkeypatch.setattr("reports.trackers.find_spec", lambda name: name)
     monkeypatch.setitem(TRACKERS, "wandb", lambda run, outputs: sent.append(run.label))

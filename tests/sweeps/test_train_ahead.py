@@ -77,12 +77,6 @@ def test_a_failed_training_says_why():
     assert train_ahead._said(ended) == "failed: no room for it"
 
 
-@pytest.mark.parametrize("threads", [0, -1])
-def test_no_threads_are_refused(threads):
-    with pytest.raises(SteerbenchError, match="threads: expected 1 or more"):
-        plan(TABLES["table5"], [f"budget.threads={threads}"])
-
-
 SMALL = [
     *("scene=totem", "scene.width=24", "scene.train=3", "scene.test=1", "trajectory=test"),
     *("budget=tiny", "budget.steps=4", "budget.samples=512", "budget.renderer_steps=8"),

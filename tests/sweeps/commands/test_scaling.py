@@ -19,12 +19,9 @@ def test_the_exponent_of_a_power_is_found(power, factor):
     assert growth(rows, "ms") == pytest.approx(power, abs=1e-9)
 
 
-def test_a_value_of_0_is_left_out():
+def test_a_value_of_0_is_left_out_and_a_single_one_has_no_exponent():
     rows = [{"value": value, "ms": 5.0 + value} for value in (0.0, 1.0, 7.0)]
     assert growth(rows, "ms") == pytest.approx(math.log(2) / math.log(7))
-
-
-def test_a_single_value_has_no_exponent():
     assert math.isnan(growth([{"value": 2.0, "ms": 1.0}, {"value": 2.0, "ms": 2.0}], "ms"))
 
 
