@@ -191,8 +191,9 @@ class Viewer:
             record=gui.add_checkbox("record a path", False),
             figures=gui.add_markdown("drawing the first picture ..."),
         )
-        for name in ("shown", "split", "height", "exact", "record"):
-            getattr(browser, name).on_update(lambda _: self._want(client.client_id))
+        controls = browser.shown, browser.split, browser.height, browser.exact, browser.record
+        for control in controls:
+            control.on_update(lambda _: self._want(client.client_id))
         gui.add_button("first view").on_click(lambda _: self._look(client.camera, self.first))
         self.browsers[client.client_id] = browser
         client.camera.on_update(lambda _: self._want(client.client_id))

@@ -45,15 +45,6 @@ def test_what_depends_on_the_machine_is_compared_on_the_same_one_only():
     assert {found.metric for found in changes([OLD], [other])} == {"psnr", "size_bytes.total"}
 
 
-def paired(*by: float) -> Change:
-    """PSNR of frames that changed by so much, on top of very different values."""
-    before = {str(i): 20.0 + 5 * i for i in range(len(by))}
-    after = {name: value + by[int(name)] for name, value in before.items()}
-    old = replace(OLD, frames={"psnr": before})
-    new = replace(OLD, frames={"psnr": after | {"more": 99.0}})
-    return next(found for found in changes([old], [new]) if found.metric == "psnr")
-
-
 @pytest.mark.parametrize(
     ("by", "verdict"),
     [
@@ -64,7 +55,11 @@ def paired(*by: float) -> Change:
     ],
 )
 def test_frames_that_both_have_are_compared_in_pairs(by, verdict):
-    found, half = paired(*by), path_interval(np.array(by))
+    before = {str(i): 20.0 + 5 * i for i in range(len(by))}
+    after = {name: value + by[int(name)] for name, value in before.items()} | {"more": 99.0}
+    old, new = (replace(OLD, frames={"psnr": frames}) for frames in (before, after))
+    found = next(found for found in changes([old], [new]) if found.metric == "psnr")
+    half = path_interval(np.array(by))
     assert found.by == pytest.approx(np.mean(by))
     assert found.interval == pytest.approx((found.by - half, found.by + half))
     assert found.verdict == verdict

@@ -242,10 +242,6 @@ table:
 """
 
 
-def decibels(difference: float) -> float:
-    return -20 * math.log10(difference)
-
-
 def test_the_page_of_a_data_set_has_means_scenes_and_gaps(steerbench, tmp_path, monkeypatch):
     data = tmp_path / "data"
     values = {"chair": 255, "mic": 204}
@@ -267,7 +263,8 @@ def test_the_page_of_a_data_set_has_means_scenes_and_gaps(steerbench, tmp_path, 
     assert "scene mean of chair, mic" in page
     # Pictures are rounded to 8 bit: 0.5 is 128 of 255, 0.25 is 64.
     grey, dark = (
-        [decibels((value - level) / 255) for value in values.values()] for level in (128, 64)
+        [-20 * math.log10((value - level) / 255) for value in values.values()]
+        for level in (128, 64)
     )
     mean = f"{sum(grey) / 2:.2f}"
     assert f"| a grey | **{mean}** / 1.00 / " in page
