@@ -77,13 +77,35 @@ def metric_format(metric: str) -> tuple[str, Write]:
     return f"{rest or family}, {unit} ↓", partial(decimal, decimals=0 if family == "work" else 2)
 
 
-def written(found: Repeated, metric: str) -> str | None:
-    """The mean of a metric as text, with half its 95 % interval if known; None without a mean."""
+def written(
+    found: Repeated, metric: str, write: Write | None = None, sign: str = " ± "
+) -> str | None:
+    """The mean of a metric as text, with half its 95 % interval if known; None without a mean.
+
+    The text is made by `write`, or in the usual format.
+    """
     mean, half = found.mean(metric), found.half(metric)
-    _, write = metric_format(metric)
+    write = write or metric_format(metric)[1]
     if mean is None:
         return None
-    return f"{write(mean)} ± {write(half)}" if half > 0 else write(mean)
+    return f"{write(mean)}{sign}{write(half)}" if half > 0 else write(mean)
+
+
+def marked(
+    lines: Sequence[Repeated],
+    metric: str,
+    marks: Sequence[str],
+    write: Write | None = None,
+    sign: str = " ± ",
+) -> list[str | None]:
+    """A column: what `written` returns for each line, the best and the second best with `marks`.
+
+    Only among figures under the same conditions; the second of two, and stages, get no mark.
+    """
+    places = {} if metric.startswith("stage_ms.") else ranks(lines, metric, write)
+    forms = dict(enumerate(marks if len(places) > 2 else marks[:1], 1))
+    texts = [written(line, metric, write, sign) for line in lines]
+    return [text and forms.get(places.get(n, 0), "%s") % text for n, text in enumerate(texts)]
 
 
 def ranks(

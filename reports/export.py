@@ -8,7 +8,7 @@ from functools import partial
 
 import pandas as pd
 
-from reports.comparison import conditions_of, metric_format, ranks
+from reports.comparison import conditions_of, marked, metric_format
 from reports.paper_tables import Lines, PaperTable
 from reports.runs import Repeated
 from reports.tables import decimal
@@ -34,7 +34,7 @@ ESCAPES = str.maketrans(
 SETTING = re.compile(r"(?P<name>[A-Z]) = (?P<base>\d+)(\^(?P<power>\d+))?")
 """A label such as "T = 2^19", which is set in math mode."""
 
-MARKS = {1: r"\textbf{%s}", 2: r"\underline{%s}"}
+MARKS = (r"\textbf{%s}", r"\underline{%s}")
 """LaTeX for the best and the second-best figure of a column."""
 
 
@@ -67,25 +67,16 @@ def _latex(table: PaperTable, lines: Sequence[Repeated]) -> str:
 
 
 def _rows(block: PaperTable, known: Mapping[str, Repeated]) -> list[list[str]]:
-    """The label and the figures of each line."""
     lines = [known.get(line.label, Repeated(line.label, ())) for line in block.lines]
-    columns = []
-    for metric in block.metrics:
-        write = partial(_written, metric)
-        places = {} if metric.startswith("stage_ms.") else ranks(lines, metric, write)
-        cells = []
-        for number, found in enumerate(lines):
-            mean, half = found.mean(metric), found.half(metric)
-            if mean is not None:
-                text = write(mean) + (rf" $\pm$ {write(half)}" if half > 0 else "")
-                place = places.get(number, 0)
-                several = place == 1 or len(places) > 2
-                cells.append(MARKS[place] % text if place in MARKS and several else text)
-            else:
-                cells.append("--")
-        columns.append(cells)
-    labels = (_label(line.label) for line in block.lines)
-    return [list(row) for row in zip(labels, *columns, strict=True)]
+    columns = [
+        marked(lines, metric, MARKS, partial(_written, metric), r" $\pm$ ")
+        for metric in block.metrics
+    ]
+    rows = zip(*columns, strict=True)
+    return [
+        [_label(line.label), *(text or "--" for text in row)]
+        for line, row in zip(block.lines, rows, strict=True)
+    ]
 
 
 def csv(tables: Sequence[PaperTable], measured: Lines) -> str:

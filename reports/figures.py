@@ -255,7 +255,6 @@ def _circle(axes: Axes, rows: Sequence[Row], column: str) -> None:
 
 
 def _error_against_time(axes: Axes, rows: Sequence[Row], column: str) -> None:
-    """Draw the points of one panel; each knob has its colour and marker."""
     for number, knob in enumerate(dict.fromkeys(row["knob"] for row in rows)):
         some = [row for row in rows if row["knob"] == knob and math.isfinite(row[column])]
         low = [row["ms"] - row["ms_lo"] for row in some]
@@ -296,39 +295,3 @@ def _rms(psnr: ArrayLike) -> np.ndarray:
 
 def _psnr(rms: ArrayLike) -> np.ndarray:
     return -20 * np.log10(rms)
-
-
-def growth_panels(
-    axes: Mapping[str, Sequence[Row]],
-    figures: Mapping[str, str],
-    exponents: Mapping[tuple[str, str], float],
-    path: Path,
-) -> None:
-    """Write a PNG of how figures grow: one column of panels per axis, one row per figure.
-
-    Both scales are logarithmic, so that a power law is a straight line; an axis that starts at 0 is
-    linear.
-
-    Args:
-        axes: by name, rows with "value", its "label" and every figure.
-        figures: by key in a row, the label with unit.
-        exponents: by axis and figure; shown if finite.
-    """
-    size = (0.5 + 2.2 * len(axes), 0.5 + 2.0 * len(figures))
-    figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(len(figures), len(axes), squeeze=False, sharey="row")
-    for line, (key, label) in zip(panels, figures.items(), strict=True):
-        for panel, (axis, rows) in zip(line, axes.items(), strict=True):
-            values = [row["value"] for row in rows]
-            panel.plot(values, [row[key] for row in rows], "o-", color=COLOURS[0], markersize=4)
-            panel.set_yscale("log")
-            if min(values) > 0:
-                panel.set_xscale("log")
-            panel.set_xticks(values, [row["label"] for row in rows], rotation=90, fontsize="small")
-            panel.xaxis.set_minor_locator(NullLocator())
-            if math.isfinite(exponents[axis, key]):
-                panel.set_title(f"~ {axis}^{exponents[axis, key]:.2f}", fontsize="medium")
-            panel.grid(alpha=0.3, which="both")
-            panel.spines[["top", "right"]].set_visible(False)
-        line[0].set_ylabel(label)
-    figure.savefig(path, dpi=150)

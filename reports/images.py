@@ -146,7 +146,6 @@ def _shown(height: int, width: int) -> tuple[int, int]:
 
 
 def _whole(picture: np.ndarray, detail: Detail) -> Image.Image:
-    """The picture with the detail outlined."""
     size = _shown(*picture.shape[:2])
     scale = size[0] / picture.shape[1]
     how = Image.Resampling.NEAREST if scale > 1 else Image.Resampling.BOX

@@ -124,7 +124,8 @@ def faster_with_more_pixels(runs: Sequence[Run]) -> Iterator[Outlier]:
     size = ("scene.width", "scene.height", "scene.downscale", "seed", "method.seed")
     sized = [run for run in runs if run.facts["resolution"] != MIXED]
     for group in _grouped(sized, lambda run: (_settings(run, *size), run.computer)):
-        pixels = {run.key: _pixels(run) for run in group}
+        sizes = {run.key: run.facts["resolution"].split("x") for run in group}
+        pixels = {key: math.prod(map(int, text)) for key, text in sizes.items()}
         for one, other in combinations(sorted(group, key=lambda run: pixels[run.key]), 2):
             fewer, more = one.values["frame_ms"], other.values["frame_ms"]
             if pixels[other.key] >= MORE_PIXELS * pixels[one.key] and more < fewer:
@@ -147,12 +148,7 @@ def _psnr(run: Run) -> float:
     return run.values.get("psnr", math.nan)
 
 
-def _pixels(run: Run) -> int:
-    return math.prod(map(int, run.facts["resolution"].split("x")))
-
-
 def _grouped(runs: Sequence[Run], key: Callable[[Run], object]) -> list[list[Run]]:
-    """Groups of runs that have the same `key`."""
     groups: dict[object, list[Run]] = {}
     for run in runs:
         groups.setdefault(key(run), []).append(run)

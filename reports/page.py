@@ -19,10 +19,7 @@ from reports.tables import Table, run_tables
 
 
 def write_page(
-    store: Store,
-    labels: Mapping[str, str],
-    folder: Path,
-    failures: Mapping[str, str] | None = None,
+    store: Store, labels: Mapping[str, str], folder: Path, failures: Mapping[str, str] = {}
 ) -> Path:
     """Write `folder/report.md` with its pictures, and the same as `report.html`; return the former.
 
@@ -39,7 +36,7 @@ def write_page(
     """
     runs = over_common_frames(load(store, labels))
     parts = [
-        *_heading(runs, failures or {}),
+        *_heading(runs, failures),
         *_tradeoffs(runs),
         *_time(runs),
         *_pictures(runs),
@@ -65,9 +62,8 @@ def _heading(runs: Sequence[Run], failures: Mapping[str, str]) -> Iterator[Part]
             " The best figure of each column is **bold**, among runs with the same frames, protocol"
             " and machine."
         )
-    title, conditions = f"# {labels} on {scenes}", f"Measured: {conditions_of(runs)}."
-    yield title
-    yield conditions
+    yield f"# {labels} on {scenes}"
+    yield f"Measured: {conditions_of(runs)}."
     yield table
     yield reading
     yield from missing_figures(runs)
@@ -122,7 +118,6 @@ def _pictures(runs: Sequence[Run]) -> Iterator[Part]:
 
 
 def _figures(run: Run) -> Iterator[Part]:
-    """All figures of one run."""
     yield f"## {run.label}, run {run.key}"
     for table in run_tables(run.rows):
         yield f"### {table.title}"

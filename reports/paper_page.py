@@ -29,7 +29,7 @@ def write_paper_page(
     lines: Lines,
     found: Sequence[Outlier],
     folder: Path,
-    missing: Mapping[str, str] | None = None,
+    missing: Mapping[str, str] = {},
 ) -> Path:
     """Write `folder/report.md` with its pictures, and the same as `report.html`; return the former.
 
@@ -46,7 +46,7 @@ def write_paper_page(
     runs = list(
         {run.key: run for of in lines.values() for line in of for run in line.measured}.values()
     )
-    left_out = "\n".join(f"- missing: {name}: {why}" for name, why in (missing or {}).items())
+    left_out = "\n".join(f"- missing: {name}: {why}" for name, why in missing.items())
     listed = outlier_table(found, runs)
     sources = "\n".join(f"{run.key}  {run.record['command']}" for run in runs)
     parts = [
@@ -111,7 +111,6 @@ def _steps(run: Run) -> int:
 
 
 def _images(images: Mapping[str, Any], lines: Lines) -> Iterator[Part]:
-    """Images of the middle one of the frames that all runs kept."""
     runs = _chosen(images["lines"], lines, one_scene=True)
     runs = [run for run in runs if run.views == runs[0].views]
     if runs and (frames := kept_frames(runs)):

@@ -10,7 +10,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from reports.comparison import conditions_of, metric_format, ranks, written
+from reports.comparison import conditions_of, marked, metric_format
 from reports.page import missing_figures
 from reports.runs import Repeated, Run
 from reports.scenes import scene_table
@@ -186,11 +186,7 @@ def with_published(table: PaperTable, measured: Mapping[str, Repeated]) -> Table
     beside = any(line.published for line in table.lines)
     columns = []
     for metric in table.metrics:
-        places = {} if metric.startswith("stage_ms.") else ranks(lines, metric)
-        marks = {1: "**", 2: "*" if len(places) > 2 else ""}
-        texts = [
-            _marked(found, metric, marks.get(places.get(n, 0), "")) for n, found in enumerate(lines)
-        ]
+        texts = [text or ABSENT for text in marked(lines, metric, ("**%s**", "*%s*"))]
         if beside:
             texts = [
                 _beside(text, found.mean(metric), line.published.get(metric), metric)
@@ -234,7 +230,6 @@ def _block(
 
 
 def _origin(runs: Sequence[Run]) -> str:
-    """Methods, seeds, commits and processors of `runs`."""
     machines = [run.record["machine"] for run in runs]
     origin = {
         "method": [run.facts["method"] for run in runs],
@@ -243,12 +238,6 @@ def _origin(runs: Sequence[Run]) -> str:
         "on": [f"{each['cpu']} with {each['threads']} threads" for each in machines],
     }
     return ", ".join(f"{name} {' / '.join(dict.fromkeys(of))}" for name, of in origin.items())
-
-
-def _marked(found: Repeated, metric: str, mark: str) -> str:
-    """A measured figure, enclosed in `mark`."""
-    shown = written(found, metric)
-    return f"{mark}{shown}{mark}" if shown else ABSENT
 
 
 def _beside(text: str, measured: float | None, published: float | None, metric: str) -> str:

@@ -140,7 +140,6 @@ def changes(
 
 
 def _change(metric: str, limit: Limit, pairs: Sequence[tuple[Figures, Figures]]) -> Change:
-    """Of one metric, over `pairs` of runs with the same seed."""
     values = np.array([[run.values.get(metric, math.nan) for run in pair] for pair in pairs])
     frames = [_frames_apart(metric, *pair) for pair in pairs]
     by_seed = np.array(

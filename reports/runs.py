@@ -64,7 +64,7 @@ class Run:
 
     def _repr_markdown_(self) -> str:
         """The run's tables, for display in a notebook."""
-        tables = "\n\n".join(table.section(level=4) for table in run_tables(self.rows))
+        tables = "\n\n".join(f"#### {x.title}\n\n{x.markdown()}" for x in run_tables(self.rows))
         return f"### {self.label}\n\n{tables}"
 
     @cached_property
@@ -167,15 +167,13 @@ def over_common_frames(runs: Sequence[Run]) -> list[Run]:
         if frames:
             common[run.views] = common.get(run.views, frames) & frames
     return [
-        _over(run, common[run.views]) if common.get(run.views, frames) < frames else run
+        _over(run, kept) if (kept := common.get(run.views, frames)) and kept < frames else run
         for run, frames in zip(runs, steady, strict=True)
     ]
 
 
 def _over(run: Run, kept: Collection[int]) -> Run:
-    """The run with steady figures computed over the frames `kept`; unchanged if that is empty."""
-    if not kept:
-        return run
+    """The run with steady figures computed over the frames `kept`."""
     frames = run.frames
     chosen = frames[(frames["phase"] == STEADY) & frames["frame"].isin(kept)]
     found = pd.DataFrame(phase_rows(chosen)).set_index("metric")
@@ -216,9 +214,6 @@ def _run(store: Store, key: str, label: str, rows: pd.DataFrame, record: Mapping
 
 
 def _rows_by_run(store: Store, keys: Collection[str] | None = None) -> dict[str, pd.DataFrame]:
-    """The rows of every readable run, or only of those in `keys`; unreadable ones are skipped.
-
-    There is no warning about skipped runs.
-    """
+    """The rows of every readable run, or only of those in `keys`, without a word of others."""
     rows = store.rows(report=lambda unreadable: None, keys=keys)
     return {str(run): of_run for run, of_run in rows.groupby("run")}

@@ -58,13 +58,14 @@ class Table:
         ]
         return "\n".join(f"| {' | '.join(line)} |" for line in (self.columns, rule, *lines))
 
-    def section(self, level: int = 2) -> str:
-        """The table in Markdown, with its title as a heading."""
-        return f"{'#' * level} {self.title}\n\n{self.markdown()}"
-
     def _cell(self, text: str, place: tuple[int, int]) -> str:
         escaped = text.replace("|", "\\|")
         return f"**{escaped}**" if place in self.bold else escaped
+
+
+def spread(low: float, high: float, decimals: int = 1) -> str:
+    """The ends of a range, each with this number of `decimals`."""
+    return f"{decimal(low, decimals)} – {decimal(high, decimals)}"
 
 
 def decimal(value: float | None, decimals: int) -> str:
@@ -128,8 +129,8 @@ def _quality(rows: pd.DataFrame, suffix: str) -> Table:
     lines = []
     for metric, (label, decimals) in QUALITY.items():
         if metric in value:
-            ends = [decimal(end[metric], decimals) for end in (low, high)]
-            interval = " – ".join(ends) if math.isfinite(low[metric]) else ""
+            ends = low[metric], high[metric]
+            interval = spread(*ends, decimals) if math.isfinite(ends[0]) else ""
             lines.append((label, decimal(value[metric], decimals), interval))
     title = f"Quality{suffix}, mean of {frames['psnr']} frames"
     return Table(title, ("metric", "mean", "95 % interval"), tuple(lines))

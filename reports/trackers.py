@@ -1,16 +1,16 @@
 """Sends a run of the store to an experiment tracker, under the run's key.
 
-There is one class per tracker. Each sends the figures of every frame as a series, the headline
+There is one function per tracker. Each sends the figures of every frame as a series, the headline
 figures as a summary, the pictures and the provenance. A run already sent under the same key is
 replaced or kept.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -25,73 +25,50 @@ FACTS = ("method", "scene", "resolution", "trajectory", "budget", "protocol", "s
 """Columns of the rows that say what was measured."""
 
 
-class Tracker(Protocol):
-    """An experiment tracker, to which runs are sent.
-
-    Attributes:
-        package: the package that it needs.
-    """
-
-    package: str
-
-    def send(self, run: Run, outputs: Path) -> None:
-        """Send the figures and pictures of `run`; `outputs` is the folder of its store."""
-
-
-class WandB:
+def to_wandb(run: Run, outputs: Path) -> None:
     """Weights & Biases: a run with the key as id. W&B's environment variables set the target."""
+    import wandb
 
-    package = "wandb"
-
-    def send(self, run: Run, outputs: Path) -> None:
-        import wandb
-
-        with wandb.init(
-            project=PROJECT,
-            id=run.key,
-            name=run.label,
-            config=settings(run),
-            dir=outputs,
-            resume="allow",
-        ) as sent:
-            for frame, figures in series(run):
-                sent.log(figures, step=frame)
-            sent.log({name: wandb.Image(str(path)) for name, path in pictures(run)})
-            sent.summary.update(headline(run))
+    facts = settings(run)
+    begun = wandb.init(
+        project=PROJECT, id=run.key, name=run.label, config=facts, dir=outputs, resume="allow"
+    )
+    with begun as sent:
+        for frame, figures in series(run):
+            sent.log(figures, step=frame)
+        sent.log({name: wandb.Image(str(path)) for name, path in pictures(run)})
+        sent.summary.update(headline(run))
 
 
-class TensorBoard:
+def to_tensorboard(run: Run, outputs: Path) -> None:
     """TensorBoard: event files in OUTPUTS/tensorboard/KEY, written once."""
+    from torch.utils.tensorboard import SummaryWriter
 
-    package = "tensorboard"
-
-    def send(self, run: Run, outputs: Path) -> None:
-        from torch.utils.tensorboard import SummaryWriter
-
-        folder = outputs / "tensorboard" / run.key
-        if folder.exists():
-            return
-        with SummaryWriter(str(folder)) as writer:
-            lines = [f"{name}: {value}" for name, value in settings(run).items()]
-            writer.add_text("settings", "  \n".join(lines))
-            for frame, figures in series(run):
-                for name, value in figures.items():
-                    writer.add_scalar(f"frame/{name}", value, frame)
-            for name, value in headline(run).items():
-                writer.add_scalar(f"run/{name}", value)
-            for name, path in pictures(run):
-                with Image.open(path) as image:
-                    writer.add_image(name, np.asarray(image.convert("RGB")), dataformats="HWC")
+    folder = outputs / "tensorboard" / run.key
+    if folder.exists():
+        return
+    with SummaryWriter(str(folder)) as writer:
+        lines = [f"{name}: {value}" for name, value in settings(run).items()]
+        writer.add_text("settings", "  \n".join(lines))
+        for frame, figures in series(run):
+            for name, value in figures.items():
+                writer.add_scalar(f"frame/{name}", value, frame)
+        for name, value in headline(run).items():
+            writer.add_scalar(f"run/{name}", value)
+        for name, path in pictures(run):
+            with Image.open(path) as image:
+                writer.add_image(name, np.asarray(image.convert("RGB")), dataformats="HWC")
 
 
-TRACKERS: Mapping[str, Tracker] = {
-    "wandb": WandB(),
-    "tensorboard": TensorBoard(),
+TRACKERS: dict[str, Callable[[Run, Path], None]] = {
+    "wandb": to_wandb,
+    "tensorboard": to_tensorboard,
 }
+"""What sends a run from the store in the folder `outputs`, by the tracker's name and package."""
 
 
-def tracker(name: str) -> Tracker:
-    """The tracker called `name`.
+def tracker(name: str) -> Callable[[Run, Path], None]:
+    """What sends a run to the tracker called `name`.
 
     Raises:
         SteerbenchError: there is no such tracker.
@@ -99,12 +76,9 @@ def tracker(name: str) -> Tracker:
     """
     if name not in TRACKERS:
         raise SteerbenchError(f"tracker: expected one of {', '.join(TRACKERS)}, got {name!r}")
-    found = TRACKERS[name]
-    if find_spec(found.package) is None:
-        raise Unavailable(
-            f"tracker={name} needs the package {found.package}: {install_command(name)}"
-        )
-    return found
+    if find_spec(name) is None:
+        raise Unavailable(f"tracker={name} needs the package {name}: {install_command(name)}")
+    return TRACKERS[name]
 
 
 def settings(run: Run) -> dict[str, Any]:

@@ -64,9 +64,7 @@ class Difference:
 
 
 def differences(
-    trend: Trend,
-    lines: Mapping[str, Repeated],
-    published: Mapping[str, Mapping[str, float]],
+    trend: Trend, lines: Mapping[str, Repeated], published: Mapping[str, Mapping[str, float]]
 ) -> Iterator[Difference]:
     """Every difference of `trend` between two measured lines.
 

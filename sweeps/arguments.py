@@ -83,8 +83,6 @@ def _arguments(about: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]
     include = about.get("include", [])
     if usual := about.get("settings"):
         include = [*include, "folder"]
-        help = f"settings as of `steerbench run` (default {usual})"
-        yield "overrides", {"help": help, "nargs": "*"}
     for group in (about.get("arguments", {}), *(_SHARED[name] for name in include)):
         for name, options in group.items():
             kind = TYPES[options["type"]] if "type" in options else {}
@@ -92,6 +90,9 @@ def _arguments(about: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]
             more = "; may be repeated" if kind.get("action") == "append" else ""
             more += f" (default {own['default']})" if own.get("default") else ""
             yield name, {**kind, **own, "help": own["help"] + more}
+    if usual:  # last, because it takes all words that are left
+        help = f"settings as of `steerbench run` (default {usual})"
+        yield "overrides", {"help": help, "nargs": "*"}
 
 
 def overview() -> str:

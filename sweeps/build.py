@@ -65,16 +65,11 @@ def build(config: DictConfig, group: str, *args: Any, **extra: Any) -> Any:
     try:
         prepared = instantiate(node, _partial_=True, _convert_="all")
         return prepared(*args, **extra)
-    except InstantiationException as error:
-        cause = error.__cause__ or error
-        raise (_refused(group, cause) if isinstance(cause, ValueError) else cause) from error
-    except ValueError as error:
-        raise _refused(group, error) from error
-
-
-def _refused(group: str, error: BaseException) -> SteerbenchError:
-    """The error for a value that the target rejected; the target's message names the setting."""
-    return SteerbenchError(f"{group}: {error}")
+    except (InstantiationException, ValueError) as error:
+        cause = (isinstance(error, InstantiationException) and error.__cause__) or error
+        if isinstance(cause, ValueError):  # the target's message names the setting
+            raise SteerbenchError(f"{group}: {cause}") from error
+        raise cause from error
 
 
 def check_settings(

@@ -48,7 +48,9 @@ def find(path: str) -> DataSet:
         for name, folder in folders.items()
         if (folder / mark).is_file()
     }
-    wanted = next((names for names in _known() if names & folders.keys()), set())
+    known: Any = OmegaConf.load(REFERENCES)
+    data_sets = [set(known["psnr"]), set(known["tanks_and_temples"])]
+    wanted = next((names for names in data_sets if names & folders.keys()), set())
     no_cameras = f"no {' or '.join(MARKS.values())}"
     missing = {
         name: no_cameras if name in folders else "no folder" for name in wanted - layouts.keys()
@@ -66,12 +68,6 @@ def find(path: str) -> DataSet:
             f" got {got}{reasons}; of a single scene the folder is scene.path"
         )
     return DataSet(used.pop(), whole, dict(sorted(missing.items())))
-
-
-def _known() -> list[set[str]]:
-    """The names of the scenes of each data set of the paper."""
-    content: Any = OmegaConf.load(REFERENCES)
-    return [set(content["psnr"]), set(content["tanks_and_temples"])]
 
 
 def _lack(folder: Path, layout: str) -> str | None:

@@ -41,7 +41,7 @@ def send(config: DictConfig, store: Store, run: str, label: str) -> None:
     outputs = Path(config.outputs)
     log = ConsoleLog(outputs)
     try:
-        tracker(config.tracker).send(load(store, {run: label})[0], outputs)
+        tracker(config.tracker)(load(store, {run: label})[0], outputs)
         log.info(f"sent to {config.tracker}: {run}")
     except Exception as error:  # third-party library: any exception
         log.info(f"not sent to {config.tracker}: {run}: {reason(error)}")

@@ -83,16 +83,13 @@ def of_scene(run: Run, config: DictConfig) -> bool:
 
 
 def _lines(of_block: Mapping[str, Sequence[Outcome]]) -> list[Repeated]:
-    """The lines of a block, made from the outcomes of their jobs over common frames."""
     of_block = _over_common_frames(of_block)
     measured = [{each.job.scene for each in line if each.run} for line in of_block.values()]
     common = set.intersection(*filter(None, measured)) if any(measured) else set()
     return [_line(label, outcomes, common) for label, outcomes in of_block.items()]
 
 
-def _over_common_frames(
-    of_block: Mapping[str, Sequence[Outcome]],
-) -> dict[str, list[Outcome]]:
+def _over_common_frames(of_block: Mapping[str, Sequence[Outcome]]) -> dict[str, list[Outcome]]:
     every = [each for line in of_block.values() for each in line]
     runs = iter(over_common_frames([each.run for each in every if each.run]))
     return {

@@ -48,14 +48,6 @@ class Ended:
     run: str | None = None
     failure: str | None = None
 
-    @classmethod
-    def of(cls, group: Group, begun: float) -> list[Ended]:
-        """The records of the jobs of a group, all but how they ended."""
-        return [
-            cls(number, job.name, str(job.config.outputs), job.config.report, begun)
-            for number, job in enumerate(group.jobs, group.first)
-        ]
-
     def write(self, folder: Path) -> None:
         """Write the record to `folder`, atomically."""
         with explained(folder), whole(folder / f"{self.number}{SUFFIX}") as new:
@@ -77,7 +69,11 @@ def attempt(group: Group, total: int) -> None:
     Raises as `obtain` does. The failure is printed, and kept for reports.
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
-    jobs = Ended.of(group, time.time())
+    begun = time.time()
+    jobs = [
+        Ended(number, job.name, str(job.config.outputs), job.config.report, begun)
+        for number, job in enumerate(group.jobs, group.first)
+    ]
     try:
         results = obtain(group)
     except Exception as error:

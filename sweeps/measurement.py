@@ -13,7 +13,7 @@ import torch
 from omegaconf import DictConfig
 
 from bench.console import ConsoleLog
-from bench.results import Measurement, Store, content_key
+from bench.results import Store, content_key
 from bench.run import Task, measure
 from bench.types import Log, Method
 from sweeps import failures
@@ -118,10 +118,10 @@ class _Ready:
         scene = scene_of(config)
         trajectory = build(config, "trajectory", scene)
         weights = Path(settings.weights_dir) if settings.weights_dir else None
-        parts = run_parts(config, scene, method, trajectory) | {
-            "lpips": protocol.find_lpips(weights, log)
-        }
-        parts |= {"turns": turns} if turns else {}
+        parts = run_parts(config, scene, method, trajectory)
+        parts["lpips"] = protocol.find_lpips(weights, log)
+        if turns:
+            parts["turns"] = turns
         task = Task(scene, trajectory, protocol, budget, settings.seed, weights, settings.pictures)
         return cls(job, method, task, parts, Store(Path(settings.outputs)))
 
@@ -129,12 +129,6 @@ class _Ready:
     def run(self) -> str:
         """Its key in the store."""
         return self.store.key(self.parts)
-
-    def keep(self, measurement: Measurement) -> None:
-        """Store the measurement, with its command and the folder of its scene."""
-        command, place = shlex.join(self.job.command), scene_folder(self.job.config)
-        record = {**measurement.record, "command": command, "scene_path": place}
-        self.store.save(self.parts, replace(measurement, record=record))
 
 
 def _ready(group: Group, log: Log) -> list[_Ready]:
@@ -171,4 +165,6 @@ def _measure(ready: Sequence[_Ready], log: Log) -> None:
     for each in ready:
         each.store.remove(each.run)
     for each, measurement in zip(ready, measurements, strict=True):
-        each.keep(measurement)
+        command, place = shlex.join(each.job.command), scene_folder(each.job.config)
+        record = {**measurement.record, "command": command, "scene_path": place}
+        each.store.save(each.parts, replace(measurement, record=record))

@@ -29,10 +29,6 @@ class PlugIn:
     folder: Path | None
     fault: str = ""
 
-    def files(self) -> list[Path]:
-        """Its choices, `GROUP/NAME.yaml`."""
-        return [] if self.folder is None else sorted(self.folder.glob("*/*.yaml"))
-
 
 @cache
 def installed() -> tuple[PlugIn, ...]:

@@ -79,6 +79,5 @@ def _train(config: DictConfig) -> float:
 
 
 def _said(ended: Future[float]) -> str:
-    """How a training ended, in words."""
     error = ended.exception()
     return f"trained in {ended.result():.0f} s" if error is None else f"failed: {reason(error)}"

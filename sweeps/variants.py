@@ -21,7 +21,7 @@ from bench.protocol import EvaluationProtocol
 from bench.study import Study, Variant, study_of
 from bench.trajectories import Trajectory
 from bench.types import Log, Method, Scene
-from reports.tables import decimal
+from reports.tables import decimal, spread
 from sweeps.build import build, engine_kinds, target_of
 from sweeps.configured import checked_settings, scene_of
 from sweeps.device_lock import device_lock
@@ -182,11 +182,7 @@ def common_ground(config: DictConfig, frames: int) -> tuple[Scene, Trajectory, E
 
 
 def _usable(configs: Mapping[str, DictConfig], log: Log) -> dict[str, Method]:
-    """The methods that can be used here; the log says why others cannot.
-
-    Raises:
-        Unavailable: the first method cannot be used.
-    """
+    """The methods that can be used here, of which the first is one; the log says why not others."""
     methods: dict[str, Method] = {}
     for name, config in configs.items():
         torch.manual_seed(config.seed)
@@ -236,13 +232,7 @@ def engines(words: Sequence[str] = ()) -> list[Variant]:
     ]
 
 
-COMPARED = (
-    "PSNR to the first, dB ↑",
-    "PSNR, dB ↑",
-    "lost, dB ↓",
-    "frame, ms ↓",
-    "of rounds",
-)
+COMPARED = ("PSNR to the first, dB ↑", "PSNR, dB ↑", "lost, dB ↓", "frame, ms ↓", "of rounds")
 """The columns of `compared_cells`."""
 
 
@@ -270,13 +260,8 @@ def compared_cells(row: Row) -> tuple[str, ...]:
         decimal(row["psnr"], 2),
         decimal(row["lost"], 3),
         decimal(row["frame_ms"], 1),
-        range_text(row),
+        spread(row["ms_lo"], row["ms_hi"]),
     )
-
-
-def range_text(values: Mapping[str, Any]) -> str:
-    """Mean frame times of the fastest and the slowest round, as text."""
-    return f"{decimal(values['ms_lo'], 1)} – {decimal(values['ms_hi'], 1)}"
 
 
 def amount(value: float) -> str:

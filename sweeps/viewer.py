@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
+from functools import partial
 from io import StringIO
 from itertools import count
 from pathlib import Path
@@ -21,15 +22,7 @@ from bench.compositing import composite
 from bench.errors import SteerbenchError, Unavailable, install_command
 from bench.metrics import as_bytes, psnr
 from bench.types import Camera, Log, Scene
-from bench.viewing import (
-    Ask,
-    Drawn,
-    Painter,
-    Turns,
-    difference,
-    divided,
-    seen_from,
-)
+from bench.viewing import Ask, Drawn, Painter, Turns, difference, divided, seen_from
 
 if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle, ViserServer
@@ -164,14 +157,12 @@ class Viewer:
             with gui.add_folder(f"knobs of {method.name}", order=LAST, expand_by_default=False):
                 for knob, settings in knobs.items():
                     choice = gui.add_dropdown(knob, (AS_GIVEN, *settings))
-                    choice.on_update(self._turner(place, knob, choice))
+                    choice.on_update(partial(self._note, place, knob))
 
-    def _turner(self, place: int, knob: str, choice: Any) -> Callable[[Any], None]:
-        def turned(_: Any) -> None:
-            self._turned.append((place, knob, choice.value))
-            self._redraw()
-
-        return turned
+    def _note(self, place: int, knob: str, event: Any) -> None:
+        self._turned.append((place, knob, event.target.value))
+        for who in list(self.browsers):
+            self._want(who)
 
     def _turn(self, place: int, knob: str, setting: str) -> None:
         try:
@@ -182,14 +173,9 @@ class Viewer:
             browser.drawn = None
 
     def _refuse(self, what: str, error: SteerbenchError) -> None:
-        """Report, here and in all browsers, what did not work."""
         self.log.info(f"{what}: {error}")
         for browser in list(self.browsers.values()):
             browser.client.add_notification(what, str(error), color="red")
-
-    def _redraw(self) -> None:
-        for who in list(self.browsers):
-            self._want(who)
 
     def _join(self, client: ClientHandle) -> None:
         gui, names = client.gui, [method.name for method in self.painter.methods]
@@ -222,7 +208,6 @@ class Viewer:
             self.turns.want(who, Ask(_camera(browser.client.camera, int(browser.height.value))))
 
     def _save(self, browser: Browser) -> None:
-        """Write the recorded path to a file and discard it."""
         last = browser.path[-1]
         cameras = [c for c in browser.path if (c.width, c.height) == (last.width, last.height)]
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -286,17 +271,12 @@ def _three(vector: Tensor) -> tuple[float, float, float]:
 
 
 def _figures(painter: Painter, drawn: Sequence[Drawn], truth: Tensor | None) -> str:
-    """Frame times, times of stages and PSNR of each method, as Markdown."""
     height, width = drawn[0].rgb.shape[:2]
     lines = [f"{width} x {height} pixels", ""]
     for method, picture in zip(painter.methods, drawn, strict=True):
         quality = "" if truth is None else f", {psnr(picture.rgb, truth):.2f} dB"
-        lines += [
-            f"**{method.name}** {picture.ms:.0f} ms{quality}",
-            "",
-            "| stage | ms |",
-            "|---|---|",
-        ]
+        lines += [f"**{method.name}** {picture.ms:.0f} ms{quality}", ""]
+        lines += ["| stage | ms |", "|---|---|"]
         lines += [f"| {stage} | {ms:.1f} |" for stage, ms in picture.stages_ms.items()]
         lines.append("")
     return "\n".join(lines)

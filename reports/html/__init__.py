@@ -65,7 +65,6 @@ def html_page(parts: Sequence[Part], runs: Sequence[Run]) -> str:
 
 
 def _origin(run: Run) -> dict[str, str]:
-    """Figures and provenance of a run, by name."""
     formats = {metric: metric_format(metric) for metric in (*QUALITY, *COST)}
     figures = [
         f"{label.rstrip(' ↑↓')} {write(run.values[metric])}"
@@ -122,7 +121,6 @@ def _table(table: Table, origins: dict[str, dict[str, str]]) -> str:
 
 
 def _in_short(keys: Sequence[str], origins: dict[str, dict[str, str]]) -> str:
-    """Short provenance of a line's figures, for a tooltip."""
     shown = [
         "run {run}, commit {commit}, {machine}: {command}".format(**origins[key])
         for key in keys[:3]
@@ -165,7 +163,6 @@ def _name_mark(element: ElementTree.Element, mark: Mark) -> None:
 
 
 def _frame(frame: Frame) -> dict[str, Any]:
-    """The values of `frame` for the template."""
     height, width = frame.truth.shape[:2]
     left, top, right, bottom = frame.detail.box
     views = [{"titles": ("ground truth",), "rendering": _uri(frame.truth)}]

@@ -100,10 +100,7 @@ def _knobs(config: DictConfig, words: Sequence[str], trained: bool) -> Knobs:
 
 
 def _chosen(knobs: Knobs, parts: Sequence[str] | None) -> list[tuple[str, Variant]]:
-    """The variants of knobs whose names contain any of `parts`, each with its knob.
-
-    Those that all knobs are compared with come first.
-    """
+    """What all knobs are compared with, and variants of knobs with any of `parts` in their name."""
     chosen = set(list(knobs)[: list(knobs).index(AS_IT_IS.name) + 1])
     turned = [knob for knob in knobs if knob not in chosen]
     for part in parts or [""]:

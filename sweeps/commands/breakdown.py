@@ -13,7 +13,7 @@ from bench.probes import OTHER
 from bench.study import Study, Variant
 from bench.types import NullProbe
 from bench.waits import Line, device_waits
-from reports.tables import Table, decimal
+from reports.tables import Table, decimal, spread
 from sweeps.commands.skips import nothing_skipped
 from sweeps.device_lock import on_gpu
 from sweeps.execute import Launcher
@@ -27,7 +27,6 @@ from sweeps.variants import (
     declared,
     engines,
     fitted,
-    range_text,
     render_variants,
     settings,
     settings_of,
@@ -50,7 +49,8 @@ def main(options: argparse.Namespace) -> int:
     variants = settings_of(words, usual)
     if study.skips:
         variants |= settings_of([*words, *nothing_skipped(study)], _ending(usual, DENSE))
-    shared = _shared(words, study)
+    configs = [composed([*folder_words(words), *of]) for of in study.beside.values()]
+    shared = [word for word in words if holds(word, configs)]  # settings that all of them have
     for name, of_method in study.beside.items():
         other = [*shared, *of_method]
         variants |= settings_of(other, _ending(_precisions(other), f", {name}") or [Variant(name)])
@@ -82,10 +82,7 @@ def _print_waits(words: Sequence[str], frames: int, launcher: Launcher) -> int:
 
 
 def _waits(words: Sequence[str], frames: int) -> list[Counter[Line]]:
-    """Where the host waits in each steady frame.
-
-    The path is rendered once before, so that one-time set-up is not counted.
-    """
+    """Where the host waits in each steady frame of a second round: the first sets things up."""
     with fitted({"as it is": words}, frames) as each:
         (method,) = each.methods.values()
         for _ in range(2):
@@ -106,7 +103,6 @@ def with_engine(words: Sequence[str]) -> list[str]:
 
 
 def _precisions(words: Sequence[str]) -> list[Variant]:
-    """The chosen engine at each of its precisions; empty if the method uses no engine."""
     config = composed(words, return_hydra_config=True)
     if not computes_with_engine(config):
         return []
@@ -116,16 +112,6 @@ def _precisions(words: Sequence[str]) -> list[Variant]:
 
 def _ending(variants: Iterable[Variant], ending: str) -> list[Variant]:
     return [Variant(variant.name + ending, variant.settings) for variant in variants]
-
-
-def _shared(words: Sequence[str], study: Study) -> list[str]:
-    """The `words` that also apply to all methods compared with.
-
-    These are all words except `method=` and settings of the method that one of the others lacks.
-    """
-    folders = folder_words(words)
-    others = [composed([*folders, *settings]) for settings in study.beside.values()]
-    return [word for word in words if holds(word, others)]
 
 
 def _row(variant: Rendered, trained_alike: bool) -> Row:
@@ -156,7 +142,7 @@ def _line(row: Row, parts: Iterable[str]) -> tuple[str, ...]:
         row["line"],
         *(decimal(row["parts"].get(part, 0.0), 1) for part in parts),
         decimal(row["frame_ms"], 1),
-        range_text(row),
+        spread(row["ms_lo"], row["ms_hi"]),
         decimal(row["p99_to_p50"], 2),
         decimal(1e3 / row["frame_ms"], 2),
         decimal(row["psnr"], 2),

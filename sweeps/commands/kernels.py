@@ -13,7 +13,7 @@ from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from reports.tables import Table
 from sweeps.device_lock import device_lock
-from sweeps.terminal import console, rich_table
+from sweeps.terminal import show
 
 COLUMNS = ("kernel", "case", "backend", "dtype", "error", "tolerance", "ms", "M items/s", "ratio")
 """`ratio`: time of the reference backend over time of this one, in the same case and run."""
@@ -36,7 +36,7 @@ def main(options: argparse.Namespace) -> int:
         rows = timed_rows(cases, device, compiled(device), options.repeats, log)
     if not rows:
         raise SteerbenchError(f"--filter: no kernel has {options.filter!r} in its name")
-    console().print(rich_table(Table("Kernels", COLUMNS, tuple(_line(row) for row in rows))))
+    show(Table("Kernels", COLUMNS, tuple(map(_line, rows))))
     print(json.dumps(rows))
     return int(any(row["status"] != "ok" for row in rows))
 

@@ -30,7 +30,8 @@ def main(options: argparse.Namespace) -> int:
         for name, about in described(group, words).items()
     ]
     _show("Choices", ("choice", "what it is"), files)
-    _show("Installed plug-ins", ("plug-in", "what it brings"), _plug_ins(words))
+    plug_ins = [(each.name, _brings(each, words)) for each in installed()]
+    _show("Installed plug-ins", ("plug-in", "what it brings"), plug_ins)
     if not options.here:
         console().print("Backends and engines that this machine can use: steerbench list --here")
         return 0
@@ -56,23 +57,18 @@ def described(group: str, words: Sequence[str] = ()) -> dict[str, str]:
     return {name: _comment(path.read_text()) for name, path in choices(group, words).items()}
 
 
-def _plug_ins(words: Sequence[str]) -> list[tuple[str, str]]:
-    return [(each.name, _brings(each, words)) for each in installed()]
-
-
 def _brings(plug_in: PlugIn, words: Sequence[str]) -> str:
     """The choices of a plug-in, or why it has none."""
     if plug_in.folder is None:
         return f"cannot be used: {plug_in.fault}"
     brought = []
-    for path in plug_in.files():
+    for path in sorted(plug_in.folder.glob("*/*.yaml")):
         group, hidden = path.parent.name, choices(path.parent.name, words)[path.stem] != path
         brought.append(f"{group}={path.stem}" + (" (hidden: the name is taken)" if hidden else ""))
     return ", ".join(brought) or f"nothing: there are no GROUP/NAME.yaml in {plug_in.folder}"
 
 
 def _state(name: str, kind: Any) -> str:
-    """Whether an engine can be used here, or why not."""
     try:
         kind(kind.precisions[0])
     except (Unavailable, SteerbenchError) as reason:

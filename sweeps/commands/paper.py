@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -110,24 +111,16 @@ def _groups(jobs: Sequence[Planned], look_up: bool) -> tuple[list[Group], set[st
         wanted = [Job(job.config, job.command, job.name) for job in planned]
         first = sum(len(group.jobs) for group in groups)
         group = Group(wanted, planned[0].turns, first)
-        if there := _stored(group) if look_up else []:
+        there: list[Obtained] = []
+        with suppress(SteerbenchError):  # a job that cannot start says so when it is measured
+            there = stored(group) if look_up else []
+        if there:
             measured |= {job.key for job in planned}
             for each, obtained in zip(wanted, there, strict=True):
                 say(each, obtained)
         else:
             groups.append(group)
     return groups, measured
-
-
-def _stored(group: Group) -> list[Obtained]:
-    """The runs of a group if the store has all of them; otherwise none.
-
-    Also none if a job cannot even start; the error is reported when it is measured.
-    """
-    try:
-        return stored(group)
-    except SteerbenchError:
-        return []
 
 
 def _attempted(group: Group, total: int) -> int:

@@ -20,8 +20,6 @@ SHOWN = (
 )
 """The columns of the printed table; csv and json have all columns."""
 
-FILTERS = ("method", "scene", "metric")
-
 
 def main(options: argparse.Namespace) -> int:
     """Print the rows below `options.outputs`, filtered if asked, as a table, csv or json.
@@ -32,7 +30,7 @@ def main(options: argparse.Namespace) -> int:
     rows = Store(options.outputs).rows(report=lambda message: print(message, file=sys.stderr))
     if rows.empty:
         raise SteerbenchError(f"{options.outputs}: no runs yet; `steerbench run` makes one")
-    for column in FILTERS:
+    for column in ("method", "scene", "metric"):
         wanted = getattr(options, column)
         if wanted is not None:
             if wanted not in set(rows[column]):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Collection, Sequence
 from math import prod
@@ -50,7 +51,8 @@ def main(argv: Sequence[str]) -> int:
         SteerbenchError: a setting or a choice does not exist, or a job failed.
     """
     # Hydra's parser accepts overrides only in one contiguous block, so flags go first.
-    sys.argv = [sys.argv[0], *sorted(argv, key=_is_override)]
+    flags = [word for word in argv if word.startswith("-") or not re.search("^~|=", word)]
+    sys.argv = [sys.argv[0], *flags, *(word for word in argv if word not in flags)]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors instead of printing them
     _hide_subcommand_from_completion()
     SweepCallback.folder = None
@@ -108,7 +110,6 @@ def _alone(config: DictConfig, command: Sequence[str]) -> None:
 
 
 def _one_of_many(config: DictConfig, command: Sequence[str]) -> None:
-    """Attempt the current job of a sweep."""
     from sweeps.jobs import attempt
     from sweeps.measurement import Group, Job
     from sweeps.processes import set_up
@@ -122,10 +123,7 @@ def _one_of_many(config: DictConfig, command: Sequence[str]) -> None:
 
 
 def _sizes(file: Path) -> dict[str, int] | None:
-    """The number of values, for each setting with several, in the sweep that `file` describes.
-
-    Hydra's own sweeper writes it; None with another one.
-    """
+    """How many values each swept setting has, by the file of Hydra's own sweeper; else None."""
     if not file.exists():
         return None
     sweep = OmegaConf.load(file).hydra
@@ -180,10 +178,6 @@ def _config_dir() -> list[str]:
     """The folder of further choices from the command line, as one word, for the job's command."""
     sources = HydraConfig.get().runtime.config_sources
     return [f"--config-dir={x.path}" for x in sources if x.provider == "command-line"]
-
-
-def _is_override(argument: str) -> bool:
-    return argument.startswith("~") or ("=" in argument and not argument.startswith("-"))
 
 
 def _hide_subcommand_from_completion() -> None:

@@ -16,13 +16,12 @@ from omegaconf import DictConfig
 from bench.accuracy import mean_figures
 from bench.cameras import frame_camera
 from bench.console import ConsoleLog
-from bench.errors import SteerbenchError, explained
+from bench.errors import SteerbenchError
 from bench.frontier import observed_order
 from bench.probes import FrameRecord, MemoryMeter, StageClock, p99_to_p50
 from bench.study import Study
 from bench.threads import torch_threads
 from bench.types import Camera, Log, Method, Scene
-from reports.figures import growth_panels
 from reports.tables import Table, decimal, megabytes
 from sweeps.build import build
 from sweeps.configured import checked_settings, scene_of
@@ -59,8 +58,6 @@ class Point:
 
 def main(options: argparse.Namespace) -> int:
     """Print a table with the fitted exponents, then its rows as JSON in the last line."""
-    if options.plot is not None and options.plot.suffix != ".png":
-        raise SteerbenchError(f"--plot: expected a name that ends in .png, got {options.plot}")
     words, launcher = settings(options, METHOD, "trajectory=smooth", FEW_STEPS)
     config = composed(words, return_hydra_config=True)
     points = _chosen(config, options.axis)
@@ -75,9 +72,6 @@ def main(options: argparse.Namespace) -> int:
     title = f"{config.method.get('name', scene)} on {scene}, {rows[0]['frames']} frames"
     show(_table(title, axes))
     print_rows(rows)
-    if options.plot is not None:
-        _plot(axes, options.plot)
-        ConsoleLog(launcher.outputs).info(f"plot: {options.plot}")
     return 0
 
 
@@ -93,7 +87,6 @@ def _points(study: Study) -> Iterator[Point]:
 
 
 def _rows(words: Sequence[str], points: Sequence[Point], frames: int) -> list[Row]:
-    """Measure the points one after the other."""
     config = composed(words)
     log, scene = ConsoleLog(Path(checked_settings(config).outputs)), scene_of(config)
     rows = []
@@ -106,11 +99,7 @@ def _rows(words: Sequence[str], points: Sequence[Point], frames: int) -> list[Ro
 
 
 def _chosen(config: DictConfig, names: Sequence[str] | None) -> list[Point]:
-    """The points of the axes `names`; by default, of all axes.
-
-    Raises:
-        SteerbenchError: the method has no such axis, or the engine has a fixed number of threads.
-    """
+    """The points of the axes `names`; by default, of all axes."""
     study = declared(config)
     axes = ("pixels", "threads", *study.axes)
     for name in names or ():
@@ -198,14 +187,6 @@ def _table(title: str, axes: Mapping[str, Sequence[Row]]) -> Table:
         )
         lines.append((f"exponent of {axis}", *powers))
     return Table(title, ("", *(label for label, _ in figures.values())), tuple(lines))
-
-
-def _plot(axes: Mapping[str, Sequence[Row]], path: Path) -> None:
-    figures = {"frame_ms": "ms / frame", "peak_bytes": "peak memory, bytes"}
-    exponents = {(axis, key): growth(axes[axis], key) for axis in axes for key in figures}
-    with explained(path.parent):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        growth_panels(axes, figures, exponents, path)
 
 
 def growth(rows: Sequence[Row], figure: str) -> float:

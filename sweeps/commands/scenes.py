@@ -33,7 +33,6 @@ def _get(name: str, to: Path, log: ConsoleLog) -> int:
 
 
 def _found(name: str) -> tuple[Published, Sequence[str]]:
-    """The data set called `name` and all its scenes, or the one with a scene called `name`."""
     known = published()
     for data in known:
         if name == data.name:

@@ -14,29 +14,15 @@ from bench.checking import failed, run_cases
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from reports.tables import Table
-from sweeps.terminal import console, rich_table
+from sweeps.terminal import show
 
 COLUMNS = (
-    "subject",
-    "case",
-    "what must hold",
-    "by",
-    "on",
-    "precision",
-    "worst",
-    "at most",
-    "status",
+    *("subject", "case", "what must hold", "by", "on", "precision"),
+    *("worst", "at most", "status"),
 )
 CASE_COLUMNS = (
-    "subject",
-    "case",
-    "what must hold",
-    "cells",
-    "backend, precision",
-    "worst",
-    "at most",
-    "status",
-    "the tolerance",
+    *("subject", "case", "what must hold", "cells", "backend, precision"),
+    *("worst", "at most", "status", "the tolerance"),
 )
 """Columns with one line per case, which shows the cell nearest to its tolerance."""
 
@@ -57,17 +43,11 @@ def main(options: argparse.Namespace) -> int:
     if options.format == "markdown":
         print(Table(title, CASE_COLUMNS, tuple(_case_lines(rows)), figures=False).markdown())
     else:
-        lines = tuple(_line(row) for row in rows)
-        console().print(rich_table(Table(title, COLUMNS, lines, figures=False)))
+        labels = ("subject", "case", "holds", "backend", "device", "precision")
+        lines = tuple((*(row[name] for name in labels), *_end(row)) for row in rows)
+        show(Table(title, COLUMNS, lines, figures=False))
     print(json.dumps(rows))
     return int(wrong > 0)
-
-
-def _line(row: Mapping[str, Any]) -> tuple[str, ...]:
-    return (
-        *(row[name] for name in ("subject", "case", "holds", "backend", "device", "precision")),
-        *_end(row),
-    )
 
 
 def _end(row: Mapping[str, Any]) -> tuple[str, str, str]:

@@ -8,8 +8,10 @@ import shutil
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 
 from bench.results import COLUMNS, Store
+from reports.runs import Run, load
 
 FIGURES = {
     "psnr": (30.456, 29.5, 31.5),
@@ -53,6 +55,21 @@ def rows_with_cold(rows: pd.DataFrame) -> pd.DataFrame:
     cold.loc[cold["metric"].str.match("frame_ms|stage_ms"), figures] *= 2
     cold.loc[cold["metric"] == "fps", figures] /= 2
     return pd.concat([rows, cold], ignore_index=True)
+
+
+@pytest.fixture
+def run(store: Store, stored_run: str) -> Run:
+    """A run of six scored frames, three of them pictured."""
+    (found,) = load(store, {stored_run: "run"})
+    return found
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """The figures that would be saved."""
+    figures: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
+    return figures
 
 
 @pytest.fixture

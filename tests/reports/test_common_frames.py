@@ -39,7 +39,7 @@ def run_of(memory: int, scene: str = "one", shift: float = 0.0) -> Run:
     return Run("key", "run", pd.DataFrame(rows).assign(**facts), lambda: frames, record, Path())
 
 
-def test_equal_pictures_have_equal_figures_whatever_the_method_remembers() -> None:
+def test_equal_pictures_have_equal_figures_whatever_the_method_remembers():
     runs = over_common_frames([run_of(memory) for memory in (0, 1, 3)])
     for run in runs:
         assert run.values["psnr"] == pytest.approx(sum(PSNR[3:]) / 3)
@@ -48,19 +48,19 @@ def test_equal_pictures_have_equal_figures_whatever_the_method_remembers() -> No
         assert run.headline["n"]["psnr"] == 3
 
 
-def test_figures_of_cold_frames_stay() -> None:
+def test_figures_of_cold_frames_stay():
     run = over_common_frames([run_of(1), run_of(3)])[0]
     cold = run.rows[run.rows["phase"] == COLD].set_index("metric")["value"]
     assert cold["psnr"] == PSNR[0]
 
 
-def test_runs_of_other_views_do_not_count() -> None:
+def test_runs_of_other_views_do_not_count():
     alone, other = over_common_frames([run_of(0), run_of(3, scene="another")])
     assert alone.values["psnr"] == pytest.approx(sum(PSNR) / 6)
     assert other.values["psnr"] == pytest.approx(sum(PSNR[3:]) / 3)
 
 
-def test_without_a_common_frame_all_stay_as_they_are() -> None:
+def test_without_a_common_frame_all_stay_as_they_are():
     cold = run_of(len(PSNR))
     runs = over_common_frames([run_of(0), cold])
     assert runs[0].values["psnr"] == pytest.approx(sum(PSNR) / 6)

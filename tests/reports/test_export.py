@@ -8,10 +8,9 @@ from dataclasses import replace
 import pandas as pd
 import pytest
 
-from bench.results import Store
 from reports import export
 from reports.paper_tables import Line, PaperTable
-from reports.runs import Repeated, Run, load
+from reports.runs import Repeated, Run
 from sweeps.plan import chosen
 
 TABLE = PaperTable(
@@ -30,17 +29,14 @@ TABLE = PaperTable(
 
 
 @pytest.fixture
-def lines(store: Store, stored_run: str) -> dict[str, list[Repeated]]:
+def lines(run: Run) -> dict[str, list[Repeated]]:
     """Three measured lines; two of them differ by less than the decimals show."""
-    (run,) = load(store, {stored_run: "run"})
     figures = {
         "T = 2^19": (30.456, 0.9512, 25.24e6),
         "K = 3": (30.461, 0.9514, 25.0e6),
         "mine_1": (29.0, 0.9, 3e6),
     }
-    return {
-        "table9": [Repeated(label, [of(run, *values)]) for label, values in figures.items()],
-    }
+    return {"table9": [Repeated(label, [of(run, *values)]) for label, values in figures.items()]}
 
 
 def of(run: Run, psnr: float, ssim: float, size: float) -> Run:
@@ -58,29 +54,23 @@ def cells(text: str) -> dict[str, list[str]]:
     }
 
 
-def test_latex_has_the_decimals_of_the_paper_and_marks_the_best(
-    lines: dict[str, list[Repeated]],
-) -> None:
+def test_latex_has_the_decimals_of_the_paper_and_marks_the_best(lines):
     found = cells(export.latex([TABLE], lines))
     # 0.9512 and 0.9514 are both .951: they share the first place.
     assert found["$T = 2^{19}$"] == [r"\textbf{30.46}", r"\textbf{0.951}", "25.2"]
     assert found["$K = 3$"] == [r"\textbf{30.46}", r"\textbf{0.951}", r"\underline{25.0}"]
+    assert found["not yet"] == ["--", "--", "--"]  # not measured
     assert found[r"mine\_1"] == [r"\underline{29.00}", r"\underline{0.900}", r"\textbf{3.0}"]
 
 
-def test_latex_has_a_dash_for_what_was_not_measured(lines: dict[str, list[Repeated]]) -> None:
-    found = cells(export.latex([TABLE], lines))
-    assert found["not yet"] == ["--", "--", "--"]
-
-
-def test_latex_of_several_seeds_has_their_interval(lines: dict[str, list[Repeated]]) -> None:
+def test_latex_of_several_seeds_has_their_interval(lines):
     (line, *_) = lines["table9"]
     runs = [of(line.runs[0], psnr, 0.95, 1e6) for psnr in (29.0, 31.0)]
     found = cells(export.latex([TABLE], {"table9": [replace(line, runs=runs)]}))
     assert found["$T = 2^{19}$"][0] == r"30.00 $\pm$ 12.71"  # t(0.975, 1) = 12.71
 
 
-def test_latex_is_escaped_and_of_booktabs(lines: dict[str, list[Repeated]]) -> None:
+def test_latex_is_escaped_and_of_booktabs(lines):
     text = export.latex([TABLE], lines)
     assert r"\caption{Quality \& size." in text
     for rule in ("toprule", "midrule", "bottomrule"):
@@ -89,7 +79,7 @@ def test_latex_is_escaped_and_of_booktabs(lines: dict[str, list[Repeated]]) -> N
     assert text.isascii()
 
 
-def test_a_rule_stands_before_what_is_beyond_the_paper(lines: dict[str, list[Repeated]]) -> None:
+def test_a_rule_stands_before_what_is_beyond_the_paper(lines):
     (table,) = (table for table in chosen(None, []) if table.name == "table5")
     run = lines["table9"][0].runs[0]
     labels = [line.label for block in table.blocks for line in block.lines]
@@ -101,7 +91,7 @@ def test_a_rule_stands_before_what_is_beyond_the_paper(lines: dict[str, list[Rep
     assert "lean" not in alone
 
 
-def test_csv_has_a_figure_a_row_as_it_was_measured(lines: dict[str, list[Repeated]]) -> None:
+def test_csv_has_a_figure_a_row_as_it_was_measured(lines):
     found = pd.read_csv(io.StringIO(export.csv([TABLE], lines)))
     assert len(found) == len(TABLE.lines) * len(TABLE.metrics)
     row = found.set_index(["line", "metric"]).loc[("T = 2^19", "psnr")]

@@ -294,9 +294,7 @@ return { begun, changed, maps, zoomed, split, hidden, mark, row: panel.innerText
 
 
 @needs_browser
-def test_two_pictures_lie_under_a_divider_and_a_mark_and_a_row_show_their_run(
-    page, stored_run, tmp_path
-):
+def test_pictures_lie_under_a_divider_and_marks_and_rows_show_their_run(page, stored_run, tmp_path):
     found = in_browser((page / "report.html").read_text(), LOOK, tmp_path)
     (where,) = {alt.partition(": ")[2] for alt in found["begun"]}
     assert found["begun"] == [f"first: {where}", f"copy 0: {where}"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -61,7 +60,7 @@ def test_an_image_has_a_place_for_every_picture(tmp_path, runs, columns, lines):
         assert np.count_nonzero((pixels == 50 * number).all(axis=-1)) > panel[0] * panel[1]
 
 
-def test_a_page_has_a_few_of_the_frames_that_all_runs_kept(tmp_path: Path) -> None:
+def test_a_page_has_a_few_of_the_frames_that_all_runs_kept(tmp_path):
     runs = [SimpleNamespace(pictures=tmp_path / name) for name in ("many", "some")]
     for run, kept in zip(runs, (range(9), range(0, 9, 2)), strict=True):
         run.pictures.mkdir()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,16 +13,10 @@ from reports import figures
 from reports.outliers import Outlier
 from reports.paper_page import PAGE, _curves, write_paper_page
 from reports.parts import Plot
-from reports.runs import Repeated, Run, load
+from reports.runs import Repeated, Run
 from sweeps.plan import chosen
 
 TABLES = chosen(None, [])
-
-
-@pytest.fixture
-def run(store, stored_run: str) -> Run:
-    """A run of six scored frames, three of them pictured."""
-    return load(store, {stored_run: "run"})[0]
 
 
 def of(run: Run, label: str) -> Repeated:
@@ -31,7 +24,7 @@ def of(run: Run, label: str) -> Repeated:
     return Repeated(label, [replace(run, label=label)])
 
 
-def test_every_line_that_is_shown_in_a_figure_is_one_of_the_tables() -> None:
+def test_every_line_that_is_shown_in_a_figure_is_one_of_the_tables():
     lines = {
         (table.name, line.label)
         for table in TABLES
@@ -44,7 +37,7 @@ def test_every_line_that_is_shown_in_a_figure_is_one_of_the_tables() -> None:
     assert all(set(plot.get("tables", ())) <= {name for name, _ in lines} for plot in PAGE["plots"])
 
 
-def test_the_page_has_every_table_and_every_figure(run: Run, tmp_path: Path) -> None:
+def test_the_page_has_every_table_and_every_figure(run, tmp_path):
     lines = {
         table.name: [of(run, line.label) for block in table.blocks for line in block.lines]
         for table in TABLES
@@ -62,9 +55,7 @@ def test_the_page_has_every_table_and_every_figure(run: Run, tmp_path: Path) -> 
     assert html.count('<div class="frame"') == 2
 
 
-def test_points_of_a_curve_are_not_plotted_against_cost(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_points_of_a_curve_are_not_plotted_against_cost(run, tmp_path, monkeypatch):
     (table,) = (table for table in TABLES if table.name == "table6")
     lines = [of(run, line.label) for line in (*table.lines, *table.marks.values())]
     drawn: list[str] = []
@@ -79,14 +70,14 @@ def test_points_of_a_curve_are_not_plotted_against_cost(
     assert drawn == [f"SteerNeRF, {line.label}" for line in table.lines]
 
 
-def test_a_page_of_nothing_still_says_what_is_missing(tmp_path: Path) -> None:
+def test_a_page_of_nothing_still_says_what_is_missing(tmp_path):
     lines = {"table5": [Repeated("with joint training", [], ["not measured yet"])]}
     text = write_paper_page(TABLES, lines, [], tmp_path).read_text()
     assert "| with joint training: not measured yet | – / 33.05 |" in text
     assert "![" not in text
 
 
-def test_outliers_among_the_runs_of_the_page_are_listed(run: Run, tmp_path: Path) -> None:
+def test_outliers_among_the_runs_of_the_page_are_listed(run, tmp_path):
     lines = {"table5": [of(run, "with joint training")]}
     found = [Outlier(run.key, "13 dB among 30s"), Outlier("another", "not of this page")]
     text = write_paper_page(TABLES, lines, found, tmp_path).read_text()
@@ -95,11 +86,7 @@ def test_outliers_among_the_runs_of_the_page_are_listed(run: Run, tmp_path: Path
     assert "not of this page" not in text
 
 
-def test_a_curve_has_a_point_for_every_scored_frame_and_hollow_ones_for_cold(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drawn = []
-    monkeypatch.setattr(figures.Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+def test_a_curve_has_a_point_for_every_scored_frame_and_hollow_ones_for_cold(run, tmp_path, drawn):
     frames = run.frames.copy()
     frames.loc[0, "phase"] = "cold"
     frames.loc[3, "psnr"] = float("nan")
@@ -109,11 +96,7 @@ def test_a_curve_has_a_point_for_every_scored_frame_and_hollow_ones_for_cold(
     assert list(cold.get_xdata()) == [0]
 
 
-def test_a_mark_stands_where_its_line_is_in_quality_and_cost(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drawn = []
-    monkeypatch.setattr(figures.Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+def test_a_mark_stands_where_its_line_is_in_quality_and_cost(run, tmp_path, drawn):
     lines = [of(run, "measured"), Repeated("missing", [])]
     figures.quality_against(lines, "size_bytes.total", 1e6, "MB", tmp_path / "marks.png")
     (mark,) = drawn[0].axes[0].lines
@@ -121,15 +104,7 @@ def test_a_mark_stands_where_its_line_is_in_quality_and_cost(
 
 
 @pytest.mark.parametrize(("of_method", "of_budget"), [(None, 80), (80, 7)])
-def test_a_curve_has_a_point_for_every_share_of_the_training_that_was_measured(
-    of_method: int | None,
-    of_budget: int,
-    run: Run,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    drawn: list[figures.Figure] = []
-    monkeypatch.setattr(figures.Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+def test_a_curve_has_a_point_for_every_measured_share(of_method, of_budget, run, tmp_path, drawn):
     (table,) = (table for table in TABLES if table.name == "table5")
     made_of = {"config": {"method": {"steps": of_method}}}
     budget = {"renderer_steps": of_budget}

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 
-from bench.results import Store
-from reports.paper_tables import (
-    ABSENT,
-    Line,
-    PaperTable,
-    section,
-    with_published,
-)
+from reports.paper_tables import ABSENT, Line, PaperTable, section, with_published
 from reports.publish import markdown
-from reports.runs import Repeated, Run, load
+from reports.runs import Repeated, Run
 from reports.tables import QUALITY
 from reports.trends import Trend
 from sweeps.overrides import CONFIGS
@@ -49,17 +41,14 @@ def with_psnr(run: Run, value: float) -> Run:
 
 
 @pytest.fixture
-def run(store: Store, stored_run: str) -> Run:
+def run(run: Run) -> Run:
     """A run of known figures."""
-    (found,) = load(store, {stored_run: "here"})
     figures = {"psnr": 30.456, "frame_ms": 12.0, "stage_ms.other": 8.0}
-    rows = found.rows.copy()
-    for metric, value in figures.items():
-        rows.loc[rows["metric"] == metric, "value"] = value
-    return replace(found, rows=rows[rows["metric"].isin(figures)])
+    rows = run.rows[run.rows["metric"].isin(figures)]
+    return replace(run, rows=rows.assign(value=rows["metric"].map(figures)))
 
 
-def test_the_experiments_declare_the_six_tables_of_the_paper() -> None:
+def test_the_experiments_declare_the_six_tables_of_the_paper():
     assert [table.name for table in TABLES] == [f"table{number}" for number in range(1, 7)]
     for table in TABLES:
         labels = [line.label for line in table.lines]
@@ -75,9 +64,7 @@ def test_the_experiments_declare_the_six_tables_of_the_paper() -> None:
 @pytest.mark.parametrize(
     "table", [table for table in TABLES if table.beyond], ids=lambda table: table.name
 )
-def test_the_block_beyond_the_paper_has_its_lines_and_trends_but_no_published_figure(
-    table: PaperTable,
-) -> None:
+def test_the_block_beyond_the_paper_has_its_lines_and_trends_but_no_published_figure(table):
     first, second = table.blocks
     own = [line for line in first.lines if "method" not in line.job]
     assert [line.job for line in second.lines] == [
@@ -93,7 +80,7 @@ def test_the_block_beyond_the_paper_has_its_lines_and_trends_but_no_published_fi
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
-def test_the_lines_of_a_table_take_every_value_of_its_grid_and_no_other(table: PaperTable) -> None:
+def test_the_lines_of_a_table_take_every_value_of_its_grid_and_no_other(table):
     experiment = OmegaConf.load(CONFIGS / "experiment" / f"{table.name}.yaml")
     jobs = [line.job for block in table.blocks for line in block.lines]
     for name, values in experiment.hydra.sweeper.params.items():
@@ -101,12 +88,7 @@ def test_the_lines_of_a_table_take_every_value_of_its_grid_and_no_other(table: P
         assert {usual, *(job[name] for job in jobs if name in job)} == {usual, *others}
 
 
-def test_weights_from_other_scenes_are_a_matter_of_the_block_beyond_the_paper() -> None:
-    for table in TABLES[1:]:
-        assert "other scenes" not in " ".join(table.notes)
-
-
-def test_a_section_shows_both_blocks_each_with_its_trends(run: Run, tmp_path: Path) -> None:
+def test_a_section_shows_both_blocks_each_with_its_trends(run, tmp_path):
     (table,) = (table for table in TABLES if table.name == "table5")
     labels = [line.label for block in table.blocks for line in block.lines]
     lines = [Repeated(label, [run]) for label in labels]
@@ -120,7 +102,7 @@ def test_a_section_shows_both_blocks_each_with_its_trends(run: Run, tmp_path: Pa
     assert "33.05" not in beyond.partition("- ")[0]
 
 
-def test_a_cell_is_measured_published_and_their_difference(run: Run) -> None:
+def test_a_cell_is_measured_published_and_their_difference(run):
     shown = with_published(TABLE, {"here": Repeated("here", [run])})
     assert shown.columns[1:] == ("PSNR, dB ↑", "ms / frame ↓", "model, MB ↓", "other, ms ↓")
     assert shown.lines[0] == (
@@ -133,7 +115,7 @@ def test_a_cell_is_measured_published_and_their_difference(run: Run) -> None:
     assert shown.lines[1] == ("elsewhere", ABSENT, ABSENT, f"{ABSENT} / 5.00", ABSENT)
 
 
-def test_a_stage_holds_the_stages_inside_it(run: Run) -> None:
+def test_a_stage_holds_the_stages_inside_it(run):
     rows = run.rows.copy()
     inside = rows[rows["metric"] == "stage_ms.other"].assign(
         metric="stage_ms.other/march", value=3.0
@@ -143,7 +125,7 @@ def test_a_stage_holds_the_stages_inside_it(run: Run) -> None:
     assert shown.lines[0][4] == f"11.00 / {ABSENT}"
 
 
-def test_several_seeds_give_their_mean_and_its_interval(run: Run) -> None:
+def test_several_seeds_give_their_mean_and_its_interval(run):
     shown = with_published(
         TABLE, {"here": Repeated("here", [with_psnr(run, x) for x in (29.0, 31.0)])}
     )
@@ -152,12 +134,12 @@ def test_several_seeds_give_their_mean_and_its_interval(run: Run) -> None:
     assert shown.lines[0][2] == "12.0 / 10.0 / +2.0"
 
 
-def test_a_gap_says_why_in_its_line() -> None:
+def test_a_gap_says_why_in_its_line():
     shown = with_published(TABLE, {"here": Repeated("here", [], ["failed: no room"])})
     assert shown.lines[0][:2] == ("here: failed: no room", f"{ABSENT} / 31.00")
 
 
-def test_the_best_is_bold_and_the_second_of_three_italic(run: Run) -> None:
+def test_the_best_is_bold_and_the_second_of_three_italic(run):
     table = replace(TABLE, lines=[Line(name, {"method": name}) for name in "abc"])
     psnr = {"a": 1.0, "b": 3.0, "c": 2.0}
     of = {name: Repeated(name, [with_psnr(run, value)]) for name, value in psnr.items()}
@@ -168,18 +150,14 @@ def test_the_best_is_bold_and_the_second_of_three_italic(run: Run) -> None:
 
 
 @pytest.mark.parametrize("published", [{}, {"psnr": 31.0}])
-def test_lines_of_which_nothing_is_published_show_what_was_measured_alone(
-    run: Run, published: dict[str, float]
-) -> None:
+def test_lines_of_which_nothing_is_published_show_what_was_measured_alone(run, published):
     table = replace(TABLE, lines=[Line("a", {"method": "a"}, published)])
     shown = with_published(table, {"a": Repeated("a", [with_psnr(run, 30.0)])})
     assert shown.columns[0] == ("measured / paper / difference" if published else "measured")
     assert shown.lines[0][1] == ("30.00 / 31.00 / -1.00" if published else "30.00")
 
 
-def test_a_section_says_on_what_and_what_to_mind_and_whether_trends_hold(
-    run: Run, tmp_path: Path
-) -> None:
+def test_a_section_says_on_what_and_what_to_mind_and_whether_trends_hold(run, tmp_path):
     trend = Trend("psnr", ["elsewhere", "here"])
     lines = [Repeated("here", [with_psnr(run, 31.0)]), Repeated("elsewhere", [run])]
     published = [TABLE.lines[0], replace(TABLE.lines[1], published={"psnr": 30.4})]

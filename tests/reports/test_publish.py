@@ -15,7 +15,7 @@ TABLE = Table("t", ("a", "b"), (("x", "1 < 2"),))
 PARTS: list[Part] = ["# Title & more", TABLE]
 
 
-def test_a_page_is_written_in_both_forms(tmp_path: Path) -> None:
+def test_a_page_is_written_in_both_forms(tmp_path):
     assert publish(PARTS, tmp_path) == tmp_path / "report.md"
     assert (tmp_path / "report.md").read_text() == f"# Title & more\n\n{TABLE.markdown()}\n"
     page = (tmp_path / "report.html").read_text()
@@ -23,7 +23,7 @@ def test_a_page_is_written_in_both_forms(tmp_path: Path) -> None:
     assert "1 &lt; 2</td>" in page
 
 
-def test_a_page_that_cannot_be_made_leaves_the_earlier_one(tmp_path: Path) -> None:
+def test_a_page_that_cannot_be_made_leaves_the_earlier_one(tmp_path):
     publish(["# First"], tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
 
@@ -36,7 +36,7 @@ def test_a_page_that_cannot_be_made_leaves_the_earlier_one(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("form", ["report.md", "report.html"])
-def test_a_form_that_cannot_be_written_is_the_same_plain_error(tmp_path: Path, form: str) -> None:
+def test_a_form_that_cannot_be_written_is_the_same_plain_error(tmp_path, form):
     (tmp_path / form / "in the way").mkdir(parents=True)
     with pytest.raises(SteerbenchError, match=f"cannot write to {tmp_path}"):
         publish(PARTS, tmp_path)

@@ -10,9 +10,7 @@ import pytest
 
 from bench.errors import SteerbenchError
 from bench.intervals import half_interval, path_interval
-from bench.results import Store
 from reports.regression import LIMITS, Change, Figures, Limit, changes
-from reports.runs import load
 
 OLD = Figures(
     {"psnr": 30.0, "frame_ms": 100.0, "size_bytes.total": 1000.0}, {}, "one machine", "views"
@@ -36,53 +34,39 @@ def change(metric: str, value: float, old: Figures = OLD) -> Change | None:
         ("size_bytes.total", 1002.0, True),
     ],
 )
-def test_worse_is_what_passes_the_limit_in_the_wrong_direction(
-    metric: str, value: float, worse: bool
-) -> None:
+def test_worse_is_what_passes_the_limit_in_the_wrong_direction(metric, value, worse):
     found = change(metric, value)
     assert found is not None
     assert found.verdict == ("worse" if worse else "")
 
 
-def test_what_depends_on_the_machine_is_compared_on_the_same_one_only() -> None:
+def test_what_depends_on_the_machine_is_compared_on_the_same_one_only():
     other = replace(OLD, machine="another machine", values={**OLD.values, "frame_ms": 500.0})
     assert {found.metric for found in changes([OLD], [other])} == {"psnr", "size_bytes.total"}
 
 
-def paired(*by: float) -> Change:
-    """PSNR of frames that changed by so much, on top of very different values."""
+@pytest.mark.parametrize(
+    ("by", "verdict"),
+    [
+        ([-0.3, -0.2, -0.4, -0.3], "worse"),
+        ([-1.0] * 13 + [0.8] * 11, ""),  # -0.175 dB in the mean, but the interval contains 0
+        ([-0.05] * 24, ""),  # certain, but within the limit
+        ([0.0] * 23 + [-20.0], "worse"),  # one frame is broken
+    ],
+)
+def test_frames_that_both_have_are_compared_in_pairs(by, verdict):
     before = {str(i): 20.0 + 5 * i for i in range(len(by))}
-    after = {name: value + by[int(name)] for name, value in before.items()}
-    old = replace(OLD, frames={"psnr": before})
-    new = replace(OLD, frames={"psnr": after | {"more": 99.0}})
-    return next(found for found in changes([old], [new]) if found.metric == "psnr")
-
-
-def test_frames_that_both_have_are_compared_in_pairs() -> None:
-    apart = [-0.3, -0.2, -0.4, -0.3]
-    found = paired(*apart)
-    assert found.by == pytest.approx(-0.3)
-    half = path_interval(np.array(apart))
-    assert found.interval == pytest.approx((-0.3 - half, -0.3 + half))
-    assert found.verdict == "worse"
-
-
-def test_a_change_whose_interval_contains_no_change_is_chance() -> None:
-    found = paired(*[-1.0] * 13, *[0.8] * 11)  # -0.175 dB in the mean
-    assert found.by < -LIMITS["psnr"].absolute
-    assert found.interval is not None
-    assert found.interval[0] < 0 < found.interval[1]
-    assert found.verdict == ""
-
-
-def test_a_sure_change_within_the_limit_is_as_good() -> None:
-    found = paired(*[-0.05] * 24)
-    assert found.interval == pytest.approx((-0.05, -0.05))
-    assert found.verdict == ""
+    after = {name: value + by[int(name)] for name, value in before.items()} | {"more": 99.0}
+    old, new = (replace(OLD, frames={"psnr": frames}) for frames in (before, after))
+    found = next(found for found in changes([old], [new]) if found.metric == "psnr")
+    half = path_interval(np.array(by))
+    assert found.by == pytest.approx(np.mean(by))
+    assert found.interval == pytest.approx((found.by - half, found.by + half))
+    assert found.verdict == verdict
 
 
 @pytest.mark.parametrize("metric", ["work.samples", "work.products"])
-def test_more_work_is_worse_on_any_machine(metric: str) -> None:
+def test_more_work_is_worse_on_any_machine(metric):
     old = replace(OLD, values={metric: 1e6})
     found = [
         next(changes([old], [replace(old, values={metric: work}, machine="another")])).verdict
@@ -91,13 +75,7 @@ def test_more_work_is_worse_on_any_machine(metric: str) -> None:
     assert found == ["", "worse"]
 
 
-def test_one_broken_frame_among_many_is_worse() -> None:
-    found = paired(*[0.0] * 23, -20.0)
-    assert found.by == pytest.approx(-20 / 24)
-    assert found.verdict == "worse"
-
-
-def test_frames_without_an_error_hide_no_others() -> None:
+def test_frames_without_an_error_hide_no_others():
     """Equal pictures have an infinite PSNR, before and after."""
     before = {str(i): 30.0 for i in range(9)} | {"9": math.inf}
     after = {str(i): 20.0 for i in range(9)} | {"9": math.inf}
@@ -109,7 +87,7 @@ def test_frames_without_an_error_hide_no_others() -> None:
     assert next(changes([old], [old])).verdict == ""
 
 
-def test_one_slow_frame_among_many_is_chance() -> None:
+def test_one_slow_frame_among_many_is_chance():
     times = {str(i): 100.0 for i in range(24)}
     old = replace(OLD, frames={"frame_ms": times})
     new = replace(OLD, frames={"frame_ms": {**times, "11": 2000.0}})
@@ -129,33 +107,29 @@ def seeds(*by: float, metric: str = "psnr") -> Change:
     return next(found for found in changes(old, new) if found.metric == metric)
 
 
-def test_seeds_of_which_some_became_better_have_changed_by_chance() -> None:
+def test_seeds_of_which_some_became_better_have_changed_by_chance():
     """All frames of a training change alike, so that those of one seed would call it worse."""
     found = seeds(-0.6, 0.2, -0.4)
     assert found.by == pytest.approx(-0.8 / 3)
     half = half_interval(np.array([-0.6, 0.2, -0.4]))
     assert found.interval == pytest.approx((found.by - half, found.by + half))
     assert found.verdict == ""
-    assert seeds(-0.6).verdict == "worse"
+    assert seeds(-0.6).verdict == seeds(-0.6, -0.5, -0.7).verdict == "worse"
 
 
-def test_a_change_that_all_seeds_have_is_worse() -> None:
-    assert seeds(-0.6, -0.5, -0.7).verdict == "worse"
-
-
-def test_one_broken_frame_of_one_seed_is_worse() -> None:
+def test_one_broken_frame_of_one_seed_is_worse():
     whole = replace(OLD, frames={"psnr": {str(i): 30.0 for i in range(6)}})
     broken = replace(OLD, frames={"psnr": {**whole.frames["psnr"], "3": 10.0}})
     found = next(changes([whole] * 3, [whole, broken, whole]))
     assert found.verdict == "worse"
 
 
-def test_a_metric_that_one_seed_lacks_is_missing() -> None:
+def test_a_metric_that_one_seed_lacks_is_missing():
     lacking = replace(OLD, values={"frame_ms": 100.0})
     assert next(changes([OLD, OLD], [OLD, lacking])).verdict == "missing"
 
 
-def test_a_metric_or_a_frame_that_is_gone_is_missing() -> None:
+def test_a_metric_or_a_frame_that_is_gone_is_missing():
     gone = replace(OLD, values={"frame_ms": 100.0, "size_bytes.total": 1000.0})
     assert {found.metric: found.verdict for found in changes([OLD], [gone])}["psnr"] == "missing"
     old = replace(OLD, frames={"psnr": {"0": 30.0, "1": 30.0, "2": 30.0}})
@@ -163,20 +137,19 @@ def test_a_metric_or_a_frame_that_is_gone_is_missing() -> None:
     assert next(changes([old], [new])).verdict == "missing"
 
 
-def test_figures_of_other_frames_are_not_compared() -> None:
+def test_figures_of_other_frames_are_not_compared():
     with pytest.raises(SteerbenchError, match=r"of other frames, .*: views; another scene"):
         list(changes([OLD], [replace(OLD, views="another scene")]))
 
 
-def test_a_baseline_can_have_limits_of_its_own() -> None:
+def test_a_baseline_can_have_limits_of_its_own():
     new = replace(OLD, values={**OLD.values, "psnr": 29.0})
     (wide,) = changes([OLD], [new], {"psnr": Limit(1, absolute=2.0)})
     assert wide.verdict == ""
     assert LIMITS["psnr"].absolute < 1
 
 
-def test_frames_are_those_that_the_headline_is_the_mean_of(store: Store, stored_run: str) -> None:
-    (run,) = load(store, {stored_run: "run"})
+def test_frames_are_those_that_the_headline_is_the_mean_of(run):
     table = run.frames.assign(psnr=[30.0, *[math.nan] * (len(run.frames) - 1)], peak_bytes=1.0)
     figures = Figures.of(replace(run, read_frames=lambda: table))
     assert len(figures.frames["psnr"]) == 1  # the others have no truth
@@ -185,8 +158,5 @@ def test_frames_are_those_that_the_headline_is_the_mean_of(store: Store, stored_
     assert "peak_bytes" not in figures.frames  # its headline was the largest of older runs
 
 
-def test_a_metric_that_only_the_baseline_has_a_limit_for_is_kept(
-    store: Store, stored_run: str
-) -> None:
-    (run,) = load(store, {stored_run: "run"})
+def test_a_metric_that_only_the_baseline_has_a_limit_for_is_kept(run):
     assert set(Figures.of(run, {"train_s": Limit(-1)}).values) == {"train_s"}

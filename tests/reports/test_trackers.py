@@ -7,14 +7,7 @@ import pytest
 
 from bench.errors import SteerbenchError, Unavailable
 from reports import trackers
-from reports.runs import load
 from reports.trackers import headline, pictures, series, tracker
-
-
-@pytest.fixture
-def run(store, stored_run):
-    (run,) = load(store, {stored_run: "grey"})
-    return run
 
 
 def test_tensorboard_has_the_figures_of_every_frame_and_of_the_run(run, tmp_path):
@@ -22,7 +15,7 @@ def test_tensorboard_has_the_figures_of_every_frame_and_of_the_run(run, tmp_path
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     for _ in range(2):  # what was written once is kept
-        tracker("tensorboard").send(run, tmp_path)
+        tracker("tensorboard")(run, tmp_path)
     events = EventAccumulator(str(tmp_path / "tensorboard" / run.key))
     events.Reload()
     for name, value in headline(run).items():
@@ -37,7 +30,7 @@ def test_wandb_has_a_run_whose_id_is_the_key(run, tmp_path, monkeypatch):
     pytest.importorskip("wandb")
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
-    tracker("wandb").send(run, tmp_path)
+    tracker("wandb")(run, tmp_path)
     (path,) = tmp_path.glob(f"wandb/offline-run-*/run-{run.key}.wandb")
     content = path.read_bytes()
     for name in ("psnr", "frame_ms", run.record["commit"], *(name for name, _ in pictures(run))):

@@ -36,16 +36,13 @@ def baseline(outputs: Path, tmp_path: Path) -> Path:
     return path
 
 
-def test_a_store_is_as_good_as_itself(
-    baseline: Path, outputs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_store_is_as_good_as_itself(baseline, outputs, capsys):
+    assert list(json.loads(baseline.read_text())["runs"]) == ["method=offset scene=tiny"]
     assert check(baseline, outputs) == 0
     assert "as good as the baseline" in capsys.readouterr().out
 
 
-def test_a_figure_that_became_worse_is_shown_and_fails(
-    baseline: Path, outputs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_figure_that_became_worse_is_shown_and_fails(baseline, outputs, capsys):
     held = json.loads(baseline.read_text())
     ((figures,),) = (seeds.values() for seeds in held["runs"].values())
     figures["values"]["psnr"] += 1
@@ -57,16 +54,7 @@ def test_a_figure_that_became_worse_is_shown_and_fails(
     assert "worse" in line
 
 
-def test_a_run_is_known_by_what_was_typed_in_any_order_but_for_places(
-    baseline: Path, outputs: Path
-) -> None:
-    held = json.loads(baseline.read_text())
-    assert list(held["runs"]) == ["method=offset scene=tiny"]
-
-
-def test_a_baseline_that_is_recorded_anew_keeps_its_limits_and_its_runs(
-    baseline: Path, outputs: Path
-) -> None:
+def test_a_baseline_that_is_recorded_anew_keeps_its_limits_and_its_runs(baseline, outputs):
     held = json.loads(baseline.read_text())
     held["limits"] = {"psnr": {"better": 1, "absolute": 0.5}}
     baseline.write_text(json.dumps(held))
@@ -77,9 +65,7 @@ def test_a_baseline_that_is_recorded_anew_keeps_its_limits_and_its_runs(
     assert list(again["runs"]["method=offset scene=tiny"]["5"]["values"]) == ["psnr"]
 
 
-def test_a_run_that_is_missing_fails(
-    baseline: Path, outputs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_is_missing_fails(baseline, outputs, capsys):
     held = json.loads(baseline.read_text())
     (seeds,) = held["runs"].values()
     held["runs"] = {"method=other": seeds}
@@ -88,9 +74,7 @@ def test_a_run_that_is_missing_fails(
     assert "method=other: no such run" in capsys.readouterr().out
 
 
-def test_a_run_of_other_frames_fails_and_the_others_are_still_compared(
-    baseline: Path, outputs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_of_other_frames_fails_and_the_others_are_still_compared(baseline, outputs, capsys):
     held = json.loads(baseline.read_text())
     ((command, seeds),) = held["runs"].items()
     others = {"5": {**seeds["5"], "views": "others"}}
@@ -103,9 +87,7 @@ def test_a_run_of_other_frames_fails_and_the_others_are_still_compared(
 
 
 @pytest.mark.parametrize("text", [None, "", "{}", '{"schema": 99}'])
-def test_what_is_no_baseline_is_refused_with_the_way_to_make_one(
-    text: str | None, outputs: Path, tmp_path: Path
-) -> None:
+def test_what_is_no_baseline_is_refused_with_the_way_to_make_one(text, outputs, tmp_path):
     path = tmp_path / "none.json"
     if text is not None:
         path.write_text(text)
@@ -113,9 +95,7 @@ def test_what_is_no_baseline_is_refused_with_the_way_to_make_one(
         check(path, outputs)
 
 
-def test_two_runs_are_compared_by_the_beginning_of_their_keys(
-    outputs: Path, stored_run: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_runs_are_compared_by_the_beginning_of_their_keys(outputs, stored_run, capsys):
     assert dispatch(["compare", stored_run[:6], stored_run, "--outputs", str(outputs)]) == 0
     assert "psnr" in capsys.readouterr().out
     with pytest.raises(SteerbenchError, match="expected the beginning of one key, 0 runs"):
@@ -123,54 +103,31 @@ def test_two_runs_are_compared_by_the_beginning_of_their_keys(
 
 
 @pytest.fixture
-def unread(outputs: Path, stored_run: str) -> str:
-    """The key of a second run beside the first, which an older version stored."""
-    key = f"0{stored_run[1:]}"
-    record = shutil.copytree(outputs / "runs" / stored_run, outputs / "runs" / key) / "record.json"
-    held = json.loads(record.read_text())
-    record.write_text(json.dumps(held | {"schema_version": 1}))
-    return key
+def copy(outputs: Path, stored_run: str) -> Path:
+    """The folder of a second run beside the first, as yet the same."""
+    folder = outputs / "runs" / f"0{stored_run[1:]}"
+    return shutil.copytree(outputs / "runs" / stored_run, folder)
 
 
-@pytest.fixture
-def second_seed(outputs: Path, stored_run: str) -> str:
-    """The key of the same run with seed 6, whose PSNR is 1 dB higher."""
-    key = f"0{stored_run[1:]}"
-    folder = shutil.copytree(outputs / "runs" / stored_run, outputs / "runs" / key)
-    rows = pd.read_csv(folder / "rows.csv").assign(seed=6, run=key)
+def test_all_seeds_of_a_run_are_one_entry_and_none_may_be_missing(outputs, copy, tmp_path, capsys):
+    rows = pd.read_csv(copy / "rows.csv").assign(seed=6, run=copy.name)
     rows.loc[rows["metric"] == "psnr", "value"] += 1
-    rows.to_csv(folder / "rows.csv", index=False)
-    return key
-
-
-def test_all_seeds_of_a_run_are_one_entry(outputs: Path, second_seed: str, tmp_path: Path) -> None:
+    rows.to_csv(copy / "rows.csv", index=False)
     path = tmp_path / "baseline.json"
     assert check(path, outputs, "--record") == 0
     (seeds,) = json.loads(path.read_text())["runs"].values()
     assert seeds.keys() == {"5", "6"}
     assert seeds["6"]["values"]["psnr"] == pytest.approx(seeds["5"]["values"]["psnr"] + 1)
     assert check(path, outputs) == 0
-
-
-def test_a_seed_that_is_missing_fails(
-    outputs: Path, second_seed: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "baseline.json"
-    check(path, outputs, "--record")
-    shutil.rmtree(outputs / "runs" / second_seed)
+    shutil.rmtree(copy)
     assert check(path, outputs) == 1
     assert "scene=tiny: no such run with seed=6 below" in capsys.readouterr().out
 
 
-def test_a_run_of_another_schema_is_left_out(
-    baseline: Path, outputs: Path, stored_run: str, unread: str
-) -> None:
+def test_a_run_of_another_schema_is_left_out_and_not_compared(baseline, outputs, stored_run, copy):
+    record = json.loads((copy / "record.json").read_text())
+    (copy / "record.json").write_text(json.dumps(record | {"schema_version": 1}))
     assert check(baseline, outputs) == 0
     assert [run.key for run in readable(Store(outputs))] == [stored_run]
-
-
-def test_a_run_of_another_schema_cannot_be_compared(
-    outputs: Path, stored_run: str, unread: str
-) -> None:
-    with pytest.raises(SteerbenchError, match=f"{unread}: its rows have schema 1; this version"):
-        dispatch(["compare", unread, stored_run, "--outputs", str(outputs)])
+    with pytest.raises(SteerbenchError, match=f"{copy.name}: its rows have schema 1; this version"):
+        dispatch(["compare", copy.name, stored_run, "--outputs", str(outputs)])

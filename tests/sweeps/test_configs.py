@@ -53,7 +53,7 @@ def default(field: Field) -> Any:
 
 
 @pytest.mark.parametrize("choice", CHOICES)
-def test_a_choice_says_what_it_is_and_composes_to_something_that_exists(choice: str) -> None:
+def test_a_choice_says_what_it_is_and_composes_to_something_that_exists(choice):
     assert (CONFIGS / f"{choice.replace('=', '/')}.yaml").read_text().startswith("# ")
     assert callable(get_object(node(choice)["_target_"]))
 
@@ -61,7 +61,7 @@ def test_a_choice_says_what_it_is_and_composes_to_something_that_exists(choice: 
 @pytest.mark.parametrize(
     "choice", [x for x in CHOICES if x[0] in "mbp"]
 )  # method, budget, protocol
-def test_options_stand_there_with_all_their_fields_and_no_other_default(choice: str) -> None:
+def test_options_stand_there_with_all_their_fields_and_no_other_default(choice):
     there = list(options(choice, node(choice)))
     assert [name for name, _, value in there if value is MISSING] == []
     method = choice.startswith("method")
@@ -74,7 +74,7 @@ def test_options_stand_there_with_all_their_fields_and_no_other_default(choice: 
 
 
 @pytest.mark.parametrize("path", SIZES, ids=lambda path: f"{path.parent.name}/{path.stem}")
-def test_a_size_changes_settings_that_are_there(path) -> None:
+def test_a_size_changes_settings_that_are_there(path):
     owner, budget = path.parent.name, f"budget={path.stem}"
     assert path.stem in choices("budget")
     word = USERS.get(owner, f"method={owner}")
@@ -88,5 +88,5 @@ def test_a_size_changes_settings_that_are_there(path) -> None:
     ("words", "steps"),
     [([], None), (["budget=paper"], 300), (["budget=paper", "method.steps=7"], 7)],
 )
-def test_a_budget_changes_a_setting_of_a_method_and_a_word_wins(words, steps) -> None:
+def test_a_budget_changes_a_setting_of_a_method_and_a_word_wins(words, steps):
     assert composed(["method=nerf", *words]).method.steps == steps

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,7 +55,7 @@ def nsvf(folder: Path, pictures: bool = True) -> Path:
 # Which scenes there are
 
 
-def test_of_nerf_synthetic_what_is_there_is_found_and_the_rest_is_named(tmp_path: Path) -> None:
+def test_of_nerf_synthetic_what_is_there_is_found_and_the_rest_is_named(tmp_path):
     for name in ("mic", "lego"):
         blender(tmp_path / name)
     blender(tmp_path / "chair", pictures=False)
@@ -74,7 +74,7 @@ def test_of_nerf_synthetic_what_is_there_is_found_and_the_rest_is_named(tmp_path
     }
 
 
-def test_of_tanks_and_temples_too(tmp_path: Path) -> None:
+def test_of_tanks_and_temples_too(tmp_path):
     for name in ("Barn", "Truck"):
         nsvf(tmp_path / name)
     nsvf(tmp_path / "Family", pictures=False)
@@ -83,12 +83,12 @@ def test_of_tanks_and_temples_too(tmp_path: Path) -> None:
     assert set(found.missing) == {"Caterpillar", "Family", "Ignatius"}
 
 
-def test_scenes_of_ones_own_miss_nothing(tmp_path: Path) -> None:
+def test_scenes_of_ones_own_miss_nothing(tmp_path):
     blender(tmp_path / "teapot")
     assert find(str(tmp_path)).missing == {}
 
 
-def test_scenes_of_two_layouts_have_no_mean(tmp_path: Path) -> None:
+def test_scenes_of_two_layouts_have_no_mean(tmp_path):
     blender(tmp_path / "mic")
     nsvf(tmp_path / "Barn")
     with pytest.raises(SteerbenchError, match="scenes of both: Barn, mic"):
@@ -96,7 +96,7 @@ def test_scenes_of_two_layouts_have_no_mean(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("make", [lambda path: None, blender])
-def test_a_folder_without_scenes_is_refused(tmp_path: Path, make: Callable[[Path], object]) -> None:
+def test_a_folder_without_scenes_is_refused(tmp_path, make):
     make(tmp_path)
     with pytest.raises(SteerbenchError, match=r"got none.*scene\.path"):
         find(str(tmp_path))
@@ -106,14 +106,14 @@ def test_a_folder_without_scenes_is_refused(tmp_path: Path, make: Callable[[Path
 
 
 @pytest.mark.parametrize("word", ["scene=totem", "scene.path=elsewhere", "++scene.path=elsewhere"])
-def test_a_scene_beside_a_data_set_is_refused(tmp_path: Path, word: str) -> None:
+def test_a_scene_beside_a_data_set_is_refused(tmp_path, word):
     blender(tmp_path / "mic")
     with pytest.raises(SteerbenchError, match="expected one of them"):
         data_set([word, f"data={tmp_path}"])
     assert data_set([word]) == ([word], None)
 
 
-def test_other_settings_of_the_scenes_go_through(tmp_path: Path) -> None:
+def test_other_settings_of_the_scenes_go_through(tmp_path):
     blender(tmp_path / "mic")
     words, data = data_set(["scene.downscale=4", f"data={tmp_path}", "budget=tiny"])
     assert words == ["scene.downscale=4", "budget=tiny"]
@@ -122,7 +122,7 @@ def test_other_settings_of_the_scenes_go_through(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["/data/chair", "/a b,c (d)/it's", "/x=1/${y}#2", "~/Jürgen"])
-def test_any_folder_can_be_named_in_a_command(text: str) -> None:
+def test_any_folder_can_be_named_in_a_command(text):
     config = composed(["scene=blender", setting("scene.path", text)])
     assert config.scene._get_node("path")._value() == text
 
@@ -130,7 +130,7 @@ def test_any_folder_can_be_named_in_a_command(text: str) -> None:
 # Their jobs
 
 
-def test_every_scene_is_a_job_of_its_own_and_a_command_that_makes_it(tmp_path: Path) -> None:
+def test_every_scene_is_a_job_of_its_own_and_a_command_that_makes_it(tmp_path):
     for name in ("mic", "chair"):
         blender(tmp_path / "my data" / name)
     data = find(str(tmp_path / "my data"))
@@ -176,7 +176,7 @@ def run_of(source: Run, job: Planned, psnr: float) -> Run:
     return replace(source, key=job.key[:16], rows=rows)
 
 
-def test_a_figure_is_the_mean_over_seeds_of_means_over_scenes(psnr) -> None:
+def test_a_figure_is_the_mean_over_seeds_of_means_over_scenes(psnr):
     found = {(0, "a", 0): 30.0, (0, "b", 0): 20.0, (0, "a", 1): 32.0, (0, "b", 1): 22.0}
     line, _ = psnr(found, "ab", "0,1")
     assert [run.values["psnr"] for run in line.runs] == [25.0, 27.0]
@@ -188,7 +188,7 @@ def test_a_figure_is_the_mean_over_seeds_of_means_over_scenes(psnr) -> None:
     assert len(line.measured) == 4
 
 
-def test_means_are_over_the_scenes_that_all_lines_have(psnr) -> None:
+def test_means_are_over_the_scenes_that_all_lines_have(psnr):
     found = {(0, "a", 0): 30.0, (0, "b", 0): 20.0, (0, "c", 0): 10.0, (1, "a", 0): 31.0}
     found[1, "c", 0] = 11.0
     one, other = psnr(found, "abc", "0")
@@ -198,20 +198,20 @@ def test_means_are_over_the_scenes_that_all_lines_have(psnr) -> None:
     assert one.runs[0].conditions == other.runs[0].conditions
 
 
-def test_a_line_of_which_nothing_was_measured_takes_no_scene_away(psnr) -> None:
+def test_a_line_of_which_nothing_was_measured_takes_no_scene_away(psnr):
     one, other = psnr({(0, "a", 0): 30.0, (0, "b", 0): 20.0}, "ab", "0")
     assert one.mean("psnr") == 25.0
     assert (list(other.runs), other.gaps) == ([], ["not measured yet"])
 
 
-def test_lines_without_a_common_scene_have_no_mean(psnr) -> None:
+def test_lines_without_a_common_scene_have_no_mean(psnr):
     one, other = psnr({(0, "a", 0): 30.0, (1, "b", 0): 20.0}, "ab", "0")
     assert one.mean("psnr") is None
     assert one.gaps == ["b not measured yet", "no scene that all lines have"]
     assert other.mean("psnr") is None
 
 
-def test_a_seed_without_all_scenes_is_left_out_and_named(psnr) -> None:
+def test_a_seed_without_all_scenes_is_left_out_and_named(psnr):
     found = {(0, "a", 0): 30.0, (0, "b", 0): 20.0, (0, "a", 1): 99.0}
     line, _ = psnr(found, "ab", "0,1")
     assert line.mean("psnr") == 25.0
@@ -242,13 +242,7 @@ table:
 """
 
 
-def decibels(difference: float) -> float:
-    return -20 * math.log10(difference)
-
-
-def test_the_page_of_a_data_set_has_its_means_its_scenes_and_what_is_missing(
-    steerbench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_page_of_a_data_set_has_means_scenes_and_gaps(steerbench, tmp_path, monkeypatch):
     data = tmp_path / "data"
     values = {"chair": 255, "mic": 204}
     for name, value in values.items():
@@ -269,7 +263,8 @@ def test_the_page_of_a_data_set_has_its_means_its_scenes_and_what_is_missing(
     assert "scene mean of chair, mic" in page
     # Pictures are rounded to 8 bit: 0.5 is 128 of 255, 0.25 is 64.
     grey, dark = (
-        [decibels((value - level) / 255) for value in values.values()] for level in (128, 64)
+        [-20 * math.log10((value - level) / 255) for value in values.values()]
+        for level in (128, 64)
     )
     mean = f"{sum(grey) / 2:.2f}"
     assert f"| a grey | **{mean}** / 1.00 / " in page

@@ -48,7 +48,7 @@ def waiting(outputs: Path, device: str) -> tuple[threading.Thread, Heard, thread
     return thread, log, had
 
 
-def test_a_device_that_is_locked_is_waited_for(tmp_path: Path) -> None:
+def test_a_device_that_is_locked_is_waited_for(tmp_path):
     with device_lock.device_lock("cpu", Heard(tmp_path)):
         thread, log, had = waiting(tmp_path / "elsewhere", "cpu")
         assert "waiting: another process measures on cpu" in log.messages.get(timeout=PATIENCE_S)
@@ -57,7 +57,7 @@ def test_a_device_that_is_locked_is_waited_for(tmp_path: Path) -> None:
     assert had.is_set()
 
 
-def test_a_failure_releases_the_lock(tmp_path: Path) -> None:
+def test_a_failure_releases_the_lock(tmp_path):
     with pytest.raises(KeyError), device_lock.device_lock("cpu", Heard(tmp_path)):
         raise KeyError
     thread, _, had = waiting(tmp_path, "cpu")
@@ -65,7 +65,7 @@ def test_a_failure_releases_the_lock(tmp_path: Path) -> None:
     assert had.is_set()
 
 
-def test_gpus_are_told_apart_by_their_uuid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gpus_are_told_apart_by_their_uuid(tmp_path, monkeypatch):
     names = {"cuda:0": "GPU-a", "cuda:1": "GPU-b"}
     monkeypatch.setattr(
         torch.cuda, "get_device_properties", lambda device: SimpleNamespace(uuid=names[device])
@@ -76,16 +76,14 @@ def test_gpus_are_told_apart_by_their_uuid(tmp_path: Path, monkeypatch: pytest.M
     assert lock_file("cuda:0") == second
 
 
-def test_locks_lie_where_every_job_and_user_of_the_machine_sees_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_locks_lie_where_every_job_and_user_of_the_machine_sees_them(tmp_path, monkeypatch):
     monkeypatch.delenv(device_lock.FOLDER)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "of this job"))
     assert lock_file("cpu").parent == Path("/var/tmp")
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local", "ray"])
-def test_a_launcher_runs_every_job_and_names_those_that_fail(spawn, launcher: str) -> None:
+def test_a_launcher_runs_every_job_and_names_those_that_fail(spawn, launcher):
     plugin = f"hydra_{launcher.partition('_')[0]}_launcher"
     pytest.importorskip(f"hydra_plugins.{plugin}", reason=f"{plugin} is an extra")
     process = spawn("-m", "method.level=0.3,0.6,7", f"hydra/launcher={launcher}")

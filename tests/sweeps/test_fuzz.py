@@ -35,7 +35,7 @@ OVERRIDES = st.one_of(
 
 @pytest.mark.slow
 @given(st.lists(OVERRIDES, max_size=3))
-def test_any_overrides_compose_and_build_or_are_refused(overrides: list[str]) -> None:
+def test_any_overrides_compose_and_build_or_are_refused(overrides):
     with contextlib.suppress(SteerbenchError):
         config = composed(["method=steernerf_lean", *overrides])
         for group in ("method", "protocol", "budget"):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -33,16 +32,12 @@ def test_jobs_are_read_as_they_were_written_in_the_order_of_the_sweep(tmp_path):
         (["scene.seed", "elsewhere"], "ngp (seed=1)"),
     ],
 )
-def test_a_label_has_the_method_and_what_varies_with_the_whole_name_of_what_ends_alike(
-    names, expected
-):
+def test_a_label_has_method_and_what_varies_by_whole_names_where_ends_are_alike(names, expected):
     words = ("+experiment=demo", "scene.seed=1", "seed=2", "method=ngp")
     assert label("ngp", words, names) == expected
 
 
-def test_a_failure_that_cannot_be_kept_is_printed_all_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_failure_that_cannot_be_kept_is_printed_all_the_same(tmp_path, monkeypatch, capsys):
     def obtain(group: Group) -> None:
         raise SteerbenchError("the cause")
 

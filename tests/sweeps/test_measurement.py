@@ -25,7 +25,7 @@ def measured(runs: list[Obtained]) -> list[bool]:
     return [each.measured for each in runs]
 
 
-def test_lines_that_are_measured_in_turns_are_found_together_or_not_at_all() -> None:
+def test_lines_that_are_measured_in_turns_are_found_together_or_not_at_all():
     """A table of times must not have one line of today beside one of last week."""
     assert measured(obtain(group(0.5, 0.75))) == [True, True]
     assert measured(stored(group(0.5, 0.75))) == [False, False]
@@ -34,7 +34,7 @@ def test_lines_that_are_measured_in_turns_are_found_together_or_not_at_all() -> 
     assert measured(obtain(group(0.75, 0.5))) == [False, False]
 
 
-def test_what_an_interruption_left_of_a_group_is_measured_again_with_the_rest() -> None:
+def test_what_an_interruption_left_of_a_group_is_measured_again_with_the_rest():
     first, second = obtain(group(0.5, 0.75))
     mark = first.store.folder / first.run / "of yesterday"
     mark.touch()
@@ -45,7 +45,7 @@ def test_what_an_interruption_left_of_a_group_is_measured_again_with_the_rest() 
     assert measured(stored(group(0.5, 0.75))) == [False, False]
 
 
-def test_a_line_alone_is_another_run_than_the_same_in_turns() -> None:
+def test_a_line_alone_is_another_run_than_the_same_in_turns():
     (alone,) = obtain(group(0.5, turns=""))
     assert alone.run not in {run.run for run in obtain(group(0.5, 0.75))}
     assert measured(obtain(group(0.5, turns=""))) == [False]

@@ -34,7 +34,7 @@ FRAMES = ["--frames", "3", "--repeats", "1"]
     ],
     ids=" ".join,
 )
-def test_it_ends_well(command: list[str], steerbench, gpu) -> None:
+def test_it_ends_well(command, steerbench, gpu):
     name, *options = command
     settings = [word for word in SMALLEST if name != "paper" or not word.startswith("method=")]
     outcome = steerbench(name, *options, *settings)
@@ -42,14 +42,14 @@ def test_it_ends_well(command: list[str], steerbench, gpu) -> None:
     assert gpu.waited
 
 
-def test_pictures_are_scored_there(steerbench, gpu, lpips_weights) -> None:
+def test_pictures_are_scored_there(steerbench, gpu, lpips_weights):
     words = ("scene.width=32", "protocol.lpips=[alex]", f"weights_dir={lpips_weights}")
     outcome = steerbench("run", *SMALLEST, *words)
     assert outcome.status == 0, outcome.err
     assert "LPIPS alex" in outcome.out
 
 
-def test_kernels_are_compared_there(steerbench, gpu) -> None:
+def test_kernels_are_compared_there(steerbench, gpu):
     outcome = steerbench("kernels", "--filter", "adam")
     assert outcome.status == 0, outcome.err + outcome.out
     assert gpu.waited

@@ -50,18 +50,16 @@ def test_a_setting_without_default_is_asked_for(run):
     assert outcome.err == "steerbench: scene.path is not set: give scene.path=...\n"
 
 
-def test_deleting_what_is_not_there_is_an_error_without_traceback(run):
-    outcome = run("~nothing")
-    assert outcome.status == 2
-    assert "'nothing' does not exist" in outcome.err
-    assert "Traceback" not in outcome.err
-
-
 @pytest.mark.parametrize(
-    "argument", ["budget=0.0", "~budget=0.0", "scene=null", "~seed", "~method"]
+    ("argument", "said"),
+    [
+        ("~nothing", "'nothing' does not exist"),
+        *((word, "") for word in ("budget=0.0", "~budget=0.0", "scene=null", "~seed", "~method")),
+    ],
 )
-def test_a_choice_that_is_no_name_or_none_is_an_error_without_traceback(run, argument):
+def test_what_is_no_choice_or_not_there_is_an_error_without_traceback(run, argument, said):
     outcome = run(argument)
     assert outcome.status == 2
     assert outcome.err.startswith("steerbench: ")
+    assert said in outcome.err
     assert "Traceback" not in outcome.err

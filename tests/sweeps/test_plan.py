@@ -69,37 +69,29 @@ def content(monkeypatch: pytest.MonkeyPatch, tiny_scene: Scene) -> Callable[[str
     )
 
 
-def test_of_folders_with_one_name_each_shows_its_own(
-    measured: Store, tmp_path: Path, content: Callable[[str], None]
-) -> None:
+def test_of_folders_with_one_name_each_shows_its_own(measured, tmp_path, content):
     content("a")
     assert shown(measured, tmp_path / "a" / "mic") == ["a"]
     content("b")
     assert shown(measured, tmp_path / "b" / "mic") == ["b"]
 
 
-def test_a_scene_that_lies_where_it_was_measured_is_not_loaded(
-    measured: Store, tmp_path: Path, content: Callable[[str], None]
-) -> None:
+def test_a_scene_that_lies_where_it_was_measured_is_not_loaded(measured, tmp_path, content):
     assert shown(measured, tmp_path / "b" / "mic") == ["b"]
 
 
 @pytest.mark.parametrize(("digest", "found"), [("a", ["a"]), ("c", [])])
-def test_a_scene_that_lies_elsewhere_is_known_by_its_content(
-    measured: Store, tmp_path: Path, content: Callable[[str], None], digest: str, found: list[str]
-) -> None:
+def test_a_scene_elsewhere_is_known_by_its_content(measured, tmp_path, content, digest, found):
     (tmp_path / "c" / "mic").mkdir(parents=True)
     content(digest)
     assert shown(measured, tmp_path / "c" / "mic") == found
 
 
-def test_of_a_scene_that_is_not_here_the_last_run_is_shown(
-    measured: Store, tmp_path: Path, content: Callable[[str], None]
-) -> None:
+def test_of_a_scene_that_is_not_here_the_last_run_is_shown(measured, tmp_path, content):
     assert shown(measured, tmp_path / "gone" / "mic") == ["b"]
 
 
-def test_a_failure_stands_beside_what_was_measured_before(measured: Store, tmp_path: Path) -> None:
+def test_a_failure_stands_beside_what_was_measured_before(measured, tmp_path):
     asked = job(tmp_path / "b" / "mic")
     outputs = measured.folder.parent
     failures.keep(outputs, described(asked.config), "no such folder")
@@ -110,9 +102,7 @@ def test_a_failure_stands_beside_what_was_measured_before(measured: Store, tmp_p
 
 @pytest.mark.parametrize(("gpu", "engine"), [(False, "OpenVino"), (True, "TorchEngine")])
 @pytest.mark.parametrize("asked", [[], ["engine=torch"]])
-def test_the_engine_of_the_first_table_is_one_for_the_device(
-    gpu: bool, engine: str, asked: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_engine_of_the_first_table_is_one_for_the_device(gpu, engine, asked, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
     (table,) = (table for table in chosen(None, []) if table.name == "table1")
     targets = {job.config.engine._target_.split(".")[-1] for job in plan(table, asked)}

@@ -9,7 +9,6 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import pytest
 
@@ -65,7 +64,7 @@ def plugged(
     plug_ins.installed.cache_clear()
 
 
-def test_a_package_that_cannot_be_imported_is_a_line(plugged: Any, steerbench: Any) -> None:
+def test_a_package_that_cannot_be_imported_is_a_line(plugged, steerbench):
     plugged("broken.configs", {"broken/__init__.py": "import nothing_of_this_name\n"})
     listed = steerbench("list")
     assert listed.status == 0
@@ -73,13 +72,13 @@ def test_a_package_that_cannot_be_imported_is_a_line(plugged: Any, steerbench: A
     assert "No module named 'nothing_of_this_name'" in " ".join(listed.out.split())
 
 
-def test_an_entry_that_leads_nowhere_says_so(plugged: Any) -> None:
+def test_an_entry_that_leads_nowhere_says_so(plugged):
     found = plugged("nowhere_at_all")
     assert found.folder is None
     assert found.fault == "there is no package nowhere_at_all"
 
 
-def test_a_name_that_is_taken_stays_ours(plugged: Any, steerbench: Any) -> None:
+def test_a_name_that_is_taken_stays_ours(plugged, steerbench):
     plugged("taken", {"taken/method/ngp.yaml": "# Theirs.\n_target_: theirs.Ngp\n"})
     listed = steerbench("list").out
     assert "Theirs." not in listed

@@ -35,19 +35,6 @@ def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
     return recorder
 
 
-def test_help_says_what_it_does_and_what_can_be_set(steerbench):
-    outcome = steerbench("pretrain", "--help")
-    assert outcome.status == 0
-    words = " ".join(outcome.out.split())
-    for text in (
-        "train one 2D renderer on all",
-        "--scenes",
-        "--output FILE",
-        "settings as of `steerbench run`",
-    ):
-        assert text in words
-
-
 def test_one_renderer_is_trained_on_as_many_scenes_as_asked_for(steerbench, recorder):
     outcome = steerbench("pretrain", "--scenes", "3", "--output", "w.safetensors", "seed=5")
     assert outcome.status == 0
@@ -68,25 +55,13 @@ def test_as_many_threads_are_used_as_asked_for(steerbench, recorder, monkeypatch
     assert asked == [1]
 
 
-@pytest.mark.parametrize("scenes", ["0", "-2"])
-def test_no_scenes_at_all_are_refused(steerbench, recorder, scenes):
-    outcome = steerbench("pretrain", "--scenes", scenes, "--output", "w.safetensors")
-    assert outcome.status == 2
-    assert f"--scenes: expected 1 or more, got {scenes}" in outcome.err
-    assert recorder.config == {}
-
-
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["--scenes", "two", "--output", "w"], "--scenes: expected 1 or more, got two"),
+        (["--scenes", "0", "--output", "w"], "--scenes: expected 1 or more, got 0"),
         (["--scenes", "2"], "the following arguments are required: --output"),
         (["--output", "w", "method.joint.rat=1"], "Did you mean method.joint.rate?"),
-        (["--output", "w", "budget=pretran"], "Did you mean pretrain?"),
-        (["--output", "w", "seed"], "cannot read 'seed'"),
         (["--output", "w", "seed=-1"], "seed: expected 0 or more"),
-        (["--output", "w", "threads=0"], "threads: expected 1 or more"),
-        (["--output", "w", "device=gpu"], "device: expected auto, cpu, cuda or cuda:N, got gpu"),
     ],
 )
 def test_a_wrong_word_is_answered_with_what_is_expected(steerbench, recorder, argv, message):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 import pytest
 
@@ -13,9 +12,7 @@ pytest.importorskip("hydra_plugins.hydra_ray_launcher", reason="hydra-ray-launch
 
 
 @pytest.mark.slow
-def test_a_sweep_outlives_a_node_of_its_cluster(
-    spawn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sweep_outlives_a_node_of_its_cluster(spawn, tmp_path, monkeypatch):
     """Two nodes on the loopback; the one whose job is in the middle of its training is killed."""
     from ray.cluster_utils import Cluster
 

@@ -21,7 +21,7 @@ def pictures(folder: str) -> list[np.ndarray]:
 
 
 @pytest.mark.slow
-def test_every_frame_of_a_run_is_written_and_its_path_can_be_followed(steerbench) -> None:
+def test_every_frame_of_a_run_is_written_and_its_path_can_be_followed(steerbench):
     assert steerbench("run", "method=ngp", *SCENE, *QUICK, *PROTOCOL).status == 0
     (run,) = Store(Path("outputs")).rows()["run"].unique()
 
@@ -46,7 +46,7 @@ def test_every_frame_of_a_run_is_written_and_its_path_can_be_followed(steerbench
 
 
 @pytest.mark.slow
-def test_a_path_file_may_be_timed(steerbench) -> None:
+def test_a_path_file_may_be_timed(steerbench):
     assert steerbench("render", "method=ngp", *SCENE, *QUICK, "--output", "there").status == 0
     words = ("trajectory=path", "trajectory.path=there/path.json")
     outcome = steerbench("run", "method=ngp", *words, *SCENE, *QUICK, *PROTOCOL)
@@ -56,7 +56,7 @@ def test_a_path_file_may_be_timed(steerbench) -> None:
     assert rows["n"]["psnr"] == 0  # without ground truth
 
 
-def test_scored_pictures_are_no_run_to_render(steerbench) -> None:
+def test_scored_pictures_are_no_run_to_render(steerbench):
     for name in ("a", "b"):
         Path(name).mkdir()
         Image.fromarray(np.zeros((16, 16, 3), np.uint8)).save(f"{name}/0.png")

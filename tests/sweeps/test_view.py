@@ -101,7 +101,7 @@ def opened(steerbench: Callable[..., Any], tmp_path: Path) -> Iterator[Callable[
         viewer.stop()
 
 
-def test_a_browser_gets_a_picture_of_its_own_shape(opened: Callable[..., Viewer]) -> None:
+def test_a_browser_gets_a_picture_of_its_own_shape(opened):
     viewer = opened("method.level=0.4")
     height = viewer.first.height
     with browser(viewer) as page:
@@ -111,7 +111,7 @@ def test_a_browser_gets_a_picture_of_its_own_shape(opened: Callable[..., Viewer]
         assert np.abs(page.picture - 102).max() <= 2  # JPEG
 
 
-def test_a_turned_knob_is_another_method(opened: Callable[..., Viewer]) -> None:
+def test_a_turned_knob_is_another_method(opened):
     viewer = opened("method=shades")
     with browser(viewer) as page:
         page.look()
@@ -124,7 +124,7 @@ def test_a_turned_knob_is_another_method(opened: Callable[..., Viewer]) -> None:
         page.until(lambda: page.picture.mean() == before)
 
 
-def test_two_methods_stand_side_by_side(opened: Callable[..., Viewer]) -> None:
+def test_two_methods_stand_side_by_side(opened):
     viewer = opened("method.level=0.4", "--beside", "shades")
     with browser(viewer) as page:
         page.look()
@@ -135,9 +135,7 @@ def test_two_methods_stand_side_by_side(opened: Callable[..., Viewer]) -> None:
         page.until(lambda: abs(page.picture.mean() - min(4 * abs(right - left), 255)) < 8)
 
 
-def test_a_recorded_path_can_be_measured(
-    opened: Callable[..., Viewer], steerbench: Callable[..., Any]
-) -> None:
+def test_a_recorded_path_can_be_measured(opened, steerbench):
     viewer = opened()
     with browser(viewer) as page:
         page.look()
@@ -156,9 +154,7 @@ def test_a_recorded_path_can_be_measured(
     assert outcome.status == 0, outcome.err
 
 
-def test_a_browser_that_leaves_in_the_middle_of_a_frame_takes_nothing_with_it(
-    opened: Callable[..., Viewer], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_browser_that_leaves_in_the_middle_of_a_frame_takes_nothing_with_it(opened, monkeypatch):
     viewer, left = opened(), threading.Event()
     viewer.server.on_client_disconnect(lambda _: left.set())
     (method,) = viewer.painter.methods
@@ -179,9 +175,7 @@ def test_a_browser_that_leaves_in_the_middle_of_a_frame_takes_nothing_with_it(
         other.until(lambda: other.picture.size > 0 and len(viewer.browsers) == 1)
 
 
-def test_a_picture_that_fails_is_named_and_the_next_is_drawn(
-    opened: Callable[..., Viewer], capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_picture_that_fails_is_named_and_the_next_is_drawn(opened, capfd):
     viewer = opened()
     (method,) = viewer.painter.methods
     method.level = float("nan")
@@ -193,7 +187,7 @@ def test_a_picture_that_fails_is_named_and_the_next_is_drawn(
         page.until(lambda: page.picture.size > 0)
 
 
-def test_two_browsers_get_their_own_pictures(opened: Callable[..., Viewer]) -> None:
+def test_two_browsers_get_their_own_pictures(opened):
     viewer = opened()
     with browser(viewer) as one, browser(viewer) as two:
         one.look()
@@ -203,5 +197,5 @@ def test_two_browsers_get_their_own_pictures(opened: Callable[..., Viewer]) -> N
             page.until(lambda page=page, height=height: len(page.picture) == height)
 
 
-def test_it_serves_this_machine_alone_unless_told_otherwise() -> None:
+def test_it_serves_this_machine_alone_unless_told_otherwise():
     assert cli.parsed(["view"]).host == "127.0.0.1"

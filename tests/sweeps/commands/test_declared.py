@@ -40,14 +40,14 @@ def variants(name: str) -> tuple[list[Variant], list[Variant]]:
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_no_two_settings_have_one_name(name: str) -> None:
+def test_no_two_settings_have_one_name(name):
     names = [variant.name for some in variants(name) for variant in some]
     assert len(set(names)) == len(names)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", METHODS)
-def test_one_training_serves_all_that_is_chosen_afterwards(name: str) -> None:
+def test_one_training_serves_all_that_is_chosen_afterwards(name):
     found = study(name)
     off = [Variant(words, (f"{setting}=false",)) for words, setting in found.skips.items()]
     exact = Variant("everything off", found.exact)
@@ -56,7 +56,7 @@ def test_one_training_serves_all_that_is_chosen_afterwards(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_other_knobs_need_a_training_each(name: str) -> None:
+def test_other_knobs_need_a_training_each(name):
     trainings = [trained(name)]
     for variant in variants(name)[1]:
         trainings.append(trained(name, *variant.settings))
@@ -64,12 +64,12 @@ def test_other_knobs_need_a_training_each(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_what_is_chosen_afterwards_is_a_setting_of_the_method(name: str) -> None:
+def test_what_is_chosen_afterwards_is_a_setting_of_the_method(name):
     assert set(study(name).chosen) <= composed([f"method={name}"]).method.keys()
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_axes_and_other_methods_can_be_set(name: str) -> None:
+def test_axes_and_other_methods_can_be_set(name):
     found = study(name)
     for axis in found.axes.values():
         for value in axis.values:

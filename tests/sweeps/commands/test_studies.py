@@ -179,6 +179,6 @@ def test_scaling_has_pixels_and_threads_for_every_method(study):
         ("some stage/inside", "some stage/inside"),
     ],
 )
-def test_a_stage_is_counted_with_the_innermost_that_is_declared(stage: str, part: str) -> None:
+def test_a_stage_is_counted_with_the_innermost_that_is_declared(stage, part):
     parts = {"field": "field", "renderer": "renderer", "renderer/network": "network"}
     assert Study(parts=parts).part_of(stage) == part

@@ -55,9 +55,7 @@ def test_without_the_first_there_is_nothing_to_compare_with(trained):
         (0, ("+protocol.memory=cold", "protocol.name=cold"), r"protocol\.memory: expected steady"),
     ],
 )
-def test_what_cannot_be_compared_is_refused_before_anything_is_trained(
-    trained, monkeypatch, memory, more, message
-):
+def test_what_cannot_be_compared_is_refused_at_once(trained, monkeypatch, memory, more, message):
     monkeypatch.setattr("stand_ins.Grey.memory", memory)
     with pytest.raises(SteerbenchError, match=message), fitted(greys(0.1, more=more), 2):
         pass
