@@ -7,7 +7,7 @@ the unit roundoff u of the type that the result is computed in, never from an ob
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cache, partial
 from typing import Any, NamedTuple
@@ -144,23 +144,17 @@ class Property:
 
 @dataclass(frozen=True)
 class Difference:
-    """Computes how far results are from those of the reference backend on the CPU: where they are
-    nearest to their `tolerances`, or at most if there are none."""
+    """Computes how far results are from those of the reference backend on the CPU, where they are
+    nearest to their `tolerances`."""
 
     prepare: Prepare
-    tolerances: Callable[[], Sequence[Tolerance]] | None = None
+    tolerances: Callable[[], Sequence[Tolerance]]
 
-    def __call__(self, backend: str, device: str, precision: str) -> float | Apart:
+    def __call__(self, backend: str, device: str, precision: str) -> Apart:
         if (backend, device) == ("reference", "cpu"):
-            return 0.0 if self.tolerances is None else Apart(0.0, 0.0)
+            return Apart(0.0, 0.0)
         got = tuple(result.cpu() for result in self.prepare(device)(backend))
-        return self.compare(got, self.prepare("cpu")("reference"))
-
-    def compare(self, got: Sequence[Tensor], want: Sequence[Tensor]) -> float | Apart:
-        """The difference between results and those of the reference."""
-        if self.tolerances is None:
-            return largest_error(got, want)
-        return nearest(got, want, self.tolerances())
+        return nearest(got, self.prepare("cpu")("reference"), self.tolerances())
 
 
 @dataclass(frozen=True)
@@ -216,29 +210,31 @@ class Operation:
         """The cases with the inputs that `make` makes on the CPU: one of the outputs and, if there
         are gradients, one of outputs and gradients. They are timed if `items`, the number that a
         call processes, is given."""
-        ways = [(self.subject, self._outputs, self.outputs, self._tolerances)]
+        ways: list[tuple[str, Mapping[str, Bound]]] = [(self.subject, {})]
         if self.gradients:
-            both = {**self.outputs, **{f"gradient of {k}": v for k, v in self.gradients.items()}}
-            ways.append((f"{self.subject} backward", self._both, both, self._all_tolerances))
-        return [
-            Case(
+            ways.append((f"{self.subject} backward", self.gradients))
+        found = []
+        for subject, gradients in ways:
+            bounds = {**self.outputs, **{f"gradient of {k}": v for k, v in gradients.items()}}
+            prepare = partial(self._prepare, make, tuple(gradients))
+            case = Case(
                 subject,
                 name,
                 "the result is that of the reference",
                 "; ".join(f"{result}: {bound.why}" for result, bound in bounds.items()),
                 dict.fromkeys((backend, precision) for backend in self.backends),
-                Difference(partial(prepare, make), partial(tolerances, make)),
-                None if items is None else Timed(items, partial(prepare, make)),
+                Difference(prepare, partial(self._tolerances, make, gradients)),
+                None if items is None else Timed(items, prepare),
             )
-            for subject, prepare, bounds, tolerances in ways
-        ]
+            found.append(case)
+        return found
 
-    def _outputs(self, make: Callable[[], Given], device: str) -> Computation:
-        return partial(self.compute, placed(make(), device))
-
-    def _both(self, make: Callable[[], Given], device: str) -> Computation:
+    def _prepare(
+        self, make: Callable[[], Given], learned: Sequence[str], device: str
+    ) -> Computation:
+        """Computes the outputs, then the gradients of the inputs `learned`."""
         given = placed(make(), device)
-        wanted = [x.requires_grad_() for x in self._wanted(given)]
+        wanted = [x.requires_grad_() for name in learned for x in _several(given[name])]
 
         @cache
         def shine(*shapes: torch.Size) -> list[Tensor]:
@@ -247,32 +243,26 @@ class Operation:
 
         def call(backend: str) -> tuple[Tensor, ...]:
             results = self.compute(given, backend)
-            learned = [x for x in results if x.requires_grad]
-            grads = [
-                grad.to(x.dtype)
-                for x, grad in zip(learned, shine(*(x.shape for x in learned)), strict=True)
-            ]
-            found = torch.autograd.grad(learned, wanted, grads, materialize_grads=True)
+            if not wanted:
+                return results
+            lit = [x for x in results if x.requires_grad]
+            drawn = zip(lit, shine(*(x.shape for x in lit)), strict=True)
+            grads = [grad.to(x.dtype) for x, grad in drawn]
+            found = torch.autograd.grad(lit, wanted, grads, materialize_grads=True)
             return (*(x.detach() for x in results), *found)
 
         return call
 
-    def _wanted(self, given: Given) -> list[Tensor]:
-        return [x for name in self.gradients for x in _several(given[name])]
-
-    def _tolerances(self, make: Callable[[], Given]) -> list[Tolerance]:
+    def _tolerances(
+        self, make: Callable[[], Given], gradients: Mapping[str, Bound]
+    ) -> list[Tolerance]:
         given = make()
-        return [bound.of(given) for bound in self.outputs.values()]
-
-    def _all_tolerances(self, make: Callable[[], Given]) -> list[Tolerance]:
-        given = make()
-        wanted = [
-            bound.of(given) for name, bound in self.gradients.items() for _ in _several(given[name])
-        ]
-        return [*self._tolerances(make), *wanted]
+        each = [(bound, 1) for bound in self.outputs.values()]
+        each += [(bound, len(_several(given[name]))) for name, bound in gradients.items()]
+        return [bound.of(given) for bound, count in each for _ in range(count)]
 
 
-def _several(value: Tensor | Iterable[Tensor]) -> Iterable[Tensor]:
+def _several(value: Tensor | Sequence[Tensor]) -> Sequence[Tensor]:
     return [value] if isinstance(value, Tensor) else value
 
 
@@ -289,38 +279,6 @@ def placed(value: Any, device: str) -> Any:
             value, **{f.name: placed(getattr(value, f.name), device) for f in fields(value)}
         )
     return value
-
-
-@dataclass(frozen=True)
-class Agreement:
-    """Makes cases which check that all `backends` agree with the reference.
-
-    The tolerance depends on the inputs; `derivation` says how.
-    """
-
-    subject: str
-    backends: Sequence[str]
-    derivation: str
-
-    def case(
-        self,
-        name: str,
-        prepare: Prepare,
-        tolerance: float,
-        *,
-        precision: str = "fp32",
-        items: int | None = None,
-    ) -> Case:
-        """Make one case; it is timed if `items`, the number that a call processes, is given."""
-        return Case(
-            self.subject,
-            name,
-            "the result is that of the reference",
-            self.derivation,
-            {(backend, precision): tolerance for backend in self.backends},
-            Difference(prepare),
-            None if items is None else Timed(items, prepare),
-        )
 
 
 def on_backends(

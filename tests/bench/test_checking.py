@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from bench.case import Agreement, Bound, Case, Operation, largest_error, nearest
+from bench.case import Bound, Case, Operation, largest_error, nearest
 from bench.checking import failed, run_cases, timed_rows
 from bench.types import Log, Unavailable
 
@@ -121,21 +121,24 @@ def test_the_number_nearest_to_its_tolerance_is_reported() -> None:
     assert nearest((zero[:0],), (zero[:0],), (tolerance[:0],)) == (0.0, 0.0)
 
 
+def fake(subject: str, *backends: str) -> Operation:
+    """Backend "cpu" is `off`."""
+    bound = Bound("", 0.5)
+    return Operation(
+        subject, backends, lambda given, name: (given["off"] * (name == "cpu"),), {"off": bound}
+    )
+
+
 @pytest.mark.parametrize("items", [None, 10])
 def test_a_backend_that_is_wrong_on_any_case_of_a_kernel_gets_no_time(items, quiet_log: Log):
-    def wrong(device: str):
-        return lambda backend: (torch.tensor([float(backend == "cpu")]),)
-
-    def right(device: str):
-        return lambda backend: (torch.zeros(1),)
-
-    kernel = Agreement("fake", ("reference", "cpu", "gpu"), "")
-    other = Agreement("other", ("reference", "cpu"), "")
+    kernel = fake("fake", "reference", "cpu", "gpu")
+    other = fake("other", "reference", "cpu")
+    right, wrong = ({"off": torch.full((1,), off)} for off in (0.0, 1.0))
     cases = [
-        kernel.case("large", right, 0.5, items=1000),
-        kernel.case("no sample", wrong, 0.5, items=items),
-        other.case("large", right, 0.5, items=1000),
-        Agreement("never timed", ("cpu",), "").case("small", wrong, 0.5),
+        *kernel.cases("large", lambda: right, items=1000),
+        *kernel.cases("no sample", lambda: wrong, items=items),
+        *other.cases("large", lambda: right, items=1000),
+        *fake("never timed", "cpu").cases("small", lambda: wrong),
     ]
     found = timed_rows(cases, "cpu", ("reference", "cpu"), 2, quiet_log)
     rows = {(row["kernel"], row["backend"]): row for row in found if row["case"] == "large"}
