@@ -190,6 +190,7 @@ class Operation:
         gradients: the bound of the gradient of an input, by the name of the input, which is a
             tensor or a list of them. There are no other gradients.
         draw: the gradients of the results, at random.
+        relative: gradients are compared in units of the largest number of each.
     """
 
     subject: str
@@ -198,6 +199,7 @@ class Operation:
     outputs: Mapping[str, Bound]
     gradients: Mapping[str, Bound] = field(default_factory=dict)
     draw: Callable[[torch.Generator, Sequence[int]], Tensor] = uniform
+    relative: bool = False
 
     def cases(
         self,
@@ -249,6 +251,8 @@ class Operation:
             drawn = zip(lit, shine(*(x.shape for x in lit)), strict=True)
             grads = [grad.to(x.dtype) for x, grad in drawn]
             found = torch.autograd.grad(lit, wanted, grads, materialize_grads=True)
+            if self.relative:
+                found = tuple(x / x.abs().max().clamp(min=1e-30) if len(x) else x for x in found)
             return (*(x.detach() for x in results), *found)
 
         return call
