@@ -19,6 +19,12 @@ BRICK = 4
 """Cells along the side of a brick; its 64 cells are one word of `Occupancy.words`."""
 
 
+def expect(holds: bool, name: str, expected: str, got: object) -> None:
+    """Raise ValueError with the `name` of a setting, and what is expected, unless that `holds`."""
+    if not holds:
+        raise ValueError(f"{name}: expected {expected}, got {got}")
+
+
 class Occupancy:
     """Which cells of the unit cube may hold matter.
 
@@ -29,8 +35,7 @@ class Occupancy:
     def __init__(self, cells: Tensor) -> None:
         size = cells.shape[0]
         check_shape("cells", cells, size, size, size)
-        if size % BRICK**2:
-            raise ValueError(f"cells: expected a side that is a multiple of 16, got {size}")
+        expect(not size % BRICK**2, "cells", "a side that is a multiple of 16", size)
         self.cells = cells.bool()
 
     @classmethod

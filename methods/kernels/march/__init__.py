@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from bench.types import Rays, check_shape
 from methods.kernels.dispatch import implementation
-from methods.kernels.types import Extent, Occupancy, Samples
+from methods.kernels.types import Extent, Occupancy, Samples, expect
 
 MAX_SAMPLES = 1024
 """Most samples of a ray through the unit cube at the usual step, sqrt(3) / 1024."""
@@ -72,10 +72,8 @@ def march(
             does not wait for a GPU.
     """
     segments = _segments(rays, step, window, jitter, start)
-    if limit is None:
-        limit = longest_ray(step)
-    if limit < 1:
-        raise ValueError(f"limit: expected 1 or more, got {limit}")
+    limit = longest_ray(step) if limit is None else limit
+    expect(limit >= 1, "limit", "1 or more", limit)
     kernel = implementation(__name__, backend, rays.origins.device)
     return kernel.march(segments, occupancy, step, limit, extent)
 
@@ -136,6 +134,5 @@ def _segments(
     check_shape("window", window, count, 2)
     check_shape("jitter", jitter, count)
     check_shape("start", start, count)
-    if not step > 0:
-        raise ValueError(f"step: expected a positive length, got {step}")
+    expect(step > 0, "step", "a positive length", step)
     return Segments(rays, window, jitter, start)
