@@ -382,7 +382,7 @@ GO_ON = [
     ("encode backward", "one sample"),
     ("hash adam", "1 samples, 2 features"),
     ("spherical", "131 directions"),
-    ("splat", "sparse"),
+    ("splat", "at borders, outside or not finite"),
 ]
 """Cases of kernels for which the host does not wait."""
 

@@ -166,9 +166,9 @@ def cases() -> list[Case]:
     )
     many = partial(_given, rays=1 << 12, most=64)
     found = COMPOSITE.cases("64 samples a ray", many, items=1 << 18)
-    for name, kind in KINDS.items():
+    for name, options in KINDS.items():
         for operation in (COMPOSITE, WEIGHTS, VISIBLE):
-            found += operation.cases(name, partial(_given, **kind))
+            found += operation.cases(name, partial(_given, **options))
     for name, extreme in EXTREMES.items():
         found.append(pixels.case(name, partial(_pixel_error, extreme)))
         found.append(gradients.case(name, partial(_gradient_error, extreme)))

@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from bench.types import Rays, check_shape
 from methods.kernels.dispatch import implementation
-from methods.kernels.types import Extent, Occupancy, Samples, expect
+from methods.kernels.types import Extent, Occupancy, Samples, check_rays, expect
 
 MAX_SAMPLES = 1024
 """Most samples of a ray through the unit cube at the usual step, sqrt(3) / 1024."""
@@ -68,8 +68,8 @@ def march(
         start: [R] int32 first step, from `Samples.resume` of an earlier call with the same rays;
             negative: no samples; None: 0.
         limit: maximum number of samples per ray; None: all.
-        extent: how many samples there are, from `extents` or `sample_counts`; with it, the host
-            does not wait for a GPU.
+        extent: how many samples there are, from `extents`; with it, the host does not wait for a
+            GPU.
     """
     segments = _segments(rays, step, window, jitter, start)
     limit = longest_ray(step) if limit is None else limit
@@ -91,25 +91,9 @@ def extents(
 
     The host waits for a GPU, once.
     """
-    counts = sample_counts(rays, occupancy, step, window=window, backend=backend)
+    segments = _segments(rays, step, window, None, None)
+    counts = implementation(__name__, backend, rays.origins.device).count(segments, occupancy, step)
     return Extent.of_each(functional.pad(counts, (0, -len(counts) % size)).view(-1, size))
-
-
-def sample_counts(
-    rays: Rays,
-    occupancy: Occupancy,
-    step: float,
-    *,
-    window: Tensor | None = None,
-    jitter: Tensor | None = None,
-    start: Tensor | None = None,
-    backend: str = "auto",
-) -> Tensor:
-    """How many samples `march` finds for each of R `rays`: [R] int64."""
-    segments = _segments(rays, step, window, jitter, start)
-    kernel = implementation(__name__, backend, rays.origins.device)
-    counts: Tensor = kernel.count(segments, occupancy, step)
-    return counts
 
 
 def longest_ray(step: float) -> int:
@@ -121,9 +105,7 @@ def _segments(
     rays: Rays, step: float, window: Tensor | None, jitter: Tensor | None, start: Tensor | None
 ) -> Segments:
     """Check the arguments of `march` and fill in defaults."""
-    origins, count = rays.origins, len(rays.origins)
-    check_shape("origins", origins, None, 3)
-    check_shape("directions", rays.directions, count, 3)
+    origins, count = rays.origins, check_rays(rays)
     if window is None:
         ends = origins.new_zeros(()), origins.new_full((), torch.inf)
         window = torch.stack(ends).expand(count, 2)

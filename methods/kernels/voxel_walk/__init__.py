@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from bench.types import Rays, check_shape
 from methods.kernels.dispatch import implementation
-from methods.kernels.types import Intervals, expect
+from methods.kernels.types import Intervals, check_rays, expect
 
 BRICK = 8
 """Cells along the side of a brick."""
@@ -175,9 +175,7 @@ def walk(
     Raises:
         ValueError: wrong shapes, a limit below 1; backend "cpu": not float32.
     """
-    origins, count = rays.origins, len(rays.origins)
-    check_shape("origins", origins, None, 3)
-    check_shape("directions", rays.directions, count, 3)
+    origins, count = rays.origins, check_rays(rays)
     if start is None:
         start = origins.new_zeros(1).expand(count)
     check_shape("start", start, count)
@@ -185,5 +183,4 @@ def walk(
     limit = most if limit is None else limit
     expect(limit >= 1, "limit", "1 or more", limit)
     kernel = implementation(__name__, backend, origins.device)
-    crossings: Crossings = kernel.walk(rays, voxels, start, min(limit, most))
-    return crossings
+    return kernel.walk(rays, voxels, start, min(limit, most))

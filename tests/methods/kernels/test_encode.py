@@ -1,4 +1,4 @@
-"""The hash-grid encoding against a plain loop, closed forms and finite differences."""
+"""The hash-grid encoding: published levels, gradients, what is collected and refused."""
 
 from __future__ import annotations
 
