@@ -144,7 +144,8 @@ class Property:
 
 @dataclass(frozen=True)
 class Difference:
-    """How far results are from those of the reference on the CPU, where nearest to `tolerances`."""
+    """Computes how far results are from those of the reference backend on the CPU, where they are
+    nearest to their `tolerances`."""
 
     prepare: Prepare
     tolerances: Callable[[], Sequence[Tolerance]]
@@ -189,6 +190,7 @@ class Operation:
         gradients: the bound of the gradient of an input, by the name of the input, which is a
             tensor or a list of them. There are no other gradients.
         draw: the gradients of the results, at random.
+        relative: gradients are compared in units of the largest number of each.
     """
 
     subject: str
@@ -197,6 +199,7 @@ class Operation:
     outputs: Mapping[str, Bound]
     gradients: Mapping[str, Bound] = field(default_factory=dict)
     draw: Callable[[torch.Generator, Sequence[int]], Tensor] = uniform
+    relative: bool = False
 
     def cases(
         self,
@@ -209,29 +212,31 @@ class Operation:
         """The cases with the inputs that `make` makes on the CPU: one of the outputs and, if there
         are gradients, one of outputs and gradients. They are timed if `items`, the number that a
         call processes, is given."""
-        ways = [(self.subject, self._outputs, self.outputs)]
+        ways: list[tuple[str, Mapping[str, Bound]]] = [(self.subject, {})]
         if self.gradients:
-            both = {**self.outputs, **{f"gradient of {k}": v for k, v in self.gradients.items()}}
-            ways.append((f"{self.subject} backward", self._both, both))
-        return [
-            Case(
+            ways.append((f"{self.subject} backward", self.gradients))
+        found = []
+        for subject, gradients in ways:
+            bounds = {**self.outputs, **{f"gradient of {k}": v for k, v in gradients.items()}}
+            prepare = partial(self._prepare, make, tuple(gradients))
+            case = Case(
                 subject,
                 name,
                 "the result is that of the reference",
                 "; ".join(f"{result}: {bound.why}" for result, bound in bounds.items()),
                 dict.fromkeys((backend, precision) for backend in self.backends),
-                Difference(partial(prepare, make), partial(self._tolerances, make, bounds)),
-                None if items is None else Timed(items, partial(prepare, make)),
+                Difference(prepare, partial(self._tolerances, make, gradients)),
+                None if items is None else Timed(items, prepare),
             )
-            for subject, prepare, bounds in ways
-        ]
+            found.append(case)
+        return found
 
-    def _outputs(self, make: Callable[[], Given], device: str) -> Computation:
-        return partial(self.compute, placed(make(), device))
-
-    def _both(self, make: Callable[[], Given], device: str) -> Computation:
+    def _prepare(
+        self, make: Callable[[], Given], learned: Sequence[str], device: str
+    ) -> Computation:
+        """Computes the outputs, then the gradients of the inputs `learned`."""
         given = placed(make(), device)
-        wanted = [x.requires_grad_() for name in self.gradients for x in _several(given[name])]
+        wanted = [x.requires_grad_() for name in learned for x in _several(given[name])]
 
         @cache
         def shine(*shapes: torch.Size) -> list[Tensor]:
@@ -240,27 +245,25 @@ class Operation:
 
         def call(backend: str) -> tuple[Tensor, ...]:
             results = self.compute(given, backend)
-            learned = [x for x in results if x.requires_grad]
-            grads = [
-                grad.to(x.dtype)
-                for x, grad in zip(learned, shine(*(x.shape for x in learned)), strict=True)
-            ]
-            found = torch.autograd.grad(learned, wanted, grads, materialize_grads=True)
+            if not wanted:
+                return results
+            lit = [x for x in results if x.requires_grad]
+            drawn = zip(lit, shine(*(x.shape for x in lit)), strict=True)
+            grads = [grad.to(x.dtype) for x, grad in drawn]
+            found = torch.autograd.grad(lit, wanted, grads, materialize_grads=True)
+            if self.relative:
+                found = tuple(x / x.abs().max().clamp(min=1e-30) if len(x) else x for x in found)
             return (*(x.detach() for x in results), *found)
 
         return call
 
     def _tolerances(
-        self, make: Callable[[], Given], bounds: Mapping[str, Bound]
+        self, make: Callable[[], Given], gradients: Mapping[str, Bound]
     ) -> list[Tolerance]:
-        """The tolerance of each result and, with the `bounds` of gradients, of each gradient."""
         given = make()
-        counts = {f"gradient of {k}": len(_several(given[k])) for k in self.gradients}
-        return [
-            tolerance
-            for name, bound in bounds.items()
-            for tolerance in [bound.of(given)] * counts.get(name, 1)
-        ]
+        each = [(bound, 1) for bound in self.outputs.values()]
+        each += [(bound, len(_several(given[name]))) for name, bound in gradients.items()]
+        return [bound.of(given) for bound, count in each for _ in range(count)]
 
 
 def _several(value: Tensor | Sequence[Tensor]) -> Sequence[Tensor]:

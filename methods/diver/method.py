@@ -15,7 +15,7 @@ from methods.diver.model import CornerModel
 from methods.diver.rendering import Baked, Stored
 from methods.diver.training import DiverLessons, DiverTraining
 from methods.instant_ngp.stage1 import TrainedField
-from methods.kernels.types import Occupancy, Pixels
+from methods.kernels.types import Occupancy, Pixels, expect
 from methods.rendering.frame import Render
 from methods.students.method import Student
 
@@ -57,16 +57,10 @@ class Diver(Student):
     def __post_init__(self) -> None:
         super().__post_init__()
         size = self.resolution
-        if size % MULTIPLE or not MULTIPLE <= size <= FINEST:
-            raise ValueError(
-                f"resolution: expected a multiple of {MULTIPLE} up to {FINEST}, got {size}"
-            )
-        if self.stored not in ("bf16", "fp32"):
-            raise ValueError(f"stored: expected bf16 or fp32, got {self.stored!r}")
-        if not 0 <= self.faint < 1:
-            raise ValueError(
-                f"faint: expected a weight of 0 or more and less than 1, got {self.faint}"
-            )
+        whole = MULTIPLE <= size <= FINEST and not size % MULTIPLE
+        expect(whole, "resolution", f"a multiple of {MULTIPLE} up to {FINEST}", size)
+        expect(self.stored in ("bf16", "fp32"), "stored", "bf16 or fp32", self.stored)
+        expect(0 <= self.faint < 1, "faint", "a weight of 0 or more and less than 1", self.faint)
 
     def model_settings(self) -> Mapping[str, object]:
         """The number of voxels."""

@@ -14,7 +14,7 @@ from methods.diver.model import CornerModel, as_intervals
 from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import STOP, composite, visible, weights
-from methods.kernels.types import Pixels
+from methods.kernels.types import Pixels, expect
 from methods.kernels.voxel_walk import Crossings, walk
 from methods.rendering.field import pad
 from methods.students.voxels import largest_weights
@@ -45,10 +45,11 @@ class DiverLessons(PixelOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (self.corner_rate > 0 and self.sparsity >= 0 and self.prune_rays >= 0):
-            raise ValueError(f"expected corner_rate > 0, sparsity, prune_rays >= 0: {self}")
-        if not (0 <= self.prune_at <= 1 and 0 <= self.prune_below < 1):
-            raise ValueError(f"expected prune_at in [0, 1], prune_below in [0, 1): {self}")
+        expect(self.corner_rate > 0, "corner_rate", "more than 0", self.corner_rate)
+        expect(self.sparsity >= 0, "sparsity", "0 or more", self.sparsity)
+        expect(self.prune_rays >= 0, "prune_rays", "0 or more", self.prune_rays)
+        expect(0 <= self.prune_at <= 1, "prune_at", "a share in [0, 1]", self.prune_at)
+        expect(0 <= self.prune_below < 1, "prune_below", "a weight in [0, 1)", self.prune_below)
 
 
 class DiverTraining(PixelTraining):

@@ -25,6 +25,7 @@ from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.composite import STOP, check_stop
 from methods.kernels.dispatch import refuse_gpu
 from methods.kernels.encode import HashGrid
+from methods.kernels.types import expect
 from methods.rendering.frame import FeatureFrame
 from methods.training import loop
 
@@ -76,10 +77,8 @@ class GaussianSplatting:
     )
 
     def __post_init__(self) -> None:
-        if self.count < 1 or self.degree not in range(4):
-            raise ValueError(
-                f"expected count >= 1 and degree 0 to 3, got {self.count} and {self.degree}"
-            )
+        expect(self.count >= 1, "count", "1 or more", self.count)
+        expect(self.degree in range(4), "degree", "0 to 3", self.degree)
         check_stop(self.stop)
         refuse_gpu(self.backend, self.name)
         where = self.backend, self.device, self.seed

@@ -17,6 +17,7 @@ from methods.gaussians.kernels.ssim import ssim
 from methods.gaussians.mcmc import disturb, relocate
 from methods.gaussians.model import Gaussians
 from methods.kernels.composite import STOP
+from methods.kernels.types import expect
 from methods.training import checkpoint, loop
 
 
@@ -57,8 +58,9 @@ class Fitting:
     size: float = 0.5
 
     def __post_init__(self) -> None:
-        if not (0 < self.opacity < 1 and self.size > 0 and self.every > 0):
-            raise ValueError(f"expected opacity in (0, 1), size > 0, every > 0: {self}")
+        expect(0 < self.opacity < 1, "opacity", "more than 0 and less than 1", self.opacity)
+        expect(self.size > 0, "size", "more than 0", self.size)
+        expect(self.every > 0, "every", "1 or more", self.every)
 
 
 class GaussianTraining:

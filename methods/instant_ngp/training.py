@@ -16,7 +16,7 @@ from methods.instant_ngp.field import HashField
 from methods.instant_ngp.optimiser import FieldOptimiser
 from methods.instant_ngp.pixels import PixelBatches
 from methods.kernels.composite import check_stop
-from methods.kernels.types import Pixels
+from methods.kernels.types import Pixels, expect
 from methods.rendering.batch import opacity_entropy, render_batch
 from methods.rendering.occupancy import EVERY, MIN_VIEWS, STEP, DensityGrid, learnable_cells
 from methods.rendering.sampling import Sampling, check_step, suitable_step
@@ -99,12 +99,6 @@ class TrainingOptions(PixelOptions):
         if self.march_step is None:
             return Sampling(step=suitable_step(budget.steps))
         return Sampling(step=self.march_step * STEP)
-
-
-def expect(holds: bool, name: str, expected: str, got: float) -> None:
-    """Raise ValueError with the `name` of a setting, and what is expected, unless that `holds`."""
-    if not holds:
-        raise ValueError(f"{name}: expected {expected}, got {got}")
 
 
 def new_grid(scene: Scene, device: torch.device) -> DensityGrid:

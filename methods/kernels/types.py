@@ -13,10 +13,24 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.types import check_shape
+from bench.types import Rays, check_shape
 
 BRICK = 4
 """Cells along the side of a brick; its 64 cells are one word of `Occupancy.words`."""
+
+
+def expect(holds: bool, name: str, expected: str, got: object) -> None:
+    """Raise ValueError with the `name` of a setting, and what is expected, unless that `holds`."""
+    if not holds:
+        raise ValueError(f"{name}: expected {expected}, got {got}")
+
+
+def check_rays(rays: Rays) -> int:
+    """The number of rays; raise ValueError if their shapes do not fit."""
+    count = len(rays.origins)
+    check_shape("origins", rays.origins, None, 3)
+    check_shape("directions", rays.directions, count, 3)
+    return count
 
 
 class Occupancy:
@@ -29,8 +43,7 @@ class Occupancy:
     def __init__(self, cells: Tensor) -> None:
         size = cells.shape[0]
         check_shape("cells", cells, size, size, size)
-        if size % BRICK**2:
-            raise ValueError(f"cells: expected a side that is a multiple of 16, got {size}")
+        expect(not size % BRICK**2, "cells", "a side that is a multiple of 16", size)
         self.cells = cells.bool()
 
     @classmethod
@@ -116,13 +129,9 @@ class Extent:
     @classmethod
     def of_each(cls, counts: Tensor) -> list[Extent]:
         """The extent of each group of rays with `counts` [G, R] samples. Waits for a GPU, once."""
-        return [cls(*size) for size in cls.figures(counts).tolist()]
-
-    @staticmethod
-    def figures(counts: Tensor) -> Tensor:
-        """`total` and `longest` of each group of `counts` [G, R], on the same device: [G, 2]."""
         counts = functional.pad(counts, (0, 1))  # for a group without rays
-        return torch.stack((counts.sum(dim=1), counts.amax(dim=1)), dim=1)
+        figures = torch.stack((counts.sum(dim=1), counts.amax(dim=1)), dim=1)
+        return [cls(*size) for size in figures.tolist()]
 
 
 @dataclass(frozen=True)
@@ -142,15 +151,10 @@ class Intervals:
     offsets: Tensor
     longest: int | None = field(default=None, kw_only=True)
 
-    def first_of_each(
-        self, counts: Tensor, extent: Extent | None = None
-    ) -> tuple[Tensor, Tensor, int]:
+    def first_of_each(self, counts: Tensor) -> tuple[Tensor, Tensor, int]:
         """Indices of the first `counts` [R] samples of each ray, and their `offsets` and `longest`.
-
-        `extent` is that of `counts`; if None, the host waits for a GPU.
-        """
-        if extent is None:
-            (extent,) = Extent.of_each(counts[None])
+        The host waits for a GPU."""
+        (extent,) = Extent.of_each(counts[None])
         offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
         shift = (self.offsets - offsets)[:-1].repeat_interleave(counts, output_size=extent.total)
         return torch.arange(extent.total, device=shift.device) + shift, offsets, extent.longest
@@ -175,12 +179,9 @@ class Samples(Intervals):
     def __len__(self) -> int:
         return len(self.t)
 
-    def front(self, counts: Tensor, extent: Extent | None = None) -> Samples:
-        """Only the first `counts` [R] samples of each ray, with no more to follow.
-
-        `extent` is as for `first_of_each`.
-        """
-        return self.chosen(*self.first_of_each(counts, extent))
+    def front(self, counts: Tensor) -> Samples:
+        """Only the first `counts` [R] samples of each ray, with no more to follow."""
+        return self.chosen(*self.first_of_each(counts))
 
     def chosen(self, index: Tensor, offsets: Tensor, longest: int | None) -> Samples:
         """Only the samples at `index` [N], which lie on the rays as `offsets` [R + 1] say, with no

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from bench.types import Budget, Scene
 from methods.instant_ngp.stage1 import TrainedField
+from methods.kernels.types import expect
 from methods.kilonerf.field import KiloField
 from methods.kilonerf.grid import Grid, place_networks
 from methods.kilonerf.training import KiloLessons, KiloTraining
@@ -36,8 +37,8 @@ class KiloNerf(FieldStudent):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 1 <= self.networks <= MOST:
-            raise ValueError(f"networks: expected 1 to {MOST} along an axis, got {self.networks}")
+        along = f"1 to {MOST} along an axis"
+        expect(1 <= self.networks <= MOST, "networks", along, self.networks)
 
     def model_settings(self) -> Mapping[str, object]:
         """The number of networks."""

@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from bench.types import Budget, Scene
 from methods.instant_ngp.stage1 import TrainedField
+from methods.kernels.types import expect
 from methods.kilonerf.field import KiloField
 from methods.kilonerf.grid import Pieces
 from methods.students.fields import FieldLessons, FieldStudent, StudentTraining
@@ -34,8 +35,8 @@ class KiloLessons(FieldLessons):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (self.points_each >= 1 and self.view_cost >= 0):
-            raise ValueError(f"expected points_each >= 1, view_cost >= 0: {self}")
+        expect(self.points_each >= 1, "points_each", "1 or more", self.points_each)
+        expect(self.view_cost >= 0, "view_cost", "0 or more", self.view_cost)
 
 
 class KiloTraining(StudentTraining):

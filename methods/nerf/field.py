@@ -8,9 +8,10 @@ from torch.nn import functional
 
 from bench.types import Probe
 from methods.instant_ngp.field import Precision
-from methods.students.fields import REACH, StudentField
+from methods.students.fields import REACH
 from methods.students.networks import (
     Dense,
+    NetworkField,
     density_of,
     parameter_bytes,
     positional,
@@ -36,11 +37,8 @@ DIRECTION_FREQUENCIES = 4
 DENSITY = 1 / REACH
 """Density at a network output of 1, chosen so that the weights are of the usual size."""
 
-CHUNK = 1 << 14
-"""Samples that go through the network together: 16 MiB of activations."""
 
-
-class NerfField(StudentField):
+class NerfField(NetworkField):
     """One network of 595,844 parameters (Mildenhall et al. 2020, Figure 7).
 
     Positions in the unit cube are mapped to [-1, 1], as in Section 5.1.
@@ -50,8 +48,6 @@ class NerfField(StudentField):
         backend: backend of the kernels that render it.
         generator: source of the initial weights.
     """
-
-    round_samples = 2  # a sample costs half a million products
 
     def __init__(
         self, precision: Precision, backend: str, generator: torch.Generator | None = None
@@ -67,13 +63,7 @@ class NerfField(StudentField):
         self.view = Dense(WIDTH + direction, VIEW_WIDTH, precision, generator)
         self.colour = Dense(VIEW_WIDTH, 3, precision, generator)
 
-    def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """Density [S], and the output of the trunk as the geometry."""
-        parts = [self._density(part) for part in positions.split(CHUNK)]
-        sigma, geometry = (torch.cat(column) for column in zip(*parts, strict=True))
-        return sigma, geometry
-
-    def _density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+    def density_together(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         encoded = positional(2 * positions - 1, POSITION_FREQUENCIES)
         hidden = encoded
         for number, layer in enumerate(self.trunk):
@@ -87,12 +77,7 @@ class NerfField(StudentField):
         """Encoding [R, 27] of the unit directions."""
         return positional(functional.normalize(directions, dim=-1), DIRECTION_FREQUENCIES)
 
-    def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
-        """Colours [S, 3]."""
-        pairs = zip(geometry.split(CHUNK), encoded.split(CHUNK), strict=True)
-        return torch.cat([self._colours(*pair) for pair in pairs])
-
-    def _colours(self, geometry: Tensor, encoded: Tensor) -> Tensor:
+    def colours_together(self, geometry: Tensor, encoded: Tensor) -> Tensor:
         hidden = self._view(geometry, encoded).relu_()
         return self.colour(hidden).to(encoded.dtype).sigmoid()
 

@@ -12,9 +12,9 @@ from bench.types import Probe
 from methods.instant_ngp.field import Precision
 from methods.kernels.corner_gather import CORNERS, corner_gather, trilinear
 from methods.kernels.types import Occupancy
-from methods.students.fields import StudentField
 from methods.students.networks import (
     Dense,
+    NetworkField,
     density_of,
     parameter_bytes,
     positional,
@@ -38,9 +38,6 @@ ACROSS = 3.0
 """Side of the cube, approximately, in the units of the published scenes, in which the release
 measures lengths."""
 
-CHUNK = 1 << 14
-"""Samples that go through the network together: 16 MiB of activations."""
-
 
 class Layer(nn.Sequential):
     """A dense layer, LayerNorm over its outputs, ReLU."""
@@ -62,7 +59,7 @@ class Norm(nn.LayerNorm):
         return functional.layer_norm(input, self.normalized_shape, weight, bias, self.eps)
 
 
-class NsvfField(StudentField):
+class NsvfField(NetworkField):
     """Sparse voxels with embeddings, and a network of 545,284 parameters (Liu et al. 2020,
     Section 3.1, Appendix B, with the LayerNorm of the release).
 
@@ -72,8 +69,6 @@ class NsvfField(StudentField):
         backend: backend of the kernels that render it.
         generator: source of the initial weights and embeddings.
     """
-
-    round_samples = 2  # a sample costs half a million products
 
     index: Tensor
     corners: Tensor
@@ -111,13 +106,8 @@ class NsvfField(StudentField):
             Dense(WIDTH, 3, precision, generator),
         )
 
-    def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """Density [S], 0 outside all voxels, and the output of the trunk as the geometry."""
-        parts = [self._density(part) for part in positions.split(CHUNK)]
-        sigma, geometry = (torch.cat(column) for column in zip(*parts, strict=True))
-        return sigma, geometry
-
-    def _density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+    def density_together(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """As of any network; the density is 0 outside all voxels."""
         embedding, inside = self.embedding(positions)
         hidden = self.trunk(positional(embedding, EMBEDDING_FREQUENCIES))
         raw = self.opacity(hidden)[:, 0].to(embedding.dtype)
@@ -141,11 +131,10 @@ class NsvfField(StudentField):
         unit = functional.normalize(directions, dim=-1)
         return positional(unit, DIRECTION_FREQUENCIES, identity=False, scale=1.0)
 
-    def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
-        """Colours [S, 3]; the network's output is linear, -1 black and 1 white, as released."""
-        pairs = zip(geometry.split(CHUNK), encoded.split(CHUNK), strict=True)
-        shown = [self.colour(torch.cat((hidden, d.to(hidden)), dim=1)) for hidden, d in pairs]
-        return (torch.cat(shown).to(encoded.dtype) + 1) / 2
+    def colours_together(self, geometry: Tensor, encoded: Tensor) -> Tensor:
+        """The network's output is linear, -1 black and 1 white, as released."""
+        shown = self.colour(torch.cat((geometry, encoded.to(geometry)), dim=1))
+        return (shown.to(encoded.dtype) + 1) / 2
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
         density, colour = products(self.trunk, self.opacity), products(self.colour)

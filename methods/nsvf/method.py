@@ -12,7 +12,7 @@ import torch
 from bench.types import Budget, Scene
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.encode import encode
-from methods.kernels.types import BRICK, Occupancy
+from methods.kernels.types import BRICK, Occupancy, expect
 from methods.nsvf.field import EMBEDDING, NsvfField
 from methods.rendering.sampling import Sampling, check_step
 from methods.students.fields import FieldStudent, StudentTraining
@@ -41,12 +41,9 @@ class Nsvf(FieldStudent):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_step("step", self.step)
-        if self.resolution < 1 or self.resolution % BRICK**2:
-            raise ValueError(
-                f"resolution: expected a multiple of {BRICK**2}, got {self.resolution}"
-            )
-        if self.start not in ("random", "teacher"):
-            raise ValueError(f"start: expected random or teacher, got {self.start!r}")
+        size = self.resolution
+        expect(size > 0 and not size % BRICK**2, "resolution", f"a multiple of {BRICK**2}", size)
+        expect(self.start in ("random", "teacher"), "start", "random or teacher", self.start)
         if self.start == "teacher" and self.teacher.grid.channels != EMBEDDING:
             raise ValueError(
                 f"start=teacher: expected a grid of {EMBEDDING} channels (levels x features), got "

@@ -13,7 +13,7 @@ from bench.study import Axis, Study, Variant, turned
 from bench.types import Budget, Probe, Rays, Scene
 from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
-from methods.kernels.types import Occupancy, Pixels
+from methods.kernels.types import Occupancy, Pixels, expect
 from methods.plenoctree.kernels.voxel_light import render_voxels
 from methods.plenoctree.octree import Octree
 from methods.plenoctree.start import Extraction, extract
@@ -59,8 +59,7 @@ class PlenOctree(Student):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.stored not in ("fp16", "fp32"):
-            raise ValueError(f"stored: expected fp16 or fp32, got {self.stored!r}")
+        expect(self.stored in ("fp16", "fp32"), "stored", "fp16 or fp32", self.stored)
 
     def model_settings(self) -> Mapping[str, object]:
         """The settings of the extraction."""

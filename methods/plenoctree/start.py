@@ -14,7 +14,7 @@ from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.composite import STOP, weights
 from methods.kernels.spherical import spherical_harmonics
-from methods.kernels.types import Occupancy
+from methods.kernels.types import Occupancy, expect
 from methods.kernels.voxel_walk import BRICK, Crossings, Voxels
 from methods.plenoctree.kernels.voxel_light import Light
 from methods.plenoctree.octree import Octree
@@ -51,22 +51,15 @@ class Extraction:
     most_leaves: int = 12_000_000
 
     def __post_init__(self) -> None:
-        if self.resolution % (BRICK * BRICK) or not 128 <= self.resolution <= 2048:
-            raise ValueError(
-                f"resolution: expected a multiple of {BRICK * BRICK} from 128 to 2048, "
-                f"got {self.resolution}"
-            )
-        if self.degree not in range(4):
-            raise ValueError(f"degree: expected 0 to 3, got {self.degree}")
-        if self.directions < (self.degree + 1) ** 2:
-            raise ValueError(
-                f"directions: expected at least {(self.degree + 1) ** 2}, as many as degree "
-                f"{self.degree} has harmonics, got {self.directions}"
-            )
-        if min(self.rays, self.points, self.most_leaves) < 1 or not self.least_weight >= 0:
-            raise ValueError(
-                f"expected rays, points and most_leaves >= 1, least_weight >= 0, got {self}"
-            )
+        size, terms = self.resolution, (self.degree + 1) ** 2
+        whole = 128 <= size <= 2048 and not size % BRICK**2
+        expect(whole, "resolution", f"a multiple of {BRICK**2} from 128 to 2048", size)
+        expect(self.degree in range(4), "degree", "0 to 3", self.degree)
+        needed = f"at least {terms}, as many as degree {self.degree} has harmonics"
+        expect(self.directions >= terms, "directions", needed, self.directions)
+        for name in ("rays", "points", "most_leaves"):
+            expect(getattr(self, name) >= 1, name, "1 or more", getattr(self, name))
+        expect(self.least_weight >= 0, "least_weight", "0 or more", self.least_weight)
 
 
 @torch.no_grad()
@@ -111,11 +104,8 @@ def _candidates(occupancy: Occupancy, options: Extraction) -> Tensor:
             f"{options.most_leaves:,}: choose a smaller method.extraction.resolution, or a larger "
             "most_leaves where there is the memory for them (about 500 bytes each)"
         )
-    if not wide.is_integer():
-        raise ValueError(
-            f"resolution: expected a multiple of {occupancy.resolution}, that of the field's "
-            f"occupancy, got {size}"
-        )
+    of_field = f"a multiple of {occupancy.resolution}, that of the field's occupancy"
+    expect(wide.is_integer(), "resolution", of_field, size)
     side = torch.arange(int(wide), dtype=torch.int32, device=cells.device)
     inner = torch.cartesian_prod(side, side, side).view(-1, 3)
     return (cells[:, None] * int(wide) + inner).reshape(-1, 3)

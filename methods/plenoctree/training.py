@@ -13,7 +13,7 @@ from bench.types import Budget, Rays, Scene
 from methods.instant_ngp.training import PixelOptions, PixelTraining
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import STOP, composite, visible
-from methods.kernels.types import Pixels
+from methods.kernels.types import Pixels, expect
 from methods.kernels.voxel_walk import walk
 from methods.plenoctree.kernels.voxel_light import shade_voxels
 from methods.plenoctree.octree import Octree
@@ -37,10 +37,8 @@ class OctreeLessons(PixelOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.density_rate >= 0:
-            raise ValueError(f"density_rate: expected 0 or more, got {self.density_rate}")
-        if self.samples < 1:
-            raise ValueError(f"samples: expected 1 or more, got {self.samples}")
+        expect(self.density_rate >= 0, "density_rate", "0 or more", self.density_rate)
+        expect(self.samples >= 1, "samples", "1 or more", self.samples)
 
 
 class OctreeTraining(PixelTraining):

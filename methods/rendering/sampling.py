@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from methods.kernels.composite import STOP
+from methods.kernels.types import expect
 from methods.rendering.occupancy import RESOLUTION, STEP
 
 FAINT = 0.1
@@ -28,8 +29,7 @@ def suitable_step(steps: int) -> float:
 
 def check_step(name: str, length: float) -> None:
     """Raise ValueError unless the `length` of a step is more than 0."""
-    if not length > 0:
-        raise ValueError(f"{name}: expected a length of more than 0, got {length}")
+    expect(length > 0, name, "a length of more than 0", length)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from torch.nn import functional
 from bench.types import Budget, Log, Probe, Rays, Scene
 from methods.instant_ngp.stage1 import TrainedField
 from methods.instant_ngp.training import PixelOptions, PixelTraining
-from methods.kernels.types import Occupancy, Pixels
+from methods.kernels.types import Occupancy, Pixels, expect
 from methods.rendering.batch import render_batch
 from methods.rendering.field import ROUND_SAMPLES, Field
 from methods.rendering.frame import Render, everywhere
@@ -45,10 +45,8 @@ class FieldLessons(PixelOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (0 <= self.points <= 1 and 0 < self.share <= 1):
-            raise ValueError(
-                f"points, share: expected shares from 0 to 1, of samples more than 0: {self}"
-            )
+        expect(0 <= self.points <= 1, "points", "a share from 0 to 1", self.points)
+        expect(0 < self.share <= 1, "share", "a share in (0, 1], of the samples", self.share)
 
 
 class StudentField(nn.Module, Field):

@@ -20,7 +20,7 @@ from methods.instant_ngp.stage1 import Setup, TrainedField, train_field
 from methods.instant_ngp.training import PixelOptions
 from methods.kernels.composite import check_stop
 from methods.kernels.dispatch import refuse_gpu
-from methods.kernels.types import Occupancy
+from methods.kernels.types import Occupancy, expect
 from methods.rendering.frame import Render, render_frame
 from methods.training import checkpoint, loop
 
@@ -60,8 +60,7 @@ class Student(ABC):
     def __post_init__(self) -> None:
         check_stop(self.stop)
         refuse_gpu(self.teacher.backend, self.name)
-        if self.steps is not None and self.steps < 1:
-            raise ValueError(f"steps: expected 1 or more, or none, got {self.steps}")
+        expect(self.steps is None or self.steps >= 1, "steps", "1 or more, or none", self.steps)
         self.train_s = 0.0
 
     def model_settings(self) -> Mapping[str, object]:

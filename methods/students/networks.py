@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from dataclasses import dataclass
 
 import torch
@@ -11,7 +12,7 @@ from torch.nn import functional
 
 from methods.instant_ngp.field import Precision
 from methods.kernels import multiplies_bf16
-from methods.students.fields import FieldLessons
+from methods.students.fields import FieldLessons, StudentField
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,33 @@ class Dense(nn.Linear):
         half = self.precision == "bf16" and multiplies_bf16(self.weight.device.type)
         dtype = torch.bfloat16 if half else self.weight.dtype
         return functional.linear(inputs.to(dtype), weight.to(dtype), bias.to(dtype))
+
+
+CHUNK = 1 << 14
+"""Samples that go through the network together: 16 MiB of activations."""
+
+
+class NetworkField(StudentField):
+    """A field that is one large network of dense layers."""
+
+    round_samples = 2  # a sample costs half a million products
+
+    @abstractmethod
+    def density_together(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """Density [S], and the output of the trunk as the geometry, of a few samples."""
+
+    @abstractmethod
+    def colours_together(self, geometry: Tensor, encoded: Tensor) -> Tensor:
+        """Colours [S, 3] of a few samples."""
+
+    def density(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        parts = [self.density_together(part) for part in positions.split(CHUNK)]
+        sigma, geometry = (torch.cat(column) for column in zip(*parts, strict=True))
+        return sigma, geometry
+
+    def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
+        pairs = zip(geometry.split(CHUNK), encoded.split(CHUNK), strict=True)
+        return torch.cat([self.colours_together(*pair) for pair in pairs])
 
 
 def density_of(raw: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bench.types import Rays, check_shape
 from methods.instant_ngp.pixels import PixelBatches
-from methods.kernels.types import Occupancy
+from methods.kernels.types import Occupancy, expect
 from methods.kernels.voxel_walk import Crossings, Voxels, walk
 
 CHUNK_RAYS = 1 << 15
@@ -46,8 +46,7 @@ def occupied_voxels(occupancy: Occupancy, resolution: int) -> Tensor:
     Raises:
         ValueError: the resolution is less than 1.
     """
-    if resolution < 1:
-        raise ValueError(f"resolution: expected 1 or more, got {resolution}")
+    expect(resolution >= 1, "resolution", "1 or more", resolution)
     size, device = occupancy.resolution, occupancy.cells.device
     voxel = torch.arange(resolution, device=device)
     first, last = voxel * size // resolution, -(-(voxel + 1) * size // resolution)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bench.types import check_shape
 from methods.kernels.dispatch import implementation
-from methods.kernels.types import Intervals, Pixels
+from methods.kernels.types import Intervals, Pixels, expect
 
 STOP = 1e-4
 """Transmittance at which a ray ends: what lies behind changes a pixel by less than this."""
@@ -18,8 +18,7 @@ STOP = 1e-4
 
 def check_stop(stop: float) -> None:
     """Raise ValueError unless 0 <= `stop` < 1; from 1 on, rays would end before they begin."""
-    if not 0 <= stop < 1:
-        raise ValueError(f"stop: expected a transmittance of 0 or more and less than 1, got {stop}")
+    expect(0 <= stop < 1, "stop", "a transmittance of 0 or more and less than 1", stop)
 
 
 def composite(

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -22,6 +20,7 @@ from bench.case import (
     Property,
     largest_error,
     on_backends,
+    placed,
 )
 from methods.kernels.composite import composite, visible, weights
 from methods.kernels.dispatch import served
@@ -32,74 +31,23 @@ INF = math.inf
 DEPTH = 2.0
 """Largest t of the samples; values and gradients of pixels are at most 1."""
 
-
-@dataclass(frozen=True)
-class Kind:
-    """Inputs of an agreement: `rays` of up to `most` samples."""
-
-    rays: int
-    most: int
-    channels: int = 3
-    density: float = 2.0
-    carry: bool = False
-    stop: float = 0.0
-
-
-KINDS = {
-    "no ray": Kind(0, 0),
-    "rays without samples": Kind(5, 0),
-    "one sample a ray": Kind(7, 1),
-    "1024 samples a ray": Kind(3, 1024),
-    "ragged rays": Kind(101, 37),
-    "nine channels": Kind(33, 20, channels=9),
-    "no density": Kind(9, 12, density=0.0),
-    "opaque at once": Kind(9, 12, density=1e30),
-    "continued": Kind(33, 20, carry=True),
+KINDS: dict[str, dict[str, Any]] = {
+    "no ray": {"rays": 0, "most": 0},
+    "rays without samples": {"rays": 5, "most": 0},
+    "one sample a ray": {"rays": 7, "most": 1},
+    "1024 samples a ray": {"rays": 3, "most": 1024},
+    "ragged rays": {"rays": 101, "most": 37},
+    "nine channels": {"channels": 9},
+    "no density": {"density": 0.0},
+    "opaque at once": {"density": 1e30},
+    "continued": {"carry": True},
     # A ray could end a sample earlier only if its transmittance, one in 10^6, is within rounding
     # of `stop`.
-    "stopped after a few samples": Kind(40, 12, stop=0.3),
-    "stopped after many samples": Kind(20, 200, stop=0.3),
-    "continued and stopped": Kind(33, 20, carry=True, stop=0.3),
+    "stopped after a few samples": {"rays": 40, "most": 12, "stop": 0.3},
+    "stopped after many samples": {"most": 200, "stop": 0.3},
+    "continued and stopped": {"carry": True, "stop": 0.3},
 }
-
-TIMED = Kind(1 << 12, 64)
-
-LIGHT = (
-    "a transmittance T = exp(-tau), tau a sum of n, or a product of n, is off by (n + 8) T tau u "
-    "in each backend, T tau < 1"
-)
-
-
-@dataclass(frozen=True)
-class Bundle:
-    """Samples of R rays, of which each has `counts` [R]."""
-
-    sigma: Tensor
-    values: Tensor
-    t: Tensor
-    delta: Tensor
-    counts: Tensor
-
-    def apply(self, change: Callable[[Tensor], Tensor]) -> Bundle:
-        """The bundle with all numbers of samples changed."""
-        return replace(self, **{name: change(getattr(self, name)) for name in PER_SAMPLE})
-
-    @property
-    def intervals(self) -> Intervals:
-        """Where the samples lie."""
-        return Intervals(self.t, self.delta, pad(self.counts.cumsum(0), (1, 0)))
-
-    def composite(self, backend: str, carry: Pixels | None = None, stop: float = 0.0) -> Pixels:
-        """The pixels of the rays, without a background."""
-        given = self.sigma, self.values, self.intervals
-        return composite(*given, stop=stop, carry=carry, backend=backend)
-
-    def to(self, device: str) -> Bundle:
-        """The bundle on another device."""
-        return replace(self.apply(lambda x: x.to(device)), counts=self.counts.to(device))
-
-
-PER_SAMPLE = ("sigma", "values", "t", "delta")
+"""Inputs of an agreement, see `_given`."""
 
 EXTREMES = {
     "density 0": (0.0, 0.1),
@@ -123,95 +71,41 @@ RAY = (
     "a weight has 4 roundings, what is in front 1, a sum of n in pairs log2 n: (8 + log2 n) u; in "
     "fp64, where nothing wider is there to sum thicknesses in, n u more"
 )
+LIGHT = (
+    "a transmittance T = exp(-tau), tau a sum of n, or a product of n, is off by (n + 8) T tau u "
+    "in each backend, T tau < 1"
+)
+SUM = f"{LIGHT}, and so are the weights together; adding them up, n u more: 4 (n + 8) u"
+OF_A_WEIGHT = f"{LIGHT}; a weight is at most tau_i T: 2 (n + 8) min(tau_i, 1) u"
 
 
-def cases() -> list[Case]:
-    """Agreements; one extreme sample among ordinary ones; sums of weights on long rays."""
-    pixels = Property(
-        "composite",
-        "pixels are those of the closed form",
-        "8 samples: a weight has 4 roundings, thickness in front and sum 9; values up to 2: 32 u",
-        on_backends(32, "fp64", "fp16", "bf16"),
-    )
-    gradients = Property(
-        "composite backward",
-        "gradients are finite and those of the closed form",
-        "as of a pixel, by the length of the sample; behind it, as many again: 64 u",
-        on_backends(64, "fp64"),
-    )
-    found = _agreements()
-    for name, extreme in EXTREMES.items():
-        found.append(pixels.case(name, partial(_pixel_error, extreme)))
-        found.append(gradients.case(name, partial(_gradient_error, extreme)))
-    for count in LENGTHS:
-        units = 8 + math.log2(count)
-        light = Property(
-            "transmittance",
-            "weights and what is left add up to 1",
-            RAY,
-            on_backends(units) | {("reference", "fp64"): (units + count) * 2**-53},
-        )
-        for kind in ("thin", "opaque", "alternating"):
-            name = f"{count:,} samples, {kind}"
-            found.append(light.case(name, partial(_light_error, count, kind)))
-    return found
-
-
-def _agreements() -> list[Case]:
-    found = []
-    for name, kind in KINDS.items():
-        for operation in (COMPOSITE, WEIGHTS, VISIBLE):
-            found += operation.cases(name, partial(_given, kind))
-    return [*found, *COMPOSITE.cases("64 samples a ray", partial(_given, TIMED), items=1 << 18)]
-
-
-def _given(kind: Kind) -> Given:
-    generator = torch.Generator().manual_seed(kind.rays + kind.most)
-    rays, channels = kind.rays, kind.channels
-    draw = partial(torch.rand, generator=generator)
-    counts = torch.randint(0, kind.most + 1, (rays,), generator=generator)
-    if kind == Kind(rays, kind.most):
-        counts[: rays // 2] = kind.most  # make sure that longest rays occur
-    total = int(counts.sum())
-    alpha = draw(rays)
-    carry = Pixels(alpha[:, None].expand(rays, channels), DEPTH * alpha, alpha)
-    return {
-        "sigma": kind.density * draw(total),
-        "values": draw(total, channels),
-        "t": DEPTH * draw(total),
-        "delta": DEPTH / max(kind.most, 1) * draw(total),
-        "counts": counts,
-        "carry": carry if kind.carry else None,
-        "kind": kind,
-    }
-
-
-def _bundle(given: Given) -> Bundle:
-    return Bundle(*(given[name] for name in (*PER_SAMPLE, "counts")))
+def _intervals(given: Given) -> Intervals:
+    return Intervals(given["t"], given["delta"], pad(given["counts"].cumsum(0), (1, 0)))
 
 
 def _composite(given: Given, backend: str) -> tuple[Tensor, ...]:
-    pixels = _bundle(given).composite(backend, given["carry"], given["kind"].stop)
+    how = {"stop": given["stop"], "carry": given["carry"], "backend": backend}
+    pixels = composite(given["sigma"], given["values"], _intervals(given), **how)
     return pixels.values, pixels.depth_sum, pixels.alpha
 
 
 def _lit(given: Given, backend: str) -> dict[str, Any]:
     """The optional arguments of `weights` and `visible`."""
     front = None if given["carry"] is None else 1 - given["carry"].alpha
-    return {"stop": given["kind"].stop, "front": front, "backend": backend}
+    return {"stop": given["stop"], "front": front, "backend": backend}
 
 
 def _weights(given: Given, backend: str) -> tuple[Tensor]:
-    return (weights(given["sigma"], _bundle(given).intervals, **_lit(given, backend)),)
+    return (weights(given["sigma"], _intervals(given), **_lit(given, backend)),)
 
 
 def _visible(given: Given, backend: str) -> tuple[Tensor, ...]:
-    return visible(given["sigma"], _bundle(given).intervals, **_lit(given, backend))
+    return visible(given["sigma"], _intervals(given), **_lit(given, backend))
 
 
 def _roundings(given: Given) -> float:
     """Those of a transmittance in both backends: 2 (n + 8) u."""
-    return 2 * (given["kind"].most + 8) * U32
+    return 2 * (int(given["counts"].max()) + 8 if len(given["counts"]) else 8) * U32
 
 
 def _of_weights(given: Given) -> Tensor:
@@ -219,13 +113,10 @@ def _of_weights(given: Given) -> Tensor:
 
 
 def _of_sigma(given: Given) -> Tensor:
-    channels = given["kind"].channels
+    channels = given["values"].shape[1]
     gain = channels + DEPTH + 1
     return given["delta"] * gain * (2 * _roundings(given) + 2 * (channels + 2) * U32)
 
-
-SUM = f"{LIGHT}, and so are the weights together; adding them up, n u more: 4 (n + 8) u"
-OF_A_WEIGHT = f"{LIGHT}; a weight is at most tau_i T: 2 (n + 8) min(tau_i, 1) u"
 
 COMPOSITE = Operation(
     "composite",
@@ -259,14 +150,83 @@ VISIBLE = Operation(
 )
 
 
-def _samples(extreme: tuple[float, float]) -> Bundle:
-    """One ray of 8 samples, the fourth `extreme`, in float64."""
-    sigma, delta = torch.full((8,), 2.0), torch.full((8,), 0.1)
-    sigma, delta = sigma.double(), delta.double()
+def cases() -> list[Case]:
+    """Agreements; one extreme sample among ordinary ones; sums of weights on long rays."""
+    pixels = Property(
+        "composite",
+        "pixels are those of the closed form",
+        "8 samples: a weight has 4 roundings, thickness in front and sum 9; values up to 2: 32 u",
+        on_backends(32, "fp64", "fp16", "bf16"),
+    )
+    gradients = Property(
+        "composite backward",
+        "gradients are finite and those of the closed form",
+        "as of a pixel, by the length of the sample; behind it, as many again: 64 u",
+        on_backends(64, "fp64"),
+    )
+    many = partial(_given, rays=1 << 12, most=64)
+    found = COMPOSITE.cases("64 samples a ray", many, items=1 << 18)
+    for name, options in KINDS.items():
+        for operation in (COMPOSITE, WEIGHTS, VISIBLE):
+            found += operation.cases(name, partial(_given, **options))
+    for name, extreme in EXTREMES.items():
+        found.append(pixels.case(name, partial(_pixel_error, extreme)))
+        found.append(gradients.case(name, partial(_gradient_error, extreme)))
+    for count in LENGTHS:
+        units = 8 + math.log2(count)
+        light = Property(
+            "transmittance",
+            "weights and what is left add up to 1",
+            RAY,
+            on_backends(units) | {("reference", "fp64"): (units + count) * 2**-53},
+        )
+        for kind in ("thin", "opaque", "alternating"):
+            name = f"{count:,} samples, {kind}"
+            found.append(light.case(name, partial(_light_error, count, kind)))
+    return found
+
+
+def _given(
+    rays: int = 33,
+    most: int = 20,
+    channels: int = 3,
+    density: float = 2.0,
+    carry: bool = False,
+    stop: float = 0.0,
+) -> Given:
+    """`rays` of up to `most` samples, which every second one has."""
+    generator = torch.Generator().manual_seed(rays + most)
+    draw = partial(torch.rand, generator=generator)
+    counts = torch.randint(0, most + 1, (rays,), generator=generator)
+    counts[: rays // 2] = most
+    total, alpha = int(counts.sum()), draw(rays)
+    front = Pixels(alpha[:, None].expand(rays, channels), DEPTH * alpha, alpha)
+    return {
+        "sigma": density * draw(total),
+        "values": draw(total, channels),
+        "t": DEPTH * draw(total),
+        "delta": DEPTH / max(most, 1) * draw(total),
+        "counts": counts,
+        "carry": front if carry else None,
+        "stop": stop,
+    }
+
+
+def _ray(sigma: Tensor, delta: Tensor, values: Tensor, t: Tensor, dtype: torch.dtype) -> Given:
+    """Samples of a single ray."""
+    samples = {"sigma": sigma, "values": values, "t": t, "delta": delta}
+    counts = torch.tensor([len(sigma)])
+    rounded = {name: x.to(dtype) for name, x in samples.items()}
+    return rounded | {"counts": counts, "carry": None, "stop": 0.0}
+
+
+def _extreme(extreme: tuple[float, float], precision: str) -> Given:
+    """One ray of 8 samples, the fourth `extreme`."""
+    sigma, delta = torch.full((2, 8), 2.0, dtype=torch.float64)
+    delta[:] = 0.1
     sigma[3], delta[3] = extreme
-    values = torch.linspace(0, 1, 24).view(8, 3).flip(0).double()
-    t = torch.linspace(0, 2, 8).double()
-    return Bundle(sigma, values, t, delta, torch.tensor([8]))
+    values, t = torch.linspace(0, 1, 24).view(8, 3).flip(0), torch.linspace(0, 2, 8)
+    return _ray(sigma, delta, values, t, DTYPES[precision])
 
 
 def _exact_weights(sigma: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
@@ -278,48 +238,40 @@ def _exact_weights(sigma: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _pixel_error(extreme: tuple[float, float], backend: str, device: str, precision: str) -> float:
-    samples = _samples(extreme).apply(lambda x: x.to(DTYPES[precision]))
-    pixels = samples.to(device).composite(backend)
-    exact = samples.apply(Tensor.double)
-    weights, _ = _exact_weights(exact.sigma, exact.delta)
-    want = (weights @ exact.values)[None], (weights @ exact.t)[None], weights.sum()[None]
-    return largest_error(_cpu(pixels), want)
+    given = _extreme(extreme, precision)
+    pixels = _composite(placed(given, device), backend)
+    sigma, values, t, delta = (given[name].double() for name in ("sigma", "values", "t", "delta"))
+    weights, _ = _exact_weights(sigma, delta)
+    want = (weights @ values)[None], (weights @ t)[None], weights.sum()[None]
+    return largest_error([x.cpu() for x in pixels], want)
 
 
 def _gradient_error(
     extreme: tuple[float, float], backend: str, device: str, precision: str
 ) -> float:
     """Error of the gradient of the sum of all outputs by sigma, over the sample's length."""
-    samples = _samples(extreme).apply(lambda x: x.to(DTYPES[precision])).to(device)
-    sigma, values = samples.sigma.requires_grad_(), samples.values.requires_grad_()
-    pixels = samples.composite(backend)
-    total = pixels.values.sum() + pixels.depth_sum.sum() + pixels.alpha.sum()
-    got_sigma, got_values = torch.autograd.grad(total, (sigma, values))
+    given = _extreme(extreme, precision)
+    there = placed(given, device)
+    learned = [there[name].requires_grad_() for name in ("sigma", "values")]
+    total = sum(x.sum() for x in _composite(there, backend))
+    assert isinstance(total, Tensor)
+    got_sigma, got_values = (x.cpu() for x in torch.autograd.grad(total, learned))
 
-    exact = samples.apply(lambda x: x.detach().cpu().double())
-    delta = exact.delta
-    weights, behind = _exact_weights(exact.sigma, delta)
-    gain = exact.values.sum(dim=1) + exact.t + 1
+    sigma, values, t, delta = (given[name].double() for name in ("sigma", "values", "t", "delta"))
+    weights, behind = _exact_weights(sigma, delta)
+    gain = values.sum(dim=1) + t + 1
     later = (weights * gain).flip(0).cumsum(0).flip(0) - weights * gain
     length = torch.where(delta > 0, delta, 1)
     want_sigma = torch.where(delta > 0, behind * gain - later, 0)
     want_values = weights[:, None].expand(8, 3)
-    return largest_error(
-        (got_sigma.cpu().double() / length, got_values.cpu()), (want_sigma, want_values)
-    )
+    return largest_error((got_sigma.double() / length, got_values), (want_sigma, want_values))
 
 
 def _light_error(count: int, kind: str, backend: str, device: str, precision: str) -> float:
     """|sum of weights + exact transmittance of the ray - 1|."""
     tau = {"thin": [1e-4], "opaque": [50.0], "alternating": [1e-4, 0.0, 1e-2, 1e-30]}[kind]
-    delta = torch.tensor(tau, dtype=DTYPES[precision]).repeat(-(-count // len(tau)))[:count]
-    ones = torch.ones(count, dtype=delta.dtype, device=device)
-    samples = Bundle(ones, ones[:, None], ones, delta.to(device), torch.tensor([count]).to(device))
-    pixels = samples.composite(backend)
-    left = math.exp(-math.fsum(delta.double().tolist()))
-    sums = (pixels.values[0, 0], pixels.depth_sum[0], pixels.alpha[0])
-    return max(abs(x.double().item() + left - 1) for x in sums)
-
-
-def _cpu(pixels: Pixels) -> tuple[Tensor, ...]:
-    return tuple(x.detach().cpu() for x in (pixels.values, pixels.depth_sum, pixels.alpha))
+    delta, ones = torch.tensor(tau).repeat(-(-count // len(tau)))[:count], torch.ones(count)
+    given = _ray(ones, delta, ones[:, None], ones, DTYPES[precision])
+    left = math.exp(-math.fsum(given["delta"].double().tolist()))
+    sums = torch.cat([x.flatten() for x in _composite(placed(given, device), backend)])
+    return (sums.double() + left - 1).abs().max().item()

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from bench.types import check_shape
 from methods.kernels.dispatch import implementation
+from methods.kernels.types import expect
 
 CORNERS = 8
 
@@ -51,10 +52,8 @@ def corner_gather(
             table = table.detach().requires_grad_()  # otherwise there is no backward pass
     if len(voxel) and voxel.device.type == "cpu":  # on a GPU the check would wait
         low, high = (int(end) for end in torch.aminmax(voxel))
-        if not 0 <= low <= high < len(corners):
-            raise ValueError(
-                f"voxel: expected rows of the {len(corners)} voxels, got {low} to {high}"
-            )
+        rows, found = f"rows of the {len(corners)} voxels", f"{low} to {high}"
+        expect(0 <= low <= high < len(corners), "voxel", rows, found)
     return implementation(__name__, backend, table.device).corner_gather(
         table, corners, voxel, weights, grad_buffer=grad_buffer
     )

@@ -134,8 +134,7 @@ def collect(features: Tensor, positions: Tensor, gradients: SampleGradients) -> 
     """The `features` [N, levels * F] that `encode` computed at `positions` [N, 3] without a
     gradient, as part of the graph: the backward pass adds their gradient to `gradients`."""
     asking = torch.empty(0, device=features.device, requires_grad=True)
-    collected: Tensor = _Collect.apply(features, asking, positions, gradients)
-    return collected
+    return _Collect.apply(features, asking, positions, gradients)
 
 
 def encode(

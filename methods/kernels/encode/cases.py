@@ -188,32 +188,25 @@ def _corners(position: list[float], grid: HashGrid, level: int) -> list[tuple[in
     found = []
     for bits in itertools.product((0, 1), repeat=3):
         x, y, z = (math.floor(p) + bit for p, bit in zip(places, bits, strict=True))
-        weight = math.prod(
-            p - math.floor(p) if bit else 1 - (p - math.floor(p))
-            for p, bit in zip(places, bits, strict=True)
-        )
-        if grid.dense[level]:
-            res = grid.resolutions[level]
-            index = (x + y * res + z * res * res) % grid.sizes[level]
-        else:
-            index = x ^ y * PRIMES[1] % 2**32 ^ z * PRIMES[2] % 2**32
-            index %= grid.sizes[level]
+        weight = math.prod(p % 1 if bit else 1 - p % 1 for p, bit in zip(places, bits, strict=True))
+        res, size = grid.resolutions[level], grid.sizes[level]
+        dense = x + y * res + z * res * res
+        hashed = x ^ y * PRIMES[1] % 2**32 ^ z * PRIMES[2] % 2**32
+        index = (dense if grid.dense[level] else hashed) % size
         found.append((grid.offsets[level] + index, weight))
     return found
 
 
 def _exact(positions: Tensor, grid: HashGrid) -> Tensor:
-    return torch.tensor(
+    rows = [
         [
-            [
-                math.fsum(w * _value(e, f) for e, w in _corners(position, grid, level))
-                for level in range(grid.levels)
-                for f in range(grid.features)
-            ]
-            for position in positions.double().clamp(0, 1).tolist()
-        ],
-        dtype=torch.float64,
-    )
+            math.fsum(w * _value(e, f) for e, w in _corners(position, grid, level))
+            for level in range(grid.levels)
+            for f in range(grid.features)
+        ]
+        for position in positions.double().clamp(0, 1).tolist()
+    ]
+    return torch.tensor(rows, dtype=torch.float64)
 
 
 def _table() -> Tensor:

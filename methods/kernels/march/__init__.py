@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from bench.types import Rays, check_shape
 from methods.kernels.dispatch import implementation
-from methods.kernels.types import Extent, Occupancy, Samples
+from methods.kernels.types import Extent, Occupancy, Samples, check_rays, expect
 
 MAX_SAMPLES = 1024
 """Most samples of a ray through the unit cube at the usual step, sqrt(3) / 1024."""
@@ -68,14 +68,12 @@ def march(
         start: [R] int32 first step, from `Samples.resume` of an earlier call with the same rays;
             negative: no samples; None: 0.
         limit: maximum number of samples per ray; None: all.
-        extent: how many samples there are, from `extents` or `sample_counts`; with it, the host
-            does not wait for a GPU.
+        extent: how many samples there are, from `extents`; with it, the host does not wait for a
+            GPU.
     """
     segments = _segments(rays, step, window, jitter, start)
-    if limit is None:
-        limit = longest_ray(step)
-    if limit < 1:
-        raise ValueError(f"limit: expected 1 or more, got {limit}")
+    limit = longest_ray(step) if limit is None else limit
+    expect(limit >= 1, "limit", "1 or more", limit)
     kernel = implementation(__name__, backend, rays.origins.device)
     return kernel.march(segments, occupancy, step, limit, extent)
 
@@ -93,25 +91,9 @@ def extents(
 
     The host waits for a GPU, once.
     """
-    counts = sample_counts(rays, occupancy, step, window=window, backend=backend)
+    segments = _segments(rays, step, window, None, None)
+    counts = implementation(__name__, backend, rays.origins.device).count(segments, occupancy, step)
     return Extent.of_each(functional.pad(counts, (0, -len(counts) % size)).view(-1, size))
-
-
-def sample_counts(
-    rays: Rays,
-    occupancy: Occupancy,
-    step: float,
-    *,
-    window: Tensor | None = None,
-    jitter: Tensor | None = None,
-    start: Tensor | None = None,
-    backend: str = "auto",
-) -> Tensor:
-    """How many samples `march` finds for each of R `rays`: [R] int64."""
-    segments = _segments(rays, step, window, jitter, start)
-    kernel = implementation(__name__, backend, rays.origins.device)
-    counts: Tensor = kernel.count(segments, occupancy, step)
-    return counts
 
 
 def longest_ray(step: float) -> int:
@@ -123,9 +105,7 @@ def _segments(
     rays: Rays, step: float, window: Tensor | None, jitter: Tensor | None, start: Tensor | None
 ) -> Segments:
     """Check the arguments of `march` and fill in defaults."""
-    origins, count = rays.origins, len(rays.origins)
-    check_shape("origins", origins, None, 3)
-    check_shape("directions", rays.directions, count, 3)
+    origins, count = rays.origins, check_rays(rays)
     if window is None:
         ends = origins.new_zeros(()), origins.new_full((), torch.inf)
         window = torch.stack(ends).expand(count, 2)
@@ -136,6 +116,5 @@ def _segments(
     check_shape("window", window, count, 2)
     check_shape("jitter", jitter, count)
     check_shape("start", start, count)
-    if not step > 0:
-        raise ValueError(f"step: expected a positive length, got {step}")
+    expect(step > 0, "step", "a positive length", step)
     return Segments(rays, window, jitter, start)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from bench.case import DTYPES, U32, Bound, Case, Given, Operation, Property
+from bench.case import DTYPES, U32, Bound, Case, Given, Operation, Property, placed
 from bench.types import Rays
 from methods.kernels.dispatch import served
 from methods.kernels.march import MAX_SAMPLES, march
@@ -21,13 +21,116 @@ STEP = math.sqrt(3) / MAX_SAMPLES
 LONG = 4 * STEP  # for agreement: Triton's interpreter takes milliseconds per step
 AXES = torch.cat((torch.eye(3), -torch.eye(3)))
 ALL = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * 3)  # [27, 3], one is 0
+SOME = ALL[ALL.any(dim=1)]
 
 SIZE = 16
-CELL = (3, 12, 8)
+CELL = torch.tensor([3, 12, 8])
 """The only occupied cell of a grid."""
 
 FINE = 1e-4
 """A step at which a ray has more than `MAX_SAMPLES` samples."""
+
+
+def some_rays(count: int, away: float = 1.5) -> Rays:
+    """Rays towards the cube from a sphere around it, every fourth from inside."""
+    generator = torch.Generator().manual_seed(count)
+    outside = normalize(torch.randn(count, 3, generator=generator), dim=-1) * away + 0.5
+    inside = torch.rand(count, 3, generator=generator)
+    origins = torch.where(torch.arange(count)[:, None] % 4 == 3, inside, outside)
+    return Rays(origins, torch.rand(count, 3, generator=generator) - origins)
+
+
+def special_rays() -> Rays:
+    """Rays along axes, diagonals, grid planes, through corners, without direction, not finite."""
+    targets = torch.tensor([[0.5, 0.5, 0.5], [0.0, 0.0, 0.0], [1.0, 1.0, 0.5], [0.25, 0.3, 0.75]])
+    far = targets[:, None] - 2 * ALL
+    near = targets[:, None].expand_as(far)
+    bad = torch.tensor(
+        [[torch.nan, 0.5, 0.5], [0.5, torch.inf, 0.5], [0.5, 0.5, -1e30], [0.5, 0.5, 0.5]]
+    )
+    ahead = ALL.expand(4, 27, 3).reshape(-1, 3)
+    last = torch.tensor([[1.0, 1.0, 1.0]] * 3 + [[torch.nan, 1.0, 1.0]])
+    origins = torch.cat((far.reshape(-1, 3), near.reshape(-1, 3), bad))
+    return Rays(origins, torch.cat((ahead, ahead, last)))
+
+
+MIDDLE = torch.full((3,), 0.5)
+SPECIAL = {
+    "along axes": Rays(MIDDLE - 2 * AXES, AXES),
+    "along diagonals": Rays(MIDDLE - 2 * SOME, SOME),
+    "in planes of the grid": Rays(torch.tensor([[-1.0, 0.25, 0.5]]), AXES[:1]),
+    "through a corner of the cube": Rays(-2 * SOME, SOME),
+    "through an edge of the cube": Rays(torch.tensor([0.0, 0.0, 0.5]) - 2 * SOME, SOME),
+    "from inside": Rays(MIDDLE.expand(26, 3), SOME),
+    "from a face": Rays(torch.tensor([0.0, 0.5, 0.5]).expand(26, 3), SOME),
+    "from a corner": Rays(torch.zeros(26, 3), SOME),
+    "away from the cube": Rays(MIDDLE + 2 * AXES, AXES),
+    "past the cube": Rays(MIDDLE - 2 * AXES + 3 * AXES.roll(1, dims=1), AXES),
+    "without direction": Rays(MIDDLE.expand(1, 3), torch.zeros(1, 3)),
+    "from 1e6 away": Rays(MIDDLE - 1e6 * SOME, SOME),
+    "of direction 1e-30": Rays(MIDDLE - 2 * SOME, 1e-30 * SOME),
+    "of direction 1e-40": Rays(MIDDLE - 2 * SOME, 1e-40 * SOME),
+    "from inside, of direction 1e-40": Rays(MIDDLE.expand(26, 3), 1e-40 * SOME),
+    "of direction 1e30": Rays(MIDDLE - 2 * SOME, 1e30 * SOME),
+    "of directions 1 and 1e-40": Rays(
+        MIDDLE + 0.01 - 2 * AXES, AXES + 1e-40 * AXES.roll(1, dims=1)
+    ),
+    "along an edge, off it by 1e-40": Rays(torch.zeros(6, 3), AXES.abs() + 1e-40),
+    "along an edge, off it by 1e-30": Rays(torch.zeros(6, 3), AXES.abs() + 1e-30),
+}
+
+
+def cells(kind: str, size: int) -> Tensor:
+    """Some cells [G, G, G] of a grid of G = `size`: none, all, one at its border, a hollow sphere,
+    or at random."""
+    axis = (torch.arange(size) + 0.5) / size - 0.5
+    radius = (axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2).sqrt()
+    drawn = torch.rand(size, size, size, generator=torch.Generator().manual_seed(3))
+    one = torch.zeros(size, size, size, dtype=torch.bool)
+    one[size - 1, 0, size // 2] = True
+    return {
+        "empty": radius < 0,
+        "full": radius >= 0,
+        "one": one,
+        "shell": (radius > 0.27) & (radius < 0.3),
+        "porous shell": (radius > 0.27) & (radius < 0.4) & (drawn < 0.5),
+        "dust": drawn < 0.03,
+    }[kind]
+
+
+def slab_lengths(rays: Rays, lower: Tensor, upper: Tensor) -> Tensor:
+    """World length [R, V] of rays in boxes from `lower` to `upper` [V, 3] (slab test, float64); 0
+    where t overflows in the type of the rays."""
+    lower, upper = lower.double(), upper.double()
+    o, d = rays.origins.cpu().double()[:, None], rays.directions.cpu().double()[:, None]
+    a, b = (lower - o) / d, (upper - o) / d  # [R, V, 3]
+    moves = (d != 0).expand_as(a)
+    enter = torch.where(moves, torch.minimum(a, b), -torch.inf).amax(dim=2).clamp(min=0)
+    leave = torch.where(moves, torch.maximum(a, b), torch.inf).amin(dim=2)
+    between = (moves | (o >= lower) & (o < upper)).all(dim=2)
+    largest = torch.finfo(rays.origins.dtype).max
+    known = (o.abs().amax(dim=2) + 1) / d.abs().amax(dim=2) < largest
+    length = (leave - enter).clamp(min=0) * d.norm(dim=2)
+    return torch.where(between & known, length, 0)
+
+
+OUTPUTS = ("offsets", "ray", "t", "delta", "positions", "resume")
+
+
+@cache
+def _occupancy(kind: str, device: torch.device) -> Occupancy:
+    return Occupancy(cells(kind, 128 if kind == "shell" else 32).to(device))
+
+
+def _march(given: Given, backend: str) -> tuple[Tensor, ...]:
+    rays, how = given["rays"], given["how"]
+    occupancy = _occupancy(given["grid"], rays.origins.device)
+    samples = march(rays, occupancy, **how, backend=backend)
+    return tuple(getattr(samples, name) for name in OUTPUTS)
+
+
+EQUAL = Bound("the same operations in the same order: 0", 0.0)
+MARCH = Operation("march", served(__package__), _march, dict.fromkeys(OUTPUTS, EQUAL))
 
 
 def cases() -> list[Case]:
@@ -41,113 +144,41 @@ def _agreements() -> list[Case]:
     near = torch.rand(129, generator=generator)
     everywhere = torch.tensor([-torch.inf, torch.inf]).expand(129, 2)
     start = torch.randint(-1, 100, (129,), generator=generator).int()
-    kinds: list[tuple[str, Rays, str, dict[str, Any]]] = [
-        ("no ray", _rays(0), "dust", {}),
-        ("one ray", _rays(1), "dust", {}),
-        ("inside and outside", _rays(129), "dust", {}),
-        ("jitter", _rays(129), "dust", {"jitter": torch.rand(129, generator=generator)}),
-        ("window", _rays(129), "dust", {"window": torch.stack((near, near + 0.5), dim=1)}),
-        ("window without bounds", _rays(129), "dust", {"window": everywhere}),
-        ("resumed", _rays(129), "dust", {"start": start}),
-        ("limit 1", _rays(129), "dust", {"limit": 1}),
-        ("limit 7", _rays(129), "dust", {"limit": 7}),
-        ("empty grid", _rays(65), "empty", {}),
-        ("full grid", _rays(65), "full", {}),
-        ("one cell", _rays(65), "cell", {}),
-        ("axes, planes and corners", _special_rays(), "dust", {}),
-    ]
+    kinds: dict[str, tuple[Rays, str, dict[str, Any]]] = {
+        "no ray": (some_rays(0), "dust", {}),
+        "one ray": (some_rays(1), "dust", {}),
+        "inside and outside": (some_rays(129), "dust", {}),
+        "jitter": (some_rays(129), "dust", {"jitter": torch.rand(129, generator=generator)}),
+        "window": (some_rays(129), "dust", {"window": torch.stack((near, near + 0.5), dim=1)}),
+        "window without bounds": (some_rays(129), "dust", {"window": everywhere}),
+        "resumed": (some_rays(129), "dust", {"start": start}),
+        "limit 1": (some_rays(129), "dust", {"limit": 1}),
+        "limit 7": (some_rays(129), "dust", {"limit": 7}),
+        "empty grid": (some_rays(65), "empty", {}),
+        "full grid": (some_rays(65), "full", {}),
+        "one cell": (some_rays(65), "one", {}),
+        "axes, planes, corners and what is not finite": (special_rays(), "dust", {}),
+    }
     found = []
-    for name, rays, grid, options in kinds:
-        given = {"rays": rays, "grid": grid, "step": LONG, "options": options}
+    for name, (rays, grid, options) in kinds.items():
+        given = {"rays": rays, "grid": grid, "how": {"step": LONG} | options}
         found += MARCH.cases(name, partial(dict, given))
-    timed = {"rays": _rays(1 << 13), "grid": "shell", "step": STEP, "options": {}}
-    return [*found, *MARCH.cases("hollow sphere", partial(dict, timed), items=1 << 13)]
-
-
-def _march(given: Given, backend: str) -> tuple[Tensor, ...]:
-    rays = given["rays"]
-    grid = _grid(given["grid"], rays.origins.device)
-    samples = march(rays, grid, given["step"], backend=backend, **given["options"])
-    return tuple(getattr(samples, name) for name in OUTPUTS)
-
-
-OUTPUTS = ("offsets", "ray", "t", "delta", "positions", "resume")
-EQUAL = Bound("the same operations in the same order: 0", 0.0)
-MARCH = Operation("march", served(__package__), _march, dict.fromkeys(OUTPUTS, EQUAL))
-
-
-@cache
-def _grid(kind: str, device: torch.device) -> Occupancy:
-    size = 128 if kind == "shell" else 32
-    axis = (torch.arange(size) + 0.5) / size - 0.5
-    radius = (axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2).sqrt()
-    cells = {
-        "empty": radius < 0,
-        "full": radius >= 0,
-        "cell": torch.zeros(size, size, size, dtype=torch.bool),
-        "shell": (radius > 0.27) & (radius < 0.3),
-        "dust": torch.rand(size, size, size, generator=torch.Generator().manual_seed(3)) < 0.02,
-    }[kind]
-    if kind == "cell":
-        cells[size - 1, 0, size // 2] = True
-    return Occupancy(cells.to(device))
-
-
-def _rays(count: int) -> Rays:
-    """Rays towards the cube from a sphere around it, every fourth from inside."""
-    generator = torch.Generator().manual_seed(count)
-    outside = normalize(torch.randn(count, 3, generator=generator), dim=-1) * 1.5 + 0.5
-    inside = torch.rand(count, 3, generator=generator)
-    origins = torch.where(torch.arange(count)[:, None] % 4 == 3, inside, outside)
-    return Rays(origins, torch.rand(count, 3, generator=generator) - origins)
-
-
-def _special_rays() -> Rays:
-    """Rays along axes, diagonals, grid planes, through corners, without direction, not finite."""
-    targets = torch.tensor([[0.5, 0.5, 0.5], [0.0, 0.0, 0.0], [1.0, 1.0, 0.5], [0.25, 0.3, 0.75]])
-    far = targets[:, None] - 2 * ALL
-    near = targets[:, None].expand_as(far)
-    bad = torch.tensor([[torch.nan, 0.5, 0.5], [0.5, torch.inf, 0.5], [0.5, 0.5, -1e30]])
-    origins = torch.cat((far.reshape(-1, 3), near.reshape(-1, 3), bad))
-    ahead = ALL.expand(4, 27, 3).reshape(-1, 3)
-    return Rays(origins, torch.cat((ahead, ahead, torch.ones(3, 3))))
+    many = {"rays": some_rays(1 << 13), "grid": "shell", "how": {"step": STEP}}
+    return [*found, *MARCH.cases("hollow sphere", partial(dict, many), items=1 << 13)]
 
 
 def _ways() -> list[Case]:
     """Every kind of ray through a full grid, an empty one, and one with a single cell."""
-    some = ALL[ALL.any(dim=1)]
-    middle, corner, far = torch.full((3,), 0.5), torch.zeros(3), 1e6
-    kinds: dict[str, tuple[Tensor, Tensor]] = {
-        "along axes": (middle - 2 * AXES, AXES),
-        "along diagonals": (middle - 2 * some, some),
-        "in planes of the grid": (torch.tensor([[-1.0, 0.25, 0.5]]), AXES[:1]),
-        "through a corner of the cube": (corner - 2 * some, some),
-        "through an edge of the cube": (torch.tensor([0.0, 0.0, 0.5]) - 2 * some, some),
-        "from inside": (middle.expand(26, 3), some),
-        "from a face": (torch.tensor([0.0, 0.5, 0.5]).expand(26, 3), some),
-        "from a corner": (corner.expand(26, 3), some),
-        "away from the cube": (middle + 2 * AXES, AXES),
-        "past the cube": (middle - 2 * AXES + 3 * AXES.roll(1, dims=1), AXES),
-        "without direction": (middle.expand(1, 3), torch.zeros(1, 3)),
-        "from 1e6 away": (middle - far * some, some),
-        "of direction 1e-30": (middle - 2 * some, 1e-30 * some),
-        "of direction 1e-40": (middle - 2 * some, 1e-40 * some),
-        "from inside, of direction 1e-40": (middle.expand(26, 3), 1e-40 * some),
-        "of direction 1e30": (middle - 2 * some, 1e30 * some),
-        "of directions 1 and 1e-40": (middle - 2 * AXES, AXES + 1e-40 * AXES.roll(1, dims=1)),
-        "along an edge, off it by 1e-40": (corner.expand(6, 3), AXES.abs() + 1e-40),
-        "along an edge, off it by 1e-30": (corner.expand(6, 3), AXES.abs() + 1e-30),
-    }
     found = []
     for grid, holds in (
         ("full grid", "samples add up to the way through the cube, and lie on it"),
         ("one cell", "samples add up to the way through the cell, and lie on it"),
         ("empty grid", "no samples"),
     ):
-        for kind, rays in kinds.items():
+        for kind, rays in SPECIAL.items():
             if "1e6" in kind and grid == "one cell":
                 continue  # there, rounding of t is as large as the cell
-            size = rays[0].abs().max().item() + 1
+            size = rays.origins.abs().max().item() + 1
             # Sampling rounds the ends of the path: by half a step in the cube, where the first
             # sample lies half a step behind the entry; by one step in the cell, over both ends.
             steps = {"full grid": 0.5, "one cell": 1.0, "empty grid": 0.0}[grid]
@@ -158,51 +189,29 @@ def _ways() -> list[Case]:
                 f"{steps} steps, and t rounded 4 times at the size of the origin: 4 √3 |o| u",
                 {(b, "fp32"): steps * STEP + rounding for b in ("reference", "cpu")},
             )
-            found.append(way.case(f"{kind}, {grid}", partial(_way_error, grid, Rays(*rays), STEP)))
+            found.append(way.case(f"{kind}, {grid}", partial(_way_error, grid, rays, STEP)))
     rest = Property(
         "march",
         "going on from where a ray was left gives the rest of the way",
         "half a step, and t rounded 4 times at the size of the origin: 4 √3 |o| u",
         {(b, "fp32"): FINE / 2 + 12 * math.sqrt(3) * U32 for b in ("reference", "cpu")},
     )
-    diagonals = Rays(*kinds["along diagonals"])
-    error = partial(_way_error, "full grid", diagonals, FINE)
+    error = partial(_way_error, "full grid", SPECIAL["along diagonals"], FINE)
     return [*found, rest.case("1024 samples reached", error)]
 
 
-def _one_or_all(kind: str, device: str) -> Occupancy:
-    cells = torch.full((SIZE, SIZE, SIZE), kind == "full grid")
-    if kind == "one cell":
-        cells[CELL] = True
-    return Occupancy(cells.to(device))
-
-
-def _way(kind: str, rays: Rays) -> Tensor:
-    """World length of rays inside occupied cells (slab test, float64); 0 where t overflows."""
-    origins, directions = rays.origins.cpu(), rays.directions.cpu()
-    if kind == "empty grid":
-        return torch.zeros(len(origins), dtype=torch.float64)
-    lower, upper = torch.zeros(3).double(), torch.ones(3).double()
-    if kind == "one cell":
-        lower = torch.tensor(CELL).double() / SIZE
-        upper = lower + 1 / SIZE
-    o, d = origins.double(), directions.double()
-    ends = torch.stack(((lower - o) / d, (upper - o) / d))
-    between = (o >= lower) & (o < upper) | (d != 0)
-    enter = torch.where(d == 0, -torch.inf, ends.amin(0)).amax(1).clamp(min=0)
-    leave = torch.where(d == 0, torch.inf, ends.amax(0)).amin(1)
-    way = (leave - enter).clamp(min=0) * d.norm(dim=1)
-    known = (o.abs().amax(1) + 1) / d.abs().amax(1) < torch.finfo(origins.dtype).max
-    return torch.where(between.all(1) & known, way, 0)
-
-
 def _way_error(
-    grid: str, rays: Rays, step: float, backend: str, device: str, precision: str
+    grid: str, given: Rays, step: float, backend: str, device: str, precision: str
 ) -> float:
     """Error of the path length covered by the samples, found in as many calls as needed."""
-    dtype = DTYPES[precision]
-    rays = Rays(rays.origins.to(device, dtype), rays.directions.to(device, dtype))
-    occupancy, count = _one_or_all(grid, device), len(rays.origins)
+    rays, dtype = placed(given, device), DTYPES[precision]
+    rays = Rays(rays.origins.to(dtype), rays.directions.to(dtype))
+    occupied = torch.full((SIZE, SIZE, SIZE), grid == "full grid")
+    lower, upper = torch.zeros(1, 3), torch.ones(1, 3)
+    if grid == "one cell":
+        occupied[tuple(CELL)] = True
+        lower, upper = CELL[None] / SIZE, (CELL[None] + 1) / SIZE
+    occupancy, count = Occupancy(occupied.to(device)), len(rays.origins)
     start = torch.zeros(count, dtype=torch.int32, device=device)
     counts = torch.zeros(count, dtype=torch.int64, device=device)
     outside = 0.0
@@ -217,4 +226,5 @@ def _way_error(
                 return math.inf
     if (start >= 0).any():
         return math.inf
-    return max((counts.cpu() * step - _way(grid, rays)).abs().max().item(), outside)
+    way = slab_lengths(rays, lower, upper)[:, 0] * (grid != "empty grid")
+    return max((counts.cpu() * step - way).abs().max().item(), outside)

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from bench.types import Unavailable, check_shape
 from methods.kernels.dispatch import implementation
+from methods.kernels.types import expect
 
 CHANNELS = 16
 RATIOS = (1 / 4, 3 / 4, 15 / 4, 5 / 16, 15 / 16, 35 / 32, 105 / 4, 21 / 32, 7 / 16, 105 / 16)
@@ -44,10 +45,13 @@ def shade(coefficients: Tensor, directions: Tensor, *, backend: str = "auto") ->
     """
     if backend == "gpu":
         raise Unavailable("backend='gpu': shade has no such version: use backend=auto")
-    check_shape("coefficients", coefficients, len(directions), None, 3)
     check_shape("directions", directions, None, 3)
-    if coefficients.shape[1] not in SIZES:
-        raise ValueError(
-            f"coefficients: expected one of {SIZES} a colour, got {list(coefficients.shape)}"
-        )
+    check_harmonics("coefficients", coefficients, len(directions))
     return implementation(__name__, backend, directions.device).shade(coefficients, directions)
+
+
+def check_harmonics(name: str, coefficients: Tensor, count: int | None) -> None:
+    """Raise ValueError unless `coefficients` [N, C, 3] are those of whole degrees; None: any N."""
+    check_shape(name, coefficients, count, None, 3)
+    size = coefficients.shape[1]
+    expect(size in SIZES, name, f"one of {SIZES} coefficients a colour", size)

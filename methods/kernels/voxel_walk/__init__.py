@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from bench.types import Rays, check_shape
 from methods.kernels.dispatch import implementation
-from methods.kernels.types import Intervals
+from methods.kernels.types import Intervals, check_rays, expect
 
 BRICK = 8
 """Cells along the side of a brick."""
@@ -51,18 +51,14 @@ class Voxels:
     def __post_init__(self) -> None:
         coordinates, size = self.coordinates, self.resolution
         check_shape("coordinates", coordinates, None, 3)
-        if size % BRICK or not 0 < size <= MAX_RESOLUTION:
-            raise ValueError(
-                f"resolution: expected a multiple of {BRICK} from {BRICK} to {MAX_RESOLUTION}, "
-                f"got {size}"
-            )
-        if coordinates.is_floating_point():
-            raise ValueError(f"coordinates: expected integers, got {coordinates.dtype}")
-        if len(coordinates) and not 0 <= coordinates.min() <= coordinates.max() < size:
-            raise ValueError(
-                f"coordinates: expected 0 to {size - 1}, got {int(coordinates.min())} to "
-                f"{int(coordinates.max())}"
-            )
+        whole = 0 < size <= MAX_RESOLUTION and not size % BRICK
+        multiple = f"a multiple of {BRICK} from {BRICK} to {MAX_RESOLUTION}"
+        expect(whole, "resolution", multiple, size)
+        kind = coordinates.dtype
+        expect(not kind.is_floating_point, "coordinates", "integers", kind)
+        if len(coordinates):
+            low, high = (int(end) for end in torch.aminmax(coordinates))
+            expect(0 <= low <= high < size, "coordinates", f"0 to {size - 1}", f"{low} to {high}")
         if int((self.leaves >= 0).sum()) != len(coordinates):
             raise ValueError("coordinates: expected every cell once, got some of them twice")
 
@@ -179,17 +175,12 @@ def walk(
     Raises:
         ValueError: wrong shapes, a limit below 1; backend "cpu": not float32.
     """
-    origins, count = rays.origins, len(rays.origins)
-    check_shape("origins", origins, None, 3)
-    check_shape("directions", rays.directions, count, 3)
+    origins, count = rays.origins, check_rays(rays)
     if start is None:
         start = origins.new_zeros(1).expand(count)
     check_shape("start", start, count)
     most = 3 * voxels.resolution  # planes of the cube, and one cell before the first
-    if limit is None:
-        limit = most
-    if limit < 1:
-        raise ValueError(f"limit: expected 1 or more, got {limit}")
+    limit = most if limit is None else limit
+    expect(limit >= 1, "limit", "1 or more", limit)
     kernel = implementation(__name__, backend, origins.device)
-    crossings: Crossings = kernel.walk(rays, voxels, start, min(limit, most))
-    return crossings
+    return kernel.walk(rays, voxels, start, min(limit, most))

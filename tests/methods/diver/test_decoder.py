@@ -64,18 +64,3 @@ def test_rendered_rays_are_those_of_the_trained_model() -> None:
     torch.testing.assert_close(got.values, want.values.detach(), rtol=0, atol=1e-4)
     torch.testing.assert_close(got.alpha, want.alpha.detach(), rtol=0, atol=1e-4)
     assert got.alpha.max() > 0.5
-
-
-def test_an_even_medium_has_the_opacity_of_its_number_of_voxels() -> None:
-    """All corners alike: a crossing has the same integrated density, however long it is."""
-    model, rays = random_model(), some_rays(100)
-    with torch.no_grad():
-        model.table.copy_(model.table[:1].clone())
-        model.decoder.third.bias[0] = 0.05 - (
-            model.decoder.third.weight[0]
-            @ model.decoder.second(model.decoder.first(model.table[0]).relu()).relu()
-        )
-    pixels = Baked(model, "fp32").render_rays(rays, NullProbe(), stop=0.0, faint=0.0)
-    crossed = walk(rays, model.voxels).offsets.diff()
-    want = 1 - torch.exp(-0.05 * crossed)
-    torch.testing.assert_close(pixels.alpha, want, rtol=0, atol=1e-3)

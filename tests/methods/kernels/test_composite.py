@@ -91,25 +91,6 @@ def test_gradients_in_float64() -> None:
     assert torch.autograd.gradcheck(outputs, (sigma, values))
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_homogeneous_medium_has_the_opacity_of_beer_lambert(backend: str) -> None:
-    count, sigma = 100, 3.0
-    inputs = {
-        "sigma": torch.full((count,), sigma),
-        "values": torch.full((count, 1), 0.25),
-        "t": (torch.arange(count) + 0.5) / count,
-        "delta": torch.full((count,), 1 / count),
-        "offsets": torch.tensor([0, count]),
-    }
-    pixels = composite(**inputs, stop=0.0, backend=backend).over(torch.ones(1))
-    opacity = 1 - math.exp(-sigma)
-    assert pixels.alpha.item() == pytest.approx(opacity, abs=1e-5)
-    assert pixels.values.item() == pytest.approx(0.25 * opacity + 1 - opacity, abs=1e-5)
-    # integral of t sigma exp(-sigma t) over [0, 1], by the midpoint rule: error below h^2 sigma^2.
-    depth = (1 - math.exp(-sigma) * (1 + sigma)) / sigma
-    assert pixels.depth_sum.item() == pytest.approx(depth, abs=sigma**2 / count**2)
-
-
 def part(inputs: dict, index: Tensor, counts: list[int]) -> dict:
     """Only the samples at `index`, on rays of `counts`."""
     columns = {name: inputs[name][index] for name in ("sigma", "values", "t", "delta")}

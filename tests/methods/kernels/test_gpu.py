@@ -19,10 +19,9 @@ from bench.case import U32, largest_error
 from bench.types import Rays
 from methods.checks import kernels
 from methods.kernels import availability
-from methods.kernels.adam import AdamState, hash_adam_, sparse_adam_
+from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import composite, visible, weights
-from methods.kernels.encode import HashGrid, SampleGradients, encode
-from methods.kernels.encode.reference import corners
+from methods.kernels.encode import HashGrid, encode
 from methods.kernels.march import extents, march
 from methods.kernels.types import Intervals, Occupancy
 from methods.steernerf.kernels.splat import gather
@@ -178,18 +177,6 @@ def test_types_that_it_does_not_serve_are_refused() -> None:
     positions = torch.rand(2, 3, dtype=torch.float64, device=DEVICE)
     with pytest.raises(ValueError, match="expects positions of float32"):
         encode(positions, torch.rand(grid.entries, 2, device=DEVICE), grid, backend="gpu")
-
-
-def test_the_first_step_moves_the_corners_of_a_sample_by_the_rate() -> None:
-    grid = HashGrid(levels=2, log2_table=10, n_min=4, n_max=20)
-    position = torch.full((1, 3), 0.3, device=DEVICE)
-    table, gradients = torch.zeros(grid.entries, 2, device=DEVICE), SampleGradients()
-    gradients.add(position, torch.ones(1, grid.channels, device=DEVICE))
-    hash_adam_(table, gradients, grid, AdamState.like(table), 0.1, backend="gpu")
-    want = torch.zeros_like(table)
-    for level in range(grid.levels):
-        want[corners(position, grid, level)[0]] = -0.1
-    torch.testing.assert_close(table, want, rtol=16 * U32, atol=0)
 
 
 def test_a_table_that_cannot_be_changed_in_place_is_refused() -> None:

@@ -187,19 +187,6 @@ def test_the_front_of_a_ray_is_its_first_samples() -> None:
             assert torch.equal(getattr(front, name)[kept], getattr(samples, name)[whole])
 
 
-def test_words_and_bounds_describe_the_cells() -> None:
-    cells = torch.zeros(32, 32, 32, dtype=torch.bool)
-    cells[3, 17, 30] = cells[5, 20, 31] = True
-    grid = Occupancy(cells)
-    words = grid.words
-    assert words.count_nonzero() == 2
-    assert words[0, 4, 7] == 1 << (3 + 4 * 1 + 16 * 2)
-    assert words[1, 5, 7] == -(1 << 63) >> 63 << (1 + 4 * 0 + 16 * 3) & 1 << 49
-    assert torch.equal(
-        grid.bounds, torch.tensor([[3 / 32, 17 / 32, 30 / 32], [6 / 32, 21 / 32, 1.0]])
-    )
-
-
 def test_clearance_is_the_distance_to_the_nearest_brick_along_the_farthest_axis() -> None:
     cells = torch.zeros(32, 32, 32, dtype=torch.bool)
     cells[3, 17, 30] = cells[21, 20, 31] = True  # in the bricks (0, 4, 7) and (5, 5, 7)
@@ -207,14 +194,6 @@ def test_clearance_is_the_distance_to_the_nearest_brick_along_the_farthest_axis(
     apart = [(brick - torch.tensor(of)).abs().amax(dim=1) for of in ((0, 4, 7), (5, 5, 7))]
     assert torch.equal(Occupancy(cells).clearance.flatten(), torch.minimum(*apart).to(torch.uint8))
     assert (Occupancy(torch.zeros_like(cells)).clearance == 8).all()
-
-
-def test_the_last_bit_of_a_word_is_a_cell_too() -> None:
-    cells = torch.zeros(16, 16, 16, dtype=torch.bool)
-    cells[3, 3, 3] = True  # bit 63, the sign
-    origins, directions = torch.tensor([[-1.0, 3.5 / 16, 3.5 / 16]]), torch.tensor([[1.0, 0, 0]])
-    samples = march(Rays(origins, directions), Occupancy(cells), STEP, backend="cpu")
-    assert len(samples) == pytest.approx(1 / 16 / STEP, abs=1)
 
 
 def test_wrong_arguments_are_named() -> None:

@@ -16,7 +16,7 @@ from bench.types import Rays, check_shape
 from methods.kernels.composite import check_stop
 from methods.kernels.corner_gather import CORNERS
 from methods.kernels.dispatch import implementation
-from methods.kernels.types import Pixels
+from methods.kernels.types import Pixels, check_rays, expect
 from methods.kernels.voxel_walk import Crossings, Voxels
 
 
@@ -66,16 +66,10 @@ def segment_weights(
     Raises:
         ValueError: rays or voxels do not belong to the crossings; backend "cpu": not float32.
     """
-    count = len(rays.origins)
-    check_shape("origins", rays.origins, count, 3)
-    check_shape("directions", rays.directions, count, 3)
-    if len(crossings.offsets) != count + 1:
-        raise ValueError(
-            f"crossings: expected those of the {count} rays, got of {len(crossings.offsets) - 1}"
-        )
+    count, crossed = check_rays(rays), len(crossings.offsets) - 1
+    expect(crossed == count, "crossings", f"those of the {count} rays", f"of {crossed}")
     kernel = implementation(__name__, backend, rays.origins.device)
-    weights: Tensor = kernel.segment_weights(rays, crossings, voxels)
-    return weights
+    return kernel.segment_weights(rays, crossings, voxels)
 
 
 def render_segments(
@@ -104,9 +98,7 @@ def render_segments(
             no multiple of 16.
     """
     check_stop(stop)
-    count, (hidden, features) = len(rays.origins), layers.hidden.shape
-    check_shape("origins", rays.origins, count, 3)
-    check_shape("directions", rays.directions, count, 3)
+    count, (hidden, features) = check_rays(rays), layers.hidden.shape
     check_shape("rows", corners.rows, len(voxels), CORNERS)
     check_shape("table", corners.table, None, features)
     check_shape("hidden_bias", layers.hidden_bias, hidden)
@@ -117,7 +109,4 @@ def render_segments(
     check_shape("colour_bias", layers.colour_bias, 3)
     check_shape("towards", towards, count, hidden)
     kernel = implementation(__name__, backend, rays.origins.device)
-    rendered: tuple[Pixels, Tensor, Tensor] = kernel.render_segments(
-        rays, voxels, corners, layers, towards, stop, faint
-    )
-    return rendered
+    return kernel.render_segments(rays, voxels, corners, layers, towards, stop, faint)

@@ -10,7 +10,6 @@ from functools import partial
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from bench.case import (
     DTYPES,
@@ -28,6 +27,7 @@ from bench.types import Rays
 from methods.diver.kernels.segments import Corners, Layers, render_segments, segment_weights
 from methods.kernels.corner_gather import CORNERS
 from methods.kernels.dispatch import served
+from methods.kernels.march.cases import some_rays
 from methods.kernels.voxel_walk import Crossings, Voxels, walk
 
 FEATURES = HIDDEN = 32
@@ -92,7 +92,13 @@ RENDER = Operation(
 
 def cases() -> list[Case]:
     """Segments of every kind; few and many rays, both types of tables, rays that end early, NaN."""
-    return [*_weights(), *_rendered(), _nan()]
+    spoilt = Property(
+        "render_segments",
+        "a NaN among the features spoils the rays through its voxels alone",
+        "exact",
+        on_backends(0),
+    )
+    return [*_weights(), *_rendered(), spoilt.case("NaN in a corner", _nan_error)]
 
 
 def _weights() -> Iterator[Case]:
@@ -177,27 +183,19 @@ def _rendered() -> Iterator[Case]:
         ("129 rays, table of bfloat16", 129, torch.bfloat16, 0.0, 0.0),
         ("129 rays, stop and faint", 129, torch.float32, 1e-4, 1e-5),
     ):
-        yield from RENDER.cases(name, partial(_scene, SIDE, count, dtype, stop, faint))
-    many = partial(_scene, 64, 1 << 13, torch.bfloat16, 1e-2, 1e-2)
+        yield from RENDER.cases(name, partial(scene, SIDE, count, dtype, stop, faint))
+    many = partial(scene, 64, 1 << 13, torch.bfloat16, 1e-2, 1e-2)
     yield from RENDER.cases("8,192 rays in 64^3", many, items=1 << 13)
 
 
-def _scene(side: int, count: int, dtype: torch.dtype, stop: float, faint: float) -> Given:
-    voxels, corners, layers = some_scene(side, dtype)
-    rays, towards = some_rays(count)
-    given = {"rays": rays, "voxels": voxels, "corners": corners, "layers": layers}
-    return given | {"towards": towards, "stop": stop, "faint": faint}
-
-
-def some_scene(side: int, dtype: torch.dtype) -> tuple[Voxels, Corners, Layers]:
+def scene(side: int, count: int, dtype: torch.dtype, stop: float, faint: float) -> Given:
     """Every third voxel of a grid, with features from -1 to 1."""
     generator = torch.Generator().manual_seed(side)
 
     def between(low: float, high: float, *shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator) * (high - low) + low
 
-    cells = torch.cartesian_prod(*[torch.arange(side)] * 3)
-    cells = cells[torch.rand(len(cells), generator=generator) < 1 / 3].int()
+    cells = (torch.rand(side, side, side, generator=generator) < 1 / 3).nonzero().int()
     bits = torch.arange(CORNERS)[:, None] >> torch.arange(3) & 1
     vertices = cells[:, None] + bits  # [V, 8, 3]
     rows = (vertices * torch.tensor([(side + 1) ** 2, side + 1, 1])).sum(dim=2).int()
@@ -211,30 +209,20 @@ def some_scene(side: int, dtype: torch.dtype) -> tuple[Voxels, Corners, Layers]:
         between(-1, 1, 3, HIDDEN) / HIDDEN,
         between(-1, 1, 3),
     )
-    return Voxels(cells, side), Corners(rows, table), layers
-
-
-def some_rays(count: int) -> tuple[Rays, Tensor]:
-    """From all around into the cube, and what the direction of each adds."""
-    generator = torch.Generator().manual_seed(count)
-    origins = normalize(torch.randn(count, 3, generator=generator), dim=1) * 1.5 + 0.5
-    rays = Rays(origins, torch.rand(count, 3, generator=generator) - origins)
-    return rays, torch.rand(count, HIDDEN, generator=generator) - 0.5
-
-
-def _nan() -> Case:
-    kept = Property(
-        "render_segments",
-        "a NaN among the features spoils the rays through its voxels alone",
-        "exact",
-        on_backends(0),
-    )
-    return kept.case("NaN in a corner", _nan_error)
+    return {
+        "rays": some_rays(count),
+        "voxels": Voxels(cells, side),
+        "corners": Corners(rows, table),
+        "layers": layers,
+        "towards": between(-0.5, 0.5, count, HIDDEN),
+        "stop": stop,
+        "faint": faint,
+    }
 
 
 def _nan_error(backend: str, device: str, precision: str) -> float:
     """0 if it holds, else infinity."""
-    given = placed(_scene(SIDE, 129, DTYPES[precision], 0.0, 0.0), device)
+    given = placed(scene(SIDE, 129, DTYPES[precision], 0.0, 0.0), device)
     corners = given["corners"]
     whole, _, _ = render_segments(**given, backend=backend)
     row = corners.rows[len(corners.rows) // 2, 0]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -29,9 +28,6 @@ from methods.kernels.dispatch import served
 CLEAR = 1e-4
 """Minimum relative distance of every opacity, at every pixel, from a threshold of a comparison."""
 
-Drawn = tuple[Ellipses, Tensor, Tensor]
-"""Ellipses, opacities, colours."""
-
 CROWD = 600
 """Gaussians at a pixel of the cases, at most."""
 
@@ -40,56 +36,39 @@ def _off(given: Given) -> float:
     return 20 * min(len(given["opacities"]), CROWD) * U32
 
 
+def _ellipses(given: Given) -> Ellipses:
+    return Ellipses(*(given[name] for name in ("centres", "conics", "depth", "extents")))
+
+
 def _pixels(given: Given, backend: str) -> tuple[Tensor, ...]:
-    pixels = blend(**given, backend=backend)
+    rest = {name: given[name] for name in ("opacities", "colours", "width", "height", "stop")}
+    pixels = blend(_ellipses(given), **rest, backend=backend)
     return pixels.values, pixels.depth_sum, pixels.alpha
-
-
-def _blending(subject: str, light: Bound) -> Operation:
-    deep = Bound(f"depths are below 2; {light.why}", lambda given: 2 * light.of(given))
-    outputs = {"values": light, "depth sums": deep, "opacities": light}
-    return Operation(subject, served(__package__), _pixels, outputs)
 
 
 WHY = (
     "weights of at most 1 in all, each a product of n factors of 20 roundings, if n Gaussians are "
-    "at a pixel, at most 600: 20 n u"
+    "at a pixel, at most 600: 20 n u; what is behind the stop adds less than it"
 )
-BLEND = _blending("gaussian blending", Bound(WHY, _off))
-STOPPED = _blending(
-    "gaussian blending to a stop",
-    Bound(f"{WHY}; what is behind the stop adds less than it", lambda given: _off(given) + STOP),
-)
-
-
-def _gradients(given: Given, backend: str) -> tuple[Tensor, ...]:
-    """Of centres, conics, opacities and colours, in units of the largest of each kind."""
-    ellipses, rest = given["ellipses"], dict(given)
-    learned = ellipses.centres, ellipses.conics, rest["opacities"], rest["colours"]
-    centres, conics, rest["opacities"], rest["colours"] = asked = [
-        x.clone().requires_grad_() for x in learned
-    ]
-    rest["ellipses"] = replace(ellipses, centres=centres, conics=conics)
-    pixels, generator = blend(**rest, backend=backend), torch.Generator().manual_seed(2)
-    towards = [
-        torch.randn(*x.shape, generator=generator).to(x) for x in (pixels.values, pixels.alpha)
-    ]
-    grads = torch.autograd.grad((pixels.values, pixels.alpha), asked, towards)
-    return tuple(grad / grad.abs().max().clamp(min=1e-30) if len(grad) else grad for grad in grads)
-
-
-BACKWARD = Operation(
-    "gaussian blending backward",
+LIGHT = Bound(WHY, lambda given: _off(given) + given["stop"])
+BLEND = Operation(
+    "gaussian blending",
     served(__package__),
-    _gradients,
+    _pixels,
+    {
+        "values": LIGHT,
+        "depth sums": Bound(f"depths are below 2; {WHY}", lambda given: 2 * LIGHT.of(given)),
+        "opacities": LIGHT,
+    },
     dict.fromkeys(
         ("centres", "conics", "opacities", "colours"),
         Bound(
             "relative to the largest gradient of its kind; its terms, together at most some ten "
-            "times as large, are off as the weights are: 200 n u",
-            lambda given: 10 * _off(given),
+            "times as large, are off as the weights are, or behind the stop: 10 (20 n u + stop)",
+            lambda given: 10 * LIGHT.of(given),
         ),
     ),
+    relative=True,
 )
 SIZES = {
     "one pixel": (30, 1, 1, 1),
@@ -105,11 +84,10 @@ SIZES = {
 
 def cases() -> list[Case]:
     """No, some and crowded Gaussians; one alone; two in one place; a plain loop; order; stop."""
-    found = STOPPED.cases("crowded", partial(_given, *SIZES["crowded"], stop=STOP))
+    found = BLEND.cases("crowded, to a stop", partial(draw, *SIZES["crowded"], stop=STOP))
     for name, size in SIZES.items():
         items = size[0] if size[0] == 2000 else None
-        for operation in (BLEND, BACKWARD):
-            found += operation.cases(name, partial(_given, *size), items=items)
+        found += BLEND.cases(name, partial(draw, *size), items=items)
 
     def known(holds: str, why: str, units: float) -> Property:
         cells = on_backends(units, "fp64", backends=served(__package__))
@@ -124,13 +102,7 @@ def cases() -> list[Case]:
     return [*found, loop.case("13 x 9", _loop_error), hidden.case("a wall", _hidden_gradient)]
 
 
-def _given(count: int, width: int, height: int, size: int, stop: float = 0.0) -> Given:
-    ellipses, opacities, colours = draw(count, width, height, size)
-    given: dict[str, Any] = {"ellipses": ellipses, "opacities": opacities, "colours": colours}
-    return given | {"width": width, "height": height, "stop": stop}
-
-
-def draw(count: int, width: int, height: int, size: int = 1) -> Drawn:
+def draw(count: int, width: int, height: int, size: int = 1, stop: float = 0.0) -> Given:
     """Gaussians in and around a picture, one to six pixels wide, or `size` times as wide.
 
     Gaussians whose opacity at some pixel is close to a cut-off are left out, because there rounding
@@ -148,52 +120,48 @@ def draw(count: int, width: int, height: int, size: int = 1) -> Drawn:
     conics = torch.stack((variances[:, 1], -tilt, variances[:, 0]), dim=1) / area[:, None]
     opacities = 0.9 * rand(count)
     reach = 2 * (opacities / LEAST_ALPHA).clamp(min=1).log()
-    extents = (reach[:, None] * variances).sqrt()
-    ellipses = Ellipses(centres, conics, 1 + rand(count), extents)
+    drawn: dict[str, Any] = {
+        "centres": centres,
+        "conics": conics,
+        "depth": 1 + rand(count),
+        "extents": (reach[:, None] * variances).sqrt(),
+        "opacities": opacities,
+    }
     near = torch.zeros(count, dtype=torch.bool)
     for part in torch.arange(count).split(100):
-        alpha = _alphas(_take(ellipses, part), opacities[part], width, height)
+        alpha = _alphas({name: x[part] for name, x in drawn.items()}, width, height)
         near[part] = ((alpha / LEAST_ALPHA - 1).abs() < CLEAR).any(dim=0)
-    keep = (~near).nonzero().squeeze(1)
-    return _take(ellipses, keep), opacities[keep], rand(len(keep), 3)
+    drawn = {name: x[~near] for name, x in drawn.items()}
+    drawn["colours"] = rand(len(drawn["depth"]), 3)
+    return drawn | {"width": width, "height": height, "stop": stop}
 
 
-def _take(ellipses: Ellipses, index: Tensor) -> Ellipses:
-    return Ellipses(*(x[index] for x in vars(ellipses).values()))
-
-
-def _to(drawn: Drawn, device: str, dtype: torch.dtype) -> Drawn:
-    ellipses, opacities, colours = drawn
-    moved = Ellipses(*(x.to(device, dtype) for x in vars(ellipses).values()))
-    return moved, opacities.to(device, dtype), colours.to(device, dtype)
-
-
-def _alphas(ellipses: Ellipses, opacities: Tensor, width: int, height: int) -> Tensor:
+def _alphas(given: Given, width: int, height: int) -> Tensor:
     """Opacity [P, N] of each Gaussian at each pixel, in float64, without cut-offs."""
-    offset = pixel_grid(width, height).double()[:, None] - ellipses.centres.double()
-    a, b, c = ellipses.conics.double().unbind(dim=1)
+    offset = pixel_grid(width, height).double()[:, None] - given["centres"].double()
+    a, b, c = given["conics"].double().unbind(dim=1)
     x, y = offset.unbind(dim=2)
-    return opacities.double() * (-(a * x * x + 2 * b * x * y + c * y * y) / 2).exp()
+    return given["opacities"].double() * (-(a * x * x + 2 * b * x * y + c * y * y) / 2).exp()
 
 
 def _loop_error(backend: str, device: str, precision: str) -> float:
     width, height = 13, 9
-    drawn = draw(60, width, height)
-    drawn[1][0] = 1.0  # its alpha is cut
-    there = _to(drawn, device, DTYPES[precision])
-    got = blend(*there, width, height, stop=0.0, backend=backend)
-    ellipses, opacities, colours = drawn
-    alphas = _alphas(ellipses, opacities, width, height).tolist()
-    shown = torch.cat((colours, ellipses.depth[:, None], torch.ones(len(colours), 1)), dim=1)
+    given = draw(60, width, height)
+    given["opacities"][0] = 1.0  # its alpha is cut
+    dtype = DTYPES[precision]
+    there = {k: x.to(device, dtype) if isinstance(x, Tensor) else x for k, x in given.items()}
+    alphas = _alphas(given, width, height).tolist()
+    depth = given["depth"]
+    shown = torch.cat((given["colours"], depth[:, None], torch.ones(len(depth), 1)), dim=1)
     want = torch.zeros(width * height, 5, dtype=torch.float64)  # r, g, b, depth, alpha
     for pixel, row in zip(want, alphas, strict=True):
         light = 1.0
-        for i in ellipses.depth.argsort().tolist():
+        for i in depth.argsort().tolist():
             alpha = min(row[i], LARGEST_ALPHA) if row[i] >= LEAST_ALPHA else 0.0
             pixel += light * alpha * shown[i].double()
             light *= 1 - alpha
-    results = got.values.cpu(), got.depth_sum.cpu(), got.alpha.cpu()
-    return largest_error(results, (want[:, :3], want[:, 3], want[:, 4]))
+    got = [x.cpu() for x in _pixels(there, backend)]
+    return largest_error(got, (want[:, :3], want[:, 3], want[:, 4]))
 
 
 def _hidden_gradient(backend: str, device: str, precision: str) -> float:

@@ -44,9 +44,11 @@ AREA = (
 
 def _ellipses(given: Given, backend: str) -> tuple[Tensor, ...]:
     ellipses, size = project_gaussians(**given, backend=backend), given["camera"].width
-    return ellipses.centres / size, ellipses.conics, ellipses.depth, ellipses.extents / size
+    depth = ellipses.depth.detach()  # which has no gradient
+    return ellipses.centres / size, ellipses.conics, depth, ellipses.extents / size
 
 
+RELATIVE = Bound(f"relative to the largest of its kind, twice that of {AREA}", 16000 * U32)
 PROJECT = Operation(
     "gaussian projection",
     served(__package__),
@@ -57,28 +59,8 @@ PROJECT = Operation(
         "depths": Bound("10 roundings of numbers below 4, by both", 80 * U32),
         "extents": Bound("in widths of the picture, 60 roundings of numbers below 4", 480 * U32),
     },
-)
-
-
-def _gradients(given: Given, backend: str) -> tuple[Tensor, ...]:
-    """Of means, scales and rotations, in units of the largest of each kind."""
-    names = ("means", "scales", "rotations")
-    asked = {name: given[name].clone().requires_grad_() for name in names}
-    ellipses = project_gaussians(**{**given, **asked}, backend=backend)
-    results, generator = (ellipses.centres, ellipses.conics), torch.Generator().manual_seed(1)
-    towards = [torch.randn(*x.shape, generator=generator).to(x) for x in results]
-    grads = torch.autograd.grad(results, list(asked.values()), towards)
-    return tuple(grad / grad.abs().max() if len(grad) else grad for grad in grads)
-
-
-BACKWARD = Operation(
-    "gaussian projection backward",
-    served(__package__),
-    _gradients,
-    dict.fromkeys(
-        ("means", "scales", "rotations"),
-        Bound(f"relative to the largest of its kind, twice that of {AREA}", 16000 * U32),
-    ),
+    dict.fromkeys(("means", "scales", "rotations"), RELATIVE),
+    relative=True,
 )
 
 
@@ -87,8 +69,7 @@ def cases() -> list[Case]:
     found = []
     for count in (0, 1, 1000, 1 << 16):
         name, items = f"{count:,} Gaussians", count if count > 1000 else None
-        for operation in (PROJECT, BACKWARD):
-            found += operation.cases(name, partial(draw, count), items=items)
+        found += PROJECT.cases(name, partial(_given, count), items=items)
     backends = served(__package__)
     slopes = Property(
         "gaussian projection",
@@ -108,7 +89,7 @@ def cases() -> list[Case]:
     return found
 
 
-def draw(count: int) -> Given:
+def _given(count: int) -> Given:
     """Gaussians seen by `CAMERA`, one to four pixels wide, in and around its picture; an eighth of
     them are behind it."""
     generator = torch.Generator().manual_seed(count)
@@ -129,7 +110,7 @@ def draw(count: int) -> Given:
 
 
 def _slopes_error(backend: str, device: str, precision: str) -> float:
-    *drawn, camera = placed(draw(1000), device).values()
+    *drawn, camera = placed(_given(1000), device).values()
     means, scales, rotations, opacities = (x.to(DTYPES[precision]) for x in drawn)
     pixels, depth = project(camera, means)
     size = pixels.new_tensor((camera.width, camera.height))

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from bench.types import check_shape
 from methods.kernels.dispatch import implementation
+from methods.kernels.types import expect
 
 HIDDEN = 32
 """Outputs of every layer except density and colour."""
@@ -106,14 +107,10 @@ def order(networks: Tensor, count: int, *, backend: str = "auto") -> Groups:
         ValueError: wrong shape or type; on a CPU, a network number of N or more.
     """
     check_shape("networks", networks, None)
-    if networks.is_floating_point():
-        raise ValueError(f"networks: expected whole numbers, got {networks.dtype}")
-    on_cpu = networks.device.type == "cpu"  # on a GPU the check would wait
-    if len(networks) and on_cpu and int(networks.max()) >= count:
-        raise ValueError(
-            f"networks: expected numbers below {count}, got {int(networks.max())}: "
-            "a negative number stands for no network"
-        )
+    expect(not networks.is_floating_point(), "networks", "whole numbers", networks.dtype)
+    if len(networks) and networks.device.type == "cpu":  # on a GPU the check would wait
+        most = int(networks.max())
+        expect(most < count, "networks", f"numbers below {count}, negative ones for none", most)
     return implementation(__name__, backend, networks.device).order(networks, count)
 
 
@@ -128,8 +125,7 @@ def encode_frequencies(inputs: Tensor, frequencies: int, *, backend: str = "auto
         ValueError: wrong shape, F < 1; backend "cpu": not float32.
     """
     check_shape("inputs", inputs, None, 3)
-    if frequencies < 1:
-        raise ValueError(f"frequencies: expected 1 or more, got {frequencies}")
+    expect(frequencies >= 1, "frequencies", "1 or more", frequencies)
     return implementation(__name__, backend, inputs.device).encode_frequencies(inputs, frequencies)
 
 
@@ -160,10 +156,9 @@ def grouped_linear(
     check_shape("inputs", inputs, None, channels)
     check_shape("biases", biases, networks, outputs)
     check_shape("offsets", offsets, networks + 1)
-    if offsets.device.type == "cpu" and int(offsets[-1]) != len(inputs):
-        raise ValueError(
-            f"offsets: expected to end at the {len(inputs)} inputs, got {int(offsets[-1])}"
-        )
+    if offsets.device.type == "cpu":
+        end, count = int(offsets[-1]), len(inputs)
+        expect(end == count, "offsets", f"to end at the {count} inputs", end)
     return implementation(__name__, backend, inputs.device).grouped_linear(
         inputs, weights, biases, offsets, relu
     )

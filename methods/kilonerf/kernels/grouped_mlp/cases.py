@@ -7,7 +7,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from bench.case import U32, Bound, Case, Given, Operation
+from bench.case import U32, Bound, Case, Given, Operation, uniform
 from methods.kernels.dispatch import served
 from methods.kilonerf.kernels.grouped_mlp import (
     HIDDEN,
@@ -74,12 +74,15 @@ def _sums(inputs: Tensor, weights: Tensor, biases: Tensor, offsets: Tensor) -> T
 
 
 def _of_network(given: Given) -> Tensor:
-    """The same for the sums over the n samples of a network, numbers of at most 1: 2 n independent
-    roundings of partial sums of at most n, 6 sqrt(n) (n + 1) u (Higham, Mary 2019)."""
+    """The same for the sums over the n samples of each network: see `OF_NETWORK`."""
     counts = given["offsets"].diff().double()
     return 6 * counts.sqrt() * (counts + 1) * U32
 
 
+OF_NETWORK = (
+    "sums over n samples of a network, numbers of at most 1; 2 n independent roundings of partial "
+    "sums of at most n: 6 sqrt(n) (n + 1) u (Higham, Mary 2019)"
+)
 LINEAR = Operation(
     "grouped linear",
     served(__package__),
@@ -95,14 +98,8 @@ LINEAR = Operation(
             "sums of O products below 1 / 8, by both: 2 O x O / 8 u",
             lambda given: given["weights"].shape[2] ** 2 / 4 * U32,
         ),
-        "weights": Bound(
-            "sums over n samples of a network: 6 sqrt(n) (n + 1) u",
-            lambda given: _of_network(given)[:, None, None],
-        ),
-        "biases": Bound(
-            "sums over n samples of a network: 6 sqrt(n) (n + 1) u",
-            lambda given: _of_network(given)[:, None],
-        ),
+        "weights": Bound(OF_NETWORK, lambda given: _of_network(given)[:, None, None]),
+        "biases": Bound(OF_NETWORK, lambda given: _of_network(given)[:, None]),
     },
 )
 
@@ -192,8 +189,7 @@ def _numbers(count: int, networks: int) -> Tensor:
 
 
 def _uniform(seed: int, *shape: int) -> Tensor:
-    """Numbers from -1 to 1."""
-    return 2 * torch.rand(*shape, generator=torch.Generator().manual_seed(seed)) - 1
+    return uniform(torch.Generator().manual_seed(seed), shape)
 
 
 def _placed(count: int) -> Given:
@@ -227,10 +223,10 @@ def _layer(count: int, networks: int, inputs: int, outputs: int) -> Given:
 
 def _few(networks: int) -> Networks:
     """Their weights are at most 1 / 8."""
-    layers = enumerate(SHAPES.items())
-    weights = {name: _uniform(10 + n, networks, *shape) / 8 for n, (name, shape) in layers}
-    layers = enumerate(SHAPES.items())
-    biases = {name: _uniform(20 + n, networks, shape[1]) / 8 for n, (name, shape) in layers}
+    weights, biases = {}, {}
+    for n, (name, (inputs, outputs)) in enumerate(SHAPES.items()):
+        weights[name] = _uniform(10 + n, networks, inputs, outputs) / 8
+        biases[name] = _uniform(20 + n, networks, outputs) / 8
     return Networks(weights, biases)
 
 

@@ -13,8 +13,8 @@ from torch import Tensor
 from bench.types import Rays, check_shape
 from methods.kernels.composite import STOP, check_stop
 from methods.kernels.dispatch import implementation
-from methods.kernels.spherical import SIZES
-from methods.kernels.types import Pixels
+from methods.kernels.spherical import check_harmonics
+from methods.kernels.types import Pixels, check_rays
 from methods.kernels.voxel_walk import Voxels
 
 
@@ -52,13 +52,11 @@ def render_voxels(
         ValueError: wrong shapes, a stop outside [0, 1); backend "cpu": not float32.
     """
     check_stop(stop)
-    check_shape("origins", rays.origins, None, 3)
-    check_shape("directions", rays.directions, len(rays.origins), 3)
+    check_rays(rays)
     check_shape("density", light.density, len(voxels))
-    _check_harmonics(light.harmonics, len(voxels))
+    check_harmonics("harmonics", light.harmonics, len(voxels))
     kernel = implementation(__name__, backend, rays.origins.device)
-    rendered: tuple[Pixels, Tensor, Tensor] = kernel.render_voxels(rays, voxels, light, stop, faint)
-    return rendered
+    return kernel.render_voxels(rays, voxels, light, stop, faint)
 
 
 def shade_voxels(
@@ -86,7 +84,7 @@ def shade_voxels(
     Raises:
         ValueError: wrong shapes; backend "cpu": not float32.
     """
-    _check_harmonics(harmonics, None)
+    check_harmonics("harmonics", harmonics, None)
     check_shape("voxel", voxel, None)
     check_shape("ray", ray, len(voxel))
     check_shape("directions", directions, None, 3)
@@ -95,13 +93,4 @@ def shade_voxels(
         if not harmonics.requires_grad:
             harmonics = harmonics.detach().requires_grad_()  # otherwise there is no backward pass
     kernel = implementation(__name__, backend, harmonics.device)
-    colours: Tensor = kernel.shade_voxels(harmonics, voxel, ray, directions, grad_buffer)
-    return colours
-
-
-def _check_harmonics(harmonics: Tensor, count: int | None) -> None:
-    check_shape("harmonics", harmonics, count, None, 3)
-    if harmonics.shape[1] not in SIZES:
-        raise ValueError(
-            f"harmonics: expected one of {SIZES} coefficients a colour, got {list(harmonics.shape)}"
-        )
+    return kernel.shade_voxels(harmonics, voxel, ray, directions, grad_buffer)

@@ -10,10 +10,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from bench.case import U32, Bound, Case, Given, Operation
-from bench.types import Rays
 from methods.kernels.dispatch import served
+from methods.kernels.march.cases import cells, some_rays
 from methods.kernels.voxel_walk import Voxels
-from methods.kernels.voxel_walk.cases import all_cells
 from methods.plenoctree.kernels.voxel_light import Light, render_voxels, shade_voxels
 
 COLOUR = (16 * 50 * 6 + 16 * 16 * 6) / 4 + 8
@@ -87,17 +86,17 @@ def cases() -> list[Case]:
 
 
 def _rendered() -> Iterator[Case]:
-    for name, rays, kind, stop, faint in (
-        ("one ray", 1, "cloud", 0.0, 0.0),
-        ("no ray", 0, "cloud", 0.0, 0.0),
-        ("cloud", 129, "cloud", 0.0, 0.0),
-        ("mist", 129, "mist", 0.0, 0.0),
-        ("stone", 129, "stone", 0.0, 0.0),
-        ("voxels without density", 129, "clear", 0.0, 0.0),
-        ("no voxel", 129, "nothing", 0.0, 0.0),
-        ("stop and faint", 129, "cloud", 1e-4, 1e-5),
+    for name, rays, kind in (
+        ("one ray", 1, "cloud"),
+        ("no ray", 0, "cloud"),
+        ("cloud", 129, "cloud"),
+        ("mist", 129, "mist"),
+        ("stone", 129, "stone"),
+        ("voxels without density", 129, "clear"),
+        ("no voxel", 129, "nothing"),
     ):
-        yield from RENDER.cases(name, partial(_scene, 24, rays, kind, stop, faint))
+        yield from RENDER.cases(name, partial(_scene, 24, rays, kind, 0.0, 0.0))
+    yield from RENDER.cases("stop and faint", partial(_scene, 24, 129, "cloud", 1e-4, 1e-5))
     many = 1 << 13
     frame = partial(_scene, 128, many, "cloud", 1e-4, 1e-5)
     yield from RENDER.cases("a frame of 128^3", frame, items=many)
@@ -105,24 +104,13 @@ def _rendered() -> Iterator[Case]:
 
 def _scene(size: int, rays: int, kind: str, stop: float, faint: float) -> Given:
     """Voxels in a thick shell, every second one, of random density and light."""
+    coordinates = cells("empty" if kind == "nothing" else "porous shell", size).nonzero()
     generator = torch.Generator().manual_seed(size)
-    cells, radius = all_cells(size)
-    kept = (radius > 0.27) & (radius < 0.4) & (torch.rand(len(cells), generator=generator) < 0.5)
-    if kind == "nothing":
-        kept[:] = False
-    coordinates = cells[kept]
     scale = {"clear": 0.0, "mist": 2.0, "stone": 1e4}.get(kind, 20.0)
     density = scale * torch.rand(len(coordinates), generator=generator)
     harmonics = torch.randn(len(coordinates), 9, 3, generator=generator).clamp(-6, 6)
     light, voxels = Light(density, harmonics), Voxels(coordinates, size)
-    return {"rays": views(rays), "voxels": voxels, "light": light, "stop": stop, "faint": faint}
-
-
-def views(count: int) -> Rays:
-    """Rays from all around into the cube."""
-    generator = torch.Generator().manual_seed(count)
-    origins = normalize(torch.randn(count, 3, generator=generator), dim=1) * 1.5 + 0.5
-    return Rays(origins, torch.rand(count, 3, generator=generator) - origins)
+    return {"rays": some_rays(rays), "voxels": voxels, "light": light, "stop": stop, "faint": faint}
 
 
 def _shaded() -> Iterator[Case]:

@@ -15,8 +15,9 @@ RAYS = 40
 
 def given(**layers: torch.Tensor) -> tuple:
     """A small scene with some rays, and `layers` in place of its own."""
-    voxels, corners, own = cases.some_scene(cases.SIDE, torch.float32)
-    rays, towards = cases.some_rays(RAYS)
+    rays, voxels, corners, own, towards, _, _ = cases.scene(
+        cases.SIDE, RAYS, torch.float32, 0.0, 0.0
+    ).values()
     return rays, voxels, corners, replace(own, **layers), towards
 
 
