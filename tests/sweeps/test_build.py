@@ -148,8 +148,6 @@ def test_a_target_that_cannot_be_imported_is_named(name):
         (["method.model.scale=8"], "use renderer.init=scratch"),
         (["method.renderer.width=0"], "renderer.width: expected 1 to 4096, got 0"),
         (["method.renderer.blocks=-1"], "renderer.blocks: expected 0 to 256, got -1"),
-        (["method=steernerf", "method.rendering.refined=0.1"], "rendering.refined: UNet does not"),
-        (["method=steernerf", "method.joint.refined=0.2"], "joint.refined: UNet does"),
         (["method.joint.opacity_entropy=-1"], "joint.opacity_entropy: expected 0 or more, got -1"),
     ],
 )
