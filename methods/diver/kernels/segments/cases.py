@@ -119,7 +119,7 @@ def _weights() -> Iterator[Case]:
     )
     for name, make in kinds.items():
         yield from WEIGH.cases(name, make)
-        yield exact.case(name, partial(_moment_error, make))
+        yield exact.case(f"{name}, by monomials", partial(_moment_error, make))
 
 
 def _inside(entry: Tensor, leave: Tensor) -> Given:
