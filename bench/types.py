@@ -36,7 +36,7 @@ from bench.errors import SteerbenchError as SteerbenchError
 from bench.errors import Unavailable as Unavailable
 
 EMPTY_ALPHA = 1e-3
-"""Pixels with a lower opacity are empty: their depth is +inf and they are never unprojected."""
+"""Pixels with a lower opacity are empty: their depth is +inf."""
 
 BACKGROUNDS = {"white": 1.0, "black": 0.0}
 """Backgrounds by name: the value of every channel of `Scene.background`."""
@@ -145,7 +145,8 @@ class Budget:
         samples: target number of field samples with a gradient per step; it sets the ray count. A
             training may take a share of it.
         frames: at most this many test frames are rendered and scored (0: all).
-        renderer_steps: optimiser steps of the second stage, for methods with a 2D renderer.
+        renderer_steps: optimiser steps of what is trained after the field: a 2D renderer, Gaussians,
+            the representation that starts from the field.
         threads: CPU threads of a training; None: as many as torch uses. On a CPU `steerbench paper`
             runs as many trainings in parallel as the cores have room for.
     """

@@ -19,7 +19,7 @@ from methods.rendering.frame import FeatureFrame
 from methods.steernerf.kernels.splat import splat
 
 CLEAR_ALPHA = 0.1
-"""Opacity from which on the expected depth of a pixel is reliable."""
+"""The expected depth of a pixel is reliable if its opacity is more than this."""
 
 
 @dataclass(frozen=True)

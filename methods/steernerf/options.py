@@ -22,7 +22,7 @@ class Model:
     scale: int  # s; the field is rendered at 1/s of the resolution
     step: float  # ray-marching step at low resolution, in diagonals of the cube / 1024
     stop: float  # transmittance at which a ray ends
-    feature_background: float  # what features beyond RGB are composited on; untrained ones are 1/2
+    feature_background: float  # what features beyond RGB are composited on
 
     def __post_init__(self) -> None:
         for name, (least, most) in SIZES.items():

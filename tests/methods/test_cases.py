@@ -22,7 +22,7 @@ DEAR = ("march", "composite backward", "encode backward")
 
 
 def marks(case: Case, cell: Cell) -> list[pytest.MarkDecorator]:
-    """Of a dear kernel that is interpreted `make test` takes the first case."""
+    """Of a kernel that takes long in the interpreter, `make test` takes the first case."""
     interpreted = cell[0] == "gpu" and not torch.cuda.is_available()
     first = next(other for other in QUICK if other.subject == case.subject)
     slow = interpreted and case.subject in DEAR and case is not first
@@ -128,7 +128,6 @@ NAMES = {
     "blending": "blend",
     "projection": "project_gaussians",
     "grouped_mlp": "grouped_linear",
-    "relu": "relu_",
     "spherical": "spherical_harmonics",
     "voxel_light": "render_voxels shade_voxels",
     "voxel_walk": "walk",

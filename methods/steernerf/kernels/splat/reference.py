@@ -13,8 +13,9 @@ def splat(pixels: Tensor, depth: Tensor, width: int, height: int) -> Tensor:
     # values to integers is undefined.
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     taken = inside & (depth > 0) & (depth < torch.inf)  # [N]
-    # Eq. 8, Eq. 10: rounded to a pixel. Not negative: this is floor. No indices of valid points,
-    # which would wait for a GPU: other points go to an extra bin.
+    # Eq. 8, Eq. 10: the point is rounded to a pixel; the conversion is floor, because coordinates
+    # are not negative. Points that no pixel shows go to an extra bin: to leave them out, the host
+    # would have to wait for a GPU.
     row, column = (torch.where(taken, x, 0).long() for x in (v, u))
     pixel = torch.where(taken, row * width + column, height * width)
     index = torch.full((height * width + 1,), -1, dtype=torch.int32, device=pixels.device)
