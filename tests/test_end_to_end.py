@@ -162,8 +162,7 @@ def test_wherever_it_is_killed_again_and_again_a_sweep_ends_with_the_same_rows(
 
 def test_parity_compares_every_engine_with_torch_in_fp32(tmp_path: Path) -> None:
     words = ("--frames", "4", *SMALLEST, "scene.test=3", "budget.frames=0")
-    found, said = study(tmp_path, "parity", *words)
-    assert "frames to build the network on: found in" in said  # made for another engine
+    found, _ = study(tmp_path, "parity", *words)
     standard = found["torch, fp32"]
     assert standard["lost"] == 0
     assert standard["apart"] is None  # there is no difference
@@ -183,7 +182,6 @@ def test_skips_lists_the_work_of_a_frame_with_and_without_each_switch(
     assert dense["cells"] == 16 * 16
     assert found["empty space"]["samples"] < dense["samples"]
     assert found["all of these"]["samples"] <= found["empty space"]["samples"]
-    assert found["and a window of depths"]["samples"] <= found["all of these"]["samples"]
 
 
 def test_breakdown_divides_the_frame_and_names_every_line(first: tuple[Path, str]) -> None:

@@ -66,6 +66,8 @@ class SteerNerf:
         seed: int = 0,
     ) -> None:
         self.stage2 = self.kind(model, renderer, joint, after)
+        with torch.random.fork_rng(devices=[]):
+            self.stage2.make()  # what a 2D renderer refuses, it refuses before anything is trained
         if rendering.range.mode != "off" and not model.frames:
             raise ValueError(
                 "rendering.range.mode: expected off without preceding frames (L = 0), got "

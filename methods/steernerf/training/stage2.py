@@ -49,8 +49,6 @@ class Stage2:
         if self.after not in (*MARKS, 1):
             choices = ", ".join(map(str, MARKS))
             raise ValueError(f"after: expected {choices} or 1, got {self.after}")
-        with torch.random.fork_rng(devices=[]):
-            self.make()  # what the 2D renderer refuses, it refuses before anything is trained
 
     def make(self) -> Renderer2d:
         """Make an untrained 2D renderer."""
