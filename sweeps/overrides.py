@@ -64,7 +64,7 @@ def settled(config: DictConfig) -> DictConfig:
 
 
 def changed(config: DictConfig, words: Sequence[str]) -> DictConfig:
-    """A copy of `config` with values changed as Hydra would; faster than composing it anew."""
+    """A copy of `config` with values changed as Hydra would; faster than composing it again."""
     copy = config.copy()
     for override in OverridesParser.create().parse_overrides(list(words)):
         OmegaConf.update(copy, override.get_key_element(), override.value())

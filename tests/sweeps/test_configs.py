@@ -1,4 +1,4 @@
-"""What can be set stands in the configurations, once, and a size changes only what stands there."""
+"""Settings are in the configurations, each once, and a size changes only settings that are there."""
 
 from __future__ import annotations
 
