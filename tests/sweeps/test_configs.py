@@ -1,4 +1,4 @@
-"""Settings are in the configurations, each once, and a size changes only settings that are there."""
+"""Settings are in the configurations, each once, and a size changes only those that are there."""
 
 from __future__ import annotations
 
