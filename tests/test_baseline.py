@@ -21,7 +21,11 @@ RUN = [
     *("budget=tiny", "budget.steps=200", "budget.samples=16384", "budget.renderer_steps=100"),
     *("budget.frames=0", "method.training.march_step=4"),
 ]
-METHODS = (["method=ngp"], ["method=steernerf_lean,steernerf", "method.model.step=4"])
+METHODS = (
+    ["method=ngp"],
+    ["method=steernerf_lean", "method.model.step=4"],
+    ["method=steernerf", "method.model.step=4"],
+)
 METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "work.samples", "work.products")
 
 
