@@ -1,4 +1,5 @@
-"""Run time against error, for computations with a known exact answer and for whole methods.
+"""Run time against error, for computations with a known exact answer and for whole methods; the
+Pareto frontier of settings that trade one for the other.
 
 The compared settings take turns; times come from further rounds of what gave the errors.
 """
@@ -11,17 +12,16 @@ from dataclasses import dataclass
 from itertools import compress, product
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from bench.compositing import composite
-from bench.frontier import observed_order
+from bench.errors import unexpected
 from bench.metrics import psnr, psnr_of_mse
 from bench.probes import FrameRecord, StageClock, p99_to_p50, times_ms
-from bench.protocol import EvaluationProtocol
-from bench.scoring import check_frame
+from bench.protocol import EvaluationProtocol, check_frame
 from bench.trajectories import Trajectory
-from bench.types import Log, Method, Scene, SteerbenchError
+from bench.types import Log, Method, Scene, composite
 
 
 @dataclass(frozen=True)
@@ -37,16 +37,12 @@ class Trial:
 class Experiment:
     """A computation whose exact answer is known, and a knob that trades its time for its error.
 
-    Attributes:
-        subject: what is computed.
-        knob: the parameter that is varied, with its unit.
-        trials: the settings of the knob.
-        smooth: the range of settings (lowest, highest) in which the error should follow a power
-            of the knob; None: it follows none, or rounding hides it.
+    `smooth` is the range of settings in which the error should follow a power of the knob; None: it
+    follows none, or rounding hides it.
     """
 
-    subject: str
-    knob: str
+    subject: str  # what is computed
+    knob: str  # the parameter that is varied, with its unit
     trials: Sequence[Trial]
     smooth: tuple[float, float] | None = None
 
@@ -67,34 +63,21 @@ def experiment_rows(
             trials = experiment.trials
             apart = ((trial.call().double() - trial.exact).abs() for trial in trials)
             errors = [float(difference.max()) for difference in apart]  # and warms up
-            order = _order(experiment, errors)
-            low, high = experiment.smooth or (None, None)
+            fit = dict.fromkeys(("order", "order_from", "order_to"))
+            if experiment.smooth:
+                low, high = experiment.smooth
+                pairs = [(float(x.setting), e) for x, e in zip(trials, errors, strict=True)]
+                smooth = [(setting, error) for setting, error in pairs if low <= setting <= high]
+                order = observed_order(*zip(*smooth, strict=True))
+                fit = {"order": order, "order_from": low, "order_to": high}
             times = times_ms([trial.call for trial in trials], repeats)
+            about = {"subject": experiment.subject, "knob": experiment.knob}
             rows += [
-                {
-                    "subject": experiment.subject,
-                    "knob": experiment.knob,
-                    "setting": trial.setting,
-                    "error": error,
-                    **_spread(of_trial),
-                    "order": order,
-                    "order_from": low,
-                    "order_to": high,
-                }
+                {**about, "setting": trial.setting, "error": error, **_spread(of_trial), **fit}
                 for trial, error, of_trial in zip(trials, errors, times, strict=True)
             ]
             progress.advance(note=experiment.subject)
     return rows
-
-
-def _order(experiment: Experiment, errors: Sequence[float]) -> float | None:
-    if experiment.smooth is None:
-        return None
-    low, high = experiment.smooth
-    settings = [float(trial.setting) for trial in experiment.trials]
-    pairs = zip(settings, errors, strict=True)
-    fitted = [(setting, error) for setting, error in pairs if low <= setting <= high]
-    return observed_order(*zip(*fitted, strict=True))
 
 
 def _spread(times: Sequence[float]) -> dict[str, float]:
@@ -114,17 +97,15 @@ def render_in_turns(
     Each frame is rendered by one method after the other. The first round warms up and is scored;
     `repeats` more are timed.
 
-    Returns:
-        One row for each method, of the steady frames (`steady_frames`): setting (its name), ms
-        (mean frame time of the lower median round), ms_lo and ms_hi (extremes over the rounds), and
-        for the median round p99_to_p50, stage_ms.* and work.* as in `bench.run.measure`. Of the
-        frames with a ground truth, rounded as `protocol` says: psnr (mean over frames),
-        psnr_to_first (against the first method, from the MSE over all frames; inf if equal) and
-        worst (largest difference of any channel from the first method, on a scale of 1).
+    Returns one row for each method, of the steady frames (`steady_frames`): setting (its name), ms
+    (mean frame time of the lower median round), ms_lo and ms_hi (extremes over the rounds), and for
+    the median round p99_to_p50, stage_ms.* and work.* as in `bench.run.measure`. Of the frames with
+    a ground truth, rounded as `protocol` says: psnr (mean over frames), psnr_to_first (against the
+    first method, from the MSE over all frames; inf if equal) and worst (largest difference of any
+    channel from the first method, on a scale of 1).
 
-    Raises:
-        SteerbenchError: no frame is both steady and has a ground truth, or a method rendered
-            values that are not finite.
+    Raises SteerbenchError if no frame is both steady and has a ground truth, or a method rendered
+    values that are not finite.
     """
     images = scene.splits[trajectory.split].images
     ready, scored = steady_frames(methods.values(), trajectory)
@@ -169,19 +150,15 @@ def steady_frames(
     """Which frames are steady, and the indices of the steady frames with a ground truth.
 
     A frame is steady if, since the last cut, it has as many preceding frames as the method with
-    the longest memory uses.
-
-    Raises:
-        SteerbenchError: no steady frame has a ground truth.
+    the longest memory uses. Raises SteerbenchError if none of these has a ground truth.
     """
     start = max(method.memory for method in methods)
     ready = [count >= start for count in trajectory.preceding]
     scored = [n for n, step in enumerate(trajectory.steps) if ready[n] and step.truth is not None]
     if not scored:
-        raise SteerbenchError(
-            f"{trajectory.name}: none of its {len(trajectory.steps)} frames has a ground truth and "
-            f"{start} frames before it to look back on, without a cut; give more frames"
-        )
+        expected = f"a frame with a ground truth and {start} frames before it, without a cut"
+        got = f"none in {len(trajectory.steps)} frames; give more frames"
+        raise unexpected(trajectory.name, expected, got)
     return ready, scored
 
 
@@ -213,3 +190,35 @@ def mean_figures(
         f"{kind}.{name}": factor * statistics.fmean(figures.get(name, 0) for figures in of_frames)
         for name in names
     }
+
+
+def best_instead(cost: Sequence[float], error: Sequence[float]) -> list[int]:
+    """For each setting, the index of the best setting that costs no more.
+
+    Best is the least `error`, then the least `cost`, then the lowest index. A setting on the Pareto
+    frontier gets its own index (among duplicates, only the first does); any other setting gets the
+    index of one that dominates it.
+    """
+    costs, errors = np.asarray(cost, float), np.asarray(error, float)
+    best: list[int] = [0] * len(costs)
+    least = -1
+    for index in np.lexsort((errors, costs)):  # the cheapest first; lexsort keeps the order of ties
+        if least < 0 or errors[index] < errors[least]:
+            least = int(index)
+        best[index] = least
+    return best
+
+
+def cheapest_within(cost: Sequence[float], error: Sequence[float], limit: float) -> int | None:
+    """The index of the cheapest setting whose error is at most `limit`; None if there is none."""
+    allowed = [index for index, size in enumerate(error) if size <= limit]
+    return min(allowed, key=lambda index: (cost[index], error[index]), default=None)
+
+
+def observed_order(knob: Sequence[float], error: Sequence[float]) -> float:
+    """Fit the power law error = c knob^p and return p, by least squares on the logarithms.
+
+    `knob` and `error` hold at least two values, all positive.
+    """
+    slope, _ = np.polyfit(np.log(knob), np.log(error), 1)
+    return float(slope)

@@ -10,11 +10,8 @@ import ctypes
 import sys
 from collections.abc import Callable
 
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
-"""Names of parameters in malloc.h."""
-
-LARGEST_KEPT = 32 << 20
-"""Largest block in bytes that is kept when freed; glibc allows no higher limit."""
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8  # of malloc.h
+LARGEST_KEPT = 32 << 20  # bytes of a block that is kept; glibc allows no higher limit
 
 
 def keep_freed() -> None:

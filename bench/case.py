@@ -1,4 +1,4 @@
-"""A case: one check, what must hold and within which tolerance.
+"""A case: one check, what must hold and within which tolerance. Runs and times cases.
 
 Each folder keeps its cases in `cases.py`. A tolerance is derived from the arithmetic, in units of
 the unit roundoff u of the type that the result is computed in, never from an observed error.
@@ -7,30 +7,24 @@ the unit roundoff u of the type that the result is computed in, never from an ob
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+import statistics
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cache, partial
+from itertools import product
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from bench.types import Unavailable
+from bench.probes import times_ms
+from bench.types import Log, Unavailable
 
-Cell = tuple[str, str]
-"""A backend or an engine, and a precision."""
-
-Computation = Callable[[str], tuple[Tensor, ...]]
-"""Computes the outputs with a backend."""
-
-Prepare = Callable[[str], Computation]
-"""Makes inputs on a device and returns a function of the backend that computes the outputs."""
-
-Given = Mapping[str, Any]
-"""The inputs of an operation, by name."""
-
-Tolerance = float | Tensor
-"""The largest allowed error of a result, or one of each of its numbers."""
+Cell = tuple[str, str]  # a backend or an engine, and a precision
+Computation = Callable[[str], tuple[Tensor, ...]]  # computes the outputs with a backend
+Prepare = Callable[[str], Computation]  # makes the inputs on a device
+Given = Mapping[str, Any]  # the inputs of an operation, by name
+Tolerance = float | Tensor  # the largest allowed error of a result, or of each of its numbers
 
 DTYPES = {
     "fp64": torch.float64,
@@ -39,9 +33,7 @@ DTYPES = {
     "bf16": torch.bfloat16,
 }
 
-U32 = 2.0**-24
-"""Unit roundoff of float32."""
-
+U32 = 2.0**-24  # unit roundoff of float32
 U16 = 2.0**-8
 """Unit roundoff of bfloat16, and its ulp from 1/2 to 1: two nearly equal numbers below 1 may round
 to neighbours."""
@@ -55,38 +47,21 @@ class Apart(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Timed:
-    """A computation to time; one call processes `items` samples, rays or entries."""
-
-    items: int
-    prepare: Prepare
-
-
-@dataclass(frozen=True)
 class Case:
     """A property that must hold for every backend or engine.
 
-    Attributes:
-        subject: the computation that is checked ("composite backward").
-        name: what is special about the inputs.
-        holds: what must hold.
-        derivation: where the tolerances come from.
-        tolerances: the largest allowed error of each cell; None: `error` says it.
-        error: computes the largest error, given backend, device and precision, or `Apart` where it
-            is nearest to what is allowed. Raises `Unavailable` if the cell does not exist on that
-            device.
-        timed: None if there are too few inputs for a meaningful throughput.
-        slow: takes more than a moment, so the tests skip it.
+    `error` computes the largest error, given backend, device and precision, or `Apart` where it is
+    nearest to what is allowed. It raises `Unavailable` if the cell does not exist on that device.
     """
 
-    subject: str
-    name: str
-    holds: str
-    derivation: str
-    tolerances: Mapping[Cell, float | None]
+    subject: str  # the computation that is checked ("composite backward")
+    name: str  # what is special about the inputs
+    holds: str  # what must hold
+    derivation: str  # where the tolerances come from
+    tolerances: Mapping[Cell, float | None]  # the largest allowed errors; None: `error` says it
     error: Callable[[str, str, str], float | Apart]
-    timed: Timed | None = None
-    slow: bool = False
+    timed: int | None = None  # samples, rays or entries a call; None: too few to time
+    slow: bool = False  # takes more than a moment, so the tests skip it
 
     @property
     def quick(self) -> bool:
@@ -138,8 +113,7 @@ class Property:
 
     def case(self, name: str, error: Callable[[str, str, str], float], slow: bool = False) -> Case:
         """Make one case of the property."""
-        given = self.subject, name, self.holds, self.derivation, self.tolerances, error
-        return Case(*given, slow=slow)
+        return Case(name=name, error=error, slow=slow, **vars(self))
 
 
 @dataclass(frozen=True)
@@ -159,18 +133,12 @@ class Difference:
 
 @dataclass(frozen=True)
 class Bound:
-    """How far a result may be from that of the reference.
+    """How far a result may be from that of the reference."""
 
-    Attributes:
-        why: where it comes from.
-        off: the tolerance, or a function of the inputs, on the CPU, that computes it.
-    """
-
-    why: str
-    off: Tolerance | Callable[[Given], Tolerance]
+    why: str  # where it comes from
+    off: Tolerance | Callable[[Given], Tolerance]  # may depend on the inputs, on the CPU
 
     def of(self, given: Given) -> Tolerance:
-        """The tolerance for the inputs `given`."""
         return self.off(given) if callable(self.off) else self.off
 
 
@@ -183,23 +151,17 @@ def uniform(generator: torch.Generator, shape: Sequence[int]) -> Tensor:
 class Operation:
     """An operation; all its `backends` agree with the reference, forward and backward.
 
-    Attributes:
-        subject: its name.
-        compute: its results, a tuple, given the inputs and the backend.
-        outputs: the bound of each result, by its name, in their order.
-        gradients: the bound of the gradient of an input, by the name of the input, which is a
-            tensor or a list of them. There are no other gradients.
-        draw: the gradients of the results, at random.
-        relative: gradients are compared in units of the largest number of each.
+    `compute` returns its results, given the inputs and the backend. There are gradients of the
+    inputs named in `gradients`, each a tensor or a list of them, and no others.
     """
 
     subject: str
     backends: Sequence[str]
     compute: Callable[[Given, str], tuple[Tensor, ...]]
-    outputs: Mapping[str, Bound]
-    gradients: Mapping[str, Bound] = field(default_factory=dict)
-    draw: Callable[[torch.Generator, Sequence[int]], Tensor] = uniform
-    relative: bool = False
+    outputs: Mapping[str, Bound]  # of each result, by its name, in their order
+    gradients: Mapping[str, Bound] = field(default_factory=dict)  # by the name of the input
+    draw: Callable[[torch.Generator, Sequence[int]], Tensor] = uniform  # gradients of the results
+    relative: bool = False  # gradients are compared in units of the largest number of each
 
     def cases(
         self,
@@ -226,7 +188,7 @@ class Operation:
                 "; ".join(f"{result}: {bound.why}" for result, bound in bounds.items()),
                 dict.fromkeys((backend, precision) for backend in self.backends),
                 Difference(prepare, partial(self._tolerances, make, gradients)),
-                None if items is None else Timed(items, prepare),
+                items,
             )
             found.append(case)
         return found
@@ -261,9 +223,10 @@ class Operation:
         self, make: Callable[[], Given], gradients: Mapping[str, Bound]
     ) -> list[Tolerance]:
         given = make()
-        each = [(bound, 1) for bound in self.outputs.values()]
-        each += [(bound, len(_several(given[name]))) for name, bound in gradients.items()]
-        return [bound.of(given) for bound, count in each for _ in range(count)]
+        bounds = list(self.outputs.values())
+        for name, bound in gradients.items():
+            bounds += [bound] * len(_several(given[name]))
+        return [bound.of(given) for bound in bounds]
 
 
 def _several(value: Tensor | Sequence[Tensor]) -> Sequence[Tensor]:
@@ -292,8 +255,7 @@ def on_backends(
 
     Only the reference has other precisions than fp32.
     """
-    cells = [(backend, "fp32") for backend in backends]
-    cells += [("reference", precision) for precision in precisions]
+    cells = [*product(backends, ("fp32",)), *product(("reference",), precisions)]
     return {cell: units * torch.finfo(DTYPES[cell[1]]).eps / 2 for cell in cells}
 
 
@@ -329,3 +291,72 @@ def _errors(got: Tensor, want: Tensor) -> Tensor:
     got, want = got.detach().double(), want.detach().double()
     same = (got == want) | (got.isnan() & want.isnan())
     return torch.where(same, 0, (got - want).abs()).nan_to_num(nan=torch.inf)
+
+
+def run_cases(cases: Sequence[Case], devices: Sequence[str], log: Log) -> Iterator[dict[str, Any]]:
+    """Check all cells of `cases` on all `devices`, and yield their rows; see `Case.check`."""
+    cells = sum(len(case.tolerances) for case in cases)
+    with log.progress("stress", cells * len(devices)) as progress:
+        for case, device in product(cases, devices):
+            for cell in case.tolerances:
+                progress.advance(0, note=f"{case.subject}, {case.name}: {' '.join(cell)}")
+                yield case.check(cell, device)
+                progress.advance(note="")
+
+
+def failed(row: Mapping[str, Any]) -> bool:
+    """Whether the check of this row failed."""
+    return row["status"].startswith("failed")
+
+
+def timed_rows(
+    cases: Sequence[Case], device: str, backends: Collection[str], repeats: int, log: Log
+) -> list[dict[str, Any]]:
+    """Check the cases and time the correct ones; one row per timed case and supported backend.
+
+    A row holds kernel, case, backend, dtype, error and tolerance (absolute; error is None if not
+    finite), status ("ok", or the cases of the kernel that the backend fails, timed or not), ms
+    (median of `repeats`), mitems_s (million items a second) and ratio (time of the reference over
+    time of this backend). A backend that fails any case of a kernel is not timed.
+    """
+    subjects = {case.subject for case in cases if case.timed}
+    checked = [case for case in cases if case.subject in subjects and not case.slow]
+    results: list[tuple[Case, Difference, list[dict[str, Any]]]] = []
+    wrong: dict[tuple[str, str], list[str]] = {}
+    with log.progress("kernels", len(checked) + sum(bool(c.timed) for c in checked)) as progress:
+        for case in checked:
+            checks = [case.check(cell, device) for cell in case.tolerances if cell[0] in backends]
+            for check in filter(failed, checks):
+                wrong.setdefault((case.subject, check["backend"]), []).append(case.name)
+            if case.timed and isinstance(case.error, Difference):
+                results.append((case, case.error, checks))
+            progress.advance(note=f"{case.subject}, {case.name}")
+        rows = []
+        for case, compared, checks in results:
+            for check in checks:
+                if names := wrong.get((case.subject, check["backend"])):
+                    check["status"] = f"wrong: {', '.join(names)}"
+            correct = [check["backend"] for check in checks if check["status"] == "ok"]
+            compute = compared.prepare(device)
+            of_each = times_ms([partial(compute, name) for name in correct], repeats, device)
+            times = dict(zip(correct, map(statistics.median, of_each), strict=True))
+            rows += [_row(case, check, times) for check in checks]
+            progress.advance(note=f"timed: {case.subject}, {case.name}")
+    return rows
+
+
+def _row(case: Case, check: Mapping[str, Any], times: Mapping[str, float]) -> dict[str, Any]:
+    backend = check["backend"]
+    row = {
+        "kernel": case.subject,
+        "case": case.name,
+        "backend": backend,
+        "dtype": check["precision"],
+        **{key: check[key] for key in ("error", "tolerance", "status")},
+    }
+    if case.timed and backend in times:
+        row["ms"] = times[backend]
+        row["mitems_s"] = case.timed / times[backend] / 1e3
+        if "reference" in times:
+            row["ratio"] = times["reference"] / times[backend]
+    return row

@@ -14,23 +14,15 @@ from rich.console import Console
 from bench.errors import explained
 from bench.results import content_key
 
-PLAIN_INTERVAL_S = 10.0
-"""Time between two progress lines when there is no terminal to draw a bar on."""
-
-DRAW_INTERVAL_S = 0.2
-"""Time between two redraws of a bar."""
-
-WORTH_A_LINE_S = 2.0
-"""Work that takes longer leaves a line on the screen when it is done."""
+PLAIN_INTERVAL_S = 10.0  # between two progress lines without a terminal to draw a bar on
+DRAW_INTERVAL_S = 0.2  # between two redraws of a bar
+WORTH_A_LINE_S = 2.0  # work that takes longer leaves a line on the screen when it is done
 
 
 class ConsoleLog:
     """A `bench.types.Log` on standard error, so that standard output holds only results.
 
-    Args:
-        root: `outputs`; trained stages go to `stages/` in it.
-        quiet: say nothing and draw nothing.
-        clock: returns seconds from any origin.
+    `root` is `outputs`: trained stages go to `stages/` in it.
     """
 
     def __init__(
@@ -63,7 +55,8 @@ class ConsoleLog:
         self._bars.start()
         try:
             yield bar
-            bar.report_done()
+            if (elapsed := bar.elapsed()) > WORTH_A_LINE_S:
+                bar.say(f"done in {_duration(elapsed)}")
         finally:
             self._bars.remove_task(bar.id)
             self._bars.refresh()
@@ -84,32 +77,27 @@ class _Bar:
     def __init__(
         self, say: Callable[[str], None], bars: progress.Progress, label: str, total: int
     ) -> None:
-        self._say, self._bars, self._label, self._clock = say, bars, label, bars.get_time
+        self._say, self._bars, self._label = say, bars, label
         self.id = bars.add_task(label, total=total, note="")
-        self._begun = self._shown = self._clock()
+        self._begun, self._shown = bars.get_time(), 0.0
 
     def advance(self, steps: int = 1, note: str = "") -> None:
         self._bars.update(self.id, advance=steps, note=note)
-        plain = self._bars.disable
-        now = self._clock()
-        if now - self._shown < (PLAIN_INTERVAL_S if plain else DRAW_INTERVAL_S):
+        plain, elapsed = self._bars.disable, self.elapsed()
+        if elapsed - self._shown < (PLAIN_INTERVAL_S if plain else DRAW_INTERVAL_S):
             return
-        self._shown = now
+        self._shown = elapsed
         if plain:
             task = self._task()
             left = "?" if task.time_remaining is None else _duration(task.time_remaining)
-            elapsed = _duration(now - self._begun)
-            self._line(f"{task.percentage:.0f} %, {elapsed} elapsed, {left} left")
+            self.say(f"{task.percentage:.0f} %, {_duration(elapsed)} elapsed, {left} left")
         else:
             self._bars.refresh()
 
-    def report_done(self) -> None:
-        """Leave a line on the screen if the work took long enough."""
-        elapsed = self._clock() - self._begun
-        if elapsed > WORTH_A_LINE_S:
-            self._line(f"done in {_duration(elapsed)}")
+    def elapsed(self) -> float:
+        return self._bars.get_time() - self._begun
 
-    def _line(self, text: str) -> None:
+    def say(self, text: str) -> None:
         note = self._task().fields["note"]
         self._say(f"{self._label}: {text}" + (f", {note}" if note else ""))
 

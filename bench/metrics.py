@@ -28,10 +28,9 @@ def check_size(metric: str, width: int, height: int) -> None:
     """Raise `SteerbenchError` if pictures of this size are too small for `metric`."""
     side = SMALLEST_SIDE[metric]
     if min(width, height) < side:
-        raise SteerbenchError(
-            f"{metric} needs pictures of at least {side} x {side} pixels, got {width} x {height}: "
-            "use larger ones (a smaller scene.downscale), or with LPIPS a protocol without it"
-        )
+        advice = "use larger ones (a smaller scene.downscale), or with LPIPS a protocol without it"
+        least = f"at least {side} x {side} pixels, got {width} x {height}"
+        raise SteerbenchError(f"{metric} needs pictures of {least}: {advice}")
 
 
 def quantise(image: Tensor) -> Tensor:
@@ -75,9 +74,8 @@ def ssim(image: Tensor, reference: Tensor, window: str = "gaussian") -> float:
 
     `window` is "gaussian" (11 x 11, sigma 1.5, population covariance; Wang et al. 2004) or
     "uniform" (7 x 7, sample covariance; the default of scikit-image, used by NSVF and KiloNeRF).
-    The mean is taken over the valid region, where the window lies inside the picture.
-
-    Raises SteerbenchError if a side is shorter than 11 pixels.
+    The mean is taken over the valid region, where the window lies inside the picture. Raises
+    SteerbenchError if a side is shorter than 11 pixels.
     """
     _check_pair(image, reference)
     check_size("ssim", image.shape[1], image.shape[0])
@@ -94,9 +92,8 @@ class Lpips:
 
     The linear layers come with the `lpips` package, the backbone ("alex", "vgg" or "squeeze") from
     `bench.published`, which searches `weights_dir` first. Runs in float32 on the device of the
-    pictures, which are mapped to [-1, 1] as published.
-
-    Raises Unavailable if the weights cannot be found or downloaded, or do not fit the network.
+    pictures, which are mapped to [-1, 1] as published. Raises Unavailable if the weights cannot be
+    found or downloaded, or do not fit the network.
     """
 
     def __init__(self, net: str, weights_dir: Path | None, log: Log) -> None:
@@ -110,9 +107,8 @@ class Lpips:
         try:
             model.net.load_state_dict({name: features[source] for name, source in names.items()})
         except (KeyError, RuntimeError) as error:
-            raise Unavailable(
-                f"{path}: expected the `features.*` weights LPIPS ({net}) needs; {error}"
-            ) from error
+            expected = f"the `features.*` weights LPIPS ({net}) needs"
+            raise Unavailable(f"{path}: expected {expected}; {error}") from error
         self._model = model.requires_grad_(False).to(memory_format=torch.channels_last)
 
     @torch.inference_mode()
@@ -145,9 +141,8 @@ def _lpips_package() -> ModuleType:
             raise
         _torchvision_operators = torch.library.Library("torchvision", "DEF")
         for name in ("nms", "qnms"):
-            _torchvision_operators.define(
-                f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor"
-            )
+            arguments = "Tensor dets, Tensor scores, float iou_threshold"
+            _torchvision_operators.define(f"{name}({arguments}) -> Tensor")
     import lpips
 
     return lpips

@@ -17,9 +17,7 @@ from torch import Generator, Tensor
 from bench.errors import unexpected
 from bench.types import Camera, Scene, check_shape
 
-BEND_DEG = 2.0
-"""The rotation axis of a random motion turns by at most this much from frame to frame."""
-
+BEND_DEG = 2.0  # the rotation axis of a random motion turns by at most this a frame
 ZOOM = 0.005
 """A random motion changes its distance by at most this share per frame, and by proportionally less
 if it turns by less than a degree per frame, so that a still camera stays still."""
@@ -57,15 +55,13 @@ def lens_between(first: Camera, second: Camera, share: float) -> Camera:
 
     Raises SteerbenchError if the pictures differ in size.
     """
-    sizes = [f"{camera.width}x{camera.height}" for camera in (first, second)]
-    if sizes[0] != sizes[1]:
+    one, other = (f"{camera.width}x{camera.height}" for camera in (first, second))
+    if one != other:
         expected = "pictures of one size to interpolate between"
-        raise unexpected("cameras", expected, " and ".join(sizes))
-    inner = {
-        name: (1 - share) * getattr(first, name) + share * getattr(second, name)
-        for name in ("fx", "fy", "cx", "cy")
-    }
-    return replace(first, **inner)
+        raise unexpected("cameras", expected, f"{one} and {other}")
+    names = ("fx", "fy", "cx", "cy")
+    ends = ((name, getattr(first, name), getattr(second, name)) for name in names)
+    return replace(first, **{name: (1 - share) * a + share * b for name, a, b in ends})
 
 
 def preceding(
@@ -138,7 +134,6 @@ def _turned(camera: Camera, target: Tensor, turn: Tensor, zoom: float) -> Camera
 
 
 def _offset(camera: Camera, target: Tensor) -> Tensor:
-    """The vector [3] from `target` to the camera."""
     return camera.c2w[:, 3].double() - target.double()
 
 

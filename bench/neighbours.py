@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import psutil
 
-NOTABLE_SHARE = 0.1
-"""Share of the cores: if other processes use more, measured times deserve a warning."""
+NOTABLE_SHARE = 0.1  # of the cores: if other processes use more, times deserve a warning
 SHORTEST = 0.5
 """Seconds. The kernel counts in hundredths of a second per core, so that over a shorter time the
 rounding alone is a fifth of `NOTABLE_SHARE` or more."""
@@ -27,7 +26,6 @@ class Neighbours(NamedTuple):
 
     @property
     def notable(self) -> bool:
-        """Whether they deserve a warning."""
         return self.seconds >= SHORTEST and self.busy > NOTABLE_SHARE * self.cores
 
     def __str__(self) -> str:
@@ -42,8 +40,7 @@ class Watch:
 
     def seen(self) -> Neighbours:
         """What other processes used since the construction."""
-        spans = [now - then for now, then in zip(_seconds(), self._begin, strict=True)]
-        passed, busy, own = spans
+        passed, busy, own = (a - b for a, b in zip(_seconds(), self._begin, strict=True))
         others = max(busy - own, 0.0) / passed if passed > 0 else 0.0
         return Neighbours(others, psutil.cpu_count() or 1, passed)
 

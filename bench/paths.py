@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -40,20 +39,15 @@ from bench.types import Camera, Scene
 SAMPLES = 65
 """Poses per segment for measuring its length: 64 chords of half a circle are 0.01 % too short."""
 
-KEYFRAMES = "camera_path"
-"""The name under which a file of nerfstudio's viewer lists its cameras."""
+KEYFRAMES = "camera_path"  # under which a file of nerfstudio's viewer lists its cameras
 
 
 def follow(scene: Scene, path: str, limit: int = 0) -> Trajectory:
-    """The cameras of a file, in order and without ground truth.
+    """The first `limit` cameras of a file (0: all), in order and without ground truth.
 
     nerfstudio's file has a list `camera_path`, each entry with a `camera_to_world` of 16 numbers
     row by row and a vertical `fov` in degrees; `render_width` and `render_height` hold for all. A
     `transforms.json` has `frames`; missing intrinsics are taken from the first test camera.
-
-    Args:
-        path: the file.
-        limit: if > 0, keep only the first `limit` cameras.
 
     Raises SteerbenchError if the file is damaged or has no cameras, or a pose is not rigid.
     """
@@ -77,18 +71,11 @@ def follow(scene: Scene, path: str, limit: int = 0) -> Trajectory:
 def spline(
     scene: Scene, path: str | None, split: str = "test", keys: int = 6, degrees: float = 1.0
 ) -> Trajectory:
-    """A smooth path through a few key cameras; see `leading`.
+    """A smooth path through a few key cameras, in steps of at most `degrees`; see `leading`.
 
-    Args:
-        path: a file of cameras, as `follow` reads it; all of them are keys. None: the keys are
-            cameras of the scene.
-        split: the split these keys come from. Only they have ground truth.
-        keys: how many, evenly spread over the split.
-        degrees: largest step from frame to frame.
-
-    Raises:
-        SteerbenchError: as `follow`; as `from_split`; `degrees` is not positive; fewer than two
-            keys, two consecutive keys with the same pose, or their pictures differ in size.
+    All cameras of the file `path` are keys, see `follow`; without a file, so many `keys` are evenly
+    spread over the `split`, and only they have ground truth. Raises SteerbenchError as `follow`,
+    `from_split` and `leading` do.
     """
     if not degrees > 0:
         raise unexpected("trajectory.degrees", "more than 0", degrees)
@@ -106,27 +93,23 @@ def spline(
 
 def write(path: Path, cameras: Sequence[Camera], scene: Scene, fps: float = 30.0) -> None:
     """Write `cameras` (scene units, all of one size) as a path that nerfstudio's viewer reads."""
-    first = cameras[0]
+    first, keyframes = cameras[0], []
+    for camera in cameras:
+        moved = move_camera(camera, scene.unit_length, scene.origin)
+        pose = opengl_to_opencv(moved.c2w.double())  # its own inverse: it flips two axes
+        fov = math.degrees(2 * math.atan(camera.height / 2 / camera.fy))
+        flat = [*pose.flatten().tolist(), 0.0, 0.0, 0.0, 1.0]
+        aspect = camera.width / camera.height
+        keyframes.append({"camera_to_world": flat, "fov": fov, "aspect": aspect})
     record = {
         "camera_type": "perspective",
         "render_width": first.width,
         "render_height": first.height,
         "fps": fps,
         "seconds": len(cameras) / fps,
-        KEYFRAMES: [_keyframe(camera, scene) for camera in cameras],
+        KEYFRAMES: keyframes,
     }
     path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-
-
-def _keyframe(camera: Camera, scene: Scene) -> dict[str, Any]:
-    moved = move_camera(camera, scene.unit_length, scene.origin)
-    pose = opengl_to_opencv(moved.c2w.double())  # its own inverse: it flips two axes
-    rows = torch.cat((pose, pose.new_tensor([[0, 0, 0, 1]])))
-    return {
-        "camera_to_world": rows.flatten().tolist(),
-        "fov": math.degrees(2 * math.atan(camera.height / 2 / camera.fy)),
-        "aspect": camera.width / camera.height,
-    }
 
 
 def _of_viewer(record: dict, file: Path) -> list[Camera]:

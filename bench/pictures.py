@@ -6,37 +6,32 @@ import hashlib
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
 
-from bench.compositing import composite
 from bench.errors import unexpected
 from bench.metrics import Lpips, check_size
-from bench.protocol import EvaluationProtocol
+from bench.protocol import PICTURES, EvaluationProtocol, Scoring
 from bench.results import STEADY, Measurement
 from bench.run import UNITS, mean_row
 from bench.scenes.images import contents, decode_bytes
-from bench.scoring import PICTURES, Flicker, kept_pictures
 from bench.trajectories import resolution, spread
-from bench.types import BACKGROUNDS, Log, Split, SteerbenchError
+from bench.types import BACKGROUNDS, Log, Split, SteerbenchError, composite
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 """Endings of files that count as pictures; other files in a folder are ignored."""
 
-NAMED = 5
-"""An error names at most this many files and gives the number of the rest."""
+NAMED = 5  # an error names at most this many files and gives the number of the rest
 
 Match = Literal["name", "order"]
 
 
-@dataclass(frozen=True)
-class Pair:
+class Pair(NamedTuple):
     """A file to score; `name` and `truth` of its true picture, a file or uint8 [H, W, 3 or 4]."""
 
     picture: Path
@@ -98,14 +93,6 @@ def listed(folder: Path) -> list[Path]:
     return files
 
 
-def read(path: Path) -> Tensor:
-    """Read a picture file as uint8 [H, W, 3 or 4].
-
-    Raises SteerbenchError if it is not a picture, is damaged, or has more than 8 bits per channel.
-    """
-    return decode_bytes(contents(path), path)
-
-
 def score(
     pairs: Sequence[Pair],
     protocol: EvaluationProtocol,
@@ -118,37 +105,29 @@ def score(
 ) -> Measurement:
     """Score pictures under a protocol, on whose background any alpha is composited.
 
-    Args:
-        facts: method, scene and so on, for the rows.
-        sequence: whether the pictures are consecutive frames, so that flicker is scored, too.
-        kept: number of pictures that are kept, with their truth and error map.
-
+    `facts` (method, scene and so on) are for the rows. Pictures in `sequence` are consecutive
+    frames, so that flicker is scored, too. So many pictures are `kept`, with truth and error map.
     Raises SteerbenchError if a picture cannot be read, or differs in size from its true picture.
     """
     background = torch.full((3,), BACKGROUNDS[protocol.background])
-    shown = spread(len(pairs), kept)
+    scoring = Scoring(protocol, lpips, background, spread(len(pairs), kept))
     frames: list[dict[str, Any]] = []
-    images: dict[str, np.ndarray] = {}
     sizes: list[tuple[int, int]] = []
     alphas = 0
-    seen, truths, blinking = hashlib.sha256(), hashlib.sha256(), Flicker()
+    seen, truths = hashlib.sha256(), hashlib.sha256()
     with log.progress("scoring", len(pairs)) as progress:
-        for index, pair in enumerate(pairs):
-            picture = read(pair.picture)
-            truth = read(pair.truth) if isinstance(pair.truth, Path) else pair.truth
-            _check(pair, picture, truth, protocol)
+        for index, (path, name, true) in enumerate(pairs):
+            picture, truth = (
+                decode_bytes(contents(x), x) if isinstance(x, Path) else x for x in (path, true)
+            )
+            _check(path, name, picture, truth, protocol)
             seen.update(picture.numpy().tobytes())
             truths.update(truth.numpy().tobytes())
             alphas += picture.shape[2] == 4
             rgb = composite(picture, background)
-            figures = protocol.score(rgb, truth, background, lpips)
-            now = protocol.rounded(rgb), composite(truth, background)
-            if sequence:
-                figures |= blinking.since_last(now)
-            frames.append({"frame": index, "name": pair.name, "phase": STEADY, **figures})
+            figures = scoring.score(index, rgb, truth, cut=not sequence)
+            frames.append({"frame": index, "name": name, "phase": STEADY, **figures})
             sizes.append((rgb.shape[1], rgb.shape[0]))
-            if index in shown:
-                images |= kept_pictures(index, rgb, now[1])
             progress.advance()
     if alphas:
         log.info(f"{alphas} pictures with an alpha channel were put on {protocol.background}")
@@ -167,18 +146,20 @@ def score(
         "truths": truths.hexdigest(),
         "with_alpha": alphas,
     }
-    return Measurement(rows, table, images, record)
+    return Measurement(rows, table, scoring.images, record)
 
 
-def _check(pair: Pair, picture: Tensor, truth: Tensor, protocol: EvaluationProtocol) -> None:
+def _check(
+    path: Path, name: str, picture: Tensor, truth: Tensor, protocol: EvaluationProtocol
+) -> None:
     if picture.shape[:2] != truth.shape[:2]:
         wanted, got = (f"{image.shape[1]} x {image.shape[0]}" for image in (truth, picture))
-        raise unexpected(pair.picture, f"{wanted} pixels, as {pair.name} has", got)
+        raise unexpected(path, f"{wanted} pixels, as {name} has", got)
     try:
         for metric in protocol.metric_names:
             check_size(metric, picture.shape[1], picture.shape[0])
     except SteerbenchError as error:
-        raise SteerbenchError(f"{pair.picture}: {error}") from error
+        raise SteerbenchError(f"{path}: {error}") from error
 
 
 def _repeated(names: Sequence[str]) -> list[str]:

@@ -1,41 +1,44 @@
-"""The clock, the counters and the memory meter of a measurement."""
+"""The clock, the counters and the memory meter of a measurement, and where it waits for a GPU."""
 
 from __future__ import annotations
 
+import linecache
 import re
 import resource
 import sys
 import time
-from collections import defaultdict
+import traceback
+import warnings
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import dropwhile
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from bench.allocator import give_back
+from bench.errors import Unavailable
 
-OTHER = "other"
-"""The stage that gets the time of a frame outside any stage."""
+OTHER = "other"  # the stage that gets the time of a frame outside any stage
+TORCH = str(Path(torch.__file__).parent)
+ROOT = f"{Path(__file__).parent.parent}/"
 
 
 @dataclass(frozen=True)
 class FrameRecord:
     """The times and the work of one frame.
 
-    Attributes:
-        stages_ns: time of each stage and of `other`, without nested stages: a stage inside another
-            is named "outer/inner", and its time is not part of "outer".
-        done: units of work by counter.
-        dense: the work of a method that skips nothing, for the counters that report it.
+    A stage inside another is named "outer/inner", and its time is not part of "outer".
     """
 
-    stages_ns: dict[str, int]
-    done: dict[str, int]
-    dense: dict[str, int]
+    stages_ns: dict[str, int]  # time of each stage and of `other`
+    done: dict[str, int]  # units of work by counter
+    dense: dict[str, int]  # the work of a method that skips nothing, of counters that report it
 
     @property
     def total_ns(self) -> int:
@@ -127,10 +130,7 @@ class StageClock:
 def times_ms(
     calls: Sequence[Callable[[], object]], repeats: int, device: str = "cpu"
 ) -> list[list[float]]:
-    """Milliseconds of `repeats` runs of each call.
-
-    The calls take turns, so that a drifting clock affects all alike.
-    """
+    """Milliseconds of `repeats` runs of each call, in turns: a drifting clock affects all alike."""
     clocks = [StageClock(device) for _ in calls]
     for _ in range(repeats):
         for clock, call in zip(clocks, calls, strict=True):
@@ -142,21 +142,15 @@ def times_ms(
 class MemoryMeter:
     """Measures peak memory over regions of code: `with meter: ...`, as often as needed.
 
-    Memory freed earlier, say in a training, is first returned to the system.
-
-    Attributes:
-        peak_bytes: the highest peak so far; 0 before the first region.
-        of_process: whether the memory of the whole process is measured, including what other code
-            keeps.
-        source: what was read, in words. It must be reported with the figure: memory of a device, of
-            a process while it renders, and of a process since its start are different things.
+    `source`, what was read, must be reported with the figure: memory of a device, of a process
+    while it renders, and of a process since its start are different things.
     """
 
     def __init__(self, device: str) -> None:
-        self.peak_bytes = 0
+        self.peak_bytes = 0  # the highest so far
         self._device = torch.device(device)
-        self.of_process = self._device.type != "cuda"
-        give_back()
+        self.of_process = self._device.type != "cuda"  # with all that other code keeps
+        give_back()  # what was freed earlier, say in a training
         if not self.of_process:
             self.source = "peak allocated on the device while rendering"
         elif _reset_high_water_mark():
@@ -193,3 +187,54 @@ def _process_peak_bytes() -> int:
         return int(peak_kib[1]) * 1024
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
+
+
+class Line(NamedTuple):
+    """A line of a source file."""
+
+    path: str
+    number: int
+
+    @property
+    def place(self) -> str:
+        """File and line number; the path is relative to the repository if the file is inside it."""
+        return f"{self.path.removeprefix(ROOT)}:{self.number}"
+
+    @property
+    def source(self) -> str:
+        return linecache.getline(*self).strip()
+
+
+@contextmanager
+def device_waits() -> Iterator[Counter[Line]]:
+    """Count how often the host waits for the GPU inside the context, by the line that caused it.
+
+    Torch reports the waits (`torch.cuda.set_sync_debug_mode`), except explicit synchronisation as
+    by a clock. Raises Unavailable if there is no GPU.
+    """
+    if not torch.cuda.is_available():
+        raise Unavailable("to count how often the host waits for the device, a GPU is needed")
+    waits: Counter[Line] = Counter()
+
+    def note(message, category, filename, lineno, file=None, line=None):
+        if "synchronizing CUDA operation" in str(message):
+            waits[_cause(Line(filename, lineno))] += 1
+        else:
+            show(message, category, filename, lineno, file, line)
+
+    before = torch.cuda.get_sync_debug_mode()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("always", "called a synchronizing CUDA operation")
+        show, warnings.showwarning = warnings.showwarning, note
+        torch.cuda.set_sync_debug_mode("warn")
+        try:
+            yield waits
+        finally:
+            torch.cuda.set_sync_debug_mode(before)
+
+
+def _cause(warned: Line) -> Line:
+    """The innermost line outside torch in the call stack of the line that the warning names."""
+    lines = (Line(f.f_code.co_filename, number) for f, number in traceback.walk_stack(None))
+    outwards = dropwhile(lambda line: line != warned, lines)
+    return next((line for line in outwards if not line.path.startswith(TORCH)), warned)

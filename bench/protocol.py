@@ -1,23 +1,51 @@
-"""The protocol: the rules of a fair measurement. Its name is in every row."""
+"""The protocol: the rules of a fair measurement, and the scores by them, frame by frame.
+
+Its name is in every row.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from bench import metrics
-from bench.compositing import composite
 from bench.errors import unexpected
+from bench.provenance import sha256
 from bench.published import locate
-from bench.sources import sha256
 from bench.trajectories import Trajectory
-from bench.types import BACKGROUNDS, Log, Scene, SteerbenchError, Unavailable
+from bench.types import (
+    BACKGROUNDS,
+    Camera,
+    Frame,
+    Log,
+    Scene,
+    SteerbenchError,
+    Unavailable,
+    check_shape,
+    composite,
+)
+
+PICTURES = 3
+"""Default number of scored frames whose pictures are kept."""
+
+ERROR_RANGE = 0.1
+"""Absolute error (mean over channels) that the brightest colour of an error map stands for."""
+
+CHOICES = {
+    "rounding": ("8bit", "none"),
+    "ssim": ("gaussian", "uniform"),
+    "background": tuple(BACKGROUNDS),
+    "memory": ("steady", "cold"),
+    "flicker": ("split", "exact"),
+}
+"""The values of the protocol's options; "8bit" clips and rounds the prediction."""
 
 _named: set[str] = set()  # reasons why figures are missing that this process has logged
 
@@ -27,43 +55,25 @@ class EvaluationProtocol:
     """How pictures are scored and how frames are timed; the defaults are `steerbench-1`.
 
     A protocol that differs from the defaults needs a name of its own, so that its rows are never
-    mixed with those of another.
-
-    Attributes:
-        name: as shown in result rows.
-        rounding: how the prediction is rounded before scoring: "8bit" (clip, then round) or "none".
-        ssim: window of the SSIM, see `bench.metrics.ssim`.
-        lpips: backbones of LPIPS, each with a metric `lpips_<net>` of its own.
-        background: "white" or "black": onto which pictures with an opacity channel are composited.
-        warmup: frames rendered before the timed sequence, spread over the trajectory.
-        memory: "steady": a method keeps its preceding frames along the trajectory; "cold": it is
-            reset before every frame.
-        flicker: where the true pictures of consecutive frames come from. "split": only frames with
-            ground truth have one. "exact": the scene renders it for the other frames, if it can;
-            this takes about half a second at 400 x 400.
-        stages: whether to time the stages of a frame; this waits for the GPU at each stage.
+    mixed with those of another. A method keeps its preceding frames along the trajectory ("steady")
+    or is reset before every frame ("cold"). The flicker needs true pictures of consecutive frames:
+    those with a ground truth have one ("split"), or the scene renders it for the other frames
+    ("exact"), which takes about half a second at 400 x 400.
     """
 
     name: str = "steerbench-1"
     rounding: str = "8bit"
-    ssim: str = "gaussian"
-    lpips: tuple[str, ...] = ("alex", "vgg")
-    background: str = "white"
-    warmup: int = 3
+    ssim: str = "gaussian"  # the window, see `bench.metrics.ssim`
+    lpips: tuple[str, ...] = ("alex", "vgg")  # backbones, each with a metric `lpips_<net>`
+    background: str = "white"  # onto which pictures with an opacity channel are composited
+    warmup: int = 3  # frames before the timed sequence, spread over the trajectory
     memory: str = "steady"
     flicker: str = "split"
-    stages: bool = True
+    stages: bool = True  # whether to time the stages of a frame: a GPU is waited for at each
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lpips", tuple(self.lpips))  # a list, when read from YAML
-        choices = {
-            "rounding": ("8bit", "none"),
-            "ssim": ("gaussian", "uniform"),
-            "background": tuple(BACKGROUNDS),
-            "memory": ("steady", "cold"),
-            "flicker": ("split", "exact"),
-        }
-        for option, allowed in choices.items():
+        for option, allowed in CHOICES.items():
             if getattr(self, option) not in allowed:
                 got = repr(getattr(self, option))
                 raise unexpected(f"protocol.{option}", " or ".join(allowed), got)
@@ -142,3 +152,72 @@ class EvaluationProtocol:
         for net in self.lpips:
             scores[f"lpips_{net}"] = lpips[net](image, truth) if net in lpips else math.nan
         return scores
+
+
+def check_frame(frame: Frame, camera: Camera, method: str, index: int) -> None:
+    """Raise SteerbenchError if a pixel is not finite, ValueError if the size is not `camera`'s."""
+    check_shape("rgb", frame.rgb, camera.height, camera.width, 3)
+    broken = int((~torch.isfinite(frame.rgb)).any(dim=-1).sum())
+    if broken:
+        raise SteerbenchError(
+            f"{method} rendered {broken} of {camera.height * camera.width} pixels of frame {index} "
+            "as NaN or infinite: the training is broken; train again with a lower learning rate or "
+            "another seed"
+        )
+
+
+class Scoring:
+    """Scores the frames of a sequence in order; keeps the last one for the flicker.
+
+    `images` holds 8-bit pictures by file name: ground truth, rendering and error map of the `shown`
+    frames, once they are scored.
+    """
+
+    def __init__(
+        self,
+        protocol: EvaluationProtocol,
+        lpips: Mapping[str, metrics.Lpips],
+        background: Tensor,
+        shown: Collection[int],
+    ) -> None:
+        self.images: dict[str, np.ndarray] = {}
+        self._protocol, self._lpips = protocol, lpips
+        self._background, self._shown = background, shown
+        self._last: tuple[Tensor, Tensor] | None = None
+
+    def score(
+        self, index: int, rgb: Tensor, truth: Tensor | None, *, scored: bool = True, cut: bool
+    ) -> dict[str, float]:
+        """The figures of frame `index`, rendered as `rgb` [H, W, 3]; none without `truth`.
+
+        `truth` is uint8 [H, W, 3 or 4]; that of a frame which is not `scored` serves the flicker
+        alone. After a `cut`, or a frame of another size or without truth, there is no flicker.
+        """
+        figures: dict[str, float] = {}
+        last, self._last = self._last, None
+        if truth is None:
+            return figures
+        if scored:
+            figures |= self._protocol.score(rgb, truth, self._background, self._lpips)
+            if index in self._shown:
+                self.images |= _pictures(index, rgb, composite(truth, self._background))
+        true = composite(truth.to(rgb.device), self._background)
+        # On the GPU it would count as memory of the method.
+        self._last = self._protocol.rounded(rgb).cpu(), true.cpu()
+        if not cut and last is not None and last[0].shape == rgb.shape:
+            figures["flicker"] = metrics.flicker(*self._last, *last)
+        return figures
+
+
+def _pictures(index: int, rgb: Tensor, truth: Tensor) -> dict[str, np.ndarray]:
+    """Ground truth, rendering and error map of a frame, as 8-bit pictures by file name."""
+    import matplotlib  # imported here: it takes 0.3 s, needed only for pictures
+
+    rendering, truth = metrics.quantise(rgb).cpu(), truth.cpu()
+    error = (rendering - truth).abs().mean(dim=-1) / ERROR_RANGE
+    of_error = matplotlib.colormaps["inferno"](error.numpy(), bytes=True)[..., :3]
+    return {
+        f"{index:04d}-truth": metrics.as_bytes(truth),
+        f"{index:04d}-rendered": metrics.as_bytes(rendering),
+        f"{index:04d}-error": of_error,
+    }

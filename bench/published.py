@@ -28,9 +28,7 @@ from bench.threads import in_parallel
 from bench.types import Log, SteerbenchError, Unavailable
 
 LISTS = Path(__file__).parent / "scenes"
-GROUND_TRUTH = ("_depth_", "_normal_")
-"""Marks in the names of pictures that no loader reads; an archive may lack these pictures."""
-
+GROUND_TRUTH = ("_depth_", "_normal_")  # pictures that no loader reads; an archive may lack them
 WEIGHTS_ADDRESS = "https://download.pytorch.org/models/"
 TIMEOUT_S = 10.0
 
@@ -53,20 +51,13 @@ _unreachable: list[str] = []  # why a download of weights failed
 
 @dataclass(frozen=True)
 class Published:
-    """A data set, as `published.toml` describes it.
-
-    Attributes:
-        archive: URL of a zip file with the folder of one `{scene}`; or
-        folder: URL of the folder with all files.
-        layout: the value of `scene=` that reads its scenes.
-        licence: the licence of the data.
-    """
+    """A data set, as `published.toml` describes it."""
 
     name: str
-    layout: str
+    layout: str  # the value of `scene=` that reads its scenes
     licence: str
-    archive: str | None = None
-    folder: str | None = None
+    archive: str | None = None  # URL of a zip file with the folder of one `{scene}`; or
+    folder: str | None = None  # URL of the folder with all files
 
     @cached_property
     def hashes(self) -> Mapping[str, str]:
@@ -79,12 +70,11 @@ class Published:
 
     @property
     def scenes(self) -> set[str]:
-        """The names of the scenes."""
         return {name.split("/")[0] for name in self.hashes}
 
     def of(self, scene: str) -> dict[str, str]:
         """The part of `hashes` that belongs to `scene`."""
-        return {name: d for name, d in self.hashes.items() if name.split("/")[0] == scene}
+        return {name: d for name, d in self.hashes.items() if name.startswith(f"{scene}/")}
 
 
 def published() -> list[Published]:
@@ -115,11 +105,8 @@ def get(data: Published, scene: str, folder: Path, log: Log) -> Path:
 def fetch(address: str, target: Path, sha256: str | None, log: Log) -> Path:
     """Download `address` to `target` unless it is there already and correct; returns `target`.
 
-    A download that breaks off leaves nothing. `sha256` None: the content is not checked.
-
-    Raises:
-        Unavailable: no answer, the connection breaks off, or the content has another hash.
-        OSError: `target` cannot be written.
+    A download that breaks off leaves nothing. `sha256` None: the content is not checked. Raises
+    Unavailable without an answer, if the connection breaks off, or the content has another hash.
     """
     import pooch
     import requests
@@ -128,10 +115,8 @@ def fetch(address: str, target: Path, sha256: str | None, log: Log) -> Path:
         with requests.get(address, stream=True, timeout=TIMEOUT_S) as answer:
             answer.raise_for_status()
             total = int(answer.headers.get("Content-Length", 0))
-            with (
-                Path(output_file).open("wb") as file,
-                log.progress(f"downloading {target.name}", total) as progress,
-            ):
+            bar = log.progress(f"downloading {target.name}", total)
+            with Path(output_file).open("wb") as file, bar as progress:
                 for chunk in answer.iter_content(1 << 16):
                     file.write(chunk)
                     progress.advance(len(chunk))
@@ -159,10 +144,10 @@ def _unpack(archive: Path, wanted: Mapping[str, str], folder: Path) -> None:
         except (zipfile.BadZipFile, EOFError) as error:
             raise Unavailable(f"{archive.name}: expected a zip file, {error}; try again") from error
         if wrong := _wrong(Path(new), wanted):
-            raise Unavailable(
-                f"{archive.name}: expected the published files, {len(wrong)} of {len(wanted)} are "
-                f"missing or have another SHA-256, {wrong[0]} the first of them"
+            which = (
+                f"{len(wrong)} of {len(wanted)} missing or with another SHA-256, {wrong[0]} first"
             )
+            raise Unavailable(f"{archive.name}: expected the published files, got {which}")
         for name in there:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (Path(new) / name).replace(folder / name)
@@ -186,15 +171,12 @@ def _sha256(path: Path) -> str | None:
 
 @dataclass(frozen=True)
 class VerifyReport:
-    """A copy of a data set, compared with its registry: files by their path in the release.
-
-    `wrong` files have other content or cannot be read; `extra` ones are not on the list.
-    """
+    """A copy of a data set, compared with its registry: files by their path in the release."""
 
     ok: Sequence[str]
-    wrong: Sequence[str]
+    wrong: Sequence[str]  # of other content, or cannot be read
     missing: Sequence[str]
-    extra: Sequence[str]
+    extra: Sequence[str]  # not on the list
 
     @property
     def passed(self) -> bool:
@@ -264,10 +246,8 @@ def locate(net: str, weights_dir: Path | None, log: Log) -> Path:
                     raise
         except (OSError, SteerbenchError) as error:
             _unreachable.append(str(error))
-    raise Unavailable(
-        f"{name} is not on this machine, and {_unreachable[0]}; "
-        "name a folder that has it as weights_dir=DIR or in $STEERBENCH_WEIGHTS"
-    )
+    advice = "name a folder that has it as weights_dir=DIR or in $STEERBENCH_WEIGHTS"
+    raise Unavailable(f"{name} is not on this machine, and {_unreachable[0]}; {advice}")
 
 
 def load_features(net: str, weights_dir: Path | None, log: Log) -> tuple[Path, dict[str, Tensor]]:
@@ -278,10 +258,8 @@ def load_features(net: str, weights_dir: Path | None, log: Log) -> tuple[Path, d
     except (OSError, RuntimeError, EOFError, pickle.UnpicklingError):
         state = None
     if not isinstance(state, dict):
-        raise Unavailable(
-            f"{path}: expected a torch state dict, could not read one; fetch the file again "
-            f"from {WEIGHTS_ADDRESS}{BACKBONES[net].published}"
-        )
+        again = f"fetch the file again from {WEIGHTS_ADDRESS}{BACKBONES[net].published}"
+        raise Unavailable(f"{path}: expected a torch state dict, could not read one; {again}")
     return path, state
 
 
@@ -290,8 +268,6 @@ def _verified(path: Path) -> Path:
     promised = re.search(r"-([0-9a-f]{8})\.pth$", path.name)
     got = _sha256(path) if promised else None
     if promised and not (got or "").startswith(promised[1]):
-        raise Unavailable(
-            f"{path}: expected a SHA-256 that begins with {promised[1]}, got {got}; "
-            "the file is damaged: delete it and fetch it again"
-        )
+        said = f"{path}: expected a SHA-256 that begins with {promised[1]}, got {got}"
+        raise Unavailable(f"{said}; the file is damaged: delete it and fetch it again")
     return path

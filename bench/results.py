@@ -39,8 +39,7 @@ COLUMNS = [
 no interval). NaN with n = 0 means not available. `phase` says which frames: "steady", "cold" (with
 fewer preceding frames than the method looks back on), or "all" for a figure of the whole run."""
 
-STEADY, COLD, WHOLE = "steady", "cold", "all"
-"""The values of the column `phase`."""
+STEADY, COLD, WHOLE = "steady", "cold", "all"  # the values of the column `phase`
 
 FIGURES = {"value": "float64", "lo": "float64", "hi": "float64", "n": "int64", "seed": "int64"}
 RECORD = "record.json"
@@ -56,19 +55,12 @@ def content_key(parts: Mapping[str, object]) -> str:
 
 @dataclass(frozen=True)
 class Measurement:
-    """The figures and pictures of one run.
+    """The figures and pictures of one run."""
 
-    Attributes:
-        rows: one metric per row, `COLUMNS` without `run` and `commit`.
-        frames: one frame per row; NaN where a figure does not exist for that frame.
-        pictures: uint8 [H, W, 3] by file name without `.png`.
-        record: what the figures mean; JSON values only.
-    """
-
-    rows: pd.DataFrame
-    frames: pd.DataFrame
-    pictures: dict[str, np.ndarray]
-    record: dict[str, object]
+    rows: pd.DataFrame  # one metric per row, `COLUMNS` without `run` and `commit`
+    frames: pd.DataFrame  # one frame per row; NaN where a figure does not exist for that frame
+    pictures: dict[str, np.ndarray]  # uint8 [H, W, 3] by file name without `.png`
+    record: dict[str, object]  # what the figures mean; JSON values only
 
 
 class Store:

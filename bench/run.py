@@ -21,9 +21,8 @@ from bench.intervals import path_interval
 from bench.metrics import Lpips
 from bench.neighbours import Neighbours, Watch
 from bench.probes import MemoryMeter, StageClock
-from bench.protocol import EvaluationProtocol
+from bench.protocol import ERROR_RANGE, PICTURES, EvaluationProtocol, Scoring, check_frame
 from bench.results import COLD, STEADY, WHOLE, Measurement
-from bench.scoring import ERROR_RANGE, PICTURES, Scoring, check_frame
 from bench.trajectories import Trajectory, spread
 from bench.types import Budget, Log, Method, Scene
 
@@ -43,30 +42,23 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Task:
-    """What a method is measured on.
-
-    `seed`, that of the method, is only written into the rows. LPIPS backbones are searched in
-    `weights_dir` first. Of so many scored frames the `pictures` are kept.
-    """
+    """What a method is measured on."""
 
     scene: Scene
     trajectory: Trajectory
     protocol: EvaluationProtocol
     budget: Budget
-    seed: int
-    weights_dir: Path | None = None
-    pictures: int = PICTURES
+    seed: int  # of the method; only written into the rows
+    weights_dir: Path | None = None  # where LPIPS backbones are searched first
+    pictures: int = PICTURES  # scored frames whose pictures are kept
 
 
 def measure(methods: Sequence[Method], task: Task, log: Log) -> list[Measurement]:
     """Fit `methods` to the scene of `task`; render its trajectory under the clock and score it.
 
     Several methods render each frame one after the other, so that their times come from the same
-    minutes. Peak memory of the process is that of all methods together.
-
-    Raises:
-        SteerbenchError: the scene does not fit the protocol, or a method rendered values that are
-            not finite.
+    minutes. Peak memory of the process is that of all methods together. Raises SteerbenchError if
+    the scene does not fit the protocol, or a method rendered values that are not finite.
     """
     lpips, missing = task.protocol.load_lpips(task.weights_dir, log)
     task.protocol.check(task.scene, task.trajectory)
@@ -88,7 +80,9 @@ class _Take:
         self.method, device = method, method.settings()["device"]
         self.clock = StageClock(device, stages=task.protocol.stages)
         self.meter = MemoryMeter(device)
-        self.scoring = Scoring(task.scene, task.trajectory, task.protocol, lpips, task.pictures)
+        scored = [n for n, step in enumerate(task.trajectory.steps) if step.truth is not None]
+        shown = {scored[n] for n in spread(len(scored), task.pictures)}
+        self.scoring = Scoring(task.protocol, lpips, task.scene.background, shown)
         self.rows: list[dict[str, Any]] = []
 
     def metered(self, *, warm: bool = False) -> AbstractContextManager[object]:
@@ -184,7 +178,14 @@ def _draw(take: _Take, task: Task, index: int, before: int) -> None:
         **{f"work.{name}": done for name, done in record.done.items()},
         **{f"work.{name}.dense": dense for name, dense in record.dense.items()},
     }
-    take.rows.append(figures | take.scoring.score(index, step, frame.rgb))
+    scene, truth, scored = task.scene, None, step.truth is not None
+    if step.truth is not None:
+        split = scene.splits[task.trajectory.split]
+        figures["name"], truth = split.names[step.truth], split.images[step.truth]
+    elif task.protocol.flicker == "exact" and scene.exact is not None:
+        truth = scene.exact(step.camera)
+    scores = take.scoring.score(index, frame.rgb, truth, scored=scored, cut=step.cut)
+    take.rows.append(figures | scores)
 
 
 def _frame_table(table: list[dict[str, Any]], protocol: EvaluationProtocol) -> pd.DataFrame:

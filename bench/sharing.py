@@ -42,7 +42,10 @@ def locked(path: Path, waiting: str, log: Log) -> Iterator[None]:
         handle = _opened(path)
     try:
         try:
-            _lock(handle, waiting, log)
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            log.info(waiting)
+            fcntl.flock(handle, fcntl.LOCK_EX)
         except OSError as error:
             log.info(f"not locked, others may do the same meanwhile: {path}: {error.strerror}")
         yield
@@ -70,11 +73,3 @@ def _opened(path: Path) -> int:
     with suppress(OSError):  # some file systems have no modes
         os.fchmod(handle, 0o666)  # regardless of umask, so that other users can lock it, too
     return handle
-
-
-def _lock(handle: int, waiting: str, log: Log) -> None:
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        log.info(waiting)
-        fcntl.flock(handle, fcntl.LOCK_EX)

@@ -22,55 +22,37 @@ def turned(label: str, setting: str, values: Iterable[object], *more: str) -> li
 
 @dataclass(frozen=True)
 class Axis:
-    """A setting that the cost of a frame grows with.
+    """A setting that the cost of a frame grows with."""
 
-    Attributes:
-        label: how a value is shown, "K = {}".
-        setting: its name, "method.model.channels".
-        values: the values to measure.
-        size: converts a value to the size used in the power-law fit; None: the value itself.
-    """
-
-    label: str
-    setting: str
-    values: tuple[int, ...]
-    size: tuple[float, ...] | None = None
+    label: str  # how a value is shown, "K = {}"
+    setting: str  # its name, "method.model.channels"
+    values: tuple[int, ...]  # to measure
+    size: tuple[float, ...] | None = None  # of each value in the power-law fit; None: the value
 
 
 @dataclass(frozen=True)
 class Study:
-    """What can be varied in a method, and which stages it has; every attribute is optional.
+    """What can be varied in a method, and which stages it has; every attribute is optional."""
 
-    Attributes:
-        knobs: by knob, the variants that need no new training. Engines and precisions need not be
-            declared.
-        trained: the same for variants that need a training of their own.
-        exact: settings with which the trained model gives up no accuracy for speed.
-        skips: by what is skipped, the setting that switches this skipping off with `false`.
-        skips_with: settings shared by all lines of the study of skips.
-        savings: further savings, each compared on top of all skips.
-        axes: by name, what the cost of a frame grows with, beside pixels and threads.
-        parts: by stage, the part of a frame that it counts towards, with all stages nested in it.
-            Other stages are parts of their own.
-        network_stage: the stage that the engine computes.
-        network_size: the name of the network in `Method.sizes`.
-        beside: by name, the settings of other methods to compare with.
-        chosen: the method's own settings that no training depends on; by default, it depends on
-            all.
-    """
-
+    # By knob, the variants that need no new training (engines and precisions need not be declared),
+    # and those that need a training of their own.
     knobs: Mapping[str, Sequence[Variant]] = field(default_factory=dict)
     trained: Mapping[str, Sequence[Variant]] = field(default_factory=dict)
-    exact: tuple[str, ...] = ()
+    exact: tuple[str, ...] = ()  # settings that give up no accuracy of the trained model for speed
+    # By what is skipped, the setting that switches this skipping off with `false`; settings shared
+    # by all lines of the study of skips; further savings, each compared on top of all skips.
     skips: Mapping[str, str] = field(default_factory=dict)
     skips_with: tuple[str, ...] = ()
     savings: Sequence[Variant] = ()
+    # By name, what the cost of a frame grows with, beside pixels and threads.
     axes: Mapping[str, Axis] = field(default_factory=dict)
+    # By stage, the part of a frame that it counts towards, with all stages nested in it. Other
+    # stages are parts of their own.
     parts: Mapping[str, str] = field(default_factory=dict)
-    network_stage: str = ""
-    network_size: str = ""
-    beside: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    chosen: tuple[str, ...] = ()
+    network_stage: str = ""  # the stage that the engine computes
+    network_size: str = ""  # the name of the network in `Method.sizes`
+    beside: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # settings of other methods
+    chosen: tuple[str, ...] = ()  # the method's own settings that no training depends on
 
     def part_of(self, stage: str) -> str:
         """The part of a frame that `stage` (for example "field/march") counts towards."""

@@ -20,41 +20,26 @@ from bench.errors import unexpected
 from bench.motion import between, preceding, rotation_between, viewing_target
 from bench.types import Camera, Scene, SteerbenchError
 
-MIXED = "mixed"
-"""Stands for the resolution of a trajectory whose frames differ in size."""
+MIXED = "mixed"  # the resolution of a trajectory whose frames differ in size
 
 
 @dataclass(frozen=True)
 class Step:
-    """One frame of a trajectory.
-
-    Attributes:
-        camera: the camera to render.
-        truth: the index of its ground truth in the split; None: unscored.
-        cut: whether the camera jumped here instead of moving from the previous step. The first
-            step of a trajectory always counts as a cut, marked or not.
-    """
+    """One frame of a trajectory. The first one always counts as a cut, marked or not."""
 
     camera: Camera
-    truth: int | None
-    cut: bool = False
+    truth: int | None  # the index of its ground truth in the split; None: unscored
+    cut: bool = False  # the camera jumped here instead of moving from the previous step
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """The frames of one sequence, in the order in which they are rendered.
+    """The frames of one sequence, in the order in which they are rendered."""
 
-    Attributes:
-        name: as shown in result rows.
-        split: the split of the scene that `Step.truth` indexes.
-        steps: at least one.
-        reads: the files that the trajectory was read from.
-    """
-
-    name: str
-    split: str
-    steps: tuple[Step, ...]
-    reads: tuple[Path, ...] = ()
+    name: str  # as shown in result rows
+    split: str  # the split of the scene that `Step.truth` indexes
+    steps: tuple[Step, ...]  # at least one
+    reads: tuple[Path, ...] = ()  # the files that the trajectory was read from
 
     @property
     def resolution(self) -> str:
@@ -82,7 +67,7 @@ def spread(total: int, count: int) -> list[int]:
 
 
 def from_split(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:
-    """The cameras of a split in order; `limit` > 0 keeps only that many, evenly spread.
+    """The cameras of a split in order, or only `limit`, evenly spread.
 
     A kept frame whose predecessor was dropped comes after a cut.
     """
@@ -93,10 +78,8 @@ def from_split(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:
 
 
 def orbit(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:
-    """The cameras of a split in order, without gaps; `limit` > 0 keeps only the first `limit`.
-
-    If the split was recorded along a path, preceding frames are true neighbours on that path.
-    """
+    """The first `limit` cameras of a split in order, without gaps: if it was recorded along a path,
+    preceding frames are true neighbours on that path."""
     cameras, kept, part = _kept(scene, split, limit)
     return Trajectory(f"{split}-orbit{part}", split, tuple(Step(cameras[k], k) for k in kept))
 
@@ -104,8 +87,8 @@ def orbit(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:
 def smooth(scene: Scene, split: str = "test", degrees: float = 1.0, limit: int = 0) -> Trajectory:
     """A path through the cameras of a split that turns by at most `degrees` from frame to frame.
 
-    Frames between two cameras have no ground truth: they are rendered and timed, not scored.
-    `limit` > 0 keeps only the first `limit` cameras, so that the path has no gaps.
+    Frames between two cameras have no ground truth: they are rendered and timed, not scored. The
+    path goes through the first `limit` cameras, so that it has no gaps.
     """
     steps, part = _smooth_steps(scene, split, degrees, limit)
     return Trajectory(f"{split}-smooth{degrees:g}deg{part}", split, tuple(steps))
@@ -123,12 +106,10 @@ def jump(
         allowed = f"1 to {len(steps) - 1}, fewer than the {len(steps)} frames of the path"
         got = f"{every}; trajectory.limit=0 takes all cameras"
         raise unexpected("trajectory.every", allowed, got)
-    pieces = [steps[start : start + every] for start in range(0, len(steps), every)]
-    jumps = [
-        replace(step, cut=position == 0)
-        for piece in _shuffled(len(pieces))
-        for position, step in enumerate(pieces[piece])
-    ]
+    jumps: list[Step] = []
+    for piece in _shuffled(-(-len(steps) // every)):
+        first, *others = steps[piece * every : (piece + 1) * every]
+        jumps += [replace(first, cut=True), *others]
     return Trajectory(f"{split}-jump{every}-{degrees:g}deg{part}", split, tuple(jumps))
 
 
@@ -163,7 +144,7 @@ def approached(
 
     The `lead` frames before a camera have no ground truth; the first of them comes after a cut.
     From frame to frame the camera turns by `degrees` about what it looks at (`motion.preceding`).
-    `seed` seeds the motions; `limit` > 0 keeps only that many cameras, evenly spread.
+    `seed` seeds the motions; only `limit` cameras, evenly spread, are approached.
     """
     _check(lead >= 0, "lead", "0 or more", lead)
     _check(0 < degrees <= 180, "degrees", "more than 0, up to 180", degrees)

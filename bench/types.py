@@ -35,15 +35,9 @@ from torch import Tensor
 from bench.errors import SteerbenchError as SteerbenchError
 from bench.errors import Unavailable as Unavailable
 
-EMPTY_ALPHA = 1e-3
-"""Pixels with a lower opacity are empty: their depth is +inf."""
-
-BACKGROUNDS = {"white": 1.0, "black": 0.0}
-"""Backgrounds by name: the value of every channel of `Scene.background`."""
-
-
-DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?")
-"""Valid device names; `auto` is the GPU if there is one."""
+EMPTY_ALPHA = 1e-3  # pixels with a lower opacity are empty: their depth is +inf
+BACKGROUNDS = {"white": 1.0, "black": 0.0}  # by name, every channel of `Scene.background`
+DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?")  # valid names; `auto` is the GPU if there is one
 
 
 def check_shape(name: str, value: Tensor, *shape: int | None) -> None:
@@ -52,6 +46,15 @@ def check_shape(name: str, value: Tensor, *shape: int | None) -> None:
     if len(got) != len(shape) or any(s not in (None, g) for s, g in zip(shape, got, strict=True)):
         want = ", ".join("any" if size is None else str(size) for size in shape)
         raise ValueError(f"{name}: expected shape [{want}], got {got}")
+
+
+def composite(picture: Tensor, background: Tensor) -> Tensor:
+    """Composite an 8-bit `picture` [H, W, 3 or 4] onto `background` [3]; float [H, W, 3]."""
+    values = picture.float() / 255.0
+    if values.shape[-1] == 3:
+        return values
+    rgb, alpha = values[..., :3], values[..., 3:]
+    return rgb * alpha + background.to(values) * (1.0 - alpha)
 
 
 @dataclass(frozen=True)
@@ -112,25 +115,16 @@ class Split:
 class Scene:
     """Everything a method may learn from and everything it is scored on.
 
-    Attributes:
-        name: short name, as shown in result rows.
-        splits: "train" and "test" at least.
-        background: rgb [3] in [0, 1] onto which RGBA pictures and predictions are composited.
-        bounds: [2, 3] lower and upper corner of the content, inside the unit cube.
-        unit_length: length of one scene unit in the data set's own unit.
-        digest: content hash of cameras, pictures and normalisation.
-        origin: [3] the corner (0, 0, 0) of the unit cube in the data set's own coordinates:
-            data set point = origin + unit_length * scene point, with the same axes.
-        exact: renders the exact picture of any camera, uint8 [H, W, 3 or 4] as in a split; None
-            if the scene cannot.
+    A point of the data set is origin + unit_length * scene point, with the same axes. `exact`
+    renders the true picture of any camera as in a split; None if the scene cannot.
     """
 
-    name: str
-    splits: Mapping[str, Split]
-    background: Tensor
-    bounds: Tensor
-    unit_length: float
-    digest: str
+    name: str  # as shown in result rows
+    splits: Mapping[str, Split]  # "train" and "test" at least
+    background: Tensor  # [3] in [0, 1], onto which RGBA pictures and predictions are composited
+    bounds: Tensor  # [2, 3] lower and upper corner of the content, inside the unit cube
+    unit_length: float  # of one scene unit, in the data set's own unit
+    digest: str  # content hash of cameras, pictures and normalisation
     origin: Tensor = field(default_factory=lambda: torch.zeros(3))
     exact: Callable[[Camera], Tensor] | None = None
 
@@ -139,24 +133,16 @@ class Scene:
 class Budget:
     """How much work a training may do, in steps rather than seconds so that it is repeatable.
 
-    Attributes:
-        name: as shown in result rows.
-        steps: optimiser steps of the (pre-)training of a field.
-        samples: target number of field samples with a gradient per step; it sets the ray count. A
-            training may take a share of it.
-        frames: at most this many test frames are rendered and scored (0: all).
-        renderer_steps: optimiser steps of what is trained after the field: a 2D renderer, Gaussians,
-            the representation that starts from the field.
-        threads: CPU threads of a training; None: as many as torch uses. On a CPU `steerbench paper`
-            runs as many trainings in parallel as the cores have room for.
+    `samples`, of which a training may take a share, sets the number of rays. `renderer_steps` are
+    of what is trained after the field: a 2D renderer, Gaussians, what starts from the field.
     """
 
-    name: str
-    steps: int
-    samples: int
-    frames: int = 0
+    name: str  # as shown in result rows
+    steps: int  # of the optimiser, in the (pre-)training of a field
+    samples: int  # of a field with a gradient, per step
+    frames: int = 0  # at most so many test frames are rendered and scored; 0: all
     renderer_steps: int = 1
-    threads: int | None = None
+    threads: int | None = None  # of the CPU, for one training; None: as many as torch uses
 
     def __post_init__(self) -> None:
         if min(self.steps, self.samples, self.renderer_steps) < 1 or self.frames < 0:
@@ -179,7 +165,7 @@ class Log(Protocol):
 
 
 class Progress(Protocol):
-    """The handle of a running progress bar."""
+    """A running progress bar."""
 
     def advance(self, steps: int = 1, note: str = "") -> None:
         """Count `steps` as done; `note` is a short figure shown beside the bar ("31.2 dB")."""
@@ -201,16 +187,13 @@ class Probe(Protocol):
 class Method(Protocol):
     """A radiance-field renderer.
 
-    Attributes:
-        name: as shown in result rows.
-        train_s: seconds of training, summed over all processes that continued it; `fit` sets it
-            even if it only loads.
-        memory: preceding frames that it uses; 0: every frame is rendered independently.
+    `train_s` are the seconds of training, summed over all processes that continued it; `fit` sets
+    them even if it only loads.
     """
 
-    name: str
+    name: str  # as shown in result rows
     train_s: float
-    memory: int
+    memory: int  # preceding frames that it uses; 0: every frame is rendered independently
 
     def fit(self, scene: Scene, budget: Budget, log: Log) -> None:
         """Train, or load the stages that an earlier training with the same key stored."""

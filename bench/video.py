@@ -11,8 +11,7 @@ import numpy as np
 
 from bench.errors import SteerbenchError, Unavailable, install_command
 
-QUALITY = "18"
-"""H.264's constant rate factor; at 18 the video hardly differs from the original."""
+QUALITY = "18"  # H.264's constant rate factor: the video hardly differs from the original
 
 
 @contextmanager
@@ -20,18 +19,14 @@ def recorded(path: Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
     """A function that appends a picture, uint8 [H, W, 3], to a video; all have the same size.
 
     H.264 needs even sizes: if the height or width is odd, the last row or column is repeated.
-
-    Raises:
-        Unavailable: PyAV is not installed.
-        SteerbenchError: the file cannot be written, or its ending is not that of a video.
+    Raises Unavailable without PyAV, and SteerbenchError if the file cannot be written or its ending
+    is not that of a video.
     """
     try:
         import av
     except ImportError as error:
-        raise Unavailable(
-            f"{path}: videos need PyAV: {install_command('video')}; without --video the pictures "
-            "alone are written"
-        ) from error
+        how = f"{install_command('video')}; without --video the pictures alone are written"
+        raise Unavailable(f"{path}: videos need PyAV: {how}") from error
     try:
         with av.open(path, "w") as container:
             stream = container.add_stream("h264", rate=Fraction(fps).limit_denominator(1000))

@@ -13,14 +13,11 @@ from torch import Tensor
 from bench.cameras import scale_camera
 from bench.metrics import quantise
 from bench.probes import OTHER, StageClock
-from bench.scoring import check_frame
+from bench.protocol import check_frame
 from bench.types import Camera, Method
 
-COARSE = 2
-"""While a camera moves, a slow method renders this many times fewer pixels along both axes."""
-
-FLUENT_MS = 100.0
-"""A method is slow if a frame takes longer than this: the user notices the lag."""
+COARSE = 2  # while a camera moves, a slow method renders so many times fewer pixels a side
+FLUENT_MS = 100.0  # a method is slow if a frame takes longer: the user notices the lag
 
 
 @dataclass(frozen=True)
@@ -68,15 +65,11 @@ class Turns:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A picture rendered by a method.
+    """A picture rendered by a method."""
 
-    `rgb` [H, W, 3] in [0, 1] is on the CPU, rounded to 8 bits; `ms` is the frame time, `stages_ms`
-    that of each stage without nested stages, longest first.
-    """
-
-    rgb: Tensor
-    ms: float
-    stages_ms: dict[str, float]
+    rgb: Tensor  # [H, W, 3] in [0, 1], on the CPU, rounded to 8 bits
+    ms: float  # of the frame
+    stages_ms: dict[str, float]  # of each stage without nested stages, longest first
 
 
 class Painter:

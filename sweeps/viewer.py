@@ -18,10 +18,9 @@ from torch.nn import functional
 
 from bench import paths
 from bench.cameras import pack_camera
-from bench.compositing import composite
 from bench.errors import SteerbenchError, Unavailable, install_command
 from bench.metrics import as_bytes, psnr
-from bench.types import Camera, Log, Scene
+from bench.types import Camera, Log, Scene, composite
 from bench.viewing import Ask, Drawn, Painter, Turns, difference, divided, seen_from
 
 if TYPE_CHECKING:

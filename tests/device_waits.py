@@ -19,8 +19,8 @@ from unittest.mock import patch
 import torch
 
 from bench.console import ConsoleLog
+from bench.probes import Line, device_waits
 from bench.types import NullProbe, Scene, Split
-from bench.waits import Line, device_waits
 from methods.instant_ngp.training import FieldTraining
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.training.joint import JointTraining

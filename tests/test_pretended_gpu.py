@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from bench.cameras import place_camera
+from bench.probes import device_waits
 from bench.types import Log, NullProbe
-from bench.waits import device_waits
 from methods.engines.torch_engine import TorchEngine
 from methods.kernels import dispatch
 from methods.kernels.encode import HashGrid, encode

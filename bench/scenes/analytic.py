@@ -19,54 +19,41 @@ from torch import Tensor
 
 from bench.cameras import look_at, move_camera
 from bench.errors import unexpected
+from bench.provenance import digest
 from bench.scenes import blender
 from bench.scenes.files import opengl_to_opencv, whole_number
 from bench.scenes.medley import medley
 from bench.scenes.models import MODELS
 from bench.scenes.raytrace import Model, render
-from bench.sources import digest
 from bench.threads import in_parallel
 from bench.types import Camera, Log, Scene, SteerbenchError, Unavailable
 
-ANGLE_X = 0.69
-"""Horizontal field of view in radians."""
-
-DISTANCE = 4.3
-"""Distance of all cameras from the centre of the scene, in the model's units."""
-
-MEDLEY = re.compile("medley-(0|[1-9][0-9]*)")
-"""Names of the variants of `medley`."""
+ANGLE_X = 0.69  # horizontal field of view in radians
+DISTANCE = 4.3  # of all cameras from the centre of the scene, in the model's units
+MEDLEY = re.compile("medley-(0|[1-9][0-9]*)")  # names of the variants of `medley`
 
 
 def load(
-    name: str,
+    name: str,  # one of `MODELS`, `medley`, or `medley-N` for its variant N
     *,
-    variant: int | None = None,
+    variant: int | None = None,  # only for `medley`
     width: int = 400,
-    height: int | None = None,
+    height: int | None = None,  # None: square pictures
     train: int = 60,
     test: int = 24,
-    seed: int = 0,
+    seed: int = 0,  # of the training poses
     downscale: int = 1,
     background: str = "white",
     bounds: str | list = "auto",
-    root: str | Path = "outputs/scenes",
+    root: str | Path = "outputs/scenes",  # holds a folder for each scene
     log: Log,
 ) -> Scene:
     """Read an embedded scene; write it first if it does not exist yet.
 
-    Args:
-        name: one of `MODELS`, `medley`, or `medley-N` for its variant N.
-        variant: variant number; only for `medley`.
-        width, height: size of the pictures; square if no height is given.
-        train: number of training pictures, from all around, 10 degrees below to 80 degrees above
-            the horizon.
-        test: number of test pictures, on a smooth orbit, 1 degree of azimuth apart (360 close it).
-        seed: seed of the training poses.
-        downscale, background, bounds: see `blender.load`.
-        root: where scenes are written, each into a folder of its own.
-
-    Raises SteerbenchError when an option is out of range or `root` cannot be written.
+    `train` pictures come from all around, 10 degrees below to 80 degrees above the horizon; `test`
+    pictures from a smooth orbit, 1 degree of azimuth apart (360 close it). For `downscale`,
+    `background` and `bounds` see `blender.load`. Raises SteerbenchError when an option is out of
+    range or `root` cannot be written.
     """
     if name == "medley":
         name = f"medley-{whole_number(variant, 'variant', 0)}"

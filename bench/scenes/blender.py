@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from bench.errors import unexpected
-from bench.scenes.assemble import assemble, describe_splits
-from bench.scenes.bounds import Box, cube, hull_box, parse_box
+from bench.scenes.assemble import Box, assemble, cube, describe_splits, hull_box, parse_box
 from bench.scenes.files import data_folder, focal_length, frames_of, inside, opengl_pose, read_json
 from bench.scenes.images import Pictures, View, image_size
 from bench.types import Camera, Log, Scene
@@ -24,18 +23,13 @@ def load(
     name: str | None = None,
     log: Log,
 ) -> Scene:
-    """Read a scene folder.
+    """Read the scene folder `path`; `name`, in result rows, is by default that of the folder.
 
-    Args:
-        path: the folder with the `transforms_*.json`.
-        downscale: average blocks of downscale x downscale pixels; pixels at the right and bottom
-            that do not fill a block are dropped.
-        background: "white" or "black", what RGBA pictures are composited onto.
-        bounds: what fills the unit cube. "auto": the box of the visual hull of the training masks,
-            or [-1.5, 1.5]^3 without masks; "full": [-1.5, 1.5]^3; or [[x, y, z], [x, y, z]].
-        name: the scene's name in result rows; by default the folder's name.
-
-    A split other than train and test is left out if none of its pictures exist.
+    `downscale` averages blocks of so many pixels squared; pixels at the right and bottom that do
+    not fill a block are dropped. RGBA pictures are composited onto `background`, "white" or
+    "black". `bounds` fill the unit cube: the box of the visual hull of the training masks ("auto";
+    without masks as "full"), [-1.5, 1.5]^3 ("full"), or [[x, y, z], [x, y, z]]. The split val is
+    left out if none of its pictures exist.
     """
     root = data_folder(path)
     read = ((split, read_split(root, split, log)) for split in ("train", "val", "test"))
@@ -43,12 +37,10 @@ def load(
     pictures = describe_splits(views, downscale, log)
     box = scene_box(bounds, pictures["train"], log)
     files = [root / camera_file(split) for split in views]
-    name = name or root.name
-    return assemble(name, pictures, box, background=background, camera_files=files)
+    return assemble(name or root.name, pictures, box, background=background, camera_files=files)
 
 
 def camera_file(split: str) -> str:
-    """The name of a split's camera file."""
     return f"transforms_{split}.json"
 
 

@@ -14,8 +14,15 @@ from torch import Tensor
 
 from bench.cameras import scale_camera
 from bench.errors import Unavailable, install_command, unexpected
-from bench.scenes.assemble import assemble, describe_splits, every_nth, leave_out
-from bench.scenes.bounds import MARGIN, Box, parse_box
+from bench.scenes.assemble import (
+    MARGIN,
+    Box,
+    assemble,
+    describe_splits,
+    every_nth,
+    leave_out,
+    parse_box,
+)
 from bench.scenes.distortion import Lens
 from bench.scenes.files import data_folder, inside, rigid_pose
 from bench.scenes.images import View, image_size
@@ -28,11 +35,8 @@ LISTS = {"frames": (64, "<I", 16), "images": (64, "<Q", 24), "points3D": (43, "<
 """Layout of an entry in each binary list: bytes before the count of its parts (for an image, plus a
 name), the type of this count, bytes per part."""
 
-STRAY = 0.01
-"""Share of the points, at either end of an axis, that the box may exclude."""
-
-ASPECT = 0.01
-"""Largest relative difference between the aspect ratios of a picture and its camera."""
+STRAY = 0.01  # share of the points, at either end of an axis, that the box may exclude
+ASPECT = 0.01  # largest relative difference of the aspect ratios of a picture and its camera
 
 
 def load(
@@ -46,17 +50,12 @@ def load(
     background: str = "white",
     log: Log,
 ) -> Scene:
-    """Read a capture folder.
+    """Read the capture folder `path`: its pictures in `images`, its sparse model in `model`.
 
-    Args:
-        path: the folder.
-        images: its folder of pictures. They may be smaller than those that COLMAP saw.
-        model: its folder with `cameras`, `images` and `points3D`, `.bin` or `.txt`; None: the first
-            of `MODELS` that has them.
-        split_every: see `bench.scenes.transforms.load`.
-        bounds: what fills the unit cube. "auto": the box of the points without outliers;
-            or [[x, y, z], [x, y, z]].
-        downscale, background: see `bench.scenes.blender.load`.
+    The pictures may be smaller than those that COLMAP saw; the model is by default the first of
+    `MODELS`. `bounds` fill the unit cube: the box of the points without outliers ("auto"), or
+    [[x, y, z], [x, y, z]]. For `split_every` see `transforms.load`, for `downscale` and
+    `background` `blender.load`.
 
     Lens distortion is undone for every COLMAP camera model that has a focal length, and pictures
     are cropped to what the lens saw. Pictures that COLMAP did not register are ignored. Registered
@@ -73,7 +72,6 @@ def load(
 
 
 def model_folder(root: Path, model: str | None) -> Path:
-    """The folder of the sparse model in `root`."""
     places = MODELS if model is None else (model,)
     for place in places:
         folder = inside(root, place, "scene.model")
@@ -125,7 +123,6 @@ def check_length(file: Path) -> None:
 
 
 def read_views(root: Path, images: str, folder: Path, reconstruction: Any, log: Log) -> list[View]:
-    """The views of all registered images whose picture exists."""
     pictures = inside(root, images, "scene.images")
     views, missing = [], []
     for image in reconstruction.images.values():
@@ -161,8 +158,6 @@ def read_camera(image: Any, file: Path, where: str) -> tuple[Camera, Lens | None
 
 @dataclass(frozen=True)
 class ColmapLens:
-    """A lens of COLMAP, given by the name of its `model` and its `params`."""
-
     model: str
     params: tuple[float, ...]
 

@@ -17,11 +17,8 @@ from torch import Tensor
 
 from bench.errors import unexpected
 
-SMALLEST_ANGLE = 1e-9
-"""Smallest angle of view in radians: below any telescope's, but its tangent is not 0."""
-
-ORTHONORMAL_TOLERANCE = 1e-3
-"""Largest entry of R^T R - I. Poses are stored with at least three digits."""
+SMALLEST_ANGLE = 1e-9  # of view in radians: below any telescope's, but its tangent is not 0
+ORTHONORMAL_TOLERANCE = 1e-3  # largest entry of R^T R - I; poses have at least three digits
 
 
 def data_folder(path: str | Path) -> Path:

@@ -14,7 +14,7 @@ from colorsys import hsv_to_rgb
 from typing import TypeVar
 
 from bench.scenes import textures
-from bench.scenes.opaque import Part, Solids
+from bench.scenes.raytrace import Part, Solids
 from bench.scenes.solids import (
     Box,
     Capsule,
@@ -31,14 +31,9 @@ from bench.scenes.textures import Colour, Texture
 
 Item = TypeVar("Item")
 
-REACH = 1.2
-"""All parts lie in a ball of this radius, inside the models' cube and inside every picture."""
-
-CORE = 5
-"""Number of core parts, on which the other parts are placed."""
-
-FINEST = 0.016
-"""Width of the finest stripes and dots: two pixels in a picture 400 pixels wide."""
+REACH = 1.2  # all parts lie in a ball of this radius, inside the models' cube and every picture
+CORE = 5  # core parts, on which the other parts are placed
+FINEST = 0.016  # width of stripes and dots: two pixels in a picture 400 pixels wide
 
 
 class Draw:
@@ -86,16 +81,15 @@ def medley(variant: int) -> Solids:
     colours = palette(draw)
     parts: list[Part] = []
     for shape, paint in zip(shapes, painters, strict=True):
-        parts.append(
-            Part(
-                shape,
-                paint(draw, colours, sorted(shape.extent())[1]),
-                place(draw, shape, parts[:CORE]),
-                (draw.between(-180, 180), draw.between(-180, 180), draw.between(-180, 180)),
-                gloss=draw.between(0.2, 0.9) if draw.share() < 0.45 else 0.0,
-                sharpness=draw.small(15, 150),
-            )
+        part = Part(
+            shape,
+            paint(draw, colours, sorted(shape.extent())[1]),
+            place(draw, shape, parts[:CORE]),
+            (draw.between(-180, 180), draw.between(-180, 180), draw.between(-180, 180)),
+            gloss=draw.between(0.2, 0.9) if draw.share() < 0.45 else 0.0,
+            sharpness=draw.small(15, 150),
         )
+        parts.append(part)
     return Solids(parts)
 
 
@@ -138,27 +132,23 @@ def scaled(vector: Sequence[float], factor: float) -> Triple:
 
 
 def die(draw: Draw, size: float) -> Shape:
-    """A box with its corners rounded by a ball."""
     half = 0.8 * size
     sides = (half, draw.between(0.8, 1.0) * half, draw.between(0.8, 1.0) * half)
     return Common(Box(sides), ball(1.1 * size))
 
 
 def beam(draw: Draw, size: float) -> Shape:
-    """A long box."""
     thick = draw.between(0.02, 0.06)
     return Box((thick, draw.between(0.6, 2.0) * thick, draw.between(0.35, 0.8)))
 
 
 def bowl(draw: Draw, size: float) -> Shape:
-    """A ball minus another ball."""
     size = 1.2 * size
     bite = ball(draw.between(0.75, 0.95) * size)
     return Carved(ball(size), [Shifted(bite, (0.0, 0.0, 0.5 * size))])
 
 
 def niches(draw: Draw, size: float) -> Shape:
-    """A box with niches in four of its sides."""
     bite = ball(draw.between(0.5, 0.75) * size)
     sides = [(size, 0.0, 0.0), (-size, 0.0, 0.0), (0.0, size, 0.0), (0.0, -size, 0.0)]
     body = Box((size, size, draw.between(0.5, 1.0) * size))
@@ -166,14 +156,12 @@ def niches(draw: Draw, size: float) -> Shape:
 
 
 def ring(draw: Draw, size: float) -> Shape:
-    """A piece of a pipe."""
     size = 1.5 * size
     bore = Cylinder(draw.between(0.75, 0.94) * size, 2 * size)
     return Carved(Cylinder(size, draw.between(0.1, 0.7) * size), [Shifted(bore, (0.0, 0.0, 0.0))])
 
 
 def window(draw: Draw, size: float) -> Shape:
-    """A thin box with four openings."""
     x, y, thin = 1.5 * size, draw.between(0.9, 1.5) * size, draw.between(0.02, 0.05)
     opening = Box((0.4 * x, 0.4 * y, 2 * thin))
     places = [(s * 0.46 * x, t * 0.46 * y, 0.0) for s in (-1, 1) for t in (-1, 1)]
@@ -236,20 +224,17 @@ def pair(draw: Draw, colours: list[Colour]) -> tuple[Colour, Colour]:
 
 
 def rings(draw: Draw, colours: list[Colour], size: float) -> Texture:
-    """A checkerboard on a disc."""
     width = stripe(draw, size) + FINEST  # it narrows towards the axis
     return textures.polar_checker(*pair(draw, colours), 2 * around(size, width), width)
 
 
 def screw(draw: Draw, colours: list[Colour], size: float) -> Texture:
-    """Stripes around the axis, straight or winding."""
     width = stripe(draw, size) + FINEST  # it narrows towards the axis and where it winds
     twist = draw.between(-1.2, 1.2) / max(size, 0.05)
     return textures.spiral(*pair(draw, colours), around(size, width), twist)
 
 
 def dots(draw: Draw, colours: list[Colour], size: float) -> Texture:
-    """Dots on a lattice."""
     radius = 0.7 * stripe(draw, size)
     return textures.pips(*pair(draw, colours), draw.between(2.2, 3.5) * radius, radius)
 

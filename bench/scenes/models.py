@@ -6,9 +6,7 @@ import math
 from collections.abc import Callable
 from itertools import pairwise
 
-from bench.scenes.media import Ball, Cloud
-from bench.scenes.opaque import Part, Solids
-from bench.scenes.raytrace import Model
+from bench.scenes.raytrace import Ball, Cloud, Model, Part, Solids
 from bench.scenes.solids import (
     Box,
     Capsule,

@@ -8,8 +8,7 @@ from pathlib import Path
 import torch
 
 from bench.errors import unexpected
-from bench.scenes.assemble import assemble, describe_splits
-from bench.scenes.bounds import MARGIN, Box
+from bench.scenes.assemble import MARGIN, Box, assemble, describe_splits
 from bench.scenes.files import data_folder, inside, number, numbers, read_text, rigid_pose
 from bench.scenes.images import View, image_size
 from bench.types import Camera, Log, Scene
@@ -25,11 +24,7 @@ PICTURE_NAME = re.compile(r"[012]_.*\.(png|jpg|jpeg)", re.IGNORECASE)
 
 
 def load(path: str | Path, *, downscale: int = 1, background: str = "white", log: Log) -> Scene:
-    """Read a scene folder.
-
-    Args:
-        path: the folder with `bbox.txt`, `intrinsics.txt`, `pose/` and `rgb/`.
-        downscale, background: see `bench.scenes.blender.load`.
+    """Read the scene folder `path`; for `downscale` and `background` see `blender.load`.
 
     Pictures and poses are named 0_* (train), 1_* (val) and 2_* (test); poses have OpenCV axes.
     If there are no 2_*, the 1_* are the test split, as in Tanks & Temples. The box of `bbox.txt`,
@@ -92,7 +87,6 @@ def read_intrinsics(root: Path) -> tuple[float, float, float, float]:
 
 
 def picture_files(root: Path) -> list[Path]:
-    """The pictures of all splits, by name."""
     folder = inside(root, "rgb", root / "rgb")
     if not folder.is_dir():
         raise unexpected(folder, "a folder of pictures", "nothing there")

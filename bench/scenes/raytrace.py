@@ -1,14 +1,15 @@
 """Renders exact pictures of analytic models: every sub-pixel ray is solved in closed form.
 
-A picture is rendered in bands of rows. In each band, a part of a model is traced only in the
-columns that its bounding box can cover.
+A model is made of opaque solids under one fixed light, or of overlapping homogeneous media. A
+picture is rendered in bands of rows. In each band, a part of a model is traced only in the columns
+that its bounding box can cover.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import torch
@@ -16,13 +17,21 @@ from torch import Tensor
 
 from bench.cameras import project
 from bench.errors import unexpected
+from bench.scenes.solids import Carved, Shape, Triple, ball_interval, box_corners, unit
+from bench.scenes.textures import Colour, Texture
 from bench.types import EMPTY_ALPHA, Camera, Frame
 
-BAND_RAYS = 1 << 18
-"""Rays per band: enough to hide the cost of calls, few enough to stay in the cache."""
+BAND_RAYS = 1 << 18  # enough to hide the cost of calls, few enough to stay in the cache
 
 Span = tuple[int, int, int]
 """A part's number, the first column that it can cover in a band, and one past the last."""
+
+
+LIGHT = (0.48, -0.6, 0.64)  # unit direction to the light
+LIFT = 1e-4  # distance of a shadow ray's start above the surface, in the model's units
+
+SKY, GROUND, SUN = 0.52, 0.24, 0.62
+"""Light from above, from below, and from the light's direction, as shares of a surface's colour."""
 
 
 @dataclass(frozen=True)
@@ -46,23 +55,15 @@ class Band:
         return u, v, w
 
 
-@dataclass(frozen=True)
-class Traced:
-    """What rays [rows, W, S] see: `rgb` (premultiplied), `alpha`, `depth` (premultiplied)."""
-
-    rgb: Tensor
-    alpha: Tensor
-    depth: Tensor
-
-
 class Model(Protocol):
     """A model made of parts, through which a band of rays can be traced."""
 
     def boxes(self) -> Tensor:
         """Corners of a box around each part, [P, 8, 3]."""
 
-    def trace(self, band: Band, spans: Sequence[Span]) -> Traced:
-        """What the rays see of the parts in `spans`; a part is never seen outside its span."""
+    def trace(self, band: Band, spans: Sequence[Span]) -> tuple[Tensor, Tensor, Tensor]:
+        """What the rays [rows, W, S] see of the parts in `spans`: rgb and depth, premultiplied by
+        alpha, which comes between them. A part is never seen outside its span."""
 
 
 def render(model: Model, camera: Camera, background: Tensor, samples: int) -> Frame:
@@ -88,9 +89,8 @@ def render(model: Model, camera: Camera, background: Tensor, samples: int) -> Fr
         first, last = min(span[1] for span in spans), max(span[2] for span in spans)
         band = Band(camera.c2w[:, 3], camera.c2w[:, :3], x[None, first:last], y[top:bottom, None])
         traced = model.trace(band, [(part, a - first, b - first) for part, a, b in spans])
-        rgb[top:bottom, first:last] = traced.rgb.mean(2)
-        alpha[top:bottom, first:last] = traced.alpha.mean(2)
-        depth[top:bottom, first:last] = traced.depth.mean(2)
+        for picture, seen in zip((rgb, alpha, depth), traced, strict=True):
+            picture[top:bottom, first:last] = seen.mean(2)
     empty = alpha < EMPTY_ALPHA
     depth = (depth / alpha.clamp(min=EMPTY_ALPHA)).masked_fill(empty, math.inf)
     return Frame(rgb + (1 - alpha)[..., None] * background.to(device), depth, alpha)
@@ -139,3 +139,202 @@ class ProjectedBoxes:
         last = last.masked_fill(~self.in_front, self.width).clamp(max=self.width)
         columns = torch.stack((first, last.masked_fill(self.behind, 0)), dim=1).tolist()
         return [(part, int(a), int(b)) for part, (a, b) in enumerate(columns) if a < b]
+
+
+@dataclass(frozen=True)
+class Part:
+    """A solid placed in a model, with the texture of its own frame."""
+
+    shape: Shape
+    texture: Texture
+    centre: Triple = (0.0, 0.0, 0.0)  # origin of the frame, in the model's units
+    turn: Triple = (0.0, 0.0, 0.0)  # in degrees about x, then y, then z
+    gloss: float = 0.0  # strength of the highlight, 0 for a matt surface
+    sharpness: float = 60.0  # exponent of the highlight
+    frame: Tensor = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "frame", rotation(*self.turn))
+
+
+class Solids:
+    """A model of opaque parts, lit by a point at infinity: shadows are hard and exact."""
+
+    def __init__(self, parts: Sequence[Part]) -> None:
+        self.parts = parts
+        light = torch.tensor(LIGHT)
+        across = unit(torch.linalg.cross(light, torch.tensor((0.0, 0.0, 1.0)))[None])[0]
+        self.light_axes = torch.stack((across, torch.linalg.cross(light, across), light), dim=1)
+        boxes = self.boxes() @ self.light_axes
+        self.low, self.high = boxes.amin(1), boxes.amax(1)
+
+    def boxes(self) -> Tensor:
+        placed = ((box_corners(p.shape.extent()) @ p.frame.T, p.centre) for p in self.parts)
+        return torch.stack([corners + torch.tensor(centre) for corners, centre in placed])
+
+    def trace(self, band: Band, spans: Sequence[Span]) -> tuple[Tensor, Tensor, Tensor]:
+        """Find the nearest surface over all parts, then shade only that."""
+        shape = (band.y.shape[0], *band.x.shape[1:])
+        depth = band.x.new_full(shape, math.inf)
+        owner = torch.full(shape, -1, dtype=torch.int16, device=depth.device)
+        for number, first, last in spans:
+            part, columns = self.parts[number], slice(first, last)
+            frame = part.frame.to(depth)
+            x, y, z = ((band.origin - depth.new_tensor(part.centre)) @ frame).tolist()
+            t = part.shape.hit((x, y, z), band.directions(frame, columns))
+            nearest = depth[:, columns]
+            owner[:, columns].masked_fill_(t < nearest, number)
+            torch.minimum(nearest, t, out=nearest)
+        seen = owner >= 0
+        rgb = depth.new_zeros(*shape, 3)
+        for number, first, last in spans:
+            rays = (owner[:, first:last] == number).nonzero(as_tuple=True)
+            if len(rays[0]):
+                row, column, sample = rays[0], rays[1] + first, rays[2]
+                x, y = band.x[0, column, sample], band.y[row, 0, sample]
+                directions = torch.stack((x, y, torch.ones_like(x)), 1) @ band.rotation.T
+                points = band.origin + depth[row, column, sample, None] * directions
+                rgb[row, column, sample] = self.shade(number, points, directions)
+        return rgb, seen.to(depth.dtype), depth.masked_fill_(~seen, 0)
+
+    def shade(self, number: int, points: Tensor, directions: Tensor) -> Tensor:
+        """Lambert and Blinn-Phong colours [N, 3] of a part's `points`, seen along `directions`."""
+        part = self.parts[number]
+        frame, light = part.frame.to(points), points.new_tensor(LIGHT)
+        local = (points - points.new_tensor(part.centre)) @ frame
+        normals = part.shape.normal(local) @ frame.T
+        toward = -unit(directions)
+        # The normal points to the viewer's side of the surface.
+        facing = (normals * toward).sum(1, keepdim=True)
+        normals = torch.where(facing < 0, -normals, normals)
+        height = 0.5 + 0.5 * normals[:, 2:]
+        sun = (normals * light).sum(1, keepdim=True)
+        lit = sun[:, 0] > 0
+        lit[lit.clone()] = ~self.shadowed(number, (points + LIFT * normals)[lit])
+        sun = sun * lit[:, None]
+        colour = part.texture(local) * (GROUND + (SKY - GROUND) * height + SUN * sun)
+        if part.gloss:
+            half = unit(toward + light)
+            highlight = (normals * half).sum(1, keepdim=True).clamp(min=0) ** part.sharpness
+            colour = colour + part.gloss * highlight * lit[:, None]
+        return colour.clamp(max=1)
+
+    def shadowed(self, number: int, points: Tensor) -> Tensor:
+        """[N] bool: whether another part is between these points of part `number` and the light."""
+        dark = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+        light, columns = points.new_tensor(LIGHT), points.T.contiguous()
+        for caster in (self.parts[k] for k in self.casters(number, points)):
+            frame = caster.frame.to(points)
+            centre = points.new_tensor(caster.centre)[:, None]
+            x, y, z = (frame.T @ (columns - centre)).unbind(0)
+            u, v, w = (light @ frame).unbind(0)
+            dark |= caster.shape.hit((x, y, z), (u, v, w)) < math.inf
+        return dark
+
+    def casters(self, number: int, points: Tensor) -> list[int]:
+        """The parts that may lie between these points of part `number` and the light.
+
+        Seen from the light, their box overlaps the box of the points and reaches nearer. A convex
+        part is skipped for itself: it casts no shadow on its own lit side.
+        """
+        if not len(points):
+            return []
+        seen = (points @ self.light_axes.to(points)).cpu()
+        low, high = seen.amin(0), seen.amax(0)
+        candidates = (self.low < high)[:, :2].all(1) & (self.high > low).all(1)
+        candidates[number] = isinstance(self.parts[number].shape, Carved)
+        return candidates.nonzero()[:, 0].tolist()
+
+
+def rotation(x: float, y: float, z: float) -> Tensor:
+    """[3, 3] rotation by degrees about x, then y, then z."""
+    turns = torch.eye(3, dtype=torch.float64)
+    for axis, degrees in enumerate((x, y, z)):
+        c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+        turn = torch.eye(3, dtype=torch.float64)
+        a, b = (axis + 1) % 3, (axis + 2) % 3
+        turn[a, a], turn[a, b], turn[b, a], turn[b, b] = c, -s, s, c
+        turns = turn @ turns
+    return turns.float()
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A sphere of constant density (sigma, 1 / unit length) that glows in one colour."""
+
+    centre: Triple
+    radius: float
+    density: float
+    colour: Colour
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Balls whose densities add where they overlap; their colours are averaged, density-weighted.
+
+    Between two crossings of surfaces the density k (per unit of t) and the colour c are constant.
+    With transmittance T at the start of such a piece [a, b]
+
+        opacity += T (1 - e^-x),    rgb += T (1 - e^-x) c,    x = k (b - a),
+        depth   += T ((1 - e^-x) a + (1 - e^-x - x e^-x) / k),
+
+    where the last line is the integral of t k e^(-k (t - a)).
+    """
+
+    balls: Sequence[Ball]
+
+    def boxes(self) -> Tensor:
+        balls = self.balls
+        return torch.stack([torch.tensor(b.centre) + box_corners((b.radius,) * 3) for b in balls])
+
+    def trace(self, band: Band, spans: Sequence[Span]) -> tuple[Tensor, Tensor, Tensor]:
+        """Integrate all balls in `spans` together, for the rays that hit any of them."""
+        shape = (band.y.shape[0], *band.x.shape[1:])
+        balls = [self.balls[number] for number, _, _ in spans]
+        directions = band.directions(torch.eye(3, device=band.x.device), slice(None))
+        enter, leave = band.x.new_zeros(2, len(balls), *shape)
+        for k, ((_, first, last), ball) in enumerate(zip(spans, balls, strict=True)):
+            columns = slice(first, last)
+            origin = (band.origin - torch.tensor(ball.centre).to(band.origin)).tolist()
+            a, b = ball_interval(origin, [d[:, columns] for d in directions], ball.radius)
+            missed = (a > b) | (b <= 0)
+            enter[k, :, columns] = a.clamp_(min=0).masked_fill_(missed, 0)
+            leave[k, :, columns] = b.masked_fill_(missed, 0)
+        met = (leave > 0).any(0)
+        speed = torch.stack([d[met] for d in directions]).norm(dim=0)  # length per unit of t
+        density = speed.new_tensor([ball.density for ball in balls])
+        colour = speed.new_tensor([ball.colour for ball in balls])
+        seen = integrate(enter[:, met], leave[:, met], speed, density, colour)
+        rgb, (alpha, depth) = speed.new_zeros(*shape, 3), speed.new_zeros(2, *shape)
+        rgb[met], alpha[met], depth[met] = seen
+        return rgb, alpha, depth
+
+
+def integrate(
+    enter: Tensor, leave: Tensor, speed: Tensor, density: Tensor, colour: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """rgb [N, 3], opacity [N] and depth times opacity [N] of rays through B overlapping media.
+
+    `enter` and `leave` [B, N] are the interval of each medium along each ray, equal where the ray
+    misses it; `speed` [N] the length of a ray's direction; `density` [B], `colour` [B, 3].
+    """
+    ends, order = torch.cat((enter, leave)).sort(dim=0)  # [2B, N]
+    step = torch.cat((density, -density))
+    emission = torch.cat((density[:, None] * colour, -density[:, None] * colour))
+    k, alpha, depth = speed.new_zeros(3, len(speed))
+    glow, rgb = speed.new_zeros(2, len(speed), 3)
+    transmittance = torch.ones_like(k)
+    for piece in range(len(ends) - 1):
+        k = k + step[order[piece]]
+        glow = glow + emission[order[piece]]
+        # Outside all media k is only rounding error, far below the density of the thinnest medium.
+        outside = ~(k > 1e-3 * density.min())
+        rate = (k * speed).masked_fill(outside, 1)
+        x = (rate * (ends[piece + 1] - ends[piece])).masked_fill(outside, 0)
+        passed, absorbed = torch.exp(-x), -torch.expm1(-x)
+        weight = transmittance * absorbed
+        rgb = rgb + (weight / k.masked_fill(outside, 1))[:, None] * glow
+        alpha = alpha + weight
+        depth = depth + weight * ends[piece] + transmittance * (absorbed - x * passed) / rate
+        transmittance = transmittance * passed
+    return rgb, alpha, depth

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from bench.cameras import scale_camera
 from bench.errors import unexpected
-from bench.scenes.assemble import assemble, describe_splits, every_nth, leave_out
-from bench.scenes.bounds import Box
+from bench.scenes.assemble import Box, assemble, describe_splits, every_nth, leave_out
 from bench.scenes.distortion import Fisheye, Lens, RadialTangential
 from bench.scenes.files import (
     data_folder,
@@ -57,15 +56,12 @@ def load(
     background: str = "white",
     log: Log,
 ) -> Scene:
-    """Read a capture folder.
+    """Read the capture folder `path`; for `downscale` and `background` see `blender.load`.
 
-    Args:
-        path: the folder with `transforms.json`.
-        split_every: pictures 0, split_every, 2 * split_every ..., in the order of their names, are
-            the test split, and all others the training split.
-        aabb_scale: side of our unit cube relative to that of instant-ngp, x * 0.33 + 0.5; by
-            default the value in the file, or 1. `scale` and `offset` in the file replace 0.33, 0.5.
-        downscale, background: see `bench.scenes.blender.load`.
+    Pictures 0, split_every, 2 * split_every ..., in the order of their names, are the test split,
+    all others the training split. `aabb_scale` is the side of our unit cube relative to that of
+    instant-ngp, x * 0.33 + 0.5; by default the value in the file, or 1. `scale` and `offset` in the
+    file replace 0.33 and 0.5.
 
     Intrinsics of a frame take precedence over those of the file. Lens distortion is undone, and
     pictures are cropped to what the lens saw. Frames without a picture are logged and left out.
@@ -79,7 +75,6 @@ def load(
 
 
 def read_views(root: Path, record: dict, log: Log) -> list[View]:
-    """The views of all frames whose picture exists."""
     path = root / CAMERA_FILE
     views, missing = [], []
     for where, frame in frames_of(record, path):

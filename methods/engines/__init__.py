@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from bench.errors import Unavailable, explained, install_command
+from bench.provenance import digest, libraries
 from bench.sharing import missing
-from bench.sources import digest, libraries
 from bench.types import Log
 from methods.engines.network import Network as Network
 

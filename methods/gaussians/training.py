@@ -11,8 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench.cameras import place_camera, scale_camera
-from bench.compositing import composite
-from bench.types import Camera, NullProbe, Scene
+from bench.types import Camera, NullProbe, Scene, composite
 from methods.gaussians.kernels.ssim import ssim
 from methods.gaussians.mcmc import disturb, relocate
 from methods.gaussians.model import Gaussians

@@ -10,7 +10,7 @@ from typing import ClassVar
 import torch
 
 from bench.motion import preceding, viewing_target
-from bench.sources import digest
+from bench.provenance import digest
 from bench.threads import torch_threads
 from bench.types import Budget, Camera, Frame, Log, NullProbe, Probe, Scene
 from methods.engines import Engine, Inputs

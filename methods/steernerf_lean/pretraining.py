@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bench.errors import explained
-from bench.sources import digest
+from bench.provenance import digest
 from bench.types import Budget, Log, Scene, SteerbenchError
 from methods.instant_ngp.stage1 import Setup, train_field
 from methods.steernerf.training.examples import TrainingViews

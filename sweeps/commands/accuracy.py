@@ -10,10 +10,9 @@ from collections.abc import Mapping, Sequence
 
 from omegaconf import DictConfig
 
-from bench.accuracy import experiment_rows
+from bench.accuracy import best_instead, cheapest_within, experiment_rows
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
-from bench.frontier import best_instead, cheapest_within
 from bench.study import Variant
 from reports.tradeoff import experiment_table, setting_table, write_tradeoff
 from sweeps.device_lock import device_lock

@@ -9,10 +9,9 @@ from functools import partial
 from itertools import compress
 
 from bench.accuracy import steady_frames
-from bench.probes import OTHER
+from bench.probes import OTHER, Line, device_waits
 from bench.study import Study, Variant
 from bench.types import NullProbe
-from bench.waits import Line, device_waits
 from reports.tables import Table, decimal, spread
 from sweeps.commands.skips import nothing_skipped
 from sweeps.device_lock import on_gpu

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bench.checking import timed_rows
+from bench.case import timed_rows
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from reports.tables import Table

@@ -17,8 +17,8 @@ from bench import paths
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, explained
 from bench.metrics import as_bytes, quantise
+from bench.protocol import check_frame
 from bench.results import Store
-from bench.scoring import check_frame
 from bench.trajectories import MIXED
 from bench.types import Camera, Method, NullProbe
 from bench.video import recorded

@@ -13,11 +13,10 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig
 
-from bench.accuracy import mean_figures
+from bench.accuracy import mean_figures, observed_order
 from bench.cameras import frame_camera
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
-from bench.frontier import observed_order
 from bench.probes import FrameRecord, MemoryMeter, StageClock, p99_to_p50
 from bench.study import Study
 from bench.threads import torch_threads

@@ -15,8 +15,8 @@ from bench.console import ConsoleLog
 from bench.pictures import Match, Pair, pairs_with_folder, pairs_with_split
 from bench.pictures import score as score_pairs
 from bench.protocol import EvaluationProtocol
+from bench.provenance import digest, libraries
 from bench.results import Store
-from bench.sources import digest, libraries
 from bench.types import SteerbenchError
 from reports.runs import Run, load
 from sweeps.build import build

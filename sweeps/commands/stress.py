@@ -10,7 +10,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from bench.checking import failed, run_cases
+from bench.case import failed, run_cases
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError
 from reports.tables import Table

@@ -16,12 +16,11 @@ from bench.accuracy import (
     render_in_turns,
     steady_frames,
 )
-from bench.compositing import composite
 from bench.errors import SteerbenchError
 from bench.probes import FrameRecord
 from bench.protocol import EvaluationProtocol
 from bench.trajectories import Step, Trajectory, from_split
-from bench.types import Frame
+from bench.types import Frame, composite
 
 QUICK = EvaluationProtocol(name="quick", lpips=())
 

@@ -8,8 +8,7 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from bench.case import Bound, Case, Operation, largest_error, nearest
-from bench.checking import failed, run_cases, timed_rows
+from bench.case import Bound, Case, Operation, failed, largest_error, nearest, run_cases, timed_rows
 from bench.types import Log, Unavailable
 
 CELLS = {("cpu", "fp32"): 1e-6, ("reference", "fp64"): 1e-15}

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.frontier import best_instead, cheapest_within, observed_order
+from bench.accuracy import best_instead, cheapest_within, observed_order
 
 # Few values, so that there are ties.
 POINTS = st.lists(st.tuples(st.integers(1, 6), st.integers(-3, 3)), min_size=1, max_size=30)

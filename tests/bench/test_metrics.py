@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from bench.metrics import SMALLEST_SIDE, Lpips, flicker, psnr, quantise, ssim
-from bench.scoring import Flicker
+from bench.protocol import Flicker
 from bench.types import SteerbenchError, Unavailable
 
 

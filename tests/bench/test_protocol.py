@@ -13,11 +13,10 @@ import torch
 from omegaconf import OmegaConf
 
 from bench.cameras import scale_camera
-from bench.compositing import composite
 from bench.metrics import psnr, quantise
 from bench.protocol import EvaluationProtocol
 from bench.trajectories import from_split
-from bench.types import SteerbenchError
+from bench.types import SteerbenchError, composite
 
 CONFIGS = Path(__file__).parents[2] / "sweeps" / "configs" / "protocol"
 WHITE = torch.ones(3)

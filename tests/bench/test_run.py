@@ -11,14 +11,13 @@ import pytest
 import torch
 
 import bench.run
-from bench.compositing import composite
 from bench.intervals import path_interval
 from bench.metrics import psnr, quantise
 from bench.protocol import EvaluationProtocol
 from bench.results import COLUMNS
 from bench.run import Task, measure
 from bench.trajectories import from_split
-from bench.types import Budget, SteerbenchError
+from bench.types import Budget, SteerbenchError, composite
 
 QUICK = EvaluationProtocol(name="quick", lpips=(), warmup=2)
 BUDGET = Budget("tiny", steps=1, samples=1)

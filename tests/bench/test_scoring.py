@@ -7,11 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bench.compositing import composite
 from bench.metrics import flicker, quantise
-from bench.protocol import EvaluationProtocol
-from bench.scoring import Scoring
+from bench.protocol import EvaluationProtocol, Scoring
 from bench.trajectories import Step, Trajectory, from_split
+from bench.types import composite
 
 QUICK = EvaluationProtocol(name="quick", lpips=())
 WHITE = torch.ones(3)

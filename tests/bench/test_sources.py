@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from bench import sources
+from bench import provenance
 from bench.errors import SteerbenchError
+from bench.provenance import libraries
 from bench.run import measure
-from bench.sources import libraries
 from methods.instant_ngp.stage1 import train_field
 
 FILES = {
@@ -44,8 +44,8 @@ def defined_in(module: str, **attributes: Any) -> type:
 
 def digest(*things: Any) -> str:
     """As a process finds it that has just begun."""
-    sources._first.clear()
-    return sources.digest(*things)
+    provenance._first.clear()
+    return provenance.digest(*things)
 
 
 METHOD = defined_in("methods.alone.method")
@@ -55,7 +55,7 @@ METHOD = defined_in("methods.alone.method")
 def tree(tmp_path, monkeypatch) -> Path:
     """A small project: a method in a module that imports a package of fields."""
     write(tmp_path / "here", FILES)
-    monkeypatch.setattr(sources, "ROOT", tmp_path / "here")
+    monkeypatch.setattr(provenance, "ROOT", tmp_path / "here")
     return tmp_path / "here"
 
 
@@ -64,9 +64,9 @@ def test_a_file_that_is_changed_while_a_process_runs_ends_it(tree):
     before = digest(METHOD)
     (tree / "bench/ruler.py").write_text("A = 2\n")
     with pytest.raises(SteerbenchError, match=r"bench/ruler\.py was changed while this process"):
-        sources.digest(METHOD)
+        provenance.digest(METHOD)
     write(tree, FILES)
-    assert sources.digest(METHOD) == before
+    assert provenance.digest(METHOD) == before
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_the_digest_depends_neither_on_where_the_project_lies_nor_on_an_order(tr
     before, ruler = digest(METHOD), defined_in("bench.ruler")
     assert digest(METHOD, ruler) == digest(ruler, METHOD) == before != digest(ruler)
     shutil.move(tree, tree.with_name("there"))
-    monkeypatch.setattr(sources, "ROOT", tree.with_name("there"))
+    monkeypatch.setattr(provenance, "ROOT", tree.with_name("there"))
     assert digest(METHOD) == before
 
 
@@ -186,7 +186,7 @@ def test_the_libraries_of_the_real_things_are_found_through_their_backends():
 
 
 def test_a_training_does_not_stand_on_how_results_are_kept_and_shown():
-    names = sources.sources(train_field)
+    names = provenance.sources(train_field)
     assert "methods/instant_ngp/training.py" in names
     assert not [name for name in names if name.startswith(("bench/results", "bench/console"))]
     assert "pandas" not in libraries(train_field)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from bench.errors import Unavailable
-from bench.waits import device_waits
+from bench.probes import device_waits
 from tests.pretended_gpu import PretendedGpu
 
 

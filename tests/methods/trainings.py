@@ -11,9 +11,8 @@ from typing import Any
 import pytest
 import torch
 
-from bench.compositing import composite
 from bench.metrics import psnr
-from bench.types import Budget, Method, NullProbe, Scene
+from bench.types import Budget, Method, NullProbe, Scene, composite
 from methods.instant_ngp.stage1 import Setup
 from methods.instant_ngp.training import TrainingOptions
 from methods.kernels.encode import HashGrid

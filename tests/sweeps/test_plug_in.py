@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from bench import sources
+from bench import provenance
 
 HELPER = "LEVEL = 0.5\n"
 RENDERER = """
@@ -86,7 +86,7 @@ def test_a_change_in_a_module_is_a_new_run_of_a_new_process(call, folder, tmp_pa
             file.write("# changed\n")
         refused = call("run", "method=mine", *SMALL)
         assert f"mine/{name} was changed while this process runs" in refused.err
-        monkeypatch.setattr(sources, "_first", {})  # as a new process
+        monkeypatch.setattr(provenance, "_first", {})  # as a new process
         assert call("run", "method=mine", *SMALL).status == 0
         assert len(keys(tmp_path)) == number
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from bench.cameras import pack_camera, place_camera, unpack_camera
 from bench.motion import novel_view, viewing_target
+from bench.provenance import digest
 from bench.sharing import missing
-from bench.sources import digest
 from bench.types import Budget, Camera, Log, NullProbe, Scene, Split
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.rendering.frame import everywhere, render_frame

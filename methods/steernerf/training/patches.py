@@ -12,8 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from bench.cameras import cast, pixel_grid
-from bench.compositing import composite
-from bench.types import Camera, Rays
+from bench.types import Camera, Rays, composite
 from methods.kernels.types import Pixels
 from methods.rendering.batch import render_batch
 from methods.rendering.compaction import indices_where

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import torch
 
-from bench.sources import digest, libraries
+from bench.provenance import digest, libraries
 from bench.types import Budget, Log, Scene, SteerbenchError
 from methods.instant_ngp.stage1 import Setup, TrainedField
 from methods.steernerf.options import EVERYWHERE, Model, Rendering, Skips

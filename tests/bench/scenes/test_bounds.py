@@ -7,10 +7,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.scenes import bounds
+from bench.scenes import assemble
 from bench.scenes.analytic import picture, pose_on_sphere, train_poses
-from bench.scenes.bounds import Box, cube, hull_box
-from bench.scenes.opaque import Part, Solids
+from bench.scenes.assemble import Box, cube, hull_box
+from bench.scenes.raytrace import Part, Solids
 from bench.scenes.solids import Ellipsoid
 from bench.scenes.textures import plain
 from bench.types import Camera
@@ -57,7 +57,7 @@ def test_blocks_drop_no_cell_that_would_be_kept(monkeypatch) -> None:
     model = Solids([Part(Ellipsoid((0.2, 0.5, 0.1)), plain((1.0, 0.0, 0.0)), (0.3, -0.2, 0.1))])
     views = pictures_of(model, train_poses(20, 3))
     box = hull_box(*views, cube(1.5))
-    monkeypatch.setattr(bounds, "GLANCES", 0)
+    monkeypatch.setattr(assemble, "GLANCES", 0)
     cell_by_cell = hull_box(*views, cube(1.5))
     assert box is not None
     assert cell_by_cell is not None

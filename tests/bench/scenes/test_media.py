@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from bench.cameras import cast
-from bench.scenes.media import Ball, Cloud
 from bench.scenes.models import cloud
-from bench.scenes.raytrace import render
+from bench.scenes.raytrace import Ball, Cloud, render
 from bench.types import Camera
 from tests.bench.scenes.conftest import camera_at
 

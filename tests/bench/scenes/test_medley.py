@@ -10,8 +10,7 @@ import torch
 from bench.scenes import textures
 from bench.scenes.analytic import orbit_poses, train_poses
 from bench.scenes.medley import BULKY, CORE, REACH, SHAPES, SMALLER, Draw, medley
-from bench.scenes.opaque import Solids
-from bench.scenes.raytrace import render
+from bench.scenes.raytrace import Solids, render
 from bench.scenes.solids import Box, Capsule, Carved, Common, Cylinder, Ellipsoid, Shifted
 from bench.types import Camera
 

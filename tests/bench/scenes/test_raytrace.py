@@ -11,8 +11,7 @@ from torch import Tensor
 from bench.cameras import cast
 from bench.scenes import raytrace
 from bench.scenes.models import totem, wires
-from bench.scenes.opaque import LIGHT, Part, Solids
-from bench.scenes.raytrace import ProjectedBoxes, render, sample_offsets
+from bench.scenes.raytrace import LIGHT, Part, ProjectedBoxes, Solids, render, sample_offsets
 from bench.scenes.solids import Capsule, Ellipsoid
 from bench.scenes.textures import plain
 from bench.types import EMPTY_ALPHA, SteerbenchError

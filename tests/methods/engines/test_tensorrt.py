@@ -122,7 +122,7 @@ def test_what_tensorrt_refuses_is_said(broken, message, double, tmp_path, quiet_
 
 def test_a_build_belongs_to_its_gpu_and_version(double, monkeypatch):
     versions = {"tensorrt": "11.4.0"}
-    monkeypatch.setattr("bench.sources._version", lambda name: versions.get(name, "1.0"))
+    monkeypatch.setattr("bench.provenance._version", lambda name: versions.get(name, "1.0"))
     first = TensorRt("fp16").key()
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "another GPU")
     second = TensorRt("fp16").key()

@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bench.compositing import composite
 from bench.metrics import psnr
-from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene
+from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene, composite
 from methods.instant_ngp.method import InstantNgp
 from methods.kernels import multiplies_bf16
 from methods.kernels.encode import HashGrid

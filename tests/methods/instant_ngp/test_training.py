@@ -11,10 +11,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.compositing import composite
 from bench.console import ConsoleLog
 from bench.sharing import locked
-from bench.types import Budget, Log, Rays, Scene, Split, SteerbenchError
+from bench.types import Budget, Log, Rays, Scene, Split, SteerbenchError, composite
 from methods.instant_ngp.error_map import RUN, UNSEEN
 from methods.instant_ngp.field import HashField
 from methods.instant_ngp.stage1 import train_field

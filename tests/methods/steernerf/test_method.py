@@ -12,7 +12,7 @@ import torch
 
 from bench.console import ConsoleLog
 from bench.errors import Unavailable
-from bench.sources import sources
+from bench.provenance import sources
 from bench.types import Budget, Log, NullProbe, Scene
 from methods.engines import Engine
 from methods.engines.openvino_engine import OpenVino
