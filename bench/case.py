@@ -112,7 +112,6 @@ class Property:
     tolerances: Mapping[Cell, float]
 
     def case(self, name: str, error: Callable[[str, str, str], float], slow: bool = False) -> Case:
-        """Make one case of the property."""
         return Case(name=name, error=error, slow=slow, **vars(self))
 
 
@@ -305,7 +304,6 @@ def run_cases(cases: Sequence[Case], devices: Sequence[str], log: Log) -> Iterat
 
 
 def failed(row: Mapping[str, Any]) -> bool:
-    """Whether the check of this row failed."""
     return row["status"].startswith("failed")
 
 

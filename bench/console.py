@@ -72,8 +72,6 @@ class ConsoleLog:
 
 
 class _Bar:
-    """One running bar; see `bench.types.Progress`."""
-
     def __init__(
         self, say: Callable[[str], None], bars: progress.Progress, label: str, total: int
     ) -> None:

@@ -138,7 +138,6 @@ def _offset(camera: Camera, target: Tensor) -> Tensor:
 
 
 def _rotation(turn: Tensor) -> Tensor:
-    """The rotation matrix [3, 3] of axis times angle [3]."""
     return axis_angle_to_rotation_matrix(turn[None])[0]
 
 

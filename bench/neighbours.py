@@ -33,13 +33,10 @@ class Neighbours(NamedTuple):
 
 
 class Watch:
-    """Watches other processes from its construction on."""
-
     def __init__(self) -> None:
         self._begin = _seconds()
 
     def seen(self) -> Neighbours:
-        """What other processes used since the construction."""
         passed, busy, own = (a - b for a, b in zip(_seconds(), self._begin, strict=True))
         others = max(busy - own, 0.0) / passed if passed > 0 else 0.0
         return Neighbours(others, psutil.cpu_count() or 1, passed)

@@ -163,7 +163,6 @@ def _check(
 
 
 def _repeated(names: Sequence[str]) -> list[str]:
-    """The names that occur more than once."""
     return sorted((name for name, count in Counter(names).items() if count > 1), key=_natural)
 
 

@@ -106,7 +106,6 @@ class StageClock:
             self._open.pop()
 
     def count(self, name: str, done: int | Tensor, dense: int | None = None) -> None:
-        """Add work to the current frame; see `bench.types.Probe`."""
         self._done[name] += done
         if dense is not None:
             self._dense[name] += dense
@@ -180,7 +179,6 @@ def _reset_high_water_mark() -> bool:
 
 
 def _process_peak_bytes() -> int:
-    """Peak resident memory since the last reset, or since the process started."""
     status = Path("/proc/self/status")
     peak_kib = re.search(r"VmHWM:\s*(\d+)", status.read_text() if status.exists() else "")
     if peak_kib:  # some sandboxes have no such line
@@ -190,8 +188,6 @@ def _process_peak_bytes() -> int:
 
 
 class Line(NamedTuple):
-    """A line of a source file."""
-
     path: str
     number: int
 

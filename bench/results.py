@@ -18,13 +18,14 @@ import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from glob import escape
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from PIL import Image
 
-from bench.errors import SteerbenchError, explained
+from bench.errors import SteerbenchError, explained, unexpected
 from bench.provenance import commit, machine
 
 SCHEMA_VERSION = 3
@@ -42,8 +43,7 @@ fewer preceding frames than the method looks back on), or "all" for a figure of 
 STEADY, COLD, WHOLE = "steady", "cold", "all"  # the values of the column `phase`
 
 FIGURES = {"value": "float64", "lo": "float64", "hi": "float64", "n": "int64", "seed": "int64"}
-RECORD = "record.json"
-PARTIAL = ".partial-"
+RECORD, PARTIAL = "record.json", ".partial-"
 STALE_S = 24 * 3600.0
 
 
@@ -81,13 +81,10 @@ class Store:
     def whole_key(self, beginning: str) -> str:
         """The key of the only run whose key starts with `beginning`; raises unless there is one."""
         wanted = Path(beginning).name  # the key may be given as the path of its folder
-        folders = self.folder.iterdir() if self.folder.is_dir() else ()
-        keys = [p.name for p in folders if p.name.startswith(wanted) and self.find(p.name)]
+        keys = [p.name for p in self.folder.glob(f"{escape(wanted)}*") if self.find(p.name)]
         if len(keys) != 1:
-            raise SteerbenchError(
-                f"run {beginning!r}: expected the beginning of one key, {len(keys)} runs below "
-                f"{self.folder} have it; see `steerbench results`"
-            )
+            got = f"{len(keys)} runs below {self.folder}; see `steerbench results`"
+            raise unexpected(f"run {beginning!r}", "the beginning of one key", got)
         return keys[0]
 
     def save(self, parts: Mapping[str, object], measurement: Measurement) -> str:
@@ -127,12 +124,19 @@ class Store:
                 yield partial
                 for path in [*partial.rglob("*"), partial]:
                     _sync(path)
-                self._publish(partial, key)
+                folder = self.folder / key
+                if folder.exists() and self.find(key) is None:  # half deleted, or half copied
+                    shutil.rmtree(folder)
+                try:
+                    partial.replace(folder)
+                except OSError:
+                    if self.find(key) is None:
+                        raise
+                _sync(self.folder)
             finally:
                 shutil.rmtree(partial, ignore_errors=True)
 
     def remove(self, key: str) -> None:
-        """Remove the run `key`, if it is there."""
         removed = self.folder / f"{PARTIAL}{key}-{uuid.uuid4().hex[:8]}"
         with suppress(FileNotFoundError):
             (self.folder / key).replace(removed)  # at once: nobody reads half of it
@@ -161,24 +165,12 @@ class Store:
         )
 
     def frames(self, run: str) -> pd.DataFrame:
-        """Every frame of a run."""
         path = self._existing(run) / "frames.csv"
         return pd.read_csv(path, dtype={"name": "str"}, keep_default_na=False, na_values=[""])
 
     def record(self, run: str) -> dict[str, object]:
         """The record of a run: what it was made of, and on which machine."""
         return json.loads((self._existing(run) / RECORD).read_text(encoding="utf-8"))
-
-    def _publish(self, partial: Path, key: str) -> None:
-        folder = self.folder / key
-        if folder.exists() and self.find(key) is None:  # half deleted, or half copied
-            shutil.rmtree(folder)
-        try:
-            partial.replace(folder)
-        except OSError:
-            if self.find(key) is None:
-                raise
-        _sync(self.folder)
 
     def _sweep(self) -> None:
         """Delete what killed processes left behind: partial folders older than a day."""
@@ -194,7 +186,6 @@ class Store:
 
 
 def unreadable(schema: object) -> str:
-    """Why a run of this schema cannot be read."""
     return f"its rows have schema {schema}; this version reads schema {SCHEMA_VERSION}"
 
 
@@ -206,7 +197,6 @@ def _schema_version(folder: Path) -> object:
 
 
 def _text(path: Path) -> str:
-    """The text of a file; empty if there is no such file."""
     return path.read_text(encoding="utf-8") if path.is_file() else ""
 
 

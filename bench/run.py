@@ -28,14 +28,8 @@ from bench.types import Budget, Log, Method, Scene
 
 QUANTILES = (50, 95, 99)
 UNITS = {
-    "psnr": "dB",
-    "frame_ms": "ms",
-    "fps": "1/s",
-    "stage_ms": "ms",
-    "work": "1/frame",
-    "size_bytes": "B",
-    "peak_bytes": "B",
-    "train_s": "s",
+    **{"psnr": "dB", "frame_ms": "ms", "stage_ms": "ms", "fps": "1/s", "work": "1/frame"},
+    **{"size_bytes": "B", "peak_bytes": "B", "train_s": "s"},
 }
 """Units of metrics, by name up to the first dot; other metrics have no unit."""
 

@@ -79,12 +79,10 @@ class Rays:
 
     @classmethod
     def joined(cls, parts: Sequence[Rays]) -> Rays:
-        """The rays of all `parts`, one part after the other."""
         origins, directions = zip(*((rays.origins, rays.directions) for rays in parts), strict=True)
         return cls(torch.cat(origins), torch.cat(directions))
 
     def take(self, index: Tensor | slice) -> Rays:
-        """The rays at `index`."""
         if isinstance(index, slice):
             return Rays(self.origins[index], self.directions[index])
         return Rays(self.origins.index_select(0, index), self.directions.index_select(0, index))

@@ -172,7 +172,6 @@ class Box:
 
 
 def cube(half: float) -> Box:
-    """The box [-half, half]^3."""
     return Box(torch.full((3,), -half).double(), torch.full((3,), half).double())
 
 

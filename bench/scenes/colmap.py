@@ -23,9 +23,8 @@ from bench.scenes.assemble import (
     leave_out,
     parse_box,
 )
-from bench.scenes.distortion import Lens
 from bench.scenes.files import data_folder, inside, rigid_pose
-from bench.scenes.images import View, image_size
+from bench.scenes.images import Lens, View, image_size
 from bench.types import Camera, Log, Scene
 
 MODELS = ("sparse/0", "colmap/sparse/0", "sparse", ".")
@@ -86,7 +85,6 @@ def _kind(folder: Path) -> str:
 
 
 def read_model(folder: Path) -> Any:
-    """The `pycolmap.Reconstruction` in `folder`."""
     try:
         import pycolmap
     except ImportError as error:

@@ -42,7 +42,6 @@ def inside(root: Path, relative: str, where: str | Path) -> Path:
 
 
 def read_text(root: Path, relative: str) -> str:
-    """Read a text file of the data set."""
     path = inside(root, relative, root / relative)
     if not path.is_file():
         raise unexpected(path, "a file", "nothing there")
@@ -53,7 +52,6 @@ def read_text(root: Path, relative: str) -> str:
 
 
 def read_json(root: Path, relative: str) -> dict:
-    """Read a JSON file of the data set that holds an object."""
     path = root / relative
     try:
         value = json.loads(read_text(root, relative))

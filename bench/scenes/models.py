@@ -117,7 +117,6 @@ def wires() -> Solids:
 
 
 def wire(start: Triple, end: Triple, radius: float, colour: Colour) -> Part:
-    """A capsule from `start` to `end`."""
     x, y, z = (b - a for a, b in zip(start, end, strict=True))
     length = math.sqrt(x * x + y * y + z * z)
     tilt, azimuth = math.degrees(math.acos(z / length)), math.degrees(math.atan2(y, x))
@@ -145,7 +144,6 @@ def cage() -> list[Part]:
 
 
 def helix() -> list[Part]:
-    """A coil around z."""
     steps = 72
     points = [
         (0.45 * math.cos(0.35 * k), 0.45 * math.sin(0.35 * k), -0.7 + 1.4 * k / steps)

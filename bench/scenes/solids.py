@@ -23,8 +23,6 @@ Interval = tuple[Tensor, Tensor]
 
 
 class Shape(Protocol):
-    """A solid."""
-
     def extent(self) -> Triple:
         """Half sizes of a bounding box of the shape."""
 
@@ -52,15 +50,13 @@ class Convex(Shape, Protocol):
 
 @dataclass(frozen=True)
 class Ellipsoid(Convex):
-    """An ellipsoid with semi-axes along x, y, z."""
-
-    radii: Triple
+    radii: Triple  # along x, y, z
 
     def extent(self) -> Triple:
         return self.radii
 
     def interval(self, origin: Origin, directions: Directions) -> Interval:
-        """As `Convex.interval`, computed in the space where the ellipsoid is the unit sphere."""
+        # In the space where the ellipsoid is the unit sphere.
         o = [x / r for x, r in zip(origin, self.radii, strict=True)]
         d = [x / r for x, r in zip(directions, self.radii, strict=True)]
         return ball_interval(o, d, 1.0)
@@ -76,15 +72,12 @@ class Ellipsoid(Convex):
 
 
 def ball(radius: float) -> Ellipsoid:
-    """A sphere."""
     return Ellipsoid((radius, radius, radius))
 
 
 @dataclass(frozen=True)
 class Box(Convex):
-    """A box with half sizes along x, y, z."""
-
-    half: Triple
+    half: Triple  # sizes along x, y, z
 
     def extent(self) -> Triple:
         return self.half
@@ -97,7 +90,6 @@ class Box(Convex):
         return (points.abs() - points.new_tensor(self.half)).amax(1)
 
     def normal(self, points: Tensor) -> Tensor:
-        """The normal of the nearest face."""
         axis = (points.abs() - points.new_tensor(self.half)).argmax(1)
         return torch.nn.functional.one_hot(axis, 3).to(points.dtype) * points.sign()
 
@@ -117,16 +109,17 @@ class Cylinder(Convex):
         return overlap(wall, slab(origin[2], directions[2], self.half))
 
     def distance(self, points: Tensor) -> Tensor:
-        return torch.maximum(
-            points[:, :2].norm(dim=1) - self.radius, points[:, 2].abs() - self.half
-        )
+        return torch.maximum(*self._beyond(points))
 
     def normal(self, points: Tensor) -> Tensor:
         """The normal of the wall or of a cap, whichever is nearer."""
-        on_wall = points[:, :2].norm(dim=1) - self.radius > points[:, 2].abs() - self.half
+        beyond_wall, beyond_cap = self._beyond(points)
         wall = unit(points * points.new_tensor((1, 1, 0)))
         cap = points.sign() * points.new_tensor((0, 0, 1))
-        return torch.where(on_wall[:, None], wall, cap)
+        return torch.where((beyond_wall > beyond_cap)[:, None], wall, cap)
+
+    def _beyond(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        return points[:, :2].norm(dim=1) - self.radius, points[:, 2].abs() - self.half
 
 
 @dataclass(frozen=True)
@@ -140,7 +133,7 @@ class Capsule(Convex):
         return (self.radius, self.radius, self.half + self.radius)
 
     def interval(self, origin: Origin, directions: Directions) -> Interval:
-        """The outermost ends of an open cylinder and two balls, because their union is convex."""
+        # The outermost ends of an open cylinder and two balls, because their union is convex.
         wall = ball_interval(origin[:2], directions[:2], self.radius)
         enter, leave = overlap(wall, slab(origin[2], directions[2], self.half))
         missed = enter > leave
@@ -202,7 +195,6 @@ class Common(Convex):
         return torch.maximum(self.first.distance(points), self.second.distance(points))
 
     def normal(self, points: Tensor) -> Tensor:
-        """The normal of the shape whose surface a point lies on."""
         first = self.first.distance(points) > self.second.distance(points)
         return torch.where(first[:, None], self.first.normal(points), self.second.normal(points))
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cache, wraps
-from typing import Concatenate, ParamSpec
+from functools import cache, partial
 
 import torch
 from torch import Tensor
@@ -13,33 +12,27 @@ from torch.nn.functional import grid_sample, pad
 
 Colour = tuple[float, float, float]
 Texture = Callable[[Tensor], Tensor]
-Settings = ParamSpec("Settings")
 
 
-def texture(paint: Callable[Concatenate[Tensor, Settings], Tensor]) -> Callable[Settings, Texture]:
-    """Turn a function of points and settings into one that takes settings and returns a texture."""
-
-    def make(*settings: Settings.args, **named: Settings.kwargs) -> Texture:
-        return wraps(paint)(lambda points: paint(points, *settings, **named))
-
-    return make
+def texture(paint: Callable[..., Tensor]) -> Callable[..., Texture]:
+    """Turn a function of settings and points into one that takes settings and returns a texture."""
+    return partial(partial, paint)
 
 
 @texture
-def plain(points: Tensor, colour: Colour) -> Tensor:
-    """One colour."""
+def plain(colour: Colour, points: Tensor) -> Tensor:
     return points.new_tensor(colour).expand(len(points), 3)
 
 
 @texture
-def checker(points: Tensor, first: Colour, second: Colour, size: float) -> Tensor:
+def checker(first: Colour, second: Colour, size: float, points: Tensor) -> Tensor:
     """Cubes of side `size`, alternating."""
     # The shift keeps faces at round coordinates away from the border between two cubes.
     return pick(((points / size + 0.137).floor().sum(1) % 2) < 1, first, second)
 
 
 @texture
-def polar_checker(points: Tensor, first: Colour, second: Colour, count: int, ring: float) -> Tensor:
+def polar_checker(first: Colour, second: Colour, count: int, ring: float, points: Tensor) -> Tensor:
     """`count` sectors around z and rings (or levels) of width `ring`, alternating."""
     x, y, z = points.unbind(1)
     sector = (torch.atan2(y, x) * count / (2 * math.pi)).floor()
@@ -48,7 +41,7 @@ def polar_checker(points: Tensor, first: Colour, second: Colour, count: int, rin
 
 
 @texture
-def spiral(points: Tensor, first: Colour, second: Colour, stripes: int, twist: float) -> Tensor:
+def spiral(first: Colour, second: Colour, stripes: int, twist: float, points: Tensor) -> Tensor:
     """Stripes around z that turn `twist` radians per unit of height."""
     x, y, z = points.unbind(1)
     phase = (torch.atan2(y, x) + twist * z) * stripes / (2 * math.pi)
@@ -56,7 +49,7 @@ def spiral(points: Tensor, first: Colour, second: Colour, stripes: int, twist: f
 
 
 @texture
-def chevrons(points: Tensor, first: Colour, second: Colour, period: float, slope: float) -> Tensor:
+def chevrons(first: Colour, second: Colour, period: float, slope: float, points: Tensor) -> Tensor:
     """Zigzag stripes along x that repeat every `period`."""
     x, _, z = points.unbind(1)
     phase = x / period + slope * ((z / period - (z / period).floor()) - 0.5).abs()
@@ -64,14 +57,14 @@ def chevrons(points: Tensor, first: Colour, second: Colour, period: float, slope
 
 
 @texture
-def pips(points: Tensor, ground: Colour, dot: Colour, spacing: float, radius: float) -> Tensor:
+def pips(ground: Colour, dot: Colour, spacing: float, radius: float, points: Tensor) -> Tensor:
     """Dots on a lattice, round on the faces of a box."""
     cell = (points / spacing).round() * spacing
     return pick((points - cell).norm(dim=1) < radius, dot, ground)
 
 
 @texture
-def eye(points: Tensor, iris: Colour) -> Tensor:
+def eye(iris: Colour, points: Tensor) -> Tensor:
     """White, with an iris and a pupil that look along -y."""
     facing = -points[:, 1] / points.norm(dim=1)
     inner = pick(facing > math.cos(0.32), (0.02, 0.02, 0.03), iris)
@@ -80,7 +73,7 @@ def eye(points: Tensor, iris: Colour) -> Tensor:
 
 
 @texture
-def marble(points: Tensor, ground: Colour, vein: Colour, scale: float) -> Tensor:
+def marble(ground: Colour, vein: Colour, scale: float, points: Tensor) -> Tensor:
     """Veins: a sine along x, distorted by noise."""
     bend = noise(points * scale) + 0.5 * noise(points * (2.1 * scale))
     wave = torch.sin((points[:, 0] + 0.6 * points[:, 2]) * 2 * scale + 5 * bend).abs()
@@ -88,7 +81,7 @@ def marble(points: Tensor, ground: Colour, vein: Colour, scale: float) -> Tensor
 
 
 @texture
-def wood(points: Tensor, light: Colour, dark: Colour, rings: float) -> Tensor:
+def wood(light: Colour, dark: Colour, rings: float, points: Tensor) -> Tensor:
     """Growth rings around an axis along x outside the part, distorted by noise."""
     _, y, z = points.unbind(1)
     radius = torch.hypot(y + 0.7, 2 * z + 0.4) + 0.08 * noise(points * 3)
@@ -97,7 +90,7 @@ def wood(points: Tensor, light: Colour, dark: Colour, rings: float) -> Tensor:
 
 
 @texture
-def mottled(points: Tensor, first: Colour, second: Colour, scale: float) -> Tensor:
+def mottled(first: Colour, second: Colour, scale: float, points: Tensor) -> Tensor:
     """Two octaves of noise that blend two colours."""
     share = 0.65 * noise(points * scale) + 0.35 * noise(points * (4.3 * scale))
     return mix(share, first, second)

@@ -12,7 +12,6 @@ from torch import Tensor
 from bench.cameras import scale_camera
 from bench.errors import unexpected
 from bench.scenes.assemble import Box, assemble, describe_splits, every_nth, leave_out
-from bench.scenes.distortion import Fisheye, Lens, RadialTangential
 from bench.scenes.files import (
     data_folder,
     describe,
@@ -24,7 +23,7 @@ from bench.scenes.files import (
     read_json,
     whole_number,
 )
-from bench.scenes.images import View, image_size
+from bench.scenes.images import Fisheye, Lens, RadialTangential, View, image_size
 from bench.types import Camera, Log, Scene
 
 CAMERA_FILE = "transforms.json"

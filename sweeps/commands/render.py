@@ -13,13 +13,12 @@ import numpy as np
 import torch
 from PIL import Image
 
-from bench import paths
 from bench.console import ConsoleLog
 from bench.errors import SteerbenchError, explained
 from bench.metrics import as_bytes, quantise
 from bench.protocol import check_frame
 from bench.results import Store
-from bench.trajectories import MIXED
+from bench.trajectories import MIXED, write_path
 from bench.types import Camera, Method, NullProbe
 from bench.video import recorded
 from sweeps.build import build
@@ -50,7 +49,7 @@ def main(options: argparse.Namespace) -> int:
             for old in folder.glob("[0-9]*.png"):
                 old.unlink()
         if trajectory.resolution != MIXED:
-            paths.write(folder / "path.json", cameras, scene, options.fps)
+            write_path(folder / "path.json", cameras, scene, options.fps)
         film = stack.enter_context(recorded(options.video, options.fps)) if options.video else None
         progress = stack.enter_context(log.progress("rendering", len(cameras)))
         for method in methods:

@@ -14,7 +14,7 @@ import torch
 
 from bench.cameras import look_at, scale_camera
 from bench.motion import between, rotation_between
-from bench.paths import follow, leading, spline, write
+from bench.trajectories import follow, leading, spline, write_path
 from bench.types import Camera, Scene, Split, SteerbenchError
 
 POSE = torch.tensor([[1.0, 0, 0, 0.5], [0, -1, 0, 0.25], [0, 0, -1, 2.0]])
@@ -49,7 +49,7 @@ def viewer(*keyframes: dict[str, Any]) -> dict[str, Any]:
 def test_a_path_comes_back_as_it_was_written(scene: Scene, tmp_path: Path) -> None:
     first = scene.splits["test"].cameras[0]
     second = replace(first, c2w=first.c2w + torch.tensor([0.0, 0, 0, 0.125]))
-    write(tmp_path / "there.json", [first, second], scene)
+    write_path(tmp_path / "there.json", [first, second], scene)
     trajectory = follow(scene, str(tmp_path / "there.json"))
     assert trajectory.name == "there"
     assert trajectory.reads == (tmp_path / "there.json",)
@@ -131,7 +131,7 @@ def test_the_keys_of_a_spline_are_a_splits_cameras_or_those_of_a_file(
     assert [step.truth for step in of_split.steps if step.truth is not None] == [0, 2, 4]
     assert of_split.preceding[-1] == len(of_split.steps) - 1 > 2
     assert of_split.name == "test-3of5-spline1deg"
-    write(tmp_path / "keys.json", cameras[:2], scene)
+    write_path(tmp_path / "keys.json", cameras[:2], scene)
     of_file = spline(scene, str(tmp_path / "keys.json"))
     assert len(of_file.steps) > 2
     assert {step.truth for step in of_file.steps} == {None}

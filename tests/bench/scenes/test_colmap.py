@@ -14,7 +14,7 @@ from PIL import Image
 from bench.cameras import pixel_grid, project
 from bench.errors import SteerbenchError, Unavailable
 from bench.scenes import colmap
-from bench.scenes.distortion import Fisheye, RadialTangential
+from bench.scenes.images import Fisheye, RadialTangential
 from bench.types import Camera
 
 pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is an extra")

@@ -14,7 +14,7 @@ from PIL import Image
 
 from bench.cameras import pixel_grid
 from bench.scenes import transforms
-from bench.scenes.distortion import Fisheye, RadialTangential, undistort, undistorted_camera
+from bench.scenes.images import Fisheye, RadialTangential, undistort, undistorted_camera
 from bench.types import Camera, SteerbenchError
 
 HERE = Path("picture.png")
