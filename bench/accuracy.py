@@ -35,28 +35,20 @@ class Trial:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A computation whose exact answer is known, and a knob that trades its time for its error.
-
-    `smooth` is the range of settings in which the error should follow a power of the knob; None: it
-    follows none, or rounding hides it.
-    """
+    """A computation whose exact answer is known, and a knob that trades its time for its error."""
 
     subject: str  # what is computed
     knob: str  # the parameter that is varied, with its unit
     trials: Sequence[Trial]
-    smooth: tuple[float, float] | None = None
+    smooth: tuple[float, float] | None = None  # settings whose error is a power of the knob, if any
 
 
 @torch.no_grad()
 def experiment_rows(
     experiments: Sequence[Experiment], repeats: int, log: Log
 ) -> list[dict[str, Any]]:
-    """Run the experiments; one row for each trial.
-
-    A row holds subject, knob, setting, error (largest absolute), ms (median of `repeats`), ms_lo
-    and ms_hi (the extremes), and order, the observed one, fitted on the settings from order_from to
-    order_to; these three are None where no order is expected.
-    """
+    """Run the experiments; one row for each trial: its largest absolute error, median and extremes
+    of `repeats` times, and the observed order, fitted on the `smooth` settings."""
     rows = []
     with log.progress("experiments", len(experiments)) as progress:
         for experiment in experiments:
@@ -216,9 +208,6 @@ def cheapest_within(cost: Sequence[float], error: Sequence[float], limit: float)
 
 
 def observed_order(knob: Sequence[float], error: Sequence[float]) -> float:
-    """Fit the power law error = c knob^p and return p, by least squares on the logarithms.
-
-    `knob` and `error` hold at least two values, all positive.
-    """
+    """The power p of error = c knob^p, by least squares on the logarithms of positive values."""
     slope, _ = np.polyfit(np.log(knob), np.log(error), 1)
     return float(slope)

@@ -21,10 +21,7 @@ def pixel_grid(width: int, height: int, device: torch.device | str = "cpu") -> T
 
 
 def cast(camera: Camera, pixels: Tensor | None = None) -> Rays:
-    """Rays through continuous `pixels` [R, 2] as (u, v), or through all pixel centres, row by row.
-
-    Directions are (x, y, 1) rotated to world axes, not normalised: the ray parameter is z-depth.
-    """
+    """Rays through `pixels` [R, 2] as (u, v), or through all pixel centres, row by row."""
     if pixels is None:
         pixels = pixel_grid(camera.width, camera.height, camera.c2w.device)
     check_shape("pixels", pixels, None, 2)
@@ -43,10 +40,7 @@ def unproject(camera: Camera, pixels: Tensor, depth: Tensor) -> Tensor:
 
 
 def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Continuous pixels [R, 2] and z-depth [R] of world `points` [R, 3] (Eq. 7, 9).
-
-    Where the depth is not positive the pixel is meaningless: the caller must reject it.
-    """
+    """Pixels [R, 2] and z-depth [R] of `points` [R, 3] (Eq. 7, 9); no pixel unless depth > 0."""
     check_shape("points", points, None, 3)
     rotation, centre = camera.c2w[:, :3].to(points.dtype), camera.c2w[:, 3].to(points.dtype)
     local = (points - centre) @ rotation  # R^T (p - c), row vectors
@@ -64,10 +58,7 @@ def within(pixels: Tensor, width: int, height: int) -> Tensor:
 
 
 def scale_camera(camera: Camera, width: int, height: int) -> Camera:
-    """The same view on a grid of `width` x `height` pixels.
-
-    With pixel centres at +0.5 every intrinsic is simply multiplied, so 1/4 and back is exact.
-    """
+    """The same view on `width` x `height` pixels; with centres at +0.5, 1/4 and back is exact."""
     sx, sy = width / camera.width, height / camera.height
     fx, fy, cx, cy = camera.fx * sx, camera.fy * sy, camera.cx * sx, camera.cy * sy
     return Camera(camera.c2w, fx, fy, cx, cy, width, height)
@@ -86,20 +77,14 @@ def crop_camera(camera: Camera, left: int, top: int, width: int, height: int) ->
 
 
 def move_camera(camera: Camera, scale: float, offset: Tensor) -> Camera:
-    """The same view after the world is moved: point x becomes scale * x + offset (`offset` [3]).
-
-    Computed in float64, so that a camera far from the origin keeps the digits of its `c2w`.
-    """
+    """The same view after x becomes scale * x + offset [3]; in float64, for cameras far away."""
     pose = camera.c2w.double()
     centre = scale * pose[:, 3:] + offset.to(pose)[:, None]
     return replace(camera, c2w=torch.cat((pose[:, :3], centre), dim=1).float())
 
 
 def place_camera(camera: Camera, device: torch.device | str) -> Camera:
-    """The same camera with its pose on `device`, where its rays and projections are then computed.
-
-    The host waits for a GPU only when it copies a pose from it.
-    """
+    """The same camera with its pose on `device`; the host waits only for a pose on a GPU."""
     waits = camera.c2w.device.type != "cpu"
     return replace(camera, c2w=camera.c2w.to(device, non_blocking=not waits))
 

@@ -48,18 +48,14 @@ class Apart(NamedTuple):
 
 @dataclass(frozen=True)
 class Case:
-    """A property that must hold for every backend or engine.
-
-    `error` computes the largest error, given backend, device and precision, or `Apart` where it is
-    nearest to what is allowed. It raises `Unavailable` if the cell does not exist on that device.
-    """
+    """A property that must hold for every backend or engine."""
 
     subject: str  # the computation that is checked ("composite backward")
     name: str  # what is special about the inputs
     holds: str  # what must hold
     derivation: str  # where the tolerances come from
     tolerances: Mapping[Cell, float | None]  # the largest allowed errors; None: `error` says it
-    error: Callable[[str, str, str], float | Apart]
+    error: Callable[[str, str, str], float | Apart]  # of backend, device, precision, if they exist
     timed: int | None = None  # samples, rays or entries a call; None: too few to time
     slow: bool = False  # takes more than a moment, so the tests skip it
 
@@ -69,12 +65,7 @@ class Case:
         return not (self.slow or self.timed)
 
     def check(self, cell: Cell, device: str) -> dict[str, Any]:
-        """Check one cell and return its row.
-
-        The row holds subject, case, holds, derivation, device, backend, precision, tolerance, error
-        (None if missing or not finite) and status: "ok", "failed", "failed: " with the exception,
-        or "unavailable: " with the reason.
-        """
+        """Check one cell; "status" is "ok", "failed", or "failed: " or "unavailable: " and why."""
         backend, precision = cell
         error, tolerance = math.inf, self.tolerances[cell]
         try:
@@ -148,17 +139,13 @@ def uniform(generator: torch.Generator, shape: Sequence[int]) -> Tensor:
 
 @dataclass(frozen=True)
 class Operation:
-    """An operation; all its `backends` agree with the reference, forward and backward.
-
-    `compute` returns its results, given the inputs and the backend. There are gradients of the
-    inputs named in `gradients`, each a tensor or a list of them, and no others.
-    """
+    """An operation; all its `backends` agree with the reference, forward and backward."""
 
     subject: str
     backends: Sequence[str]
-    compute: Callable[[Given, str], tuple[Tensor, ...]]
+    compute: Callable[[Given, str], tuple[Tensor, ...]]  # its results, with a backend
     outputs: Mapping[str, Bound]  # of each result, by its name, in their order
-    gradients: Mapping[str, Bound] = field(default_factory=dict)  # by the name of the input
+    gradients: Mapping[str, Bound] = field(default_factory=dict)  # of an input or a list of them
     draw: Callable[[torch.Generator, Sequence[int]], Tensor] = uniform  # gradients of the results
     relative: bool = False  # gradients are compared in units of the largest number of each
 
@@ -250,10 +237,7 @@ def placed(value: Any, device: str) -> Any:
 def on_backends(
     units: float, *precisions: str, backends: Sequence[str] = ("reference", "cpu")
 ) -> dict[Cell, float]:
-    """Tolerances of `units` u, for `backends` in fp32 and for the reference in `precisions`.
-
-    Only the reference has other precisions than fp32.
-    """
+    """Tolerances of `units` u: of `backends` in fp32, of the reference alone in `precisions`."""
     cells = [*product(backends, ("fp32",)), *product(("reference",), precisions)]
     return {cell: units * torch.finfo(DTYPES[cell[1]]).eps / 2 for cell in cells}
 
@@ -312,10 +296,9 @@ def timed_rows(
 ) -> list[dict[str, Any]]:
     """Check the cases and time the correct ones; one row per timed case and supported backend.
 
-    A row holds kernel, case, backend, dtype, error and tolerance (absolute; error is None if not
-    finite), status ("ok", or the cases of the kernel that the backend fails, timed or not), ms
-    (median of `repeats`), mitems_s (million items a second) and ratio (time of the reference over
-    time of this backend). A backend that fails any case of a kernel is not timed.
+    A backend that fails any case of a kernel, timed or not, is not timed; its status names these
+    cases. ms is the median of `repeats`, mitems_s million items a second, ratio the time of the
+    reference over that of this backend.
     """
     subjects = {case.subject for case in cases if case.timed}
     checked = [case for case in cases if case.subject in subjects and not case.slow]

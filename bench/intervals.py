@@ -11,10 +11,7 @@ CONFIDENCE = 0.95
 
 
 def half_interval(values: np.ndarray) -> float:
-    """Half the width of the t-interval of the mean of independent `values` [n].
-
-    nan for fewer than two values, or if one is not finite.
-    """
+    """Half the t-interval of the mean of independent `values`; nan for < 2 or not finite ones."""
     if len(values) < 2 or not np.isfinite(values).all():
         return math.nan
     return _quantile(len(values) - 1) * values.std(ddof=1) / math.sqrt(len(values))

@@ -57,10 +57,7 @@ def psnr_of_mse(mse: float) -> float:
 def flicker(
     image: Tensor, reference: Tensor, previous_image: Tensor, previous_reference: Tensor
 ) -> float:
-    """Change of the error from one frame to the next, as the RMS over pixels and channels.
-
-    A constant error scores 0: this detects what blinks, swims or shimmers.
-    """
+    """RMS of the change of the error from frame to frame: 0 for what is wrong but stands still."""
     _check_pair(image, reference)
     _check_pair(previous_image, previous_reference)
     check_shape("previous_image", previous_image, *image.shape)

@@ -51,10 +51,7 @@ def between(first: Camera, second: Camera, turn: Tensor, share: float) -> Camera
 
 
 def lens_between(first: Camera, second: Camera, share: float) -> Camera:
-    """The `first` camera with its intrinsics interpolated at `share` of the way to `second`.
-
-    Raises SteerbenchError if the pictures differ in size.
-    """
+    """`first` with its intrinsics at `share` of the way; raises if the pictures differ in size."""
     one, other = (f"{camera.width}x{camera.height}" for camera in (first, second))
     if one != other:
         expected = "pictures of one size to interpolate between"

@@ -78,10 +78,7 @@ def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
 
 
 def listed(folder: Path) -> list[Path]:
-    """The pictures in a folder, sorted by name with 10 after 9.
-
-    Raises SteerbenchError if there are none, or the names of two differ only in the ending.
-    """
+    """The pictures in a folder, 10 after 9; raises if none, or two names differ in their ending."""
     if not folder.is_dir():
         raise unexpected(folder, "a folder", "a file" if folder.exists() else "nothing there")
     files = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]

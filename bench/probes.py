@@ -31,12 +31,9 @@ ROOT = f"{Path(__file__).parent.parent}/"
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """The times and the work of one frame.
+    """The times and the work of one frame."""
 
-    A stage inside another is named "outer/inner", and its time is not part of "outer".
-    """
-
-    stages_ns: dict[str, int]  # time of each stage and of `other`
+    stages_ns: dict[str, int]  # of each stage and `other`; "outer/inner" is no part of "outer"
     done: dict[str, int]  # units of work by counter
     dense: dict[str, int]  # the work of a method that skips nothing, of counters that report it
 

@@ -91,10 +91,7 @@ def spread(total: int, count: int) -> list[int]:
 
 
 def from_split(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:
-    """The cameras of a split in order, or only `limit`, evenly spread.
-
-    A kept frame whose predecessor was dropped comes after a cut.
-    """
+    """The cameras of a split in order, or `limit` evenly spread ones; a cut is at each gap."""
     cameras, kept, part = _kept(scene, split, limit, spaced=True)
     cuts = [False, *(after != before + 1 for before, after in pairwise(kept))]
     steps = (Step(cameras[index], index, cut) for index, cut in zip(kept, cuts, strict=True))
@@ -109,11 +106,7 @@ def orbit(scene: Scene, split: str = "test", limit: int = 0) -> Trajectory:
 
 
 def smooth(scene: Scene, split: str = "test", degrees: float = 1.0, limit: int = 0) -> Trajectory:
-    """A path through the cameras of a split that turns by at most `degrees` from frame to frame.
-
-    Frames between two cameras have no ground truth: they are rendered and timed, not scored. The
-    path goes through the first `limit` cameras, so that it has no gaps.
-    """
+    """A path through the first `limit` cameras; the frames between them have no ground truth."""
     steps, part = _smooth_steps(scene, split, degrees, limit)
     return Trajectory(f"{split}-smooth{degrees:g}deg{part}", split, tuple(steps))
 
@@ -121,10 +114,7 @@ def smooth(scene: Scene, split: str = "test", degrees: float = 1.0, limit: int =
 def jump(
     scene: Scene, split: str = "test", degrees: float = 1.0, every: int = 10, limit: int = 0
 ) -> Trajectory:
-    """The smooth path cut into pieces of `every` frames and shuffled, so the camera jumps between.
-
-    The order is the same every time, and no piece follows its predecessor on the path.
-    """
+    """The smooth path, cut into pieces of `every` frames, in a fixed order that none follows on."""
     steps, part = _smooth_steps(scene, split, degrees, limit)
     if not 1 <= every < len(steps):
         allowed = f"1 to {len(steps) - 1}, fewer than the {len(steps)} frames of the path"
@@ -140,11 +130,7 @@ def jump(
 def loop(
     scene: Scene, split: str = "test", degrees: float = 1.0, frames: int = 1000, limit: int = 0
 ) -> Trajectory:
-    """The smooth path back and forth, repeated until `frames` frames are rendered.
-
-    Every round revisits exactly the same cameras, so that drift over a long sequence shows in the
-    scores of the same pictures.
-    """
+    """The smooth path back and forth, so that drift shows in scores of the same pictures."""
     _check(frames >= 1, "frames", "1 or more", frames)
     there, part = _smooth_steps(scene, split, degrees, limit)
     round_trip = there + there[-2:0:-1]

@@ -31,10 +31,7 @@ dropped block drops all its cells."""
 
 
 def every_nth(views: Sequence[View], step: int, where: Path) -> dict[str, list[View]]:
-    """Split views, sorted by name: 0, step, 2 * step ... are the test split, the others train.
-
-    Raises SteerbenchError if `step` is less than 2, or nothing is left to train on.
-    """
+    """Split views, by name: 0, step, 2 step ... test, the others train; raises if none are left."""
     whole_number(step, "split_every", 2)
     views = sorted(views, key=lambda view: view.name)
     if len(views) < 2:

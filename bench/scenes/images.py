@@ -39,16 +39,12 @@ announce more than any machine can hold."""
 
 @dataclass(frozen=True)
 class View:
-    """A picture that a data set describes.
-
-    `camera` is in the data set's units, with OpenCV axes, in float64 because a scene may lie far
-    from the origin. `lens` is None for a pinhole.
-    """
+    """A picture that a data set describes."""
 
     name: str
     path: Path
-    camera: Camera
-    lens: Lens | None = None
+    camera: Camera  # in the data set's units, in float64: a scene may lie far from the origin
+    lens: Lens | None = None  # None: a pinhole
 
 
 @dataclass(frozen=True)
@@ -93,10 +89,7 @@ class Pictures(Sequence[Tensor]):
 
 @contextmanager
 def opened(source: Path | io.BytesIO, where: Path) -> Iterator[Image.Image]:
-    """The picture in `source`, with only its header read.
-
-    Raises SteerbenchError if it is no picture, too large, or found to be damaged while it is used.
-    """
+    """The picture in `source`, header read; raises if it is none, too large, or damaged."""
     try:
         with Image.open(source) as image:
             if image.width * image.height > MOST_PIXELS:
@@ -165,10 +158,7 @@ def check_mode(image: Image.Image, path: Path) -> None:
 
 
 def shrink(image: Tensor, factor: int) -> Tensor:
-    """Average blocks of `factor` x `factor` pixels, colours weighted by alpha, rounded to 8 bits.
-
-    Columns and rows at the right and bottom that do not fill a block are dropped.
-    """
+    """Average blocks of `factor`^2 pixels, weighted by alpha, to 8 bits; drops incomplete ones."""
     if factor == 1:
         return image
     height, width = image.shape[0] // factor, image.shape[1] // factor
@@ -240,10 +230,7 @@ def undistort(image: Tensor, camera: Camera, lens: Lens, where: Path) -> Tensor:
 
 
 def undistorted_camera(camera: Camera, lens: Lens, where: Path) -> Camera:
-    """The camera of the undistorted picture; arguments and errors are those of `undistort`.
-
-    It is cropped to a rectangle in which the lens saw every pixel, so that no border is invented.
-    """
+    """The camera of the undistorted picture, cropped to where the lens saw every pixel."""
     source, left, top = _window(camera, lens, where)
     return crop_camera(camera, left, top, source.shape[1], source.shape[0])
 
@@ -275,11 +262,7 @@ def pinhole_window(
 
 
 def seen_rectangle(source: Tensor) -> tuple[int, int, int, int]:
-    """(left, top, right, bottom) of a rectangle whose pixels all lie in the distorted picture.
-
-    Starts from the whole picture and removes the side with the largest unseen share until the
-    border has no unseen pixel.
-    """
+    """(left, top, right, bottom) of a rectangle that was seen: drops the worst side in turn."""
     height, width = source.shape[:2]
     limit = source.new_tensor((width, height)) - 0.5  # last pixel centre: bilinear needs no border
     unseen = ~((source >= 0.5) & (source <= limit)).all(-1)  # True for NaN, too

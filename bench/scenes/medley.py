@@ -94,10 +94,7 @@ def medley(variant: int) -> Solids:
 
 
 def place(draw: Draw, shape: Shape, core: Sequence[Part]) -> Triple:
-    """Draw the centre of a part: the origin for the first one, otherwise near the core's surface.
-
-    Core parts surround the first one; other parts go on the outer side of a core part.
-    """
+    """The centre of a part: 0, then around the first, then on the outer side of a core part."""
     if not core:
         return (0.0, 0.0, 0.0)
     ground = draw.pick(core) if len(core) == CORE else core[0]

@@ -68,10 +68,7 @@ def read_box(root: Path) -> Box:
 
 
 def read_intrinsics(root: Path) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy in pixels, from either form of `intrinsics.txt`.
-
-    The file holds a 4x4 or 3x3 matrix, or a first line "f cx cy 0" with other data below it.
-    """
+    """fx, fy, cx, cy from a 4x4 or 3x3 matrix, or a first line "f cx cy 0" above other data."""
     path = root / "intrinsics.txt"
     rows = numbers(read_text(root, path.name), path)
     if [len(row) for row in rows] in ([4] * 4, [3] * 3):

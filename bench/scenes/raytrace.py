@@ -36,15 +36,12 @@ SKY, GROUND, SUN = 0.52, 0.24, 0.62
 
 @dataclass(frozen=True)
 class Band:
-    """The rays of some rows of a picture, [rows, W, S], all from `origin` [3].
-
-    The direction at image-plane coordinates x [1, W, S], y [rows, 1, S] is `rotation` @ (x, y, 1).
-    """
+    """The rays of some rows of a picture, from `origin` [3] along `rotation` @ (x, y, 1)."""
 
     origin: Tensor
     rotation: Tensor
-    x: Tensor
-    y: Tensor
+    x: Tensor  # [1, W, S] on the image plane
+    y: Tensor  # [rows, 1, S]
 
     def directions(self, frame: Tensor, columns: slice) -> tuple[Tensor, Tensor, Tensor]:
         """Directions of the rays in `columns`, as components along the axes of `frame` [3, 3]."""
@@ -121,10 +118,7 @@ class ProjectedBoxes:
         self.start, self.end = corners[:, pairs[:, 0]], corners[:, pairs[:, 1]]  # [P, 28, 2]
 
     def spans(self, top: int, bottom: int) -> list[Span]:
-        """The parts that may be visible in rows top <= row < bottom, each with its columns.
-
-        A part that reaches behind the camera may be visible anywhere; one behind it is not visible.
-        """
+        """The parts that may be seen in rows top <= row < bottom, each with its columns."""
         (u0, v0), (u1, v1) = self.start.unbind(-1), self.end.unbind(-1)
         flat = v0 == v1
         rise = (v1 - v0).masked_fill(flat, 1)
@@ -135,6 +129,7 @@ class ProjectedBoxes:
         ends = torch.stack((u0 + low * (u1 - u0), u0 + high * (u1 - u0)))
         first = ends.masked_fill(~meets, math.inf).amin((0, 2)).floor() - 1
         last = ends.masked_fill(~meets, -math.inf).amax((0, 2)).ceil() + 1
+        # A part that reaches behind the camera may be visible anywhere.
         first = first.masked_fill(~self.in_front, 0).clamp(min=0)
         last = last.masked_fill(~self.in_front, self.width).clamp(max=self.width)
         columns = torch.stack((first, last.masked_fill(self.behind, 0)), dim=1).tolist()

@@ -92,11 +92,7 @@ def read_views(root: Path, record: dict, log: Log) -> list[View]:
 
 
 def read_camera(settings: ChainMap, pose: Tensor, usual: Camera, where: str) -> Camera:
-    """The pinhole camera of a frame; what is not given is that of `usual`, scaled to its size.
-
-    Focal lengths come from fl_x and fl_y or from camera_angle_x and camera_angle_y. A missing
-    vertical one equals the horizontal one.
-    """
+    """The pinhole camera of a frame; what is not given is that of `usual`, scaled to its size."""
     width = whole_number(settings.get("w", usual.width), f"{where}.w", 1)
     height = whole_number(settings.get("h", usual.height), f"{where}.h", 1)
     usual = scale_camera(usual, width, height)
@@ -110,10 +106,7 @@ def read_camera(settings: ChainMap, pose: Tensor, usual: Camera, where: str) -> 
 
 
 def focal(settings: ChainMap, axis: str, size: float, where: str) -> float | None:
-    """Focal length in pixels along an axis of `size` pixels; None if not given.
-
-    A frame's angle of view takes precedence over the file's focal length: both mean the same.
-    """
+    """Focal length in pixels, from the frame or else the file; None if not given."""
     length, angle = f"fl_{axis}", f"camera_angle_{axis}"
     for level in settings.maps:
         if length in level:

@@ -1,11 +1,14 @@
-"""The clock charges every nanosecond once; the meter sees what a region allocates."""
+"""Every nanosecond of a frame is charged once, every region is metered, every wait has its line."""
 
 from __future__ import annotations
 
 import itertools
+import linecache
 import mmap
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -13,7 +16,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bench import probes
-from bench.probes import FrameRecord, MemoryMeter, StageClock, p99_to_p50
+from bench.errors import Unavailable
+from bench.probes import FrameRecord, MemoryMeter, StageClock, device_waits, p99_to_p50
+from tests.pretended_gpu import PretendedGpu
 
 
 def clock_reading(times: Iterable[int]) -> StageClock:
@@ -171,3 +176,52 @@ def test_on_a_gpu_the_meter_reads_the_allocator(monkeypatch):
         assert calls == ["reset"]
     assert meter.peak_bytes == 12345
     assert "device" in meter.source
+
+
+def test_the_line_that_waits_or_calls_what_waits_in_torch_is_named(gpu: PretendedGpu) -> None:
+    x = torch.ones(3, device="cuda")
+    with device_waits() as waits:
+        for _ in range(2):
+            torch.unique(x)
+    ((line, count),) = waits.items()
+    assert (line.path, count) == (__file__, 2)
+    assert linecache.getline(*line).strip() == "torch.unique(x)"
+    scope: dict[str, Any] = {}
+    text = "def wait():\n import warnings\n warnings.warn('called a synchronizing CUDA operation')"
+    exec(compile(text, torch.functional.__file__, "exec"), scope)
+    with device_waits() as waits:
+        scope["wait"]()
+    ((line, count),) = waits.items()
+    assert (line.path, count) == (__file__, 1)
+
+
+def test_a_wait_in_a_backward_pass_is_that_of_its_line(gpu: PretendedGpu) -> None:
+    class Asking(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, x):
+            return x.clone()
+
+        @staticmethod
+        def backward(ctx, grad):
+            return grad * grad.max().item()
+
+    x = torch.ones(3, device="cuda", requires_grad=True)
+    y = Asking.apply(x).sum()
+    with device_waits() as waits:
+        y.backward()
+    ((line, count),) = waits.items()
+    assert (line.number, count) == (Asking.backward.__code__.co_firstlineno + 2, 1)
+
+
+def test_other_warnings_are_shown_as_ever_and_afterwards_none_is_counted(gpu: PretendedGpu) -> None:
+    with pytest.warns(UserWarning, match="of something else"), device_waits() as waits:
+        warnings.warn("of something else", stacklevel=1)
+    torch.ones(1, device="cuda").item()
+    assert not waits
+    assert torch.cuda.get_sync_debug_mode() == 0
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="for a machine without a GPU")
+def test_without_a_gpu_it_says_that_one_is_needed() -> None:
+    with pytest.raises(Unavailable, match="a GPU is needed"), device_waits():
+        pass

@@ -1,16 +1,23 @@
-"""The commit follows the checkout; the machine is described so that two can be distinguished."""
+"""The digest of a thing follows the files it stands on; commit and machine are as they are."""
 
 from __future__ import annotations
 
+import importlib
 import json
+import shutil
 import subprocess
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 from bench import provenance
+from bench.errors import SteerbenchError
+from bench.provenance import libraries
+from bench.run import measure
+from methods.instant_ngp.stage1 import train_field
 
 commit = provenance.commit.__wrapped__
 
@@ -80,3 +87,179 @@ def test_what_of_the_machine_can_change_a_figure_is_a_part_of_its_record():
     decisive = provenance.computed_by(str)["machine"]
     assert decisive.items() <= provenance.machine().items()
     assert not {"threads", "cores", "memory_bytes", "system"} & decisive.keys()
+
+
+FILES = {
+    "bench/ruler.py": "",
+    "bench/unused.py": "A = 1\n",
+    "methods/__init__.py": "",
+    "methods/fields/__init__.py": "import importlib\n",
+    "methods/fields/cpu.py": "from bench import ruler\nimport numpy.linalg\n",
+    "methods/fields/cases.py": "import scipy\n",
+    "methods/fields/experiments.py": "import scipy\n",
+    "methods/fields/inner/weights.safetensors": "12",
+    "methods/alone/__init__.py": "",
+    "methods/alone/beside.py": "",
+    "methods/alone/method.py": "def fit():\n    from methods.fields import field\n",
+    "methods/alone/learned.safetensors": "34",
+}
+
+
+def write(root: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+
+
+def defined_in(module: str, **attributes: Any) -> type:
+    return type("Thing", (), {"__module__": module, **attributes})
+
+
+def digest(*things: Any) -> str:
+    """As a process finds it that has just begun."""
+    provenance._first.clear()
+    return provenance.digest(*things)
+
+
+METHOD = defined_in("methods.alone.method")
+
+
+@pytest.fixture
+def tree(tmp_path, monkeypatch) -> Path:
+    """A small project: a method in a module that imports a package of fields."""
+    write(tmp_path / "here", FILES)
+    monkeypatch.setattr(provenance, "ROOT", tmp_path / "here")
+    return tmp_path / "here"
+
+
+def test_a_file_that_is_changed_while_a_process_runs_ends_it(tree):
+    """Its old code, still loaded, would store its results under the key of the new one."""
+    before = digest(METHOD)
+    (tree / "bench/ruler.py").write_text("A = 2\n")
+    with pytest.raises(SteerbenchError, match=r"bench/ruler\.py was changed while this process"):
+        provenance.digest(METHOD)
+    write(tree, FILES)
+    assert provenance.digest(METHOD) == before
+
+
+@pytest.mark.parametrize(
+    ("name", "counts"),
+    [
+        ("methods/alone/method.py", True),
+        ("methods/alone/learned.safetensors", True),
+        ("methods/fields/__init__.py", True),
+        ("methods/fields/cpu.py", True),
+        ("methods/fields/inner/weights.safetensors", True),
+        ("bench/ruler.py", True),
+        ("bench/unused.py", False),
+        ("bench/notes.txt", False),
+        ("methods/__init__.py", False),
+        ("methods/alone/beside.py", False),
+        ("methods/fields/cases.py", False),
+        ("methods/fields/experiments.py", False),
+        ("methods/fields/__pycache__/cpu.pyc", False),
+        ("sweeps/other.py", False),
+    ],
+)
+def test_what_a_thing_stands_on_changes_its_digest_and_nothing_else(tree, name, counts):
+    before = digest(METHOD)
+    assert digest(METHOD) == before
+    write(tree, {name: FILES.get(name, "") + "# a comment\n"})
+    assert (digest(METHOD) != before) == counts
+
+
+def test_a_new_file_beside_an_imported_package_counts_and_so_does_a_new_name(tree):
+    digests = [digest(METHOD)]
+    write(tree, {"methods/fields/gpu.py": "A = 1\n"})
+    digests.append(digest(METHOD))
+    (tree / "methods/fields/gpu.py").rename(tree / "methods/fields/cuda.py")
+    digests.append(digest(METHOD))
+    assert len(set(digests)) == 3
+
+
+def test_the_digest_depends_neither_on_where_the_project_lies_nor_on_an_order(tree, monkeypatch):
+    before, ruler = digest(METHOD), defined_in("bench.ruler")
+    assert digest(METHOD, ruler) == digest(ruler, METHOD) == before != digest(ruler)
+    shutil.move(tree, tree.with_name("there"))
+    monkeypatch.setattr(provenance, "ROOT", tree.with_name("there"))
+    assert digest(METHOD) == before
+
+
+PLUGIN = {
+    "foreign_{}/__init__.py": "",
+    "foreign_{}/method.py": "from bench import ruler\nfrom foreign_{0} import helper\n",
+    "foreign_{}/helper.py": "A = 1\n",
+    "foreign_{}/data/table.bin": "5",
+    "other_{}/__init__.py": "",
+}
+
+
+@pytest.fixture(params=["package", "namespace"])
+def plugin(request, tree, tmp_path, monkeypatch) -> tuple[Path, type]:
+    """A method of another project in a package of two modules, with or without an `__init__`."""
+    files = {name.format(request.param): text for name, text in PLUGIN.items()}
+    write(tmp_path / "site", {name: text.format(request.param) for name, text in files.items()})
+    folder = tmp_path / "site" / f"foreign_{request.param}"
+    if request.param == "namespace":
+        (folder / "__init__.py").unlink()
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    importlib.invalidate_caches()
+    return folder, defined_in(f"foreign_{request.param}.method")
+
+
+@pytest.mark.parametrize("name", ["method.py", "helper.py", "data/table.bin"])
+def test_every_file_of_a_plugin_changes_its_digest(plugin, name):
+    folder, thing = plugin
+    before = digest(thing)
+    (folder / name).write_text("A = 2\n")
+    assert digest(thing) != before
+
+
+def test_what_a_plugin_imports_of_ours_counts_and_nothing_else(plugin, tree):
+    folder, thing = plugin
+    before = digest(thing)
+    write(tree, {"bench/unused.py": "# another\n"})
+    write(folder.parent, {"beside.py": "", f"{folder.name}/__pycache__/helper.pyc": ""})
+    assert digest(thing) == before
+    write(tree, {"bench/ruler.py": "# another\n"})
+    assert digest(thing) != before
+
+
+def test_the_digest_of_a_plugin_does_not_depend_on_where_it_lies(plugin, monkeypatch):
+    folder, thing = plugin
+    before = digest(thing)
+    shutil.move(folder.parent, folder.parent.with_name("elsewhere"))
+    monkeypatch.syspath_prepend(folder.parent.with_name("elsewhere"))
+    importlib.invalidate_caches()
+    assert digest(thing) == before
+
+
+def test_a_single_file_counts_with_the_module_beside_it_that_it_imports(
+    tree, tmp_path, monkeypatch
+):
+    write(tmp_path / "site", {"single_file.py": "import its_helper\n", "its_helper.py": "A = 1\n"})
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    importlib.invalidate_caches()
+    thing = defined_in("single_file")
+    before = digest(thing)
+    write(tmp_path / "site", {"its_helper.py": "A = 2\n"})
+    assert digest(thing) != before
+
+
+def test_libraries_are_those_that_the_sources_import_and_a_class_lists(tree):
+    assert libraries(METHOD) == {"numpy": metadata.version("numpy")}
+    assert libraries(defined_in("bench.unused")) == {}
+    thing = defined_in("bench.unused", libraries=("scipy", "not-installed"))
+    assert libraries(thing) == {"scipy": metadata.version("scipy")}
+
+
+def test_the_libraries_of_the_real_things_are_found_through_their_backends():
+    assert {"torch", "numba"} <= libraries(train_field).keys()
+    assert {"torch", "scipy", "torchvision", "scikit-image", "lpips"} <= libraries(measure).keys()
+
+
+def test_a_training_does_not_stand_on_how_results_are_kept_and_shown():
+    names = provenance.sources(train_field)
+    assert "methods/instant_ngp/training.py" in names
+    assert not [name for name in names if name.startswith(("bench/results", "bench/console"))]
+    assert "pandas" not in libraries(train_field)
