@@ -72,11 +72,6 @@ def test_a_rigid_motion_of_scene_and_camera_moves_no_pixel(seed: int) -> None:
     assert motion_error(seed, "cpu") <= MOTION_UNITS * U32
 
 
-def test_unproject_rejects_pixels_of_another_shape() -> None:
-    with pytest.raises(ValueError, match=r"pixels: expected shape \[any, 2\], got \[4, 3\]"):
-        unproject(camera_at((2.0, 2.0, 2.0)), torch.zeros(4, 3), torch.ones(4))
-
-
 def test_scaling_to_a_quarter_and_back_is_exact() -> None:
     camera = replace(camera_at((2.0, 2.0, 2.0)), fx=0.1, cx=1 / 3)
     assert scale_camera(scale_camera(camera, 13, 9), 52, 36) == camera

@@ -63,10 +63,3 @@ def test_where_neighbours_are_alike_the_interval_still_holds_the_mean() -> None:
     series = paths(0.8, 400, 100)
     assert coverage(half_interval, series) < 0.6
     assert coverage(path_interval, series) > 0.85
-
-
-def test_the_order_of_the_frames_counts() -> None:
-    """The same values, mixed: neighbours are no longer alike, and the mean is known better."""
-    values = np.linspace(28, 32, 60)
-    mixed = np.random.default_rng(0).permutation(values)
-    assert path_interval(values) > 2 * path_interval(mixed)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from bench.metrics import SMALLEST_SIDE, Lpips, flicker, psnr, quantise, ssim
-from bench.protocol import Flicker
+from bench.protocol import EvaluationProtocol, Scoring
 from bench.types import SteerbenchError, Unavailable
 
 
@@ -200,9 +200,11 @@ def test_scores_do_not_depend_on_the_strides_of_the_picture(lpips_weights, quiet
 
 def test_scoring_leaves_nothing_on_a_gpu(gpu, lpips_weights, quiet_log):
     """What lay there would count as memory of the method that is measured."""
-    lpips, blinking = Lpips("alex", lpips_weights, quiet_log), Flicker()
+    lpips = Lpips("alex", lpips_weights, quiet_log)
+    scoring = Scoring(EvaluationProtocol(), {}, torch.ones(3), ())
     pictures = [torch.rand(40, 40, 3).to("cuda") for _ in range(2)]
     assert math.isfinite(lpips(*pictures))
-    blinking.since_last((pictures[0], pictures[1]))
-    kept = [*lpips._model.parameters(), *lpips._model.buffers(), *blinking._last]
+    truth = torch.zeros(40, 40, 3, dtype=torch.uint8)
+    scoring.score(0, pictures[0], truth, scored=False, cut=False)
+    kept = [*lpips._model.parameters(), *lpips._model.buffers(), *scoring._last]
     assert {tensor.device.type for tensor in kept} == {"cpu"}

@@ -49,14 +49,11 @@ def test_a_checkout_names_its_commit_and_whether_it_was_changed(checkout):
     assert commit() == f"{head}-dirty"
 
 
-def test_a_copy_installed_inside_another_repository_names_its_version(checkout):
+def test_without_git_or_in_another_repository_the_version_is_named(checkout, monkeypatch):
     git(checkout, "init", "-q")
     git(checkout, "add", "sweeps")
     git(checkout, "commit", "-q", "-m", "a project that has steerbench in its .venv")
     assert commit() == metadata.version("steerbench")
-
-
-def test_without_git_the_version_is_named(checkout, monkeypatch):
     monkeypatch.setenv("PATH", "")
     assert commit() == metadata.version("steerbench")
 

@@ -80,13 +80,8 @@ def test_quality_is_the_mean_over_the_frames_of_the_protocols_scores(
     assert value(measured.rows, "psnr") == pytest.approx(np.mean(scores), rel=1e-9)
     assert row(measured.rows, "psnr")["unit"] == "dB"
     assert measured.frames["name"].tolist() == tiny_scene.splits["test"].names
-
-
-def test_the_interval_takes_the_frames_in_the_order_of_their_path(run, offset_method):
-    measured = run(offset_method)
-    found = row(measured.rows, "psnr")
-    scores = measured.frames.sort_values("frame")["psnr"].to_numpy()
-    assert found["hi"] - found["value"] == pytest.approx(path_interval(scores))
+    found = row(measured.rows, "psnr")  # its interval, of the frames in the order of their path
+    assert found["hi"] - found["value"] == pytest.approx(path_interval(np.array(scores)))
 
 
 def test_the_stages_of_every_frame_and_of_the_mean_add_up_to_the_total(run, offset_method):
@@ -242,6 +237,27 @@ def test_frames_without_ground_truth_are_timed_but_not_scored(run, offset_method
     assert math.isnan(value(run(offset_method, trajectory=unscored).rows, "psnr"))
 
 
+def test_the_exact_picture_of_a_scene_serves_flicker_when_the_protocol_asks(
+    run, offset_method, tiny_scene
+):
+    asked = []
+
+    def exact(camera):
+        asked.append(camera)
+        return torch.full((camera.height, camera.width, 4), 255, dtype=torch.uint8)
+
+    scene, protocol = replace(tiny_scene, exact=exact), replace(QUICK, flicker="exact")
+    whole = from_split(tiny_scene)
+    unscored = replace(whole, steps=tuple(replace(s, truth=None) for s in whole.steps))
+    given = {"scene": scene, "trajectory": unscored}
+    frames = run(offset_method, protocol=protocol, **given).frames
+    assert frames["flicker"].notna().tolist() == [False, *[True] * 5]
+    assert len(asked) == 6
+    assert run(offset_method, **given).frames["flicker"].isna().all()  # "split"
+    run(offset_method, scene=scene, protocol=protocol)  # ground truth is there
+    assert len(asked) == 6
+
+
 def test_pictures_show_ground_truth_rendering_and_error(run, offset_method, tiny_scene):
     pictures = run(offset_method).pictures
     assert list(pictures) == [
@@ -252,6 +268,9 @@ def test_pictures_show_ground_truth_rendering_and_error(run, offset_method, tiny
     truth, rendered = (pictures[f"0000-{kind}"].astype(int) for kind in ("truth", "rendered"))
     assert truth.shape == rendered.shape == pictures["0000-error"].shape == (32, 40, 3)
     assert set(np.unique((rendered - truth)[truth < 247])) <= {7, 8, 9}  # two roundings
+    for count, kept in ((0, []), (2, [0, 5]), (99, [0, 1, 2, 3, 4, 5])):
+        found = run(offset_method, pictures=count).pictures
+        assert sorted({int(name[:4]) for name in found}) == kept
 
 
 def test_a_rendering_with_nan_in_it_stops_the_run(run, offset_method):

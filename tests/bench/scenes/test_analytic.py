@@ -69,11 +69,6 @@ def test_every_parameter_has_its_own_folder(tmp_path, log) -> None:
     assert len(list(tmp_path.iterdir())) == 6
 
 
-def test_two_writes_are_equal_byte_for_byte(tmp_path, log) -> None:
-    one, other = (analytic.load("totem", **SMALL, root=tmp_path / p, log=log) for p in "ab")
-    assert one.digest == other.digest
-
-
 def test_cameras_come_back_as_they_were_made(drawn, log) -> None:
     scene = analytic.load("totem", **SMALL, root=drawn, log=log)
     for split, poses in (("train", train_poses(4, 0)), ("test", orbit_poses(2))):
@@ -185,12 +180,14 @@ def test_unknown_names_are_refused(tmp_path, log) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_variants_of_medley_are_scenes_of_their_own(tmp_path, log) -> None:
+def test_variants_of_medley_are_scenes_of_their_own_and_each_is_always_the_same(
+    tmp_path, log
+) -> None:
     scenes = [
-        analytic.load("medley", variant=variant, **SMALL, root=tmp_path, log=log)
-        for variant in (7, 8, 7)
+        analytic.load("medley", variant=variant, **SMALL, root=tmp_path / place, log=log)
+        for variant, place in ((7, "a"), (8, "a"), (7, "b"))
     ]
     assert [scene.name for scene in scenes] == ["medley-7", "medley-8", "medley-7"]
-    names = sorted(folder.name.rsplit("-", 1)[0] for folder in tmp_path.iterdir())
+    names = sorted(folder.name.rsplit("-", 1)[0] for folder in (tmp_path / "a").iterdir())
     assert names == ["medley-7", "medley-8"]
     assert scenes[0].digest == scenes[2].digest != scenes[1].digest

@@ -62,16 +62,19 @@ def test_too_few_training_pictures_are_refused(tiny_scene):
         hold_out(with_training(tiny_scene, 7), "validation", 8)
 
 
-SIZE = 32
+SIZE, RED = 32, plain((1.0, 0.0, 0.0))
 
 
 def camera(pose) -> Camera:
     return Camera(pose.float(), 45.0, 45.0, SIZE / 2, SIZE / 2, SIZE, SIZE)
 
 
-def pictures_of(model: Solids, poses: list) -> tuple[list[Camera], list[torch.Tensor]]:
+def hull_of(part: Part, poses: list) -> Box:
+    """The hull of what cameras at `poses` see of a model of one part."""
     cameras = [camera(pose) for pose in poses]
-    return cameras, [picture(model, c) for c in cameras]
+    box = hull_box(cameras, [picture(Solids([part]), c) for c in cameras], cube(1.5))
+    assert box is not None
+    return box
 
 
 @given(
@@ -81,9 +84,7 @@ def pictures_of(model: Solids, poses: list) -> tuple[list[Camera], list[torch.Te
 )
 @settings(max_examples=15)
 def test_no_point_of_the_surface_is_outside_the_hull(centre, radii, seed) -> None:
-    model = Solids([Part(Ellipsoid(radii), plain((1.0, 0.0, 0.0)), centre)])
-    box = hull_box(*pictures_of(model, train_poses(8, seed)), cube(1.5))
-    assert box is not None
+    box = hull_of(Part(Ellipsoid(radii), RED, centre), train_poses(8, seed))
     # The surface's outermost points are its centre +- its semi-axes.
     middle, reach = torch.tensor(centre).double(), torch.tensor(radii).double()
     assert (box.lower <= middle - reach).all()
@@ -91,23 +92,18 @@ def test_no_point_of_the_surface_is_outside_the_hull(centre, radii, seed) -> Non
 
 
 def test_the_hull_of_many_views_is_tight() -> None:
-    model = Solids([Part(Ellipsoid((0.3, 0.3, 0.3)), plain((1.0, 0.0, 0.0)))])
     poses = train_poses(24, 0) + [pose_on_sphere(k, -0.4) for k in range(6)]
-    box = hull_box(*pictures_of(model, poses), cube(1.5))
+    box = hull_of(Part(Ellipsoid((0.3, 0.3, 0.3)), RED), poses)
     # A pixel is 4 / 45 wide there; the hull has up to 2 of them and a cell of 3 / 64 more.
     slack = 2 * 4 / 45 + 2 * 3 / 64
-    assert box is not None
     assert (box.upper - box.lower).max() <= (0.6 + 2 * slack) * 1.05
 
 
 def test_blocks_drop_no_cell_that_would_be_kept(monkeypatch) -> None:
-    model = Solids([Part(Ellipsoid((0.2, 0.5, 0.1)), plain((1.0, 0.0, 0.0)), (0.3, -0.2, 0.1))])
-    views = pictures_of(model, train_poses(20, 3))
-    box = hull_box(*views, cube(1.5))
+    part = Part(Ellipsoid((0.2, 0.5, 0.1)), RED, (0.3, -0.2, 0.1))
+    box = hull_of(part, train_poses(20, 3))
     monkeypatch.setattr(assemble, "GLANCES", 0)
-    cell_by_cell = hull_box(*views, cube(1.5))
-    assert box is not None
-    assert cell_by_cell is not None
+    cell_by_cell = hull_of(part, train_poses(20, 3))
     assert torch.equal(box.lower, cell_by_cell.lower)
     assert torch.equal(box.upper, cell_by_cell.upper)
 
@@ -133,11 +129,3 @@ def test_no_hull_without_a_mask(alpha) -> None:
     image = torch.full((SIZE, SIZE, 4), alpha, dtype=torch.uint8)
     assert hull_box(cameras, [image] * 40, cube(1.2)) is None
     assert hull_box(cameras, [image[..., :3]] * 40, cube(1.2)) is None
-
-
-def test_the_unit_cube_is_filled_and_the_origin_undoes_it() -> None:
-    box = Box(torch.tensor([1.0, 2, 3]).double(), torch.tensor([3.0, 6, 4]).double())
-    assert box.side == 4
-    inside = box.in_unit_cube()
-    assert inside.tolist() == [[0.25, 0, 0.375], [0.75, 1, 0.625]]
-    assert (box.origin + box.side * inside[0].double()).tolist() == [1, 2, 3]

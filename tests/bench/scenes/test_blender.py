@@ -59,14 +59,6 @@ def test_paths_may_have_their_extension(blender_folder, edit_json, log) -> None:
     assert scene.splits["test"].names == ["test/r_0.png", "test/r_1.png"]
 
 
-def test_downscale_scales_the_camera(blender_folder, log) -> None:
-    full = blender.load(blender_folder, bounds="full", log=log).splits["train"].cameras[0]
-    half = blender.load(blender_folder, bounds="full", downscale=2, log=log).splits["train"]
-    assert half.images[0].shape == (3, 4, 4)
-    camera = half.cameras[0]
-    assert (camera.fx, camera.cx, camera.cy) == (full.fx / 2, full.cx / 2, full.cy / 2)
-
-
 def test_a_validation_split_has_all_its_pictures_or_none(blender_folder, log) -> None:
     text = (blender_folder / "transforms_train.json").read_text().replace("./train", "./val")
     (blender_folder / "transforms_val.json").write_text(text)

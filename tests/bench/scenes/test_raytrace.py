@@ -212,15 +212,6 @@ def test_overlapping_balls_against_quadrature(eye) -> None:
     assert (frame.alpha.flatten() - alpha).abs().mean() <= error / 20
 
 
-def test_a_ball_cut_into_two_halves_of_its_density_is_the_same() -> None:
-    whole = Cloud([Ball((0.1, 0.0, 0.0), 0.6, 3.0, (0.9, 0.5, 0.1))])
-    halves = Cloud([Ball((0.1, 0.0, 0.0), 0.6, 1.5, (0.9, 0.5, 0.1))] * 2)
-    camera = camera_at((0.5, -3.0, 1.0), 16)
-    one, two = render(whole, camera, BLACK, 4), render(halves, camera, BLACK, 4)
-    torch.testing.assert_close(one.rgb, two.rgb, rtol=0, atol=2e-6)
-    torch.testing.assert_close(one.depth, two.depth, rtol=1e-5, atol=0)
-
-
 def test_a_ball_behind_the_camera_is_not_seen() -> None:
     model = Cloud([Ball((0.0, -6.0, 0.0), 0.5, 9.0, (1.0, 1.0, 1.0))])
     frame = render(model, camera_at((0.0, -4.0, 0.0), 8), BLACK, samples=4)
