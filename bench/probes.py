@@ -211,7 +211,11 @@ def device_waits() -> Iterator[Counter[Line]]:
 
     def note(message, category, filename, lineno, file=None, line=None):
         if "synchronizing CUDA operation" in str(message):
-            waits[_cause(Line(filename, lineno))] += 1
+            # The innermost line outside torch, from the line outwards that the warning names.
+            warned = Line(filename, lineno)
+            lines = (Line(f.f_code.co_filename, n) for f, n in traceback.walk_stack(None))
+            outwards = dropwhile(lambda line: line != warned, lines)
+            waits[next((x for x in outwards if not x.path.startswith(TORCH)), warned)] += 1
         else:
             show(message, category, filename, lineno, file, line)
 
@@ -224,10 +228,3 @@ def device_waits() -> Iterator[Counter[Line]]:
             yield waits
         finally:
             torch.cuda.set_sync_debug_mode(before)
-
-
-def _cause(warned: Line) -> Line:
-    """The innermost line outside torch in the call stack of the line that the warning names."""
-    lines = (Line(f.f_code.co_filename, number) for f, number in traceback.walk_stack(None))
-    outwards = dropwhile(lambda line: line != warned, lines)
-    return next((line for line in outwards if not line.path.startswith(TORCH)), warned)

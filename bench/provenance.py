@@ -214,17 +214,14 @@ def _parsed(path: Path, changed: int) -> tuple[str, ...]:
 
 
 @cache
-def _distributions() -> dict[str, list[str]]:
-    """The installed distributions that provide each top-level package."""
-    return dict(metadata.packages_distributions())
-
-
-@cache
 def _version(distribution: str) -> str | None:
     try:
         return metadata.version(distribution)
     except metadata.PackageNotFoundError:
         return None
+
+
+_distributions = cache(metadata.packages_distributions)  # that provide each top-level package
 
 
 def _git(*arguments: str) -> str:

@@ -16,7 +16,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -33,18 +32,12 @@ WEIGHTS_ADDRESS = "https://download.pytorch.org/models/"
 TIMEOUT_S = 10.0
 
 
-class Backbone(NamedTuple):
-    """File names of a backbone: torchvision's own, and one with only its `features.*`."""
-
-    published: str
-    features: str
-
-
 BACKBONES = {
-    "alex": Backbone("alexnet-owt-7be5be79.pth", "alexnet_features.pth"),
-    "vgg": Backbone("vgg16-397923af.pth", "vgg16_features.pth"),
-    "squeeze": Backbone("squeezenet1_1-b8a52dc0.pth", "squeezenet1_1_features.pth"),
+    "alex": ("alexnet-owt-7be5be79.pth", "alexnet_features.pth"),
+    "vgg": ("vgg16-397923af.pth", "vgg16_features.pth"),
+    "squeeze": ("squeezenet1_1-b8a52dc0.pth", "squeezenet1_1_features.pth"),
 }
+"""File names of a backbone: torchvision's own, and one with only its `features.*`."""
 
 _unreachable: list[str] = []  # why a download of weights failed
 
@@ -258,7 +251,7 @@ def load_features(net: str, weights_dir: Path | None, log: Log) -> tuple[Path, d
     except (OSError, RuntimeError, EOFError, pickle.UnpicklingError):
         state = None
     if not isinstance(state, dict):
-        again = f"fetch the file again from {WEIGHTS_ADDRESS}{BACKBONES[net].published}"
+        again = f"fetch the file again from {WEIGHTS_ADDRESS}{BACKBONES[net][0]}"
         raise Unavailable(f"{path}: expected a torch state dict, could not read one; {again}")
     return path, state
 

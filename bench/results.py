@@ -151,7 +151,10 @@ class Store:
         for folder in sorted(self.folder.glob("[!.]*")):
             if keys is not None and folder.name not in keys:
                 continue
-            schema = _schema_version(folder)
+            try:
+                schema = json.loads(_text(folder / RECORD))["schema_version"]
+            except (ValueError, KeyError, TypeError):
+                schema = None
             first, _, body = _text(folder / "rows.csv").partition("\n")
             if schema == SCHEMA_VERSION and first == header:
                 bodies.append(body)
@@ -187,13 +190,6 @@ class Store:
 
 def unreadable(schema: object) -> str:
     return f"its rows have schema {schema}; this version reads schema {SCHEMA_VERSION}"
-
-
-def _schema_version(folder: Path) -> object:
-    try:
-        return json.loads(_text(folder / RECORD))["schema_version"]
-    except (ValueError, KeyError, TypeError):
-        return None
 
 
 def _text(path: Path) -> str:

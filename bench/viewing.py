@@ -105,20 +105,18 @@ class Painter:
             for method in self.methods:
                 method.reset()
             self._sequence = sequence
-        drawn = [_drawn(method, camera) for method in self.methods]
+        drawn = []
+        for method in self.methods:
+            clock = StageClock(method.settings()["device"])
+            with clock.frame():
+                frame = method.render(camera, clock)
+            check_frame(frame, camera, method.name, 0)
+            (record,) = clock.frames
+            times = {name: ns / 1e6 for name, ns in record.stages_ns.items() if name != OTHER or ns}
+            stages = dict(sorted(times.items(), key=lambda item: -item[1]))
+            drawn.append(Drawn(quantise(frame.rgb.cpu()), record.total_ns / 1e6, stages))
         self._full_ms[camera.width * camera.height] = sum(picture.ms for picture in drawn)
         return drawn
-
-
-def _drawn(method: Method, camera: Camera) -> Drawn:
-    clock = StageClock(method.settings()["device"])
-    with clock.frame():
-        frame = method.render(camera, clock)
-    check_frame(frame, camera, method.name, 0)
-    (record,) = clock.frames
-    times = {name: ns / 1e6 for name, ns in record.stages_ns.items() if name != OTHER or ns}
-    stages = dict(sorted(times.items(), key=lambda item: -item[1]))
-    return Drawn(quantise(frame.rgb.cpu()), record.total_ns / 1e6, stages)
 
 
 def divided(left: Tensor, right: Tensor, at: float) -> Tensor:

@@ -220,10 +220,10 @@ def lpips_weights(
     folder = tmp_path_factory.mktemp("weights")
     with warnings.catch_warnings():  # torchvision deprecates how lpips calls it
         warnings.simplefilter("ignore", UserWarning)
-        for net, backbone in BACKBONES.items():
+        for net, (_, file) in BACKBONES.items():
             state = _lpips_package().LPIPS(net=net, pnet_rand=True, verbose=False).net.state_dict()
             names = {name: re.sub(r"^slice\d+", "features", name) for name in state}
-            torch.save({names[name]: state[name] for name in state}, folder / backbone.features)
+            torch.save({names[name]: state[name] for name in state}, folder / file)
     return folder
 
 

@@ -215,25 +215,21 @@ def _left(
 ) -> Tensor:
     """The `cells` [M, 3] of `size` [3], counted from `lower` [3], that no picture drops."""
     for camera, image in views:
-        corners = lower + size * (cells[:, None] + _grid(2))  # [M, 8, 3]
-        cells = cells[maybe_seen(camera, image[..., 3] > 0, corners.float())]
+        corners = (lower + size * (cells[:, None] + _grid(2))).float()  # [M, 8, 3]
+        pixels, depth = project(camera, corners.reshape(-1, 3))
+        pixels, depth = pixels.reshape(-1, 8, 2), depth.reshape(-1, 8)
+        first = pixels.amin(1).floor() - 1
+        last = pixels.amax(1).floor() + 2  # one past the last pixel
+        limit = first.new_tensor((camera.width, camera.height))
+        inside = ((first >= 0) & (last <= limit)).all(1) & (depth > 0).all(1)
+        (u0, v0), (u1, v1) = (edge[inside].long().unbind(1) for edge in (first, last))
+        # A summed-area table counts the mask's pixels in any rectangle with four look-ups. NumPy's
+        # 32-bit cumsum takes a quarter of the time of torch's, which is 64-bit.
+        mask = (image[..., 3] > 0).numpy()
+        sums = mask.cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32)
+        table = torch.from_numpy(np.pad(sums, ((1, 0), (1, 0))))
+        count = table[v1, u1] - table[v0, u1] - table[v1, u0] + table[v0, u0]
+        seen = torch.ones(len(cells), dtype=torch.bool)
+        seen[inside] = count > 0
+        cells = cells[seen]
     return cells
-
-
-def maybe_seen(camera: Camera, mask: Tensor, corners: Tensor) -> Tensor:
-    """[M] bool: whether a cell, given by its `corners` [M, 8, 3], may be seen in `mask` [H, W]."""
-    pixels, depth = project(camera, corners.reshape(-1, 3))
-    pixels, depth = pixels.reshape(-1, 8, 2), depth.reshape(-1, 8)
-    first = pixels.amin(1).floor() - 1
-    last = pixels.amax(1).floor() + 2  # one past the last pixel
-    limit = first.new_tensor((camera.width, camera.height))
-    inside = ((first >= 0) & (last <= limit)).all(1) & (depth > 0).all(1)
-    (u0, v0), (u1, v1) = (edge[inside].long().unbind(1) for edge in (first, last))
-    # A summed-area table counts the mask's pixels in any rectangle with four look-ups. NumPy's
-    # 32-bit cumsum takes a quarter of the time of torch's, which is 64-bit.
-    sums = mask.numpy().cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32)
-    table = torch.from_numpy(np.pad(sums, ((1, 0), (1, 0))))
-    count = table[v1, u1] - table[v0, u1] - table[v1, u0] + table[v0, u0]
-    seen = torch.ones(len(corners), dtype=torch.bool)
-    seen[inside] = count > 0
-    return seen

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from bench import published
-from bench.published import BACKBONES, Backbone, fetch, get, load_features, locate, verify
+from bench.published import BACKBONES, fetch, get, load_features, locate, verify
 from bench.types import SteerbenchError, Unavailable
 from tests.bench.scenes.releases import publish
 from tests.web import Web
@@ -189,7 +189,7 @@ def weights(publisher, monkeypatch) -> tuple[str, bytes]:
     buffer = io.BytesIO()
     torch.save(STATE, buffer)
     name = f"alexnet-owt-{hashlib.sha256(buffer.getvalue()).hexdigest()[:8]}.pth"
-    monkeypatch.setitem(BACKBONES, "alex", Backbone(name, BACKBONES["alex"].features))
+    monkeypatch.setitem(BACKBONES, "alex", (name, BACKBONES["alex"][1]))
     return name, buffer.getvalue()
 
 
