@@ -109,9 +109,6 @@ def test_a_stage_has_one_folder_for_one_key_in_any_order(plain, tmp_path):
     assert folder.parent == tmp_path / "stages"
     assert plain.stage_dir("field", {"seed": 0, "steps": 10}) == folder
     assert plain.stage_dir("field", {"seed": 1, "steps": 10}) != folder
-
-
-def test_a_stage_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
     (tmp_path / "outputs").write_text("in the way")
     with pytest.raises(SteerbenchError, match=r"cannot write to .*outputs"):
         ConsoleLog(tmp_path / "outputs").stage_dir("field", {})

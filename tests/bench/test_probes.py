@@ -155,16 +155,13 @@ def test_the_peak_of_a_region_is_what_it_touches_and_the_highest_of_several_is_k
 
 def test_the_source_says_when_the_peak_includes_what_came_before(monkeypatch):
     assert "while rendering" in MemoryMeter("cpu").source
-    monkeypatch.setattr(probes, "_reset_high_water_mark", lambda: False)
-    assert "since it began" in MemoryMeter("cpu").source
-
-
-def test_the_peak_is_known_where_the_system_keeps_no_high_water_mark(monkeypatch):
-    """As in some sandboxes, whose status of a process has fewer lines."""
+    # In some sandboxes the status of a process has fewer lines.
     monkeypatch.setattr(Path, "read_text", lambda path: "VmRSS: 1 kB\n")
     with (meter := MemoryMeter("cpu")):
         pass
     assert meter.peak_bytes > 1 << 20
+    monkeypatch.setattr(probes, "_reset_high_water_mark", lambda: False)
+    assert "since it began" in MemoryMeter("cpu").source
 
 
 def test_on_a_gpu_the_meter_reads_the_allocator(monkeypatch):

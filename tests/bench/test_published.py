@@ -53,21 +53,20 @@ def test_what_is_there_and_right_is_not_downloaded_again(web, tmp_path, quiet_lo
 
 
 @pytest.mark.parametrize(
-    ("content", "breaks_after", "message"),
+    ("files", "end", "said"),
     [
-        (CONTENT, 100_000, r"the download of http://127.0.0.1:\d+/file failed"),
-        (CONTENT[::-1], None, "is damaged"),
-        (None, None, r"/file failed \(404"),
+        ({"/file": CONTENT}, 100_000, r"the download of http://127.0.0.1:\d+/file failed"),
+        ({"/file": CONTENT[::-1]}, None, "is damaged"),
+        ({}, None, r"/file failed \(404"),
     ],
     ids=["broken off", "another content", "not there"],
 )
 def test_a_download_that_fails_says_why_and_leaves_nothing(
-    web, tmp_path, quiet_log, content, breaks_after, message
+    web, tmp_path, quiet_log, files, end, said
 ):
-    if content is not None:
-        web.files["/file"] = content
-    web.breaks_after = breaks_after
-    with pytest.raises(Unavailable, match=message):
+    web.files |= files
+    web.breaks_after = end
+    with pytest.raises(Unavailable, match=said):
         download(web, tmp_path, quiet_log)
     assert found(tmp_path) == {}
 
@@ -111,15 +110,14 @@ def test_a_scene_is_unpacked_and_only_what_is_on_the_list(monkeypatch, web, tmp_
     assert found(tmp_path / "without") == pictures
 
 
-@pytest.mark.parametrize(
-    "archive",
-    [
-        b"not a zip file",
-        zipped(FILES | {"mic/train/r_0.png": b"other"}),
-        zipped({"mic/test/r_0.png": b"b"}),
-    ],
-    ids=["no archive", "another picture", "a picture missing"],
-)
+WRONG = {
+    "no archive": b"not a zip file",
+    "another picture": zipped(FILES | {"mic/train/r_0.png": b"other"}),
+    "a picture missing": zipped({"mic/test/r_0.png": b"b"}),
+}
+
+
+@pytest.mark.parametrize("archive", WRONG.values(), ids=WRONG)
 def test_a_wrong_archive_leaves_nothing_behind(monkeypatch, web, tmp_path, quiet_log, archive):
     data = publish(monkeypatch, FILES, archive=web.address + "{scene}.zip")
     web.files["/mic.zip"] = archive

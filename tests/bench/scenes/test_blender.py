@@ -74,21 +74,20 @@ def test_a_validation_split_has_all_its_pictures_or_none(blender_folder, log) ->
 def test_the_digest_depends_on_content_and_options_not_on_the_place(
     blender_folder, tmp_path, picture, edit_json, log
 ) -> None:
+    def digest(**options) -> str:
+        return blender.load(copy, **options, log=log).digest
+
     copy = tmp_path / "elsewhere" / "chair"
     shutil.copytree(blender_folder, copy)
-    assert digest(copy, log) == digest(blender_folder, log)
+    assert digest() == blender.load(blender_folder, log=log).digest
     flat = [[-1.5, -1.5, -0.5], [1.5, 1.5, 0.5]]  # centre and longest side are those of "full"
     options = [{}, {"background": "black"}, {"bounds": "full"}, {"bounds": flat}, {"downscale": 2}]
-    digests = [digest(copy, log, **some) for some in options]
+    digests = [digest(**some) for some in options]
     edit_json(copy / "transforms_test.json", lambda r: r.update(camera_angle_x=0.71))
-    digests.append(digest(copy, log))
+    digests.append(digest())
     Image.fromarray(picture(99)).save(copy / "test" / "r_1.png")
-    digests.append(digest(copy, log))
+    digests.append(digest())
     assert len(set(digests)) == 7
-
-
-def digest(folder, log, **options) -> str:
-    return blender.load(folder, **options, log=log).digest
 
 
 def frame(record: dict) -> dict:

@@ -34,7 +34,9 @@ def folder(tmp_path: Path, picture) -> Path:
     return root
 
 
-def test_prefixes_are_splits(folder, picture, log) -> None:
+def test_prefixes_are_splits_poses_opencv_and_the_box_fills_the_unit_cube(
+    folder, picture, log
+) -> None:
     scene = nsvf.load(folder, log=log)
     names = {split: list(views.names) for split, views in scene.splits.items()}
     assert names == {
@@ -43,6 +45,13 @@ def test_prefixes_are_splits(folder, picture, log) -> None:
         "test": ["rgb/2_003.png"],
     }
     assert np.array_equal(scene.splits["test"].images[0].numpy(), picture(3, channels=3))
+    camera = move_camera(scene.splits["val"].cameras[0], scene.unit_length, scene.origin)
+    expected = torch.tensor([[1.0, 0, 0, 2], [0, 1, 0, 0], [0, 0, 1, -5]])
+    torch.testing.assert_close(camera.c2w, expected, rtol=0, atol=2e-6)
+    # Sides 2.2, 4.2, 2.2: every side is longer by 5 % of the longest.
+    x = 1.1 / 4.2
+    bounds = torch.tensor([[0.5 - x, 0, 0.5 - x], [0.5 + x, 1, 0.5 + x]])
+    torch.testing.assert_close(scene.bounds, bounds)
 
 
 def test_without_2_the_1_are_the_test_split(folder, log) -> None:
@@ -52,26 +61,10 @@ def test_without_2_the_1_are_the_test_split(folder, log) -> None:
     assert "1_* are the test split" in log.messages[0]
 
 
-def test_the_box_with_its_margin_fills_the_unit_cube(folder, log) -> None:
-    scene = nsvf.load(folder, log=log)
-    # Sides 2.2, 4.2, 2.2: every side is longer by 5 % of the longest.
-    expected = torch.tensor(
-        [[0.5 - 1.1 / 4.2, 0, 0.5 - 1.1 / 4.2], [0.5 + 1.1 / 4.2, 1, 0.5 + 1.1 / 4.2]]
-    )
-    torch.testing.assert_close(scene.bounds, expected)
-
-
 @pytest.mark.parametrize(("name", "further"), [("Mic", 1.2), ("Lego", 1.1), ("Chair", 1.0)])
 def test_boxes_that_are_too_small_are_enlarged_further(folder, log, name, further) -> None:
     scene = nsvf.load(folder.rename(folder.with_name(name)), log=log)
     assert scene.unit_length == pytest.approx(4 * 1.05 * further)
-
-
-def test_poses_are_taken_as_opencv(folder, log) -> None:
-    scene = nsvf.load(folder, log=log)
-    camera = move_camera(scene.splits["val"].cameras[0], scene.unit_length, scene.origin)
-    expected = torch.tensor([[1.0, 0, 0, 2], [0, 1, 0, 0], [0, 0, 1, -5]])
-    torch.testing.assert_close(camera.c2w, expected, rtol=0, atol=2e-6)
 
 
 @pytest.mark.parametrize(

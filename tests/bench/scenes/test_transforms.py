@@ -85,20 +85,20 @@ def test_missing_pictures_are_named_once_and_left_out(folder, log) -> None:
     assert message.endswith(left_out)
 
 
-@pytest.mark.parametrize(("override", "sides"), [(None, 2), (4, 4)])
-def test_the_cube_is_that_of_instant_ngp(folder, log, override, sides) -> None:
+MAPPED = {"scale": 0.1, "offset": [0.5, 0.7, 0.5]}
+
+
+@pytest.mark.parametrize(
+    ("given", "override", "side", "y"),
+    [({}, None, 2 / 0.33, 0.5), ({}, 4, 4 / 0.33, 0.5), (MAPPED, 1, 1 / 0.1, 0.7)],
+)
+def test_the_cube_is_that_of_instant_ngp(folder, edit_json, log, given, override, side, y) -> None:
+    edit_json(folder / "transforms.json", lambda record: record.update(given))
     scene = transforms.load(folder, aabb_scale=override, log=log)
-    assert scene.unit_length == pytest.approx(sides / 0.33)
+    assert scene.unit_length == pytest.approx(side)
     assert scene.bounds.tolist() == [[0, 0, 0], [1, 1, 1]]
-    # Picture 0 was taken from (0, -4, 0): 0.33 x + 0.5 in instant-ngp's cube of side 1.
-    expected = torch.tensor([0.5, 0.5 - 4 * 0.33 / sides, 0.5])
-    torch.testing.assert_close(scene.splits["test"].cameras[0].c2w[:, 3], expected)
-
-
-def test_scale_and_offset_of_the_file_are_heeded(folder, edit_json, log) -> None:
-    edit_json(folder / "transforms.json", lambda r: r.update(scale=0.1, offset=[0.5, 0.7, 0.5]))
-    scene = transforms.load(folder, aabb_scale=1, log=log)
-    expected = torch.tensor([0.5, 0.7 - 0.4, 0.5])
+    # Picture 0 was taken from (0, -4, 0): scale x + offset in instant-ngp's cube of side 1.
+    expected = torch.tensor([0.5, y - 4 / side, 0.5])
     torch.testing.assert_close(scene.splits["test"].cameras[0].c2w[:, 3], expected)
 
 
