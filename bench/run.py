@@ -164,7 +164,7 @@ def _draw(take: _Take, task: Task, index: int, before: int) -> None:
     check_frame(frame, step.camera, method.name, index)
     phase = COLD if before < method.memory else STEADY
     record = take.clock.frames[-1]
-    figures = {
+    figures: dict[str, Any] = {
         "frame": index,
         "phase": phase,
         "frame_ms": record.total_ns / 1e6,
@@ -172,12 +172,13 @@ def _draw(take: _Take, task: Task, index: int, before: int) -> None:
         **{f"work.{name}": done for name, done in record.done.items()},
         **{f"work.{name}.dense": dense for name, dense in record.dense.items()},
     }
-    scene, truth, scored = task.scene, None, step.truth is not None
+    truth: torch.Tensor | None = None
     if step.truth is not None:
-        split = scene.splits[task.trajectory.split]
+        split = task.scene.splits[task.trajectory.split]
         figures["name"], truth = split.names[step.truth], split.images[step.truth]
-    elif task.protocol.flicker == "exact" and scene.exact is not None:
-        truth = scene.exact(step.camera)
+    elif task.protocol.flicker == "exact" and task.scene.exact is not None:
+        truth = task.scene.exact(step.camera)
+    scored = step.truth is not None
     scores = take.scoring.score(index, frame.rgb, truth, scored=scored, cut=step.cut)
     take.rows.append(figures | scores)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -21,25 +20,18 @@ CAMERA = Camera(torch.eye(3, 4), 40.0, 40.0, 16.0, 12.0, 32, 24)
 class Counting:
     """Paints how many frames of a sequence there were, in 256ths."""
 
-    name, train_s, memory = "counting", 0.0, 1
-
-    def __init__(self) -> None:
-        self.frames = 0
+    name, frames = "counting", 0
 
     def reset(self) -> None:
         self.frames = 0
 
     def render(self, camera: Camera, probe: Probe) -> Frame:
-        size = (camera.height, camera.width)
         self.frames += 1
         with probe.stage("count"):
-            rgb = torch.full((*size, 3), self.frames / 255)
-        return Frame(rgb, torch.full(size, torch.inf), torch.zeros(size))
+            rgb = torch.full((camera.height, camera.width, 3), self.frames / 255)
+        return Frame(rgb, rgb[..., 0], rgb[..., 0])
 
-    def sizes(self) -> Mapping[str, int]:
-        return {}
-
-    def settings(self) -> Mapping[str, str]:
+    def settings(self) -> dict[str, str]:
         return {"device": "cpu"}
 
 

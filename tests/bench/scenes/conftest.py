@@ -34,42 +34,27 @@ def png(header: bytes, data: bytes) -> bytes:
     )
 
 
-@pytest.fixture
-def picture() -> Callable[..., np.ndarray]:
+def picture(seed: int, width: int = 8, height: int = 6, channels: int = 4) -> np.ndarray:
     """Random 8-bit values [height, width, channels] for a seed."""
-
-    def make(seed: int, width: int = 8, height: int = 6, channels: int = 4) -> np.ndarray:
-        generator = np.random.default_rng(seed)
-        return generator.integers(0, 256, (height, width, channels), dtype=np.uint8)
-
-    return make
+    generator = np.random.default_rng(seed)
+    return generator.integers(0, 256, (height, width, channels), dtype=np.uint8)
 
 
-@pytest.fixture
-def pose() -> Callable[[int], list[list[float]]]:
+def pose(k: int) -> list[list[float]]:
     """OpenGL camera-to-world, 4x4, 4 units from 0 and looking at it from four sides; z is up."""
-
-    def make(k: int) -> list[list[float]]:
-        c, s = [(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)][k % 4]
-        return [[c, 0, s, 4 * s], [s, 0, -c, -4 * c], [0, 1, 0, 0.0], [0, 0, 0, 1]]
-
-    return make
+    c, s = [(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)][k % 4]
+    return [[c, 0, s, 4 * s], [s, 0, -c, -4 * c], [0, 1, 0, 0.0], [0, 0, 0, 1]]
 
 
-@pytest.fixture
-def edit_json() -> Callable[[Path, Callable[[dict], object]], None]:
+def edit_json(path: Path, change: Callable[[dict], object]) -> None:
     """Apply a change to the object in a JSON file."""
-
-    def edit(path: Path, change: Callable[[dict], object]) -> None:
-        record = json.loads(path.read_text())
-        change(record)
-        path.write_text(json.dumps(record))
-
-    return edit
+    record = json.loads(path.read_text())
+    change(record)
+    path.write_text(json.dumps(record))
 
 
 @pytest.fixture
-def blender_folder(tmp_path: Path, picture, pose) -> Path:
+def blender_folder(tmp_path: Path) -> Path:
     """Three training and two test pictures of 8 x 6."""
     root = tmp_path / "chair"
     for split, count, seed in (("train", 3, 0), ("test", 2, 50)):

@@ -15,10 +15,10 @@ from PIL import Image
 from bench.cameras import move_camera
 from bench.scenes import blender
 from bench.types import SteerbenchError
-from tests.bench.scenes.conftest import png
+from tests.bench.scenes.conftest import edit_json, picture, png
 
 
-def test_pictures_are_read_byte_for_byte(blender_folder, picture, log) -> None:
+def test_pictures_are_read_byte_for_byte(blender_folder, log) -> None:
     scene = blender.load(blender_folder, log=log)
     assert scene.name == "chair"
     assert {name: len(split) for name, split in scene.splits.items()} == {"train": 3, "test": 2}
@@ -42,7 +42,7 @@ def test_cameras_are_opencv_and_the_units_can_be_undone(blender_folder, log) -> 
     torch.testing.assert_close(back.c2w[:, 3], torch.tensor([0.0, -4, 0]))
 
 
-def test_opaque_pictures_take_the_whole_space(blender_folder, picture, log) -> None:
+def test_opaque_pictures_take_the_whole_space(blender_folder, log) -> None:
     for k in range(3):
         Image.fromarray(picture(k, channels=3)).save(blender_folder / "train" / f"r_{k}.png")
     scene = blender.load(blender_folder, log=log)
@@ -52,7 +52,7 @@ def test_opaque_pictures_take_the_whole_space(blender_folder, picture, log) -> N
     assert scene.splits["train"].images[0].shape == (6, 8, 3)
 
 
-def test_paths_may_have_their_extension(blender_folder, edit_json, log) -> None:
+def test_paths_may_have_their_extension(blender_folder, log) -> None:
     extended = {"file_path": "test/r_0.png"}
     edit_json(blender_folder / "transforms_test.json", lambda r: r["frames"][0].update(extended))
     scene = blender.load(blender_folder, log=log)
@@ -72,7 +72,7 @@ def test_a_validation_split_has_all_its_pictures_or_none(blender_folder, log) ->
 
 
 def test_the_digest_depends_on_content_and_options_not_on_the_place(
-    blender_folder, tmp_path, picture, edit_json, log
+    blender_folder, tmp_path, log
 ) -> None:
     def digest(**options) -> str:
         return blender.load(copy, **options, log=log).digest
@@ -128,9 +128,7 @@ def placed(place: tuple[int, int], value: float):
         ),
     ],
 )
-def test_bad_camera_file_names_file_and_field(
-    blender_folder, edit_json, log, change, message
-) -> None:
+def test_bad_camera_file_names_file_and_field(blender_folder, log, change, message) -> None:
     edit_json(blender_folder / "transforms_train.json", change)
     with pytest.raises(
         SteerbenchError, match=r"transforms_train\.json: (frames\[1\]\.)?" + message

@@ -16,6 +16,7 @@ from bench.errors import SteerbenchError, Unavailable
 from bench.scenes import colmap
 from bench.scenes.images import Fisheye, RadialTangential
 from bench.types import Camera
+from tests.bench.scenes.conftest import picture, pose
 
 pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is an extra")
 
@@ -28,10 +29,10 @@ def written(root: Path, model: str, params: tuple, kind: str, turns: list) -> Pa
     found = pycolmap.Reconstruction()
     camera = pycolmap.Camera(camera_id=1, model=model, width=8, height=6, params=params)
     found.add_camera_with_trivial_rig(camera)
-    for number, pose in enumerate(turns):
-        pose = np.array(pose)[:3] * (1, -1, -1, 1)
+    for number, turn in enumerate(turns):
+        opencv = np.array(turn)[:3] * (1, -1, -1, 1)
         image = pycolmap.Image(image_id=number + 1, camera_id=1, name=f"{number:03}.png")
-        found.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose).inverse())
+        found.add_image_with_trivial_frame(image, pycolmap.Rigid3d(opencv).inverse())
     for point in POINTS:
         found.add_point3D(point, pycolmap.Track(), np.zeros(3, np.uint8))
     folder = root / "sparse" / "0"
@@ -41,7 +42,7 @@ def written(root: Path, model: str, params: tuple, kind: str, turns: list) -> Pa
 
 
 @pytest.fixture
-def folder(tmp_path: Path, picture, pose) -> Callable[..., Path]:
+def folder(tmp_path: Path) -> Callable[..., Path]:
     """A capture of ten pictures, with a model of the camera and the kind that is asked for."""
 
     def make(model: str = "PINHOLE", params: tuple = PINHOLE[1], kind: str = "binary") -> Path:
@@ -84,7 +85,7 @@ def test_the_box_holds_all_points_but_the_outermost(folder, log) -> None:
     assert scene.unit_length < 1.06 * 6
 
 
-def test_smaller_pictures_have_smaller_cameras(folder, picture, log) -> None:
+def test_smaller_pictures_have_smaller_cameras(folder, log) -> None:
     root = folder()
     (root / "images_2").mkdir()
     for number in range(10):
@@ -129,7 +130,7 @@ def test_every_lens_is_undone(model: str, folder, log) -> None:
     assert camera.fx == pytest.approx(9.0)
 
 
-def test_what_does_not_fit_is_named(folder, picture, log) -> None:
+def test_what_does_not_fit_is_named(folder, log) -> None:
     with pytest.raises(SteerbenchError, match=r"\.png: expected a camera model with a focal"):
         colmap.load(folder("EQUIRECTANGULAR", (8.0, 6.0), "text"), log=log)
     root = folder()

@@ -12,6 +12,7 @@ from PIL import Image
 from bench.cameras import move_camera
 from bench.scenes import nsvf
 from bench.types import SteerbenchError
+from tests.bench.scenes.conftest import picture
 
 MATRIX = "9 0 4.5 0\n0 8 2.5 0\n0 0 1 0\n0 0 0 1\n"
 NAMES = ("0_000", "0_001", "1_002", "2_003")
@@ -19,7 +20,7 @@ FIRST_LINE = "9. 4.5 2.5 0.\n0. 0. 0.\n0.\n1.\n6 8\n"
 
 
 @pytest.fixture
-def folder(tmp_path: Path, picture) -> Path:
+def folder(tmp_path: Path) -> Path:
     """Two training, one validation and one test picture of 8 x 6."""
     root = tmp_path / "Truck"
     (root / "rgb").mkdir(parents=True)
@@ -34,9 +35,7 @@ def folder(tmp_path: Path, picture) -> Path:
     return root
 
 
-def test_prefixes_are_splits_poses_opencv_and_the_box_fills_the_unit_cube(
-    folder, picture, log
-) -> None:
+def test_prefixes_are_splits_poses_opencv_and_the_box_fills_the_unit_cube(folder, log) -> None:
     scene = nsvf.load(folder, log=log)
     names = {split: list(views.names) for split, views in scene.splits.items()}
     assert names == {

@@ -16,12 +16,13 @@ from bench.cameras import pixel_grid
 from bench.scenes import transforms
 from bench.scenes.images import Fisheye, RadialTangential, undistort, undistorted_camera
 from bench.types import Camera, SteerbenchError
+from tests.bench.scenes.conftest import edit_json, picture, pose
 
 HERE = Path("picture.png")
 
 
 @pytest.fixture
-def folder(tmp_path: Path, picture, pose) -> Path:
+def folder(tmp_path: Path) -> Path:
     """Ten pictures of 8 x 6, listed out of order, without a lens."""
     root = tmp_path / "desk"
     (root / "images").mkdir(parents=True)
@@ -39,7 +40,7 @@ def of_picture(number: int, **settings: object) -> Callable[[dict], object]:
     return lambda record: record["frames"][9 - number].update(settings)
 
 
-def test_every_nth_picture_by_name_is_a_test(folder, picture, log) -> None:
+def test_every_nth_picture_by_name_is_a_test(folder, log) -> None:
     scene = transforms.load(folder, split_every=4, log=log)
     assert list(scene.splits["test"].names) == [f"images/{k:03}.png" for k in (0, 4, 8)]
     assert len(scene.splits["train"]) == 7
@@ -49,21 +50,21 @@ def test_every_nth_picture_by_name_is_a_test(folder, picture, log) -> None:
 @pytest.mark.parametrize(
     ("focal", "fx"), [({"fl_x": 7.0}, 7), ({"camera_angle_x": 2 * np.arctan(0.25)}, 8 / 2 / 0.25)]
 )
-def test_intrinsics_of_a_frame_go_first(folder, edit_json, log, focal, fx) -> None:
+def test_intrinsics_of_a_frame_go_first(folder, log, focal, fx) -> None:
     edit_json(folder / "transforms.json", of_picture(8, cx=4.0, **focal))
     first, second = transforms.load(folder, log=log).splits["test"].cameras
     assert (first.fx, first.fy, first.cx, first.cy) == (9, 8, 4.5, 2.5)
     assert (second.fx, second.fy, second.cx, second.cy) == pytest.approx((fx, 8, 4, 2.5))
 
 
-def test_pictures_of_several_sizes(folder, picture, edit_json, log) -> None:
+def test_pictures_of_several_sizes(folder, log) -> None:
     Image.fromarray(picture(0, 12, 10, 3)).save(folder / "images" / "000.png")
     edit_json(folder / "transforms.json", of_picture(0, w=12, h=10))
     first, second = transforms.load(folder, log=log).splits["test"].images
     assert (tuple(first.shape), tuple(second.shape)) == ((10, 12, 3), (6, 8, 3))
 
 
-def test_focal_from_the_angle_and_the_rest_from_the_picture(folder, edit_json, log) -> None:
+def test_focal_from_the_angle_and_the_rest_from_the_picture(folder, log) -> None:
     def change(record: dict) -> None:
         for name in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
             del record[name]
@@ -92,7 +93,7 @@ MAPPED = {"scale": 0.1, "offset": [0.5, 0.7, 0.5]}
     ("given", "override", "side", "y"),
     [({}, None, 2 / 0.33, 0.5), ({}, 4, 4 / 0.33, 0.5), (MAPPED, 1, 1 / 0.1, 0.7)],
 )
-def test_the_cube_is_that_of_instant_ngp(folder, edit_json, log, given, override, side, y) -> None:
+def test_the_cube_is_that_of_instant_ngp(folder, log, given, override, side, y) -> None:
     edit_json(folder / "transforms.json", lambda record: record.update(given))
     scene = transforms.load(folder, aabb_scale=override, log=log)
     assert scene.unit_length == pytest.approx(side)
@@ -130,7 +131,7 @@ def first(**settings: object) -> Callable[[dict], object]:
         (first(file_path="x" * 5000), r"frames\[0\].file_path: expected the name of a"),
     ],
 )
-def test_bad_field_is_named(folder, edit_json, log, change, message) -> None:
+def test_bad_field_is_named(folder, log, change, message) -> None:
     edit_json(folder / "transforms.json", change)
     with pytest.raises(SteerbenchError, match=r"transforms\.json: " + message):
         transforms.load(folder, log=log)
@@ -193,7 +194,7 @@ def test_undistortion_recovers_the_pinhole_picture(name) -> None:
     assert error <= bilinear + 1
 
 
-def test_a_lens_that_does_nothing_returns_the_inner_picture(picture) -> None:
+def test_a_lens_that_does_nothing_returns_the_inner_picture() -> None:
     image = torch.from_numpy(picture(1, 100, 76, 3))
     nothing = RadialTangential((1e-12, 0.0, 0.0, 0.0, 0.0))
     straight = undistort(image, pinhole(), nothing, HERE)
@@ -219,7 +220,7 @@ def test_a_lens_that_folds_the_picture_is_refused() -> None:
         undistorted_camera(pinhole(), RadialTangential((-2.0, 0.0, 0.0, 0.0, 0.0)), HERE)
 
 
-def test_a_capture_with_a_lens_is_cropped_alike_everywhere(folder, edit_json, picture, log) -> None:
+def test_a_capture_with_a_lens_is_cropped_alike_everywhere(folder, log) -> None:
     for k in range(10):
         Image.fromarray(picture(k, 100, 76, 3)).save(folder / "images" / f"{k:03}.png")
     record = {"w": 100, "h": 76, "fl_x": 90, "fl_y": 84, "cx": 52.3, "cy": 37.1, "k1": 0.06}
@@ -247,7 +248,7 @@ FAR = [[1, 0, 0, 1e308], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (first(transform_matrix=FAR), r"images/009.png: expected lengths of"),
     ],
 )
-def test_what_float32_cannot_hold_is_refused(folder, edit_json, log, change, message) -> None:
+def test_what_float32_cannot_hold_is_refused(folder, log, change, message) -> None:
     edit_json(folder / "transforms.json", change)
     with pytest.raises(SteerbenchError, match=message):
         transforms.load(folder, log=log)
