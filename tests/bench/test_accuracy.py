@@ -48,9 +48,7 @@ def test_an_experiment_has_a_row_a_setting_with_its_largest_error_and_its_order(
         assert row["order"] == pytest.approx(3)
         assert (row["order_from"], row["order_to"]) == (0.1, 0.3)
         assert 0 <= row["ms_lo"] <= row["ms"] <= row["ms_hi"]
-
-
-def test_settings_in_words_have_no_order(quiet_log):
+    # Settings in words have no order.
     trial = Trial("packed", lambda: torch.ones(1), torch.zeros(1, dtype=torch.float64))
     (row,) = experiment_rows([Experiment("table", "format", [trial])], 1, quiet_log)
     assert (row["setting"], row["error"], row["order"]) == ("packed", 1.0, None)
@@ -147,9 +145,6 @@ def test_a_frame_soon_after_a_cut_is_not_scored(in_turns, tiny_scene):
     rows, _ = in_turns(0, memory=1, trajectory=cut)
     whole, _ = in_turns(0, memory=1, trajectory=replace(path, steps=path.steps[:2]))
     assert rows[0]["psnr"] == whole[0]["psnr"]
-
-
-def test_without_a_frame_to_score_the_answer_is_to_give_more(in_turns, tiny_scene):
     with pytest.raises(SteerbenchError, match="give more frames"):
         in_turns(0, memory=len(tiny_scene.splits["test"]))
 

@@ -60,10 +60,6 @@ def test_every_cell_of_every_case_gets_a_row(quiet_log: Log):
     assert [row["tolerance"] for row in rows] == 2 * list(CELLS.values())
 
 
-def test_a_nan_is_an_infinite_error() -> None:
-    assert largest_error((torch.tensor([torch.nan]),), (torch.ones(1),)) == torch.inf
-
-
 def scaled(wrong: str) -> Operation:
     """x y of a list of tensors x and a tensor y; backend "cpu" gets one result wrong by 1/8."""
 
@@ -110,6 +106,7 @@ def test_the_number_nearest_to_its_tolerance_is_reported() -> None:
     assert nearest((off,), (zero,), (tolerance,)) == pytest.approx((0.02, 0.01))
     assert nearest((off, zero), (zero, off), (1.0, 0.1)) == (0.5, pytest.approx(0.1))
     assert nearest((zero[:2],), (zero,), (1.0,)).error == torch.inf
+    assert largest_error((torch.tensor([torch.nan]),), (torch.ones(1),)) == torch.inf
     assert nearest((zero[:0],), (zero[:0],), (tolerance[:0],)) == (0.0, 0.0)
 
 

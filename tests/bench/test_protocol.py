@@ -23,12 +23,9 @@ WHITE = torch.ones(3)
 QUICK = EvaluationProtocol(name="quick", lpips=())
 
 
-def test_the_configuration_of_steerbench_1_is_the_default():
+def test_the_configuration_of_steerbench_1_is_the_default_and_a_change_may_not_keep_its_name():
     config = OmegaConf.load(CONFIGS / "steerbench-1.yaml")
     assert hydra.utils.instantiate(config) == EvaluationProtocol()
-
-
-def test_a_changed_protocol_may_not_keep_the_name():
     with pytest.raises(SteerbenchError, match=r"protocol\.ssim differs from what steerbench-1"):
         EvaluationProtocol(ssim="uniform")
     assert EvaluationProtocol(name="nsvf", ssim="uniform").ssim == "uniform"

@@ -12,7 +12,9 @@ from bench.errors import SteerbenchError, Unavailable
 from bench.video import recorded
 
 
-def test_a_video_shows_its_pictures_one_after_the_other(tmp_path: Path) -> None:
+def test_a_video_shows_its_pictures_in_turn_and_what_is_no_video_is_one_line(
+    tmp_path: Path,
+) -> None:
     av = pytest.importorskip("av")
     levels = (40, 120, 200)
     with recorded(tmp_path / "a.mp4", fps=10) as take:
@@ -25,9 +27,6 @@ def test_a_video_shows_its_pictures_one_after_the_other(tmp_path: Path) -> None:
     for frame, level in zip(frames, levels, strict=True):
         assert np.abs(frame.astype(int) - level).max() <= 3  # limited range of YUV, and its loss
 
-
-def test_a_file_that_is_no_video_is_one_line(tmp_path: Path) -> None:
-    pytest.importorskip("av")
     refused = pytest.raises(SteerbenchError, match=r"a\.nothing: cannot write the video")
     with refused, recorded(tmp_path / "a.nothing", fps=10) as take:
         take(np.zeros((8, 8, 3), np.uint8))

@@ -47,6 +47,9 @@ def test_a_scene_is_written_once_in_the_layout_of_nerf_synthetic(tmp_path, log) 
     assert files == pictures | {"transforms_train.json", "transforms_test.json"}
     record = json.loads((folder / "transforms_train.json").read_text())
     assert record["scene"] == {"name": "void", "seed": 0, **SMALL}
+    for change in ({"width": 25}, {"height": 19}, {"train": 5}, {"test": 3}, {"seed": 1}):
+        analytic.load("void", **options | change, log=log)
+    assert len(list(tmp_path.iterdir())) == 6
 
 
 def test_who_finishes_second_accepts_the_scene_of_the_first(tmp_path, log, monkeypatch) -> None:
@@ -60,13 +63,6 @@ def test_who_finishes_second_accepts_the_scene_of_the_first(tmp_path, log, monke
     analytic.load("void", **SMALL, root=tmp_path, log=log)
     (folder,) = tmp_path.iterdir()
     assert not (folder / "scene").exists()
-
-
-def test_every_parameter_has_its_own_folder(tmp_path, log) -> None:
-    changes = [{"width": 25}, {"height": 19}, {"train": 5}, {"test": 3}, {"seed": 1}]
-    for change in ({}, *changes):
-        analytic.load("void", **{**SMALL, **change}, root=tmp_path, log=log)
-    assert len(list(tmp_path.iterdir())) == 6
 
 
 def test_cameras_come_back_as_they_were_made(drawn, log) -> None:

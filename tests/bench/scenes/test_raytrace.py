@@ -63,15 +63,12 @@ def test_depth_of_a_sphere_is_the_closed_form(device) -> None:
     assert torch.equal(frame.alpha.flatten()[certain] > 0, (root > 0)[certain])
 
 
-def test_silhouette_of_a_sphere_has_its_closed_form_area() -> None:
+def test_silhouettes_of_a_sphere_and_a_thin_wire_have_their_closed_form_areas() -> None:
     camera = camera_at((0.0, -4.0, 0.0))
     alpha = render(Solids([sphere(0.8)]), camera, torch.ones(3), samples=16).alpha
     radius = camera.fx * math.tan(math.asin(0.8 / 4))
     # Only cells that the outline crosses can be counted wrongly, half of them either way.
     assert abs(alpha.sum().item() - math.pi * radius**2) <= 2 * math.pi * radius * CELL
-
-
-def test_a_thin_wire_covers_its_width() -> None:
     camera = camera_at((0.0, -4.0, 0.0), size=400)
     alpha = render(Solids([Part(Capsule(0.006, 1.0), RED)]), camera, torch.ones(3), 16).alpha
     width = 2 * camera.fx * math.tan(math.asin(0.006 / 4))
