@@ -55,7 +55,8 @@ class Case:
     holds: str  # what must hold
     derivation: str  # where the tolerances come from
     tolerances: Mapping[Cell, float | None]  # the largest allowed errors; None: `error` says it
-    error: Callable[[str, str, str], float | Apart]  # of backend, device, precision, if they exist
+    # The largest error, given backend, device and precision; Unavailable if there are none such.
+    error: Callable[[str, str, str], float | Apart]
     timed: int | None = None  # samples, rays or entries a call; None: too few to time
     slow: bool = False  # takes more than a moment, so the tests skip it
 
