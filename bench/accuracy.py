@@ -187,9 +187,8 @@ def mean_figures(
 def best_instead(cost: Sequence[float], error: Sequence[float]) -> list[int]:
     """For each setting, the index of the best setting that costs no more.
 
-    Best is the least `error`, then the least `cost`, then the lowest index. A setting on the Pareto
-    frontier gets its own index (among duplicates, only the first does); any other setting gets the
-    index of one that dominates it.
+    Best is the least `error`, then the least `cost`, then the lowest index: on the Pareto frontier
+    the setting itself, elsewhere one that dominates it.
     """
     costs, errors = np.asarray(cost, float), np.asarray(error, float)
     best: list[int] = [0] * len(costs)

@@ -20,10 +20,7 @@ WORTH_A_LINE_S = 2.0  # work that takes longer leaves a line on the screen when 
 
 
 class ConsoleLog:
-    """A `bench.types.Log` on standard error, so that standard output holds only results.
-
-    `root` is `outputs`: trained stages go to `stages/` in it.
-    """
+    """A `bench.types.Log` on standard error: standard output holds only results."""
 
     def __init__(
         self, root: Path, quiet: bool = False, clock: Callable[[], float] = time.monotonic

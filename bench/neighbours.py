@@ -15,12 +15,9 @@ rounding alone is a fifth of `NOTABLE_SHARE` or more."""
 
 
 class Neighbours(NamedTuple):
-    """What other processes used: `busy` cores on average, of `cores`, over `seconds`.
+    """What other processes used."""
 
-    In a virtual machine, time taken away by the host (steal time) counts as busy.
-    """
-
-    busy: float
+    busy: float  # cores on average; in a virtual machine, with what the host took (steal time)
     cores: int
     seconds: float = math.inf
 

@@ -53,11 +53,7 @@ def pairs_with_split(pictures: Path, split: Split, match: Match = "name") -> lis
 
 
 def matched(folder: Path, names: Sequence[str], match: Match) -> list[Path]:
-    """The file of `folder` for each of `names`, matched by name without the ending, or by order.
-
-    Raises SteerbenchError if a picture is missing, one belongs to none of `names`, or two names are
-    equal.
-    """
+    """The file of `folder` for each of `names`; raises if one is missing, surplus or ambiguous."""
     files = listed(folder)
     if match == "order":
         if len(files) != len(names):

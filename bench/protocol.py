@@ -32,11 +32,8 @@ from bench.types import (
     composite,
 )
 
-PICTURES = 3
-"""Default number of scored frames whose pictures are kept."""
-
-ERROR_RANGE = 0.1
-"""Absolute error (mean over channels) that the brightest colour of an error map stands for."""
+PICTURES = 3  # default number of scored frames whose pictures are kept
+ERROR_RANGE = 0.1  # mean absolute error of the brightest colour of an error map
 
 CHOICES = {
     "rounding": ("8bit", "none"),

@@ -24,8 +24,7 @@ from bench.errors import SteerbenchError
 ROOT = Path(__file__).resolve().parent.parent
 OURS = ("bench", "methods")
 WEIGHTS = "*.safetensors"
-CHECKS = ("cases.py", "experiments.py")
-"""Files that hold the checks of their folder. They do not affect results."""
+CHECKS = ("cases.py", "experiments.py")  # the checks of their folder, which affect no results
 
 CPU_MARKS = ("cpu family", "model", "CPU implementer", "CPU part")
 """Fields of /proc/cpuinfo that tell apart processors which share a name but compute differently."""

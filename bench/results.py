@@ -28,8 +28,7 @@ from PIL import Image
 from bench.errors import SteerbenchError, explained, unexpected
 from bench.provenance import commit, machine
 
-SCHEMA_VERSION = 3
-"""The version of record.json and rows.csv; folders of other versions are reported and skipped."""
+SCHEMA_VERSION = 3  # of record.json and rows.csv; other folders are reported and skipped
 
 COLUMNS = [
     *("run", "method", "scene", "split", "trajectory", "resolution", "protocol", "budget"),

@@ -15,8 +15,7 @@ from bench.types import Log
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-WORKERS = min(os.cpu_count() or 1, 8)
-"""Number of threads; more than eight would mostly wait for Python's GIL."""
+WORKERS = min(os.cpu_count() or 1, 8)  # more threads would mostly wait for Python's GIL
 
 
 @contextmanager

@@ -21,8 +21,7 @@ from bench.scenes.images import Pictures, View, describe
 from bench.threads import in_parallel, torch_threads
 from bench.types import BACKGROUNDS, Camera, Log, Scene, Split
 
-MARGIN = 0.05
-"""The box of a visual hull is enlarged by this share of its longest side, half at each end."""
+MARGIN = 0.05  # enlarges the box of a hull by this share of its longest side, half at each end
 
 CELLS = 64  # along each side of the cube that is searched for the visual hull
 BLOCK, GLANCES = 4, 16

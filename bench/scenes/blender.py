@@ -10,8 +10,7 @@ from bench.scenes.files import data_folder, focal_length, frames_of, inside, ope
 from bench.scenes.images import Pictures, View, image_size
 from bench.types import Camera, Log, Scene
 
-HALF_EXTENT = 1.5
-"""The objects of NeRF-Synthetic lie in [-1.5, 1.5]^3."""
+HALF_EXTENT = 1.5  # the objects of NeRF-Synthetic lie in [-1.5, 1.5]^3
 
 
 def load(

@@ -27,8 +27,7 @@ from bench.scenes.files import data_folder, inside, rigid_pose
 from bench.scenes.images import Lens, View, image_size
 from bench.types import Camera, Log, Scene
 
-MODELS = ("sparse/0", "colmap/sparse/0", "sparse", ".")
-"""Where the model may be in a capture's folder; the first that holds one is used."""
+MODELS = ("sparse/0", "colmap/sparse/0", "sparse", ".")  # where a model may be, in this order
 
 LISTS = {"frames": (64, "<I", 16), "images": (64, "<Q", 24), "points3D": (43, "<Q", 8)}
 """Layout of an entry in each binary list: bytes before the count of its parts (for an image, plus a
@@ -64,7 +63,13 @@ def load(
     folder = model_folder(root, model)
     reconstruction = read_model(folder)
     splits = every_nth(read_views(root, images, folder, reconstruction, log), split_every, folder)
-    box = points_box(reconstruction, folder) if bounds == "auto" else parse_box(bounds)
+    if bounds != "auto":
+        box = parse_box(bounds)
+    elif not reconstruction.num_points3D():
+        raise unexpected(folder, "points, or scene.bounds=[[x,y,z],[x,y,z]]", "no point")
+    else:
+        points = reconstruction.compute_bounding_box(STRAY, 1 - STRAY)
+        box = Box(torch.tensor(points.min), torch.tensor(points.max)).grown(MARGIN)
     pictures = describe_splits(splits, downscale, log)
     files = sorted(folder.glob(f"*{_kind(folder)}"))
     return assemble(root.name, pictures, box, background=background, camera_files=files)
@@ -170,11 +175,3 @@ class ColmapLens:
         seen = camera.img_from_cam(np.column_stack((points.numpy(), np.ones(len(points)))))
         matrix = torch.from_numpy(camera.calibration_matrix())
         return (torch.from_numpy(seen) - matrix[:2, 2]) / matrix.diagonal()[:2]
-
-
-def points_box(reconstruction: Any, folder: Path) -> Box:
-    """The box of a model's points, without the share `STRAY` at either end of each axis."""
-    if not reconstruction.num_points3D():
-        raise unexpected(folder, "points, or scene.bounds=[[x,y,z],[x,y,z]]", "no point")
-    box = reconstruction.compute_bounding_box(STRAY, 1 - STRAY)
-    return Box(torch.tensor(box.min), torch.tensor(box.max)).grown(MARGIN)

@@ -214,8 +214,7 @@ class Fisheye:
 def undistort(image: Tensor, camera: Camera, lens: Lens, where: Path) -> Tensor:
     """Undistort `image`, uint8 [H, W, C], to the pinhole picture of `undistorted_camera`.
 
-    `camera` has the intrinsics of both pictures; `where` names the picture in messages.
-    Raises SteerbenchError if the lens folds the picture over itself.
+    `camera` has the intrinsics of both. Raises if the lens folds the picture over itself.
     """
     source, _, _ = _window(camera, lens, where)
     planes = image.permute(2, 0, 1)[None].float()

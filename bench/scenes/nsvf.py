@@ -13,8 +13,7 @@ from bench.scenes.files import data_folder, inside, number, numbers, read_text, 
 from bench.scenes.images import View, image_size
 from bench.types import Camera, Log, Scene
 
-SPLITS = {"0": "train", "1": "val", "2": "test"}
-"""The split of a picture, by the first character of its name."""
+SPLITS = {"0": "train", "1": "val", "2": "test"}  # by the first character of a picture's name
 
 FURTHER = {"Mic": 1.2, "Lego": 1.1}
 """Extra factors for the boxes of two scenes, by the name of the folder: those of ngp_pl and of the

@@ -28,8 +28,7 @@ from bench.types import Camera, Log, Scene
 
 CAMERA_FILE = "transforms.json"
 
-NGP_SCALE, NGP_OFFSET = 0.33, [0.5, 0.5, 0.5]
-"""instant-ngp maps the file's coordinates x to scale * x + offset in its unit cube."""
+NGP_SCALE, NGP_OFFSET = 0.33, [0.5, 0.5, 0.5]  # x becomes scale * x + offset in its unit cube
 
 USUAL = ("k1", "k2", "p1", "p2", "k3")
 LENSES: Mapping[str, tuple[type[RadialTangential | Fisheye], tuple[str, ...]]] = {
