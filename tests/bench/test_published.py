@@ -44,14 +44,6 @@ def download(web: Web, folder: Path, log) -> bytes:
     return fetch(web.address + "file", folder / "file", digest, log).read_bytes()
 
 
-def test_what_is_there_and_right_is_not_downloaded_again(web, tmp_path, quiet_log):
-    web.files["/file"] = CONTENT
-    assert download(web, tmp_path, quiet_log) == CONTENT
-    assert download(web, tmp_path, quiet_log) == CONTENT
-    assert web.asked == ["/file"]
-    assert found(tmp_path) == {"file": CONTENT}
-
-
 @pytest.mark.parametrize(
     ("files", "end", "said"),
     [
