@@ -88,15 +88,11 @@ def in_turns(tiny_scene, quiet_log):
     return rendered
 
 
-def test_methods_take_turns_in_every_round_and_are_reset_in_each(in_turns, tiny_scene):
-    _, turns = in_turns(0, 8)
+def test_methods_take_turns_and_are_held_against_the_first_and_the_truth(in_turns, tiny_scene):
+    rows, turns = in_turns(0, 8)
     count = len(tiny_scene.splits["test"])
     round_ = [(levels, turn) for turn in ("reset", *range(count)) for levels in (0, 8)]
     assert turns == 3 * round_  # one that warms up, two that are timed
-
-
-def test_pictures_are_held_against_those_of_the_first_and_against_the_truth(in_turns):
-    rows, _ = in_turns(0, 8)
     assert [row["setting"] for row in rows] == ["0", "8"]
     assert rows[0]["psnr_to_first"] == math.inf
     # Halves of odd levels round to even ones: by up to one level more or less than 8.

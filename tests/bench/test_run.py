@@ -98,10 +98,7 @@ def test_the_stages_of_every_frame_and_of_the_mean_add_up_to_the_total(run, offs
     assert total == pytest.approx(value(measured.rows, "frame_ms"), rel=1e-12)
     whole = run(offset_method, protocol=replace(QUICK, stages=False)).frames
     assert [name for name in whole if name.startswith("stage_ms.")] == ["stage_ms.other"]
-
-
-def test_frames_a_second_follow_from_the_mean_time_and_its_interval(run, offset_method):
-    measured = run(offset_method)
+    # Frames a second follow from the mean time and its interval.
     ms, fps = row(measured.rows, "frame_ms"), row(measured.rows, "fps")
     times = measured.frames["frame_ms"]
     assert ms["value"] == pytest.approx(times.mean())
@@ -112,16 +109,14 @@ def test_frames_a_second_follow_from_the_mean_time_and_its_interval(run, offset_
     assert value(measured.rows, "frame_ms.p99") <= times.max()
 
 
-def test_warm_up_frames_come_first_and_are_forgotten_before_the_sequence(run, offset_method):
+def test_warm_up_frames_come_first_and_a_method_forgets_them_or_all(run, offset_method):
     measured = run(offset_method)
     sequence = [f"r_{i}" for i in range(6)]
     assert offset_method.calls == ["fit", "reset", "r_0", "r_5", "reset", *sequence]
     assert len(measured.frames) == 6
-
-
-def test_cold_means_that_every_frame_is_the_first_of_its_sequence(run, offset_method):
+    offset_method.calls.clear()
     run(offset_method, protocol=replace(QUICK, memory="cold", warmup=0))
-    frames = [call for i in range(6) for call in ("reset", f"r_{i}")]
+    frames = [call for i in range(6) for call in ("reset", f"r_{i}")]  # each the first of its own
     assert offset_method.calls == ["fit", "reset", "reset", *frames]
 
 
