@@ -241,7 +241,7 @@ def test_the_exact_picture_of_a_scene_serves_flicker_when_the_protocol_asks(
     assert len(asked) == 6
 
 
-def test_pictures_show_ground_truth_rendering_and_error(run, offset_method, tiny_scene):
+def test_pictures_show_ground_truth_rendering_and_error(run, offset_method):
     pictures = run(offset_method).pictures
     assert list(pictures) == [
         f"{number}-{kind}"
