@@ -64,22 +64,15 @@ def corrections() -> Tensor:
 
 
 def sparse_adam_(
-    table: Tensor,
-    grad: Tensor,
-    state: AdamState,
-    rate: float,
-    *,
-    packed: Tensor | None = None,
-    backend: str = "auto",
+    table: Tensor, grad: Tensor, state: AdamState, rate: float, *, backend: str = "auto"
 ) -> None:
     """Update in place the entries of `table` [entries, F] with a non-zero `grad`; clear `grad`.
 
-    The bias correction uses the entry's own step count. `packed`, the bfloat16 copy of the table
-    (`encode.pack`), is updated, too, if given.
+    The bias correction uses the entry's own step count.
     """
     check_shape("grad", grad, *table.shape)
-    _check(table, state, packed)
-    implementation(__name__, backend, table.device).sparse_adam_(table, grad, state, rate, packed)
+    _check(table, state)
+    implementation(__name__, backend, table.device).sparse_adam_(table, grad, state, rate)
 
 
 def hash_adam_(
@@ -92,9 +85,14 @@ def hash_adam_(
     packed: Tensor | None = None,
     backend: str = "auto",
 ) -> None:
-    """`sparse_adam_` for the hash table of `grid`, with the sum of its `gradients`; clear them."""
+    """`sparse_adam_` for the hash table of `grid`, with the sum of its `gradients`; clear them.
+
+    `packed`, the bfloat16 copy of the table (`encode.pack`), is updated, too, if given.
+    """
     check_shape("table", table, grid.entries, grid.features)
-    _check(table, state, packed)
+    _check(table, state)
+    if packed is not None:
+        check_shape("packed", packed, grid.entries)
     if gradients:
         positions, grad = gradients.joined()
         check_shape("positions", positions, None, 3)
@@ -105,11 +103,7 @@ def hash_adam_(
     gradients.clear()
 
 
-def _check(table: Tensor, state: AdamState, packed: Tensor | None) -> None:
-    entries, features = table.shape
-    for name, tensor in (("first", state.first), ("second", state.second)):
-        check_shape(name, tensor, entries, features)
-    check_shape("steps", state.steps, entries)
-    if packed is not None:
-        check_shape("packed", packed, entries)
-        check_shape("table, to be packed,", table, None, 2)
+def _check(table: Tensor, state: AdamState) -> None:
+    check_shape("first", state.first, *table.shape)
+    check_shape("second", state.second, *table.shape)
+    check_shape("steps", state.steps, len(table))

@@ -28,7 +28,11 @@ EPS = tl.constexpr(adam.EPS)
 
 
 @torch.no_grad()
-def sparse_adam_(
+def sparse_adam_(table: Tensor, grad: Tensor, state: AdamState, rate: float) -> None:
+    _step(table, grad, state, rate, None)
+
+
+def _step(
     table: Tensor, grad: Tensor, state: AdamState, rate: float, packed: Tensor | None
 ) -> None:
     given = {"table": table, "grad": grad, "first": state.first, "second": state.second}
@@ -55,7 +59,7 @@ def hash_adam_(
     rate: float,
     packed: Tensor | None,
 ) -> None:
-    sparse_adam_(table, table_gradient(positions, grad, grid), state, rate, packed)
+    _step(table, table_gradient(positions, grad, grid), state, rate, packed)
 
 
 @cache

@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from bench.types import Rays
 from methods.kernels.march import PARALLEL, Segments, longest_ray
-from methods.kernels.types import Extent, Occupancy, Samples
+from methods.kernels.types import Extent, Occupancy, Samples, offsets_of
 
 BLOCK = 1 << 12
 """Rays that are tested at a time: [BLOCK, 1024, 3] positions are 50 MB."""
@@ -19,10 +19,8 @@ BLOCK = 1 << 12
 
 def count(segments: Segments, occupancy: Occupancy, step: float) -> Tensor:
     """How many samples a ray has, [R] int64."""
-    parts = [
-        counts for _, counts, _ in _Steps.of(segments, step).taken(occupancy, longest_ray(step))
-    ]
-    return torch.cat(parts)
+    taken = _Steps.of(segments, step).taken(occupancy, longest_ray(step))
+    return torch.cat([counts for _, counts, _ in taken])
 
 
 def march(
@@ -40,9 +38,8 @@ def march(
     place = torch.nonzero_static(kept.flatten(), size=extent.total).squeeze(1)
     ray, k = place // max(steps.most, 1), place % max(steps.most, 1)
     t, positions = steps.at(ray, k)
-    offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
-    delta = torch.full_like(t, step)
-    return Samples(t, delta, offsets, ray.int(), positions, resume, longest=extent.longest)
+    where = t, torch.full_like(t, step), offsets_of(counts), ray.int(), positions, resume
+    return Samples(*where, longest=extent.longest)
 
 
 @dataclass(frozen=True)
@@ -100,22 +97,33 @@ def clip(rays: Rays, step: float, farthest: Tensor) -> tuple[Tensor, Tensor, Ten
 
     near, far, step and mask are [R] each.
     """
-    entry, leave = _cross_unit_cube(rays.origins, rays.directions)
+    origins, (slope, parallel) = rays.origins, slopes(rays.directions)
+    entry, leave = crossed(origins, parallel, -origins * slope, (1 - origins) * slope)
     near, far = entry.clamp(min=0), torch.minimum(leave, farthest)
-    # In float64, so that every backend rounds to the same float32.
-    length = rays.directions.double().norm(dim=-1).to(rays.directions.dtype)
+    length = lengths(rays.directions)
     # A true division: `step / length` would multiply by the reciprocal, which is an ulp off.
     step_t = torch.full_like(length, step) / length
     return near, far, step_t, (near < far) & far.isfinite() & step_t.isfinite()
 
 
-def _cross_unit_cube(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Where rays enter and leave [0, 1]^3 (slab test); enter > leave if they miss it."""
+def lengths(directions: Tensor) -> Tensor:
+    """Lengths [R] of directions [R, 3]; in float64, so all backends round to the same float32."""
+    return directions.double().norm(dim=-1).to(directions.dtype)
+
+
+def slopes(directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Change of t per length along each axis [R, 3], 0 for a ray that does not move along it, and
+    whether it does not."""
     parallel = directions.abs() < PARALLEL
-    slope = 1 / torch.where(parallel, 1, directions)
-    first, second = -origins * slope, (1 - origins) * slope
-    inside = (origins >= 0) & (origins <= 1)
-    outside = torch.where(inside, -torch.inf, torch.inf)
+    return torch.where(parallel, 0, 1 / torch.where(parallel, 1, directions)), parallel
+
+
+def crossed(
+    origins: Tensor, parallel: Tensor, first: Tensor, second: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Where rays enter and leave [0, 1]^3, given the t [R, 3] at which they cross its two planes of
+    each axis; enter > leave if they miss it (slab test)."""
+    outside = torch.where((origins >= 0) & (origins <= 1), -torch.inf, torch.inf)
     lower = torch.where(parallel, outside, torch.minimum(first, second))
     upper = torch.where(parallel, -outside, torch.maximum(first, second))
     return lower.amax(dim=-1), upper.amin(dim=-1)
