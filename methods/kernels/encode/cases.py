@@ -189,10 +189,10 @@ def _corners(position: list[float], grid: HashGrid, level: int) -> list[tuple[in
     for bits in itertools.product((0, 1), repeat=3):
         x, y, z = (math.floor(p) + bit for p, bit in zip(places, bits, strict=True))
         weight = math.prod(p % 1 if bit else 1 - p % 1 for p, bit in zip(places, bits, strict=True))
-        res, size = grid.resolutions[level], grid.sizes[level]
+        res, size = grid.strides[level], grid.sizes[level]
         dense = x + y * res + z * res * res
         hashed = x ^ y * PRIMES[1] % 2**32 ^ z * PRIMES[2] % 2**32
-        index = (dense if grid.dense[level] else hashed) % size
+        index = (dense if res else hashed) % size
         found.append((grid.offsets[level] + index, weight))
     return found
 

@@ -18,7 +18,7 @@ from methods.kernels.encode import PRIMES, HashGrid
 from methods.kernels.encode.reference import corners
 from methods.kernels.gpu import check_types, launch
 
-BLOCK = 256  # samples
+BLOCK = tl.constexpr(256)  # samples
 PRIME_Y, PRIME_Z = tl.constexpr(PRIMES[1]), tl.constexpr(PRIMES[2])
 
 
@@ -29,11 +29,9 @@ def encode(
     *,
     packed: Tensor | None = None,
 ) -> Tensor:
-    """A float16 or bfloat16 table gives features of its type; products and sums are float32."""
     if positions.requires_grad:
         raise ValueError("backend 'gpu' gives no gradient for positions: use backend='reference'")
-    check_types(torch.float32, positions=positions)
-    check_types(torch.float32, torch.float16, torch.bfloat16, table=table)
+    check_types(torch.float32, positions=positions, table=table)
     return _Encode.apply(positions.contiguous(), table, grid, packed)
 
 
@@ -41,7 +39,7 @@ class _Encode(torch.autograd.Function):
     @staticmethod
     def forward(ctx, positions, table, grid, packed):
         ctx.save_for_backward(positions)
-        ctx.grid, ctx.dtype = grid, table.dtype
+        ctx.grid = grid
         read = table.detach() if packed is None else packed.view(torch.bfloat16).view(-1, 2)
         features = read.new_empty(len(positions), grid.channels)
         _launch(_forward, positions, read.contiguous(), grid, features)
@@ -50,7 +48,7 @@ class _Encode(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad):
         (positions,) = ctx.saved_tensors
-        return None, table_gradient(positions, grad, ctx.grid).to(ctx.dtype), None, None
+        return None, table_gradient(positions, grad, ctx.grid), None, None
 
 
 def table_gradient(positions: Tensor, grad: Tensor, grid: HashGrid) -> Tensor:
@@ -68,18 +66,9 @@ def _launch(
     kernel: triton.JITFunction, positions: Tensor, table: Tensor, grid: HashGrid, features: Tensor
 ) -> None:
     """Run `kernel`, which reads one of `table` and `features` and writes to the other."""
-    launch(
-        kernel,
-        (triton.cdiv(len(positions), BLOCK), grid.levels),
-        positions,
-        table,
-        *_level_arrays(grid, positions.device),
-        features,
-        len(positions),
-        features.shape[1],
-        FEATURES=grid.features,
-        BLOCK=BLOCK,
-    )
+    given = positions, table, *_level_arrays(grid, positions.device), features
+    programs = triton.cdiv(len(positions), BLOCK.value), grid.levels
+    launch(kernel, programs, *given, *features.shape, FEATURES=grid.features)
 
 
 @cache
@@ -88,12 +77,9 @@ def _level_arrays(grid: HashGrid, device: torch.device) -> tuple[Tensor, Tensor]
 
     Cached, because each copy to the device would synchronise.
     """
-    strides = [res if dense else 0 for res, dense in zip(grid.resolutions, grid.dense, strict=True)]
-    shapes = list(zip(strides, grid.offsets, grid.sizes, strict=False))
-    return (
-        torch.tensor(grid.scales, dtype=torch.float32, device=device),
-        torch.tensor(shapes, dtype=torch.int64, device=device),
-    )
+    shapes = list(zip(grid.strides, grid.offsets, grid.sizes, strict=False))
+    scales = torch.tensor(grid.scales, dtype=torch.float32, device=device)
+    return scales, torch.tensor(shapes, dtype=torch.int64, device=device)
 
 
 def _scatter_sorted(positions: Tensor, grad: Tensor, grid: HashGrid, target: Tensor) -> None:
@@ -148,17 +134,7 @@ def _locate(positions, scales, shapes, level, i, inside):
 
 
 @triton.jit
-def _forward(
-    positions,
-    table,
-    scales,
-    shapes,
-    features,
-    total,
-    channels,
-    FEATURES: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+def _forward(positions, table, scales, shapes, features, total, channels, FEATURES: tl.constexpr):
     level = tl.program_id(1)
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = i < total
@@ -176,17 +152,7 @@ def _forward(
 
 
 @triton.jit
-def _scatter(
-    positions,
-    target,
-    scales,
-    shapes,
-    grad,
-    total,
-    channels,
-    FEATURES: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+def _scatter(positions, target, scales, shapes, grad, total, channels, FEATURES: tl.constexpr):
     """Adjoint of `_forward`: target[corner] += weight * grad."""
     level = tl.program_id(1)
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)

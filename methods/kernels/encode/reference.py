@@ -43,8 +43,7 @@ def corners(positions: Tensor, grid: HashGrid, level: int) -> tuple[Tensor, Tens
 def _entry(vertex: Tensor, grid: HashGrid, level: int) -> Tensor:
     """Table entry, within its level, of integer grid vertices [..., 3]."""
     x, y, z = vertex.unbind(dim=-1)
-    if grid.dense[level]:
-        res = grid.resolutions[level]
+    if res := grid.strides[level]:
         return (x + y * res + z * res**2) % grid.sizes[level]
     hashed = x * PRIMES[0] ^ (y * PRIMES[1] & 0xFFFFFFFF) ^ (z * PRIMES[2] & 0xFFFFFFFF)
     return hashed % grid.sizes[level]

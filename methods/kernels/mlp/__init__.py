@@ -12,6 +12,7 @@ from torch import Tensor
 
 from bench.types import check_shape
 from methods.kernels.dispatch import implementation
+from methods.kernels.types import expect
 
 
 def mlp(inputs: Sequence[Tensor], weights: Sequence[Tensor], *, backend: str = "auto") -> Tensor:
@@ -27,10 +28,8 @@ def mlp(inputs: Sequence[Tensor], weights: Sequence[Tensor], *, backend: str = "
         ValueError: wrong shapes or numbers of inputs or layers; backend "cpu": neither float32
             nor bfloat16.
     """
-    if len(inputs) not in (1, 2):
-        raise ValueError(f"inputs: expected one or two, got {len(inputs)}")
-    if not weights:
-        raise ValueError("weights: expected one layer or more, got none")
+    expect(len(inputs) in (1, 2), "inputs", "one or two", len(inputs))
+    expect(bool(weights), "weights", "one layer or more", "none")
     for part in inputs:
         check_shape("inputs", part, len(inputs[0]), None)
     channels = sum(part.shape[1] for part in inputs)

@@ -23,7 +23,7 @@ def test_levels_of_the_released_grid() -> None:
         *(16, 22, 28, 37, 49, 64, 85, 112),
         *(148, 195, 256, 338, 446, 589, 777, 1024),
     )
-    assert grid.dense == (True,) * 6 + (False,) * 10
+    assert grid.strides == (*grid.resolutions[:6], *[0] * 10)
     assert grid.entries * grid.features == 11_420_064
     assert HashGrid(log2_table=16, n_max=2048).entries * 2 == 1_796_048
     assert HashGrid(log2_table=19, n_max=4096).entries * 2 == 12_599_920
