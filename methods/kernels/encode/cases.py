@@ -63,7 +63,7 @@ def _of_sums(given: Given) -> Tensor:
     """Tolerance of the gradient of each entry of the table, [entries, 1]; see `SUMS`."""
     grid, tolerance = given["grid"], []
     for level, (scale, size) in enumerate(zip(grid.scales, grid.sizes, strict=True)):
-        entries, weights = corners(given["positions"], grid, level)
+        entries, weights = corners(given["positions"].nan_to_num(), grid, level)
         entry = entries.flatten() - grid.offsets[level]
         count = torch.bincount(entry, minlength=size)
         total = torch.bincount(entry, weights.flatten(), minlength=size)
@@ -108,7 +108,7 @@ def cases() -> list[Case]:
         make, items = partial(_given, positions, grid, packed), VIEW if grid is LARGE else None
         precision = "bf16" if packed else "fp32"
         found += ENCODE.cases(name, make, precision=precision, items=items)
-    return [*found, *_extremes()]
+    return [*found, *ENCODE.cases("NaN", _with_nan), *_extremes()]
 
 
 def _given(positions: Tensor, grid: HashGrid, packed: bool) -> Given:
@@ -117,6 +117,12 @@ def _given(positions: Tensor, grid: HashGrid, packed: bool) -> Given:
     table = uniform(generator, (grid.entries, grid.features))
     words = pack(table) if packed else None
     return {"positions": positions, "table": table, "grid": grid, "packed": words}
+
+
+def _with_nan() -> Given:
+    positions = _random(700)
+    positions[::7, 1] = math.nan
+    return _given(positions, SMALL, packed=False)
 
 
 def _random(count: int) -> Tensor:
@@ -147,12 +153,6 @@ def _extremes() -> list[Case]:
         FEATURES,
         on_backends(_units(GRID.n_max), "fp64") | packed,
     )
-    not_a_number = Property(
-        "encode",
-        "its own features are NaN; no others change, nor any gradient",
-        "the same arithmetic for all other positions: 0",
-        dict.fromkeys([*on_backends(0), *packed], 0.0),
-    )
     huge = Property(
         "encode",
         "features are those of the closed form",
@@ -161,7 +161,6 @@ def _extremes() -> list[Case]:
     )
     return [
         *(closed_form.case(name, partial(_feature_error, at)) for name, at in kinds.items()),
-        not_a_number.case("NaN", _spread_of_nan),
         # Reserves 9 GB, but does not fill them.
         huge.case("2^31 numbers in the table", _largest_table_error, slow=True),
     ]
@@ -209,43 +208,15 @@ def _exact(positions: Tensor, grid: HashGrid) -> Tensor:
     return torch.tensor(rows, dtype=torch.float64)
 
 
-def _table() -> Tensor:
-    return torch.tensor([[_value(e, f) for f in (0, 1)] for e in range(GRID.entries)])
-
-
-def _encoded(positions: Tensor, table: Tensor, precision: str, backend: str) -> Tensor:
-    words = pack(table) if precision == "bf16" else None
-    return encode(positions, table, GRID, packed=words, backend=backend)
-
-
 def _feature_error(positions: Tensor, backend: str, device: str, precision: str) -> float:
     dtype = torch.float32 if precision == "bf16" else DTYPES[precision]
-    places = positions.to(dtype)
-    got = _encoded(places.to(device), _table().to(device, dtype), precision, backend)
+    places, entries = positions.to(dtype), range(GRID.entries)
+    table = torch.tensor([[_value(entry, f) for f in (0, 1)] for entry in entries]).to(
+        device, dtype
+    )
+    packed = pack(table) if precision == "bf16" else None
+    got = encode(places.to(device), table, GRID, packed=packed, backend=backend)
     return largest_error((got.cpu(),), (_exact(places, GRID),))
-
-
-def _spread_of_nan(backend: str, device: str, precision: str) -> float:
-    """Change by NaN in every 7th position: of other features, and of gradients of other positions.
-
-    Infinite where the NaN does not appear in the features.
-    """
-    generator = torch.Generator().manual_seed(0)
-    positions = torch.rand(700, 3, generator=generator).to(device)
-    bad = torch.arange(700, device=device) % 7 == 0
-    spoiled = positions.clone()
-    spoiled[bad, 1] = torch.nan
-    table = _table().to(device)
-    features, grads = [], []
-    for places in (spoiled, positions):
-        learned = table.clone().requires_grad_()
-        found = _encoded(places, learned, precision, backend)
-        (grad,) = torch.autograd.grad(torch.where(bad[:, None], 0, found).sum(), learned)
-        features.append(found.detach())
-        grads.append(grad)
-    if not features[0][bad].isnan().all():
-        return math.inf
-    return largest_error((features[0][~bad], grads[0]), (features[1][~bad], grads[1]))
 
 
 def _largest_table_error(backend: str, device: str, precision: str) -> float:
