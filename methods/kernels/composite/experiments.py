@@ -33,7 +33,7 @@ THIN = 1 / 32
 
 
 def slope(y: Tensor) -> Tensor:
-    """Slope of the ramp: at one end of y the cube's opacity is two thirds, at the other almost 1."""
+    """Slope of the ramp; the cube's opacity is two thirds at y = 0 and almost 1 at y = 1."""
     return 2 + 14 * y
 
 
