@@ -39,6 +39,10 @@ ROWS = 6
 TALL = 12 if get_host_cpu_features().get("avx512f") else ROWS
 """Rows that `tall` computes together: AVX-512 has 32 registers, each as wide as 16 sums."""
 
+FAST = {"contract", "reassoc", "nsz", "arcp"}
+"""Flags of fastmath: reordering and fused multiply-adds are allowed; assuming that there is no NaN
+is not."""
+
 LANES = 16
 """Outputs that both compute together."""
 

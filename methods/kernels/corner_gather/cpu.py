@@ -13,12 +13,9 @@ from numba import get_num_threads, njit, prange, types
 from numba.extending import overload
 from torch import Tensor
 
-from methods.kernels.cpu import arrays, check_float32, u32
+from methods.kernels.cpu import FAST, arrays, check_float32, u32
 
 CHUNK = 256  # samples
-
-# Reordering and fused multiply-adds are allowed; assuming that there is no NaN is not.
-FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
 def corner_gather(

@@ -17,16 +17,12 @@ import torch
 from numba import get_num_threads, njit, prange
 from torch import Tensor
 
-from methods.kernels.cpu import add_pair, arrays, check_float32, f32, i32, pack_bf16, u32, u64
+from methods.kernels.cpu import FAST, add_pair, arrays, check_float32, f32, i32, pack_bf16, u32, u64
 from methods.kernels.encode import PRIMES, HashGrid
 
 CHUNK = 256  # samples; 256 * (8 indices + 8 weights + 8 values) * 4 bytes = 24 KiB
 
 PRIME_Y, PRIME_Z = u32(PRIMES[1]), u32(PRIMES[2])
-
-# Reordering and fused multiply-adds are allowed; assuming that there is no NaN is not, because
-# `_load` must turn NaN into 0 before it can become an address.
-FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
 def encode(
@@ -88,7 +84,8 @@ def level_arrays(grid: HashGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @njit(cache=True, fastmath=FAST)
 def _load(positions, first, count, xyz):
-    """Copy positions [first, first + count) axis by axis, clamped to [0, 1], NaN as 0."""
+    """Copy positions [first, first + count) axis by axis, clamped to [0, 1], NaN as 0: it must not
+    become an address."""
     for axis in range(3):
         for i in range(count):
             value = positions[first + i, axis]

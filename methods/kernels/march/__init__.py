@@ -29,14 +29,7 @@ PARALLEL = 2.0**-127
 
 @dataclass(frozen=True)
 class Segments:
-    """The parts of R rays to sample; see `march`.
-
-    Attributes:
-        rays: the R rays.
-        window: [R, 2] nearest and farthest t, the latter excluded.
-        jitter: [R] phase of the samples.
-        start: [R] int32 first step; negative: no samples.
-    """
+    """The parts of R rays to sample, with all that `march` may be given."""
 
     rays: Rays
     window: Tensor
