@@ -8,11 +8,13 @@ import hypothesis
 import pytest
 import torch
 from hypothesis import strategies as st
+from scipy import integrate
 from torch import Tensor
 
 from bench.case import U32
 from methods.kernels.composite import composite as composite_samples
 from methods.kernels.composite import visible, weights
+from methods.kernels.composite.experiments import exact, slope
 from methods.kernels.types import Intervals, Pixels
 
 BACKENDS = ["reference", "cpu"]
@@ -149,58 +151,23 @@ def test_the_early_stop_changes_a_pixel_by_less_than_its_threshold(
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_visible_samples_are_those_with_a_gradient(backend: str) -> None:
-    inputs = samples([40, 0, 1, 25])
-    stop = 0.05
-    counts, left = visible(inputs["sigma"], intervals(inputs), stop=stop, backend=backend)
-    values = inputs["values"].requires_grad_()
-    pixels = composite(**inputs | {"values": values}, stop=stop, backend=backend)
-    (grad,) = torch.autograd.grad(pixels.values.sum(), values)
-    seen = (grad != 0).any(dim=1)
-    for ray, count in enumerate(counts.tolist()):
-        begin, end = inputs["offsets"][ray], inputs["offsets"][ray + 1]
-        assert seen[begin : begin + count].all()
-        assert not seen[begin + count : end].any()
-    assert 0 < counts[0] < 40
-    torch.testing.assert_close(left, 1 - pixels.alpha, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_samples_are_visible_in_two_parts_as_in_one(backend: str) -> None:
-    """All have 20 samples; the second half lies behind what the first half lets through."""
-    whole = samples([20] * 30)
-    sigma, delta = whole["sigma"].view(30, 20) / 10, whole["delta"].view(30, 20)
-    offsets, stop = whole["offsets"] // 2, 0.45
-    count, left = visible(sigma.flatten(), intervals(whole), stop=stop, backend=backend)
-    first, between = visible(
-        sigma[:, :10].flatten(),
-        Intervals(whole["t"][:300], delta[:, :10].flatten(), offsets),
-        stop=stop,
-        backend=backend,
-    )
-    second, behind = visible(
-        sigma[:, 10:].flatten(),
-        Intervals(whole["t"][:300], delta[:, 10:].flatten(), offsets),
-        stop=stop,
-        front=between,
-        backend=backend,
-    )
-    assert 0 < (second > 0).sum() < 30
-    assert torch.equal(first + second, count)
-    torch.testing.assert_close(behind, left, rtol=1e-6, atol=0)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_weights_are_the_gradients_of_the_values(backend: str) -> None:
+def test_visible_samples_are_those_with_a_weight_which_is_the_gradient_of_their_value(
+    backend: str,
+) -> None:
+    """Behind pixels in front, which stay as they were."""
     inputs, alpha = samples([40, 0, 1, 25], channels=1), torch.tensor([0.0, 0.5, 0.9, 0.2])
-    carry = Pixels(torch.zeros(4, 1), torch.zeros(4), alpha)
-    values = inputs["values"].requires_grad_()
+    carry = Pixels(torch.zeros(4, 1), torch.zeros(4), alpha.clone())
+    values, given = inputs["values"].requires_grad_(), (inputs["sigma"], intervals(inputs))
     pixels = composite(**inputs | {"values": values}, stop=0.05, carry=carry, backend=backend)
+    assert torch.equal(carry.alpha, alpha)
     (gradient,) = torch.autograd.grad(pixels.values.sum(), values)
-    found = weights(inputs["sigma"], intervals(inputs), stop=0.05, front=1 - alpha, backend=backend)
+    found = weights(*given, stop=0.05, front=1 - alpha, backend=backend)
     torch.testing.assert_close(found, gradient[:, 0], rtol=1e-5, atol=1e-7)
-    assert (found == 0).any()
-    assert (found > 0.05).any()
+    counts, left = visible(*given, stop=0.05, front=1 - alpha, backend=backend)
+    torch.testing.assert_close(left, 1 - pixels.alpha, rtol=0, atol=1e-6)
+    assert 0 < counts[0] < 40
+    ends = zip(found.split([40, 0, 1, 25]), counts.tolist(), strict=True)
+    assert all((part[:count] > 0).all() and not part[count:].any() for part, count in ends)
 
 
 def test_wrong_arguments_are_named() -> None:
@@ -213,7 +180,10 @@ def test_wrong_arguments_are_named() -> None:
         composite(**samples([5], dtype=torch.float64), backend="cpu")
 
 
-def test_pixels_in_front_stay_as_they_were() -> None:
-    carry = Pixels(torch.zeros(1, 3), torch.zeros(1), torch.zeros(1))
-    composite(**samples([5]), carry=carry, backend="cpu")
-    assert carry.alpha.tolist() == [0.0]
+@pytest.mark.parametrize(("quantity", "power"), [("alpha", 0), ("depth_sum", 1)])
+@pytest.mark.parametrize("y", [0.0, 0.3, 1.0])
+def test_the_experiments_know_the_rendering_integral(quantity: str, power: int, y: float) -> None:
+    place = torch.tensor(y, dtype=torch.float64)
+    s = slope(place).item()
+    want, _ = integrate.quad(lambda x: x**power * s * x * math.exp(-s * x * x / 2), 0, 1)
+    assert exact(quantity, place).item() == pytest.approx(want, rel=1e-9)
