@@ -27,11 +27,8 @@ def cells() -> Iterator[Any]:
         for cell in case.tolerances:
             interpreted = cell[0] == "gpu" and not torch.cuda.is_available()
             slow = interpreted and case.subject in DEAR and case.subject in begun
-            name, marks = (
-                f"{case.subject}: {case.name}: {' '.join(cell)}",
-                [pytest.mark.slow] * slow,
-            )
-            yield pytest.param(case, cell, id=name, marks=marks)
+            name = f"{case.subject}: {case.name}: {' '.join(cell)}"
+            yield pytest.param(case, cell, id=name, marks=[pytest.mark.slow] * slow)
         begun.add(case.subject)
 
 

@@ -80,19 +80,6 @@ def test_reference_is_the_definition(stop: float) -> None:
         assert pixels.alpha[ray].item() == pytest.approx(alpha, abs=1e-12)
 
 
-def test_gradients_in_float64() -> None:
-    inputs = samples([3, 0, 5, 1], channels=4, dtype=torch.float64)
-    sigma, values = inputs["sigma"].requires_grad_(), inputs["values"].requires_grad_()
-    background = torch.rand(4, dtype=torch.float64)
-
-    def outputs(sigma: Tensor, values: Tensor) -> tuple[Tensor, ...]:
-        changed = inputs | {"sigma": sigma, "values": values}
-        pixels = composite(**changed, stop=0.0, backend="reference").over(background)
-        return pixels.values, pixels.depth_sum, pixels.alpha
-
-    assert torch.autograd.gradcheck(outputs, (sigma, values))
-
-
 def part(inputs: dict, index: Tensor, counts: list[int]) -> dict:
     """Only the samples at `index`, on rays of `counts`."""
     columns = {name: inputs[name][index] for name in ("sigma", "values", "t", "delta")}

@@ -57,10 +57,3 @@ def test_first_degree_is_the_direction() -> None:
     values = spherical_harmonics(direction, backend="reference")[0]
     scale = math.sqrt(3 / (4 * math.pi))
     assert values[1:4].tolist() == pytest.approx([scale * 0.48, scale * 0.8, scale * 0.36])
-
-
-def test_gradients_in_float64() -> None:
-    directions = sphere_quadrature()[0][::20].requires_grad_()
-    assert torch.autograd.gradcheck(
-        lambda d: spherical_harmonics(d, backend="reference"), (directions,)
-    )
