@@ -7,7 +7,7 @@ from torch import Tensor
 
 from methods.kernels.adam import BETAS, EPS, AdamState
 from methods.kernels.encode import HashGrid, pack
-from methods.kernels.encode.reference import encode
+from methods.kernels.encode.reference import table_gradient
 
 
 @torch.no_grad()
@@ -34,10 +34,7 @@ def hash_adam_(
     rate: float,
     packed: Tensor | None,
 ) -> None:
-    asking = table.detach().requires_grad_()
-    with torch.enable_grad():
-        encoded = encode(positions, asking, grid)
-    (total,) = torch.autograd.grad(encoded, asking, grad.to(table.dtype))
+    total = table_gradient(positions, grad.to(table.dtype), grid)
     sparse_adam_(table, total, state, rate)
     if packed is not None:
         packed.copy_(pack(table))

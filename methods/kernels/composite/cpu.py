@@ -63,10 +63,10 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def backward(ctx, *grads):
         *samples, front, opacity = ctx.saved_tensors
-        grad_sigma, grad_samples = torch.zeros(len(opacity)), torch.zeros_like(samples[0])
-        results = grad_sigma, grad_samples
-        _backward(*arrays(opacity, *samples), f32(ctx.stop), *arrays(front, *grads, *results))
-        return grad_sigma, grad_samples, None, None, None, None, None
+        results = torch.zeros(len(opacity)), torch.zeros_like(samples[0])
+        light = arrays(front, *grads)
+        _backward(*arrays(opacity, *samples), f32(ctx.stop), tuple(light), *arrays(*results))
+        return *results, None, None, None, None, None
 
 
 @njit(cache=True)
@@ -126,24 +126,12 @@ def _visible(sigma, delta, offsets, front, stop, counts, left):
 
 
 @njit(cache=True, parallel=True)
-def _backward(
-    opacity,
-    values,
-    t,
-    delta,
-    offsets,
-    stop,
-    front,
-    grad_out,
-    grad_depth,
-    grad_alpha,
-    grad_sigma,
-    grad_values,
-):
+def _backward(opacity, values, t, delta, offsets, stop, light, grad_sigma, grad_values):
     """With g_i = dL/dw_i and T_{i+1} = T_i (1 - alpha_i):
 
     dL/dsigma_i = delta_i (T_{i+1} g_i - sum_{j > i} w_j g_j).
     """
+    front, grad_out, grad_depth, grad_alpha = light
     channels = values.shape[1]
     for ray in prange(len(offsets) - 1):
         behind = 0.0  # sum of w_j g_j over samples behind i; at first over all

@@ -14,8 +14,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from methods.kernels.encode import PRIMES, HashGrid
-from methods.kernels.encode.reference import corners
+from methods.kernels.encode import PRIMES, HashGrid, reference
 from methods.kernels.gpu import check_types, launch
 
 BLOCK = tl.constexpr(256)  # samples
@@ -52,13 +51,11 @@ class _Encode(torch.autograd.Function):
 
 
 def table_gradient(positions: Tensor, grad: Tensor, grid: HashGrid) -> Tensor:
-    """The gradient [entries, F] float32 of a table, by the gradient `grad` [N, levels * F] of the
-    features at `positions` [N, 3]."""
-    target = torch.zeros(grid.entries, grid.features, device=grad.device)
+    """As that of the reference, in float32."""
     if torch.are_deterministic_algorithms_enabled():
-        _scatter_sorted(positions, grad.float(), grid, target)
-    else:
-        _launch(_scatter, positions, target, grid, grad.contiguous())
+        return reference.table_gradient(positions, grad.float(), grid)
+    target = torch.zeros(grid.entries, grid.features, device=grad.device)
+    _launch(_scatter, positions, target, grid, grad.contiguous())
     return target
 
 
@@ -80,16 +77,6 @@ def _level_arrays(grid: HashGrid, device: torch.device) -> tuple[Tensor, Tensor]
     shapes = list(zip(grid.strides, grid.offsets, grid.sizes, strict=False))
     scales = torch.tensor(grid.scales, dtype=torch.float32, device=device)
     return scales, torch.tensor(shapes, dtype=torch.int64, device=device)
-
-
-def _scatter_sorted(positions: Tensor, grad: Tensor, grid: HashGrid, target: Tensor) -> None:
-    """Add the gradient to `target` in a repeatable order."""
-    inside = torch.where(positions > 0, positions, 0).clamp(max=1)
-    for level in range(grid.levels):
-        entries, weights = corners(inside, grid, level)
-        of_level = grad[:, level * grid.features : (level + 1) * grid.features]
-        shares = weights[..., None] * of_level[:, None]  # [N, 8, F]
-        target.index_put_((entries,), shares, accumulate=True)
 
 
 @triton.jit
