@@ -236,8 +236,8 @@ def _extreme_error(
     gain = values.sum(dim=1) + t + 1
     later = (weights * gain).flip(0).cumsum(0).flip(0) - weights * gain
     length = torch.where(delta > 0, delta, 1)
-    want = torch.where(delta > 0, behind * gain - later, 0), weights[:, None].expand(8, 3)
-    return largest_error((of_sigma.double() / length, of_values), want)
+    exact = torch.where(delta > 0, behind * gain - later, 0), weights[:, None].expand(8, 3)
+    return largest_error((of_sigma.double() / length, of_values), exact)
 
 
 def _light_error(count: int, kind: str, backend: str, device: str, precision: str) -> float:
