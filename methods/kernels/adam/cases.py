@@ -118,9 +118,7 @@ def _hash_steps(given: Given, backend: str) -> tuple[Tensor, ...]:
     table, state = given["table"].clone(), AdamState.like(given["table"])
     packed = pack(table) if table.shape[1] == 2 else None
     for positions, grads in given["steps"]:
-        parts = SampleGradients()
-        for part in zip(positions.split(40), grads.split(40), strict=True):
-            parts.add(*part)
+        parts = SampleGradients(zip(positions.split(40), grads.split(40), strict=True))
         hash_adam_(table, parts, given["grid"], state, RATE, packed=packed, backend=backend)
     off = table.new_zeros(0)
     if packed is not None:

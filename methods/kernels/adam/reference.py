@@ -7,7 +7,7 @@ from torch import Tensor
 
 from methods.kernels.adam import BETAS, EPS, AdamState
 from methods.kernels.encode import HashGrid, pack
-from methods.kernels.encode.reference import table_gradient
+from methods.kernels.encode.reference import encode
 
 
 @torch.no_grad()
@@ -34,7 +34,10 @@ def hash_adam_(
     rate: float,
     packed: Tensor | None,
 ) -> None:
-    total = table_gradient(positions, grad.to(table.dtype), grid)
+    asking = table.detach().requires_grad_()
+    with torch.enable_grad():
+        encoded = encode(positions, asking, grid)
+    (total,) = torch.autograd.grad(encoded, asking, grad.to(table.dtype))
     sparse_adam_(table, total, state, rate)
     if packed is not None:
         packed.copy_(pack(table))

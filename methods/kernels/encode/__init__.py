@@ -81,29 +81,16 @@ class HashGrid:
         return self.levels * self.features
 
 
-class SampleGradients:
-    """Positions of samples and the gradients of their features, collected by the backward passes of
-    a training step. The gradient of the table is a sum over them. `adam.hash_adam_` computes it, on
-    a CPU level by level, and uses that of a level while it is in the cache."""
-
-    def __init__(self) -> None:
-        self._parts: list[tuple[Tensor, Tensor]] = []
-
-    def __bool__(self) -> bool:
-        return bool(self._parts)
-
-    def add(self, positions: Tensor, gradients: Tensor) -> None:
-        """Append `positions` [N, 3] and the `gradients` [N, levels * F] of their features."""
-        self._parts.append((positions, gradients))
+class SampleGradients(list[tuple[Tensor, Tensor]]):
+    """Positions [N, 3] of samples and the gradients [N, levels * F] of their features, collected by
+    the backward passes of a training step. The gradient of the table is a sum over them.
+    `adam.hash_adam_` computes it, on a CPU level by level, and uses that of a level while it is in
+    the cache."""
 
     def joined(self) -> tuple[Tensor, Tensor]:
-        """All positions and gradients; at least one `add` must have come before."""
-        positions, gradients = zip(*self._parts, strict=True)
+        """All positions and gradients; there must be some."""
+        positions, gradients = zip(*self, strict=True)
         return torch.cat(positions), torch.cat(gradients)
-
-    def clear(self) -> None:
-        """Forget all."""
-        self._parts.clear()
 
 
 class _Collect(torch.autograd.Function):
@@ -119,7 +106,7 @@ class _Collect(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, gradient):
-        ctx.gradients.add(*ctx.saved_tensors, gradient)
+        ctx.gradients.append((*ctx.saved_tensors, gradient))
         return None, None, None, None
 
 

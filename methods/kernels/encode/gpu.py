@@ -2,7 +2,7 @@
 
 Programs of one level are numbered consecutively, so that those running at the same time mostly read
 one level, which stays in the L2 cache. The backward pass scatters with atomics, whose order is not
-repeatable. If torch is set to use deterministic algorithms, torch's sorted scatter is used instead.
+repeatable.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from methods.kernels.encode import PRIMES, HashGrid, reference
+from methods.kernels.encode import PRIMES, HashGrid
 from methods.kernels.gpu import check_types, launch
 
 BLOCK = tl.constexpr(256)  # samples
@@ -51,9 +51,8 @@ class _Encode(torch.autograd.Function):
 
 
 def table_gradient(positions: Tensor, grad: Tensor, grid: HashGrid) -> Tensor:
-    """As that of the reference, in float32."""
-    if torch.are_deterministic_algorithms_enabled():
-        return reference.table_gradient(positions, grad.float(), grid)
+    """The gradient [entries, F] float32 of a table, by the gradient `grad` [N, levels * F] of the
+    features at `positions` [N, 3]."""
     target = torch.zeros(grid.entries, grid.features, device=grad.device)
     _launch(_scatter, positions, target, grid, grad.contiguous())
     return target

@@ -29,15 +29,6 @@ def encode(
     return features if packed is None else features.to(torch.bfloat16)
 
 
-def table_gradient(positions: Tensor, grad: Tensor, grid: HashGrid) -> Tensor:
-    """The gradient [entries, F] of a table, by the gradient `grad` [N, levels * F] of the features
-    at `positions` [N, 3]."""
-    table = grad.new_zeros(grid.entries, grid.features, requires_grad=True)
-    with torch.enable_grad():
-        features = encode(positions, table, grid)
-    return torch.autograd.grad(features, table, grad)[0]
-
-
 def corners(positions: Tensor, grid: HashGrid, level: int) -> tuple[Tensor, Tensor]:
     """Table entries [N, 8] of the corners around `positions` in [0, 1]^3, and their weights."""
     scaled = positions * grid.scales[level] + 0.5  # [N, 3]

@@ -66,9 +66,7 @@ def test_the_step_of_collected_gradients_is_that_of_their_sum(backend: str, feat
     for count in (300, 0, 1000):
         positions = torch.rand(count, 3, generator=generator)
         grad = torch.randn(count, grid.channels, generator=generator)
-        gradients = SampleGradients()
-        for part in zip(positions.split(400), grad.split(400), strict=True):
-            gradients.add(*part)
+        gradients = SampleGradients(zip(positions.split(400), grad.split(400), strict=True))
         for _ in range(2):  # the second one has no gradients to step by
             hash_adam_(tables[0], gradients, grid, states[0], 0.1, packed=words, backend=backend)
             assert not gradients
@@ -83,11 +81,11 @@ def test_the_step_of_collected_gradients_is_that_of_their_sum(backend: str, feat
 
 
 def test_wrong_arguments_are_named() -> None:
-    grid, gradients = HashGrid(levels=1, log2_table=6, n_min=4, n_max=4), SampleGradients()
+    grid = HashGrid(levels=1, log2_table=6, n_min=4, n_max=4)
+    gradients = SampleGradients([(torch.zeros(5, 3), torch.zeros(5, 3))])
     table = torch.zeros(grid.entries, 2)
     with pytest.raises(ValueError, match="steps: expected shape"):
         sparse_adam_(table, table.clone(), AdamState(table, table, torch.zeros(2)), 0.1)
-    gradients.add(torch.zeros(5, 3), torch.zeros(5, 3))
     with pytest.raises(ValueError, match=r"gradients: expected shape \[5, 2\], got \[5, 3\]"):
         hash_adam_(table, gradients, grid, AdamState.like(table), 0.1)
     with pytest.raises(ValueError, match="packed: expected shape"):

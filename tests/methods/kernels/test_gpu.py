@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 
 from bench.case import U32, largest_error, placed
 from methods.checks import kernels
@@ -24,7 +23,6 @@ from methods.kernels.encode import HashGrid, encode
 from methods.kernels.march import extents, march
 from methods.kernels.march.cases import cells, some_rays
 from methods.kernels.types import Intervals, Occupancy
-from methods.steernerf.kernels.splat import gather
 
 pytestmark = pytest.mark.skipif(
     bool(availability()["gpu"]), reason="Triton has no build for this platform"
@@ -40,32 +38,6 @@ def test_what_is_marched_has_the_extent_that_was_told() -> None:
     assert [(x.total, x.longest) for x in found] == [(int(c.sum()), int(c.max())) for c in counts]
     samples = march(rays.take(slice(30)), occupancy, 0.02, extent=found[0], backend="gpu")
     assert torch.equal(samples.offsets.diff(), counts[0])
-
-
-@pytest.mark.slow
-def test_told_to_be_deterministic_it_adds_up_in_an_order_that_repeats() -> None:
-    """In another order than the atomics', so that only the last bits may differ from theirs."""
-    torch.manual_seed(0)
-    grid = HashGrid(levels=2, log2_table=6, n_min=4, n_max=20)
-    positions = torch.rand(4000, 3, device=DEVICE)
-    table = torch.zeros(grid.entries, 2, device=DEVICE, requires_grad=True)
-    values = torch.rand(3, 5, device=DEVICE, requires_grad=True)
-    index = torch.randint(-1, 3, (4000,), dtype=torch.int32, device=DEVICE)
-    shares = torch.rand(4000, grid.channels, device=DEVICE), torch.rand(4000, 5, device=DEVICE)
-
-    def gradients() -> tuple[Tensor, ...]:
-        found = encode(positions, table, grid, backend="gpu"), gather(values, index, backend="gpu")
-        return torch.autograd.grad(found, (table, values), shares)
-
-    free = gradients()
-    torch.use_deterministic_algorithms(True)
-    try:
-        first, second = gradients(), gradients()
-    finally:
-        torch.use_deterministic_algorithms(False)
-    assert largest_error(first, second) == 0
-    # At most 4,000 terms below 1: 2 n roundings of a sum of n, as independent errors.
-    assert 0 < largest_error(first, free) <= 6 * 4000**0.5 * 4000 * U32
 
 
 def test_what_is_not_a_number_shows_and_what_is_behind_it_does_not() -> None:
