@@ -23,8 +23,6 @@ BACKENDS = ("reference", "cpu", "gpu")
 def availability() -> dict[str, str]:
     """For each backend, "" if it can be used here, otherwise why not and how to get it."""
     reasons = dict.fromkeys(BACKENDS, "")
-    if importlib.util.find_spec("numba") is None:
-        reasons["cpu"] = "numba is not installed: pip install numba"
     if importlib.util.find_spec("triton") is None:
         reasons["gpu"] = "Triton is not installed; it comes with torch for CUDA"
     elif not (torch.cuda.is_available() or interpreted()):
@@ -149,5 +147,5 @@ def compiled(device: str) -> list[str]:
 _forced: dict[str, str] = {}
 _calls: list[set[str]] = []
 
-# Imported on first use, because numba and Triton are heavy and not every machine has both.
+# Imported on first use, because numba and Triton are heavy and not every machine has the latter.
 _load = cache(importlib.import_module)

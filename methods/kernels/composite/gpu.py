@@ -31,7 +31,7 @@ def composite(
 
 def weights(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> Tensor:
     weight = torch.zeros_like(sigma, memory_format=torch.contiguous_format)
-    _launch(_weights, sigma, intervals, front, stop, weight)
+    _launch(sigma, intervals, front, stop, weight, None, None)
     return weight
 
 
@@ -40,16 +40,14 @@ def visible(
 ) -> tuple[Tensor, Tensor]:
     counts = intervals.offsets.new_zeros(len(front))
     left = torch.empty_like(front, memory_format=torch.contiguous_format)
-    _launch(_visible, sigma, intervals, front, stop, counts, left)
+    _launch(sigma, intervals, front, stop, None, counts, left)
     return counts, left
 
 
-def _launch(
-    kernel: triton.JITFunction, sigma: Tensor, intervals: Intervals, front: Tensor, *rest: Any
-) -> None:
+def _launch(sigma: Tensor, intervals: Intervals, front: Tensor, *rest: Any) -> None:
     check_types(torch.float32, sigma=sigma, delta=intervals.delta, front=front)
     samples = (x.contiguous() for x in (sigma, intervals.delta, intervals.offsets, front))
-    launch(kernel, (len(front),), *samples, *rest, num_warps=1)
+    launch(_light, (len(front),), *samples, *rest, num_warps=1)
 
 
 class _Composite(torch.autograd.Function):
@@ -127,32 +125,24 @@ def _forward(
 
 
 @triton.jit
-def _weights(sigma, delta, offsets, front, stop, weight):
-    ray = tl.program_id(0).to(tl.int64)
-    first, end = tl.load(offsets + ray), tl.load(offsets + ray + 1)
-    light = tl.load(front + ray)
-    while (first < end) & (light > stop):
-        i = first + tl.arange(0, BLOCK)
-        inside = i < end
-        found, _, _, light = _block(sigma, delta, first, i, inside, light, stop)
-        tl.store(weight + i, found, mask=inside)
-        first += BLOCK
-
-
-@triton.jit
-def _visible(sigma, delta, offsets, front, stop, counts, left):
+def _light(sigma, delta, offsets, front, stop, weight, counts, left):
+    """Write either the weights or the other two."""
     ray = tl.program_id(0).to(tl.int64)
     first, end = tl.load(offsets + ray), tl.load(offsets + ray + 1)
     light, count = tl.load(front + ray), tl.zeros([], tl.int64)
     last = light
     while (first < end) & (light > stop):
         i = first + tl.arange(0, BLOCK)
-        _, lit, behind, light = _block(sigma, delta, first, i, i < end, light, stop)
-        count += tl.sum(lit.to(tl.int64), 0)
-        last = tl.min(tl.where(lit, behind, last), 0)
+        found, lit, behind, light = _block(sigma, delta, first, i, i < end, light, stop)
+        if weight is not None:
+            tl.store(weight + i, found, mask=i < end)
+        else:
+            count += tl.sum(lit.to(tl.int64), 0)
+            last = tl.min(tl.where(lit, behind, last), 0)
         first += BLOCK
-    tl.store(counts + ray, count)
-    tl.store(left + ray, last)
+    if weight is None:
+        tl.store(counts + ray, count)
+        tl.store(left + ray, last)
 
 
 @triton.jit
