@@ -103,24 +103,13 @@ def test_every_kernel_has_cases_for_all_its_backends(kernel: str) -> None:
     assert {backend for backend, _ in cells} == set(dispatch.served(kernel))
 
 
-NAMES = {
-    "adam": "sparse_adam_ hash_adam_",
-    "segments": "segment_weights render_segments",
-    "blending": "blend",
-    "projection": "project_gaussians",
-    "grouped_mlp": "grouped_linear",
-    "spherical": "spherical_harmonics",
-    "voxel_light": "render_voxels shade_voxels",
-    "voxel_walk": "walk",
-}
-"""What a kernel is called where it is not called as its folder."""
-
-
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_backends_have_the_same_signature(kernel: str) -> None:
+def test_backends_have_the_same_signatures(kernel: str) -> None:
     assert availability()["reference"] == availability()["cpu"] == ""
     names = [name for name in dispatch.served(kernel) if not availability()[name]]
-    versions = [importlib.import_module(f"{kernel}.{name}") for name in names]
-    short = kernel.rpartition(".")[2]
-    for public in NAMES.get(short, short).split():
-        assert len({inspect.signature(getattr(version, public)) for version in versions}) == 1
+    versions = [vars(importlib.import_module(f"{kernel}.{name}")) for name in names]
+    shared = set.intersection(*map(set, versions))
+    public = [name for name in shared if name[0] != "_" and inspect.isfunction(versions[0][name])]
+    assert public
+    for name in public:
+        assert len({inspect.signature(version[name]) for version in versions}) == 1, name
