@@ -97,9 +97,8 @@ def hash_adam_(
         positions, grad = gradients.joined()
         check_shape("positions", positions, None, 3)
         check_shape("gradients", grad, len(positions), grid.channels)
-        implementation(__name__, backend, table.device).hash_adam_(
-            table, positions, grad, grid, state, rate, packed
-        )
+        kernel = implementation(__name__, backend, table.device)
+        kernel.hash_adam_(table, positions, grad, grid, state, rate, packed)
     gradients.clear()
 
 

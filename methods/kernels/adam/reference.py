@@ -36,7 +36,7 @@ def hash_adam_(
 ) -> None:
     asking = table.detach().requires_grad_()
     with torch.enable_grad():
-        encoded = encode(positions, asking, grid)
+        encoded = encode(positions, asking, grid, None)
     (total,) = torch.autograd.grad(encoded, asking, grad.to(table.dtype))
     sparse_adam_(table, total, state, rate)
     if packed is not None:

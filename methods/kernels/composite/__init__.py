@@ -49,9 +49,8 @@ def composite(
         check_shape("carry.values", carry.values, rays, channels)
         check_shape("carry.depth_sum", carry.depth_sum, rays)
         check_shape("carry.alpha", carry.alpha, rays)
-    return implementation(__name__, backend, sigma.device).composite(
-        sigma, values, intervals, stop, carry
-    )
+    kernel = implementation(__name__, backend, sigma.device)
+    return kernel.composite(sigma, values, intervals, stop, carry)
 
 
 def weights(
@@ -67,9 +66,8 @@ def weights(
     `front` [R] is the transmittance in front of each ray's first sample; None: 1.
     """
     front = _light(sigma, intervals, front)
-    return implementation(__name__, backend, sigma.device).weights(
-        sigma.detach(), intervals, stop, front
-    )
+    kernel = implementation(__name__, backend, sigma.device)
+    return kernel.weights(sigma.detach(), intervals, stop, front)
 
 
 def visible(
@@ -87,9 +85,8 @@ def visible(
     is as for `weights`.
     """
     front = _light(sigma, intervals, front)
-    return implementation(__name__, backend, sigma.device).visible(
-        sigma.detach(), intervals, stop, front
-    )
+    kernel = implementation(__name__, backend, sigma.device)
+    return kernel.visible(sigma.detach(), intervals, stop, front)
 
 
 def _light(sigma: Tensor, intervals: Intervals, front: Tensor | None) -> Tensor:

@@ -51,9 +51,8 @@ def corner_gather(
         low, high = (int(end) for end in torch.aminmax(voxel))
         rows, found = f"rows of the {len(corners)} voxels", f"{low} to {high}"
         expect(0 <= low <= high < len(corners), "voxel", rows, found)
-    return implementation(__name__, backend, table.device).corner_gather(
-        table, corners, voxel, weights, grad_buffer=grad_buffer
-    )
+    kernel = implementation(__name__, backend, table.device)
+    return kernel.corner_gather(table, corners, voxel, weights, grad_buffer)
 
 
 def trilinear(local: Tensor) -> Tensor:

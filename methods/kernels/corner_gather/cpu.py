@@ -19,12 +19,7 @@ CHUNK = 256  # samples
 
 
 def corner_gather(
-    table: Tensor,
-    corners: Tensor,
-    voxel: Tensor,
-    weights: Tensor,
-    *,
-    grad_buffer: Tensor | None = None,
+    table: Tensor, corners: Tensor, voxel: Tensor, weights: Tensor, grad_buffer: Tensor | None
 ) -> Tensor:
     if weights.requires_grad:
         raise ValueError("backend 'cpu' gives no gradient for weights: use backend='reference'")

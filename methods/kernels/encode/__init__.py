@@ -144,9 +144,8 @@ def encode(
         expect(grid.features == 2, "packed", "2 features an entry", grid.features)
         check_shape("packed", packed, grid.entries)
     read = table if gradients is None else table.detach()
-    features = implementation(__name__, backend, positions.device).encode(
-        positions, read, grid, packed=packed
-    )
+    kernel = implementation(__name__, backend, positions.device)
+    features = kernel.encode(positions, read, grid, packed)
     if gradients is not None:
         features = collect(features, positions, gradients)
     # NaN is rare. On a CPU one sum tests for it cheaply; on a GPU, waiting for it would cost more.

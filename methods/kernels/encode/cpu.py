@@ -25,13 +25,7 @@ CHUNK = 256  # samples; 256 * (8 indices + 8 weights + 8 values) * 4 bytes = 24 
 PRIME_Y, PRIME_Z = u32(PRIMES[1]), u32(PRIMES[2])
 
 
-def encode(
-    positions: Tensor,
-    table: Tensor,
-    grid: HashGrid,
-    *,
-    packed: Tensor | None = None,
-) -> Tensor:
+def encode(positions: Tensor, table: Tensor, grid: HashGrid, packed: Tensor | None) -> Tensor:
     if positions.requires_grad:
         raise ValueError("backend 'cpu' gives no gradient for positions: use backend='reference'")
     check_float32(positions, table)

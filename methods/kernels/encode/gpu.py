@@ -21,13 +21,7 @@ BLOCK = tl.constexpr(256)  # samples
 PRIME_Y, PRIME_Z = tl.constexpr(PRIMES[1]), tl.constexpr(PRIMES[2])
 
 
-def encode(
-    positions: Tensor,
-    table: Tensor,
-    grid: HashGrid,
-    *,
-    packed: Tensor | None = None,
-) -> Tensor:
+def encode(positions: Tensor, table: Tensor, grid: HashGrid, packed: Tensor | None) -> Tensor:
     if positions.requires_grad:
         raise ValueError("backend 'gpu' gives no gradient for positions: use backend='reference'")
     check_types(torch.float32, positions=positions, table=table)

@@ -8,13 +8,7 @@ from torch import Tensor
 from methods.kernels.encode import PRIMES, HashGrid
 
 
-def encode(
-    positions: Tensor,
-    table: Tensor,
-    grid: HashGrid,
-    *,
-    packed: Tensor | None = None,
-) -> Tensor:
+def encode(positions: Tensor, table: Tensor, grid: HashGrid, packed: Tensor | None) -> Tensor:
     inside = torch.where(positions > 0, positions, 0).clamp(max=1)
     found = []
     for level in range(grid.levels):

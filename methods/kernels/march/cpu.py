@@ -43,15 +43,11 @@ INTEGERS = 7
 
 def count(segments: Segments, occupancy: Occupancy, step: float) -> Tensor:
     """How many samples a ray has, [R] int64."""
-    return march(segments, occupancy, step, longest_ray(step)).offsets.diff()
+    return march(segments, occupancy, step, longest_ray(step), None).offsets.diff()
 
 
 def march(
-    segments: Segments,
-    occupancy: Occupancy,
-    step: float,
-    limit: int,
-    extent: Extent | None = None,
+    segments: Segments, occupancy: Occupancy, step: float, limit: int, extent: Extent | None
 ) -> Samples:
     origins, directions = segments.rays.origins, segments.rays.directions
     check_float32(origins)

@@ -30,11 +30,7 @@ def count(segments: Segments, occupancy: Occupancy, step: float) -> Tensor:
 
 
 def march(
-    segments: Segments,
-    occupancy: Occupancy,
-    step: float,
-    limit: int,
-    extent: Extent | None = None,
+    segments: Segments, occupancy: Occupancy, step: float, limit: int, extent: Extent | None
 ) -> Samples:
     arguments = _arguments(segments, occupancy, step, limit)
     counts, resume = _counted(arguments)

@@ -24,11 +24,7 @@ def count(segments: Segments, occupancy: Occupancy, step: float) -> Tensor:
 
 
 def march(
-    segments: Segments,
-    occupancy: Occupancy,
-    step: float,
-    limit: int,
-    extent: Extent | None = None,
+    segments: Segments, occupancy: Occupancy, step: float, limit: int, extent: Extent | None
 ) -> Samples:
     steps = _Steps.of(segments, step)
     parts = zip(*steps.taken(occupancy, limit), strict=True)
