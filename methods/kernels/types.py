@@ -69,8 +69,12 @@ class Occupancy:
 
     @cached_property
     def words(self) -> Tensor:
-        """One bit per cell, one int64 word per brick: [G/4, G/4, G/4]."""
-        return _pack_bricks(self.cells)
+        """A word per brick, [G/4, G/4, G/4] int64. Bit x + 4 y + 16 z is the cell (x, y, z)."""
+        side = self.resolution // BRICK
+        cells = self.cells.view(torch.uint8).view(side, BRICK, side, BRICK, side, BRICK)
+        cells = cells.permute(0, 2, 4, 5, 3, 1).reshape(side, side, side, 8, 8)  # bits of 8 bytes
+        weight = 1 << torch.arange(8, dtype=torch.uint8, device=cells.device)
+        return (cells * weight).sum(dim=-1, dtype=torch.uint8).view(torch.int64).squeeze(-1)
 
     @cached_property
     def bricks(self) -> Tensor:
@@ -104,15 +108,6 @@ class Occupancy:
             if len(filled):
                 lower[axis], upper[axis] = filled[0] / size, (filled[-1] + 1) / size
         return torch.stack((lower, upper))
-
-
-def _pack_bricks(bits: Tensor) -> Tensor:
-    """Pack cells into 64-bit words: bit x + 4 y + 16 z is the cell (x, y, z) of a 4^3 brick."""
-    side = bits.shape[0] // BRICK
-    cells = bits.view(torch.uint8).view(side, BRICK, side, BRICK, side, BRICK)
-    cells = cells.permute(0, 2, 4, 5, 3, 1).reshape(side, side, side, 8, 8)  # 8 bytes of 8 bits
-    weight = 1 << torch.arange(8, dtype=torch.uint8, device=bits.device)
-    return (cells * weight).sum(dim=-1, dtype=torch.uint8).view(torch.int64).squeeze(-1)
 
 
 @dataclass(frozen=True)

@@ -45,8 +45,7 @@ def mlp(inputs: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
     right = inputs[1] if len(inputs) > 1 else left.new_empty(len(left), 0)
     if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
         return _outputs(left, right, weights, learning=False)[0]
-    out: Tensor = _Network.apply(left, right, *weights)
-    return out
+    return _Network.apply(left, right, *weights)
 
 
 def _outputs(
