@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
 from functools import partial
 
 import torch
@@ -159,16 +158,19 @@ def _grid_lines() -> Tensor:
     return torch.tensor([(x, y, 0.3) for x in lines for y in lines], dtype=torch.float64)
 
 
-def _corners(position: list[float], level: int) -> Iterator[tuple[int, float]]:
-    """Entries around a position and their weights, computed with Python's own numbers."""
+def _exact(position: list[float], level: int, table: Tensor) -> Tensor:
+    """Features [F] of a level, with entries and weights computed with Python's own numbers."""
     places = [x * GRID.scales[level] + 0.5 for x in position]
     res, size = GRID.strides[level], GRID.sizes[level]
+    entries, weights = [], []
     for bits in itertools.product((0, 1), repeat=3):
         x, y, z = (math.floor(p) + bit for p, bit in zip(places, bits, strict=True))
-        weight = math.prod(p % 1 if bit else 1 - p % 1 for p, bit in zip(places, bits, strict=True))
         dense = x + y * res + z * res * res
         hashed = x ^ y * PRIMES[1] % 2**32 ^ z * PRIMES[2] % 2**32
-        yield GRID.offsets[level] + (dense if res else hashed) % size, weight
+        entries.append(GRID.offsets[level] + (dense if res else hashed) % size)
+        shares = (p % 1 if bit else 1 - p % 1 for p, bit in zip(places, bits, strict=True))
+        weights.append(math.prod(shares))
+    return torch.tensor(weights, dtype=torch.float64) @ table[entries].double()
 
 
 def _feature_error(positions: Tensor, backend: str, device: str, precision: str) -> float:
@@ -179,9 +181,6 @@ def _feature_error(positions: Tensor, backend: str, device: str, precision: str)
     packed = pack(table) if precision == "bf16" else None
     given = {"positions": places, "table": table.to(dtype), "grid": GRID, "packed": packed}
     (got,) = _encode(placed(given, device), backend)
-    exact = [
-        sum(weight * table[entry].double() for entry, weight in _corners(position, level))
-        for position in places.double().clamp(0, 1).tolist()
-        for level in range(GRID.levels)
-    ]
+    nearest = places.double().clamp(0, 1).tolist()
+    exact = [_exact(at, level, table) for at in nearest for level in range(GRID.levels)]
     return largest_error((got.cpu(),), (torch.cat(exact).view(got.shape),))
