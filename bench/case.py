@@ -136,10 +136,9 @@ class Property:
     derivation: str
     tolerances: Mapping[Cell, float]
 
-    def case(self, name: str, error: Callable[[str, str, str], float], slow: bool = False) -> Case:
+    def case(self, name: str, error: Callable[[str, str, str], float]) -> Case:
         """Make one case of the property."""
-        given = self.subject, name, self.holds, self.derivation, self.tolerances, error
-        return Case(*given, slow=slow)
+        return Case(self.subject, name, self.holds, self.derivation, self.tolerances, error)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 
 import torch
@@ -20,8 +20,6 @@ from methods.kernels.encode import HashGrid, SampleGradients
 
 BETAS = (0.9, 0.99)
 EPS = 1e-15
-
-_NAMES = ("first", "second", "steps")
 
 
 @dataclass
@@ -44,12 +42,11 @@ class AdamState:
     @classmethod
     def of(cls, tensors: Mapping[str, Tensor], prefix: str, device: torch.device) -> AdamState:
         """Restore the state from the result of `tensors` with the same prefix, on `device`."""
-        first, second, steps = (tensors[f"{prefix}{name}"].to(device) for name in _NAMES)
-        return cls(first, second, steps)
+        return cls(*(tensors[f"{prefix}{field.name}"].to(device) for field in fields(cls)))
 
     def tensors(self, prefix: str) -> dict[str, Tensor]:
         """The state, for a checkpoint; names begin with `prefix`."""
-        return {f"{prefix}{name}": getattr(self, name) for name in _NAMES}
+        return {f"{prefix}{name}": tensor for name, tensor in vars(self).items()}
 
 
 @cache

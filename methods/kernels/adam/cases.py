@@ -12,7 +12,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from bench.case import U32, Bound, Case, Given, Operation, Property, uniform
+from bench.case import U32, Bound, Case, Given, Operation, Property, on_backends, uniform
 from methods.kernels.adam import BETAS, AdamState, hash_adam_, sparse_adam_
 from methods.kernels.dispatch import served
 from methods.kernels.encode import HashGrid, SampleGradients, encode, pack
@@ -63,7 +63,7 @@ def cases() -> list[Case]:
         "adam",
         "the step is that of the closed form",
         "moments, corrections, root, quotient and sum: 16 u of rates of 1",
-        {(backend, "fp32"): 16 * U32 for backend in served(__package__)},
+        on_backends(16, backends=served(__package__)),
     )
     found = [
         first.case(f"first gradient {gradient:g}", partial(_first_step_error, gradient))
