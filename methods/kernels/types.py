@@ -146,7 +146,7 @@ class Intervals:
     delta: Tensor
     offsets: Tensor
     longest: int | None = field(default=None, kw_only=True)
-    of_a_sample: ClassVar[tuple[str, ...]] = "t", "delta"
+    of_a_sample: ClassVar[tuple[str, ...]] = "t", "delta"  # what has a row for each sample
 
     def __len__(self) -> int:
         return len(self.t)

@@ -71,9 +71,8 @@ def _unsigned(words: Tensor) -> np.ndarray:
 
 def level_arrays(grid: HashGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`HashGrid.scales`, `strides` and `offsets`."""
-    shapes = (grid.scales, np.float32), (grid.strides, np.uint32), (grid.offsets, np.int64)
-    scales, strides, offsets = (np.array(*shape) for shape in shapes)
-    return scales, strides, offsets
+    strides, offsets = np.array(grid.strides, np.uint32), np.array(grid.offsets, np.int64)
+    return np.array(grid.scales, np.float32), strides, offsets
 
 
 @njit(cache=True, fastmath=FAST)
