@@ -88,10 +88,8 @@ class Voxels:
         clearance = torch.zeros_like(near)
         for _ in range(min(self.resolution // BRICK, MAX_CLEARANCE)):
             clearance += near == 0
-            for axis in range(3):  # maximum over a cube, one axis at a time
-                kernel, padding = [1, 1, 1], [0, 0, 0]
-                kernel[axis], padding[axis] = 3, 1
-                near = functional.max_pool3d(near, kernel, stride=1, padding=padding)
+            for size in ((3, 1, 1), (1, 3, 1), (1, 1, 3)):  # maximum over a cube, axis by axis
+                near = functional.max_pool3d(near, size, 1, [n // 2 for n in size])
         return clearance[0, 0].to(torch.uint8)
 
     @cached_property
