@@ -41,18 +41,16 @@ K, RAY, COUNT, CELL, FREE = 0, 1, 2, 3, 6
 INTEGERS = 7
 
 
-def count(segments: Segments, occupancy: Occupancy, step: float) -> Tensor:
+def count(segments: Segments, occupancy: Occupancy) -> Tensor:
     """How many samples a ray has, [R] int64."""
-    return march(segments, occupancy, step, longest_ray(step), None).offsets.diff()
+    return march(segments, occupancy, None).offsets.diff()
 
 
-def march(
-    segments: Segments, occupancy: Occupancy, step: float, limit: int, extent: Extent | None
-) -> Samples:
-    origins, directions = segments.rays.origins, segments.rays.directions
+def march(segments: Segments, occupancy: Occupancy, extent: Extent | None) -> Samples:
+    step, origins, directions = segments.step, segments.rays.origins, segments.rays.directions
     check_float32(origins)
     rays = len(origins)
-    most = min(limit, longest_ray(step))
+    most = min(segments.limit, longest_ray(step))
     size = -(-rays // CHUNK) * CHUNK * most
     scratch, owners = torch.empty(size), torch.empty(size, dtype=torch.uint8)
     counts = torch.empty(rays, dtype=torch.int64)
