@@ -35,7 +35,7 @@ def cells() -> Iterator[Any]:
 KERNELS = kernels("cpu")
 
 
-@pytest.mark.parametrize(("case", "cell"), cells())
+@pytest.mark.parametrize(("case", "cell"), list(cells()))
 def test_it_holds(case: Case, cell: Cell, device: str) -> None:
     row = case.check(cell, device)
     if row["status"].startswith("unavailable"):
