@@ -103,8 +103,8 @@ class Property:
     derivation: str
     tolerances: Mapping[Cell, float]
 
-    def case(self, name: str, error: Callable[[str, str, str], float], slow: bool = False) -> Case:
-        return Case(name=name, error=error, slow=slow, **vars(self))
+    def case(self, name: str, error: Callable[[str, str, str], float]) -> Case:
+        return Case(name=name, error=error, **vars(self))
 
 
 @dataclass(frozen=True)

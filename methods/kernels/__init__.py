@@ -5,12 +5,6 @@ version (any dtype, any device, differentiable; the others are compared with it)
 version, `gpu` the Triton version. All backends of a kernel have the same signature.
 """
 
-from methods.kernels.dispatch import (
-    BACKENDS,
-    availability,
-    compiled,
-    multiplies_bf16,
-    resolve,
-)
+from methods.kernels.dispatch import BACKENDS, availability, compiled, multiplies_bf16, resolve
 
 __all__ = ["BACKENDS", "availability", "compiled", "multiplies_bf16", "resolve"]

@@ -39,6 +39,10 @@ ROWS = 6
 TALL = 12 if get_host_cpu_features().get("avx512f") else ROWS
 """Rows that `tall` computes together: AVX-512 has 32 registers, each as wide as 16 sums."""
 
+FAST = {"contract", "reassoc", "nsz", "arcp"}
+"""Flags of fastmath: reordering and fused multiply-adds are allowed; assuming that there is no NaN
+is not."""
+
 LANES = 16
 """Outputs that both compute together."""
 
@@ -178,7 +182,7 @@ def prefetch_row(array, at, count):
     prefetch(array, at + count - 1)
 
 
-def _product(rows: int, relu: bool):
+def _product(rows: int):
     """out[r, o] = bias[o] + sum_k a[r, k] w[k, o] for `rows` r and `LANES` o, of flat arrays.
 
     LLVM does not keep the sums of a loop nest in registers by itself (13 instead of 40 GFLOP/s a
@@ -186,21 +190,19 @@ def _product(rows: int, relu: bool):
 
     Its arguments: a, the place of a[0, 0], steps to the next r and the next k; w, the place of
     w[0, 0], the step to the next k; bias, its place; out, its place, the step to the next r; how
-    many k there are, 1 or more.
+    many k there are, 1 or more; whether negative results become 0.
     """
 
     @intrinsic
     def product(
-        typing, a, a_at, a_row, a_step, w, w_at, w_step, bias, bias_at, out, out_at, out_row, count
+        ctx, a, a_at, a_row, a_step, w, w_at, w_step, bias, b_at, out, out_at, out_row, count, relu
     ):
         def generate(context, builder, signature, values):
             index = ir.IntType(64)
             vector = ir.VectorType(ir.FloatType(), LANES)
             zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
             fma = cgutils.get_or_insert_function(
-                builder.module,
-                ir.FunctionType(vector, [vector] * 3),
-                f"llvm.fma.v{LANES}f32",
+                builder.module, ir.FunctionType(vector, [vector] * 3), f"llvm.fma.v{LANES}f32"
             )
 
             def pointer(array: int) -> ir.Value:
@@ -241,23 +243,21 @@ def _product(rows: int, relu: bool):
             builder.cbranch(builder.icmp_signed("<", next_k, values[12]), loop, after)
 
             builder.position_at_end(after)
-            nothing = ir.Constant(vector, [0.0] * LANES)
+            least = [ir.Constant(ir.FloatType(), end) for end in (0.0, -math.inf)]
+            floor = splat(builder.select(values[13], *least))
             for r, result in enumerate(results):
-                if relu:  # NaN is not below 0 and stays
-                    below = builder.fcmp_ordered("<", result, nothing)
-                    result = builder.select(below, nothing, result)
-                builder.store(result, lanes(out_data, row(values[11], r)), align=4)
+                below = builder.fcmp_ordered("<", result, floor)  # NaN is not, and stays
+                shown = builder.select(below, floor, result)
+                builder.store(shown, lanes(out_data, row(values[11], r)), align=4)
             return context.get_dummy_value()
 
         n = types.int64
-        return types.void(a, n, n, n, w, n, n, bias, n, out, n, n, n), generate
+        return types.void(a, n, n, n, w, n, n, bias, n, out, n, n, n, types.boolean), generate
 
     return product
 
 
-six, six_relu = _product(ROWS, relu=False), _product(ROWS, relu=True)
-tall, tall_relu = _product(TALL, relu=False), _product(TALL, relu=True)
-_one, _one_relu = _product(1, relu=False), _product(1, relu=True)
+six, tall, _one = _product(ROWS), _product(TALL), _product(1)
 
 
 @njit(cache=True)
@@ -271,21 +271,9 @@ def multiply(rows, a, a_at, a_row, a_step, w, width, bias, out, out_at, count, r
             r = min(r, rows - size)  # the last ones overlap: some are computed twice
             at, to = a_at + r * a_row, out_at + r * width + left
             if size == TALL:
-                if relu:
-                    tall_relu(
-                        a, at, a_row, a_step, w, left, width, bias, left, out, to, width, count
-                    )
-                else:
-                    tall(a, at, a_row, a_step, w, left, width, bias, left, out, to, width, count)
+                tall(a, at, a_row, a_step, w, left, width, bias, left, out, to, width, count, relu)
             elif size == ROWS:
-                if relu:
-                    six_relu(
-                        a, at, a_row, a_step, w, left, width, bias, left, out, to, width, count
-                    )
-                else:
-                    six(a, at, a_row, a_step, w, left, width, bias, left, out, to, width, count)
-            elif relu:
-                _one_relu(a, at, a_row, a_step, w, left, width, bias, left, out, to, width, count)
+                six(a, at, a_row, a_step, w, left, width, bias, left, out, to, width, count, relu)
             else:
-                _one(a, at, a_row, a_step, w, left, width, bias, left, out, to, width, count)
+                _one(a, at, a_row, a_step, w, left, width, bias, left, out, to, width, count, relu)
             r += size

@@ -7,7 +7,7 @@ import importlib
 import importlib.util
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -23,8 +23,6 @@ BACKENDS = ("reference", "cpu", "gpu")
 def availability() -> dict[str, str]:
     """For each backend, "" if it can be used here, otherwise why not and how to get it."""
     reasons = dict.fromkeys(BACKENDS, "")
-    if importlib.util.find_spec("numba") is None:
-        reasons["cpu"] = "numba is not installed: pip install numba"
     if importlib.util.find_spec("triton") is None:
         reasons["gpu"] = "Triton is not installed; it comes with torch for CUDA"
     elif not (torch.cuda.is_available() or interpreted()):
@@ -33,10 +31,7 @@ def availability() -> dict[str, str]:
 
 
 def interpreted() -> bool:
-    """Whether Triton interprets the kernels of `gpu` on CPU tensors instead of compiling them.
-
-    This is slow, and meant for tests without a GPU.
-    """
+    """Whether Triton interprets the kernels of `gpu` on CPU tensors, slowly, for tests."""
     return os.environ.get("TRITON_INTERPRET") == "1"
 
 
@@ -46,9 +41,8 @@ def resolve(backend: str, device: torch.device | str) -> str:
     `auto` depends only on the device: `cpu` for CPU tensors, `reference` for all others. The
     kernels of `gpu` have never been run on a GPU, so they must be chosen by name.
 
-    Raises:
-        Unavailable: the named backend is unknown, cannot be used here, or does not compute on this
-            device.
+    Raises `Unavailable` if the named backend is unknown, cannot be used here, or does not compute
+    on this device.
     """
     kind = torch.device(device).type
     if backend == "auto":
@@ -61,15 +55,11 @@ def resolve(backend: str, device: torch.device | str) -> str:
         )
     if reason := availability()[backend]:
         raise Unavailable(f"backend={backend!r} cannot be used here: {reason}")
-    if backend == "cpu" and kind != "cpu":
+    device = {"cpu": "cpu", "gpu": kind if interpreted() else "cuda"}.get(backend, kind)
+    if kind != device:
         raise Unavailable(
-            f"backend='cpu' serves CPU tensors, these are on {kind!r}: "
-            "use backend=auto or device=cpu"
-        )
-    if backend == "gpu" and kind != "cuda" and not interpreted():
-        raise Unavailable(
-            f"backend='gpu' serves CUDA tensors, these are on {kind!r}: "
-            "use backend=auto or device=cuda"
+            f"backend={backend!r} serves {device.upper()} tensors, these are on {kind!r}: "
+            f"use backend=auto or device={device}"
         )
     return backend
 
@@ -98,22 +88,20 @@ def multiplies_bf16(kind: str) -> bool:
 def implementation(kernel: str, backend: str, device: torch.device) -> ModuleType:
     """The module that implements `kernel`, a package, for tensors on `device`.
 
-    With `auto`, a kernel without a version for the CPU is computed there by its reference.
-
-    Raises:
-        Unavailable: see `resolve`; or the kernel has no such version.
+    With `auto`, a kernel without a version for the CPU is computed there by its reference. Raises
+    `Unavailable` as `resolve` does, or if the kernel has no such version.
     """
     for called in _calls:
         called.add(kernel)
     backend = _forced.get(kernel, backend)
     name = resolve(backend, device)
-    if backend == "auto" and name not in served(kernel):
-        name = "reference"
     if name not in served(kernel):
-        raise Unavailable(
-            f"backend={name!r}: {kernel.rpartition('.')[2]} has no such version, only "
-            f"{' and '.join(served(kernel))}: use backend=auto"
-        )
+        if backend != "auto":
+            raise Unavailable(
+                f"backend={name!r}: {kernel.rpartition('.')[2]} has no such version, only "
+                f"{' and '.join(served(kernel))}: use backend=auto"
+            )
+        name = "reference"
     if name == "cpu":
         _load("methods.kernels.cpu").follow_torch_threads()
     return _load(f"{kernel}.{name}")
@@ -151,15 +139,13 @@ def compiled(device: str) -> list[str]:
     """The backends that run on `device` here at full speed, which excludes an interpreted one."""
     usable = []
     for name in BACKENDS:
-        try:
+        with suppress(Unavailable):
             usable.append(resolve(name, device))
-        except Unavailable:
-            continue
     return [name for name in usable if not (name == "gpu" and interpreted())]
 
 
 _forced: dict[str, str] = {}
 _calls: list[set[str]] = []
 
-# Imported on first use, because numba and Triton are heavy and not every machine has both.
+# Imported on first use, because numba and Triton are heavy and not every machine has the latter.
 _load = cache(importlib.import_module)

@@ -6,8 +6,9 @@ An `Occupancy` says where samples may lie, `Samples` are `Intervals` on rays wit
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -68,8 +69,12 @@ class Occupancy:
 
     @cached_property
     def words(self) -> Tensor:
-        """One bit per cell, one int64 word per brick: [G/4, G/4, G/4]."""
-        return _pack_bricks(self.cells)
+        """A word per brick, [G/4, G/4, G/4] int64. Bit x + 4 y + 16 z is the cell (x, y, z)."""
+        side = self.resolution // BRICK
+        cells = self.cells.view(torch.uint8).view(side, BRICK, side, BRICK, side, BRICK)
+        cells = cells.permute(0, 2, 4, 5, 3, 1).reshape(side, side, side, 8, 8)  # bits of 8 bytes
+        weight = 1 << torch.arange(8, dtype=torch.uint8, device=cells.device)
+        return (cells * weight).sum(dim=-1, dtype=torch.uint8).view(torch.int64).squeeze(-1)
 
     @cached_property
     def bricks(self) -> Tensor:
@@ -105,23 +110,9 @@ class Occupancy:
         return torch.stack((lower, upper))
 
 
-def _pack_bricks(bits: Tensor) -> Tensor:
-    """Pack cells into 64-bit words: bit x + 4 y + 16 z is the cell (x, y, z) of a 4^3 brick."""
-    side = bits.shape[0] // BRICK
-    cells = bits.view(torch.uint8).view(side, BRICK, side, BRICK, side, BRICK)
-    cells = cells.permute(0, 2, 4, 5, 3, 1).reshape(side, side, side, 8, 8)  # 8 bytes of 8 bits
-    weight = 1 << torch.arange(8, dtype=torch.uint8, device=bits.device)
-    return (cells * weight).sum(dim=-1, dtype=torch.uint8).view(torch.int64).squeeze(-1)
-
-
 @dataclass(frozen=True)
 class Extent:
-    """Sample counts of some rays, known to the host.
-
-    Attributes:
-        total: samples of all rays together.
-        longest: samples of the ray that has the most.
-    """
+    """How many samples some rays have, in `total`, and the one with the most; known to the host."""
 
     total: int
     longest: int
@@ -132,6 +123,11 @@ class Extent:
         counts = functional.pad(counts, (0, 1))  # for a group without rays
         figures = torch.stack((counts.sum(dim=1), counts.amax(dim=1)), dim=1)
         return [cls(*size) for size in figures.tolist()]
+
+
+def offsets_of(counts: Tensor) -> Tensor:
+    """Where each ray's samples begin [R + 1], given its `counts` [R]; the last one is the end."""
+    return functional.pad(counts.cumsum(dim=0), (1, 0))
 
 
 @dataclass(frozen=True)
@@ -150,14 +146,25 @@ class Intervals:
     delta: Tensor
     offsets: Tensor
     longest: int | None = field(default=None, kw_only=True)
+    of_a_sample: ClassVar[tuple[str, ...]] = "t", "delta"  # what has a row for each sample
 
-    def first_of_each(self, counts: Tensor) -> tuple[Tensor, Tensor, int]:
-        """Indices of the first `counts` [R] samples of each ray, and their `offsets` and `longest`.
-        The host waits for a GPU."""
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def front(self, counts: Tensor) -> Self:
+        """Only the first `counts` [R] samples of each ray. The host waits for a GPU."""
         (extent,) = Extent.of_each(counts[None])
-        offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
+        offsets = offsets_of(counts)
         shift = (self.offsets - offsets)[:-1].repeat_interleave(counts, output_size=extent.total)
-        return torch.arange(extent.total, device=shift.device) + shift, offsets, extent.longest
+        index = torch.arange(extent.total, device=shift.device) + shift
+        return self.chosen(index, offsets, extent.longest)
+
+    def chosen(self, index: Tensor, offsets: Tensor, longest: int | None) -> Self:
+        """Only the samples at `index` [N], which lie on the rays as `offsets` [R + 1] say."""
+        # A row at a time; `x[index]` goes number by number.
+        columns = {name: getattr(self, name) for name in self.of_a_sample}
+        some = {name: x.index_select(0, index) for name, x in columns.items() if x is not None}
+        return replace(self, **some, offsets=offsets, longest=longest)
 
 
 @dataclass(frozen=True)
@@ -175,23 +182,12 @@ class Samples(Intervals):
     positions: Tensor
     resume: Tensor
     encoded: Tensor | None = field(default=None, kw_only=True)
+    of_a_sample: ClassVar[tuple[str, ...]] = "t", "delta", "ray", "positions", "encoded"
 
-    def __len__(self) -> int:
-        return len(self.t)
-
-    def front(self, counts: Tensor) -> Samples:
-        """Only the first `counts` [R] samples of each ray, with no more to follow."""
-        return self.chosen(*self.first_of_each(counts))
-
-    def chosen(self, index: Tensor, offsets: Tensor, longest: int | None) -> Samples:
-        """Only the samples at `index` [N], which lie on the rays as `offsets` [R + 1] say, with no
-        more to follow. `longest` is as for `Intervals`."""
-        # A row at a time; `x[index]` goes number by number.
-        columns = self.t, self.delta, self.ray, self.positions
-        t, delta, ray, positions = (column.index_select(0, index) for column in columns)
-        encoded = None if self.encoded is None else self.encoded.index_select(0, index)
-        resume = torch.full_like(self.resume, -1)
-        return Samples(t, delta, offsets, ray, positions, resume, longest=longest, encoded=encoded)
+    def chosen(self, index: Tensor, offsets: Tensor, longest: int | None) -> Self:
+        """As of `Intervals`, with no more to follow."""
+        some = super().chosen(index, offsets, longest)
+        return replace(some, resume=torch.full_like(self.resume, -1))
 
 
 @dataclass(frozen=True)
@@ -205,17 +201,18 @@ class Pixels:
     @classmethod
     def blank(cls, rays: int, channels: int, device: torch.device | str = "cpu") -> Pixels:
         """Rays before any sample is composited: all zeros."""
-        return cls(
-            torch.zeros(rays, channels, device=device),
-            torch.zeros(rays, device=device),
-            torch.zeros(rays, device=device),
-        )
+        shapes = (rays, channels), (rays,), (rays,)
+        return cls(*(torch.zeros(shape, device=device) for shape in shapes))
 
     def take(self, index: Tensor | slice) -> Pixels:
         """The rays at `index`."""
         if isinstance(index, slice):
             return Pixels(*(x[index] for x in self._columns))
         return Pixels(*(x.index_select(0, index) for x in self._columns))
+
+    def copy(self) -> Pixels:
+        """Contiguous tensors of their own."""
+        return Pixels(*(x.clone(memory_format=torch.contiguous_format) for x in self._columns))
 
     def put(self, index: Tensor | slice, pixels: Pixels) -> None:
         """Replace, in place, the rays at `index`."""

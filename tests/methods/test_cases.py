@@ -5,14 +5,13 @@ from __future__ import annotations
 import importlib
 import inspect
 from collections.abc import Iterator
-from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
-import methods.kernels
 from bench.case import Case, Cell, Difference, nearest
-from methods.checks import found, kernels
+from methods.checks import found, kernels, modules
 from methods.kernels import availability, dispatch
 
 CASES = found("cases")
@@ -21,25 +20,22 @@ DEAR = ("march", "composite backward", "encode backward")
 """Subjects whose kernels of the GPU have loops or many operations: interpreted, they take long."""
 
 
-def marks(case: Case, cell: Cell) -> list[pytest.MarkDecorator]:
+def cells() -> Iterator[Any]:
     """Of a kernel that takes long in the interpreter, `make test` takes the first case."""
-    interpreted = cell[0] == "gpu" and not torch.cuda.is_available()
-    first = next(other for other in QUICK if other.subject == case.subject)
-    slow = interpreted and case.subject in DEAR and case is not first
-    return [pytest.mark.slow] if slow else []
+    begun = set()
+    for case in QUICK:
+        for cell in case.tolerances:
+            interpreted = cell[0] == "gpu" and not torch.cuda.is_available()
+            slow = interpreted and case.subject in DEAR and case.subject in begun
+            name = f"{case.subject}: {case.name}: {' '.join(cell)}"
+            yield pytest.param(case, cell, id=name, marks=[pytest.mark.slow] * slow)
+        begun.add(case.subject)
 
 
-CELLS = [
-    pytest.param(
-        case, cell, id=f"{case.subject}: {case.name}: {' '.join(cell)}", marks=marks(case, cell)
-    )
-    for case in QUICK
-    for cell in case.tolerances
-]
 KERNELS = kernels("cpu")
 
 
-@pytest.mark.parametrize(("case", "cell"), CELLS)
+@pytest.mark.parametrize(("case", "cell"), list(cells()))
 def test_it_holds(case: Case, cell: Cell, device: str) -> None:
     row = case.check(cell, device)
     if row["status"].startswith("unavailable"):
@@ -47,13 +43,12 @@ def test_it_holds(case: Case, cell: Cell, device: str) -> None:
     assert row["status"] == "ok", row
 
 
-MANY_BLOCKS = {"methods.kernels.march": {"inside and outside"}}
-"""Kernels whose blocks are larger where they are interpreted, and cases of several small blocks."""
-
-
 @pytest.fixture
-def blocks_of_a_gpu(kernel: str) -> Iterator[None]:
-    module = importlib.import_module(f"{kernel}.gpu")
+def blocks_of_a_gpu() -> Iterator[None]:
+    """The march has larger blocks where it is interpreted; no other kernel has."""
+    sized = [name for name in kernels("gpu") if "interpreted()" in source(f"{name}.gpu")]
+    assert sized == ["methods.kernels.march"]
+    module = importlib.import_module("methods.kernels.march.gpu")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dispatch, "interpreted", lambda: False)
         importlib.reload(module)
@@ -61,29 +56,18 @@ def blocks_of_a_gpu(kernel: str) -> Iterator[None]:
     importlib.reload(module)
 
 
+def source(module: str) -> str:
+    return inspect.getsource(importlib.import_module(module))
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(torch.cuda.is_available(), reason="here all cases have them")
+@pytest.mark.skipif(bool(availability()["gpu"]), reason="Triton has no build for this platform")
 @pytest.mark.usefixtures("blocks_of_a_gpu")
-@pytest.mark.parametrize("kernel", MANY_BLOCKS)
-def test_it_holds_in_the_blocks_of_a_gpu(kernel: str) -> None:
-    if reason := availability()["gpu"]:
-        pytest.skip(reason)
-    cases = importlib.import_module(f"{kernel}.cases").cases()
-    chosen = [case for case in cases if case.name in MANY_BLOCKS[kernel]]
-    for case in chosen:
-        for cell in case.tolerances:
-            if cell[0] == "gpu":
-                row = case.check(cell, "cpu")
-                assert row["status"] == "ok", row
-
-
-def test_no_kernel_with_blocks_of_its_own_for_the_interpreter_is_left_out() -> None:
-    sized = {
-        kernel
-        for kernel in kernels("gpu")
-        if "interpreted()" in inspect.getsource(importlib.import_module(f"{kernel}.gpu"))
-    }
-    assert sized == set(MANY_BLOCKS)
+def test_it_holds_in_the_blocks_of_a_gpu() -> None:
+    (case,) = (x for x in CASES if (x.subject, x.name) == ("march", "inside and outside"))
+    row = case.check(("gpu", "fp32"), "cpu")
+    assert row["status"] == "ok", row
 
 
 @pytest.mark.parametrize(
@@ -107,12 +91,9 @@ def test_no_two_cases_have_the_same_name() -> None:
 
 @pytest.mark.parametrize("name", ["cases", "experiments"])
 def test_every_file_of_checks_has_some(name: str) -> None:
-    root = Path(methods.kernels.__file__).parents[2]
-    paths = [path for top in ("bench", "methods") for path in (root / top).rglob(f"{name}.py")]
-    assert paths
-    for path in paths:
-        module = ".".join(path.relative_to(root).with_suffix("").parts)
-        assert getattr(importlib.import_module(module), name)()
+    files = modules(name)
+    assert files
+    assert all(getattr(importlib.import_module(module), name)() for module in files)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -122,28 +103,13 @@ def test_every_kernel_has_cases_for_all_its_backends(kernel: str) -> None:
     assert {backend for backend, _ in cells} == set(dispatch.served(kernel))
 
 
-NAMES = {
-    "adam": "sparse_adam_ hash_adam_",
-    "segments": "segment_weights render_segments",
-    "blending": "blend",
-    "projection": "project_gaussians",
-    "grouped_mlp": "grouped_linear",
-    "spherical": "spherical_harmonics",
-    "voxel_light": "render_voxels shade_voxels",
-    "voxel_walk": "walk",
-}
-"""What a kernel is called where it is not called as its folder."""
-
-
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_backends_have_the_same_signature(kernel: str) -> None:
-    names = [name for name in dispatch.served(kernel) if not availability()[name]]
-    assert {"reference", "cpu"} <= set(names)
-    modules = [importlib.import_module(f"{kernel}.{name}") for name in names]
-    short = kernel.rpartition(".")[2]
-    for public in NAMES.get(short, short).split():
-        assert len({inspect.signature(getattr(module, public)) for module in modules}) == 1
-
-
-def test_reference_and_cpu_are_usable_everywhere() -> None:
+def test_backends_have_the_same_signatures(kernel: str) -> None:
     assert availability()["reference"] == availability()["cpu"] == ""
+    names = [name for name in dispatch.served(kernel) if not availability()[name]]
+    versions = [vars(importlib.import_module(f"{kernel}.{name}")) for name in names]
+    shared = set.intersection(*map(set, versions))
+    public = [name for name in shared if name[0] != "_" and inspect.isfunction(versions[0][name])]
+    assert public
+    for name in public:
+        assert len({inspect.signature(version[name]) for version in versions}) == 1, name

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 
 import torch
@@ -20,8 +20,6 @@ from methods.kernels.encode import HashGrid, SampleGradients
 
 BETAS = (0.9, 0.99)
 EPS = 1e-15
-
-_NAMES = ("first", "second", "steps")
 
 
 @dataclass
@@ -44,12 +42,11 @@ class AdamState:
     @classmethod
     def of(cls, tensors: Mapping[str, Tensor], prefix: str, device: torch.device) -> AdamState:
         """Restore the state from the result of `tensors` with the same prefix, on `device`."""
-        first, second, steps = (tensors[f"{prefix}{name}"].to(device) for name in _NAMES)
-        return cls(first, second, steps)
+        return cls(*(tensors[f"{prefix}{field.name}"].to(device) for field in fields(cls)))
 
     def tensors(self, prefix: str) -> dict[str, Tensor]:
         """The state, for a checkpoint; names begin with `prefix`."""
-        return {f"{prefix}{name}": getattr(self, name) for name in _NAMES}
+        return {f"{prefix}{name}": tensor for name, tensor in vars(self).items()}
 
 
 @cache
@@ -64,22 +61,15 @@ def corrections() -> Tensor:
 
 
 def sparse_adam_(
-    table: Tensor,
-    grad: Tensor,
-    state: AdamState,
-    rate: float,
-    *,
-    packed: Tensor | None = None,
-    backend: str = "auto",
+    table: Tensor, grad: Tensor, state: AdamState, rate: float, *, backend: str = "auto"
 ) -> None:
     """Update in place the entries of `table` [entries, F] with a non-zero `grad`; clear `grad`.
 
-    The bias correction uses the entry's own step count. `packed`, the bfloat16 copy of the table
-    (`encode.pack`), is updated, too, if given.
+    The bias correction uses the entry's own step count.
     """
     check_shape("grad", grad, *table.shape)
-    _check(table, state, packed)
-    implementation(__name__, backend, table.device).sparse_adam_(table, grad, state, rate, packed)
+    _check(table, state)
+    implementation(__name__, backend, table.device).sparse_adam_(table, grad, state, rate)
 
 
 def hash_adam_(
@@ -92,24 +82,24 @@ def hash_adam_(
     packed: Tensor | None = None,
     backend: str = "auto",
 ) -> None:
-    """`sparse_adam_` for the hash table of `grid`, with the sum of its `gradients`; clear them."""
+    """`sparse_adam_` for the hash table of `grid`, with the sum of its `gradients`; clear them.
+
+    `packed`, the bfloat16 copy of the table (`encode.pack`), is updated, too, if given.
+    """
     check_shape("table", table, grid.entries, grid.features)
-    _check(table, state, packed)
+    _check(table, state)
+    if packed is not None:
+        check_shape("packed", packed, grid.entries)
     if gradients:
         positions, grad = gradients.joined()
         check_shape("positions", positions, None, 3)
         check_shape("gradients", grad, len(positions), grid.channels)
-        implementation(__name__, backend, table.device).hash_adam_(
-            table, positions, grad, grid, state, rate, packed
-        )
+        kernel = implementation(__name__, backend, table.device)
+        kernel.hash_adam_(table, positions, grad, grid, state, rate, packed)
     gradients.clear()
 
 
-def _check(table: Tensor, state: AdamState, packed: Tensor | None) -> None:
-    entries, features = table.shape
-    for name, tensor in (("first", state.first), ("second", state.second)):
-        check_shape(name, tensor, entries, features)
-    check_shape("steps", state.steps, entries)
-    if packed is not None:
-        check_shape("packed", packed, entries)
-        check_shape("table, to be packed,", table, None, 2)
+def _check(table: Tensor, state: AdamState) -> None:
+    check_shape("first", state.first, *table.shape)
+    check_shape("second", state.second, *table.shape)
+    check_shape("steps", state.steps, len(table))

@@ -12,7 +12,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from bench.case import U32, Bound, Case, Given, Operation, Property, uniform
+from bench.case import U32, Bound, Case, Given, Operation, Property, on_backends, uniform
 from methods.kernels.adam import BETAS, AdamState, hash_adam_, sparse_adam_
 from methods.kernels.dispatch import served
 from methods.kernels.encode import HashGrid, SampleGradients, encode, pack
@@ -47,22 +47,23 @@ BOUNDS = {
         lambda given: SECOND * given["most"] ** 2,
     ),
     "steps": Bound("counted: 0", 0.0),
-    "packed": Bound(
-        "of the backend's own table, it is one of the two nearest bfloat16: 2^-7 of a number",
-        lambda given: (given["table"].abs() + 1.2 * STEPS * RATE) / 128,
-    ),
 }
+PACKED = Bound(
+    "of the backend's own table, it is one of the two nearest bfloat16: 2^-7 of a number",
+    lambda given: (given["table"].abs() + 1.2 * STEPS * RATE) / 128,
+)
 
 
 def cases() -> list[Case]:
     """Tables in which none, some or all entries have a gradient; tiny and huge gradients."""
     dense = Operation("adam", served(__package__), _dense_steps, BOUNDS)
-    hashed = Operation("hash adam", served(__package__), _hash_steps, BOUNDS)
+    bounds = {**BOUNDS, "packed": PACKED}
+    hashed = Operation("hash adam", served(__package__), _hash_steps, bounds)
     first = Property(
         "adam",
         "the step is that of the closed form",
         "moments, corrections, root, quotient and sum: 16 u of rates of 1",
-        {(backend, "fp32"): 16 * U32 for backend in served(__package__)},
+        on_backends(16, backends=served(__package__)),
     )
     found = [
         first.case(f"first gradient {gradient:g}", partial(_first_step_error, gradient))
@@ -90,10 +91,10 @@ def _dense(count: int, share: float, features: int) -> Given:
 
 
 def _dense_steps(given: Given, backend: str) -> tuple[Tensor, ...]:
-    table, state, packed = _start(given["table"])
+    table, state = given["table"].clone(), AdamState.like(given["table"])
     for grad in given["grads"]:
-        sparse_adam_(table, grad.clone(), state, RATE, packed=packed, backend=backend)
-    return _end(table, state, packed)
+        sparse_adam_(table, grad.clone(), state, RATE, backend=backend)
+    return table, state.first, state.second, state.steps
 
 
 def _hashed(samples: int, features: int) -> Given:
@@ -113,28 +114,17 @@ def _hashed(samples: int, features: int) -> Given:
 
 
 def _hash_steps(given: Given, backend: str) -> tuple[Tensor, ...]:
-    table, state, packed = _start(given["table"])
+    """With two features, there is a packed copy; the result says by how much it is off."""
+    table, state = given["table"].clone(), AdamState.like(given["table"])
+    packed = pack(table) if table.shape[1] == 2 else None
     for positions, grads in given["steps"]:
-        parts = SampleGradients()
-        for part in zip(positions.split(40), grads.split(40), strict=True):
-            parts.add(*part)
+        parts = SampleGradients(zip(positions.split(40), grads.split(40), strict=True))
         hash_adam_(table, parts, given["grid"], state, RATE, packed=packed, backend=backend)
-    return _end(table, state, packed)
-
-
-def _start(table: Tensor) -> tuple[Tensor, AdamState, Tensor | None]:
-    """With two features, there is a packed copy."""
-    return table.clone(), AdamState.like(table), pack(table) if table.shape[1] == 2 else None
-
-
-def _end(table: Tensor, state: AdamState, packed: Tensor | None) -> tuple[Tensor, ...]:
-    """What has changed; of the packed copy, by how much it is off the table's."""
-    off = table.new_zeros(0) if packed is None else _rounded(packed) - _rounded(pack(table))
+    off = table.new_zeros(0)
+    if packed is not None:
+        rounded, nearest = (x[:, None].view(torch.bfloat16).float() for x in (packed, pack(table)))
+        off = rounded - nearest
     return table, state.first, state.second, state.steps, off
-
-
-def _rounded(packed: Tensor) -> Tensor:
-    return packed[:, None].view(torch.bfloat16).float()
 
 
 def _first_step_error(gradient: float, backend: str, device: str, precision: str) -> float:

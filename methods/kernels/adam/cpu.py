@@ -7,6 +7,7 @@ T = 2^17), and updates it, before it takes the next one. So at most as many thre
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from numba import get_num_threads, njit, prange
 from torch import Tensor
 
 from methods.kernels.adam import BETAS, EPS, AdamState, corrections
-from methods.kernels.cpu import f32, pack_bf16, u64
+from methods.kernels.cpu import check_float32, f32, pack_bf16, u64
 from methods.kernels.encode import HashGrid
 from methods.kernels.encode.cpu import by_channel, level_arrays, scatter_level
 
@@ -25,10 +26,8 @@ ONE = u64(1)
 
 
 @torch.no_grad()
-def sparse_adam_(
-    table: Tensor, grad: Tensor, state: AdamState, rate: float, packed: Tensor | None
-) -> None:
-    _update(grad.view(-1).numpy(), table.shape[1], *_arrays(table, state, packed), f32(rate))
+def sparse_adam_(table: Tensor, grad: Tensor, state: AdamState, rate: float) -> None:
+    _update(grad.view(-1).numpy(), table.shape[1], *_arrays(table, state, rate, None))
 
 
 @torch.no_grad()
@@ -41,52 +40,33 @@ def hash_adam_(
     rate: float,
     packed: Tensor | None,
 ) -> None:
-    _update_levels(
-        positions.numpy(),
-        by_channel(grad).numpy(),
-        *level_arrays(grid),
-        *_arrays(table, state, packed),
-        f32(rate),
-        min(get_num_threads(), grid.levels),
-    )
+    samples = positions.numpy(), by_channel(grad).numpy()
+    workers = min(get_num_threads(), grid.levels)
+    _update_levels(*samples, level_arrays(grid), *_arrays(table, state, rate, packed), workers)
 
 
-def _arrays(table: Tensor, state: AdamState, packed: Tensor | None) -> tuple[np.ndarray, ...]:
-    """Table, moments, steps and packed copy, each flat, and the corrections."""
-    if table.dtype != torch.float32:
-        raise ValueError(f"backend 'cpu' updates float32, got {table.dtype}")
+def _arrays(
+    table: Tensor, state: AdamState, rate: float, packed: Tensor | None
+) -> tuple[tuple[np.ndarray, ...], tuple[Any, ...]]:
+    """`own` and `how` of `_entries`."""
+    check_float32(table)
     words = np.empty(0, np.uint32) if packed is None else packed.numpy().view(np.uint32)
     tables = (x.view(-1).numpy() for x in (table, state.first, state.second))
-    return (*tables, state.steps.numpy(), words, *corrections().numpy())
+    return (*tables, state.steps.numpy(), words), (*corrections().numpy(), f32(rate))
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def _update(grad, features, table, first, second, steps, packed, to1, to2, rate):
-    """`grad`, `table`, `first` and `second` are flat; `to1` and `to2` are the corrections."""
-    entries = len(steps)
+def _update(grad, features, own, how):
+    entries = len(own[3])
     for chunk in prange((entries + CHUNK - 1) // CHUNK):
-        a, b = chunk * CHUNK, min(entries, (chunk + 1) * CHUNK)
-        _entries(a, b, features, grad, table, first, second, steps, packed, to1, to2, rate)
+        _entries(chunk * CHUNK, min(entries, (chunk + 1) * CHUNK), features, grad, own, how)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def _update_levels(
-    positions,
-    grad,
-    scales,
-    strides,
-    offsets,
-    table,
-    first,
-    second,
-    steps,
-    packed,
-    to1,
-    to2,
-    rate,
-    workers,
-):
+def _update_levels(positions, grad, shapes, tables, how, workers):
     """As `_update`, with the gradient `grad` [levels * features, N] of samples at `positions`."""
+    scales, strides, offsets = shapes
+    table, first, second, steps, packed = tables
     levels = len(scales)
     features = len(grad) // levels
     largest = np.max(offsets[1:] - offsets[:-1])
@@ -101,12 +81,18 @@ def _update_levels(
             own = table[a:b], first[a:b], second[a:b], steps[begin:end], words
             for entry in range(0, end - begin, CHUNK):
                 last = min(end - begin, entry + CHUNK)
-                _entries(entry, last, features, total, *own, to1, to2, rate)
+                _entries(entry, last, features, total, own, how)
 
 
 @njit(cache=True, error_model="numpy")
-def _entries(a, b, features, grad, table, first, second, steps, packed, to1, to2, rate):
-    """Update the entries from `a` to `b`, at most `CHUNK`, and clear their gradient."""
+def _entries(a, b, features, grad, own, how):
+    """Update the entries from `a` to `b`, at most `CHUNK`, and clear their gradient.
+
+    All arrays are flat: `grad`; `own`, which are table, moments, steps and packed copy, the latter
+    empty if there is none. `how` are the bias corrections and the rate.
+    """
+    table, first, second, steps, packed = own
+    to1, to2, rate = how
     touched = np.empty(CHUNK, np.uint32)
     if features == 2:  # so that the compiler knows it
         count = _find(a, b, 2, grad, touched)

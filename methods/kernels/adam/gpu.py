@@ -20,7 +20,7 @@ from methods.kernels.encode import HashGrid
 from methods.kernels.encode.gpu import table_gradient
 from methods.kernels.gpu import check_types, launch
 
-BLOCK = 1024
+BLOCK = tl.constexpr(1024)
 """Features per program, 8 per lane: that many concurrent loads hide their latency."""
 
 BETA1, BETA2 = tl.constexpr(adam.BETAS[0]), tl.constexpr(adam.BETAS[1])
@@ -28,7 +28,11 @@ EPS = tl.constexpr(adam.EPS)
 
 
 @torch.no_grad()
-def sparse_adam_(
+def sparse_adam_(table: Tensor, grad: Tensor, state: AdamState, rate: float) -> None:
+    _step(table, grad, state, rate, None)
+
+
+def _step(
     table: Tensor, grad: Tensor, state: AdamState, rate: float, packed: Tensor | None
 ) -> None:
     given = {"table": table, "grad": grad, "first": state.first, "second": state.second}
@@ -36,13 +40,11 @@ def sparse_adam_(
     for name, tensor in given.items():
         if not tensor.is_contiguous():
             raise ValueError(f"backend 'gpu' expects {name} to be contiguous")
-    entries, features = table.shape
-    width = triton.next_power_of_2(max(features, 1))
-    rows, known = max(BLOCK // width, 1), _corrections(table.device)
+    (entries, features), known = table.shape, _corrections(table.device)
     words = None if packed is None else packed.view(torch.bfloat16)
     numbers = *given.values(), state.steps, words, known, known.shape[1] - 1, rate, entries
-    sizes = {"ROWS": rows, "FEATURES": features, "WIDTH": width}
-    launch(_update, (triton.cdiv(entries, rows),), *numbers, **sizes)
+    programs = triton.cdiv(entries, BLOCK.value // triton.next_power_of_2(features))
+    launch(_update, (programs,), *numbers, FEATURES=features)
 
 
 @torch.no_grad()
@@ -55,7 +57,7 @@ def hash_adam_(
     rate: float,
     packed: Tensor | None,
 ) -> None:
-    sparse_adam_(table, table_gradient(positions, grad, grid), state, rate, packed)
+    _step(table, table_gradient(positions, grad, grid), state, rate, packed)
 
 
 @cache
@@ -66,24 +68,14 @@ def _corrections(device: torch.device) -> Tensor:
 
 @triton.jit
 def _update(
-    table,
-    grad,
-    first,
-    second,
-    steps,
-    packed,
-    corrections,
-    last,
-    rate,
-    entries,
-    ROWS: tl.constexpr,
-    FEATURES: tl.constexpr,
-    WIDTH: tl.constexpr,
+    table, grad, first, second, steps, packed, known, last, rate, entries, FEATURES: tl.constexpr
 ):
-    """`last` is the largest number of steps in `corrections`; `packed` is of bfloat16.
+    """`last` is the largest number of steps in `known`, the corrections; `packed` is of bfloat16.
 
     `FEATURES` is known at compile time, so that a lane can load two or four at once.
     """
+    WIDTH: tl.constexpr = triton.next_power_of_2(FEATURES)
+    ROWS: tl.constexpr = BLOCK // WIDTH
     entry = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     feature = tl.arange(0, WIDTH)
     inside = (entry < entries)[:, None] & (feature < FEATURES)[None, :]
@@ -91,7 +83,7 @@ def _update(
     gradient = tl.load(grad + place, mask=inside, other=0.0)
     touched = tl.max((gradient != 0).to(tl.int32), 1) > 0
     step = tl.load(steps + entry, mask=touched, other=0) + 1
-    known = corrections + tl.minimum(step, last)
+    known += tl.minimum(step, last)
     correction1, correction2 = tl.load(known)[:, None], tl.load(known + last + 1)[:, None]
     changed = inside & touched[:, None]
     m = tl.load(first + place, mask=changed, other=0.0) * BETA1 + gradient * (1 - BETA1)

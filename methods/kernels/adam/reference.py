@@ -11,9 +11,7 @@ from methods.kernels.encode.reference import encode
 
 
 @torch.no_grad()
-def sparse_adam_(
-    table: Tensor, grad: Tensor, state: AdamState, rate: float, packed: Tensor | None
-) -> None:
+def sparse_adam_(table: Tensor, grad: Tensor, state: AdamState, rate: float) -> None:
     touched = (grad != 0).any(dim=-1, keepdim=True)  # a mask, as indices would wait for a GPU
     state.steps += touched.squeeze(-1)
     steps = state.steps[:, None].to(table.dtype)
@@ -25,8 +23,6 @@ def sparse_adam_(
     state.first.copy_(torch.where(touched, first, state.first))
     state.second.copy_(torch.where(touched, second, state.second))
     grad.zero_()
-    if packed is not None:
-        packed.copy_(torch.where(touched.squeeze(-1), pack(table), packed))
 
 
 def hash_adam_(
@@ -40,6 +36,8 @@ def hash_adam_(
 ) -> None:
     asking = table.detach().requires_grad_()
     with torch.enable_grad():
-        encoded = encode(positions, asking, grid)
+        encoded = encode(positions, asking, grid, None)
     (total,) = torch.autograd.grad(encoded, asking, grad.to(table.dtype))
-    sparse_adam_(table, total, state, rate, packed)
+    sparse_adam_(table, total, state, rate)
+    if packed is not None:
+        packed.copy_(pack(table))

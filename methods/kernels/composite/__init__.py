@@ -49,9 +49,8 @@ def composite(
         check_shape("carry.values", carry.values, rays, channels)
         check_shape("carry.depth_sum", carry.depth_sum, rays)
         check_shape("carry.alpha", carry.alpha, rays)
-    return implementation(__name__, backend, sigma.device).composite(
-        sigma, values, intervals, stop, carry
-    )
+    kernel = implementation(__name__, backend, sigma.device)
+    return kernel.composite(sigma, values, intervals, stop, carry)
 
 
 def weights(
@@ -64,13 +63,11 @@ def weights(
 ) -> Tensor:
     """The weights [S] that `composite` gives to samples, computed without values. No gradient.
 
-    Args:
-        front: [R] transmittance in front of each ray's first sample; None: 1.
+    `front` [R] is the transmittance in front of each ray's first sample; None: 1.
     """
     front = _light(sigma, intervals, front)
-    return implementation(__name__, backend, sigma.device).weights(
-        sigma.detach(), intervals, stop, front
-    )
+    kernel = implementation(__name__, backend, sigma.device)
+    return kernel.weights(sigma.detach(), intervals, stop, front)
 
 
 def visible(
@@ -84,23 +81,19 @@ def visible(
     """How many samples of each ray get a weight from `composite`, [R] int64, and the transmittance
     behind them, [R]. No gradient.
 
-    They are the first samples of the ray; those behind have neither weight nor gradient.
-
-    Args:
-        front: [R] transmittance in front of each ray's first sample; None: 1.
+    They are the first samples of the ray; those behind have neither weight nor gradient. `front`
+    is as for `weights`.
     """
     front = _light(sigma, intervals, front)
-    return implementation(__name__, backend, sigma.device).visible(
-        sigma.detach(), intervals, stop, front
-    )
+    kernel = implementation(__name__, backend, sigma.device)
+    return kernel.visible(sigma.detach(), intervals, stop, front)
 
 
 def _light(sigma: Tensor, intervals: Intervals, front: Tensor | None) -> Tensor:
     """Check the samples, and the transmittance in `front` of each ray or its default."""
     _check_samples(sigma, intervals)
     rays = len(intervals.offsets) - 1
-    if front is None:
-        front = sigma.new_ones(rays)
+    front = sigma.new_ones(rays) if front is None else front
     check_shape("front", front, rays)
     return front
 

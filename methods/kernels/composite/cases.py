@@ -24,7 +24,7 @@ from bench.case import (
 )
 from methods.kernels.composite import composite, visible, weights
 from methods.kernels.dispatch import served
-from methods.kernels.types import Intervals, Pixels
+from methods.kernels.types import Intervals, Pixels, offsets_of
 
 INF = math.inf
 
@@ -40,7 +40,6 @@ KINDS: dict[str, dict[str, Any]] = {
     "nine channels": {"channels": 9},
     "no density": {"density": 0.0},
     "opaque at once": {"density": 1e30},
-    "continued": {"carry": True},
     # A ray could end a sample earlier only if its transmittance, one in 10^6, is within rounding
     # of `stop`.
     "stopped after a few samples": {"rays": 40, "most": 12, "stop": 0.3},
@@ -80,7 +79,7 @@ OF_A_WEIGHT = f"{LIGHT}; a weight is at most tau_i T: 2 (n + 8) min(tau_i, 1) u"
 
 
 def _intervals(given: Given) -> Intervals:
-    return Intervals(given["t"], given["delta"], pad(given["counts"].cumsum(0), (1, 0)))
+    return Intervals(given["t"], given["delta"], offsets_of(given["counts"]))
 
 
 def _composite(given: Given, backend: str) -> tuple[Tensor, ...]:
@@ -89,18 +88,11 @@ def _composite(given: Given, backend: str) -> tuple[Tensor, ...]:
     return pixels.values, pixels.depth_sum, pixels.alpha
 
 
-def _lit(given: Given, backend: str) -> dict[str, Any]:
-    """The optional arguments of `weights` and `visible`."""
+def _light(given: Given, backend: str) -> tuple[Tensor, ...]:
     front = None if given["carry"] is None else 1 - given["carry"].alpha
-    return {"stop": given["stop"], "front": front, "backend": backend}
-
-
-def _weights(given: Given, backend: str) -> tuple[Tensor]:
-    return (weights(given["sigma"], _intervals(given), **_lit(given, backend)),)
-
-
-def _visible(given: Given, backend: str) -> tuple[Tensor, ...]:
-    return visible(given["sigma"], _intervals(given), **_lit(given, backend))
+    how = {"stop": given["stop"], "front": front, "backend": backend}
+    samples = given["sigma"], _intervals(given)
+    return weights(*samples, **how), *visible(*samples, **how)
 
 
 def _roundings(given: Given) -> float:
@@ -137,13 +129,11 @@ COMPOSITE = Operation(
     },
 )
 WEIGHTS = Operation(
-    "composite weights", served(__package__), _weights, {"weights": Bound(OF_A_WEIGHT, _of_weights)}
-)
-VISIBLE = Operation(
-    "composite visible",
+    "composite weights",
     served(__package__),
-    _visible,
+    _light,
     {
+        "weights": Bound(OF_A_WEIGHT, _of_weights),
         "counts": Bound("no transmittance is within rounding of the stop: 0", 0.0),
         "left": Bound(f"{LIGHT}: 2 (n + 8) u", _roundings),
     },
@@ -167,11 +157,11 @@ def cases() -> list[Case]:
     many = partial(_given, rays=1 << 12, most=64)
     found = COMPOSITE.cases("64 samples a ray", many, items=1 << 18)
     for name, options in KINDS.items():
-        for operation in (COMPOSITE, WEIGHTS, VISIBLE):
-            found += operation.cases(name, partial(_given, **options))
+        make = partial(_given, **options)
+        found += [*COMPOSITE.cases(name, make), *WEIGHTS.cases(name, make)]
     for name, extreme in EXTREMES.items():
-        found.append(pixels.case(name, partial(_pixel_error, extreme)))
-        found.append(gradients.case(name, partial(_gradient_error, extreme)))
+        found.append(pixels.case(name, partial(_extreme_error, extreme, False)))
+        found.append(gradients.case(name, partial(_extreme_error, extreme, True)))
     for count in LENGTHS:
         units = 8 + math.log2(count)
         light = Property(
@@ -220,51 +210,34 @@ def _ray(sigma: Tensor, delta: Tensor, values: Tensor, t: Tensor, dtype: torch.d
     return rounded | {"counts": counts, "carry": None, "stop": 0.0}
 
 
-def _extreme(extreme: tuple[float, float], precision: str) -> Given:
-    """One ray of 8 samples, the fourth `extreme`."""
+def _extreme_error(
+    extreme: tuple[float, float], backward: bool, backend: str, device: str, precision: str
+) -> float:
+    """Error of the pixel of 8 samples, the fourth `extreme`; `backward`, that of the gradients of
+    the sum of its numbers, by sigma over the sample's length."""
     sigma, delta = torch.full((2, 8), 2.0, dtype=torch.float64)
     delta[:] = 0.1
     sigma[3], delta[3] = extreme
     values, t = torch.linspace(0, 1, 24).view(8, 3).flip(0), torch.linspace(0, 2, 8)
-    return _ray(sigma, delta, values, t, DTYPES[precision])
+    given = _ray(sigma, delta, values, t, DTYPES[precision])
+    there = placed(given, device)
+    learned = [there[name].requires_grad_(backward) for name in ("sigma", "values")]
+    pixels = _composite(there, backend)
 
-
-def _exact_weights(sigma: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
-    """Weights of one ray and transmittance before and after its samples, closed form, float64."""
+    sigma, values, t, delta = (given[name].double() for name in ("sigma", "values", "t", "delta"))
     tau = torch.where(delta > 0, sigma * delta, 0)
     behind = torch.exp(-tau.cumsum(0))
-    front = torch.cat((behind.new_ones(1), behind[:-1]))
-    return front * -torch.expm1(-tau), behind
-
-
-def _pixel_error(extreme: tuple[float, float], backend: str, device: str, precision: str) -> float:
-    given = _extreme(extreme, precision)
-    pixels = _composite(placed(given, device), backend)
-    sigma, values, t, delta = (given[name].double() for name in ("sigma", "values", "t", "delta"))
-    weights, _ = _exact_weights(sigma, delta)
-    want = (weights @ values)[None], (weights @ t)[None], weights.sum()[None]
-    return largest_error([x.cpu() for x in pixels], want)
-
-
-def _gradient_error(
-    extreme: tuple[float, float], backend: str, device: str, precision: str
-) -> float:
-    """Error of the gradient of the sum of all outputs by sigma, over the sample's length."""
-    given = _extreme(extreme, precision)
-    there = placed(given, device)
-    learned = [there[name].requires_grad_() for name in ("sigma", "values")]
-    total = sum(x.sum() for x in _composite(there, backend))
-    assert isinstance(total, Tensor)
-    got_sigma, got_values = (x.cpu() for x in torch.autograd.grad(total, learned))
-
-    sigma, values, t, delta = (given[name].double() for name in ("sigma", "values", "t", "delta"))
-    weights, behind = _exact_weights(sigma, delta)
+    weights = pad(behind[:-1], (1, 0), value=1.0) * -torch.expm1(-tau)
+    if not backward:
+        want = (weights @ values)[None], (weights @ t)[None], weights.sum()[None]
+        return largest_error([x.cpu() for x in pixels], want)
+    total = torch.cat([x.flatten() for x in pixels]).sum()
+    of_sigma, of_values = (x.cpu() for x in torch.autograd.grad(total, learned))
     gain = values.sum(dim=1) + t + 1
     later = (weights * gain).flip(0).cumsum(0).flip(0) - weights * gain
     length = torch.where(delta > 0, delta, 1)
-    want_sigma = torch.where(delta > 0, behind * gain - later, 0)
-    want_values = weights[:, None].expand(8, 3)
-    return largest_error((got_sigma.double() / length, got_values), (want_sigma, want_values))
+    exact = torch.where(delta > 0, behind * gain - later, 0), weights[:, None].expand(8, 3)
+    return largest_error((of_sigma.double() / length, of_values), exact)
 
 
 def _light_error(count: int, kind: str, backend: str, device: str, precision: str) -> float:

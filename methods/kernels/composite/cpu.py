@@ -13,7 +13,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from methods.kernels.cpu import arrays, f32
+from methods.kernels.cpu import arrays, check_float32, f32
 from methods.kernels.types import Intervals, Pixels
 
 CHUNK = 64  # rays
@@ -23,11 +23,7 @@ f64 = np.float64
 def composite(
     sigma: Tensor, values: Tensor, intervals: Intervals, stop: float, carry: Pixels | None
 ) -> Pixels:
-    if not sigma.dtype == values.dtype == torch.float32:
-        raise ValueError(
-            f"backend 'cpu' composites float32, got sigma {sigma.dtype}, values {values.dtype}: "
-            "use backend='reference'"
-        )
+    check_float32(sigma, values)
     samples = intervals.t, intervals.delta, intervals.offsets
     return Pixels(*_Composite.apply(sigma, values, *samples, stop, carry))
 
@@ -53,11 +49,7 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx, sigma, values, t, delta, offsets, stop, carry):
         rays, channels = len(offsets) - 1, values.shape[1]
-        if carry is None:
-            pixels = Pixels.blank(rays, channels)
-        else:
-            parts = (carry.values, carry.depth_sum, carry.alpha)
-            pixels = Pixels(*(x.clone(memory_format=torch.contiguous_format) for x in parts))
+        pixels = Pixels.blank(rays, channels) if carry is None else carry.copy()
         front = 1 - pixels.alpha
         samples = [x.contiguous() for x in (sigma, values, t, delta, offsets)]
         learns = any(ctx.needs_input_grad)
@@ -69,12 +61,12 @@ class _Composite(torch.autograd.Function):
         return pixels.values, pixels.depth_sum, pixels.alpha
 
     @staticmethod
-    def backward(ctx, grad_values, grad_depth, grad_alpha):
+    def backward(ctx, *grads):
         *samples, front, opacity = ctx.saved_tensors
-        grad_sigma, grad_samples = torch.zeros(len(opacity)), torch.zeros_like(samples[0])
-        grads = grad_values, grad_depth, grad_alpha, grad_sigma, grad_samples
-        _backward(*arrays(opacity, *samples), f32(ctx.stop), *arrays(front, *grads))
-        return grad_sigma, grad_samples, None, None, None, None, None
+        results = torch.zeros(len(opacity)), torch.zeros_like(samples[0])
+        light = arrays(front, *grads)
+        _backward(*arrays(opacity, *samples), f32(ctx.stop), tuple(light), *arrays(*results))
+        return *results, None, None, None, None, None
 
 
 @njit(cache=True)
@@ -134,24 +126,12 @@ def _visible(sigma, delta, offsets, front, stop, counts, left):
 
 
 @njit(cache=True, parallel=True)
-def _backward(
-    opacity,
-    values,
-    t,
-    delta,
-    offsets,
-    stop,
-    front,
-    grad_out,
-    grad_depth,
-    grad_alpha,
-    grad_sigma,
-    grad_values,
-):
+def _backward(opacity, values, t, delta, offsets, stop, light, grad_sigma, grad_values):
     """With g_i = dL/dw_i and T_{i+1} = T_i (1 - alpha_i):
 
     dL/dsigma_i = delta_i (T_{i+1} g_i - sum_{j > i} w_j g_j).
     """
+    front, grad_out, grad_depth, grad_alpha = light
     channels = values.shape[1]
     for ray in prange(len(offsets) - 1):
         behind = 0.0  # sum of w_j g_j over samples behind i; at first over all

@@ -6,6 +6,8 @@ block behind which it is opaque.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import triton
 import triton.language as tl
@@ -14,7 +16,7 @@ from torch import Tensor
 from methods.kernels.gpu import check_types, launch, opacity
 from methods.kernels.types import Intervals, Pixels
 
-BLOCK = 64  # samples
+BLOCK = tl.constexpr(64)  # samples
 OPAQUE = tl.constexpr(128.0)
 """Optical thickness at which the transmittance is 0 in float32; clamping to it avoids inf."""
 
@@ -28,59 +30,46 @@ def composite(
 
 
 def weights(sigma: Tensor, intervals: Intervals, stop: float, front: Tensor) -> Tensor:
-    check_types(torch.float32, sigma=sigma, delta=intervals.delta, front=front)
     weight = torch.zeros_like(sigma, memory_format=torch.contiguous_format)
-    samples = (x.contiguous() for x in (sigma, intervals.delta, intervals.offsets, front))
-    launch(_weights, (len(front),), *samples, stop, weight, BLOCK=BLOCK, num_warps=1)
+    _launch(sigma, intervals, front, stop, weight, None, None)
     return weight
 
 
 def visible(
     sigma: Tensor, intervals: Intervals, stop: float, front: Tensor
 ) -> tuple[Tensor, Tensor]:
-    check_types(torch.float32, sigma=sigma, delta=intervals.delta, front=front)
     counts = intervals.offsets.new_zeros(len(front))
     left = torch.empty_like(front, memory_format=torch.contiguous_format)
-    samples = (x.contiguous() for x in (sigma, intervals.delta, intervals.offsets, front))
-    launch(_visible, (len(front),), *samples, stop, counts, left, BLOCK=BLOCK, num_warps=1)
+    _launch(sigma, intervals, front, stop, None, counts, left)
     return counts, left
 
 
-def _blocks(channels: int) -> dict[str, int]:
-    """The sizes of the blocks of a program."""
-    return {"CHANNELS": triton.next_power_of_2(max(channels, 1)), "BLOCK": BLOCK, "num_warps": 1}
+def _launch(sigma: Tensor, intervals: Intervals, front: Tensor, *rest: Any) -> None:
+    check_types(torch.float32, sigma=sigma, delta=intervals.delta, front=front)
+    samples = (x.contiguous() for x in (sigma, intervals.delta, intervals.offsets, front))
+    launch(_light, (len(front),), *samples, *rest, num_warps=1)
 
 
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx, sigma, values, t, delta, offsets, stop, carry):
         rays, channels = len(offsets) - 1, values.shape[1]
-        if carry is None:
-            pixels = Pixels.blank(rays, channels, sigma.device)
-        else:
-            parts = (carry.values, carry.depth_sum, carry.alpha)
-            pixels = Pixels(*(x.clone(memory_format=torch.contiguous_format) for x in parts))
+        pixels = Pixels.blank(rays, channels, sigma.device) if carry is None else carry.copy()
         front = 1 - pixels.alpha
         samples = [x.contiguous() for x in (sigma, values, t, delta, offsets)]
         outputs = pixels.values, pixels.depth_sum, pixels.alpha
-        given = *samples, front, stop, *outputs, channels
-        launch(_forward, (rays,), *given, **_blocks(channels))
+        launch(_forward, (rays,), *samples, front, stop, *outputs, CHANNELS=channels, num_warps=1)
         ctx.save_for_backward(*samples, front)
         ctx.stop = stop
         return outputs
 
     @staticmethod
-    def backward(ctx, grad_values, grad_depth, grad_alpha):
+    def backward(ctx, *grads):
         *samples, front = ctx.saved_tensors
         grad_sigma, grad_samples = torch.zeros_like(samples[0]), torch.zeros_like(samples[1])
-        channels = samples[1].shape[1]
-        given = (x.contiguous() for x in (grad_values, grad_depth, grad_alpha))
-        launch(
-            _backward,
-            (len(front),),
-            *(*samples, front, ctx.stop, *given, grad_sigma, grad_samples, channels),
-            **_blocks(channels),
-        )
+        given = *samples, front, ctx.stop, *(x.contiguous() for x in grads)
+        results, channels = (grad_sigma, grad_samples), samples[1].shape[1]
+        launch(_backward, (len(front),), *given, *results, CHANNELS=channels, num_warps=1)
         return grad_sigma, grad_samples, None, None, None, None, None
 
 
@@ -113,74 +102,61 @@ def _block(sigma, delta, first, i, inside, light, stop):
 
 @triton.jit
 def _forward(
-    sigma,
-    values,
-    t,
-    delta,
-    offsets,
-    front,
-    stop,
-    out,
-    depth_sum,
-    alpha,
-    channels,
-    CHANNELS: tl.constexpr,
-    BLOCK: tl.constexpr,
+    sigma, values, t, delta, offsets, front, stop, out, depth_sum, alpha, CHANNELS: tl.constexpr
 ):
     ray = tl.program_id(0).to(tl.int64)
     first, end = tl.load(offsets + ray), tl.load(offsets + ray + 1)
     light = tl.load(front + ray)
-    channel = tl.arange(0, CHANNELS)
-    there = channel < channels
-    sums = tl.load(out + ray * channels + channel, mask=there, other=0.0)
+    channel, there = _channels(CHANNELS)
+    sums = tl.load(out + ray * CHANNELS + channel, mask=there, other=0.0)
     depth, covered = tl.load(depth_sum + ray), tl.load(alpha + ray)
     while (first < end) & (light > stop):
         i = first + tl.arange(0, BLOCK)
         weight, lit, _, light = _block(sigma, delta, first, i, i < end, light, stop)
-        rows = values + i[:, None] * channels + channel[None, :]
+        rows = values + i[:, None] * CHANNELS + channel[None, :]
         shown = tl.load(rows, mask=lit[:, None] & there[None, :], other=0.0)
         sums += tl.sum(weight[:, None] * shown, 0)
         depth += tl.sum(weight * tl.load(t + i, mask=lit, other=0.0), 0)
         covered += tl.sum(weight, 0)
         first += BLOCK
-    tl.store(out + ray * channels + channel, sums, mask=there)
+    tl.store(out + ray * CHANNELS + channel, sums, mask=there)
     tl.store(depth_sum + ray, depth)
     tl.store(alpha + ray, covered)
 
 
 @triton.jit
-def _weights(sigma, delta, offsets, front, stop, weight, BLOCK: tl.constexpr):
-    ray = tl.program_id(0).to(tl.int64)
-    first, end = tl.load(offsets + ray), tl.load(offsets + ray + 1)
-    light = tl.load(front + ray)
-    while (first < end) & (light > stop):
-        i = first + tl.arange(0, BLOCK)
-        inside = i < end
-        found, _, _, light = _block(sigma, delta, first, i, inside, light, stop)
-        tl.store(weight + i, found, mask=inside)
-        first += BLOCK
-
-
-@triton.jit
-def _visible(sigma, delta, offsets, front, stop, counts, left, BLOCK: tl.constexpr):
+def _light(sigma, delta, offsets, front, stop, weight, counts, left):
+    """Write either the weights or the other two."""
     ray = tl.program_id(0).to(tl.int64)
     first, end = tl.load(offsets + ray), tl.load(offsets + ray + 1)
     light, count = tl.load(front + ray), tl.zeros([], tl.int64)
     last = light
     while (first < end) & (light > stop):
         i = first + tl.arange(0, BLOCK)
-        _, lit, behind, light = _block(sigma, delta, first, i, i < end, light, stop)
-        count += tl.sum(lit.to(tl.int64), 0)
-        last = tl.min(tl.where(lit, behind, last), 0)
+        found, lit, behind, light = _block(sigma, delta, first, i, i < end, light, stop)
+        if weight is not None:
+            tl.store(weight + i, found, mask=i < end)
+        else:
+            count += tl.sum(lit.to(tl.int64), 0)
+            last = tl.min(tl.where(lit, behind, last), 0)
         first += BLOCK
-    tl.store(counts + ray, count)
-    tl.store(left + ray, last)
+    if weight is None:
+        tl.store(counts + ray, count)
+        tl.store(left + ray, last)
 
 
 @triton.jit
-def _gain(values, t, i, lit, shine, of_depth, of_alpha, channel, there, channels):
+def _channels(CHANNELS: tl.constexpr):
+    """Numbers of the channels, up to a power of 2, and which of them are there."""
+    channel = tl.arange(0, triton.next_power_of_2(CHANNELS))
+    return channel, channel < CHANNELS
+
+
+@triton.jit
+def _gain(values, t, i, lit, shine, of_depth, of_alpha, CHANNELS: tl.constexpr):
     """g_i = dL/dw_i of samples that get light; 0 for others."""
-    rows = values + i[:, None] * channels + channel[None, :]
+    channel, there = _channels(CHANNELS)
+    rows = values + i[:, None] * CHANNELS + channel[None, :]
     shown = tl.load(rows, mask=lit[:, None] & there[None, :], other=0.0)
     where = tl.load(t + i, mask=lit, other=0.0)
     gain = of_depth * where + of_alpha + tl.sum(shown * shine[None, :], 1)
@@ -201,9 +177,7 @@ def _backward(
     grad_alpha,
     grad_sigma,
     grad_values,
-    channels,
     CHANNELS: tl.constexpr,
-    BLOCK: tl.constexpr,
 ):
     """With g_i = dL/dw_i and T_{i+1} = T_i (1 - alpha_i):
 
@@ -211,18 +185,17 @@ def _backward(
     """
     ray = tl.program_id(0).to(tl.int64)
     begin, end = tl.load(offsets + ray), tl.load(offsets + ray + 1)
-    channel = tl.arange(0, CHANNELS)
-    there = channel < channels
-    shine = tl.load(grad_out + ray * channels + channel, mask=there, other=0.0)
+    channel, there = _channels(CHANNELS)
+    shine = tl.load(grad_out + ray * CHANNELS + channel, mask=there, other=0.0)
     of_depth, of_alpha = tl.load(grad_depth + ray), tl.load(grad_alpha + ray)
 
     first, light, rest = begin, tl.load(front + ray), 0.0
     while (first < end) & (light > stop):
         i = first + tl.arange(0, BLOCK)
         weight, lit, _, light = _block(sigma, delta, first, i, i < end, light, stop)
-        gain = _gain(values, t, i, lit, shine, of_depth, of_alpha, channel, there, channels)
+        gain = _gain(values, t, i, lit, shine, of_depth, of_alpha, CHANNELS)
         rest += tl.sum(weight * gain, 0)
-        rows = grad_values + i[:, None] * channels + channel[None, :]
+        rows = grad_values + i[:, None] * CHANNELS + channel[None, :]
         tl.store(rows, weight[:, None] * shine[None, :], mask=lit[:, None] & there[None, :])
         first += BLOCK
 
@@ -231,7 +204,7 @@ def _backward(
     while (first < end) & (light > stop):
         i = first + tl.arange(0, BLOCK)
         weight, lit, behind, light = _block(sigma, delta, first, i, i < end, light, stop)
-        gain = _gain(values, t, i, lit, shine, of_depth, of_alpha, channel, there, channels)
+        gain = _gain(values, t, i, lit, shine, of_depth, of_alpha, CHANNELS)
         slope = behind * gain - (rest - tl.cumsum(weight * gain, 0))
         tl.store(grad_sigma + i, tl.load(delta + i, mask=lit, other=0.0) * slope, mask=lit)
         rest -= tl.sum(weight * gain, 0)

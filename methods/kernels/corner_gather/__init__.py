@@ -28,19 +28,16 @@ def corner_gather(
 ) -> Tensor:
     """Sums over c of weights[s, c] table[corners[voxel[s], c]]: features [S, F] of S samples.
 
-    Differentiable in a float32 `table`; in `weights` only with backend="reference".
+    Differentiable in a float32 `table`; in `weights`, and with other types, only with
+    backend="reference".
 
     Args:
         table: [C, F] features of the corners.
         corners: [V, 8] int32 rows of `table` for each voxel's corners. Not checked.
-        voxel: [S] int32 rows of `corners`.
+        voxel: [S] int32 rows of `corners`; checked on a CPU.
         weights: [S, 8] weights of the corners; a NaN only affects the features of its sample.
         grad_buffer: [C, F]; if given, the gradient of `table` is added to it in place and hidden
             from autograd, so that a training step neither allocates nor clears a second table.
-
-    Raises:
-        ValueError: wrong shapes; on a CPU, a voxel that is not a row of `corners`; backend "cpu":
-            other types.
     """
     check_shape("table", table, None, None)
     check_shape("corners", corners, None, CORNERS)
@@ -54,9 +51,8 @@ def corner_gather(
         low, high = (int(end) for end in torch.aminmax(voxel))
         rows, found = f"rows of the {len(corners)} voxels", f"{low} to {high}"
         expect(0 <= low <= high < len(corners), "voxel", rows, found)
-    return implementation(__name__, backend, table.device).corner_gather(
-        table, corners, voxel, weights, grad_buffer=grad_buffer
-    )
+    kernel = implementation(__name__, backend, table.device)
+    return kernel.corner_gather(table, corners, voxel, weights, grad_buffer)
 
 
 def trilinear(local: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from bench.case import U32, Bound, Case, Given, Operation, Property, largest_error, on_backends
+from bench.case import U32, Bound, Case, Given, Operation
 from methods.kernels.corner_gather import CORNERS, corner_gather
 from methods.kernels.dispatch import served
 
@@ -52,13 +52,7 @@ def cases() -> list[Case]:
     for count, channels in ((0, 32), (1, 32), (257, 1), (257, 27), (257, 32), (VIEW, 32)):
         name, items = f"{count:,} samples of {channels}", count if count == VIEW else None
         found += GATHER.cases(name, partial(_given, count, channels), items=items)
-    spoiled = Property(
-        "corner_gather",
-        "features with a NaN among their weights are NaN; no others change",
-        "the same arithmetic for all others: 0",
-        on_backends(0),
-    )
-    return [*found, spoiled.case("NaN", _spread_of_nan)]
+    return [*found, *GATHER.cases("NaN", _with_nan)]
 
 
 def _given(count: int, channels: int) -> Given:
@@ -82,11 +76,7 @@ def _given(count: int, channels: int) -> Given:
     }
 
 
-def _spread_of_nan(backend: str, device: str, precision: str) -> float:
-    """Change of other samples by NaN in every 7th sample; infinite where the NaN is lost."""
-    given = {name: x.to(device) for name, x in _given(700, 5).items()}
-    bad = torch.arange(700, device=device) % 7 == 0
-    want = corner_gather(**given, backend=backend)
-    given["weights"][bad, 3] = torch.nan
-    got = corner_gather(**given, backend=backend)
-    return largest_error((got[~bad],), (want[~bad],)) if got[bad].isnan().all() else math.inf
+def _with_nan() -> Given:
+    given = _given(700, 5)
+    given["weights"][::7, 3] = math.nan
+    return given

@@ -13,21 +13,13 @@ from numba import get_num_threads, njit, prange, types
 from numba.extending import overload
 from torch import Tensor
 
-from methods.kernels.cpu import arrays, check_float32, u32
+from methods.kernels.cpu import FAST, arrays, check_float32, u32
 
 CHUNK = 256  # samples
 
-# Reordering and fused multiply-adds are allowed; assuming that there is no NaN is not.
-FAST = {"contract", "reassoc", "nsz", "arcp"}
-
 
 def corner_gather(
-    table: Tensor,
-    corners: Tensor,
-    voxel: Tensor,
-    weights: Tensor,
-    *,
-    grad_buffer: Tensor | None = None,
+    table: Tensor, corners: Tensor, voxel: Tensor, weights: Tensor, grad_buffer: Tensor | None
 ) -> Tensor:
     if weights.requires_grad:
         raise ValueError("backend 'cpu' gives no gradient for weights: use backend='reference'")

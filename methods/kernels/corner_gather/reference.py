@@ -6,12 +6,7 @@ from torch import Tensor
 
 
 def corner_gather(
-    table: Tensor,
-    corners: Tensor,
-    voxel: Tensor,
-    weights: Tensor,
-    *,
-    grad_buffer: Tensor | None = None,
+    table: Tensor, corners: Tensor, voxel: Tensor, weights: Tensor, grad_buffer: Tensor | None
 ) -> Tensor:
     if grad_buffer is not None:
         table = table.detach().requires_grad_()

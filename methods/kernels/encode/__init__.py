@@ -13,26 +13,22 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate
 
 import torch
 from torch import Tensor
 
 from bench.types import check_shape
 from methods.kernels.dispatch import implementation
+from methods.kernels.types import expect
 
 PRIMES = (1, 2654435761, 805459861)
 
 
 @dataclass(frozen=True)
 class HashGrid:
-    """The shape of a hash-grid table.
-
-    Attributes:
-        levels: number of resolutions.
-        features: F, channels per entry.
-        log2_table: log2 of T, the maximum number of entries of a level.
-        n_min: vertices along an axis at the coarsest level.
-        n_max: vertices along an axis at the finest level.
+    """The shape of a hash-grid table: how many `levels` of 2^`log2_table` entries at most, each of
+    F `features`; vertices along an axis at the coarsest level, `n_min`, and at the finest, `n_max`.
     """
 
     levels: int = 16
@@ -42,10 +38,9 @@ class HashGrid:
     n_max: int = 1024
 
     def __post_init__(self) -> None:
-        if not (self.levels >= 1 and self.features >= 1 and 3 <= self.log2_table <= 24):
-            raise ValueError(f"levels, features >= 1 and log2_table in 3..24, got {self}")
-        if not 2 <= self.n_min <= self.n_max:
-            raise ValueError(f"expected 2 <= n_min <= n_max, got {self}")
+        whole = self.levels >= 1 and self.features >= 1 and 3 <= self.log2_table <= 24
+        expect(whole, "grid", "levels, features >= 1 and log2_table in 3..24", self)
+        expect(2 <= self.n_min <= self.n_max, "grid", "2 <= n_min <= n_max", self)
 
     @cached_property
     def scales(self) -> tuple[float, ...]:
@@ -65,17 +60,15 @@ class HashGrid:
         return tuple(min(-(-(res**3) // 8) * 8, 1 << self.log2_table) for res in self.resolutions)
 
     @cached_property
-    def dense(self) -> tuple[bool, ...]:
-        """Whether a level stores every vertex."""
-        return tuple(res**3 <= size for res, size in zip(self.resolutions, self.sizes, strict=True))
+    def strides(self) -> tuple[int, ...]:
+        """Vertices along an axis of each dense level, which stores them all; 0 of a hashed one."""
+        shapes = zip(self.resolutions, self.sizes, strict=True)
+        return tuple(res if res**3 <= size else 0 for res, size in shapes)
 
     @cached_property
     def offsets(self) -> tuple[int, ...]:
         """First table entry of each level, then the total number of entries."""
-        starts = [0]
-        for size in self.sizes:
-            starts.append(starts[-1] + size)
-        return tuple(starts)
+        return (0, *accumulate(self.sizes))
 
     @property
     def entries(self) -> int:
@@ -88,29 +81,16 @@ class HashGrid:
         return self.levels * self.features
 
 
-class SampleGradients:
-    """Positions of samples and the gradients of their features, collected by the backward passes of
-    a training step. The gradient of the table is a sum over them. `adam.hash_adam_` computes it, on
-    a CPU level by level, and uses that of a level while it is in the cache."""
-
-    def __init__(self) -> None:
-        self._parts: list[tuple[Tensor, Tensor]] = []
-
-    def __bool__(self) -> bool:
-        return bool(self._parts)
-
-    def add(self, positions: Tensor, gradients: Tensor) -> None:
-        """Append `positions` [N, 3] and the `gradients` [N, levels * F] of their features."""
-        self._parts.append((positions, gradients))
+class SampleGradients(list[tuple[Tensor, Tensor]]):
+    """Positions [N, 3] of samples and the gradients [N, levels * F] of their features, collected by
+    the backward passes of a training step. The gradient of the table is a sum over them.
+    `adam.hash_adam_` computes it, on a CPU level by level, and uses that of a level while it is in
+    the cache."""
 
     def joined(self) -> tuple[Tensor, Tensor]:
-        """All positions and gradients; at least one `add` must have come before."""
-        positions, gradients = zip(*self._parts, strict=True)
+        """All positions and gradients; there must be some."""
+        positions, gradients = zip(*self, strict=True)
         return torch.cat(positions), torch.cat(gradients)
-
-    def clear(self) -> None:
-        """Forget all."""
-        self._parts.clear()
 
 
 class _Collect(torch.autograd.Function):
@@ -126,7 +106,7 @@ class _Collect(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, gradient):
-        ctx.gradients.add(*ctx.saved_tensors, gradient)
+        ctx.gradients.append((*ctx.saved_tensors, gradient))
         return None, None, None, None
 
 
@@ -161,13 +141,11 @@ def encode(
     check_shape("positions", positions, None, 3)
     check_shape("table", table, grid.entries, grid.features)
     if packed is not None:
-        if grid.features != 2:
-            raise ValueError(f"packed tables hold 2 features an entry, the grid has {grid}")
+        expect(grid.features == 2, "packed", "2 features an entry", grid.features)
         check_shape("packed", packed, grid.entries)
     read = table if gradients is None else table.detach()
-    features = implementation(__name__, backend, positions.device).encode(
-        positions, read, grid, packed=packed
-    )
+    kernel = implementation(__name__, backend, positions.device)
+    features = kernel.encode(positions, read, grid, packed)
     if gradients is not None:
         features = collect(features, positions, gradients)
     # NaN is rare. On a CPU one sum tests for it cheaply; on a GPU, waiting for it would cost more.

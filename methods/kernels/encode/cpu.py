@@ -17,32 +17,18 @@ import torch
 from numba import get_num_threads, njit, prange
 from torch import Tensor
 
-from methods.kernels.cpu import add_pair, arrays, f32, i32, pack_bf16, u32, u64
+from methods.kernels.cpu import FAST, add_pair, arrays, check_float32, f32, i32, pack_bf16, u32, u64
 from methods.kernels.encode import PRIMES, HashGrid
 
 CHUNK = 256  # samples; 256 * (8 indices + 8 weights + 8 values) * 4 bytes = 24 KiB
 
 PRIME_Y, PRIME_Z = u32(PRIMES[1]), u32(PRIMES[2])
 
-# Reordering and fused multiply-adds are allowed; assuming that there is no NaN is not, because
-# `_load` must turn NaN into 0 before it can become an address.
-FAST = {"contract", "reassoc", "nsz", "arcp"}
 
-
-def encode(
-    positions: Tensor,
-    table: Tensor,
-    grid: HashGrid,
-    *,
-    packed: Tensor | None = None,
-) -> Tensor:
+def encode(positions: Tensor, table: Tensor, grid: HashGrid, packed: Tensor | None) -> Tensor:
     if positions.requires_grad:
         raise ValueError("backend 'cpu' gives no gradient for positions: use backend='reference'")
-    if positions.dtype != torch.float32 or table.dtype != torch.float32:
-        raise ValueError(
-            f"backend 'cpu' encodes float32, got positions {positions.dtype} and table "
-            f"{table.dtype}: use backend='reference'"
-        )
+    check_float32(positions, table)
     return _Encode.apply(positions.contiguous(), table, grid, packed)
 
 
@@ -84,21 +70,15 @@ def _unsigned(words: Tensor) -> np.ndarray:
 
 
 def level_arrays(grid: HashGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Scale, vertices along an axis (0: hashed) and first entry of each level.
-
-    The first entries are followed by the total number of entries.
-    """
-    strides = [res if dense else 0 for res, dense in zip(grid.resolutions, grid.dense, strict=True)]
-    return (
-        np.array(grid.scales, np.float32),
-        np.array(strides, np.uint32),
-        np.array(grid.offsets, np.int64),
-    )
+    """`HashGrid.scales`, `strides` and `offsets`."""
+    strides, offsets = np.array(grid.strides, np.uint32), np.array(grid.offsets, np.int64)
+    return np.array(grid.scales, np.float32), strides, offsets
 
 
 @njit(cache=True, fastmath=FAST)
 def _load(positions, first, count, xyz):
-    """Copy positions [first, first + count) axis by axis, clamped to [0, 1], NaN as 0."""
+    """Copy positions [first, first + count) axis by axis, clamped to [0, 1], NaN as 0: it must not
+    become an address."""
     for axis in range(3):
         for i in range(count):
             value = positions[first + i, axis]

@@ -2,7 +2,7 @@
 
 Programs of one level are numbered consecutively, so that those running at the same time mostly read
 one level, which stays in the L2 cache. The backward pass scatters with atomics, whose order is not
-repeatable. If torch is set to use deterministic algorithms, torch's sorted scatter is used instead.
+repeatable.
 """
 
 from __future__ import annotations
@@ -15,25 +15,16 @@ import triton.language as tl
 from torch import Tensor
 
 from methods.kernels.encode import PRIMES, HashGrid
-from methods.kernels.encode.reference import corners
 from methods.kernels.gpu import check_types, launch
 
-BLOCK = 256  # samples
+BLOCK = tl.constexpr(256)  # samples
 PRIME_Y, PRIME_Z = tl.constexpr(PRIMES[1]), tl.constexpr(PRIMES[2])
 
 
-def encode(
-    positions: Tensor,
-    table: Tensor,
-    grid: HashGrid,
-    *,
-    packed: Tensor | None = None,
-) -> Tensor:
-    """A float16 or bfloat16 table gives features of its type; products and sums are float32."""
+def encode(positions: Tensor, table: Tensor, grid: HashGrid, packed: Tensor | None) -> Tensor:
     if positions.requires_grad:
         raise ValueError("backend 'gpu' gives no gradient for positions: use backend='reference'")
-    check_types(torch.float32, positions=positions)
-    check_types(torch.float32, torch.float16, torch.bfloat16, table=table)
+    check_types(torch.float32, positions=positions, table=table)
     return _Encode.apply(positions.contiguous(), table, grid, packed)
 
 
@@ -41,7 +32,7 @@ class _Encode(torch.autograd.Function):
     @staticmethod
     def forward(ctx, positions, table, grid, packed):
         ctx.save_for_backward(positions)
-        ctx.grid, ctx.dtype = grid, table.dtype
+        ctx.grid = grid
         read = table.detach() if packed is None else packed.view(torch.bfloat16).view(-1, 2)
         features = read.new_empty(len(positions), grid.channels)
         _launch(_forward, positions, read.contiguous(), grid, features)
@@ -50,17 +41,14 @@ class _Encode(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad):
         (positions,) = ctx.saved_tensors
-        return None, table_gradient(positions, grad, ctx.grid).to(ctx.dtype), None, None
+        return None, table_gradient(positions, grad, ctx.grid), None, None
 
 
 def table_gradient(positions: Tensor, grad: Tensor, grid: HashGrid) -> Tensor:
     """The gradient [entries, F] float32 of a table, by the gradient `grad` [N, levels * F] of the
     features at `positions` [N, 3]."""
     target = torch.zeros(grid.entries, grid.features, device=grad.device)
-    if torch.are_deterministic_algorithms_enabled():
-        _scatter_sorted(positions, grad.float(), grid, target)
-    else:
-        _launch(_scatter, positions, target, grid, grad.contiguous())
+    _launch(_scatter, positions, target, grid, grad.contiguous())
     return target
 
 
@@ -68,18 +56,9 @@ def _launch(
     kernel: triton.JITFunction, positions: Tensor, table: Tensor, grid: HashGrid, features: Tensor
 ) -> None:
     """Run `kernel`, which reads one of `table` and `features` and writes to the other."""
-    launch(
-        kernel,
-        (triton.cdiv(len(positions), BLOCK), grid.levels),
-        positions,
-        table,
-        *_level_arrays(grid, positions.device),
-        features,
-        len(positions),
-        features.shape[1],
-        FEATURES=grid.features,
-        BLOCK=BLOCK,
-    )
+    given = positions, table, *_level_arrays(grid, positions.device), features
+    programs = triton.cdiv(len(positions), BLOCK.value), grid.levels
+    launch(kernel, programs, *given, *features.shape, FEATURES=grid.features)
 
 
 @cache
@@ -88,22 +67,9 @@ def _level_arrays(grid: HashGrid, device: torch.device) -> tuple[Tensor, Tensor]
 
     Cached, because each copy to the device would synchronise.
     """
-    strides = [res if dense else 0 for res, dense in zip(grid.resolutions, grid.dense, strict=True)]
-    shapes = list(zip(strides, grid.offsets, grid.sizes, strict=False))
-    return (
-        torch.tensor(grid.scales, dtype=torch.float32, device=device),
-        torch.tensor(shapes, dtype=torch.int64, device=device),
-    )
-
-
-def _scatter_sorted(positions: Tensor, grad: Tensor, grid: HashGrid, target: Tensor) -> None:
-    """Add the gradient to `target` in a repeatable order."""
-    inside = torch.where(positions > 0, positions, 0).clamp(max=1)
-    for level in range(grid.levels):
-        entries, weights = corners(inside, grid, level)
-        of_level = grad[:, level * grid.features : (level + 1) * grid.features]
-        shares = weights[..., None] * of_level[:, None]  # [N, 8, F]
-        target.index_put_((entries,), shares, accumulate=True)
+    shapes = list(zip(grid.strides, grid.offsets, grid.sizes, strict=False))
+    scales = torch.tensor(grid.scales, dtype=torch.float32, device=device)
+    return scales, torch.tensor(shapes, dtype=torch.int64, device=device)
 
 
 @triton.jit
@@ -148,17 +114,7 @@ def _locate(positions, scales, shapes, level, i, inside):
 
 
 @triton.jit
-def _forward(
-    positions,
-    table,
-    scales,
-    shapes,
-    features,
-    total,
-    channels,
-    FEATURES: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+def _forward(positions, table, scales, shapes, features, total, channels, FEATURES: tl.constexpr):
     level = tl.program_id(1)
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = i < total
@@ -176,17 +132,7 @@ def _forward(
 
 
 @triton.jit
-def _scatter(
-    positions,
-    target,
-    scales,
-    shapes,
-    grad,
-    total,
-    channels,
-    FEATURES: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+def _scatter(positions, target, scales, shapes, grad, total, channels, FEATURES: tl.constexpr):
     """Adjoint of `_forward`: target[corner] += weight * grad."""
     level = tl.program_id(1)
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)

@@ -8,13 +8,7 @@ from torch import Tensor
 from methods.kernels.encode import PRIMES, HashGrid
 
 
-def encode(
-    positions: Tensor,
-    table: Tensor,
-    grid: HashGrid,
-    *,
-    packed: Tensor | None = None,
-) -> Tensor:
+def encode(positions: Tensor, table: Tensor, grid: HashGrid, packed: Tensor | None) -> Tensor:
     inside = torch.where(positions > 0, positions, 0).clamp(max=1)
     found = []
     for level in range(grid.levels):
@@ -43,8 +37,7 @@ def corners(positions: Tensor, grid: HashGrid, level: int) -> tuple[Tensor, Tens
 def _entry(vertex: Tensor, grid: HashGrid, level: int) -> Tensor:
     """Table entry, within its level, of integer grid vertices [..., 3]."""
     x, y, z = vertex.unbind(dim=-1)
-    if grid.dense[level]:
-        res = grid.resolutions[level]
+    if res := grid.strides[level]:
         return (x + y * res + z * res**2) % grid.sizes[level]
     hashed = x * PRIMES[0] ^ (y * PRIMES[1] & 0xFFFFFFFF) ^ (z * PRIMES[2] & 0xFFFFFFFF)
     return hashed % grid.sizes[level]

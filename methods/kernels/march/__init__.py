@@ -29,19 +29,14 @@ PARALLEL = 2.0**-127
 
 @dataclass(frozen=True)
 class Segments:
-    """The parts of R rays to sample; see `march`.
-
-    Attributes:
-        rays: the R rays.
-        window: [R, 2] nearest and farthest t, the latter excluded.
-        jitter: [R] phase of the samples.
-        start: [R] int32 first step; negative: no samples.
-    """
+    """The parts of R rays to sample, with all that `march` may be given."""
 
     rays: Rays
+    step: float
     window: Tensor
     jitter: Tensor
     start: Tensor
+    limit: int
 
 
 def march(
@@ -71,11 +66,9 @@ def march(
         extent: how many samples there are, from `extents`; with it, the host does not wait for a
             GPU.
     """
-    segments = _segments(rays, step, window, jitter, start)
-    limit = longest_ray(step) if limit is None else limit
-    expect(limit >= 1, "limit", "1 or more", limit)
+    segments = _segments(rays, step, window, jitter, start, limit)
     kernel = implementation(__name__, backend, rays.origins.device)
-    return kernel.march(segments, occupancy, step, limit, extent)
+    return kernel.march(segments, occupancy, extent)
 
 
 def extents(
@@ -91,8 +84,8 @@ def extents(
 
     The host waits for a GPU, once.
     """
-    segments = _segments(rays, step, window, None, None)
-    counts = implementation(__name__, backend, rays.origins.device).count(segments, occupancy, step)
+    kernel = implementation(__name__, backend, rays.origins.device)
+    counts = kernel.count(_segments(rays, step, window, None, None, None), occupancy)
     return Extent.of_each(functional.pad(counts, (0, -len(counts) % size)).view(-1, size))
 
 
@@ -102,7 +95,12 @@ def longest_ray(step: float) -> int:
 
 
 def _segments(
-    rays: Rays, step: float, window: Tensor | None, jitter: Tensor | None, start: Tensor | None
+    rays: Rays,
+    step: float,
+    window: Tensor | None,
+    jitter: Tensor | None,
+    start: Tensor | None,
+    limit: int | None,
 ) -> Segments:
     """Check the arguments of `march` and fill in defaults."""
     origins, count = rays.origins, check_rays(rays)
@@ -117,4 +115,6 @@ def _segments(
     check_shape("jitter", jitter, count)
     check_shape("start", start, count)
     expect(step > 0, "step", "a positive length", step)
-    return Segments(rays, window, jitter, start)
+    limit = longest_ray(step) if limit is None else limit
+    expect(limit >= 1, "limit", "1 or more", limit)
+    return Segments(rays, step, window, jitter, start, limit)

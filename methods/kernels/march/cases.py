@@ -4,6 +4,7 @@ corners, or come from very far."""
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import cache, partial
 from typing import Any
 
@@ -24,11 +25,7 @@ ALL = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * 3)  # [27, 3], on
 SOME = ALL[ALL.any(dim=1)]
 
 SIZE = 16
-CELL = torch.tensor([3, 12, 8])
-"""The only occupied cell of a grid."""
-
-FINE = 1e-4
-"""A step at which a ray has more than `MAX_SAMPLES` samples."""
+"""Cells along the grids of the ways."""
 
 
 def some_rays(count: int, away: float = 1.5) -> Rays:
@@ -167,64 +164,40 @@ def _agreements() -> list[Case]:
     return [*found, *MARCH.cases("hollow sphere", partial(dict, many), items=1 << 13)]
 
 
-def _ways() -> list[Case]:
+def _ways() -> Iterator[Case]:
     """Every kind of ray through a full grid, an empty one, and one with a single cell."""
-    found = []
-    for grid, holds in (
-        ("full grid", "samples add up to the way through the cube, and lie on it"),
-        ("one cell", "samples add up to the way through the cell, and lie on it"),
-        ("empty grid", "no samples"),
+    # Sampling rounds the ends of the path: by half a step in the cube, where the first sample lies
+    # half a step behind the entry; by one step in the cell, over both ends.
+    for grid, holds, steps in (
+        ("full", "samples add up to the way through the cube, and lie on it", 0.5),
+        ("one", "samples add up to the way through the cell, and lie on it", 1.0),
+        ("empty", "no samples", 0.0),
     ):
         for kind, rays in SPECIAL.items():
-            if "1e6" in kind and grid == "one cell":
+            if "1e6" in kind and grid == "one":
                 continue  # there, rounding of t is as large as the cell
             size = rays.origins.abs().max().item() + 1
-            # Sampling rounds the ends of the path: by half a step in the cube, where the first
-            # sample lies half a step behind the entry; by one step in the cell, over both ends.
-            steps = {"full grid": 0.5, "one cell": 1.0, "empty grid": 0.0}[grid]
-            rounding = 0.0 if grid == "empty grid" else 4 * math.sqrt(3) * size * U32
+            rounding = 0.0 if grid == "empty" else 4 * math.sqrt(3) * size * U32
             way = Property(
                 "march",
                 holds,
                 f"{steps} steps, and t rounded 4 times at the size of the origin: 4 √3 |o| u",
                 {(b, "fp32"): steps * STEP + rounding for b in ("reference", "cpu")},
             )
-            found.append(way.case(f"{kind}, {grid}", partial(_way_error, grid, rays, STEP)))
-    rest = Property(
-        "march",
-        "going on from where a ray was left gives the rest of the way",
-        "half a step, and t rounded 4 times at the size of the origin: 4 √3 |o| u",
-        {(b, "fp32"): FINE / 2 + 12 * math.sqrt(3) * U32 for b in ("reference", "cpu")},
-    )
-    error = partial(_way_error, "full grid", SPECIAL["along diagonals"], FINE)
-    return [*found, rest.case("1024 samples reached", error)]
+            yield way.case(f"{kind}, {grid}", partial(_way_error, grid, rays))
 
 
-def _way_error(
-    grid: str, given: Rays, step: float, backend: str, device: str, precision: str
-) -> float:
-    """Error of the path length covered by the samples, found in as many calls as needed."""
+def _way_error(grid: str, given: Rays, backend: str, device: str, precision: str) -> float:
+    """Error of the path length covered by the samples; infinite if they are not in order."""
     rays, dtype = placed(given, device), DTYPES[precision]
     rays = Rays(rays.origins.to(dtype), rays.directions.to(dtype))
-    occupied = torch.full((SIZE, SIZE, SIZE), grid == "full grid")
-    lower, upper = torch.zeros(1, 3), torch.ones(1, 3)
-    if grid == "one cell":
-        occupied[tuple(CELL)] = True
-        lower, upper = CELL[None] / SIZE, (CELL[None] + 1) / SIZE
-    occupancy, count = Occupancy(occupied.to(device)), len(rays.origins)
-    start = torch.zeros(count, dtype=torch.int32, device=device)
-    counts = torch.zeros(count, dtype=torch.int64, device=device)
-    outside = 0.0
-    for _ in range(math.ceil(math.sqrt(3) / step / MAX_SAMPLES) + 1):
-        samples = march(rays, occupancy, step, start=start, limit=MAX_SAMPLES, backend=backend)
-        counts += samples.offsets.diff()
-        start = samples.resume
-        if len(samples):
-            outside = max(outside, (samples.positions - 0.5).abs().max().item() - 0.5)
-            same = samples.ray[1:] == samples.ray[:-1]
-            if (samples.t.diff()[same] < 0).any():
-                return math.inf
-    if (start >= 0).any():
+    occupied = cells(grid, SIZE)
+    samples = march(rays, Occupancy(occupied.to(device)), STEP, backend=backend)
+    same = samples.ray[1:] == samples.ray[:-1]
+    if (samples.t.diff()[same] < 0).any() or (samples.resume >= 0).any():
         return math.inf
-    way = slab_lengths(rays, lower, upper)[:, 0] * (grid != "empty grid")
-    return max((counts.cpu() * step - way).abs().max().item(), outside)
+    lower = occupied.nonzero() / SIZE
+    way = slab_lengths(rays, lower, lower + 1 / SIZE).sum(dim=1)
+    wrong = (samples.offsets.diff().cpu() * STEP - way).abs().max().item()
+    outside = (samples.positions - 0.5).abs().max().item() - 0.5 if len(samples) else 0.0
+    return max(wrong, outside)

@@ -15,9 +15,9 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from methods.kernels.cpu import arrays, f32, i32, slope, u64
+from methods.kernels.cpu import arrays, check_float32, f32, i32, slope, u64
 from methods.kernels.march import Segments, longest_ray
-from methods.kernels.types import Extent, Occupancy, Samples
+from methods.kernels.types import Extent, Occupancy, Samples, offsets_of
 
 CHUNK = 128
 """Rays that are marched together; their numbers stay in the first-level cache."""
@@ -41,43 +41,29 @@ K, RAY, COUNT, CELL, FREE = 0, 1, 2, 3, 6
 INTEGERS = 7
 
 
-def count(segments: Segments, occupancy: Occupancy, step: float) -> Tensor:
+def count(segments: Segments, occupancy: Occupancy) -> Tensor:
     """How many samples a ray has, [R] int64."""
-    return march(segments, occupancy, step, longest_ray(step)).offsets.diff()
+    return march(segments, occupancy, None).offsets.diff()
 
 
-def march(
-    segments: Segments,
-    occupancy: Occupancy,
-    step: float,
-    limit: int,
-    extent: Extent | None = None,
-) -> Samples:
-    origins, directions = segments.rays.origins, segments.rays.directions
-    if origins.dtype != torch.float32:
-        raise ValueError(f"backend 'cpu' marches float32, got {origins.dtype}")
+def march(segments: Segments, occupancy: Occupancy, extent: Extent | None) -> Samples:
+    step, origins, directions = segments.step, segments.rays.origins, segments.rays.directions
+    check_float32(origins)
     rays = len(origins)
-    most = min(limit, longest_ray(step))
+    most = min(segments.limit, longest_ray(step))
     size = -(-rays // CHUNK) * CHUNK * most
     scratch, owners = torch.empty(size), torch.empty(size, dtype=torch.uint8)
     counts = torch.empty(rays, dtype=torch.int64)
     resume = torch.empty(rays, dtype=torch.int32)
-    _find(
-        *arrays(origins, directions, occupancy.words.flatten(), occupancy.clearance.flatten()),
-        occupancy.resolution,
-        *arrays(occupancy.bounds),
-        f32(step),
-        *arrays(segments.window, segments.jitter, segments.start),
-        most,
-        *arrays(scratch, owners, counts, resume),
-    )
-    offsets = torch.zeros(rays + 1, dtype=torch.int64)
-    torch.cumsum(counts, dim=0, out=offsets[1:])
+    given = arrays(origins, directions, segments.window, segments.jitter, segments.start)
+    grid = arrays(occupancy.words.flatten(), occupancy.clearance.flatten(), occupancy.bounds)
+    found = arrays(scratch, owners, counts, resume)
+    _find(tuple(given), tuple(grid), occupancy.resolution, f32(step), most, tuple(found))
+    offsets = offsets_of(counts)
     total = int(offsets[-1])
     t, positions = torch.empty(total), torch.empty(total, 3)
     ray = torch.empty(total, dtype=torch.int32)
-    given = arrays(origins, directions, scratch, owners)
-    _place(*given, most, *arrays(offsets, t, positions, ray))
+    _place(*given[:2], *found[:2], most, *arrays(offsets, t, positions, ray))
     return Samples(t, torch.full((total,), step), offsets, ray, positions, resume)
 
 
@@ -265,23 +251,10 @@ def _march_chunk(
 
 
 @njit(cache=True, parallel=True)
-def _find(
-    origins,
-    directions,
-    words,
-    clearance,
-    resolution,
-    bounds,
-    step,
-    window,
-    jitter,
-    start,
-    most,
-    scratch,
-    owners,
-    counts,
-    resume,
-):
+def _find(given, grid, resolution, step, most, found):
+    origins, directions, window, jitter, start = given
+    words, clearance, bounds = grid
+    scratch, owners, counts, resume = found
     rays = len(origins)
     for chunk in prange((rays + CHUNK - 1) // CHUNK):
         floats = np.zeros(FLOATS * CHUNK, np.float32)
@@ -297,19 +270,8 @@ def _find(
             if not integers[_at(FREE, i)]:
                 active -= 1
                 _move(floats, integers, active, i)
-        _march_chunk(
-            floats,
-            integers,
-            active,
-            words,
-            clearance,
-            resolution,
-            most,
-            scratch[first * most :],
-            owners[first * most :],
-            counts[first:],
-            resume[first:],
-        )
+        own = scratch[first * most :], owners[first * most :], counts[first:], resume[first:]
+        _march_chunk(floats, integers, active, words, clearance, resolution, most, *own)
 
 
 @njit(cache=True, parallel=True)
@@ -326,6 +288,5 @@ def _place(origins, directions, scratch, owners, most, offsets, t, positions, ra
             t[sample] = along
             ray_of[sample] = first + ray
             for axis in range(3):
-                positions[sample, axis] = (
-                    origins[first + ray, axis] + along * directions[first + ray, axis]
-                )
+                way = along * directions[first + ray, axis]
+                positions[sample, axis] = origins[first + ray, axis] + way

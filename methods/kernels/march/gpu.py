@@ -14,59 +14,51 @@ from torch import Tensor
 
 from methods.kernels.dispatch import interpreted
 from methods.kernels.gpu import check_types, launch, vector
-from methods.kernels.march import PARALLEL, Segments, longest_ray
-from methods.kernels.march.reference import clip
-from methods.kernels.types import BRICK, Extent, Occupancy, Samples
+from methods.kernels.march import Segments
+from methods.kernels.march.reference import clip, slopes
+from methods.kernels.types import BRICK, Extent, Occupancy, Samples, offsets_of
 
 BLOCK = 128 if interpreted() else 32
 """Rays per program: one warp, which waits for its longest ray. The interpreter takes as long for
 many as for few."""
 
 
-def count(segments: Segments, occupancy: Occupancy, step: float) -> Tensor:
+def count(segments: Segments, occupancy: Occupancy) -> Tensor:
     """How many samples a ray has, [R] int64."""
-    counts, _ = _counted(_arguments(segments, occupancy, step, longest_ray(step)))
+    counts, _ = _counted(_arguments(segments, occupancy))
     return counts
 
 
-def march(
-    segments: Segments,
-    occupancy: Occupancy,
-    step: float,
-    limit: int,
-    extent: Extent | None = None,
-) -> Samples:
-    arguments = _arguments(segments, occupancy, step, limit)
+def march(segments: Segments, occupancy: Occupancy, extent: Extent | None) -> Samples:
+    arguments = _arguments(segments, occupancy)
     counts, resume = _counted(arguments)
     if extent is None:
         (extent,) = Extent.of_each(counts[None])
     device, total = counts.device, extent.total
-    offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
+    offsets = offsets_of(counts)
     ray = torch.empty(total, dtype=torch.int32, device=device)
     t, positions = (torch.empty(*shape, device=device) for shape in ((total,), (total, 3)))
     _launch(arguments, counts, resume, offsets, ray, t, positions)
-    delta = torch.full_like(t, step)
+    delta = torch.full_like(t, segments.step)
     return Samples(t, delta, offsets, ray, positions, resume, longest=extent.longest)
 
 
-def _arguments(segments: Segments, occupancy: Occupancy, step: float, limit: int) -> list[Any]:
+def _arguments(segments: Segments, occupancy: Occupancy) -> list[Any]:
     """The arguments of `_march` for rays and grid; the last one is R."""
     origins, directions = segments.rays.origins, segments.rays.directions
-    window, jitter, start = segments.window, segments.jitter, segments.start
+    window, jitter = segments.window, segments.jitter
     check_types(torch.float32, origins=origins, directions=directions, window=window, jitter=jitter)
-    near, far, step_t, alive = clip(segments.rays, step, window[:, 1])
-    parallel = directions.abs() < PARALLEL
-    slopes = torch.where(parallel, 0, 1 / torch.where(parallel, 1, directions))
+    near, far, step_t, alive = clip(segments)
     # Clamped to the cube: a window may lie outside it, beyond the range of integers.
     lowest = torch.minimum(torch.maximum(window[:, 0], near), far)
-    given = (origins, directions, slopes, near, far, step_t, lowest, jitter)
+    given = (origins, directions, slopes(directions)[0], near, far, step_t, lowest, jitter)
     return [
         *(x.contiguous() for x in given),
-        torch.where(alive, start, -1).int(),
+        torch.where(alive, segments.start, -1).int(),
         occupancy.words,
         occupancy.clearance,
         occupancy.resolution // BRICK,
-        limit,
+        segments.limit,
         len(origins),
     ]
 

@@ -9,40 +9,30 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from bench.types import Rays
 from methods.kernels.march import PARALLEL, Segments, longest_ray
-from methods.kernels.types import Extent, Occupancy, Samples
+from methods.kernels.types import Extent, Occupancy, Samples, offsets_of
 
 BLOCK = 1 << 12
 """Rays that are tested at a time: [BLOCK, 1024, 3] positions are 50 MB."""
 
 
-def count(segments: Segments, occupancy: Occupancy, step: float) -> Tensor:
+def count(segments: Segments, occupancy: Occupancy) -> Tensor:
     """How many samples a ray has, [R] int64."""
-    parts = [
-        counts for _, counts, _ in _Steps.of(segments, step).taken(occupancy, longest_ray(step))
-    ]
-    return torch.cat(parts)
+    return torch.cat([counts for _, counts, _ in _Steps.of(segments).taken(occupancy)])
 
 
-def march(
-    segments: Segments,
-    occupancy: Occupancy,
-    step: float,
-    limit: int,
-    extent: Extent | None = None,
-) -> Samples:
-    steps = _Steps.of(segments, step)
-    parts = zip(*steps.taken(occupancy, limit), strict=True)
+def march(segments: Segments, occupancy: Occupancy, extent: Extent | None) -> Samples:
+    steps = _Steps.of(segments)
+    parts = zip(*steps.taken(occupancy), strict=True)
     kept, counts, resume = (torch.cat(column) for column in parts)
     if extent is None:
         (extent,) = Extent.of_each(counts[None])
     place = torch.nonzero_static(kept.flatten(), size=extent.total).squeeze(1)
     ray, k = place // max(steps.most, 1), place % max(steps.most, 1)
     t, positions = steps.at(ray, k)
-    offsets = torch.cat((counts.new_zeros(1), counts.cumsum(dim=0)))
-    delta = torch.full_like(t, step)
-    return Samples(t, delta, offsets, ray.int(), positions, resume, longest=extent.longest)
+    delta = torch.full_like(t, segments.step)
+    where = t, delta, offsets_of(counts), ray.int(), positions, resume
+    return Samples(*where, longest=extent.longest)
 
 
 @dataclass(frozen=True)
@@ -57,10 +47,9 @@ class _Steps:
     most: int
 
     @classmethod
-    def of(cls, segments: Segments, step: float) -> _Steps:
-        near, far, length, alive = clip(segments.rays, step, segments.window[:, 1])
-        alive &= segments.start >= 0
-        most = longest_ray(step)
+    def of(cls, segments: Segments) -> _Steps:
+        near, far, length, alive = clip(segments)
+        most = longest_ray(segments.step)
         if alive.device.type == "cpu":  # a GPU would make the host wait
             count = torch.where(alive, (far - near) / length, 0).ceil()
             most = int(functional.pad(count, (0, 1)).max())
@@ -72,50 +61,59 @@ class _Steps:
         t = self.near[ray] + (k + self.segments.jitter[ray]) * self.length[ray]
         return t, rays.origins[ray] + t[..., None] * rays.directions[ray]
 
-    def taken(self, occupancy: Occupancy, limit: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    def taken(self, occupancy: Occupancy) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """For each batch of rays: which steps are samples [R, most], counts [R], resume [R]."""
         rays = torch.arange(len(self.near), device=self.near.device)
         k = torch.arange(self.most, device=self.near.device)
         for ray in rays.split(BLOCK):
-            yield self._taken(ray[:, None], k, occupancy, limit)
+            yield self._taken(ray[:, None], k, occupancy)
 
-    def _taken(
-        self, ray: Tensor, k: Tensor, occupancy: Occupancy, limit: int
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _taken(self, ray: Tensor, k: Tensor, occupancy: Occupancy) -> tuple[Tensor, Tensor, Tensor]:
         t, positions = self.at(ray, k)  # [R, K], [R, K, 3]
         candidate = self.alive[ray] & (t >= self.segments.window[ray, 0]) & (t < self.far[ray])
         candidate &= k >= self.segments.start[ray]
         candidate &= occupancy.holds(torch.where(candidate[..., None], positions, 0))
 
-        rank = candidate.cumsum(dim=1)
-        kept = candidate & (rank <= limit)
+        limit = self.segments.limit
+        kept = candidate & (candidate.cumsum(dim=1) <= limit)
         per_ray = kept.sum(dim=1)
-        full = (per_ray == limit) & (per_ray > 0)
+        full = per_ray == limit
         last = (kept * (k + 1)).amax(dim=1) if len(k) else per_ray
         return kept, per_ray, torch.where(full, last, -1).int()
 
 
-def clip(rays: Rays, step: float, farthest: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The range of t inside the cube and nearer than `farthest`, the step in t, whether to march.
-
-    near, far, step and mask are [R] each.
-    """
-    entry, leave = _cross_unit_cube(rays.origins, rays.directions)
-    near, far = entry.clamp(min=0), torch.minimum(leave, farthest)
-    # In float64, so that every backend rounds to the same float32.
-    length = rays.directions.double().norm(dim=-1).to(rays.directions.dtype)
+def clip(segments: Segments) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The range of t inside the cube, as far as the window reaches, the step in t, and whether to
+    march: near, far, step and mask, [R] each."""
+    origins, directions = segments.rays.origins, segments.rays.directions
+    slope, parallel = slopes(directions)
+    entry, leave = crossed(origins, parallel, -origins * slope, (1 - origins) * slope)
+    near, far = entry.clamp(min=0), torch.minimum(leave, segments.window[:, 1])
+    length = lengths(directions)
     # A true division: `step / length` would multiply by the reciprocal, which is an ulp off.
-    step_t = torch.full_like(length, step) / length
-    return near, far, step_t, (near < far) & far.isfinite() & step_t.isfinite()
+    step_t = torch.full_like(length, segments.step) / length
+    alive = (near < far) & far.isfinite() & step_t.isfinite() & (segments.start >= 0)
+    return near, far, step_t, alive
 
 
-def _cross_unit_cube(origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Where rays enter and leave [0, 1]^3 (slab test); enter > leave if they miss it."""
+def lengths(directions: Tensor) -> Tensor:
+    """Lengths [R] of directions [R, 3]; in float64, so all backends round to the same float32."""
+    return directions.double().norm(dim=-1).to(directions.dtype)
+
+
+def slopes(directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Change of t per length along each axis [R, 3], 0 for a ray that does not move along it, and
+    whether it does not."""
     parallel = directions.abs() < PARALLEL
-    slope = 1 / torch.where(parallel, 1, directions)
-    first, second = -origins * slope, (1 - origins) * slope
-    inside = (origins >= 0) & (origins <= 1)
-    outside = torch.where(inside, -torch.inf, torch.inf)
+    return torch.where(parallel, 0, 1 / torch.where(parallel, 1, directions)), parallel
+
+
+def crossed(
+    origins: Tensor, parallel: Tensor, first: Tensor, second: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Where rays enter and leave [0, 1]^3, given the t [R, 3] at which they cross its two planes of
+    each axis; enter > leave if they miss it (slab test)."""
+    outside = torch.where((origins >= 0) & (origins <= 1), -torch.inf, torch.inf)
     lower = torch.where(parallel, outside, torch.minimum(first, second))
     upper = torch.where(parallel, -outside, torch.maximum(first, second))
     return lower.amax(dim=-1), upper.amin(dim=-1)

@@ -12,25 +12,18 @@ from torch import Tensor
 
 from bench.types import check_shape
 from methods.kernels.dispatch import implementation
+from methods.kernels.types import expect
 
 
 def mlp(inputs: Sequence[Tensor], weights: Sequence[Tensor], *, backend: str = "auto") -> Tensor:
     """The outputs W_n relu(... relu(W_1 x)) [S, O_n] of a network with a ReLU between its layers.
 
-    Differentiable in inputs and weights; NaN stays NaN.
-
-    Args:
-        inputs: one or two tensors [S, I]; x is both, side by side.
-        weights: [O, I] of each layer, one or more, of the same dtype as the inputs.
-
-    Raises:
-        ValueError: wrong shapes or numbers of inputs or layers; backend "cpu": neither float32
-            nor bfloat16.
+    Differentiable in inputs and weights; NaN stays NaN. `inputs` are one or two tensors [S, I]; x
+    is both, side by side. `weights` are [O, I] of each layer, of the same dtype as the inputs, for
+    backend "cpu" float32 or bfloat16.
     """
-    if len(inputs) not in (1, 2):
-        raise ValueError(f"inputs: expected one or two, got {len(inputs)}")
-    if not weights:
-        raise ValueError("weights: expected one layer or more, got none")
+    expect(len(inputs) in (1, 2), "inputs", "one or two", len(inputs))
+    expect(bool(weights), "weights", "one layer or more", "none")
     for part in inputs:
         check_shape("inputs", part, len(inputs[0]), None)
     channels = sum(part.shape[1] for part in inputs)

@@ -15,7 +15,7 @@ from numba import njit, prange
 from torch import Tensor
 from torch.nn import functional
 
-from methods.kernels.cpu import LANES, f32, multiply, u64
+from methods.kernels.cpu import LANES, check_float32, f32, multiply, u64
 from methods.kernels.mlp.reference import layer_by_layer
 
 DEEP = 96
@@ -40,18 +40,12 @@ def mlp(inputs: Sequence[Tensor], weights: Sequence[Tensor]) -> Tensor:
     tensors = *inputs, *weights
     if all(tensor.dtype == torch.bfloat16 for tensor in tensors):
         return layer_by_layer(inputs, weights, _Relu.apply)
-    for tensor in tensors:
-        if tensor.dtype != torch.float32:
-            raise ValueError(
-                f"backend 'cpu' multiplies float32 or bfloat16, got {tensor.dtype}: "
-                "use backend='reference'"
-            )
+    check_float32(*tensors)
     left = inputs[0]
     right = inputs[1] if len(inputs) > 1 else left.new_empty(len(left), 0)
     if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
         return _outputs(left, right, weights, learning=False)[0]
-    out: Tensor = _Network.apply(left, right, *weights)
-    return out
+    return _Network.apply(left, right, *weights)
 
 
 def _outputs(
@@ -61,13 +55,8 @@ def _outputs(
     widths = [left.shape[1] + right.shape[1], *map(len, weights)]
     kept = torch.empty(len(left) * sum(map(_padded, widths[1:-1])) if learning else 0)
     out = torch.empty(len(left), widths[-1])
-    _forward(
-        *_flat(left, right),
-        left.shape[1],
-        *_flat(_joined(weights, turned=False)),
-        *_sizes(widths),
-        *_flat(kept, out),
-    )
+    given, joined = _flat(left, right), _flat(_joined(weights, turned=False))
+    _forward(*given, left.shape[1], *joined, *_sizes(widths), *_flat(kept, out))
     return out, kept
 
 
@@ -86,14 +75,8 @@ class _Network(torch.autograd.Function):
         of_weights = torch.zeros(CHUNKS, len(turned))
         wanted = any(ctx.needs_input_grad[:2])
         of_inputs = [x.new_empty(x.shape if wanted else 0) for x in (left, right)]
-        _backward(
-            *_flat(left, right),
-            left.shape[1],
-            *_flat(turned),
-            *_sizes(widths),
-            *_flat(kept, grad, *of_inputs),
-            of_weights.numpy(),
-        )
+        given, results = _flat(left, right), [*_flat(kept, grad, *of_inputs), of_weights.numpy()]
+        _backward(*given, left.shape[1], *_flat(turned), *_sizes(widths), *results)
         shapes = [(_padded(i), _padded(o)) for i, o in pairwise(widths)]
         parts = of_weights.sum(dim=0).split([i * o for i, o in shapes])
         of_layers = [

@@ -32,16 +32,9 @@ def spherical_harmonics(directions: Tensor, *, backend: str = "auto") -> Tensor:
 def shade(coefficients: Tensor, directions: Tensor, *, backend: str = "auto") -> Tensor:
     """Sums of harmonics [N, 3], for each direction weighted with its own coefficients.
 
-    Differentiable in the coefficients; in the directions with backend="reference" only.
-
-    Args:
-        coefficients: [N, C, 3] for the first C harmonics in the order of `spherical_harmonics`;
-            C is 1, 4, 9 or 16, for degrees up to 0, 1, 2 or 3.
-        directions: [N, 3] unit vectors.
-
-    Raises:
-        ValueError: wrong shapes; backend "cpu": not float32.
-        Unavailable: backend "gpu".
+    Differentiable in the `coefficients` [N, C, 3], those of the first C harmonics in the order of
+    `spherical_harmonics`; C is 1, 4, 9 or 16, for degrees up to 0, 1, 2 or 3. In the unit vectors
+    `directions` [N, 3] with backend="reference" only. There is no backend "gpu".
     """
     if backend == "gpu":
         raise Unavailable("backend='gpu': shade has no such version: use backend=auto")

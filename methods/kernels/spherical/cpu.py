@@ -7,7 +7,7 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from methods.kernels.cpu import arrays, f32, u64
+from methods.kernels.cpu import arrays, check_float32, f32, u64
 from methods.kernels.spherical import FACTORS
 
 BLOCK = 256
@@ -22,21 +22,21 @@ C00, C1, C2, C20, C22, C33, C3XYZ, C31, C30, C32 = map(f32, FACTORS)
 
 
 def spherical_harmonics(directions: Tensor) -> Tensor:
-    if directions.dtype != torch.float32 or directions.requires_grad:
-        raise ValueError(
-            "backend 'cpu' takes float32 directions without gradient: use backend='reference'"
-        )
+    _check(directions)
     values = torch.empty(len(directions), 16)
     _evaluate(*arrays(directions, values))
     return values
 
 
 def shade(coefficients: Tensor, directions: Tensor) -> Tensor:
-    if not coefficients.dtype == directions.dtype == torch.float32 or directions.requires_grad:
-        raise ValueError(
-            "backend 'cpu' takes float32, and directions without gradient: use backend='reference'"
-        )
+    _check(directions, coefficients)
     return _Shade.apply(coefficients, directions.contiguous())
+
+
+def _check(directions: Tensor, *others: Tensor) -> None:
+    check_float32(directions, *others)
+    if directions.requires_grad:
+        raise ValueError("backend 'cpu' gives no gradient for directions: use backend='reference'")
 
 
 class _Shade(torch.autograd.Function):
@@ -98,11 +98,9 @@ def _unshade(grad, directions, terms, grads):
             red, green, blue = grad[first + i, 0], grad[first + i, 1], grad[first + i, 2]
             for _ in range(terms):
                 value = basis[of]
-                grads[at], grads[at + ONE], grads[at + TWO] = (
-                    value * red,
-                    value * green,
-                    value * blue,
-                )
+                grads[at] = value * red
+                grads[at + ONE] = value * green
+                grads[at + TWO] = value * blue
                 at, of = at + THREE, of + NEXT
 
 

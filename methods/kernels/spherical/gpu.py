@@ -33,50 +33,26 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
 
 
 @triton.jit
-def _harmonic(x, y, z, k: tl.constexpr):
-    """The k-th harmonic."""
+def _harmonics(x, y, z):
     xx, yy, zz = x * x, y * y, z * z
-    if k == 0:
-        return tl.full(x.shape, C00, tl.float32)
-    elif k == 1:
-        return y * C1
-    elif k == 2:
-        return z * C1
-    elif k == 3:
-        return x * C1
-    elif k == 4:
-        return x * C2 * y
-    elif k == 5:
-        return y * C2 * z
-    elif k == 6:
-        return (2 * zz - xx - yy) * C20
-    elif k == 7:
-        return x * C2 * z
-    elif k == 8:
-        return (xx - yy) * C22
-    elif k == 9:
-        return y * C33 * (3 * xx - yy)
-    elif k == 10:
-        return x * C3XYZ * y * z
-    elif k == 11:
-        return y * C31 * (4 * zz - xx - yy)
-    elif k == 12:
-        return z * C30 * (2 * zz - 3 * xx - 3 * yy)
-    elif k == 13:
-        return x * C31 * (4 * zz - xx - yy)
-    elif k == 14:
-        return z * C32 * (xx - yy)
-    else:
-        return x * C33 * (xx - 3 * yy)
-
-
-@triton.jit
-def _rows(x, y, z, column, SIZE: tl.constexpr):
-    """For each direction, the harmonic of each `column`; 0 from `SIZE` on."""
-    rows = tl.zeros([x.shape[0], column.shape[0]], tl.float32)
-    for k in tl.static_range(SIZE):
-        rows = tl.where(column[None, :] == k, _harmonic(x, y, z, k)[:, None], rows)
-    return rows
+    return (
+        tl.full(x.shape, C00, tl.float32),
+        y * C1,
+        z * C1,
+        x * C1,
+        x * C2 * y,
+        y * C2 * z,
+        (2 * zz - xx - yy) * C20,
+        x * C2 * z,
+        (xx - yy) * C22,
+        y * C33 * (3 * xx - yy),
+        x * C3XYZ * y * z,
+        y * C31 * (4 * zz - xx - yy),
+        z * C30 * (2 * zz - 3 * xx - 3 * yy),
+        x * C31 * (4 * zz - xx - yy),
+        z * C32 * (xx - yy),
+        x * C33 * (xx - 3 * yy),
+    )
 
 
 @triton.jit
@@ -84,6 +60,10 @@ def _evaluate(directions, values, count, ROWS: tl.constexpr, SIZE: tl.constexpr)
     i = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     inside = i < count
     x, y, z = vector(directions, i, inside)
+    harmonics = _harmonics(x, y, z)
     column = tl.arange(0, SIZE)
+    rows = tl.zeros([ROWS, SIZE], tl.float32)
+    for k in tl.static_range(SIZE):
+        rows = tl.where(column[None, :] == k, harmonics[k][:, None], rows)
     place = values + i[:, None] * SIZE + column[None, :]
-    tl.store(place, _rows(x, y, z, column, SIZE), mask=inside[:, None])
+    tl.store(place, rows, mask=inside[:, None])

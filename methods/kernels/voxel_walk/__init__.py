@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -37,12 +38,8 @@ class Voxels:
     that contain any voxel. Both hold int32 numbers, -1 for empty.
 
     Attributes:
-        coordinates: [V, 3] integers from 0 to G - 1, distinct (x, y, z) of the voxels; row v is
-            voxel v.
+        coordinates: [V, 3] integers from 0 to G - 1, distinct (x, y, z); row v is voxel v.
         resolution: G, a multiple of 8, at most `MAX_RESOLUTION`.
-
-    Raises:
-        ValueError: invalid resolution or coordinates.
     """
 
     coordinates: Tensor
@@ -54,36 +51,29 @@ class Voxels:
         whole = 0 < size <= MAX_RESOLUTION and not size % BRICK
         multiple = f"a multiple of {BRICK} from {BRICK} to {MAX_RESOLUTION}"
         expect(whole, "resolution", multiple, size)
-        kind = coordinates.dtype
-        expect(not kind.is_floating_point, "coordinates", "integers", kind)
         if len(coordinates):
             low, high = (int(end) for end in torch.aminmax(coordinates))
             expect(0 <= low <= high < size, "coordinates", f"0 to {size - 1}", f"{low} to {high}")
-        if int((self.leaves >= 0).sum()) != len(coordinates):
-            raise ValueError("coordinates: expected every cell once, got some of them twice")
 
     @cached_property
-    def _maps(self) -> tuple[Tensor, Tensor]:
-        side, device = self.resolution // BRICK, self.coordinates.device
-        x, y, z = self.coordinates.long().unbind(dim=1)
-        brick = ((x // BRICK) * side + y // BRICK) * side + z // BRICK
-        used, row = brick.unique(return_inverse=True)
-        bricks = torch.full((side**3,), -1, dtype=torch.int32, device=device)
-        bricks[used] = torch.arange(len(used), dtype=torch.int32, device=device)
-        cell = (x % BRICK * BRICK + y % BRICK) * BRICK + z % BRICK
-        leaves = torch.full((len(used) * BRICK**3,), -1, dtype=torch.int32, device=device)
-        leaves[row * BRICK**3 + cell] = torch.arange(len(x), dtype=torch.int32, device=device)
-        return bricks.view(side, side, side), leaves.view(-1, BRICK**3)
-
-    @property
     def bricks(self) -> Tensor:
         """Row of `leaves` of each brick: [G/8, G/8, G/8]."""
-        return self._maps[0]
+        side = self.resolution // BRICK
+        used = torch.zeros([side] * 3, dtype=torch.bool, device=self.coordinates.device)
+        used[(self.coordinates.long() // BRICK).unbind(dim=1)] = True
+        row = used.flatten().cumsum(dim=0).view_as(used) - 1
+        return torch.where(used, row, -1).int()
 
-    @property
+    @cached_property
     def leaves(self) -> Tensor:
         """Voxel of each cell (x, y, z) of a brick, at (x * 8 + y) * 8 + z: [B, 512]."""
-        return self._maps[1]
+        coordinates, bricks = self.coordinates.long(), self.bricks
+        row = bricks[(coordinates // BRICK).unbind(dim=1)].long()
+        x, y, z = (coordinates % BRICK).unbind(dim=1)
+        leaves = bricks.new_full((int(bricks.max()) + 1, BRICK**3), -1)
+        number = torch.arange(len(row), dtype=torch.int32, device=row.device)
+        leaves[row, (x * BRICK + y) * BRICK + z] = number
+        return leaves
 
     def __len__(self) -> int:
         return len(self.coordinates)
@@ -98,10 +88,8 @@ class Voxels:
         clearance = torch.zeros_like(near)
         for _ in range(min(self.resolution // BRICK, MAX_CLEARANCE)):
             clearance += near == 0
-            for axis in range(3):  # maximum over a cube, one axis at a time
-                kernel, padding = [1, 1, 1], [0, 0, 0]
-                kernel[axis], padding[axis] = 3, 1
-                near = functional.max_pool3d(near, kernel, stride=1, padding=padding)
+            for size in ((3, 1, 1), (1, 3, 1), (1, 1, 3)):  # maximum over a cube, axis by axis
+                near = functional.max_pool3d(near, size, 1, [n // 2 for n in size])
         return clearance[0, 0].to(torch.uint8)
 
     @cached_property
@@ -126,61 +114,21 @@ class Crossings(Intervals):
         far: [S] t where it leaves; for touching voxels it equals `near` of the next one.
         ray: [S] int32, the ray that a crossing belongs to.
         voxel: [S] int32 row of `Voxels.coordinates`.
-        resume: [R] t to resume from; +inf if the ray has no more crossings.
     """
 
     near: Tensor
     far: Tensor
     ray: Tensor
     voxel: Tensor
-    resume: Tensor
-
-    def __len__(self) -> int:
-        return len(self.t)
-
-    def front(self, counts: Tensor) -> Crossings:
-        """Only the first `counts` [R] crossings of each ray, without resuming."""
-        kept, offsets, longest = self.first_of_each(counts)
-        return Crossings(
-            self.t[kept],
-            self.delta[kept],
-            offsets,
-            self.near[kept],
-            self.far[kept],
-            self.ray[kept],
-            self.voxel[kept],
-            torch.full_like(self.resume, torch.inf),
-            longest=longest,
-        )
+    of_a_sample: ClassVar[tuple[str, ...]] = "t", "delta", "near", "far", "ray", "voxel"
 
 
-def walk(
-    rays: Rays,
-    voxels: Voxels,
-    *,
-    start: Tensor | None = None,
-    limit: int | None = None,
-    backend: str = "auto",
-) -> Crossings:
+def walk(rays: Rays, voxels: Voxels, *, backend: str = "auto") -> Crossings:
     """Find every voxel that each of R `rays` crosses with positive length. Not differentiable.
 
     A ray in a plane between cells belongs to the cells above it. A ray has no crossings if it
     misses the cube, is not finite, or has a direction that is zero or so short that t overflows.
-
-    Args:
-        start: [R] first t, from `Crossings.resume` of an earlier call with the same rays; inside a
-            voxel, the rest of the voxel counts. +inf or NaN: no crossings. None: 0.
-        limit: maximum number of crossings per ray; None: all.
-
-    Raises:
-        ValueError: wrong shapes, a limit below 1; backend "cpu": not float32.
+    The rays are float32; for backend="reference" also of another type.
     """
-    origins, count = rays.origins, check_rays(rays)
-    if start is None:
-        start = origins.new_zeros(1).expand(count)
-    check_shape("start", start, count)
-    most = 3 * voxels.resolution  # planes of the cube, and one cell before the first
-    limit = most if limit is None else limit
-    expect(limit >= 1, "limit", "1 or more", limit)
-    kernel = implementation(__name__, backend, origins.device)
-    return kernel.walk(rays, voxels, start, min(limit, most))
+    check_rays(rays)
+    return implementation(__name__, backend, rays.origins.device).walk(rays, voxels)

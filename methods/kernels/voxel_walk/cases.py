@@ -20,7 +20,7 @@ from methods.kernels.voxel_walk import Voxels, walk
 SIZE = 24
 """Resolution of the grids in most cases; not a power of two, so that planes are rounded."""
 
-RESULTS = ("offsets", "ray", "voxel", "near", "far", "t", "delta", "resume")
+RESULTS = ("offsets", "ray", "voxel", "near", "far", "t", "delta")
 
 
 def _walk(given: Given, backend: str) -> tuple[Tensor, ...]:
@@ -33,13 +33,12 @@ WALK = Operation("voxel_walk", served(__package__), _walk, dict.fromkeys(RESULTS
 
 
 def cases() -> list[Case]:
-    """Every kind of grid, ray, start and limit."""
+    """Every kind of grid and ray."""
     return [*_agreements(), *_lengths()]
 
 
 def _agreements() -> Iterator[Case]:
     kinds: dict[str, dict[str, Any]] = {
-        "limit 1": {"limit": 1, "grid": "full"},
         "no ray": {"count": 0},
         "one ray": {"count": 1},
         "inside and outside": {},
@@ -47,8 +46,6 @@ def _agreements() -> Iterator[Case]:
         "no voxel": {"grid": "empty"},
         "all voxels": {"count": 65, "grid": "full"},
         "one voxel": {"grid": "one"},
-        "limit 7": {"limit": 7, "grid": "full"},
-        "begun on the way": {"begun": True, "grid": "full"},
         "axes, planes, corners and what is not finite": {"count": None, "grid": "full"},
         "from 1e6 away": {"away": 1e6, "grid": "full"},
     }
@@ -59,20 +56,9 @@ def _agreements() -> Iterator[Case]:
     yield from WALK.cases("hollow sphere in 128^3", shell, items=many)
 
 
-def _given(
-    count: int | None = 129,
-    grid: str = "dust",
-    away: float = 1.5,
-    begun: bool = False,
-    limit: int | None = None,
-) -> Given:
+def _given(count: int | None = 129, grid: str = "dust", away: float = 1.5) -> Given:
     rays = special_rays() if count is None else some_rays(count, away)
-    start = None
-    if begun:
-        generator = torch.Generator().manual_seed(4)
-        start = 2 * torch.rand(len(rays.origins), generator=generator) - 0.2
-        start[:4] = torch.tensor([torch.inf, -torch.inf, torch.nan, 1e30])
-    return {"rays": rays, "voxels": _grid(grid), "start": start, "limit": limit}
+    return {"rays": rays, "voxels": _grid(grid)}
 
 
 def _grid(kind: str) -> Voxels:
@@ -82,9 +68,8 @@ def _grid(kind: str) -> Voxels:
 
 
 def _lengths() -> Iterator[Case]:
-    """Every kind of ray through full, scattered, empty and one-voxel grids; also in rounds."""
-    around = some_rays(60)
-    kinds = {**SPECIAL, "from all around": around, "from all around, 3 at a time": around}
+    """Every kind of ray through full, scattered, empty and one-voxel grids."""
+    kinds = {**SPECIAL, "from all around": some_rays(60)}
     for grid in ("full", "dust", "one", "empty"):
         for kind, rays in kinds.items():
             size = rays.origins.abs().max().item() + 1
@@ -96,33 +81,24 @@ def _lengths() -> Iterator[Case]:
                 "corners are cut as often again: 16 √3 |o| u",
                 on_backends(16 * math.sqrt(3) * size),
             )
-            limit = 3 if "at a time" in kind else None
-            yield each.case(f"{kind}, {grid}", partial(_length_error, grid, rays, limit))
+            yield each.case(f"{kind}, {grid}", partial(_length_error, grid, rays))
 
 
-def _length_error(
-    grid: str, given: Rays, limit: int | None, backend: str, device: str, precision: str
-) -> float:
-    """Largest error of a ray's length in a voxel, walked in rounds of `limit`.
+def _length_error(grid: str, given: Rays, backend: str, device: str, precision: str) -> float:
+    """Largest error of a ray's length in a voxel.
 
     Infinite if crossings are not in order, or have gaps in the full grid.
     """
     (rays, voxels), dtype = placed((given, _grid(grid)), device), DTYPES[precision]
     rays = Rays(rays.origins.to(dtype), rays.directions.to(dtype))
-    lengths = torch.zeros(len(rays.origins), len(voxels) + 1, dtype=torch.float64)
-    start = torch.zeros_like(rays.origins[:, 0])
-    for _ in range(3 * SIZE if limit else 1):
-        found = walk(rays, voxels, start=start, limit=limit, backend=backend)
-        lengths.index_put_(
-            (found.ray.long().cpu(), found.voxel.long().cpu()), found.delta.double().cpu(), True
-        )
-        start = found.resume
-        same = found.ray[1:] == found.ray[:-1]
-        gaps = (found.near[1:] - found.far[:-1])[same]
-        if (gaps < 0).any() or (grid == "full" and gaps.any()) or (found.delta <= 0).any():
-            return math.inf
-    if (start != torch.inf).any():
+    found = walk(rays, voxels, backend=backend)
+    same = found.ray[1:] == found.ray[:-1]
+    gaps = (found.near[1:] - found.far[:-1])[same]
+    if (gaps < 0).any() or (grid == "full" and gaps.any()) or (found.delta <= 0).any():
         return math.inf
+    lengths = torch.zeros(len(rays.origins), len(voxels) + 1, dtype=torch.float64)
+    places = found.ray.long().cpu(), found.voxel.long().cpu()
+    lengths.index_put_(places, found.delta.double().cpu(), accumulate=True)
     lower = voxels.coordinates.cpu().double() / SIZE
     exact = slab_lengths(rays, lower, lower + 1 / SIZE)
     return (lengths[:, :-1] - exact).abs().amax().item() if len(voxels) else 0.0

@@ -12,7 +12,6 @@ import math
 import numpy as np
 import torch
 from numba import njit, prange
-from torch import Tensor
 
 from bench.types import Rays
 from methods.kernels.cpu import arrays, check_float32, f32, i32, slope
@@ -31,19 +30,20 @@ def maps_of(voxels: Voxels) -> tuple[np.ndarray, ...]:
     return tuple(arrays(voxels.bricks, voxels.masks, voxels.leaves, voxels.clearance))
 
 
-def walk(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> Crossings:
-    check_float32(rays.origins, rays.directions, start)
-    count, maps = len(start), maps_of(voxels)
-    given = arrays(rays.origins, rays.directions, start)
+def walk(rays: Rays, voxels: Voxels) -> Crossings:
+    check_float32(rays.origins, rays.directions)
+    count, maps = len(rays.origins), maps_of(voxels)
+    limit = 3 * voxels.resolution  # planes of the cube, and one cell before the first
+    given = arrays(rays.origins, rays.directions)
     slots = -(-min(count, BLOCK) // CHUNK) * CHUNK * limit
     kinds = torch.float32, torch.float32, torch.int32  # of entry, exit and voxel
     scratch = tuple(torch.empty(slots, dtype=kind).numpy() for kind in kinds)
-    offsets, resume = torch.zeros(count + 1, dtype=torch.int64), torch.empty(count)
+    offsets = torch.zeros(count + 1, dtype=torch.int64)
     parts = []
     for first in range(0, max(count, 1), BLOCK):
-        origins, directions, begin = (x[first : first + BLOCK] for x in given)
-        counts, again = offsets[1:][first : first + BLOCK], resume[first : first + BLOCK]
-        _find(origins, directions, maps, begin, limit, scratch, counts.numpy(), again.numpy())
+        origins, directions = (x[first : first + BLOCK] for x in given)
+        counts = offsets[1:][first : first + BLOCK]
+        _find(origins, directions, maps, limit, scratch, counts.numpy())
         ends = counts.cumsum(dim=0)
         total = int(ends[-1]) if len(ends) else 0
         found = [torch.empty(total) for _ in range(4)]
@@ -51,7 +51,7 @@ def walk(rays: Rays, voxels: Voxels, start: Tensor, limit: int) -> Crossings:
         _place(first, directions, scratch, limit, *arrays(counts, ends), tuple(arrays(*found)))
         parts.append(found)
     t, delta, near, far, ray, voxel = (torch.cat(column) for column in zip(*parts, strict=True))
-    return Crossings(t, delta, offsets.cumsum(dim=0), near, far, ray, voxel, resume)
+    return Crossings(t, delta, offsets.cumsum(dim=0), near, far, ray, voxel)
 
 
 @njit(cache=True)
@@ -179,16 +179,14 @@ def walk_ray(origin, direction, maps, start, limit, out):
 
 
 @njit(cache=True, parallel=True)
-def _find(origins, directions, maps, start, limit, scratch, counts, resume):
-    rays = len(start)
+def _find(origins, directions, maps, limit, scratch, counts):
+    rays = len(counts)
     nears, fars, voxels = scratch
     for chunk in prange((rays + CHUNK - 1) // CHUNK):
         used = chunk * CHUNK * limit
         for ray in range(chunk * CHUNK, min(rays, (chunk + 1) * CHUNK)):
             out = nears[used:], fars[used:], voxels[used:]
-            counts[ray], resume[ray] = walk_ray(
-                origins[ray], directions[ray], maps, start[ray], limit, out
-            )
+            counts[ray], _ = walk_ray(origins[ray], directions[ray], maps, f32(0), limit, out)
             used += counts[ray]
 
 

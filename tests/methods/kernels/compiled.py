@@ -20,20 +20,16 @@ from methods.checks import found, kernels
 
 AMPERE, ADA, HOPPER = (GPUTarget("cuda", capability, 32) for capability in (80, 89, 90))
 TYPES = {
-    "float32": "fp32",
-    "float16": "fp16",
-    "bfloat16": "bf16",
-    "int64": "i64",
-    "int32": "i32",
-    "int16": "i16",
-    "uint8": "u8",
-}
+    f"torch.{kind}{bits}": f"{short}{bits}"
+    for kind, short in (("float", "fp"), ("int", "i"), ("uint", "u"))
+    for bits in (8, 16, 32, 64)
+} | {"torch.bfloat16": "bf16"}
 
 
 def signature(value: Any) -> str:
     """The type of an argument, as Triton writes it, which takes a 1 for a constant."""
     if isinstance(value, Tensor):
-        return "*" + TYPES[str(value.dtype).removeprefix("torch.")]
+        return f"*{TYPES[str(value.dtype)]}"
     if value == 1:
         return "constexpr"
     return {float: "fp32", int: "i32"}.get(type(value), "constexpr")

@@ -3,98 +3,68 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import hypothesis
 import pytest
 import torch
 from hypothesis import strategies as st
+from scipy import integrate
 from torch import Tensor
 
 from bench.case import U32
-from methods.kernels.composite import composite as composite_samples
-from methods.kernels.composite import visible, weights
-from methods.kernels.types import Intervals, Pixels
+from methods.kernels.composite import composite, visible, weights
+from methods.kernels.composite.experiments import exact, slope
+from methods.kernels.types import Intervals, Pixels, offsets_of
 
 BACKENDS = ["reference", "cpu"]
 
-
-def composite(
-    sigma: Tensor, values: Tensor, t: Tensor, delta: Tensor, offsets: Tensor, **options
-) -> Pixels:
-    return composite_samples(sigma, values, Intervals(t, delta, offsets), **options)
-
-
-def intervals(inputs: dict) -> Intervals:
-    return Intervals(inputs["t"], inputs["delta"], inputs["offsets"])
+Inputs = tuple[Tensor, Tensor, Intervals]
 
 
 def samples(
     counts: list[int], channels: int = 3, dtype: torch.dtype = torch.float32, seed: int = 0
-) -> dict:
+) -> Inputs:
     generator = torch.Generator().manual_seed(len(counts) + seed)
     total = sum(counts)
 
     def draw(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator, dtype=dtype)
 
-    return {
-        "sigma": 30 * draw(total),
-        "values": draw(total, channels),
-        "t": draw(total).cumsum(0),
-        "delta": 0.1 * draw(total),
-        "offsets": torch.tensor([0, *counts]).cumsum(0),
-    }
+    sigma, values = 30 * draw(total), draw(total, channels)
+    t, delta = draw(total).cumsum(0), 0.1 * draw(total)
+    return sigma, values, Intervals(t, delta, offsets_of(torch.tensor(counts)))
 
 
-def plain_composite(inputs: dict, stop: float) -> list[tuple[list[float], float, float]]:
-    """The definition (Eq. 2, 3), a ray and a sample at a time, in Python numbers."""
-    rays = []
-    for begin, end in zip(inputs["offsets"][:-1], inputs["offsets"][1:], strict=True):
-        colour, depth, alpha = [0.0] * inputs["values"].shape[1], 0.0, 0.0
-        transmittance = 1.0
-        for i in range(int(begin), int(end)):
-            if transmittance <= stop:
-                break
-            opacity = 1 - math.exp(-inputs["sigma"][i].item() * inputs["delta"][i].item())
-            weight = transmittance * opacity
-            colour = [
-                c + weight * v for c, v in zip(colour, inputs["values"][i].tolist(), strict=True)
-            ]
-            depth += weight * inputs["t"][i].item()
-            alpha += weight
-            transmittance *= 1 - opacity
-        rays.append((colour, depth, alpha))
-    return rays
+def plain_composite(rows: list[list[float]], stop: float) -> list[float]:
+    """The sums of a ray by definition (Eq. 2, 3), in Python numbers. A sample is a row: density,
+    length, and the five numbers that are summed."""
+    sums, transmittance = [0.0] * 5, 1.0
+    for sigma, delta, *shown in rows:
+        if transmittance <= stop:
+            break
+        opacity = 1 - math.exp(-sigma * delta)
+        sums = [total + transmittance * opacity * x for total, x in zip(sums, shown, strict=True)]
+        transmittance *= 1 - opacity
+    return sums
 
 
 @pytest.mark.parametrize("stop", [0.0, 0.3])
 def test_reference_is_the_definition(stop: float) -> None:
-    inputs = samples([4, 0, 1, 9], dtype=torch.float64)
-    pixels = composite(**inputs, stop=stop, backend="reference")
-    want = plain_composite(inputs, stop)
-    for ray, (colour, depth, alpha) in enumerate(want):
-        assert pixels.values[ray].tolist() == pytest.approx(colour, abs=1e-12)
-        assert pixels.depth_sum[ray].item() == pytest.approx(depth, abs=1e-12)
-        assert pixels.alpha[ray].item() == pytest.approx(alpha, abs=1e-12)
+    sigma, values, where = inputs = samples([4, 0, 1, 9], dtype=torch.float64)
+    pixels = composite(*inputs, stop=stop, backend="reference")
+    summed = torch.column_stack((values, where.t, torch.ones_like(sigma)))
+    rows = torch.column_stack((sigma, where.delta, summed)).split([4, 0, 1, 9])
+    got = torch.column_stack((pixels.values, pixels.depth_sum, pixels.alpha)).tolist()
+    for ray, pixel in zip(rows, got, strict=True):
+        assert pixel == pytest.approx(plain_composite(ray.tolist(), stop), abs=1e-12)
 
 
-def test_gradients_in_float64() -> None:
-    inputs = samples([3, 0, 5, 1], channels=4, dtype=torch.float64)
-    sigma, values = inputs["sigma"].requires_grad_(), inputs["values"].requires_grad_()
-    background = torch.rand(4, dtype=torch.float64)
-
-    def outputs(sigma: Tensor, values: Tensor) -> tuple[Tensor, ...]:
-        changed = inputs | {"sigma": sigma, "values": values}
-        pixels = composite(**changed, stop=0.0, backend="reference").over(background)
-        return pixels.values, pixels.depth_sum, pixels.alpha
-
-    assert torch.autograd.gradcheck(outputs, (sigma, values))
-
-
-def part(inputs: dict, index: Tensor, counts: list[int]) -> dict:
-    """Only the samples at `index`, on rays of `counts`."""
-    columns = {name: inputs[name][index] for name in ("sigma", "values", "t", "delta")}
-    return columns | {"offsets": torch.tensor([0, *counts]).cumsum(0)}
+def part(inputs: Inputs, index: Tensor, counts: list[int]) -> Inputs:
+    """Only the samples where `index` is true, on rays of `counts`."""
+    sigma, values, where = inputs
+    some = where.chosen(index.nonzero().squeeze(1), offsets_of(torch.tensor(counts)), None)
+    return sigma[index], values[index], some
 
 
 CHANNELS_APART, RAYS_APART, SPLIT = "channels apart", "rays apart", "behind a front half"
@@ -108,32 +78,30 @@ CHANNELS_APART, RAYS_APART, SPLIT = "channels apart", "rays apart", "behind a fr
 def test_pixels_composited_in_parts_are_those_of_one_go(
     how: str, backend: str, counts: list[int], seed: int
 ) -> None:
-    inputs = samples(counts, seed=seed)
+    sigma, values, where = inputs = samples(counts, seed=seed)
     ray = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))
-    whole = composite(**inputs, stop=0.0, backend=backend)
+    whole = composite(*inputs, stop=0.0, backend=backend)
     if how == CHANNELS_APART:
-        values = [inputs["values"][:, [channel]] for channel in range(3)]
-        parts = [composite(**inputs | {"values": x}, stop=0.0, backend=backend) for x in values]
+        columns = values.split(1, dim=1)
+        parts = [composite(sigma, x, where, stop=0.0, backend=backend) for x in columns]
         got = Pixels(torch.cat([x.values for x in parts], 1), parts[0].depth_sum, parts[0].alpha)
     elif how == RAYS_APART:
         got = whole.take(torch.arange(len(counts)).flip(0))
         for number, count in enumerate(counts):
             alone = part(inputs, ray == number, [count])
-            here = torch.tensor([number])
-            got.put(here, composite(**alone, stop=0.0, backend=backend))
+            got.put(torch.tensor([number]), composite(*alone, stop=0.0, backend=backend))
     else:
         halves = [count // 2 for count in counts]
         front = torch.cat([torch.arange(n) < half for n, half in zip(counts, halves, strict=True)])
         rest = [count - half for count, half in zip(counts, halves, strict=True)]
-        carry = composite(**part(inputs, front, halves), stop=0.0, backend=backend)
-        behind = part(inputs, ~front, rest)
-        got = composite(**behind, stop=0.0, carry=carry, backend=backend)
+        carry = composite(*part(inputs, front, halves), stop=0.0, backend=backend)
+        got = composite(*part(inputs, ~front, rest), stop=0.0, carry=carry, backend=backend)
     # The compiled kernel adds up front to back, whatever lies beside; the reference in an order
     # that depends on the longest ray, and at a split both round: sums of up to 64 weights.
-    exact = backend == "cpu" and how != SPLIT
+    equal = backend == "cpu" and how != SPLIT
     for name, most in (("values", 1), ("depth_sum", 64), ("alpha", 1)):
         error = (getattr(got, name) - getattr(whole, name)).abs().max().item()
-        assert error <= (0 if exact else 64 * most * U32), name
+        assert error <= (0 if equal else 64 * most * U32), name
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -142,78 +110,47 @@ def test_the_early_stop_changes_a_pixel_by_less_than_its_threshold(
     backend: str, stop: float
 ) -> None:
     inputs = samples([40] * 50)
-    exact = composite(**inputs, stop=0.0, backend=backend)
-    stopped = composite(**inputs, stop=stop, backend=backend)
-    difference = (exact.alpha - stopped.alpha).abs().max().item()
+    whole = composite(*inputs, stop=0.0, backend=backend)
+    stopped = composite(*inputs, stop=stop, backend=backend)
+    difference = (whole.alpha - stopped.alpha).abs().max().item()
     assert 0 < difference <= stop + 1e-6
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_visible_samples_are_those_with_a_gradient(backend: str) -> None:
-    inputs = samples([40, 0, 1, 25])
-    stop = 0.05
-    counts, left = visible(inputs["sigma"], intervals(inputs), stop=stop, backend=backend)
-    values = inputs["values"].requires_grad_()
-    pixels = composite(**inputs | {"values": values}, stop=stop, backend=backend)
-    (grad,) = torch.autograd.grad(pixels.values.sum(), values)
-    seen = (grad != 0).any(dim=1)
-    for ray, count in enumerate(counts.tolist()):
-        begin, end = inputs["offsets"][ray], inputs["offsets"][ray + 1]
-        assert seen[begin : begin + count].all()
-        assert not seen[begin + count : end].any()
-    assert 0 < counts[0] < 40
-    torch.testing.assert_close(left, 1 - pixels.alpha, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_samples_are_visible_in_two_parts_as_in_one(backend: str) -> None:
-    """All have 20 samples; the second half lies behind what the first half lets through."""
-    whole = samples([20] * 30)
-    sigma, delta = whole["sigma"].view(30, 20) / 10, whole["delta"].view(30, 20)
-    offsets, stop = whole["offsets"] // 2, 0.45
-    count, left = visible(sigma.flatten(), intervals(whole), stop=stop, backend=backend)
-    first, between = visible(
-        sigma[:, :10].flatten(),
-        Intervals(whole["t"][:300], delta[:, :10].flatten(), offsets),
-        stop=stop,
-        backend=backend,
-    )
-    second, behind = visible(
-        sigma[:, 10:].flatten(),
-        Intervals(whole["t"][:300], delta[:, 10:].flatten(), offsets),
-        stop=stop,
-        front=between,
-        backend=backend,
-    )
-    assert 0 < (second > 0).sum() < 30
-    assert torch.equal(first + second, count)
-    torch.testing.assert_close(behind, left, rtol=1e-6, atol=0)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_weights_are_the_gradients_of_the_values(backend: str) -> None:
-    inputs, alpha = samples([40, 0, 1, 25], channels=1), torch.tensor([0.0, 0.5, 0.9, 0.2])
-    carry = Pixels(torch.zeros(4, 1), torch.zeros(4), alpha)
-    values = inputs["values"].requires_grad_()
-    pixels = composite(**inputs | {"values": values}, stop=0.05, carry=carry, backend=backend)
+def test_visible_samples_are_those_with_a_weight_which_is_the_gradient_of_their_value(
+    backend: str,
+) -> None:
+    """Behind pixels in front, which stay as they were."""
+    sigma, values, where = samples([40, 0, 1, 25], channels=1)
+    alpha = torch.tensor([0.0, 0.5, 0.9, 0.2])
+    carry = Pixels(torch.zeros(4, 1), torch.zeros(4), alpha.clone())
+    values.requires_grad_()
+    pixels = composite(sigma, values, where, stop=0.05, carry=carry, backend=backend)
+    assert torch.equal(carry.alpha, alpha)
     (gradient,) = torch.autograd.grad(pixels.values.sum(), values)
-    found = weights(inputs["sigma"], intervals(inputs), stop=0.05, front=1 - alpha, backend=backend)
+    found = weights(sigma, where, stop=0.05, front=1 - alpha, backend=backend)
     torch.testing.assert_close(found, gradient[:, 0], rtol=1e-5, atol=1e-7)
-    assert (found == 0).any()
-    assert (found > 0.05).any()
+    counts, left = visible(sigma, where, stop=0.05, front=1 - alpha, backend=backend)
+    torch.testing.assert_close(left, 1 - pixels.alpha, rtol=0, atol=1e-6)
+    assert 0 < counts[0] < 40
+    ends = zip(found.split([40, 0, 1, 25]), counts.tolist(), strict=True)
+    assert all((part[:count] > 0).all() and not part[count:].any() for part, count in ends)
 
 
 def test_wrong_arguments_are_named() -> None:
-    inputs = samples([5])
+    sigma, values, where = samples([5])
     with pytest.raises(ValueError, match="values: expected shape"):
-        composite(**inputs | {"values": torch.zeros(4, 3)})
+        composite(sigma, values[1:], where)
     with pytest.raises(ValueError, match="offsets: expected to end at the 5 samples"):
-        composite(**inputs | {"offsets": torch.tensor([0, 6])})
+        composite(sigma, values, replace(where, offsets=torch.tensor([0, 6])))
     with pytest.raises(ValueError, match="float32"):
-        composite(**samples([5], dtype=torch.float64), backend="cpu")
+        composite(*samples([5], dtype=torch.float64), backend="cpu")
 
 
-def test_pixels_in_front_stay_as_they_were() -> None:
-    carry = Pixels(torch.zeros(1, 3), torch.zeros(1), torch.zeros(1))
-    composite(**samples([5]), carry=carry, backend="cpu")
-    assert carry.alpha.tolist() == [0.0]
+@pytest.mark.parametrize(("quantity", "power"), [("alpha", 0), ("depth_sum", 1)])
+@pytest.mark.parametrize("y", [0.0, 0.3, 1.0])
+def test_the_experiments_know_the_rendering_integral(quantity: str, power: int, y: float) -> None:
+    place = torch.tensor(y, dtype=torch.float64)
+    s = slope(place).item()
+    want, _ = integrate.quad(lambda x: x**power * s * x * math.exp(-s * x * x / 2), 0, 1)
+    assert exact(quantity, place).item() == pytest.approx(want, rel=1e-9)

@@ -1,4 +1,4 @@
-"""Corner features: weights, their gradient, input that is refused."""
+"""Corner features: weights, gradients beside autograd, input that is refused."""
 
 from __future__ import annotations
 
@@ -6,6 +6,13 @@ import pytest
 import torch
 
 from methods.kernels.corner_gather import corner_gather, trilinear
+from methods.plenoctree.kernels.voxel_light import shade_voxels
+
+RANDOM = torch.Generator().manual_seed(0)
+WEIGHTS = torch.rand(9, 8, generator=RANDOM)
+VOXEL, RAY = (torch.randint(4, (9,), generator=RANDOM).int() for _ in range(2))
+CORNERS = torch.randint(20, (4, 8), generator=RANDOM).int()
+DIRECTIONS = torch.nn.functional.normalize(torch.randn(4, 3, generator=RANDOM), dim=1)
 
 
 def test_weights_are_0_and_1_at_corners_and_those_of_a_product_between() -> None:
@@ -29,6 +36,25 @@ def test_weights_have_a_gradient_by_the_reference_only() -> None:
     torch.testing.assert_close(weights.grad, table.sum(dim=1)[None])
     with pytest.raises(ValueError, match="no gradient for weights"):
         corner_gather(table, corners, voxel, weights, backend="cpu")
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize(
+    ("read", "rest", "shape"),
+    [
+        (corner_gather, (CORNERS, VOXEL, WEIGHTS), (20, 4)),
+        (shade_voxels, (VOXEL, RAY, DIRECTIONS), (4, 9, 3)),
+    ],
+)
+def test_a_buffer_gets_the_gradient_whether_or_not_the_table_asks_for_one(
+    read, rest, shape, backend
+) -> None:
+    table = torch.rand(shape, generator=torch.Generator().manual_seed(1)).requires_grad_()
+    (gradient,) = torch.autograd.grad(read(table, *rest, backend=backend).sum(), table)
+    for asked in (False, True):
+        buffer, source = torch.ones(shape), table.detach().requires_grad_(asked)
+        read(source, *rest, grad_buffer=buffer, backend=backend).sum().backward()
+        torch.testing.assert_close(buffer, gradient + 1)
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ def test_levels_of_the_released_grid() -> None:
         *(16, 22, 28, 37, 49, 64, 85, 112),
         *(148, 195, 256, 338, 446, 589, 777, 1024),
     )
-    assert grid.dense == (True,) * 6 + (False,) * 10
+    assert grid.strides == (*grid.resolutions[:6], *[0] * 10)
     assert grid.entries * grid.features == 11_420_064
     assert HashGrid(log2_table=16, n_max=2048).entries * 2 == 1_796_048
     assert HashGrid(log2_table=19, n_max=4096).entries * 2 == 12_599_920
@@ -67,6 +67,19 @@ def test_the_backward_pass_gives_the_same_bits_twice() -> None:
     assert torch.equal(*twice)
 
 
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_a_position_that_is_not_a_number_spoils_its_own_features_alone(backend: str) -> None:
+    table = random_table(GRID, torch.float32).requires_grad_()
+    positions = torch.rand(70, 3, generator=torch.Generator().manual_seed(0))
+    positions[::7, 1] = torch.nan
+    good = ~positions.isnan().any(dim=1)
+    found, want = (encode(x, table, GRID, backend=backend) for x in (positions, positions[good]))
+    assert torch.equal(found[good], want)
+    assert found[~good].isnan().all()
+    gradients = (torch.autograd.grad(x, table, torch.ones_like(x)) for x in (found, want))
+    torch.testing.assert_close(*gradients)
+
+
 def test_wrong_arguments_are_named() -> None:
     table = random_table(GRID, torch.float32)
     with pytest.raises(ValueError, match=r"positions: expected shape \[any, 3\], got \[4, 2\]"):
@@ -75,7 +88,7 @@ def test_wrong_arguments_are_named() -> None:
         encode(torch.zeros(4, 3), table[1:], GRID)
     with pytest.raises(ValueError, match="float32"):
         encode(torch.zeros(4, 3), table.double(), GRID, backend="cpu")
-    with pytest.raises(ValueError, match="no gradient for positions"):
-        encode(torch.zeros(4, 3, requires_grad=True), table, GRID, backend="cpu")
     with pytest.raises(ValueError, match="n_min <= n_max"):
         HashGrid(n_min=64, n_max=32)
+    with pytest.raises(ValueError, match="no gradient for positions"):
+        encode(torch.zeros(4, 3, requires_grad=True), table, GRID, backend="cpu")

@@ -13,18 +13,16 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 
-from bench.case import U32, largest_error
-from bench.types import Rays
+from bench.case import U32, largest_error, placed
 from methods.checks import kernels
 from methods.kernels import availability
 from methods.kernels.adam import AdamState, sparse_adam_
 from methods.kernels.composite import composite, visible, weights
 from methods.kernels.encode import HashGrid, encode
 from methods.kernels.march import extents, march
+from methods.kernels.march.cases import cells, some_rays
 from methods.kernels.types import Intervals, Occupancy
-from methods.steernerf.kernels.splat import gather
 
 pytestmark = pytest.mark.skipif(
     bool(availability()["gpu"]), reason="Triton has no build for this platform"
@@ -32,95 +30,30 @@ pytestmark = pytest.mark.skipif(
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
 
-def test_a_table_of_half_precision_gives_features_of_its_type() -> None:
-    torch.manual_seed(0)
-    grid = HashGrid(levels=4, log2_table=10, n_min=4, n_max=40)
-    positions = torch.rand(57, 3, device=DEVICE)
-    for dtype in (torch.float16, torch.bfloat16):
-        table = torch.randn(grid.entries, 2, device=DEVICE).to(dtype).requires_grad_()
-        exact = table.detach().double().requires_grad_()
-        features = encode(positions, table, grid, backend="gpu")
-        right = encode(positions.double(), exact, grid, backend="reference")
-        # Fractions as in the cases of `encode`, at sizes up to that of the table, and one rounding.
-        size = table.detach().abs().max().item()
-        unit = torch.finfo(dtype).eps
-        tolerance = size * (3 * 2 * 2 * U32 * grid.n_max + 11 * U32 + unit)
-        assert features.dtype == dtype
-        assert (features - right).abs().max() <= tolerance
-        features.sum().backward()
-        right.sum().backward()
-        assert table.grad is not None
-        assert exact.grad is not None
-        most = exact.grad.abs().max().item()  # an entry's gradient is a sum of weights
-        assert (table.grad - exact.grad).abs().max() <= most * unit + 57 * 6 * U32 * grid.n_max
-
-
 def test_what_is_marched_has_the_extent_that_was_told() -> None:
-    generator = torch.Generator().manual_seed(0)
-    cells = torch.rand(16, 16, 16, generator=generator) < 0.2
-    origins = torch.rand(40, 3, generator=generator) * 3 - 1
-    rays = Rays(origins.to(DEVICE), (0.5 - origins).to(DEVICE))
-    occupancy = Occupancy(cells.to(DEVICE))
-    found = extents(rays, occupancy, 0.02, 30, backend="gpu")
-    counts = march(rays, occupancy, 0.02, backend="reference").offsets.diff().split(30)
-    assert [(x.total, x.longest) for x in found] == [(int(c.sum()), int(c.max())) for c in counts]
-    first = Rays(rays.origins[:30], rays.directions[:30])
-    samples = march(first, occupancy, 0.02, extent=found[0], backend="gpu")
-    assert torch.equal(samples.offsets.diff(), counts[0])
-
-
-@pytest.mark.slow
-def test_told_to_be_deterministic_it_adds_up_in_an_order_that_repeats() -> None:
-    """In another order than the atomics', so that only the last bits may differ from theirs."""
-    torch.manual_seed(0)
-    grid = HashGrid(levels=2, log2_table=6, n_min=4, n_max=20)
-    positions = torch.rand(4000, 3, device=DEVICE)
-    table = torch.zeros(grid.entries, 2, device=DEVICE, requires_grad=True)
-    weights_of_rows = torch.rand(4000, grid.channels, device=DEVICE)
-    values = torch.rand(3, 5, device=DEVICE, requires_grad=True)
-    index = torch.randint(-1, 3, (4000,), dtype=torch.int32, device=DEVICE)
-    rows = torch.rand(4000, 5, device=DEVICE)
-
-    def gradients() -> tuple[Tensor, ...]:
-        loss = (encode(positions, table, grid, backend="gpu") * weights_of_rows).sum()
-        loss = loss + (gather(values, index, backend="gpu") * rows).sum()
-        return torch.autograd.grad(loss, (table, values))
-
-    free = gradients()
-    torch.use_deterministic_algorithms(True)
-    try:
-        first, second = gradients(), gradients()
-    finally:
-        torch.use_deterministic_algorithms(False)
-    assert largest_error(first, second) == 0
-    # At most 4,000 terms below 1: 2 n roundings of a sum of n, as independent errors.
-    assert 0 < largest_error(first, free) <= 6 * 4000**0.5 * 4000 * U32
+    given = placed(some_rays(40), DEVICE), Occupancy(cells("dust", 16).to(DEVICE)), 0.02
+    (extent,) = extents(*given, 40, backend="gpu")
+    samples = march(*given, backend="reference")
+    assert (extent.total, extent.longest) == (len(samples), int(samples.offsets.diff().max()))
+    known = march(*given, extent=extent, backend="gpu")
+    assert torch.equal(known.offsets, samples.offsets)
 
 
 def test_what_is_not_a_number_shows_and_what_is_behind_it_does_not() -> None:
-    sigma = torch.tensor([1.0, torch.nan, 1.0, torch.inf, 1.0], device=DEVICE)
-    delta = torch.full_like(sigma, 0.5)
-    offsets = torch.tensor([0, 1, 3, 5], device=DEVICE)
-    ones = torch.ones(5, 1, device=DEVICE)
-    pixels = composite(sigma, ones, Intervals(ones[:, 0], delta, offsets), backend="gpu")
-    thin = -torch.expm1(torch.tensor(-0.5)).item()
-    assert pixels.alpha[0].item() == pytest.approx(thin, abs=4 * U32)
-    assert pixels.alpha[1].isnan()
-    assert pixels.alpha[2] == 1  # opaque: what is behind has no weight
-
-
-def test_behind_what_is_not_a_number_a_long_ray_has_no_weights() -> None:
-    """In the blocks to come neither: 64 samples are one."""
-    sigma = torch.full((200,), 0.01, device=DEVICE)
-    sigma[10] = torch.nan
-    offsets = torch.tensor([0, 200], device=DEVICE)
+    """On a ray of several blocks of 64 samples; an opaque sample hides what is behind, too."""
+    offsets = torch.tensor([0, 200, 202], device=DEVICE)
+    sigma = torch.full((202,), 0.01, device=DEVICE)
+    sigma[10], sigma[200] = torch.nan, torch.inf
     intervals = Intervals(sigma, torch.ones_like(sigma), offsets)
     found = weights(sigma, intervals, backend="gpu").cpu()
     assert (found[:10] > 0).all()
     assert found[10].isnan()
-    assert not found[11:].any()
+    assert found[11:].tolist() == [0] * 189 + [1, 0]
     counts, _ = visible(sigma, intervals, backend="gpu")
-    assert counts.tolist() == [11]
+    assert counts.tolist() == [11, 1]
+    pixels = composite(sigma, torch.ones_like(sigma)[:, None], intervals, backend="gpu")
+    assert pixels.alpha[0].isnan()
+    assert pixels.alpha[1] == 1
 
 
 def test_what_is_not_contiguous_is_read_all_the_same() -> None:
@@ -172,14 +105,11 @@ def test_every_kernel_compiles_for_a_gpu_that_is_not_here(tmp_path: Path) -> Non
     assert written <= compiled
 
 
-def test_types_that_it_does_not_serve_are_refused() -> None:
-    grid = HashGrid(levels=1, log2_table=3, n_min=2, n_max=2)
+def test_what_it_does_not_serve_is_refused() -> None:
+    grid, table = HashGrid(levels=1, log2_table=3, n_min=2, n_max=2), torch.zeros(2, 8).T
     positions = torch.rand(2, 3, dtype=torch.float64, device=DEVICE)
     with pytest.raises(ValueError, match="expects positions of float32"):
-        encode(positions, torch.rand(grid.entries, 2, device=DEVICE), grid, backend="gpu")
-
-
-def test_a_table_that_cannot_be_changed_in_place_is_refused() -> None:
-    table = torch.zeros(2, 5, device=DEVICE).T
+        encode(positions, table.to(DEVICE), grid, backend="gpu")
+    table = table.to(DEVICE)
     with pytest.raises(ValueError, match="expects table to be contiguous"):
         sparse_adam_(table, table, AdamState.like(table), 0.1, backend="gpu")

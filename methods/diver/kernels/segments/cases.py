@@ -127,7 +127,7 @@ def _inside(entry: Tensor, leave: Tensor) -> Given:
     count, rays = len(entry), Rays(entry / SIDE, (leave - entry) / SIDE)
     number, zeros, ones = torch.arange(count), torch.zeros(count), torch.ones(count)
     offsets, first = torch.arange(count + 1), torch.zeros(count, dtype=torch.int32)
-    crossings = Crossings(ones / 2, ones, offsets, zeros, ones, number.int(), first, ones)
+    crossings = Crossings(ones / 2, ones, offsets, zeros, ones, number.int(), first)
     voxels = Voxels(torch.zeros(1, 3, dtype=torch.int32), SIDE)
     return {"rays": rays, "crossings": crossings, "voxels": voxels}
 

@@ -23,7 +23,6 @@ from methods.kernels.cpu import (
     multiply,
     prefetch,
     tall,
-    tall_relu,
 )
 from methods.kilonerf.kernels.grouped_mlp import HIDDEN, Groups, Networks
 
@@ -312,10 +311,7 @@ def _encode_all(inputs, frequencies, out):
 def _block(a, a_row, a_step, w, bias, out, out_row, count, relu):
     """`TALL` rows times w [count, 32], plus bias [32]: out [TALL, 32 of `out_row`]."""
     for left in range(0, HIDDEN, LANES):
-        if relu:
-            tall_relu(a, 0, a_row, a_step, w, left, HIDDEN, bias, left, out, left, out_row, count)
-        else:
-            tall(a, 0, a_row, a_step, w, left, HIDDEN, bias, left, out, left, out_row, count)
+        tall(a, 0, a_row, a_step, w, left, HIDDEN, bias, left, out, left, out_row, count, relu)
 
 
 @njit(cache=True, parallel=True, fastmath={"contract", "reassoc"})
@@ -402,7 +398,7 @@ def _colours(given, layers, groups, raw):
                 _block(given, HIDDEN, 1, feature, of, joined, channels, HIDDEN, False)
                 of = direction_biases[n]
                 _block(joined, channels, 1, direction, of, inner, HIDDEN, channels, True)
-                tall(inner, 0, HIDDEN, 1, last, 0, LANES, bias, 0, result, 0, LANES, HIDDEN)
+                tall(inner, 0, HIDDEN, 1, last, 0, LANES, bias, 0, result, 0, LANES, HIDDEN, False)
                 for r in range(rows):
                     for c in range(3):
                         raw[permutation[first + r], c] = result[r * LANES + c]

@@ -35,11 +35,7 @@ def gather(values: Tensor, index: Tensor) -> Tensor:
 def scatter(rows: Tensor, index: Tensor, points: int) -> Tensor:
     """Sums [points, C] of the `rows` of the pixels that show each point."""
     sums = rows.new_zeros(points, rows.shape[1])
-    if torch.are_deterministic_algorithms_enabled():
-        shown = index >= 0
-        sums.index_put_((index[shown].long(),), rows[shown], accumulate=True)
-    else:
-        _move(_scatter, sums, index, rows)
+    _move(_scatter, sums, index, rows)
     return sums
 
 
