@@ -250,10 +250,9 @@ class FieldTraining(PixelTraining):
             self.field,
             rays,
             self.grid.occupancy,
-            replace(self.sampling, stop=self.options.stop),
+            replace(self.sampling, stop=self.options.stop, thin=self.options.thin),
             jitter=jitter,
             background=background,
-            thin=self.options.thin,
         )
 
     def _update(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -95,3 +96,8 @@ def pad(samples: Tensor) -> Tensor:
     """
     padding = -len(samples) % BATCH_QUANTUM
     return functional.pad(samples, (0, 0) * (samples.dim() - 1) + (0, padding))
+
+
+def cat(parts: Sequence[Tensor]) -> Tensor:
+    """`torch.cat` of one or more tensors; a single one is not copied."""
+    return parts[0] if len(parts) == 1 else torch.cat(parts)

@@ -39,12 +39,16 @@ class Sampling:
     Attributes:
         step: world length of a step.
         stop: transmittance at which a ray ends.
-        window: [R, 2] nearest and farthest t of each ray; None: all of it.
+        window: for frames: [R, 2] nearest and farthest t of each ray; None: all of it.
+        thin: for training: of the samples with an optical depth sigma delta below this, which
+            hardly show, one of some is kept and gets the length of all. Which one is left to
+            chance: the expected optical depth and its gradient stay the same.
     """
 
     step: float = STEP
     stop: float = STOP
     window: Tensor | None = None
+    thin: float = 0.0
 
     @property
     def least_weight(self) -> float:

@@ -44,7 +44,7 @@ from methods.nsvf.method import Nsvf
 from methods.plenoctree.method import PlenOctree
 from methods.plenoctree.start import Extraction
 from methods.plenoctree.training import OctreeLessons
-from methods.rendering import field, rays
+from methods.rendering import field, frame
 from methods.rendering.occupancy import EVERY, STEP
 from methods.steernerf.method import SteerNerf
 from methods.steernerf.options import RangeReduction
@@ -278,7 +278,7 @@ def test_a_frame_waits_equally_often_whatever_its_rays(
     gpu: PretendedGpu, name: str, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     method = fitted(name, "cuda", scene, tmp_path)
-    monkeypatch.setattr(rays, "CHUNK_RAYS", 50)
+    monkeypatch.setattr(frame, "CHUNK_RAYS", 50)
     counts, marched = [], []
     for size in (16, 32):
         cameras = [scale_camera(c, size, size) for c in scene.splits["test"].cameras]

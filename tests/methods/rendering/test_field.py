@@ -13,8 +13,8 @@ from methods.instant_ngp.field import HashField
 from methods.kernels.types import Occupancy
 from methods.rendering.batch import render_batch
 from methods.rendering.field import BATCH_QUANTUM, Field, pad, query
+from methods.rendering.frame import render_rays
 from methods.rendering.occupancy import RESOLUTION, DensityGrid
-from methods.rendering.rays import render_rays
 from methods.rendering.sampling import Sampling
 from tests.methods.conftest import GRID, Work, look_at_the_middle
 from tests.methods.solids import DENSITY, Solid, ball
@@ -29,10 +29,6 @@ def solid() -> Field:
 
 def hash_field() -> Field:
     return HashField(GRID, generator=torch.Generator().manual_seed(0))
-
-
-def test_a_field_has_more_than_its_attributes() -> None:
-    assert {"channels", "backend", "device", "density", "features", "count"} < MEMBERS
 
 
 @pytest.mark.parametrize("make", [solid, hash_field])

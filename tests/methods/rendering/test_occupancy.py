@@ -13,7 +13,6 @@ from methods.rendering.occupancy import (
     DECAY,
     INITIAL,
     RESOLUTION,
-    STEP,
     THRESHOLD,
     DensityGrid,
     learnable_cells,
@@ -36,31 +35,6 @@ class Slab:
 
 
 GENERATOR = torch.Generator().manual_seed(0)
-
-
-def test_the_threshold_is_an_opacity_of_one_percent_a_step() -> None:
-    assert abs(THRESHOLD * STEP - 0.01) < 1e-12
-
-
-def swept(grid: DensityGrid, field: Slab, sweeps: int = 8) -> DensityGrid:
-    """Visit each cell `sweeps` times and more; one in e^sweeps is left out."""
-    for _ in range(sweeps):
-        grid.update(field, GENERATOR, samples=2 * grid.density.numel())
-    return grid
-
-
-def test_visits_find_the_matter_and_nothing_else() -> None:
-    cells = swept(DensityGrid(WHOLE), Slab(100.0)).occupancy.cells
-    assert cells[: RESOLUTION // 4].all()
-    assert cells[RESOLUTION // 4 :].float().mean() < 10 * math.exp(-8)
-
-
-def test_cells_that_may_not_be_occupied_stay_empty() -> None:
-    allowed = WHOLE.clone()
-    allowed[:, RESOLUTION // 2 :] = False
-    cells = swept(DensityGrid(allowed), Slab(100.0)).occupancy.cells
-    assert cells[: RESOLUTION // 4, : RESOLUTION // 2].all()
-    assert not cells[:, RESOLUTION // 2 :].any()
 
 
 def test_cells_outside_the_bounds_cannot_be_learnt() -> None:
@@ -111,7 +85,10 @@ def test_a_density_that_is_not_a_number_is_as_good_as_none() -> None:
 @pytest.mark.slow
 def test_matter_that_is_thin_everywhere_is_kept_where_it_is_denser_than_the_mean() -> None:
     thin = Slab(0.1 * THRESHOLD)
-    cells = swept(DensityGrid(WHOLE), thin, sweeps=24).occupancy.cells  # 1.2 * 0.8^24 < 0.1
+    grid = DensityGrid(WHOLE)
+    for _ in range(24):  # 1.2 * 0.8^24 < 0.1
+        grid.update(thin, GENERATOR, samples=2 * grid.density.numel())
+    cells = grid.occupancy.cells
     assert cells[: RESOLUTION // 4].all()
     assert cells[RESOLUTION // 4 :].float().mean() < 0.5
 
