@@ -23,7 +23,7 @@ from bench.waits import device_waits
 from methods.checks import found
 from methods.diver.method import Diver
 from methods.diver.training import DiverLessons
-from methods.engines import cuda_graphs
+from methods.engines import torch_engine
 from methods.engines.torch_engine import TorchEngine
 from methods.gaussians.method import GaussianSplatting
 from methods.gaussians.training import Fitting
@@ -189,7 +189,7 @@ def one_round(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lean_training, "compacts", lambda device: False)
     for kind in (HashField, StudentField, KiloField, NerfField, NsvfField):
         monkeypatch.setattr(kind, "round_samples", longest_ray(STEP))
-    monkeypatch.setattr(cuda_graphs, "WARM_UP", 1)
+    monkeypatch.setattr(torch_engine, "WARM_UP", 1)
     monkeypatch.setattr(TorchEngine, "samples", lambda engine, network: 1)
 
 
