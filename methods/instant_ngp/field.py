@@ -21,6 +21,7 @@ from methods.rendering.field import (
     CHUNK_SAMPLES,
     LOG_DENSITY_CLAMP,
     ROUND_SAMPLES,
+    cat,
 )
 
 Precision = Literal["bf16", "fp32"]
@@ -125,7 +126,7 @@ class HashField(nn.Module):
         every = positions.split(size)
         known = [None] * len(every) if encoded is None else encoded.split(size)
         parts = [self._density(*part, weights) for part in zip(every, known, strict=True)]
-        sigma, geometry = (_joined(column) for column in zip(*parts, strict=True))
+        sigma, geometry = (cat(column) for column in zip(*parts, strict=True))
         return sigma, geometry
 
     def _density(
@@ -148,7 +149,7 @@ class HashField(nn.Module):
         weights = self._weights("feature_in", "feature_mid", "feature_out")
         size = self._part(geometry)
         pairs = zip(geometry.split(size), directions.split(size), strict=True)
-        return _joined([self._features(*pair, weights) for pair in pairs])
+        return cat([self._features(*pair, weights) for pair in pairs])
 
     def _features(self, geometry: Tensor, directions: Tensor, weights: list[Tensor]) -> Tensor:
         raw = mlp([directions, geometry], weights, backend=self.backend)
@@ -185,10 +186,6 @@ class HashField(nn.Module):
         if self.precision == "bf16":
             layers = [layer.to(torch.bfloat16) for layer in layers]
         return [layer.to(self._compute_dtype) for layer in layers]
-
-
-def _joined(parts: tuple[Tensor, ...] | list[Tensor]) -> Tensor:
-    return parts[0] if len(parts) == 1 else torch.cat(parts)
 
 
 def _xavier_uniform(outputs: int, inputs: int, generator: torch.Generator | None) -> nn.Parameter:

@@ -14,6 +14,9 @@ from methods.instant_ngp.field import Precision
 from methods.kernels import multiplies_bf16
 from methods.students.fields import FieldLessons, StudentField
 
+CHUNK = 1 << 14
+"""Samples that go through a network together: 16 MiB of activations."""
+
 
 @dataclass(frozen=True)
 class NetworkLessons(FieldLessons):
@@ -47,11 +50,6 @@ def positional(
     return torch.cat(parts, dim=-1)
 
 
-def positional_channels(channels: int, frequencies: int, *, identity: bool = True) -> int:
-    """Channels that `positional` makes of `channels` values."""
-    return channels * (2 * frequencies + identity)
-
-
 class Dense(nn.Linear):
     """A dense layer: `inputs` [S, I] times weights, plus biases, [S, O].
 
@@ -81,10 +79,6 @@ class Dense(nn.Linear):
         return functional.linear(inputs.to(dtype), weight.to(dtype), bias.to(dtype))
 
 
-CHUNK = 1 << 14
-"""Samples that go through the network together: 16 MiB of activations."""
-
-
 class NetworkField(StudentField):
     """A field that is one large network of dense layers."""
 
@@ -106,6 +100,9 @@ class NetworkField(StudentField):
     def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
         pairs = zip(geometry.split(CHUNK), encoded.split(CHUNK), strict=True)
         return torch.cat([self.colours_together(*pair) for pair in pairs])
+
+    def sizes(self) -> dict[str, int]:
+        return {"network": sum(x.numel() * x.element_size() for x in self.parameters())}
 
 
 def density_of(raw: Tensor) -> Tensor:
@@ -133,8 +130,3 @@ def products(*layers: nn.Module) -> int:
     """Multiplications per sample in all dense layers inside `layers`."""
     dense = (part for layer in layers for part in layer.modules() if isinstance(part, Dense))
     return sum(part.weight.numel() for part in dense)
-
-
-def parameter_bytes(network: nn.Module) -> int:
-    """Bytes of all parameters as they are stored."""
-    return sum(value.numel() * value.element_size() for value in network.parameters())

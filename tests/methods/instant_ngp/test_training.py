@@ -15,8 +15,8 @@ from bench.compositing import composite
 from bench.console import ConsoleLog
 from bench.sharing import locked
 from bench.types import Budget, Log, Rays, Scene, Split, SteerbenchError
-from methods.instant_ngp.error_map import RUN, UNSEEN
 from methods.instant_ngp.field import HashField
+from methods.instant_ngp.pixels import RUN, UNSEEN
 from methods.instant_ngp.stage1 import train_field
 from methods.instant_ngp.training import (
     MIN_RAYS,
