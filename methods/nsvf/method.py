@@ -21,7 +21,7 @@ from methods.students.voxels import occupied_voxels
 
 @dataclass(kw_only=True, eq=False)
 class Nsvf(FieldStudent):
-    """A neural sparse voxel field; its voxels are where the field that it starts from is occupied."""
+    """A neural sparse voxel field with voxels where the field that it starts from is occupied."""
 
     training: NetworkLessons
     name: str = "nsvf"

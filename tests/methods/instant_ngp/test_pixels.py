@@ -1,4 +1,4 @@
-"""Pixels of the training pictures: which rays they have, which are drawn, and where the error is."""
+"""Pixels of the training pictures: their rays, which are drawn, and where the error is."""
 
 from __future__ import annotations
 
