@@ -82,30 +82,24 @@ class OpenVino(Engine):
             model = self._openvino.convert_model(
                 engines.readable(network), example_input=samples[0], input=shapes
             )
-        if self._nncf is None:
-            return model
+        return model if self._nncf is None else self._quantised(model, samples, self._nncf)
+
+    def _quantised(self, model: Any, samples: Sequence[Inputs], nncf: Any) -> Any:
         logging.getLogger("nncf").setLevel(logging.ERROR)
-        frames = self._nncf.Dataset(samples, lambda inputs: [x.numpy() for x in inputs])
+        frames = nncf.Dataset(samples, lambda inputs: [x.numpy() for x in inputs])
+        options = {
+            "preset": nncf.QuantizationPreset.MIXED,  # activations are not symmetric
+            "subset_size": len(samples),
+        }
+        if self.uncalibrated:
+            plain = nncf.AdvancedQuantizationParameters(disable_bias_correction=True)
+            options["ignored_scope"] = nncf.IgnoredScope(types=list(NO_PRODUCTS), validate=False)
+            options["advanced_parameters"] = plain
         with contextlib.redirect_stdout(sys.stderr):  # its progress bars
-            options = _products_alone(self._nncf) if self.uncalibrated else {}
-            quantised = self._nncf.quantize(
-                model,
-                frames,
-                preset=self._nncf.QuantizationPreset.MIXED,  # activations are not symmetric
-                subset_size=len(samples),
-                **options,
-            )
+            quantised = nncf.quantize(model, frames, **options)
         if self.uncalibrated:
             _fix_ranges(quantised)
         return quantised
-
-
-def _products_alone(nncf: Any) -> dict[str, Any]:
-    """Options that make NNCF round only the inputs of products, without bias correction."""
-    return {
-        "ignored_scope": nncf.IgnoredScope(types=list(NO_PRODUCTS), validate=False),
-        "advanced_parameters": nncf.AdvancedQuantizationParameters(disable_bias_correction=True),
-    }
 
 
 def _fix_ranges(model: Any) -> None:

@@ -97,10 +97,8 @@ def new_grid(scene: Scene, device: torch.device) -> DensityGrid:
 class PixelTraining(loop.Training, ABC):
     """A training whose steps render random pixels of the training pictures.
 
-    Subclasses say what is trained, how its rays are rendered and how its parameters are updated.
-
-    Args:
-        samples: samples with a gradient that a step aims at; the number of rays follows from it.
+    Subclasses say what is trained, how its rays are rendered and how its parameters are updated. A
+    step aims at `samples` samples with a gradient; the number of rays follows from it.
     """
 
     advice = "Try a smaller learning rate (method.training.rate)."
@@ -137,11 +135,7 @@ class PixelTraining(loop.Training, ABC):
         return self.options.rate * loop.cosine(self.step / self.steps, self.options.final_rate)
 
     def advance(self) -> dict[str, float]:
-        """Take one step; return its mean squared error, where `loop.look` does.
-
-        Raises:
-            SteerbenchError: the loss is not finite.
-        """
+        """Take one step; return its mean squared error, as `loop.look` does."""
         numbers, alike = self._numbers()
         rays, colours = self.batches.at(numbers)
         target, background = self._target(colours)

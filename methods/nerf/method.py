@@ -14,8 +14,7 @@ from methods.kernels.types import Occupancy, Pixels
 from methods.nerf.field import NerfField
 from methods.rendering.field import query
 from methods.rendering.frame import Render
-from methods.students.fields import FieldStudent
-from methods.students.networks import NetworkLessons
+from methods.students.fields import FieldLessons, FieldStudent
 
 CHUNK_RAYS = 1 << 9
 """Rays whose samples are evaluated together: 200 MiB of outputs of a trunk of 256 channels."""
@@ -25,7 +24,7 @@ CHUNK_RAYS = 1 << 9
 class Nerf(FieldStudent):
     """One NeRF network, rendered where the field that it starts from is occupied, or everywhere."""
 
-    training: NetworkLessons
+    training: FieldLessons
     name: str = "nerf"
     skip: bool = True  # the samples outside the occupied cells; the picture is the same
 

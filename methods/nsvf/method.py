@@ -14,8 +14,7 @@ from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import BRICK, Occupancy, expect
 from methods.nsvf.field import EMBEDDING, NsvfField
 from methods.rendering.sampling import Sampling, check_step
-from methods.students.fields import FieldStudent, StudentTraining
-from methods.students.networks import NetworkLessons
+from methods.students.fields import FieldLessons, FieldStudent, StudentTraining
 from methods.students.voxels import occupied_voxels
 
 
@@ -23,7 +22,7 @@ from methods.students.voxels import occupied_voxels
 class Nsvf(FieldStudent):
     """A neural sparse voxel field with voxels where the field that it starts from is occupied."""
 
-    training: NetworkLessons
+    training: FieldLessons
     name: str = "nsvf"
     resolution: int = 128  # voxels along a side of the cube, a multiple of 16
     step: float = 0.5  # length of a step of the rays in voxels, in training and rendering

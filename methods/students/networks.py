@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -12,32 +11,20 @@ from torch.nn import functional
 
 from methods.instant_ngp.field import Precision
 from methods.kernels import multiplies_bf16
-from methods.students.fields import FieldLessons, StudentField
+from methods.students.fields import StudentField
 
 CHUNK = 1 << 14
 """Samples that go through a network together: 16 MiB of activations."""
 
 
-@dataclass(frozen=True)
-class NetworkLessons(FieldLessons):
-    """How to train one large network: in many small steps, at a lower rate than a hash grid."""
-
-    rate: float = 1e-3
-    final_rate: float = 0.1
-    share: float = 0.25
-
-
 def positional(
     values: Tensor, frequencies: int, *, identity: bool = True, scale: float = math.pi
 ) -> Tensor:
-    """Sines and cosines of `values` [S, C], at frequencies 2^0 to 2^(F - 1) times `scale`.
+    """Sines and cosines of `values` [S, C], at frequencies 2^0 to 2^(F - 1) times `scale`, the
+    lowest first: [S, C (2 F + identity)].
 
     Mildenhall et al. (2020), Eq. 4; the release has no pi (`scale` 1) and puts the values
     themselves in front (`identity`).
-
-    Returns:
-        [S, C (2 F + identity)]: the values, then sines and cosines of the lowest frequency, and so
-        on.
     """
     angles = scale * values
     sine, cosine = angles.sin(), angles.cos()

@@ -83,10 +83,8 @@ def train(
 
     On the way, the results after the numbers of steps in `marks` are written as well. If another
     process runs the same training, this one waits for it. A killed training resumes from the
-    checkpoint beside `finished`.
-
-    Raises:
-        SteerbenchError: something is not finite; the last good checkpoint is kept.
+    checkpoint beside `finished`. `SteerbenchError` is raised if something is not finite; the last
+    good checkpoint is kept.
     """
     with missing(finished, log) as to_train:
         if to_train:
@@ -154,13 +152,11 @@ def resume(training: Training, path: Path) -> None:
 def look(
     training: Training, errors: Mapping[str, Tensor], tensors: Mapping[str, Tensor]
 ) -> dict[str, float]:
-    """Return the `errors` of a step as numbers.
+    """Return the `errors` of a step as numbers; raise `SteerbenchError` if one is not finite, with
+    the names of the `tensors` that are not.
 
     On a GPU this happens every `LOOK_EVERY` steps, with the errors that were requested the time
     before, which have arrived meanwhile; in all other steps there are none.
-
-    Raises:
-        SteerbenchError: an error is not finite; it names which of `tensors` are not.
     """
     on_cpu = all(error.device.type == "cpu" for error in errors.values())
     if not on_cpu and training.step % LOOK_EVERY:

@@ -55,8 +55,7 @@ from methods.steernerf_lean import training as lean_training
 from methods.steernerf_lean.lean_renderer import LeanRenderer
 from methods.steernerf_lean.method import SteerNerfLean
 from methods.steernerf_lean.pipeline import LeanPipeline
-from methods.students.fields import StudentField
-from methods.students.networks import NetworkLessons
+from methods.students.fields import FieldLessons, StudentField
 from methods.training import loop
 from tests.methods.conftest import Work
 from tests.methods.models import (
@@ -119,7 +118,7 @@ def gaussians(**where: Any) -> GaussianSplatting:
     return GaussianSplatting(grid=GRID, training=STAGE1, count=40, fitting=Fitting(), **where)
 
 
-NETWORK = NetworkLessons(max_rays=64)
+NETWORK = FieldLessons(max_rays=64)
 EXTRACTION = Extraction(resolution=128, degree=1, rays=200, points=1, directions=4)
 METHODS: Mapping[str, Callable[..., Method]] = {
     "ngp": partial(InstantNgp, grid=GRID, training=STAGE1),

@@ -13,7 +13,7 @@ from methods.kernels.composite import STOP
 from methods.nerf.field import NerfField
 from methods.nerf.method import Nerf
 from methods.rendering.sampling import Sampling
-from methods.students.networks import NetworkLessons
+from methods.students.fields import FieldLessons
 from tests.methods.conftest import Work
 from tests.methods.trainings import EXACT_TEACHER, TAUGHT
 
@@ -23,7 +23,7 @@ LONG = EXACT_TEACHER.training.march_step
 
 
 def new_method(**options: Any) -> Nerf:
-    training = NetworkLessons(rate=1e-3)
+    training = FieldLessons(rate=1e-3)
     return Nerf(**{"teacher": EXACT_TEACHER, "training": training} | options)
 
 

@@ -17,7 +17,7 @@ from methods.kernels.encode import encode
 from methods.kernels.types import Occupancy
 from methods.nsvf.field import NsvfField
 from methods.nsvf.method import Nsvf
-from methods.students.networks import NetworkLessons
+from methods.students.fields import FieldLessons
 from tests.methods.trainings import (
     EXACT_GRID,
     EXACT_TEACHER,
@@ -31,7 +31,7 @@ SINES = (torch.sin, torch.cos)
 
 
 def new_method(**options: Any) -> Nsvf:
-    training = NetworkLessons(rate=2e-3)
+    training = FieldLessons(rate=2e-3)
     return Nsvf(
         **{"teacher": EXACT_TEACHER, "training": training, "resolution": 32, "start": "random"}
         | options

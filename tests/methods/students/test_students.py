@@ -23,8 +23,8 @@ from methods.nsvf.method import Nsvf
 from methods.plenoctree.method import PlenOctree
 from methods.plenoctree.start import Extraction
 from methods.plenoctree.training import OctreeLessons
+from methods.students.fields import FieldLessons
 from methods.students.method import Student
-from methods.students.networks import NetworkLessons
 from methods.training import loop
 from sweeps.overrides import composed
 from tests.methods.trainings import (
@@ -43,11 +43,11 @@ SMALL: dict[str, Callable[..., Student]] = {
     "kilonerf": partial(
         KiloNerf, teacher=TEACHER, training=KiloLessons(points_each=64, rate=1e-2), networks=4
     ),
-    "nerf": partial(Nerf, teacher=EXACT_TEACHER, training=NetworkLessons()),
+    "nerf": partial(Nerf, teacher=EXACT_TEACHER, training=FieldLessons()),
     "nsvf": partial(
         Nsvf,
         teacher=EXACT_TEACHER,
-        training=NetworkLessons(rate=2e-3),
+        training=FieldLessons(rate=2e-3),
         resolution=32,
         start="random",
     ),
@@ -151,8 +151,8 @@ def test_wrong_settings_are_refused(name: str, wrong: dict[str, Any]) -> None:
         (KiloLessons, {"points_each": 0}),
         (KiloLessons, {"view_cost": -1.0}),
         (KiloLessons, {"points": 2.0}),
-        (NetworkLessons, {"share": 0.0}),
-        (NetworkLessons, {"share": 1.5}),
+        (FieldLessons, {"share": 0.0}),
+        (FieldLessons, {"share": 1.5}),
         (OctreeLessons, {"density_rate": -1.0}),
         (OctreeLessons, {"samples": 0}),
         (Extraction, LEAVES | {"resolution": 100}),
