@@ -54,23 +54,15 @@ class Built:
 
 
 class Engine(ABC):
-    """Builds networks at one `precision`, called `name` in rows.
+    """Builds networks at one of its `precisions`; only int8 depends on `calibration`.
 
-    Args:
-        precision: one of `precisions`.
-        calibration: for int8 only; other precisions do not depend on it.
-
-    Attributes:
-        uncalibrated: whether this is int8 without calibration.
-        libraries: distributions that the constructor loads.
-
-    Raises:
-        Unavailable: the engine does not have this precision, or cannot be used here.
+    The constructor raises `Unavailable` if the engine does not have the precision, or cannot be
+    used here.
     """
 
-    name: ClassVar[str]
+    name: ClassVar[str]  # as shown in rows
     precisions: ClassVar[tuple[Precision, ...]]
-    libraries: ClassVar[tuple[str, ...]] = ()
+    libraries: ClassVar[tuple[str, ...]] = ()  # distributions that the constructor loads
 
     def __init__(self, precision: Precision = "fp32", calibration: Calibration = "frames") -> None:
         if precision not in self.precisions:
@@ -133,10 +125,8 @@ def keep(path: Path, write: Callable[[Path], None], log: Log) -> None:
     """Let `write` create the file `path` unless it exists: atomically, and in one process only.
 
     `write` gets a path with the same name in a temporary folder. Files that it leaves there which
-    differ from `path` only in their suffix are kept, too.
-
-    Raises:
-        SteerbenchError: the folder of `path` cannot be written to.
+    differ from `path` only in their suffix are kept, too. A folder that cannot be written to raises
+    `SteerbenchError`.
     """
     with missing(path, log) as to_build:
         if not to_build:

@@ -30,11 +30,8 @@ class OpenVino(Engine):
     """OpenVINO on the CPU.
 
     With int8, everything not quantised is computed in bfloat16 if the CPU has it, otherwise in
-    float32.
-
-    Raises:
-        Unavailable: OpenVINO, or NNCF for int8, is not installed; or bfloat16 is wanted and this
-            CPU lacks it, so that OpenVINO would silently compute in float32.
+    float32. Where the CPU lacks bfloat16, OpenVINO would compute in float32 without saying so:
+    then `bf16` is refused.
     """
 
     name = "openvino"

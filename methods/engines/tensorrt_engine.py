@@ -35,9 +35,6 @@ class TensorRt(Engine):
     It builds plans. A plan is valid for one GPU model, one version, and up to a number of cells,
     which is a power of two. Plans for expected sizes are built beforehand, others on demand. With
     int8, everything not quantised is computed in float32.
-
-    Raises:
-        Unavailable: there is no CUDA GPU, or TensorRT, onnx or ONNX Runtime is not installed.
     """
 
     name = "tensorrt"

@@ -39,12 +39,7 @@ class Setup:
         device: str,
         seed: int,
     ) -> Setup:
-        """Make a setup with `auto` replaced by what it means on this machine.
-
-        Raises:
-            ValueError: the grid does not exist at this precision, or `device` names no device.
-            Unavailable: the backend cannot be used here.
-        """
+        """Make a setup with `auto` replaced by what it means on this machine."""
         if not DEVICE.fullmatch(device):
             raise ValueError(f"device: expected auto, cpu, cuda or cuda:N, got {device!r}")
         if device == "auto":

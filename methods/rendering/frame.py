@@ -32,18 +32,12 @@ Render = Callable[[Tensor, Rays], Pixels]
 
 @dataclass(frozen=True)
 class FeatureFrame:
-    """A field as a `camera` of w x h pixels sees it: F and D of SteerNeRF.
-
-    Attributes:
-        values: [h, w, K] features on the background; the first three are RGB.
-        depth: [h, w] z-depth, +inf where a pixel is empty.
-        alpha: [h, w] opacity.
-    """
+    """A field as a camera of w x h pixels sees it: F and D of SteerNeRF."""
 
     camera: Camera
-    values: Tensor
-    depth: Tensor
-    alpha: Tensor
+    values: Tensor  # [h, w, K] features on the background; the first three are RGB
+    depth: Tensor  # [h, w] z-depth, +inf where a pixel is empty
+    alpha: Tensor  # [h, w] opacity
 
     @classmethod
     def of(cls, camera: Camera, pixels: Pixels, background: Tensor) -> FeatureFrame:

@@ -20,12 +20,8 @@ OFFSETS = tuple((c & 1, c >> 1 & 1, c >> 2 & 1) for c in range(8))
 
 
 def corners_of(coordinates: Tensor) -> tuple[Tensor, Tensor]:
-    """Find the corners of V voxels at `coordinates` [V, 3], from 0 to 2^20, each corner once.
-
-    Returns:
-        corners: [V, 8] int32, which vertices are the corners of each voxel.
-        vertices: [C, 3] int32, integer coordinates of all corners, ordered by x, then y, then z.
-    """
+    """The corners of V voxels at `coordinates` [V, 3], from 0 to 2^20: [V, 8] int32, which vertices
+    each has, and [C, 3] int32, the coordinates of all vertices, ordered by x, then y, then z."""
     offsets = torch.tensor(OFFSETS, device=coordinates.device)
     x, y, z = (coordinates.long()[:, None] + offsets).unbind(dim=-1)  # [V, 8]
     keys, corners = torch.unique((x << 42) + (y << 21) + z, return_inverse=True)
