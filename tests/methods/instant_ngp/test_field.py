@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from methods.instant_ngp.field import HashField
+from methods.instant_ngp.field import LOG_DENSITY_CLAMP, HashField, _ClampedExp
 from methods.kernels.encode import HashGrid, SampleGradients, encode
 from tests.methods.conftest import Work
 
@@ -99,8 +99,6 @@ def test_sizes_are_those_of_the_precision() -> None:
 
 
 def test_the_gradient_of_a_huge_density_is_clamped() -> None:
-    from methods.instant_ngp.field import LOG_DENSITY_CLAMP, _ClampedExp
-
     log_density = torch.tensor([-100.0, 0.0, 30.0], requires_grad=True)
     sigma = _ClampedExp.apply(log_density)
     sigma.sum().backward()
