@@ -45,7 +45,7 @@ def cells(count: int, seed: int = 0) -> Inputs:
     return torch.rand(side * side, renderer.layout.width, generator=generator) - 0.5, neighbours
 
 
-def blank_cells(count: int) -> Inputs:
+def blanks(count: int) -> Inputs:
     """The same, of zeros."""
     rows, neighbours = cells(0)
     return rows.new_zeros(count, rows.shape[1]), neighbours.new_zeros(count, 9)
@@ -123,7 +123,7 @@ def test_sizes_that_may_come_are_compiled_before_a_frame_is_timed(
 ) -> None:
     network, _ = lean()
     quantum = network.quantum
-    built = build(OpenVino("fp32"), network, [blank_cells(2 * quantum)])
+    built = build(OpenVino("fp32"), network, [blanks(2 * quantum)])
     sizes = json.loads((tmp_path / "network.json").read_text())
     assert sizes == [quantum, 2 * quantum, 3 * quantum]
     nothing = cells(0)  # a view of nothing has no cells

@@ -19,7 +19,7 @@ from tests.methods.engines import tensorrt_double
 from tests.methods.engines.test_engines import (
     TOLERANCE,
     assert_close,
-    blank_cells,
+    blanks,
     cells,
     lean,
     unet,
@@ -42,7 +42,7 @@ def test_tensors_go_in_and_out_as_the_network_takes_and_gives_them(precision, ma
 
 def test_plans_are_built_for_the_sizes_to_expect_and_found_again(double, tmp_path, build):
     module, _ = lean()
-    build(TensorRt("fp16"), module, [blank_cells(2 * module.quantum)])
+    build(TensorRt("fp16"), module, [blanks(2 * module.quantum)])
     plans = {path.name for path in tmp_path.glob("*.plan")}
     assert plans == {"upto-512.plan", "upto-1024.plan", "upto-2048.plan"}  # 1, 2 and 3 times 512
     build(TensorRt("fp16"), module, None)

@@ -15,13 +15,13 @@ from methods.kernels.types import Occupancy, Pixels
 from methods.rendering.batch import KEPT_THIN, render_batch, visible_samples
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import Sampling
-from tests.methods.conftest import look_at_the_middle
+from tests.methods.conftest import Cloud, look_at_the_middle
 
 Thick = tuple[HashField, Occupancy, Rays]
 
 
 @pytest.fixture
-def thick(cloud: tuple[HashField, Occupancy], device: str) -> Thick:
+def thick(cloud: Cloud, device: str) -> Thick:
     """The cloud a hundred times as dense, so that it hides its own samples, and rays through it."""
     field, occupancy = cloud
     thin = field.density
@@ -69,9 +69,7 @@ def test_leaving_out_hidden_samples_changes_no_gradient(thick: Thick, device: st
             torch.testing.assert_close(some, want, rtol=1e-3, atol=atol)
 
 
-def test_thin_samples_are_kept_in_turn_and_stand_for_the_others(
-    cloud: tuple[HashField, Occupancy], device: str
-) -> None:
+def test_thin_samples_are_kept_in_turn_for_the_others(cloud: Cloud, device: str) -> None:
     field, occupancy = cloud
     rays = rays_on(device)
     jitter = torch.full((len(rays.origins),), 0.5, device=device)
@@ -95,9 +93,7 @@ def test_thin_samples_are_kept_in_turn_and_stand_for_the_others(
     torch.testing.assert_close(length, expected, rtol=1024 * 2**-24, atol=0)
 
 
-def test_the_rounds_of_the_first_pass_change_no_sample(
-    thick: Thick, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rounds_change_no_sample(thick: Thick, monkeypatch: pytest.MonkeyPatch) -> None:
     """But for a transmittance that reaches `stop` just where a round ends: it is rounded there."""
     field, occupancy, rays = thick
     jitter = torch.full((len(rays.origins),), 0.7, device=rays.origins.device)
@@ -114,9 +110,7 @@ def test_the_rounds_of_the_first_pass_change_no_sample(
     assert 0 < len(found[0][1]) < len(found[0][0])
 
 
-def test_a_guide_tells_which_samples_are_hidden(
-    cloud: tuple[HashField, Occupancy], device: str
-) -> None:
+def test_a_guide_tells_which_samples_are_hidden(cloud: Cloud, device: str) -> None:
     field, occupancy = cloud
     rays = rays_on(device)
 

@@ -11,9 +11,7 @@ from tests.pretended_gpu import PretendedGpu
 MASK = torch.tensor([False, True, True, False, True])
 
 
-def test_a_gpu_computes_all_and_waits_for_nothing_a_cpu_what_is_worth_it(
-    gpu: PretendedGpu,
-) -> None:
+def test_a_gpu_computes_all_and_waits_for_nothing_a_cpu_what_is_worth_it(gpu: PretendedGpu) -> None:
     assert kept_indices(MASK).tolist() == [1, 2, 4]
     mask = MASK.to("cuda")
     with device_waits() as waits:

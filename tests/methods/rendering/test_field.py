@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
-
 import pytest
 import torch
 
@@ -20,7 +18,6 @@ from tests.methods.conftest import GRID, Work, look_at_the_middle
 from tests.methods.solids import DENSITY, Solid, ball
 
 EVERYWHERE = Occupancy(torch.ones(32, 32, 32, dtype=torch.bool))
-MEMBERS = {name for name in vars(Field) if not name.startswith("_")} | set(Field.__annotations__)
 
 
 def solid() -> Field:
@@ -29,16 +26,6 @@ def solid() -> Field:
 
 def hash_field() -> Field:
     return HashField(GRID, generator=torch.Generator().manual_seed(0))
-
-
-@pytest.mark.parametrize("make", [solid, hash_field])
-@pytest.mark.parametrize("name", sorted(MEMBERS))
-def test_a_field_has_every_member_with_the_same_arguments(make, name: str) -> None:
-    member, wanted = getattr(make(), name), getattr(Field, name, None)
-    if inspect.isfunction(wanted):
-        parameters = list(inspect.signature(wanted).parameters)[1:]  # without self
-        own = inspect.signature(member).parameters.values()
-        assert sum(given.default is inspect.Parameter.empty for given in own) == len(parameters)
 
 
 @pytest.mark.parametrize("make", [solid, hash_field])

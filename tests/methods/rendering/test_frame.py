@@ -17,13 +17,11 @@ from methods.rendering.batch import render_batch
 from methods.rendering.frame import everywhere, rays_at_matter, render_frame, render_rays
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import FAINT, Sampling
-from tests.methods.conftest import GRID, Work, look_at_the_middle
+from tests.methods.conftest import GRID, Cloud, Work, look_at_the_middle
 
 
 @pytest.mark.parametrize(("turn", "lift"), [(0.0, 0.0), (0.13, 0.7), (0.6, -1.2)])
-def test_no_ray_that_has_samples_is_left_out(
-    cloud: tuple[HashField, Occupancy], turn: float, lift: float
-) -> None:
+def test_no_ray_that_has_samples_is_left_out(cloud: Cloud, turn: float, lift: float) -> None:
     occupancy = Occupancy(cloud[1].cells.cpu())
     camera = look_at_the_middle(turn, lift)
     pixels, rays = rays_at_matter(camera, occupancy)
@@ -44,7 +42,7 @@ def test_a_camera_inside_the_matter_sees_it_in_all_pixels() -> None:
     assert len(pixels) == camera.width * camera.height
 
 
-def test_a_frame_is_its_rays_on_the_background(cloud: tuple[HashField, Occupancy]) -> None:
+def test_a_frame_is_its_rays_on_the_background(cloud: Cloud) -> None:
     field, occupancy = cloud
     camera = replace(place_camera(look_at_the_middle(0.1, 0.4), field.device), width=20)
     background, work = torch.tensor((0.25, 0.5, 1.0), device=field.device), Work()
@@ -65,7 +63,7 @@ def test_a_frame_is_its_rays_on_the_background(cloud: tuple[HashField, Occupancy
     assert work.done["rays"] == len(rays_at_matter(camera, occupancy)[0]) < 32 * 20
 
 
-def test_a_window_is_that_of_its_pixel(cloud: tuple[HashField, Occupancy]) -> None:
+def test_a_window_is_that_of_its_pixel(cloud: Cloud) -> None:
     """Half of the pixels may look nowhere, though `render_frame` asks for some pixels only."""
     field, occupancy = cloud
     camera = place_camera(look_at_the_middle(0.1, 0.4), field.device)
@@ -81,7 +79,7 @@ def test_a_window_is_that_of_its_pixel(cloud: tuple[HashField, Occupancy]) -> No
     torch.testing.assert_close(half.alpha[:, 16:], whole.alpha[:, 16:], rtol=0, atol=1e-6)
 
 
-def test_rounds_render_what_one_go_renders(cloud: tuple[HashField, Occupancy], device: str) -> None:
+def test_rounds_render_what_one_go_renders(cloud: Cloud, device: str) -> None:
     field, occupancy = cloud
     rays = cast(place_camera(look_at_the_middle(0.1, 0.4), device))
     half = torch.full((len(rays.origins),), 0.5, device=device)
@@ -96,7 +94,7 @@ def test_rounds_render_what_one_go_renders(cloud: tuple[HashField, Occupancy], d
 
 
 def test_at_once_rays_look_as_in_rounds(
-    cloud: tuple[HashField, Occupancy], device: str, monkeypatch: pytest.MonkeyPatch
+    cloud: Cloud, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     field, occupancy = cloud
     rays = cast(place_camera(look_at_the_middle(0.1, 0.4), device))
@@ -131,7 +129,7 @@ def test_samples_behind_the_early_stop_are_hardly_evaluated() -> None:
 
 @pytest.mark.parametrize("compacts", [True, False])
 def test_faint_samples_are_black_and_not_looked_at_in_rounds(
-    cloud: tuple[HashField, Occupancy], compacts: bool, monkeypatch: pytest.MonkeyPatch
+    cloud: Cloud, compacts: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rendering, "compacts", lambda device: compacts)
     field, occupancy = cloud
