@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 import json
 from collections.abc import Sequence
-from enum import Enum
+from enum import Enum, IntEnum
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -28,11 +28,8 @@ class Logger:
     def __init__(self, min_severity: int) -> None: ...
 
 
-class NetworkDefinitionCreationFlag(Enum):
+class NetworkDefinitionCreationFlag(IntEnum):
     STRONGLY_TYPED = 0
-
-    def __int__(self) -> int:
-        return self.value
 
 
 class BuilderFlag(Enum):

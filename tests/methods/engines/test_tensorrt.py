@@ -16,14 +16,7 @@ import torch
 from bench.errors import SteerbenchError, Unavailable
 from methods.engines.tensorrt_engine import TensorRt
 from tests.methods.engines import tensorrt_double
-from tests.methods.engines.test_engines import (
-    TOLERANCE,
-    assert_close,
-    blanks,
-    cells,
-    lean,
-    unet,
-)
+from tests.methods.engines.test_engines import TOLERANCE, assert_close, blanks, cells, lean, unet
 
 
 @pytest.mark.parametrize("precision", TensorRt.precisions)

@@ -26,13 +26,7 @@ from methods.plenoctree.training import OctreeLessons
 from methods.students.fields import FieldLessons
 from methods.students.method import Student
 from methods.training import loop
-from tests.methods.trainings import (
-    EXACT_TEACHER,
-    TAUGHT,
-    TEACHER,
-    goes_on_after_a_kill,
-    quality,
-)
+from tests.methods.trainings import EXACT_TEACHER, TAUGHT, TEACHER, goes_on_after_a_kill, quality
 
 LEAVES = {"resolution": 128, "degree": 1, "rays": 20_000, "points": 2, "directions": 8}
 SMALL: dict[str, Callable[..., Student]] = {
