@@ -27,12 +27,15 @@ pytestmark = [
 
 
 class Layers(Network):
-    """Two convolutions, and one of what is pooled between them."""
+    """Two convolutions, and one of what is pooled between them. Weights are so large that what they
+    make leaves its range, too."""
 
     def __init__(self) -> None:
         super().__init__()
+        torch.manual_seed(0)
         self.first, self.second = nn.Conv2d(4, 8, 3, padding=1), nn.Conv2d(8, 3, 3, padding=1)
         self.pooled = nn.Conv2d(8, 3, 1)
+        self.requires_grad_(False).first.weight.mul_(2)
 
     def forward(self, x: Tensor) -> Inputs:
         between = self.first(x).relu()
@@ -48,14 +51,6 @@ def no_bfloat16(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("methods.engines.openvino_engine._capabilities", lambda openvino: [])
 
 
-def layers() -> Layers:
-    """With weights so large that what they make leaves its range, too."""
-    torch.manual_seed(0)
-    module = Layers().requires_grad_(False)
-    module.first.weight.mul_(2)
-    return module
-
-
 def noise(seed: int) -> Inputs:
     generator = torch.Generator().manual_seed(seed)
     return (torch.randn(1, 4, 8, 8, generator=generator),)
@@ -66,22 +61,21 @@ def rounded(x: Tensor, largest: float) -> Tensor:
     return (x * 127 / largest).round().clamp(-128, 127) * largest / 127
 
 
-def weights(kind: Kind, folder: Path) -> list[np.ndarray]:
-    """All 8-bit constants, and the scales of those that are convolved with."""
+def weights(kind: Kind, folder: Path) -> dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]]:
+    """The 8-bit weights that are convolved with, and their scales, by shape."""
     if kind is OpenVino:
         model = OpenVino().load("openvino").Core().read_model(folder / "network.xml")
         convolved = [op for op in model.get_ordered_ops() if op.get_type_name() == "Convolution"]
         kernels = [op.input_value(1).get_node() for op in convolved]
-        pairs = [
-            (kernel.input_value(0).get_node().input_value(0), kernel.input_value(1))
-            for kernel in kernels
-        ]
-        return [x.get_node().data for pair in pairs for x in pair]
+        pairs = [(k.input_value(0).get_node().input_value(0), k.input_value(1)) for k in kernels]
+        found = [[x.get_node().data for x in pair] for pair in pairs]
+        return {q.shape: (q, scale) for q, scale in found}
     graph = onnx.load(folder / "network.onnx").graph
     values = {x.name: onnx.numpy_helper.to_array(x) for x in graph.initializer}
     makers = {name: node for node in graph.node for name in node.output}
     kernels = [makers[node.input[1]] for node in graph.node if node.op_type == "Conv"]
-    return [values[name] for kernel in kernels for name in kernel.input[:2]]
+    found = [[values[name] for name in kernel.input[:2]] for kernel in kernels]
+    return {q.shape: (q, scale) for q, scale in found}
 
 
 def adds_products_exactly() -> bool:
@@ -96,18 +90,10 @@ def test_activations_are_rounded_on_the_ranges_of_trtexec(
 ) -> None:
     if kind is OpenVino and not adds_products_exactly():
         pytest.skip("this CPU has no VNNI: sums of 8-bit products saturate")
-    module, inputs = layers(), (3 * noise(1)[0],)  # beyond all three ranges
+    module, inputs = Layers(), (3 * noise(1)[0],)  # beyond all three ranges
     got = build(kind("int8", "none"), module, [noise(0)]).run(*inputs)
-    found = weights(kind, tmp_path)
-    kernels = [
-        torch.from_numpy(q * scale.reshape(-1, 1, 1, 1))
-        for q, scale in zip(found[::2], found[1::2], strict=True)
-    ]
-    by_shape = {tuple(kernel.shape): kernel for kernel in kernels}
-    first, second, pooled = (
-        by_shape[tuple(layer.weight.shape)]
-        for layer in (module.first, module.second, module.pooled)
-    )
+    found = [weights(kind, tmp_path)[layer.weight.shape] for layer in module.children()]
+    first, second, pooled = (torch.from_numpy(q * scale.reshape(-1, 1, 1, 1)) for q, scale in found)
     x = rounded(inputs[0], 2)
     between = functional.conv2d(x, first, module.first.bias, padding=1).relu()
     assert between.max() > 4
@@ -126,26 +112,21 @@ def test_activations_are_rounded_on_the_ranges_of_trtexec(
 def test_weights_are_those_of_int8_on_frames(kind: Kind, build: Build, tmp_path: Path) -> None:
     found = {}
     for calibration in ("frames", "none"):
-        build(kind("int8", calibration), layers(), [noise(0)], calibration)
+        build(kind("int8", calibration), Layers(), [noise(0)], calibration)
         found[calibration] = weights(kind, tmp_path / calibration)
-    assert len(found["none"]) == 6
-    for some, others in zip(found["none"], found["frames"], strict=True):
-        assert np.array_equal(some, others)
-    if kind is TensorRt:  # every channel is scaled by its largest weight
-        module = layers()
-        largest = {
-            tuple(layer.weight.shape): layer.weight.abs().amax((1, 2, 3)).numpy()
-            for layer in (module.first, module.second, module.pooled)
-        }
-        for q, scale in zip(found["none"][::2], found["none"][1::2], strict=True):
-            assert np.allclose(127 * scale, largest[q.shape], rtol=1e-6)
+    for layer in Layers().children():
+        q, scale = found["none"][layer.weight.shape]
+        assert all(map(np.array_equal, (q, scale), found["frames"][layer.weight.shape]))
+        if kind is TensorRt:  # every channel is scaled by its largest weight
+            largest = layer.weight.abs().amax((1, 2, 3)).numpy()
+            assert np.allclose(127 * scale, largest, rtol=1e-6)
             assert (np.abs(q.astype(int)).reshape(len(q), -1).max(1) == 127).all()
 
 
 def test_no_number_of_a_frame_is_read(kind: Kind, build: Build) -> None:
     samples = {"once": noise(0), "again": (9 * noise(1)[0],)}
     once, again = (
-        build(kind("int8", "none"), layers(), [some], folder).run(*noise(2))
+        build(kind("int8", "none"), Layers(), [some], folder).run(*noise(2))
         for folder, some in samples.items()
     )
     for a, b in zip(once, again, strict=True):
