@@ -17,6 +17,7 @@ from methods.rendering.occupancy import (
     learnable_cells,
 )
 from tests.methods.conftest import look_at_the_middle
+from tests.methods.solids import Solid, slab
 
 UNIT_CUBE = torch.tensor([[0.0] * 3, [1.0] * 3])
 WHOLE = torch.ones(RESOLUTION, RESOLUTION, RESOLUTION, dtype=torch.bool)
@@ -26,11 +27,9 @@ AROUND = [look_at_the_middle(turn / 4, lift) for turn in range(4) for lift in (-
 GENERATOR = torch.Generator().manual_seed(0)
 
 
-class Slab:
+def quarter(sigma: float) -> Solid:
     """A field of density `sigma` where x < 1/4, nothing elsewhere."""
-
-    def __init__(self, sigma: float) -> None:
-        self.density = lambda places: (sigma * (places[:, 0] < 0.25).float(), None)
+    return Solid(slab(-1.0, 0.25), density=sigma)
 
 
 def test_cells_outside_the_bounds_cannot_be_learnt() -> None:
@@ -62,7 +61,7 @@ def test_cells_at_a_camera_cannot_be_learnt() -> None:
 
 def test_a_cell_is_occupied_until_it_was_visited_and_keeps_its_value_in_between() -> None:
     grid = DensityGrid(WHOLE)
-    grid.update(Slab(0.0), GENERATOR, samples=4096)
+    grid.update(quarter(0.0), GENERATOR, samples=4096)
     visited = grid.density < INITIAL
     assert 0 < visited.sum() <= 4096
     torch.testing.assert_close(
@@ -74,13 +73,13 @@ def test_a_cell_is_occupied_until_it_was_visited_and_keeps_its_value_in_between(
 def test_a_density_that_is_not_a_number_is_as_good_as_none() -> None:
     grid, other = DensityGrid(WHOLE), DensityGrid(WHOLE)
     for one, sigma in ((grid, math.nan), (other, 0.0)):
-        one.update(Slab(sigma), torch.Generator().manual_seed(1), samples=4096)
+        one.update(quarter(sigma), torch.Generator().manual_seed(1), samples=4096)
     assert torch.equal(grid.density, other.density)
 
 
 @pytest.mark.slow
 def test_matter_that_is_thin_everywhere_is_kept_where_it_is_denser_than_the_mean() -> None:
-    thin = Slab(0.1 * THRESHOLD)
+    thin = quarter(0.1 * THRESHOLD)
     grid = DensityGrid(WHOLE)
     for _ in range(24):  # 1.2 * 0.8^24 < 0.1
         grid.update(thin, GENERATOR, samples=2 * grid.density.numel())
