@@ -134,19 +134,19 @@ def _kept(rounds: list[Round], thin: float, turns: Tensor) -> Samples:
     """The visible samples, numbered along each ray from its turn [R] on. Of those below the optical
     depth `thin`, the ones stay whose number `KEPT_THIN` divides, with the length of all."""
     rays = torch.arange(len(turns), dtype=torch.int32, device=turns.device)
-    numbers, visible_, of_ray = [], [], []
+    numbers, shown, of_ray = [], [], []
     for some in rounds:
         own = some.samples.ray
         number = torch.arange(len(own), device=own.device)
         number -= some.samples.offsets.index_select(0, own)
-        visible_.append(number < some.counts.index_select(0, own))
+        shown.append(number < some.counts.index_select(0, own))
         numbers.append(number + turns[some.chosen].index_select(0, own))
         of_ray.append(rays[some.chosen].index_select(0, own))
         turns[some.chosen] += some.counts  # all samples of a ray that goes on are visible
     every = [some.samples for some in rounds]
     delta, ray = cat([samples.delta for samples in every]), cat(of_ray)
     faint = cat([some.sigma for some in rounds]) * delta < thin
-    index = cat(visible_) & (~faint | (cat(numbers) % KEPT_THIN == 0))
+    index = cat(shown) & (~faint | (cat(numbers) % KEPT_THIN == 0))
     index = index.nonzero().squeeze(1)
     ray_of_kept = ray.index_select(0, index)
     counts = torch.zeros_like(turns).index_add_(0, ray_of_kept, torch.ones_like(index))
