@@ -20,17 +20,9 @@ from tests.methods.solids import DENSITY, Solid, ball
 EVERYWHERE = Occupancy(torch.ones(32, 32, 32, dtype=torch.bool))
 
 
-def solid() -> Field:
-    return Solid(ball())
-
-
-def hash_field() -> Field:
-    return HashField(GRID, generator=torch.Generator().manual_seed(0))
-
-
-@pytest.mark.parametrize("make", [solid, hash_field])
-def test_a_field_answers_in_the_shapes_that_are_promised(make) -> None:
-    field, positions = make(), torch.rand(7, 3)
+@pytest.mark.parametrize("field", [Solid(ball()), HashField(GRID)], ids=["solid", "hash"])
+def test_a_field_answers_in_the_shapes_that_are_promised(field: Field) -> None:
+    positions = torch.rand(7, 3)
     assert field.device == torch.device("cpu")
     encoded = field.encode_directions(torch.rand(2, 3))
     sigma, values = query(field, positions, torch.tensor([0, 0, 0, 1, 1, 1, 1]), encoded)
@@ -40,7 +32,7 @@ def test_a_field_answers_in_the_shapes_that_are_promised(make) -> None:
 
 
 def test_rays_of_a_solid_end_at_its_surface() -> None:
-    field, rays = solid(), cast(look_at_the_middle(0.1, 0.4))
+    field, rays = Solid(ball()), cast(look_at_the_middle(0.1, 0.4))
     work = Work()
     pixels = render_rays(field, rays, EVERYWHERE, work, Sampling())
     batch, used = render_batch(field, rays, EVERYWHERE, Sampling())
@@ -54,12 +46,12 @@ def test_rays_of_a_solid_end_at_its_surface() -> None:
     assert used > 0
 
 
-def test_the_density_grid_finds_a_solid() -> None:
+def test_the_density_grid_finds_a_Solid(ball()) -> None:
     slice_ = torch.zeros(RESOLUTION, RESOLUTION, RESOLUTION, dtype=torch.bool)
     slice_[62:66] = True  # through the middle of the ball
     grid, generator = DensityGrid(slice_), torch.Generator().manual_seed(0)
     for _ in range(4):
-        grid.update(solid(), generator, samples=2 * int(slice_.sum()))
+        grid.update(Solid(ball()), generator, samples=2 * int(slice_.sum()))
     axis = (torch.arange(RESOLUTION) + 0.5) / RESOLUTION - 0.5
     radius = (axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2).sqrt()
     cells = grid.occupancy.cells
