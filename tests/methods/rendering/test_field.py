@@ -46,7 +46,7 @@ def test_rays_of_a_solid_end_at_its_surface() -> None:
     assert used > 0
 
 
-def test_the_density_grid_finds_a_Solid(ball()) -> None:
+def test_the_density_grid_finds_a_solid() -> None:
     slice_ = torch.zeros(RESOLUTION, RESOLUTION, RESOLUTION, dtype=torch.bool)
     slice_[62:66] = True  # through the middle of the ball
     grid, generator = DensityGrid(slice_), torch.Generator().manual_seed(0)
