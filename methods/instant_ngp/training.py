@@ -41,7 +41,7 @@ class PixelOptions:
     # no density can pass for background.
     random_background: bool = True
     max_rays: int = 1 << 15  # maximum number of rays in a step
-    by_error: float = 0.0  # share of the rays that an `ErrorMap` draws; the others see all alike
+    by_error: float = 0.0  # share of the rays that an `ErrorMap` draws; the rest see all alike
 
     def __post_init__(self) -> None:
         expect(self.rate > 0, "rate", "more than 0", self.rate)
