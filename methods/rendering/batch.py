@@ -114,9 +114,9 @@ def visible_samples(
     if jitter is None or not how.thin:
         if len(rounds) == 1:
             return samples.front(counts)
-        return _kept(rounds, 0.0, torch.zeros_like(rounds[0].counts))
+        return thinned(rounds, 0.0, torch.zeros_like(rounds[0].counts))
     # Digits of the phase that say nothing of where in a step the samples lie.
-    return _kept(rounds, how.thin, (jitter * 2**12).long())
+    return thinned(rounds, how.thin, (jitter * 2**12).long())
 
 
 def _encoded_densities(field: Encoder, samples: Samples) -> tuple[Tensor, Samples]:
@@ -130,7 +130,7 @@ def _encoded_densities(field: Encoder, samples: Samples) -> tuple[Tensor, Sample
     return torch.cat(sigma)[: len(samples)], replace(samples, encoded=known)
 
 
-def _kept(rounds: list[Round], thin: float, turns: Tensor) -> Samples:
+def thinned(rounds: list[Round], thin: float, turns: Tensor) -> Samples:
     """The visible samples, numbered along each ray from its turn [R] on. Of those below the optical
     depth `thin`, the ones stay whose number `KEPT_THIN` divides, with the length of all."""
     rays = torch.arange(len(turns), dtype=torch.int32, device=turns.device)

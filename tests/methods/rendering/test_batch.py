@@ -9,10 +9,10 @@ from torch import Tensor
 from bench.cameras import cast, place_camera
 from bench.types import Rays
 from methods.instant_ngp.field import HashField
-from methods.kernels.composite import composite
+from methods.kernels.composite import composite, visible
 from methods.kernels.march import march
 from methods.kernels.types import Occupancy, Pixels
-from methods.rendering.batch import KEPT_THIN, render_batch, visible_samples
+from methods.rendering.batch import KEPT_THIN, Round, render_batch, thinned, visible_samples
 from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import Sampling
 from tests.methods.conftest import Cloud, look_at_the_middle
@@ -73,14 +73,14 @@ def test_thin_samples_are_kept_in_turn_for_the_others(cloud: Cloud, device: str)
     field, occupancy = cloud
     rays = rays_on(device)
     jitter = torch.full((len(rays.origins),), 0.5, device=device)
-    every = visible_samples(field, rays, occupancy, Sampling(), jitter=jitter)
-    depth = (field.density(every.positions)[0] * every.delta).median().item()
+    samples = march(rays, occupancy, STEP, jitter=jitter)
+    sigma = field.density(samples.positions)[0].detach()
+    counts, _ = visible(sigma, samples)
+    every, depth = samples.front(counts), (sigma * samples.delta).median().item()
 
     # The turns of one phase take all thin samples once, each with the length of all.
-    turns = [
-        visible_samples(field, rays, occupancy, Sampling(thin=depth), jitter=jitter + turn / 2**12)
-        for turn in range(KEPT_THIN)
-    ]
+    rounds = [Round(slice(None), samples, sigma, counts)]
+    turns = [thinned(rounds, depth, torch.full_like(counts, 5 + n)) for n in range(KEPT_THIN)]
     length, number = torch.zeros(2, len(rays.origins), device=device)
     for kept in turns:
         assert len(kept) < 0.8 * len(every)
