@@ -17,16 +17,11 @@ def kernels(having: str = "reference") -> list[str]:
 
 def modules(name: str) -> list[str]:
     """The modules of bench and methods that are called `name`: "cases" or "experiments"."""
-    paths = sorted(
-        path for top in ("bench", "methods") for path in (ROOT / top).rglob(f"{name}.py")
-    )
+    paths = sorted(p for top in ("bench", "methods") for p in (ROOT / top).rglob(f"{name}.py"))
     return [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in paths]
 
 
 def found(name: str) -> list[Any]:
     """The results of the function `name` of all modules of this name, in one list."""
-    return [
-        check
-        for module in modules(name)
-        for check in getattr(importlib.import_module(module), name)()
-    ]
+    makers = (getattr(importlib.import_module(module), name) for module in modules(name))
+    return [check for make in makers for check in make()]

@@ -20,7 +20,6 @@ from methods.engines.torch_engine import TorchEngine
 from methods.kernels import dispatch
 from methods.kernels.encode import HashGrid, encode
 from methods.kernels.types import Occupancy
-from methods.rendering import rays
 from methods.rendering.frame import everywhere, render_frame
 from methods.rendering.sampling import Sampling
 from tests.methods.conftest import look_at_the_middle
@@ -259,7 +258,7 @@ def test_planted_a_range_on_the_cpu_is_found(
     gpu: PretendedGpu, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     background, arange = torch.ones(4, device="cuda"), torch.arange
-    monkeypatch.setattr(rays.torch, "arange", lambda *of, device=None, **kind: arange(*of, **kind))
+    monkeypatch.setattr(torch, "arange", lambda *of, device=None, **kind: arange(*of, **kind))
     with pytest.raises(RuntimeError, match="same device"):
         draw(background)
 

@@ -19,7 +19,7 @@ from methods.kernels.voxel_walk import Crossings, walk
 from methods.rendering.field import pad
 from methods.students.voxels import largest_weights
 from methods.training import checkpoint
-from methods.training.optimiser import step_at
+from methods.training.loop import step_at
 
 
 @dataclass(frozen=True)

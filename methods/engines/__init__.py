@@ -29,7 +29,7 @@ from methods.engines.network import Network as Network
 Precision = Literal["fp32", "bf16", "fp16", "int8"]
 
 Calibration = Literal["frames", "none"]
-"""Source of the ranges of 8-bit activations: real frames, or none: `fixed_ranges`."""
+"""Source of the ranges of 8-bit activations: real frames, or none: see `largest`."""
 
 Inputs = tuple[Tensor, ...]
 
@@ -46,37 +46,23 @@ to expect."""
 
 @dataclass(frozen=True)
 class Built:
-    """A network built by an engine.
-
-    Attributes:
-        run: called like the network. The next call may overwrite the returned tensors.
-        size: bytes of the weights in a file at this precision.
-    """
+    """A network built by an engine: `run` is called like the network, and its next call may
+    overwrite the returned tensors; `size` is the bytes of its weights in a file."""
 
     run: Callable[..., Inputs]
     size: int
 
 
 class Engine(ABC):
-    """Builds networks at one `precision`.
+    """Builds networks at one of its `precisions`; only int8 depends on `calibration`.
 
-    Args:
-        precision: one of `precisions`.
-        calibration: for int8 only; other precisions do not depend on it.
-
-    Attributes:
-        uncalibrated: whether this is int8 without calibration.
-        name: as shown in rows.
-        precisions: the supported precisions.
-        libraries: distributions that the constructor loads.
-
-    Raises:
-        Unavailable: the engine does not have this precision, or cannot be used here.
+    The constructor raises `Unavailable` if the engine does not have the precision, or cannot be
+    used here.
     """
 
-    name: ClassVar[str]
+    name: ClassVar[str]  # as shown in rows
     precisions: ClassVar[tuple[Precision, ...]]
-    libraries: ClassVar[tuple[str, ...]] = ()
+    libraries: ClassVar[tuple[str, ...]] = ()  # distributions that the constructor loads
 
     def __init__(self, precision: Precision = "fp32", calibration: Calibration = "frames") -> None:
         if precision not in self.precisions:
@@ -86,6 +72,15 @@ class Engine(ABC):
             )
         self.precision = precision
         self.uncalibrated = precision == "int8" and calibration == "none"
+
+    def load(self, library: str) -> ModuleType:
+        """Import a library of the engine; raise `Unavailable` if it is not installed."""
+        try:
+            return importlib.import_module(library)
+        except ImportError as error:
+            raise Unavailable(
+                f"engine={self.name} cannot be used here ({error}): {install_command(self.name)}"
+            ) from error
 
     def check(self, device: torch.device) -> None:
         """Raise `Unavailable` unless the engine can compute at this precision on `device`."""
@@ -122,24 +117,16 @@ class Engine(ABC):
 
     @abstractmethod
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
-        """Build `network`, or load an earlier build of it.
-
-        Args:
-            network: on the device where it will run.
-            samples: inputs of `self.samples(network)` frames.
-            folder: where builds are stored.
-            log: shows progress, and where an earlier build was found.
-        """
+        """Build `network`, which is on the device where it will run, or load an earlier build of it
+        from `folder`. `samples` are inputs of `self.samples(network)` frames."""
 
 
 def keep(path: Path, write: Callable[[Path], None], log: Log) -> None:
     """Let `write` create the file `path` unless it exists: atomically, and in one process only.
 
     `write` gets a path with the same name in a temporary folder. Files that it leaves there which
-    differ from `path` only in their suffix are kept, too.
-
-    Raises:
-        SteerbenchError: the folder of `path` cannot be written to.
+    differ from `path` only in their suffix are kept, too. A folder that cannot be written to raises
+    `SteerbenchError`.
     """
     with missing(path, log) as to_build:
         if not to_build:
@@ -152,14 +139,23 @@ def keep(path: Path, write: Callable[[Path], None], log: Log) -> None:
                 part.replace(path.parent / part.name)
 
 
-def note_sizes(model: Path, samples: Sequence[Inputs], network: Network) -> None:
-    """Note beside a stored `model` which numbers of rows to prepare for."""
-    model.with_suffix(".json").write_text(json.dumps(sizes_to_expect(samples, network)))
+def keep_model(
+    path: Path,
+    network: Network,
+    samples: Samples,
+    write: Callable[[Path, Sequence[Inputs]], None],
+    log: Log,
+) -> list[int]:
+    """As `keep`, for a model of `network` that `write` makes from `samples`; return the numbers of
+    rows to prepare for, which are noted beside it."""
 
+    def make(new: Path) -> None:
+        seen = samples()
+        write(new, seen)
+        new.with_suffix(".json").write_text(json.dumps(sizes_to_expect(seen, network)))
 
-def noted_sizes(model: Path) -> list[int]:
-    """The numbers of rows that `note_sizes` noted."""
-    return json.loads(model.with_suffix(".json").read_text())
+    keep(path, make, log)
+    return json.loads(path.with_suffix(".json").read_text())
 
 
 def readable(network: Network) -> Network:
@@ -178,20 +174,17 @@ def sizes_to_expect(samples: Sequence[Inputs], network: Network) -> list[int]:
     return sorted({*seen, *range(least * step, most * step + 1, step)})
 
 
-def resized(sample: Inputs, size: int) -> Inputs:
-    """Zeros like `sample`, but `size` rows."""
-    return tuple(x.new_zeros(size, *x.shape[1:]) for x in sample)
+def largest(maker: str | None) -> float:
+    """The largest number in the range of an 8-bit activation without calibration, as of
+    `trtexec --int8` without `--calib`; `maker` is the type of the operator that computes the
+    tensor, None for an input of the network.
 
+    `setTensorDynamicRange` in samples/common/sampleEngines.cpp of the repository NVIDIA/TensorRT
+    (at 147005ff) goes through the layers in order. An input without a range gets [-2, 2], an output
+    [-4, 4], the output of a pooling layer [-2, 2]. So network inputs and pooled tensors have
+    [-2, 2], all others [-4, 4]. An 8-bit integer q, from -128 to 127, stands for q * largest / 127.
 
-def required(engine: str, library: str, extra: str) -> ModuleType:
-    """Import a library that `engine` needs.
-
-    Raises:
-        Unavailable: it is not installed.
+    Only the inputs of products are rounded: TensorRT fuses sums and activations with the
+    convolution before them, and leaves the network's outputs in float32.
     """
-    try:
-        return importlib.import_module(library)
-    except ImportError as error:
-        raise Unavailable(
-            f"engine={engine} cannot be used here ({error}): {install_command(extra)}"
-        ) from error
+    return 2.0 if maker is None or maker.endswith("Pool") else 4.0

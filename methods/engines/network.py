@@ -14,16 +14,11 @@ class Network(nn.Module, ABC):
     """A network that engines can run: it maps tensors to a tuple of tensors.
 
     Inputs are rows [N, C] or pictures [B, C, H, W]; only their C is always the same.
-
-    Attributes:
-        varying: whether inputs are rows, whose N differs from frame to frame.
-        quantum: N is a multiple of `quantum` while frames are rendered.
-        backend: backend of its kernels; engines convert it with "reference", which is plain torch.
     """
 
-    varying = False
-    quantum = 1
-    backend = "auto"
+    varying = False  # whether inputs are rows, whose N differs from frame to frame
+    quantum = 1  # N is a multiple of it while frames are rendered
+    backend = "auto"  # of its kernels; engines convert it with "reference", which is plain torch
 
     @abstractmethod
     def products(self, *inputs: Tensor) -> int:

@@ -16,39 +16,22 @@ from torch import Tensor
 
 from bench.errors import Unavailable
 from bench.types import Log
-from methods.engines import (
-    Built,
-    Calibration,
-    Engine,
-    Folder,
-    Inputs,
-    Network,
-    Precision,
-    Samples,
-    keep,
-    note_sizes,
-    noted_sizes,
-    readable,
-    required,
-)
-from methods.engines.fixed_ranges import largest
+from methods import engines
+from methods.engines import Built, Calibration, Engine, Folder, Inputs, Network, Precision, Samples
 
 # Disables the telemetry of OpenVINO and NNCF; both work without this package.
 sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
 
 NO_PRODUCTS = ("Add", "Multiply", "MaxPool")
-"""Operators whose inputs NNCF would also round, unlike `fixed_ranges`."""
+"""Operators whose inputs NNCF would also round, unlike TensorRT: see `engines.largest`."""
 
 
 class OpenVino(Engine):
     """OpenVINO on the CPU.
 
     With int8, everything not quantised is computed in bfloat16 if the CPU has it, otherwise in
-    float32.
-
-    Raises:
-        Unavailable: OpenVINO, or NNCF for int8, is not installed; or bfloat16 is wanted and this
-            CPU lacks it, so that OpenVINO would silently compute in float32.
+    float32. Where the CPU lacks bfloat16, OpenVINO would compute in float32 without saying so:
+    then `bf16` is refused.
     """
 
     name = "openvino"
@@ -57,8 +40,8 @@ class OpenVino(Engine):
 
     def __init__(self, precision: Precision = "fp32", calibration: Calibration = "frames") -> None:
         super().__init__(precision, calibration)
-        self._openvino = required(self.name, "openvino", "openvino")
-        self._nncf = required(self.name, "nncf", "openvino") if precision == "int8" else None
+        self._openvino = self.load("openvino")
+        self._nncf = self.load("nncf") if precision == "int8" else None
         self._half = precision != "fp32" and "BF16" in _capabilities(self._openvino)
         if precision == "bf16" and not self._half:
             raise Unavailable(
@@ -73,17 +56,14 @@ class OpenVino(Engine):
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
         """Convert `network`, for int8 quantised, and compile it for the rows to expect."""
 
-        def write(path: Path) -> None:
-            seen = samples()
+        def write(path: Path, seen: Sequence[Inputs]) -> None:
             model = self._convert(network, seen)
             self._openvino.save_model(model, path, compress_to_fp16=self.precision == "bf16")
-            note_sizes(path, seen, network)
 
         path = folder() / "network.xml"
-        keep(path, write, log)
+        sizes = engines.keep_model(path, network, samples, write, log)
         model = self._openvino.Core().read_model(path)
         compiled = _Compiled(self._openvino, model, half=self._half)
-        sizes = noted_sizes(path)
         with log.progress("compiling", len(sizes)) as progress:
             for size in sizes:
                 compiled.prepare(size)
@@ -97,43 +77,37 @@ class OpenVino(Engine):
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # from the tracer, and about argument checks
             model = self._openvino.convert_model(
-                readable(network), example_input=samples[0], input=shapes
+                engines.readable(network), example_input=samples[0], input=shapes
             )
-        if self._nncf is None:
-            return model
+        return model if self._nncf is None else self._quantised(model, samples, self._nncf)
+
+    def _quantised(self, model: Any, samples: Sequence[Inputs], nncf: Any) -> Any:
         logging.getLogger("nncf").setLevel(logging.ERROR)
-        frames = self._nncf.Dataset(samples, lambda inputs: [x.numpy() for x in inputs])
+        frames = nncf.Dataset(samples, lambda inputs: [x.numpy() for x in inputs])
+        options = {
+            "preset": nncf.QuantizationPreset.MIXED,  # activations are not symmetric
+            "subset_size": len(samples),
+        }
+        if self.uncalibrated:
+            plain = nncf.AdvancedQuantizationParameters(disable_bias_correction=True)
+            options["ignored_scope"] = nncf.IgnoredScope(types=list(NO_PRODUCTS), validate=False)
+            options["advanced_parameters"] = plain
         with contextlib.redirect_stdout(sys.stderr):  # its progress bars
-            options = _uncalibrated(self._nncf) if self.uncalibrated else {}
-            quantised = self._nncf.quantize(
-                model,
-                frames,
-                preset=self._nncf.QuantizationPreset.MIXED,  # activations are not symmetric
-                subset_size=len(samples),
-                **options,
-            )
+            quantised = nncf.quantize(model, frames, **options)
         if self.uncalibrated:
             _fix_ranges(quantised)
         return quantised
 
 
-def _uncalibrated(nncf: Any) -> dict[str, Any]:
-    """Options that make NNCF round only the inputs of products, without bias correction."""
-    return {
-        "ignored_scope": nncf.IgnoredScope(types=list(NO_PRODUCTS), validate=False),
-        "advanced_parameters": nncf.AdvancedQuantizationParameters(disable_bias_correction=True),
-    }
-
-
 def _fix_ranges(model: Any) -> None:
-    """Replace the ranges on which `model` rounds activations by `fixed_ranges`."""
+    """Replace the ranges on which `model` rounds activations by those of `engines.largest`."""
     from openvino import opset13
 
     for op in model.get_ops():
         if op.get_type_name() != "FakeQuantize":
             continue
         maker = op.input_value(0).get_node().get_type_name()
-        most = largest(None if maker == "Parameter" else maker)
+        most = engines.largest(None if maker == "Parameter" else maker)
         bounds = (np.float32(-most * 128 / 127), np.float32(most))
         for place, bound in enumerate(2 * bounds, start=1):  # ranges of input and output
             op.input(place).replace_source_output(opset13.constant(bound).output(0))

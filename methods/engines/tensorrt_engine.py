@@ -1,30 +1,32 @@
-"""TensorRT as an engine: fp32, fp16, and int8; it reads an `onnx_model`."""
+"""TensorRT as an engine: fp32, fp16, and int8.
+
+It reads an ONNX model of the network. TensorRT 11 computes in the types of the model (strong
+typing), so the model contains them: fp16 by casting the network, int8 by pairs of QuantizeLinear
+and DequantizeLinear, which ONNX Runtime inserts. TensorRT requires that these are symmetric and
+leave the bias in float32 (https://docs.nvidia.com/deeplearning/tensorrt, "Explicit Quantization").
+"""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from bench.errors import SteerbenchError, Unavailable
 from bench.types import Log
-from methods.engines import (
-    Built,
-    Calibration,
-    Engine,
-    Folder,
-    Inputs,
-    Network,
-    Precision,
-    Samples,
-    keep,
-    noted_sizes,
-    onnx_model,
-    required,
-)
+from methods import engines
+from methods.engines import Built, Calibration, Engine, Folder, Inputs, Network, Precision, Samples
+
+OPSET = 17
+
+PRODUCTS = ("Conv", "Gemm", "MatMul")
+"""Operators to quantise. Sums and activations in 8 bits would cost quality and save nothing."""
 
 
 class TensorRt(Engine):
@@ -33,9 +35,6 @@ class TensorRt(Engine):
     It builds plans. A plan is valid for one GPU model, one version, and up to a number of cells,
     which is a power of two. Plans for expected sizes are built beforehand, others on demand. With
     int8, everything not quantised is computed in float32.
-
-    Raises:
-        Unavailable: there is no CUDA GPU, or TensorRT, onnx or ONNX Runtime is not installed.
     """
 
     name = "tensorrt"
@@ -49,8 +48,8 @@ class TensorRt(Engine):
                 "engine=tensorrt computes on a CUDA GPU, and torch sees none here: use "
                 "engine=openvino"
             )
-        loaded = [required(self.name, library, "tensorrt") for library in self.libraries]
-        self._tensorrt = loaded[-1]
+        for library in self.libraries:
+            self.load(library)
 
     def check(self, device: torch.device) -> None:
         """Raise `Unavailable` unless `device` is the first CUDA GPU."""
@@ -66,10 +65,104 @@ class TensorRt(Engine):
 
     def build(self, network: Network, samples: Samples, folder: Folder, log: Log) -> Built:
         """Export `network` as an ONNX model, and build plans for the sizes to expect."""
-        path = onnx_model.kept(network, samples, folder, self, log)
-        plans = _Plans(self._tensorrt, path, network, exact=self.precision != "fp16", log=log)
-        plans.prepare(noted_sizes(path))
-        return Built(plans, onnx_model.weight_bytes(path))
+        import onnx
+
+        path = folder() / "network.onnx"
+
+        def write(path: Path, seen: Sequence[Inputs]) -> None:
+            seen = [tuple(x.cpu() for x in inputs) for inputs in seen]
+            plain: nn.Module = engines.readable(network).cpu()
+            if self.precision == "fp16":
+                plain = _Halved(plain)
+            exact = path if self.precision != "int8" else path.with_name("exported.onnx")
+            _export(plain, network, seen[0], exact)
+            if self.precision == "int8":
+                _quantise(exact, seen, path, uncalibrated=self.uncalibrated)
+
+        sizes = engines.keep_model(path, network, samples, write, log)
+        plans = _Plans(path, network, exact=self.precision != "fp16", log=log)
+        plans.prepare(sizes)
+        weights = onnx.load(path).graph.initializer
+        return Built(plans, sum(onnx.numpy_helper.to_array(weight).nbytes for weight in weights))
+
+
+class _Halved(nn.Module):
+    """A network in float16, with inputs and outputs in float32."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network.half()
+
+    def forward(self, *inputs: Tensor) -> Inputs:
+        halved = (x.half() if x.is_floating_point() else x for x in inputs)
+        return tuple(x.float() for x in self.network(*halved))
+
+
+def _names(kind: str, count: int) -> list[str]:
+    """Names of `count` inputs or outputs (the `kind`) of an exported network, in order."""
+    return [f"{kind}{place}" for place in range(count)]
+
+
+def _export(module: nn.Module, network: Network, sample: Inputs, path: Path) -> None:
+    inputs = _names("input", len(sample))
+    with torch.no_grad(), warnings.catch_warnings():
+        outputs = len(module(*sample))
+        warnings.simplefilter("ignore")  # the exporter's own deprecations
+        torch.onnx.export(
+            module,
+            sample,
+            path,
+            input_names=inputs,
+            output_names=_names("output", outputs),
+            dynamic_axes={name: [0] for name in inputs if network.varying},
+            opset_version=OPSET,
+            dynamo=False,
+        )
+
+
+def _quantise(exported: Path, samples: Sequence[Inputs], path: Path, *, uncalibrated: bool) -> None:
+    """Quantise the products of a model to 8 bits, with ranges from `samples` or with fixed ones."""
+    from onnxruntime import quantization
+    from onnxruntime.quantization import shape_inference
+
+    prepared = path.with_name("prepared.onnx")
+    shape_inference.quant_pre_process(exported, prepared, skip_symbolic_shape=True)
+    frames = iter(
+        dict(zip(_names("input", len(inputs)), (x.numpy() for x in inputs), strict=True))
+        for inputs in samples
+    )
+    symmetric = {"ActivationSymmetric": True, "QuantizeBias": False}
+    quantization.quantize_static(
+        prepared,
+        path,
+        SimpleNamespace(get_next=lambda: next(frames, None)),
+        quant_format=quantization.QuantFormat.QDQ,
+        per_channel=True,
+        op_types_to_quantize=list(PRODUCTS),
+        extra_options={**symmetric, **(_fixed_ranges(prepared) if uncalibrated else {})},
+    )
+
+
+def _fixed_ranges(prepared: Path) -> dict[str, Any]:
+    """Options of the quantiser that set the ranges of `engines.largest`, whatever the samples
+    contain. A tensor padded with zeros keeps its range."""
+    import onnx
+
+    graph = onnx.load(prepared).graph
+    bounds = {entry.name: engines.largest(None) for entry in graph.input}
+    for node in graph.node:
+        padded = bounds.get(node.input[0]) if node.op_type == "Pad" else None
+        for name in node.output:
+            bounds[name] = padded or engines.largest(node.op_type)
+    read = {name for node in graph.node if node.op_type in PRODUCTS for name in node.input}
+    zero = np.array(0, np.int8)
+    return {
+        "OpTypesToExcludeOutputQuantization": list(PRODUCTS),
+        "TensorQuantOverrides": {
+            name: [{"scale": np.array(bounds[name] / 127, np.float32), "zero_point": zero}]
+            for name in sorted(read & bounds.keys())
+        },
+    }
 
 
 class _Plans:
@@ -78,12 +171,11 @@ class _Plans:
     `exact`: compute float32 in float32, not in TF32.
     """
 
-    def __init__(
-        self, tensorrt: Any, model: Path, network: Network, *, exact: bool, log: Log
-    ) -> None:
-        self._tensorrt, self._model, self._network = tensorrt, model, network
-        self._exact, self._log = exact, log
-        self._logger = tensorrt.Logger(tensorrt.Logger.ERROR)
+    def __init__(self, model: Path, network: Network, *, exact: bool, log: Log) -> None:
+        import tensorrt
+
+        self._tensorrt, self._logger = tensorrt, tensorrt.Logger(tensorrt.Logger.ERROR)
+        self._model, self._network, self._exact, self._log = model, network, exact, log
         self._executions: dict[int, _Execution] = {}
 
     def prepare(self, sizes: Sequence[int]) -> None:
@@ -103,7 +195,7 @@ class _Plans:
     def _execution(self, ceiling: int) -> _Execution:
         if ceiling not in self._executions:
             path = self._model.with_name(f"upto-{ceiling}.plan")
-            keep(path, lambda new: self._build(ceiling, new), self._log)
+            engines.keep(path, lambda new: self._build(ceiling, new), self._log)
             self._executions[ceiling] = _Execution(self._tensorrt, path, self._logger)
         return self._executions[ceiling]
 
@@ -148,9 +240,9 @@ class _Execution:
 
     def __call__(self, *inputs: Tensor) -> Inputs:
         inputs, context = tuple(x.contiguous() for x in inputs), self._context
-        named = dict(zip(onnx_model.names("input", len(inputs)), inputs, strict=True))
+        named = dict(zip(_names("input", len(inputs)), inputs, strict=True))
         accepted = [context.set_input_shape(name, tuple(x.shape)) for name, x in named.items()]
-        outputs = onnx_model.names("output", self._tensors - len(inputs)) if all(accepted) else []
+        outputs = _names("output", self._tensors - len(inputs)) if all(accepted) else []
         for name in outputs:
             shape = tuple(context.get_tensor_shape(name))
             named[name] = torch.empty(shape, device=inputs[0].device)

@@ -1,29 +1,27 @@
-"""torch as an engine: the network as trained or in half precision, on a GPU with CUDA graphs."""
+"""torch as an engine: the network as trained or in half precision, on a GPU with CUDA graphs.
+
+In plain torch the lean network is some two hundred small operations, which the CPU launches one by
+one. A graph, recorded once for each input size and then replayed, needs a single launch.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from bench.errors import Unavailable
 from bench.types import Log
-from methods.engines import (
-    Built,
-    Engine,
-    Folder,
-    Inputs,
-    Network,
-    Samples,
-    resized,
-    sizes_to_expect,
-)
-from methods.engines.cuda_graphs import Replayed
+from methods.engines import Built, Engine, Folder, Inputs, Network, Samples, sizes_to_expect
 from methods.kernels import multiplies_bf16
 
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
+
+WARM_UP = 3
+"""Runs before recording, in which libraries choose algorithms and allocate workspace."""
 
 
 class TorchEngine(Engine):
@@ -62,15 +60,8 @@ class TorchEngine(Engine):
         return Built(run if _on_cpu(network) else _recorded(run, network, samples, log), size)
 
 
-def _recorded(run: Callable[..., Inputs], network: Network, samples: Samples, log: Log) -> Replayed:
-    """`run` as CUDA graphs, recorded beforehand for the expected sizes."""
-    replayed, seen = Replayed(run), samples()
-    expected = [resized(seen[0], size) for size in sizes_to_expect(seen, network)] or seen[:1]
-    with torch.no_grad(), log.progress("recording CUDA graphs", len(expected)) as progress:
-        for inputs in expected:
-            replayed(*inputs)
-            progress.advance()
-    return replayed
+def _on_cpu(network: Network) -> bool:
+    return next(network.parameters()).device.type == "cpu"
 
 
 def _arithmetic(device: torch.device, dtype: torch.dtype) -> AbstractContextManager[object]:
@@ -82,5 +73,60 @@ def _arithmetic(device: torch.device, dtype: torch.dtype) -> AbstractContextMana
     return nullcontext()
 
 
-def _on_cpu(network: Network) -> bool:
-    return next(network.parameters()).device.type == "cpu"
+def _recorded(run: Callable[..., Inputs], network: Network, samples: Samples, log: Log) -> Replayed:
+    """`run` as CUDA graphs, recorded beforehand for the expected sizes."""
+    replayed, seen = Replayed(run), samples()
+    sizes = sizes_to_expect(seen, network)
+    blank = [tuple(x.new_zeros(size, *x.shape[1:]) for x in seen[0]) for size in sizes]
+    expected = blank or seen[:1]
+    with torch.no_grad(), log.progress("recording CUDA graphs", len(expected)) as progress:
+        for inputs in expected:
+            replayed(*inputs)
+            progress.advance()
+    return replayed
+
+
+Replay = tuple[Callable[[], Any], Inputs]
+"""A function that replays another, and the output tensors, which every replay overwrites."""
+
+
+class Replayed:
+    """Replays `run`; it is recorded for every input size when that size first occurs.
+
+    The next call, of any size, overwrites the outputs, because all recordings share memory. `run`
+    computes on a CUDA GPU, without waiting for it.
+    """
+
+    def __init__(self, run: Callable[..., Inputs]) -> None:
+        self._run = run
+        self._recordings: dict[tuple[torch.Size, ...], tuple[Inputs, Replay]] = {}
+        self._stream: torch.cuda.Stream | None = None  # on the first call's device
+        self._pool: Any = None
+
+    def __call__(self, *inputs: Tensor) -> Inputs:
+        if not all(x.numel() for x in inputs):
+            return self._run(*inputs)  # launches nothing, and CUDA cannot record an empty graph
+        with torch.cuda.device_of(inputs[0]):
+            sizes = tuple(x.shape for x in inputs)
+            if sizes not in self._recordings:
+                copies = tuple(x.clone() for x in inputs)
+                self._recordings[sizes] = copies, self.record(lambda: self._run(*copies))
+            held, (replay, outputs) = self._recordings[sizes]
+            for own, x in zip(held, inputs, strict=True):
+                own.copy_(x)
+            replay()
+        return outputs
+
+    def record(self, run: Callable[[], Inputs]) -> Replay:
+        """Record a graph. All share one memory pool, because no two are replayed at once."""
+        if self._stream is None:
+            self._stream, self._pool = torch.cuda.Stream(), torch.cuda.graph_pool_handle()
+        self._stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(self._stream):
+            for _ in range(WARM_UP):
+                run()
+        torch.cuda.current_stream().wait_stream(self._stream)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, pool=self._pool, stream=self._stream):
+            outputs = run()
+        return graph.replay, outputs

@@ -10,7 +10,7 @@ from torch import Tensor
 from bench.types import NullProbe, Scene
 from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
-from methods.rendering.rays import render_rays
+from methods.rendering.frame import render_rays
 
 SOLID = 0.5
 """Opacity above which a ray counts as ending at a surface."""

@@ -42,18 +42,11 @@ def cases() -> list[Case]:
         "pictures of one pixel": partial(_scene, 128, size=1),
         "all cameras the same": partial(_scene, 128, apart=0.0),
     }
-    checks = []
-    holds = f"losses and parameters stay finite for {STEPS} steps"
-    for name, make in pictures.items():
-        checks.append(_exactly("training", holds).case(name, partial(_stays_finite, make)))
-    holds = "it stays finite, or stops with a SteerbenchError and a good last state"
-    for rate in (10.0, 1e10, 1e30):
-        error = partial(_keeps_a_good_state, rate)
-        checks.append(_exactly("training", holds).case(f"learning rate {rate:g}", error))
-    holds = "the next step stops with a SteerbenchError that names the table"
-    for value in (math.nan, math.inf):
-        error = partial(_reports, value)
-        checks.append(_exactly("training", holds).case(f"{value} in the table", error))
+    finite = _exactly("training", f"losses and parameters stay finite for {STEPS} steps")
+    good = _exactly(
+        "training", "it stays finite, or stops with a SteerbenchError and a good last state"
+    )
+    named = _exactly("training", "the next step stops with a SteerbenchError that names the table")
     shrunk = Property(
         "training",
         "they do not vanish: 1e-20 of what they were",
@@ -61,14 +54,18 @@ def cases() -> list[Case]:
         "roundings of size 1: 16 u, in bf16 5 ulp",
         {(b, p): 16 * U32 if p == "fp32" else 5 * U16 for b, p in BY},
     )
-    checks.append(shrunk.case("gradients 1e-20 as large", _shrunk_gradient_error))
     holds = f"no cell counts as occupied after {FORGOTTEN_AFTER} visits"
     forgotten = _exactly("density grid", holds)
-    checks.append(forgotten.case("field explodes, then is empty", _unforgotten))
-    for raw in (-1e4, -100.0, 100.0, 1e4):
-        finite = _exactly("field", "pixels, opacity and gradients are finite")
-        checks.append(finite.case(f"log density {raw:g}", partial(_extreme_density, raw)))
-    return checks
+    rendered = _exactly("field", "pixels, opacity and gradients are finite")
+    densities, rates = (-1e4, -100.0, 100.0, 1e4), (10.0, 1e10, 1e30)
+    return [
+        *(finite.case(name, partial(_stays_finite, make)) for name, make in pictures.items()),
+        *(good.case(f"learning rate {r:g}", partial(_keeps_a_good_state, r)) for r in rates),
+        *(named.case(f"{x} in the table", partial(_reports, x)) for x in (math.nan, math.inf)),
+        shrunk.case("gradients 1e-20 as large", _shrunk_gradient_error),
+        forgotten.case("field explodes, then is empty", _unforgotten),
+        *(rendered.case(f"log density {x:g}", partial(_extreme_density, x)) for x in densities),
+    ]
 
 
 def _exactly(subject: str, holds: str) -> Property:
@@ -78,16 +75,15 @@ def _exactly(subject: str, holds: str) -> Property:
 def _scene(level: int, *, alpha: int = 255, size: int = 8, apart: float = 1.0) -> Scene:
     """Pictures of a single grey `level`, from all around."""
     middle, up = torch.full((3,), 0.5), torch.tensor([0.0, 0.0, 1.0])
-    cameras, images = [], []
+    cameras = []
     for view in range(6):
         angle = apart * math.pi * view / 3
         away = torch.tensor([math.cos(angle), math.sin(angle), 0.3])
         pose = look_at(0.5 + 1.3 * away, middle, up)
         cameras.append(Camera(pose, size, size, size / 2, size / 2, size, size))
-        image = torch.full((size, size, 4), level, dtype=torch.uint8)
-        image[..., 3] = alpha
-        images.append(image)
-    split = Split(cameras, images, [str(view) for view in range(6)])
+    image = torch.full((size, size, 4), level, dtype=torch.uint8)
+    image[..., 3] = alpha
+    split = Split(cameras, [image] * 6, [str(view) for view in range(6)])
     bounds = torch.tensor([[0.0] * 3, [1.0] * 3])
     return Scene("stress", {"train": split, "test": split}, torch.ones(3), bounds, 1.0, "stress")
 
@@ -98,25 +94,22 @@ def _field(backend: str, device: str, precision: str) -> HashField:
     return HashField(GRID, precision=kind, backend=backend, generator=generator).to(device)
 
 
-def _training(
-    scene: Scene, options: TrainingOptions, backend: str, device: str, precision: str
-) -> FieldTraining:
-    field = _field(backend, device, precision)
-    training = FieldTraining(field, scene, Budget("stress", STEPS, samples=512), options, seed=0)
+def _training(scene: Scene, options: TrainingOptions, *where: str) -> FieldTraining:
+    budget = Budget("stress", STEPS, samples=512)
+    training = FieldTraining(_field(*where), scene, budget, options, seed=0)
     training.rays = MIN_RAYS
     return training
 
 
-def _stays_finite(make: Callable[[], Scene], backend: str, device: str, precision: str) -> float:
-    training = _training(make(), QUICK, backend, device, precision)
+def _stays_finite(make: Callable[[], Scene], *where: str) -> float:
+    training = _training(make(), QUICK, *where)
     losses = [loss for _ in range(STEPS) for loss in training.advance().values()]
     loop.check_finite(training)
     return 0.0 if all(map(math.isfinite, losses)) else math.inf
 
 
-def _keeps_a_good_state(rate: float, backend: str, device: str, precision: str) -> float:
-    options = replace(QUICK, rate=rate)
-    new = partial(_training, _scene(128), options, backend, device, precision)
+def _keeps_a_good_state(rate: float, *where: str) -> float:
+    new = partial(_training, _scene(128), replace(QUICK, rate=rate), *where)
     with tempfile.TemporaryDirectory() as folder:
         kept, training = Path(folder) / "kept.safetensors", new()
         loop.save(training, kept)
@@ -133,8 +126,8 @@ def _keeps_a_good_state(rate: float, backend: str, device: str, precision: str) 
     return 0.0
 
 
-def _reports(value: float, backend: str, device: str, precision: str) -> float:
-    training = _training(_scene(128), QUICK, backend, device, precision)
+def _reports(value: float, *where: str) -> float:
+    training = _training(_scene(128), QUICK, *where)
     with torch.no_grad():
         training.field.table.fill_(value)
         training.field.repack()
@@ -147,9 +140,9 @@ def _reports(value: float, backend: str, device: str, precision: str) -> float:
     return math.inf
 
 
-def _rendered(field: HashField, device: str) -> Tensor:
+def _rendered(field: HashField) -> Tensor:
     """Sum of all numbers of the pixels of 8 rays of 16 samples."""
-    generator = torch.Generator().manual_seed(0)
+    device, generator = field.device, torch.Generator().manual_seed(0)
     positions = torch.rand(128, 3, generator=generator).to(device)
     sigma, geometry = field.density(positions)
     directions = torch.ones(128, 3, device=device)
@@ -161,36 +154,36 @@ def _rendered(field: HashField, device: str) -> Tensor:
     return pixels.values.sum() + pixels.depth_sum.sum() + pixels.alpha.sum()
 
 
-def _shrunk_gradient_error(backend: str, device: str, precision: str) -> float:
+def _shrunk_gradient_error(*where: str) -> float:
     """Largest error of the gradients of all parameters, relative to the largest of each."""
-    field = _field(backend, device, precision)
+    field = _field(*where)
     learned = list(field.parameters())
-    whole = torch.autograd.grad(_rendered(field, device), learned)
-    shrunk = torch.autograd.grad(1e-20 * _rendered(field, device), learned)
+    whole = torch.autograd.grad(_rendered(field), learned)
+    shrunk = torch.autograd.grad(1e-20 * _rendered(field), learned)
     return max(
         ((1e20 * s.double() - w.double()).abs().max() / w.abs().max()).item()
         for s, w in zip(shrunk, whole, strict=True)
     )
 
 
-def _extreme_density(raw: float, backend: str, device: str, precision: str) -> float:
-    field = _field(backend, device, precision)
+def _extreme_density(raw: float, *where: str) -> float:
+    field = _field(*where)
     with torch.no_grad():
         field.table.fill_(1.0)
         field.layers["density_in"].fill_(1 / GRID.channels)
         field.layers["density_out"].fill_(raw / len(field.layers["density_in"]))
         field.repack()
-    total = _rendered(field, device)
+    total = _rendered(field)
     gradients = torch.autograd.grad(total, list(field.parameters()))
     return 0.0 if all(x.isfinite().all() for x in (total, *gradients)) else math.inf
 
 
-def _unforgotten(backend: str, device: str, precision: str) -> float:
+def _unforgotten(*where: str) -> float:
     """Cells that count as occupied after the field was infinitely dense, and then empty."""
-    cells = torch.zeros(128, 128, 128, dtype=torch.bool, device=device)
+    field = _field(*where)
+    cells = torch.zeros(128, 128, 128, dtype=torch.bool, device=field.device)
     cells[0, 0, :4] = True
-    grid, field = DensityGrid(cells), _field(backend, device, precision)
-    generator = torch.Generator(device).manual_seed(0)
+    grid, generator = DensityGrid(cells), torch.Generator(field.device).manual_seed(0)
     with torch.no_grad():
         field.table.fill_(1.0)
         field.layers["density_in"].fill_(1.0)

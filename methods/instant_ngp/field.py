@@ -21,6 +21,7 @@ from methods.rendering.field import (
     CHUNK_SAMPLES,
     LOG_DENSITY_CLAMP,
     ROUND_SAMPLES,
+    cat,
 )
 
 Precision = Literal["bf16", "fp32"]
@@ -80,14 +81,8 @@ class HashField(nn.Module):
 
     def widen(self, channels: int, generator: torch.Generator | None = None) -> None:
         """Append features up to `channels`, with random initial weights from `generator`; without a
-        generator, they are 1/2 everywhere until they are trained.
-
-        Raises:
-            ValueError: there are more features than `channels` already.
-        """
+        generator, they are 1/2 everywhere until they are trained."""
         old = self.layers["feature_out"].detach()
-        if channels < len(old):
-            raise ValueError(f"channels: expected at least {len(old)}, got {channels}")
         more = torch.zeros(channels - len(old), HIDDEN_CHANNELS)
         if generator is not None:
             more = _xavier_uniform(channels, HIDDEN_CHANNELS, generator).detach()[len(old) :]
@@ -122,18 +117,15 @@ class HashField(nn.Module):
         """
         weights = self._weights("density_in", "density_out")
         size = self._part(positions)
-        every = positions.split(size)
-        known = [None] * len(every) if encoded is None else encoded.split(size)
-        parts = [self._density(*part, weights) for part in zip(every, known, strict=True)]
-        sigma, geometry = (_joined(column) for column in zip(*parts, strict=True))
-        return sigma, geometry
-
-    def _density(
-        self, positions: Tensor, known: Tensor | None, weights: list[Tensor]
-    ) -> tuple[Tensor, Tensor]:
-        features = self.encode(positions) if known is None else self._learning(known, positions)
-        geometry = mlp([features.to(self._compute_dtype)], weights, backend=self.backend)
-        return _ClampedExp.apply(geometry[:, 0].to(self.table.dtype)), geometry
+        parts = positions.split(size)
+        known = [None] * len(parts) if encoded is None else encoded.split(size)
+        sigma, geometry = [], []
+        for part, code in zip(parts, known, strict=True):
+            features = self.encode(part) if code is None else self._learning(code, part)
+            outputs = mlp([features.to(self._compute_dtype)], weights, backend=self.backend)
+            geometry.append(outputs)
+            sigma.append(_ClampedExp.apply(outputs[:, 0].to(self.table.dtype)))
+        return cat(sigma), cat(geometry)
 
     def _learning(self, known: Tensor, positions: Tensor) -> Tensor:
         """The encoding that is `known`, with a gradient if one is asked for."""
@@ -147,12 +139,11 @@ class HashField(nn.Module):
         """Features [S, K] float32 of samples with encoded view `directions` [S, 16]."""
         weights = self._weights("feature_in", "feature_mid", "feature_out")
         size = self._part(geometry)
-        pairs = zip(geometry.split(size), directions.split(size), strict=True)
-        return _joined([self._features(*pair, weights) for pair in pairs])
-
-    def _features(self, geometry: Tensor, directions: Tensor, weights: list[Tensor]) -> Tensor:
-        raw = mlp([directions, geometry], weights, backend=self.backend)
-        return raw.to(self.table.dtype).sigmoid()
+        parts = []
+        for pair in zip(directions.split(size), geometry.split(size), strict=True):
+            raw = mlp(list(pair), weights, backend=self.backend)
+            parts.append(raw.to(self.table.dtype).sigmoid())
+        return cat(parts)
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
         """Count the work of `samples` densities and `shaded` features."""
@@ -185,10 +176,6 @@ class HashField(nn.Module):
         if self.precision == "bf16":
             layers = [layer.to(torch.bfloat16) for layer in layers]
         return [layer.to(self._compute_dtype) for layer in layers]
-
-
-def _joined(parts: tuple[Tensor, ...] | list[Tensor]) -> Tensor:
-    return parts[0] if len(parts) == 1 else torch.cat(parts)
 
 
 def _xavier_uniform(outputs: int, inputs: int, generator: torch.Generator | None) -> nn.Parameter:

@@ -19,15 +19,8 @@ from methods.rendering.frame import everywhere, render_frame
 
 
 class InstantNgp:
-    """Instant-NGP as a `bench.types.Method`.
-
-    Args:
-        grid: shape of the hash table.
-        training: how the field is trained.
-        precision: "bf16" (packed table, bfloat16 networks) or "fp32".
-        stop: transmittance at which a ray ends when rendering, less than 1.
-        name: as shown in result rows.
-    """
+    """Instant-NGP as a `bench.types.Method`: the field of a `Setup`, rendered with rays that end at
+    the transmittance `stop`, less than 1. `name` is shown in result rows."""
 
     memory = 0
     study = Study(

@@ -1,4 +1,4 @@
-"""The pixels of all training pictures, and the rays through them."""
+"""The pixels of all training pictures, the rays through them, and which ones are drawn."""
 
 from __future__ import annotations
 
@@ -9,8 +9,18 @@ from torch.nn import functional
 from bench.types import Rays, Split
 
 STRIP = 8
-"""Width of the strips of a picture in which its pixels are numbered, row by row: a run of
-`error_map.RUN` pixels is then 8 wide and 16 high, and its pixels are alike."""
+"""Width of the strips of a picture in which its pixels are numbered, row by row: a run of `RUN`
+pixels is then mostly 8 wide and 16 high, and its pixels are alike."""
+
+RUN = 128
+"""Consecutive pixels that share one estimate of an error."""
+
+REFRESHED = 16
+"""Steps after which the chances of the runs follow their estimates: they change slowly, and summing
+up those of half a million runs takes longer than drawing from them."""
+
+UNSEEN = 0.1
+"""Estimate for a run that no ray has met yet: about that of an untrained field."""
 
 
 def one_from_each(count: int, generator: torch.Generator, device: torch.device) -> Tensor:
@@ -22,11 +32,6 @@ def one_from_each(count: int, generator: torch.Generator, device: torch.device) 
     return (places + torch.arange(count, device=device)) / count
 
 
-def _in_strips(picture: Tensor) -> Tensor:
-    """The pixels [H, W, C] of a picture as [H W, C], strip by strip, row by row."""
-    return torch.cat([strip.flatten(0, 1) for strip in picture.split(STRIP, dim=1)])
-
-
 class PixelBatches:
     """Random pixels of the pictures of a split, with their rays.
 
@@ -36,11 +41,11 @@ class PixelBatches:
     def __init__(self, split: Split, device: torch.device) -> None:
         self._device = device
         channels = max(picture.shape[-1] for picture in split.images)
-        pictures = [
+        pictures = []
+        for picture in split.images:
+            strips = torch.cat([strip.flatten(0, 1) for strip in picture.split(STRIP, dim=1)])
             # An opaque picture among transparent ones gets an alpha of 255.
-            functional.pad(_in_strips(picture), (0, channels - picture.shape[-1]), value=255)
-            for picture in split.images
-        ]
+            pictures.append(functional.pad(strips, (0, channels - strips.shape[-1]), value=255))
         self._pixels = torch.cat([p.to(device) for p in pictures])  # [P, 3 or 4] uint8
         ends = torch.tensor([len(picture) for picture in pictures]).cumsum(0)
         self._ends = ends.to(device)  # of each picture in `_pixels`
@@ -89,3 +94,40 @@ class PixelBatches:
         directions.addcmul_(column[:, None] + 0.5, right).addcmul_(row[:, None] + 0.5, down)
         colours = self._pixels.index_select(0, pixel).float() / 255
         return Rays(self._centres.index_select(0, view), directions), colours
+
+
+class ErrorMap:
+    """Running estimates of the squared error of each run of pixels.
+
+    A run is drawn in proportion to the root of its error, its root mean square error, to which the
+    gradients of its pixels are proportional. The chances are not made up for by weights: the loss
+    then counts wrong pixels more, and has less noise. There are `pixels` pixels in all pictures.
+    """
+
+    def __init__(self, pixels: int, device: torch.device) -> None:
+        self._pixels = pixels
+        # [T] mean squared error of each run; each new pixel counts as much as the estimate.
+        self.errors = torch.full((-(-pixels // RUN),), UNSEEN, device=device)
+        self._met = torch.ones_like(self.errors)  # 1, plus the pixels met while `learn` runs
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Let the chances follow the estimates; `ends` [T] sums them up to each run."""
+        self.ends = self.errors.sqrt().cumsum(0, dtype=torch.float64)
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """Draw the numbers [count] of pixels, in the order of their runs."""
+        device, ends = self.errors.device, self.ends
+        places = one_from_each(count, generator, device) * ends[-1]
+        run = torch.searchsorted(ends, places).clamp(max=len(ends) - 1)
+        within = torch.randint(RUN, (count,), generator=generator, device=device)
+        return (run * RUN + within).clamp(max=self._pixels - 1)
+
+    def learn(self, pixels: Tensor, errors: Tensor) -> None:
+        """Update the estimates with the squared `errors` [R] of some `pixels` [R]."""
+        run = pixels // RUN
+        self._met.index_add_(0, run, torch.ones_like(errors))
+        self.errors.index_add_(0, run, errors)
+        means = self.errors.index_select(0, run) / self._met.index_select(0, run)
+        self.errors.index_copy_(0, run, means)  # a run that appears twice has the same mean twice
+        self._met.index_fill_(0, run, 1)

@@ -20,22 +20,14 @@ from methods.training import checkpoint, loop
 
 @dataclass(frozen=True)
 class Setup:
-    """What a field is and where it runs.
+    """What a field is and where it runs; see `resolved`."""
 
-    Attributes:
-        grid: shape of the hash table.
-        training: how the field is trained.
-        precision: "bf16" (packed table, bfloat16 networks) or "fp32".
-        backend, device: resolved names.
-        seed: of everything random in the training.
-    """
-
-    grid: HashGrid
+    grid: HashGrid  # shape of the hash table
     training: TrainingOptions
-    precision: Precision
+    precision: Precision  # "bf16": packed table, bfloat16 networks
     backend: str
     device: torch.device
-    seed: int
+    seed: int  # of everything random in the training
 
     @classmethod
     def resolved(
@@ -47,12 +39,7 @@ class Setup:
         device: str,
         seed: int,
     ) -> Setup:
-        """Make a setup with `auto` replaced by what it means on this machine.
-
-        Raises:
-            ValueError: the grid does not exist at this precision, or `device` names no device.
-            Unavailable: the backend cannot be used here.
-        """
+        """Make a setup with `auto` replaced by what it means on this machine."""
         if not DEVICE.fullmatch(device):
             raise ValueError(f"device: expected auto, cpu, cuda or cuda:N, got {device!r}")
         if device == "auto":
@@ -93,8 +80,8 @@ class Setup:
 
 @dataclass(frozen=True)
 class TrainedField:
-    """A trained `field`, the `grid` of its densities, the `sampling` of its rays in training, and
-    the seconds that its training took."""
+    """A trained field, the grid of its densities, how its rays are marched, and the seconds that
+    its training took."""
 
     field: HashField
     grid: DensityGrid
@@ -112,24 +99,18 @@ class TrainedField:
 
 
 def train_field(setup: Setup, scene: Scene, budget: Budget, log: Log) -> TrainedField:
-    """Train a field on the pictures of `scene`, or load the result of the same training.
-
-    A killed training resumes from its last checkpoint.
-    """
+    """Train a field on the pictures of `scene`, or load the result of the same training."""
     generator = torch.Generator().manual_seed(setup.seed)
     field = HashField(
         setup.grid, precision=setup.precision, backend=setup.backend, generator=generator
     ).to(setup.device)
     finished = log.stage_dir("field", setup.key(scene, budget)) / "field.safetensors"
-    if not finished.exists():
-        training = FieldTraining(field, scene, budget, setup.training, setup.seed)
-        loop.train(training, finished, "training", log)
-        field.gradients = None
-        return TrainedField(field, training.grid, training.sampling, training.seconds)
-    tensors, figures = checkpoint.read(finished)
-    grid = new_grid(scene, setup.device)
+
+    def begin() -> FieldTraining:
+        return FieldTraining(field, scene, budget, setup.training, setup.seed)
+
+    tensors, seconds = loop.trained(begin, finished, "field", log)
+    grid, field.gradients = new_grid(scene, setup.device), None
     with checkpoint.restoring(finished):
         restore_field(field, grid, tensors)
-        seconds = figures["seconds"]
-    log.info(f"trained field found: {finished}")
     return TrainedField(field, grid, setup.training.sampling(budget), seconds)

@@ -6,22 +6,22 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from bench.types import Budget, Rays, Scene, SteerbenchError
-from methods.instant_ngp.error_map import REFRESHED, ErrorMap
 from methods.instant_ngp.field import HashField
-from methods.instant_ngp.optimiser import FieldOptimiser
-from methods.instant_ngp.pixels import PixelBatches
+from methods.instant_ngp.pixels import REFRESHED, ErrorMap, PixelBatches
+from methods.kernels.adam import AdamState, hash_adam_
 from methods.kernels.composite import check_stop
+from methods.kernels.encode import SampleGradients
 from methods.kernels.types import Pixels, expect
 from methods.rendering.batch import opacity_entropy, render_batch
 from methods.rendering.occupancy import EVERY, MIN_VIEWS, STEP, DensityGrid, learnable_cells
 from methods.rendering.sampling import Sampling, check_step, suitable_step
 from methods.training import checkpoint, loop
-from methods.training.optimiser import cosine
 
 MIN_RAYS = 64
 """Minimum number of rays in a step."""
@@ -32,25 +32,16 @@ GRID_YOUTH_STEPS = 256
 
 @dataclass(frozen=True)
 class PixelOptions:
-    """How to train on random pixels; rate, schedule and entropy follow ngp_pl by default.
+    """How to train on random pixels; rate, schedule and entropy follow ngp_pl by default."""
 
-    Attributes:
-        rate: initial learning rate.
-        final_rate: share of `rate` left at the end of the cosine schedule.
-        opacity_entropy: weight of -o ln o, which drives the opacity of a ray to 0 or 1.
-        random_background: composite RGBA pictures on a random colour per ray instead of the scene's
-            background, so that no density can pass for background.
-        max_rays: maximum number of rays in a step.
-        by_error: share of the rays that are drawn where the error is, by an `ErrorMap`; the others
-            go through all pixels alike.
-    """
-
-    rate: float = 1e-2
-    final_rate: float = 1 / 30
-    opacity_entropy: float = 1e-3
+    rate: float = 1e-2  # initial learning rate
+    final_rate: float = 1 / 30  # share of it left at the end of the cosine schedule
+    opacity_entropy: float = 1e-3  # weight of -o ln o, which drives an opacity to 0 or 1
+    # Composite RGBA pictures on a random colour per ray instead of the scene's background, so that
+    # no density can pass for background.
     random_background: bool = True
-    max_rays: int = 1 << 15
-    by_error: float = 0.0
+    max_rays: int = 1 << 15  # maximum number of rays in a step
+    by_error: float = 0.0  # share of the rays that an `ErrorMap` draws; the rest see all alike
 
     def __post_init__(self) -> None:
         expect(self.rate > 0, "rate", "more than 0", self.rate)
@@ -63,24 +54,15 @@ class PixelOptions:
 @dataclass(frozen=True)
 class TrainingOptions(PixelOptions):
     """How to train a field in stage 1; `rate` is that of table and networks. The defaults are made
-    for a short training on a CPU (docs/log.md); `budget=full` sets those of SteerNeRF's release.
+    for a short training on a CPU (docs/log.md); `budget=full` sets those of SteerNeRF's release."""
 
-    Attributes:
-        march_step: length of a ray-marching step, in diagonals of the cube / 1024; 1 in the
-            release. None: the `suitable_step` of a training of so many steps.
-        share: samples with a gradient in a step, as a share of the budget's.
-        grid_samples: cells visited in an update of the density grid.
-        rays: number of rays in every step; None: as many as give `share` of the budget's samples.
-        stop: transmittance at which a ray ends.
-        thin: optical depth of a sample below which only some are kept; `render_batch` says how.
-    """
-
+    # Step of the rays, in diagonals of the cube / 1024, 1 in the release; None: `suitable_step`.
     march_step: float | None = None
-    share: float = 0.5
-    grid_samples: int = 1 << 17
-    rays: int | None = None
-    stop: float = 3e-2
-    thin: float = 1e-2
+    share: float = 0.5  # samples with a gradient in a step, as a share of the budget's
+    grid_samples: int = 1 << 17  # cells visited in an update of the density grid
+    rays: int | None = None  # in every step; None: as many as give `share` of the samples
+    stop: float = 3e-2  # transmittance at which a ray ends
+    thin: float = 1e-2  # see `Sampling`
     by_error: float = 0.5
 
     def __post_init__(self) -> None:
@@ -115,10 +97,8 @@ def new_grid(scene: Scene, device: torch.device) -> DensityGrid:
 class PixelTraining(loop.Training, ABC):
     """A training whose steps render random pixels of the training pictures.
 
-    Subclasses say what is trained, how its rays are rendered and how its parameters are updated.
-
-    Args:
-        samples: samples with a gradient that a step aims at; the number of rays follows from it.
+    Subclasses say what is trained, how its rays are rendered and how its parameters are updated. A
+    step aims at `samples` samples with a gradient; the number of rays follows from it.
     """
 
     advice = "Try a smaller learning rate (method.training.rate)."
@@ -152,14 +132,10 @@ class PixelTraining(loop.Training, ABC):
 
     def learning_rate(self) -> float:
         """The learning rate of the next step."""
-        return self.options.rate * cosine(self.step / self.steps, self.options.final_rate)
+        return self.options.rate * loop.cosine(self.step / self.steps, self.options.final_rate)
 
     def advance(self) -> dict[str, float]:
-        """Take one step; return its mean squared error, where `loop.look` does.
-
-        Raises:
-            SteerbenchError: the loss is not finite.
-        """
+        """Take one step; return its mean squared error, as `loop.look` does."""
         numbers, alike = self._numbers()
         rays, colours = self.batches.at(numbers)
         target, background = self._target(colours)
@@ -191,13 +167,12 @@ class PixelTraining(loop.Training, ABC):
 
     def _target(self, colours: Tensor) -> tuple[Tensor, Tensor]:
         """Composite colours on a background; also return that background, [3] or [R, 3]."""
+        background, generator = self.background, self.generator
         if colours.shape[-1] == 3:
-            return colours, self.background
-        background = self.background
+            return colours, background
         if self.options.random_background:
-            background = torch.rand(
-                len(colours), 3, generator=self.generator, device=colours.device
-            )
+            count, device = len(colours), colours.device
+            background = torch.rand(count, 3, generator=generator, device=device)
         rgb, alpha = colours[:, :3], colours[:, 3:]
         return rgb * alpha + background * (1 - alpha), background
 
@@ -214,7 +189,6 @@ class PixelTraining(loop.Training, ABC):
         return tensors, {"rays": self.rays}
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        """Restore the result, and what `state` returned."""
         self.restore_result(tensors)
         self.rays = int(figures["rays"])
         self.generator.set_state(tensors["generator"].cpu())
@@ -234,7 +208,7 @@ class FieldTraining(PixelTraining):
         samples = math.ceil(options.share * budget.samples)
         super().__init__(scene, field.device, budget.steps, samples, options, seed)
         self.field, self.grid = field, new_grid(scene, field.device)
-        self.sampling = options.sampling(budget)
+        self.sampling = replace(options.sampling(budget), stop=options.stop, thin=options.thin)
         self.rays = options.rays or self.rays
         self.optimiser = FieldOptimiser(field)
 
@@ -246,15 +220,8 @@ class FieldTraining(PixelTraining):
         return super().advance()
 
     def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
-        return render_batch(
-            self.field,
-            rays,
-            self.grid.occupancy,
-            replace(self.sampling, stop=self.options.stop),
-            jitter=jitter,
-            background=background,
-            thin=self.options.thin,
-        )
+        field, cells, how = self.field, self.grid.occupancy, self.sampling
+        return render_batch(field, rays, cells, how, jitter=jitter, background=background)
 
     def _update(self) -> None:
         self.optimiser.step(self.learning_rate())
@@ -274,16 +241,14 @@ class FieldTraining(PixelTraining):
         return tensors | {"grid.density": self.grid.density}
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore what `result` returned."""
         restore_field(self.field, self.grid, tensors)
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Optimisers, random numbers, number of rays, error map."""
+        """Also the optimisers."""
         tensors, figures = super().state()
         return self.optimiser.tensors() | tensors, figures
 
     def restore(self, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-        """Restore the result, and what `state` returned."""
         super().restore(tensors, figures)
         self.optimiser.restore(tensors)
 
@@ -293,3 +258,52 @@ def restore_field(field: HashField, grid: DensityGrid, tensors: Mapping[str, Ten
     field.load_state_dict(checkpoint.part(tensors, "field."))
     field.repack()
     grid.restore(tensors["grid.density"])
+
+
+class FieldOptimiser:
+    """Adam for the networks of `field`, and for its table one that skips untouched entries.
+
+    Once this exists, the field collects the gradients of its samples in `gradients`, until `step`.
+    """
+
+    def __init__(self, field: HashField) -> None:
+        self._field = field
+        self._table = AdamState.like(field.table.detach())
+        field.gradients = SampleGradients()
+
+    @cached_property
+    def _networks(self) -> torch.optim.Adam:
+        # Created when needed: a process's first one imports torch's compiler, which takes seconds.
+        parameters = list(self._field.layers.values())
+        return torch.optim.Adam(parameters, betas=(0.9, 0.99), eps=1e-15, fused=True)
+
+    def step(self, rate: float) -> None:
+        """Update table and networks at learning rate `rate`."""
+        loop.step_at(self._networks, rate)
+        field = self._field
+        assert field.gradients is not None
+        hash_adam_(
+            field.table.detach(),
+            field.gradients,
+            field.grid,
+            self._table,
+            rate,
+            packed=field.packed,
+            backend=field.backend,
+        )
+
+    @property
+    def table_moments(self) -> Tensor:
+        """The sum of the table's moments, which is not finite where one of them is not."""
+        return self._table.first + self._table.second
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The state, for a checkpoint."""
+        networks = checkpoint.optimiser_tensors(self._networks, "network.")
+        return self._table.tensors("adam.") | networks
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restore what `tensors` returned; gradients of a step that was not finished are lost."""
+        self._field.gradients = SampleGradients()
+        self._table = AdamState.of(tensors, "adam.", self._field.table.device)
+        checkpoint.restore_optimiser(self._networks, tensors, "network.")

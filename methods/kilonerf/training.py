@@ -30,6 +30,8 @@ class KiloLessons(FieldLessons):
     """
 
     rate: float = 3e-3
+    final_rate: float = 1 / 30
+    share: float = 1.0
     points_each: int = 128
     view_cost: float = 1e-6
 

@@ -9,21 +9,10 @@ from torch.nn import functional
 from bench.types import Probe
 from methods.instant_ngp.field import Precision
 from methods.students.fields import REACH
-from methods.students.networks import (
-    Dense,
-    NetworkField,
-    density_of,
-    parameter_bytes,
-    positional,
-    positional_channels,
-    products,
-)
+from methods.students.networks import Dense, NetworkField, density_of, positional, products
 
-WIDTH = 256
-"""Outputs of every layer of the trunk."""
-
-LAYERS = 8
-"""Layers of the trunk."""
+WIDTH, LAYERS = 256, 8
+"""Outputs of every layer of the trunk, and how many there are."""
 
 SKIP = 5
 """Layers of the trunk after which the encoded position is concatenated again."""
@@ -41,20 +30,15 @@ DENSITY = 1 / REACH
 class NerfField(NetworkField):
     """One network of 595,844 parameters (Mildenhall et al. 2020, Figure 7).
 
-    Positions in the unit cube are mapped to [-1, 1], as in Section 5.1.
-
-    Args:
-        precision: precision of the products, "bf16" or "fp32".
-        backend: backend of the kernels that render it.
-        generator: source of the initial weights.
+    Positions in the unit cube are mapped to [-1, 1], as in Section 5.1. `precision` is that of the
+    products, `backend` that of the kernels that render the field.
     """
 
     def __init__(
         self, precision: Precision, backend: str, generator: torch.Generator | None = None
     ) -> None:
         super().__init__(backend)
-        position = positional_channels(3, POSITION_FREQUENCIES)
-        direction = positional_channels(3, DIRECTION_FREQUENCIES)
+        position, direction = 3 + 6 * POSITION_FREQUENCIES, 3 + 6 * DIRECTION_FREQUENCIES
         inputs = [position if layer == 0 else WIDTH for layer in range(LAYERS)]
         inputs[SKIP] += position
         self.trunk = nn.ModuleList(Dense(size, WIDTH, precision, generator) for size in inputs)
@@ -78,22 +62,15 @@ class NerfField(NetworkField):
         return positional(functional.normalize(directions, dim=-1), DIRECTION_FREQUENCIES)
 
     def colours_together(self, geometry: Tensor, encoded: Tensor) -> Tensor:
-        hidden = self._view(geometry, encoded).relu_()
-        return self.colour(hidden).to(encoded.dtype).sigmoid()
-
-    def _view(self, geometry: Tensor, encoded: Tensor) -> Tensor:
-        """The bottleneck and the layer that sees the direction. No activation separates the two, so
-        one product with their merged weights saves two thirds of the work of a colour."""
+        # No activation separates the bottleneck and the layer that sees the direction: one product
+        # with their merged weights saves two thirds of the work of a colour.
         of_feature, of_direction = self.view.weight.split((WIDTH, encoded.shape[1]), dim=1)
         weight = torch.cat((of_feature @ self.bottleneck.weight, of_direction), dim=1)
         bias = self.view.bias + of_feature @ self.bottleneck.bias
         inputs = torch.cat((geometry, encoded.to(geometry.dtype)), dim=1)
-        return self.view.forward_with(inputs, weight, bias)
+        hidden = self.view.forward_with(inputs, weight, bias).relu_()
+        return self.colour(hidden).to(encoded.dtype).sigmoid()
 
     def count(self, probe: Probe, samples: int, shaded: int) -> None:
-        density = products(self.trunk, self.opacity)
-        colour = products(self.view, self.colour)
+        density, colour = products(self.trunk, self.opacity), products(self.view, self.colour)
         probe.count("products", density * samples + colour * shaded)
-
-    def sizes(self) -> dict[str, int]:
-        return {"network": parameter_bytes(self)}

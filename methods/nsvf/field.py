@@ -12,15 +12,7 @@ from bench.types import Probe
 from methods.instant_ngp.field import Precision
 from methods.kernels.corner_gather import CORNERS, corner_gather, trilinear
 from methods.kernels.types import Occupancy
-from methods.students.networks import (
-    Dense,
-    NetworkField,
-    density_of,
-    parameter_bytes,
-    positional,
-    positional_channels,
-    products,
-)
+from methods.students.networks import Dense, NetworkField, density_of, positional, products
 from methods.students.voxels import corners_of
 
 EMBEDDING = 32
@@ -60,15 +52,9 @@ class Norm(nn.LayerNorm):
 
 
 class NsvfField(NetworkField):
-    """Sparse voxels with embeddings, and a network of 545,284 parameters (Liu et al. 2020,
-    Section 3.1, Appendix B, with the LayerNorm of the release).
-
-    Args:
-        occupancy: its cells are the voxels.
-        precision: precision of the products, "bf16" or "fp32".
-        backend: backend of the kernels that render it.
-        generator: source of the initial weights and embeddings.
-    """
+    """Voxels, the cells of an occupancy, with embeddings, and a network of 545,284 parameters (Liu
+    et al. 2020, Section 3.1, Appendix B, with the LayerNorm of the release). `precision` is that of
+    the products, `backend` that of the kernels that render the field."""
 
     index: Tensor
     corners: Tensor
@@ -95,8 +81,7 @@ class NsvfField(NetworkField):
         def layers(*widths: int) -> list[Layer]:
             return [Layer(*pair, precision, generator) for pair in pairwise(widths)]
 
-        encoded = positional_channels(EMBEDDING, EMBEDDING_FREQUENCIES)
-        direction = positional_channels(3, DIRECTION_FREQUENCIES, identity=False)
+        encoded, direction = EMBEDDING * (1 + 2 * EMBEDDING_FREQUENCIES), 6 * DIRECTION_FREQUENCIES
         self.trunk = nn.Sequential(*layers(encoded, WIDTH, WIDTH, WIDTH))
         self.opacity = nn.Sequential(
             *layers(WIDTH, DENSITY_WIDTH), Dense(DENSITY_WIDTH, 1, precision, generator)
@@ -143,4 +128,4 @@ class NsvfField(NetworkField):
 
     def sizes(self) -> dict[str, int]:
         embeddings = self.embeddings.numel() * self.embeddings.element_size()
-        return {"embeddings": embeddings, "network": parameter_bytes(self) - embeddings}
+        return {"embeddings": embeddings, "network": super().sizes()["network"] - embeddings}

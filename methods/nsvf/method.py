@@ -11,30 +11,22 @@ import torch
 
 from bench.types import Budget, Scene
 from methods.instant_ngp.stage1 import TrainedField
-from methods.kernels.encode import encode
 from methods.kernels.types import BRICK, Occupancy, expect
 from methods.nsvf.field import EMBEDDING, NsvfField
 from methods.rendering.sampling import Sampling, check_step
-from methods.students.fields import FieldStudent, StudentTraining
-from methods.students.networks import NetworkLessons
+from methods.students.fields import FieldLessons, FieldStudent, StudentTraining
 from methods.students.voxels import occupied_voxels
 
 
 @dataclass(kw_only=True, eq=False)
 class Nsvf(FieldStudent):
-    """A neural sparse voxel field whose voxels are where the field that it starts from is occupied.
+    """A neural sparse voxel field with voxels where the field that it starts from is occupied."""
 
-    Attributes:
-        resolution: voxels along a side of the cube, a multiple of 16.
-        step: length of a ray-marching step in voxels, in training and rendering.
-        start: initial embeddings: "random", or the features of the "teacher" at their corners.
-    """
-
-    training: NetworkLessons
+    training: FieldLessons
     name: str = "nsvf"
-    resolution: int = 128
-    step: float = 0.5
-    start: Literal["random", "teacher"] = "teacher"
+    resolution: int = 128  # voxels along a side of the cube, a multiple of 16
+    step: float = 0.5  # length of a step of the rays in voxels, in training and rendering
+    start: Literal["random", "teacher"] = "teacher"  # embeddings: its features at their corners
 
     kind = "nsvf"
 
@@ -71,27 +63,16 @@ class Nsvf(FieldStudent):
         return field.to(teacher.device)
 
     def begin(self, trained: TrainedField, scene: Scene, budget: Budget) -> StudentTraining:
-        """Make the training of a new field, whose embeddings are as `start` says."""
+        """Make the training of a new field. With `start=teacher` every corner begins as the trained
+        field's encoding of its position, in 1 / pi of the usual size of embeddings: the angles of
+        the positional encoding then begin at that size and reach 32 times it, which is still smooth
+        from corner to corner."""
         training = super().begin(trained, scene, budget)
-        if self.start == "teacher" and isinstance(training.field, NsvfField):
-            start_at_corners(training.field, trained)
+        field = training.field
+        if self.start == "teacher" and isinstance(field, NsvfField):
+            with torch.no_grad():
+                features = trained.field.encode(field.vertices / self.resolution)
+                spread = features.std() if features.numel() > 1 else features.new_ones(())
+                size = EMBEDDING**-0.5 / math.pi
+                field.embeddings.copy_(features * size / spread.clamp(min=1e-12))
         return training
-
-
-@torch.no_grad()
-def start_at_corners(field: NsvfField, trained: TrainedField) -> None:
-    """Set every corner to the trained field's encoding of its position, in 1 / pi of the usual size
-    of embeddings. The angles of the positional encoding then begin at that size and reach 32 times
-    it, which is still smooth from corner to corner."""
-    hash_field = trained.field
-    places = field.vertices / len(field.index)
-    features = encode(
-        places,
-        hash_field.table,
-        hash_field.grid,
-        packed=hash_field.packed,
-        backend=hash_field.backend,
-    )
-    spread = features.std() if features.numel() > 1 else features.new_ones(())
-    size = EMBEDDING**-0.5 / math.pi
-    field.embeddings.copy_(features * size / spread.clamp(min=1e-12))

@@ -33,8 +33,5 @@ def indices_where(masks: Sequence[Tensor]) -> list[Tensor]:
     """Indices where each of `masks` is true, in order; the host waits for a GPU, once for all."""
     if not masks:
         return []
-    sizes = to_host([mask.sum() for mask in masks])
-    return [
-        torch.nonzero_static(mask, size=size).squeeze(1)
-        for mask, size in zip(masks, sizes, strict=True)
-    ]
+    pairs = zip(masks, to_host([mask.sum() for mask in masks]), strict=True)
+    return [torch.nonzero_static(mask, size=size).squeeze(1) for mask, size in pairs]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -29,17 +30,11 @@ LOG_DENSITY_CLAMP = 15.0
 
 
 class Field(Protocol):
-    """A density and K features of a position and a view direction (SteerNeRF Eq. 4).
+    """A density and K features of a position and a view direction (SteerNeRF Eq. 4)."""
 
-    Attributes:
-        channels: K; the first three features are RGB.
-        backend: backend of the kernels that render it.
-        round_samples: samples of a ray that are best evaluated together where rays end early.
-    """
-
-    channels: int
-    backend: str
-    round_samples: int
+    channels: int  # K; the first three features are RGB
+    backend: str  # of the kernels that render it
+    round_samples: int  # of a ray, that are best evaluated together where rays end early
 
     @property
     def device(self) -> torch.device:
@@ -74,10 +69,8 @@ def query(
     field: Field, positions: Tensor, ray: Tensor, directions: Tensor, encoded: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Density [S] and features [S, K] at `positions` [S, 3] on rays `ray` [S], whose encoded
-    directions are `directions` [R, D]; evaluated as a padded batch.
-
-    `encoded` is the encoding [S, E] of the positions by `field`, an `Encoder`, if it is known.
-    """
+    directions are `directions` [R, D]; evaluated as a padded batch. `encoded` is the encoding
+    [S, E] of the positions by `field`, an `Encoder`, if it is known."""
     if encoded is None:
         sigma, geometry = field.density(pad(positions))
     else:
@@ -95,3 +88,8 @@ def pad(samples: Tensor) -> Tensor:
     """
     padding = -len(samples) % BATCH_QUANTUM
     return functional.pad(samples, (0, 0) * (samples.dim() - 1) + (0, padding))
+
+
+def cat(parts: Sequence[Tensor]) -> Tensor:
+    """`torch.cat` of one or more tensors; a single one is not copied."""
+    return parts[0] if len(parts) == 1 else torch.cat(parts)

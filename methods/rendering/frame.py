@@ -1,19 +1,30 @@
-"""A frame of a field: features, depth and opacity of every pixel of a camera."""
+"""Volume rendering of frames: features, depth and opacity of the pixels of a camera.
+
+On a CPU rays take a few samples at a time and end early; on a GPU all samples are taken at once, so
+that the host need not wait.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from bench.cameras import cast, project
 from bench.types import EMPTY_ALPHA, Camera, Frame, Probe, Rays
-from methods.kernels.types import BRICK, Occupancy, Pixels
-from methods.rendering.field import Field
-from methods.rendering.rays import render_rays
+from methods.kernels.composite import composite, weights
+from methods.kernels.march import extents, march
+from methods.kernels.types import BRICK, Occupancy, Pixels, Samples
+from methods.rendering.compaction import compacts
+from methods.rendering.field import CACHED_SAMPLES, CHUNK_SAMPLES, Field, pad, query
 from methods.rendering.sampling import Sampling
+
+CHUNK_RAYS = 1 << 16
+"""Rays rendered together: enough to keep all threads busy, few enough to stay in the cache. This
+also bounds the memory of a GPU, which holds all samples of these rays."""
 
 Render = Callable[[Tensor, Rays], Pixels]
 """Renders some pixels of a frame, given their row-major indices [P] and their rays."""
@@ -21,19 +32,12 @@ Render = Callable[[Tensor, Rays], Pixels]
 
 @dataclass(frozen=True)
 class FeatureFrame:
-    """A field as a camera sees it: F and D of SteerNeRF.
-
-    Attributes:
-        camera: a camera of w x h pixels.
-        values: [h, w, K] features on the background; the first three are RGB.
-        depth: [h, w] z-depth, +inf where a pixel is empty.
-        alpha: [h, w] opacity.
-    """
+    """A field as a camera of w x h pixels sees it: F and D of SteerNeRF."""
 
     camera: Camera
-    values: Tensor
-    depth: Tensor
-    alpha: Tensor
+    values: Tensor  # [h, w, K] features on the background; the first three are RGB
+    depth: Tensor  # [h, w] z-depth, +inf where a pixel is empty
+    alpha: Tensor  # [h, w] opacity
 
     @classmethod
     def of(cls, camera: Camera, pixels: Pixels, background: Tensor) -> FeatureFrame:
@@ -51,17 +55,10 @@ class FeatureFrame:
 
 @torch.no_grad()
 def render_frame(
-    camera: Camera,
-    occupancy: Occupancy,
-    background: Tensor,
-    probe: Probe,
-    render: Render,
+    camera: Camera, occupancy: Occupancy, background: Tensor, probe: Probe, render: Render
 ) -> FeatureFrame:
-    """Render the frame of `camera`, composited on `background` [K].
-
-    Args:
-        render: renders the pixels that may see matter.
-    """
+    """Render the frame of `camera`, composited on `background` [K]; `render` renders the pixels
+    that may see matter."""
     size = camera.height * camera.width
     with probe.stage("rays"):
         seen, rays = rays_at_matter(camera, occupancy)
@@ -115,11 +112,97 @@ def sees_matter(camera: Camera, occupancy: Occupancy) -> Tensor:
     # How many boxes cover a pixel: the 2D prefix sum, from the top left, of +1 and -1 at
     # the corners of the boxes.
     edges = torch.zeros(camera.height + 1, camera.width + 1, dtype=torch.int32, device=device)
-    for row, column, sign in (
-        (top, left, 1),
-        (top, right, -1),
-        (bottom, left, -1),
-        (bottom, right, 1),
-    ):
+    corner_signs = ((top, left, 1), (top, right, -1), (bottom, left, -1), (bottom, right, 1))
+    for row, column, sign in corner_signs:
         edges.index_put_((row, column), edges.new_full((), sign), True)
     return edges.cumsum(dim=0).cumsum(dim=1)[:-1, :-1] != 0
+
+
+@torch.no_grad()
+def render_rays(
+    field: Field, rays: Rays, occupancy: Occupancy, probe: Probe, how: Sampling
+) -> Pixels:
+    """Render R `rays`. Values are not composited on a background.
+
+    On a CPU, rays are rendered in rounds, so that few samples are evaluated behind the early stop:
+    a round takes the next few samples of the rays that are still open, evaluates and composites
+    them, and drops the rays that have ended. When fewer than half of the rays are left, each takes
+    proportionally more samples.
+
+    On a GPU, the work is that of a single round with all samples, and the host waits once, for the
+    sample counts of all chunks. Only the GPU knows which samples are hidden or faint, and
+    evaluating them takes less time than asking.
+    """
+    count, device = len(rays.origins), rays.origins.device
+    window, backend = how.window, field.backend
+    canvas = Pixels.blank(count, field.channels, device)
+
+    def advance(index: Tensor | slice, **options: Any) -> tuple[Tensor, Tensor]:
+        """Composite the next samples of some rays, which `options` of `march` choose; return where
+        to resume, and the opacities."""
+        with probe.stage("march"):
+            some = rays.take(index)
+            options["window"] = None if window is None else window[index]
+            samples = march(some, occupancy, how.step, backend=backend, **options)
+        probe.count("samples", len(samples))
+        front = canvas.take(index)
+        if not len(samples):
+            return samples.resume, front.alpha
+        sigma, values = _evaluated(field, samples, some.directions, front, how, probe)
+        with probe.stage("composite"):
+            pixels = composite(sigma, values, samples, stop=how.stop, carry=front, backend=backend)
+            canvas.put(index, pixels)
+        return samples.resume, pixels.alpha
+
+    chunks = range(0, count, CHUNK_RAYS)
+    if not compacts(device):
+        with probe.stage("march"):
+            sizes = extents(rays, occupancy, how.step, CHUNK_RAYS, window=window, backend=backend)
+        for first, extent in zip(chunks, sizes, strict=True):
+            if extent.total:
+                advance(slice(first, first + CHUNK_RAYS), extent=extent)
+        return canvas
+    for first in chunks:
+        open_ = torch.arange(first, min(first + CHUNK_RAYS, count), device=device)
+        start = torch.zeros(len(open_), dtype=torch.int32, device=device)
+        whole = len(open_)
+        while len(open_):
+            limit = field.round_samples * max(whole // (2 * len(open_)), 1)
+            resume, alpha = advance(open_, start=start, limit=limit)
+            with probe.stage("composite"):
+                left = ((resume >= 0) & (1 - alpha > how.stop)).nonzero().squeeze(1)
+                open_, start = open_[left], resume[left]
+    return canvas
+
+
+def _evaluated(
+    field: Field, samples: Samples, directions: Tensor, front: Pixels, how: Sampling, probe: Probe
+) -> tuple[Tensor, Tensor]:
+    """Density [S] and features [S, K] of `samples` behind the pixels in `front`; features of faint
+    samples are 0."""
+
+    def bright(sigma: Tensor) -> Tensor:
+        through = 1 - front.alpha
+        weight = weights(sigma, samples, stop=how.stop, front=through, backend=field.backend)
+        return weight > how.least_weight
+
+    with probe.stage("field"):
+        encoded = field.encode_directions(directions)
+        if compacts(samples.t.device):
+            sigma, geometry = field.density(pad(samples.positions))
+            sigma = sigma[: len(samples)]
+            seen = bright(sigma).nonzero().squeeze(1)
+            shaded, values = len(seen), sigma.new_zeros(len(samples), field.channels)
+            for part in seen.split(CACHED_SAMPLES):
+                index = pad(part)
+                view = encoded.index_select(0, samples.ray.index_select(0, index))
+                shown = field.features(geometry.index_select(0, index), view)
+                values.index_copy_(0, part, shown[: len(part)])
+        else:
+            columns = samples.positions.split(CHUNK_SAMPLES), samples.ray.split(CHUNK_SAMPLES)
+            parts = [query(field, *piece, encoded) for piece in zip(*columns, strict=True)]
+            sigma, values = (torch.cat(column) for column in zip(*parts, strict=True))
+            shaded, values = len(samples), torch.where(bright(sigma)[:, None], values, 0)
+    probe.count("shaded_samples", shaded, len(samples))
+    field.count(probe, len(samples), shaded)
+    return sigma, values

@@ -21,7 +21,7 @@ from bench.cameras import place_camera, project, within
 from bench.types import Camera
 from methods.kernels.march import MAX_SAMPLES
 from methods.kernels.types import BRICK, Occupancy
-from methods.rendering.field import LOG_DENSITY_CLAMP, Field
+from methods.rendering.field import CHUNK_SAMPLES, LOG_DENSITY_CLAMP, Field
 
 RESOLUTION = 128
 STEP = math.sqrt(3) / MAX_SAMPLES
@@ -45,9 +45,6 @@ LARGEST = math.exp(LOG_DENSITY_CLAMP)
 
 MIN_VIEWS = 2
 """Training cameras that must see a place before it may count as occupied."""
-
-CHUNK = 1 << 18
-"""Visits whose density is evaluated together: bounds the memory of an update."""
 
 
 def learnable_cells(bounds: Tensor, cameras: Sequence[Camera]) -> Tensor:
@@ -100,7 +97,9 @@ class DensityGrid:
     def update(self, field: Field, generator: torch.Generator, samples: int) -> None:
         """Visit `samples` random cells: half drawn from all cells, half from the occupied ones."""
         cells = self._draw(samples, generator)
-        sigma = torch.cat([self._visit(field, part, generator) for part in cells.split(CHUNK)])
+        sigma = torch.cat(
+            [self._visit(field, part, generator) for part in cells.split(CHUNK_SAMPLES)]
+        )
         density = self.density.view(-1)
         values = torch.fmax(DECAY * density[cells], sigma.clamp(max=LARGEST))  # not NaN
         density.scatter_reduce_(0, cells, values, "amax", include_self=False)
@@ -110,9 +109,8 @@ class DensityGrid:
         """Density at a random point of each of `cells` [N]."""
         # Not `torch.unravel_index`: it checks the largest index, and waits for a GPU.
         rows, columns = self.density.shape[1:]
-        corner = torch.stack(
-            (cells // (rows * columns), cells // columns % rows, cells % columns), dim=-1
-        )
+        place = cells // (rows * columns), cells // columns % rows, cells % columns
+        corner = torch.stack(place, dim=-1)
         jitter = torch.rand(len(cells), 3, generator=generator, device=cells.device)
         return field.density((corner + jitter) / RESOLUTION)[0]
 
@@ -120,12 +118,9 @@ class DensityGrid:
         device = self.density.device
         occupied = self.occupancy.cells.flatten().nonzero().squeeze(1)
         pools = [pool for pool in (self._candidates, occupied) if len(pool)]
-        return torch.cat(
-            [
-                pool[torch.randint(len(pool), (samples // 2,), generator=generator, device=device)]
-                for pool in pools
-            ]
-        )
+        count = (samples // 2,)
+        drawn = (torch.randint(len(p), count, generator=generator, device=device) for p in pools)
+        return torch.cat([pool[index] for pool, index in zip(pools, drawn, strict=True)])
 
     def _threshold(self) -> None:
         mean = self.density.sum() / len(self._candidates)  # others have a density of 0

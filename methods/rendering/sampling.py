@@ -34,17 +34,15 @@ def check_step(name: str, length: float) -> None:
 
 @dataclass(frozen=True)
 class Sampling:
-    """How rays are marched.
+    """How rays are marched."""
 
-    Attributes:
-        step: world length of a step.
-        stop: transmittance at which a ray ends.
-        window: [R, 2] nearest and farthest t of each ray; None: all of it.
-    """
-
-    step: float = STEP
-    stop: float = STOP
-    window: Tensor | None = None
+    step: float = STEP  # world length
+    stop: float = STOP  # transmittance at which a ray ends
+    window: Tensor | None = None  # in frames: [R, 2] nearest and farthest t; None: all of a ray
+    # In training: of the samples with an optical depth sigma delta below this, which hardly show,
+    # one of some is kept and gets the length of all. Which one is left to chance: the expected
+    # optical depth and its gradient stay the same.
+    thin: float = 0.0
 
     @property
     def least_weight(self) -> float:

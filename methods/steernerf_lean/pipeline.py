@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from bench.types import Camera, NullProbe, Probe
-from methods.rendering.frame import FeatureFrame
-from methods.rendering.rays import render_rays
+from methods.rendering.frame import FeatureFrame, render_rays
 from methods.steernerf.buffer import Buffer, Cloud
 from methods.steernerf.pipeline import Pipeline
 from methods.steernerf.view import View

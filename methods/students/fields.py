@@ -23,7 +23,6 @@ from methods.rendering.occupancy import STEP
 from methods.rendering.sampling import Sampling
 from methods.students.method import Student
 from methods.training import checkpoint, loop
-from methods.training.optimiser import step_at
 
 REACH = 5 * STEP
 """Length over which densities become the opacities that are compared: about the 0.0211 of KiloNeRF,
@@ -32,16 +31,15 @@ in the units of its scenes."""
 
 @dataclass(frozen=True)
 class FieldLessons(PixelOptions):
-    """How to train a student that is a field: first on points, then on rays as Instant-NGP is.
+    """How to train a student that is a field: first on points, then on rays as Instant-NGP is. One
+    large network takes many small steps, at a lower rate than a hash grid."""
 
-    Attributes:
-        points: share of the steps, at the beginning, that compare densities and colours at random
-            points of occupied cells with the guide's.
-        share: samples with a gradient in a step, as a share of the budget's.
-    """
-
+    rate: float = 1e-3
+    final_rate: float = 0.1
+    # Share of the steps, at the beginning, that compare densities and colours at random points of
+    # occupied cells with the guide's.
     points: float = 0.5
-    share: float = 1.0
+    share: float = 0.25  # samples with a gradient in a step, as a share of the budget's
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -116,12 +114,7 @@ class StudentTraining(PixelTraining):
     """Trains on points of the guide, then on rays of the photos, within occupied cells.
 
     On rays, samples that the guide's density hides are left out: it costs less than the density of
-    a large network.
-
-    Args:
-        student: whose `training`, `sampling` and `occupancy` it follows.
-        field: what is trained.
-        trained: holds its guide.
+    a large network. The training follows the settings of `student`; `trained` holds the guide.
     """
 
     def __init__(
@@ -147,8 +140,7 @@ class StudentTraining(PixelTraining):
         """Take one step; return its mean squared error, of opacities and colours or of pixels."""
         if self.step >= self.points_until:
             return super().advance()
-        positions, directions = self._places()
-        loss = self._difference(positions, directions)
+        loss = self._difference(*self._places())
         loss.backward()
         errors = loop.look(self, {"": loss}, {"loss": loss})
         self._update()
@@ -170,28 +162,21 @@ class StudentTraining(PixelTraining):
         with torch.no_grad():
             wanted, shown = _seen(self.guide, positions, directions)
         opacity, colour = self._learned(positions, directions)
-        return (
-            functional.mse_loss(opacity, wanted)
-            + (wanted * (colour - shown).square().sum(dim=1)).mean()
-        )
+        apart = (colour - shown).square().sum(dim=1)
+        return functional.mse_loss(opacity, wanted) + (wanted * apart).mean()
 
     def _learned(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """The opacity [S] over `REACH` and colour [S, 3] that are compared with the guide's."""
         return _seen(self.field, positions, directions)
 
     def _render(self, rays: Rays, jitter: Tensor, background: Tensor) -> tuple[Pixels, int]:
+        field, cells, how, guide = self.field, self.occupancy, self.sampling, self.guide
         return render_batch(
-            self.field,
-            rays,
-            self.occupancy,
-            self.sampling,
-            jitter=jitter,
-            background=background,
-            guide=self.guide,
+            field, rays, cells, how, jitter=jitter, background=background, guide=guide
         )
 
     def _update(self) -> None:
-        step_at(self.optimiser, self.learning_rate())
+        loop.step_at(self.optimiser, self.learning_rate())
 
     def watched(self) -> dict[str, Tensor]:
         return dict(self.field.named_parameters())

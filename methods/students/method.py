@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -31,25 +31,16 @@ class Student(ABC):
 
     `train_s` counts the training of the field, the initialisation of the model and its own
     training.
-
-    Attributes:
-        teacher: the field that it starts from, and where it runs.
-        training: how the model is trained.
-        stop: transmittance at which a ray ends when rendering, less than 1.
-        name: as shown in result rows.
-        steps: steps of its own training; None: `budget.renderer_steps`.
     """
 
-    teacher: Setup
-    training: PixelOptions
-    stop: float = 1e-2
-    name: str
-    steps: int | None = None
+    teacher: Setup  # the field that it starts from, and where it runs
+    training: PixelOptions  # how the model is trained
+    stop: float = 1e-2  # transmittance at which a ray ends when rendering, less than 1
+    name: str  # as shown in result rows
+    steps: int | None = None  # of its own training; None: `budget.renderer_steps`
 
     memory = 0
-    kind: ClassVar[str]
-    """Name of its trained stage, for example "nerf"."""
-
+    kind: ClassVar[str]  # name of its trained stage, for example "nerf"
     study = Study(
         knobs={"stop": turned("stop", "method.stop", ("1e-1", "1e-2", "1e-3"))},
         exact=("method.stop=1e-4",),
@@ -97,16 +88,8 @@ class Student(ABC):
             trained = train_field(self.teacher, scene, budget, log)
             folder = log.stage_dir(self.kind, self._key(scene, budget))
             finished = folder / f"{self.kind}.safetensors"
-            if finished.exists():
-                tensors, figures = checkpoint.read(finished)
-                seconds = figures["seconds"]
-                log.info(f"trained {self.kind} found: {finished}")
-            else:
-                begun = time.monotonic()
-                training = self.begin(trained, scene, budget)
-                training.seconds = time.monotonic() - begun
-                loop.train(training, finished, self.kind, log)
-                tensors, seconds = training.result(), training.seconds
+            begin = partial(self.begin, trained, scene, budget)
+            tensors, seconds = loop.trained(begin, finished, self.kind, log)
             with checkpoint.restoring(finished):
                 self.restore(tensors)
         self.train_s = trained.train_s + seconds

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -12,29 +11,20 @@ from torch.nn import functional
 
 from methods.instant_ngp.field import Precision
 from methods.kernels import multiplies_bf16
-from methods.students.fields import FieldLessons, StudentField
+from methods.students.fields import StudentField
 
-
-@dataclass(frozen=True)
-class NetworkLessons(FieldLessons):
-    """How to train one large network: in many small steps, at a lower rate than a hash grid."""
-
-    rate: float = 1e-3
-    final_rate: float = 0.1
-    share: float = 0.25
+CHUNK = 1 << 14
+"""Samples that go through a network together: 16 MiB of activations."""
 
 
 def positional(
     values: Tensor, frequencies: int, *, identity: bool = True, scale: float = math.pi
 ) -> Tensor:
-    """Sines and cosines of `values` [S, C], at frequencies 2^0 to 2^(F - 1) times `scale`.
+    """Sines and cosines of `values` [S, C], at frequencies 2^0 to 2^(F - 1) times `scale`, the
+    lowest first: [S, C (2 F + identity)].
 
     Mildenhall et al. (2020), Eq. 4; the release has no pi (`scale` 1) and puts the values
     themselves in front (`identity`).
-
-    Returns:
-        [S, C (2 F + identity)]: the values, then sines and cosines of the lowest frequency, and so
-        on.
     """
     angles = scale * values
     sine, cosine = angles.sin(), angles.cos()
@@ -45,11 +35,6 @@ def positional(
         # with 1 - 2 sin^2 for the cosine they would grow faster.
         sine, cosine = 2 * sine * cosine, (cosine - sine) * (cosine + sine)
     return torch.cat(parts, dim=-1)
-
-
-def positional_channels(channels: int, frequencies: int, *, identity: bool = True) -> int:
-    """Channels that `positional` makes of `channels` values."""
-    return channels * (2 * frequencies + identity)
 
 
 class Dense(nn.Linear):
@@ -81,10 +66,6 @@ class Dense(nn.Linear):
         return functional.linear(inputs.to(dtype), weight.to(dtype), bias.to(dtype))
 
 
-CHUNK = 1 << 14
-"""Samples that go through the network together: 16 MiB of activations."""
-
-
 class NetworkField(StudentField):
     """A field that is one large network of dense layers."""
 
@@ -106,6 +87,9 @@ class NetworkField(StudentField):
     def features(self, geometry: Tensor, encoded: Tensor) -> Tensor:
         pairs = zip(geometry.split(CHUNK), encoded.split(CHUNK), strict=True)
         return torch.cat([self.colours_together(*pair) for pair in pairs])
+
+    def sizes(self) -> dict[str, int]:
+        return {"network": sum(x.numel() * x.element_size() for x in self.parameters())}
 
 
 def density_of(raw: Tensor) -> Tensor:
@@ -133,8 +117,3 @@ def products(*layers: nn.Module) -> int:
     """Multiplications per sample in all dense layers inside `layers`."""
     dense = (part for layer in layers for part in layer.modules() if isinstance(part, Dense))
     return sum(part.weight.numel() for part in dense)
-
-
-def parameter_bytes(network: nn.Module) -> int:
-    """Bytes of all parameters as they are stored."""
-    return sum(value.numel() * value.element_size() for value in network.parameters())

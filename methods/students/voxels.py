@@ -7,9 +7,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from bench.types import Rays, check_shape
+from bench.types import Rays
 from methods.instant_ngp.pixels import PixelBatches
-from methods.kernels.types import Occupancy, expect
+from methods.kernels.types import Occupancy
 from methods.kernels.voxel_walk import Crossings, Voxels, walk
 
 CHUNK_RAYS = 1 << 15
@@ -20,16 +20,8 @@ OFFSETS = tuple((c & 1, c >> 1 & 1, c >> 2 & 1) for c in range(8))
 
 
 def corners_of(coordinates: Tensor) -> tuple[Tensor, Tensor]:
-    """Find the corners of V voxels, each corner once.
-
-    Args:
-        coordinates: [V, 3] int, from 0 to 2^20.
-
-    Returns:
-        corners: [V, 8] int32, which vertices are the corners of each voxel.
-        vertices: [C, 3] int32, integer coordinates of all corners, ordered by x, then y, then z.
-    """
-    check_shape("coordinates", coordinates, None, 3)
+    """The corners of V voxels at `coordinates` [V, 3], from 0 to 2^20: [V, 8] int32, which vertices
+    each has, and [C, 3] int32, the coordinates of all vertices, ordered by x, then y, then z."""
     offsets = torch.tensor(OFFSETS, device=coordinates.device)
     x, y, z = (coordinates.long()[:, None] + offsets).unbind(dim=-1)  # [V, 8]
     keys, corners = torch.unique((x << 42) + (y << 21) + z, return_inverse=True)
@@ -39,14 +31,8 @@ def corners_of(coordinates: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def occupied_voxels(occupancy: Occupancy, resolution: int) -> Tensor:
-    """The voxels [V, 3] int32 of a grid of another resolution that overlap occupied cells.
-
-    They are ordered by x, then y, then z.
-
-    Raises:
-        ValueError: the resolution is less than 1.
-    """
-    expect(resolution >= 1, "resolution", "1 or more", resolution)
+    """The voxels [V, 3] int32 of a grid of another resolution that overlap occupied cells, ordered
+    by x, then y, then z."""
     size, device = occupancy.resolution, occupancy.cells.device
     voxel = torch.arange(resolution, device=device)
     first, last = voxel * size // resolution, -(-(voxel + 1) * size // resolution)
@@ -66,12 +52,8 @@ def largest_weights(
     generator: torch.Generator,
     backend: str,
 ) -> Tensor:
-    """The largest weight [V] that each voxel has in a pixel, over random training rays.
-
-    Args:
-        weigh: returns the weights [S] of the voxels that rays cross.
-        rays: how many rays are traced, at most as many as there are.
-    """
+    """The largest weight [V] that each voxel has in a pixel, over as many random training `rays`,
+    or all that there are. `weigh` returns the weights [S] of the voxels that rays cross."""
     largest = torch.zeros(len(voxels), device=voxels.coordinates.device)
     most = min(rays, len(batches))
     for first in range(0, most, CHUNK_RAYS):

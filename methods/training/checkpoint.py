@@ -18,11 +18,8 @@ from bench.types import SteerbenchError
 
 
 def write(path: Path, tensors: Mapping[str, Tensor], figures: Mapping[str, float]) -> None:
-    """Write a file whole or not at all, even if another process writes the same file.
-
-    Raises:
-        SteerbenchError: the file cannot be written.
-    """
+    """Write a file whole or not at all, even if another process writes the same file; raise
+    `SteerbenchError` if it cannot be written."""
     packed = {name: tensor.contiguous() for name, tensor in tensors.items()}
     try:
         with whole(path) as new:
@@ -34,11 +31,8 @@ def write(path: Path, tensors: Mapping[str, Tensor], figures: Mapping[str, float
 
 
 def read(path: Path) -> tuple[dict[str, Tensor], dict[str, float]]:
-    """Read the tensors and figures of a file written by `write`.
-
-    Raises:
-        SteerbenchError: the file is damaged, or was not written by `write`.
-    """
+    """Read the tensors and figures of a file; raise `SteerbenchError` if it is damaged, or was not
+    written by `write`."""
     try:
         with safe_open(path, "pt") as file:
             figures = json.loads(file.metadata()["training"])
@@ -52,11 +46,8 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, float]]:
 
 @contextmanager
 def restoring(path: Path) -> Iterator[None]:
-    """Context in which state that was read from `path` is restored.
-
-    Raises:
-        SteerbenchError: the state does not fit: it belongs to another training.
-    """
+    """Context in which state that was read from `path` is restored; it raises `SteerbenchError` if
+    the state belongs to another training, and so does not fit."""
     try:
         yield
     except (KeyError, RuntimeError) as error:

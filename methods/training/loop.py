@@ -1,10 +1,11 @@
-"""The loop of every training: progress, checkpoints, resuming after a kill, finiteness checks."""
+"""The loop of every training: progress, checkpoints, resuming after a kill, finiteness checks,
+learning rates."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Protocol
 
@@ -21,40 +22,18 @@ LOOK_EVERY = 10
 CHECKPOINT_S = 20.0
 """Seconds between checkpoints: the most that a killed training loses."""
 
-
-class Asked:
-    """Errors of a step, by label, on their way to the host, which does not wait for them."""
-
-    def __init__(self, errors: Mapping[str, Tensor]) -> None:
-        together = torch.stack([error.detach() for error in errors.values()])
-        self._labels, self._values = list(errors), together.to("cpu", non_blocking=True)
-        self._arrived = None
-        if together.device.type == "cuda":
-            self._arrived = torch.cuda.current_stream(together.device).record_event()
-
-    def tell(self) -> dict[str, float]:
-        """Return the errors as numbers; the host waits if they have not arrived yet."""
-        if self._arrived is not None:
-            self._arrived.synchronize()
-        return dict(zip(self._labels, self._values.tolist(), strict=True))
+Asked = Callable[[], dict[str, float]]
+"""Tells the errors of a step, by label; the host waits if they have not arrived yet."""
 
 
 class Training(Protocol):
-    """What the loop drives.
+    """What the loop drives."""
 
-    Attributes:
-        steps: how many steps there are in all.
-        step: how many are done.
-        seconds: the time they took, over all the processes the training was continued in.
-        advice: what to try if the training breaks down.
-        asked: the errors that `look` requested last; None at first.
-    """
-
-    steps: int
-    step: int
-    seconds: float
-    advice: str
-    asked: Asked | None
+    steps: int  # how many there are in all
+    step: int  # how many are done
+    seconds: float  # the time they took, over all the processes the training was continued in
+    advice: str  # what to try if the training breaks down
+    asked: Asked | None  # the errors that `look` requested last; None at first
 
     def advance(self) -> Mapping[str, float]:
         """Take one step; return what `look` returns, the mean squared errors to show by label (""
@@ -76,6 +55,23 @@ class Training(Protocol):
         """Restore result and state."""
 
 
+def trained(
+    begin: Callable[[], Training], finished: Path, label: str, log: Log
+) -> tuple[dict[str, Tensor], float]:
+    """The result of the training that `begin` makes, and its seconds, of making it and of all its
+    steps: read from `finished`, after a `train` if that is missing."""
+    if finished.exists():
+        log.info(f"trained {label} found: {finished}")
+    else:
+        begun = time.monotonic()
+        training = begin()
+        training.seconds = time.monotonic() - begun
+        train(training, finished, label, log)
+    tensors, figures = checkpoint.read(finished)
+    with checkpoint.restoring(finished):
+        return tensors, figures["seconds"]
+
+
 def train(
     training: Training,
     finished: Path,
@@ -87,10 +83,8 @@ def train(
 
     On the way, the results after the numbers of steps in `marks` are written as well. If another
     process runs the same training, this one waits for it. A killed training resumes from the
-    checkpoint beside `finished`.
-
-    Raises:
-        SteerbenchError: something is not finite; the last good checkpoint is kept.
+    checkpoint beside `finished`. `SteerbenchError` is raised if something is not finite; the last
+    good checkpoint is kept.
     """
     with missing(finished, log) as to_train:
         if to_train:
@@ -139,11 +133,8 @@ def save(training: Training, path: Path, done: bool = False) -> None:
 
 
 def load(training: Training, path: Path) -> None:
-    """Load into `training` a result that `train` wrote to `path`.
-
-    Raises:
-        SteerbenchError: the file is damaged, or belongs to another training.
-    """
+    """Load into `training` a result that `train` wrote to `path`; raise `SteerbenchError` if the
+    file is damaged, or belongs to another training."""
     tensors, figures = checkpoint.read(path)
     with checkpoint.restoring(path):
         training.restore_result(tensors)
@@ -151,11 +142,7 @@ def load(training: Training, path: Path) -> None:
 
 
 def resume(training: Training, path: Path) -> None:
-    """Restore `training` to the state of a checkpoint.
-
-    Raises:
-        SteerbenchError: the file is damaged, or belongs to another training.
-    """
+    """Restore `training` to the state of a checkpoint; it raises what `load` raises."""
     tensors, figures = checkpoint.read(path)
     with checkpoint.restoring(path):
         training.restore(tensors, figures)
@@ -165,23 +152,36 @@ def resume(training: Training, path: Path) -> None:
 def look(
     training: Training, errors: Mapping[str, Tensor], tensors: Mapping[str, Tensor]
 ) -> dict[str, float]:
-    """Return the `errors` of a step as numbers.
+    """Return the `errors` of a step as numbers; raise `SteerbenchError` if one is not finite, with
+    the names of the `tensors` that are not.
 
     On a GPU this happens every `LOOK_EVERY` steps, with the errors that were requested the time
     before, which have arrived meanwhile; in all other steps there are none.
-
-    Raises:
-        SteerbenchError: an error is not finite; it names which of `tensors` are not.
     """
     on_cpu = all(error.device.type == "cpu" for error in errors.values())
     if not on_cpu and training.step % LOOK_EVERY:
         return {}
-    before, training.asked = training.asked, Asked(errors)
+    before, training.asked = training.asked, _ask(errors)
     asked = training.asked if on_cpu else before
-    told = {} if asked is None else asked.tell()
+    told = {} if asked is None else asked()
     if not all(map(math.isfinite, told.values())):
         check_finite(training, tensors)
     return told
+
+
+def _ask(errors: Mapping[str, Tensor]) -> Asked:
+    """Send the errors to the host, which does not wait for them."""
+    together = torch.stack([error.detach() for error in errors.values()])
+    labels, values, arrived = list(errors), together.to("cpu", non_blocking=True), None
+    if together.device.type == "cuda":
+        arrived = torch.cuda.current_stream(together.device).record_event()
+
+    def tell() -> dict[str, float]:
+        if arrived is not None:
+            arrived.synchronize()
+        return dict(zip(labels, values.tolist(), strict=True))
+
+    return tell
 
 
 def check_finite(training: Training, more: Mapping[str, Tensor] | None = None) -> None:
@@ -193,3 +193,19 @@ def check_finite(training: Training, more: Mapping[str, Tensor] | None = None) -
             f"training stopped at step {training.step}: not finite: {', '.join(bad)}. The last "
             f"good checkpoint was kept. {training.advice}"
         )
+
+
+def cosine(done: float, final: float, half_waves: int = 1) -> float:
+    """Share of the learning rate left after a share `done` of the steps: from 1 to `final`.
+
+    One half wave falls all the way; three fall, rise to 1 again, and fall.
+    """
+    return final + (1 - final) * 0.5 * (1 + math.cos(half_waves * math.pi * done))
+
+
+def step_at(optimiser: torch.optim.Optimizer, rate: float) -> None:
+    """Take a step at learning rate `rate` and clear the gradients."""
+    for group in optimiser.param_groups:
+        group["lr"] = rate
+    optimiser.step()
+    optimiser.zero_grad(set_to_none=True)

@@ -23,6 +23,8 @@ SIZE = 32
 
 GRID = HashGrid(levels=4, log2_table=10, n_min=4, n_max=32)
 
+Cloud = tuple[HashField, Occupancy]
+
 
 def ball(camera: Camera) -> Tensor:
     """A ball of radius 0.3 in the middle of the cube, coloured by its normal: uint8 [H, W, 4]."""
@@ -92,7 +94,7 @@ def teacher(ball_scene: Scene, shared_log: Log) -> TrainedField:
 
 
 @pytest.fixture
-def cloud(device: str) -> tuple[HashField, Occupancy]:
+def cloud(device: str) -> Cloud:
     """A random field, dense enough to stop rays, in a box of the cube."""
     field = HashField(GRID, precision="fp32", generator=torch.Generator().manual_seed(0))
     with torch.no_grad():

@@ -23,7 +23,7 @@ from bench.types import Budget, Method, NullProbe, Scene, Split
 from methods.checks import found
 from methods.diver.method import Diver
 from methods.diver.training import DiverLessons
-from methods.engines import cuda_graphs
+from methods.engines import torch_engine
 from methods.engines.torch_engine import TorchEngine
 from methods.gaussians.method import GaussianSplatting
 from methods.gaussians.training import Fitting
@@ -44,7 +44,7 @@ from methods.nsvf.method import Nsvf
 from methods.plenoctree.method import PlenOctree
 from methods.plenoctree.start import Extraction
 from methods.plenoctree.training import OctreeLessons
-from methods.rendering import field, rays
+from methods.rendering import field, frame
 from methods.rendering.occupancy import EVERY, STEP
 from methods.steernerf.method import SteerNerf
 from methods.steernerf.options import RangeReduction
@@ -55,8 +55,7 @@ from methods.steernerf_lean import training as lean_training
 from methods.steernerf_lean.lean_renderer import LeanRenderer
 from methods.steernerf_lean.method import SteerNerfLean
 from methods.steernerf_lean.pipeline import LeanPipeline
-from methods.students.fields import StudentField
-from methods.students.networks import NetworkLessons
+from methods.students.fields import FieldLessons, StudentField
 from methods.training import loop
 from tests.methods.conftest import Work
 from tests.methods.models import (
@@ -119,7 +118,7 @@ def gaussians(**where: Any) -> GaussianSplatting:
     return GaussianSplatting(grid=GRID, training=STAGE1, count=40, fitting=Fitting(), **where)
 
 
-NETWORK = NetworkLessons(max_rays=64)
+NETWORK = FieldLessons(max_rays=64)
 EXTRACTION = Extraction(resolution=128, degree=1, rays=200, points=1, directions=4)
 METHODS: Mapping[str, Callable[..., Method]] = {
     "ngp": partial(InstantNgp, grid=GRID, training=STAGE1),
@@ -189,7 +188,7 @@ def one_round(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lean_training, "compacts", lambda device: False)
     for kind in (HashField, StudentField, KiloField, NerfField, NsvfField):
         monkeypatch.setattr(kind, "round_samples", longest_ray(STEP))
-    monkeypatch.setattr(cuda_graphs, "WARM_UP", 1)
+    monkeypatch.setattr(torch_engine, "WARM_UP", 1)
     monkeypatch.setattr(TorchEngine, "samples", lambda engine, network: 1)
 
 
@@ -278,7 +277,7 @@ def test_a_frame_waits_equally_often_whatever_its_rays(
     gpu: PretendedGpu, name: str, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     method = fitted(name, "cuda", scene, tmp_path)
-    monkeypatch.setattr(rays, "CHUNK_RAYS", 50)
+    monkeypatch.setattr(frame, "CHUNK_RAYS", 50)
     counts, marched = [], []
     for size in (16, 32):
         cameras = [scale_camera(c, size, size) for c in scene.splits["test"].cameras]

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from methods.instant_ngp.optimiser import FieldOptimiser
 from methods.instant_ngp.stage1 import TrainedField
-from methods.instant_ngp.training import restore_field
+from methods.instant_ngp.training import FieldOptimiser, restore_field
 from methods.kernels import multiplies_bf16
 from methods.rendering.batch import opacity_entropy
 from methods.rendering.occupancy import EVERY
@@ -20,7 +19,7 @@ from methods.steernerf.renderer import Renderer2d
 from methods.steernerf.training.options import JointOptions
 from methods.steernerf.training.patches import Batch, Patches
 from methods.training import checkpoint, loop
-from methods.training.optimiser import cosine, step_at
+from methods.training.loop import cosine, step_at
 
 
 class JointTraining:

@@ -35,7 +35,7 @@ class MotionOptions:
 
 @dataclass(frozen=True)
 class JointOptions:
-    """How stage 2 is trained; rates fall or wave along `methods.training.optimiser.cosine`."""
+    """How stage 2 is trained; rates fall or wave along `methods.training.loop.cosine`."""
 
     field: Literal["joint", "frozen"]  # frozen: as stage 1 left it (the paper's Table 5)
     features: Literal["random", "constant"]  # initial features beyond RGB; constant: 1/2

@@ -3,18 +3,34 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 import torch
 
+from bench.types import Log
+from methods.engines import Built, Engine, Inputs, Network
 from tests.methods.engines import tensorrt_double
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Callable[[], Path]:
-    return lambda: tmp_path
+def build(tmp_path: Path, quiet_log: Log) -> Callable[..., Built]:
+    """Builds a network with an engine from the inputs of some frames, in a folder."""
+
+    def built(
+        engine: Engine, network: Network, samples: Sequence[Inputs] | None, folder: str = ""
+    ) -> Built:
+        place = tmp_path / folder
+        place.mkdir(exist_ok=True)
+
+        def frames() -> Sequence[Inputs]:
+            assert samples is not None, "the frames are not needed again"
+            return samples
+
+        return engine.build(network, frames, lambda: place, quiet_log)
+
+    return built
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 import json
 from collections.abc import Sequence
-from enum import Enum
+from enum import Enum, IntEnum
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -28,11 +28,8 @@ class Logger:
     def __init__(self, min_severity: int) -> None: ...
 
 
-class NetworkDefinitionCreationFlag(Enum):
+class NetworkDefinitionCreationFlag(IntEnum):
     STRONGLY_TYPED = 0
-
-    def __int__(self) -> int:
-        return self.value
 
 
 class BuilderFlag(Enum):
@@ -55,46 +52,40 @@ class Network:
         return SimpleNamespace(name=tensor.name, shape=shape)
 
 
-class Profile(dict[str, list[list[int]]]):
-    def set_shape(
-        self, input: str, min: Sequence[int], opt: Sequence[int], max: Sequence[int]
-    ) -> None:
-        assert all(a <= b <= c for a, b, c in zip(min, opt, max, strict=True))
-        self[input] = [list(min), list(max)]
-
-
-class Config:
-    def __init__(self) -> None:
-        self.profile: Profile | None = None
-        self.cleared: list[BuilderFlag] = []
-
-    def add_optimization_profile(self, profile: Profile) -> int:
-        self.profile = profile
-        return 0
-
-    def clear_flag(self, flag: BuilderFlag) -> None:
-        self.cleared.append(flag)
-
-
 class Builder:
+    """Also its own config, and the one profile of that."""
+
     built = 0
 
-    def __init__(self, logger: Logger) -> None: ...
+    def __init__(self, logger: Logger) -> None:
+        self.shapes: dict[str, list[list[int]]] = {}
+        self.profiles = 0
 
     def create_network(self, flags: int) -> Network:
         assert flags == 1 << NetworkDefinitionCreationFlag.STRONGLY_TYPED.value
         return Network()
 
-    def create_builder_config(self) -> Config:
-        return Config()
+    def create_builder_config(self) -> Builder:
+        return self
 
-    def create_optimization_profile(self) -> Profile:
-        return Profile()
+    create_optimization_profile = create_builder_config
 
-    def build_serialized_network(self, network: Network, config: Config) -> bytes | None:
-        assert config.profile is not None
+    def clear_flag(self, flag: BuilderFlag) -> None: ...
+
+    def set_shape(
+        self, input: str, min: Sequence[int], opt: Sequence[int], max: Sequence[int]
+    ) -> None:
+        assert all(a <= b <= c for a, b, c in zip(min, opt, max, strict=True))
+        self.shapes[input] = [list(min), list(max)]
+
+    def add_optimization_profile(self, profile: Builder) -> int:
+        self.profiles += 1
+        return 0
+
+    def build_serialized_network(self, network: Network, config: Builder) -> bytes | None:
+        assert config.profiles == 1
         Builder.built += 1
-        return json.dumps(config.profile).encode() + b"\n" + network.model
+        return json.dumps(config.shapes).encode() + b"\n" + network.model
 
 
 class OnnxParser:
@@ -120,25 +111,22 @@ class Runtime:
 
 
 class CudaEngine:
-    def __init__(self, shapes: dict[str, list[list[int]]], model: bytes) -> None:
-        self.shapes, self.session = shapes, onnxruntime.InferenceSession(model)
+    """Also its one execution context."""
 
-    @property
-    def num_io_tensors(self) -> int:
-        return len(self.session.get_inputs()) + len(self.session.get_outputs())
-
-    def create_execution_context(self) -> ExecutionContext:
-        return ExecutionContext(self)
-
-
-class ExecutionContext:
-    def __init__(self, engine: CudaEngine) -> None:
-        self._engine = engine
+    def __init__(self, limits: dict[str, list[list[int]]], model: bytes) -> None:
+        self._limits, self._session = limits, onnxruntime.InferenceSession(model)
         self._shapes: dict[str, tuple[int, ...]] = {}
         self._addresses: dict[str, int] = {}
 
+    @property
+    def num_io_tensors(self) -> int:
+        return len(self._session.get_inputs()) + len(self._session.get_outputs())
+
+    def create_execution_context(self) -> CudaEngine:
+        return self
+
     def set_input_shape(self, name: str, shape: tuple[int, ...]) -> bool:
-        least, most = self._engine.shapes[name]
+        least, most = self._limits[name]
         self._shapes[name] = shape
         return all(a <= b <= c for a, b, c in zip(least, shape, most, strict=True))
 
@@ -148,19 +136,18 @@ class ExecutionContext:
 
     def get_tensor_shape(self, name: str) -> tuple[int, ...]:
         zeros = {x: np.zeros(self._shapes[x], kind) for x, kind in self._kinds().items()}
-        return self._engine.session.run([name], zeros)[0].shape
+        return self._session.run([name], zeros)[0].shape
 
     def execute_async_v3(self, stream_handle: int) -> bool:
-        session = self._engine.session
         kinds = self._kinds().items()
         arrays = {x: self._memory(x, self._shapes[x], kind) for x, kind in kinds}
-        names = [x.name for x in session.get_outputs()]
-        for name, value in zip(names, session.run(names, arrays), strict=True):
+        names = [x.name for x in self._session.get_outputs()]
+        for name, value in zip(names, self._session.run(names, arrays), strict=True):
             self._memory(name, value.shape, value.dtype)[...] = value
         return True
 
     def _kinds(self) -> dict[str, type[np.generic]]:
-        return {x.name: ONNX_TYPES[x.type] for x in self._engine.session.get_inputs()}
+        return {x.name: ONNX_TYPES[x.type] for x in self._session.get_inputs()}
 
     def _memory(
         self, name: str, shape: tuple[int, ...], dtype: type[np.generic] | np.dtype

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable
 
 import numpy as np
 import onnx
@@ -15,50 +14,39 @@ import pytest
 import torch
 
 from bench.errors import SteerbenchError, Unavailable
-from methods.engines import resized
 from methods.engines.tensorrt_engine import TensorRt
 from tests.methods.engines import tensorrt_double
-from tests.methods.engines.test_engines import TOLERANCE, cells, lean, unet
+from tests.methods.engines.test_engines import TOLERANCE, assert_close, blanks, cells, lean, unet
 
 
 @pytest.mark.parametrize("precision", TensorRt.precisions)
-@pytest.mark.parametrize("network", [lean, unet])
-def test_tensors_go_in_and_out_as_the_network_takes_and_gives_them(
-    precision, network, double, tmp_path, quiet_log
-):
-    module, inputs = network()
-    built = TensorRt(precision).build(module, lambda: inputs, lambda: tmp_path, quiet_log)
+@pytest.mark.parametrize("make", [lean, unet])
+def test_tensors_go_in_and_out_as_the_network_takes_and_gives_them(precision, make, double, build):
+    module, inputs = make()
+    built = build(TensorRt(precision), module, inputs)
     for some in inputs:
-        for got, want in zip(built.run(*some), module(*some), strict=True):
-            assert got.shape == want.shape
-            assert got.dtype == torch.float32
-            error = (got - want).square().mean().sqrt()
-            # The tolerance is of half a dozen layers; the U-Net has 19, whose roundings add up as
-            # their square root.
-            depth = math.sqrt(19 / 6) if network is unet else 1.0
-            tolerance = depth * TOLERANCE.get(precision, 2**-8)
-            assert error < tolerance * want.square().mean().sqrt()
+        got = built.run(*some)
+        assert all(x.dtype == torch.float32 for x in got)
+        # The tolerance is of half a dozen layers; the U-Net has 19, whose roundings add up as
+        # their square root.
+        depth = math.sqrt(19 / 6) if make is unet else 1.0
+        assert_close(got, module(*some), depth * TOLERANCE.get(precision, 2**-8))
 
 
-def test_plans_are_built_for_the_sizes_to_expect_and_found_again(double, tmp_path, quiet_log):
+def test_plans_are_built_for_the_sizes_to_expect_and_found_again(double, tmp_path, build):
     module, _ = lean()
-    sample = resized(cells(0), 2 * module.quantum)
-
-    def build(samples: Callable) -> None:
-        TensorRt("fp16").build(module, samples, lambda: tmp_path, quiet_log)
-
-    build(lambda: [sample])
+    build(TensorRt("fp16"), module, [blanks(2 * module.quantum)])
     plans = {path.name for path in tmp_path.glob("*.plan")}
     assert plans == {"upto-512.plan", "upto-1024.plan", "upto-2048.plan"}  # 1, 2 and 3 times 512
-    build(lambda: pytest.fail("the frames are not needed again"))
+    build(TensorRt("fp16"), module, None)
     assert tensorrt_double.Builder.built == 3
 
 
 def test_a_view_of_more_cells_than_expected_has_a_plan_built_and_of_none_needs_none(
-    double, tmp_path, quiet_log
+    double, tmp_path, build
 ):
     module, inputs = lean()
-    built = TensorRt("fp32").build(module, lambda: inputs, lambda: tmp_path, quiet_log)
+    built = build(TensorRt("fp32"), module, inputs)
     before = tensorrt_double.Builder.built
     many = cells(70 * 70)
     for _ in range(2):
@@ -70,9 +58,8 @@ def test_a_view_of_more_cells_than_expected_has_a_plan_built_and_of_none_needs_n
         assert got.shape == want.shape
 
 
-def test_int8_is_symmetric_with_biases_in_float32(double, tmp_path, quiet_log):
-    module, inputs = unet()
-    TensorRt("int8").build(module, lambda: inputs, lambda: tmp_path, quiet_log)
+def test_int8_is_symmetric_with_biases_in_float32(double, tmp_path, build):
+    build(TensorRt("int8"), *unet())
     graph = onnx.load(tmp_path / "network.onnx").graph
     values = {x.name: onnx.numpy_helper.to_array(x) for x in graph.initializer}
     pairs = [n for n in graph.node if n.op_type in ("QuantizeLinear", "DequantizeLinear")]
@@ -83,24 +70,14 @@ def test_int8_is_symmetric_with_biases_in_float32(double, tmp_path, quiet_log):
     assert all(values[bias].dtype == np.float32 for bias in biases)
 
 
-def test_float32_is_not_computed_in_tf32(double, tmp_path, quiet_log, monkeypatch):
-    configs = []
-    make = tensorrt_double.Builder.create_builder_config
-    monkeypatch.setattr(
-        tensorrt_double.Builder,
-        "create_builder_config",
-        lambda self: configs.append(make(self)) or configs[-1],
-    )
-    module, inputs = unet()
+def test_float32_is_not_computed_in_tf32(double, build, monkeypatch):
+    cleared = []
+    clear = "tests.methods.engines.tensorrt_double.Builder.clear_flag"
+    monkeypatch.setattr(clear, lambda config, flag: cleared.append((precision, flag)))
     for precision in TensorRt.precisions:
-        folder = tmp_path / precision
-        folder.mkdir()
-        TensorRt(precision).build(module, lambda: inputs, lambda at=folder: at, quiet_log)
-    assert [config.cleared for config in configs] == [
-        [tensorrt_double.BuilderFlag.TF32],
-        [],
-        [tensorrt_double.BuilderFlag.TF32],  # of what is not quantised
-    ]
+        build(TensorRt(precision), *unet(), precision)
+    tf32 = tensorrt_double.BuilderFlag.TF32
+    assert cleared == [("fp32", tf32), ("int8", tf32)]  # int8: of what is not quantised
 
 
 @pytest.mark.parametrize(
@@ -111,13 +88,11 @@ def test_float32_is_not_computed_in_tf32(double, tmp_path, quiet_log, monkeypatc
         ("Runtime.deserialize_cuda_engine", r"cannot load its plan: remove .*\.plan"),
     ],
 )
-def test_what_tensorrt_refuses_is_said(broken, message, double, tmp_path, quiet_log, monkeypatch):
+def test_what_tensorrt_refuses_is_said(broken, message, double, tmp_path, build, monkeypatch):
     monkeypatch.setattr(f"tests.methods.engines.tensorrt_double.{broken}", lambda *arguments: None)
-    module, inputs = lean()
     with pytest.raises(SteerbenchError, match=message):
-        TensorRt("fp32").build(module, lambda: inputs, lambda: tmp_path, quiet_log)
-    plans = [path.name for path in tmp_path.iterdir() if path.suffix == ".plan"]
-    assert len(plans) == (1 if "Runtime" in broken else 0)
+        build(TensorRt("fp32"), *lean())
+    assert len(list(tmp_path.glob("*.plan"))) == (1 if "Runtime" in broken else 0)
 
 
 def test_a_build_belongs_to_its_gpu_and_version(double, monkeypatch):
@@ -136,9 +111,8 @@ def test_what_is_not_the_first_gpu_is_refused(device, double):
         TensorRt("fp16").check(torch.device(device))
 
 
-def test_inputs_that_a_plan_is_not_for_are_refused(double, tmp_path, quiet_log):
-    module, inputs = unet()  # of one size
-    built = TensorRt("fp32").build(module, lambda: inputs, lambda: tmp_path, quiet_log)
+def test_inputs_that_a_plan_is_not_for_are_refused(double, build):
+    built = build(TensorRt("fp32"), *unet())  # of one size
     with pytest.raises(SteerbenchError, match=r"on \[1, 12, 40, 44\]; it says why above"):
         built.run(torch.zeros(1, 12, 40, 44))
 

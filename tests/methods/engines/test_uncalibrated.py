@@ -12,27 +12,30 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bench.console import ConsoleLog
-from methods.engines import CALIBRATION, Engine, Inputs, Network, required
+from methods.engines import CALIBRATION, Built, Engine, Inputs, Network
 from methods.engines.openvino_engine import OpenVino
 from methods.engines.tensorrt_engine import TensorRt
-from tests.methods.engines.test_engines import lean, unet
+from tests.methods.engines.test_engines import CPU, Make, lean, unet
 
 Kind = Callable[[str, str], Engine]
+Build = Callable[..., Built]
 
-pytestmark = pytest.mark.usefixtures("double", "no_bfloat16")
-
-KINDS = [OpenVino, TensorRt]
-CPU = torch.device("cpu")
+pytestmark = [
+    pytest.mark.usefixtures("double", "no_bfloat16"),
+    pytest.mark.parametrize("kind", [OpenVino, TensorRt]),
+]
 
 
 class Layers(Network):
-    """Two convolutions, and one of what is pooled between them."""
+    """Two convolutions, and one of what is pooled between them. Weights are so large that what they
+    make leaves its range, too."""
 
     def __init__(self) -> None:
         super().__init__()
+        torch.manual_seed(0)
         self.first, self.second = nn.Conv2d(4, 8, 3, padding=1), nn.Conv2d(8, 3, 3, padding=1)
         self.pooled = nn.Conv2d(8, 3, 1)
+        self.requires_grad_(False).first.weight.mul_(2)
 
     def forward(self, x: Tensor) -> Inputs:
         between = self.first(x).relu()
@@ -48,14 +51,6 @@ def no_bfloat16(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("methods.engines.openvino_engine._capabilities", lambda openvino: [])
 
 
-def layers() -> Layers:
-    """With weights so large that what they make leaves its range, too."""
-    torch.manual_seed(0)
-    module = Layers().requires_grad_(False)
-    module.first.weight.mul_(2)
-    return module
-
-
 def noise(seed: int) -> Inputs:
     generator = torch.Generator().manual_seed(seed)
     return (torch.randn(1, 4, 8, 8, generator=generator),)
@@ -66,36 +61,21 @@ def rounded(x: Tensor, largest: float) -> Tensor:
     return (x * 127 / largest).round().clamp(-128, 127) * largest / 127
 
 
-def built(
-    kind: Kind,
-    network: Network,
-    samples: list[Inputs],
-    folder: Path,
-    calibration: str = "none",
-) -> Callable[..., Inputs]:
-    folder.mkdir(exist_ok=True)
-    log = ConsoleLog(folder, quiet=True)
-    engine = kind("int8", calibration)
-    return engine.build(network, lambda: samples, lambda: folder, log).run
-
-
-def weights(kind: Kind, folder: Path) -> list[np.ndarray]:
-    """All 8-bit constants, and the scales of those that are convolved with."""
+def weights(kind: Kind, folder: Path) -> dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]]:
+    """The 8-bit weights that are convolved with, and their scales, by shape."""
     if kind is OpenVino:
-        openvino = required("openvino", "openvino", "openvino")
-        model = openvino.Core().read_model(folder / "network.xml")
+        model = OpenVino().load("openvino").Core().read_model(folder / "network.xml")
         convolved = [op for op in model.get_ordered_ops() if op.get_type_name() == "Convolution"]
         kernels = [op.input_value(1).get_node() for op in convolved]
-        pairs = [
-            (kernel.input_value(0).get_node().input_value(0), kernel.input_value(1))
-            for kernel in kernels
-        ]
-        return [x.get_node().data for pair in pairs for x in pair]
+        pairs = [(k.input_value(0).get_node().input_value(0), k.input_value(1)) for k in kernels]
+        found = [[x.get_node().data for x in pair] for pair in pairs]
+        return {q.shape: (q, scale) for q, scale in found}
     graph = onnx.load(folder / "network.onnx").graph
     values = {x.name: onnx.numpy_helper.to_array(x) for x in graph.initializer}
     makers = {name: node for node in graph.node for name in node.output}
     kernels = [makers[node.input[1]] for node in graph.node if node.op_type == "Conv"]
-    return [values[name] for kernel in kernels for name in kernel.input[:2]]
+    found = [[values[name] for name in kernel.input[:2]] for kernel in kernels]
+    return {q.shape: (q, scale) for q, scale in found}
 
 
 def adds_products_exactly() -> bool:
@@ -105,22 +85,15 @@ def adds_products_exactly() -> bool:
     return any(can.get(name) for name in ("avx512_vnni", "avx_vnni", "amx_int8"))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_activations_are_rounded_on_the_ranges_of_trtexec(kind: Kind, tmp_path: Path) -> None:
+def test_activations_are_rounded_on_the_ranges_of_trtexec(
+    kind: Kind, build: Build, tmp_path: Path
+) -> None:
     if kind is OpenVino and not adds_products_exactly():
         pytest.skip("this CPU has no VNNI: sums of 8-bit products saturate")
-    module, inputs = layers(), (3 * noise(1)[0],)  # beyond all three ranges
-    got = built(kind, module, [noise(0)], tmp_path)(*inputs)
-    found = weights(kind, tmp_path)
-    kernels = [
-        torch.from_numpy(q * scale.reshape(-1, 1, 1, 1))
-        for q, scale in zip(found[::2], found[1::2], strict=True)
-    ]
-    by_shape = {tuple(kernel.shape): kernel for kernel in kernels}
-    first, second, pooled = (
-        by_shape[tuple(layer.weight.shape)]
-        for layer in (module.first, module.second, module.pooled)
-    )
+    module, inputs = Layers(), (3 * noise(1)[0],)  # beyond all three ranges
+    got = build(kind("int8", "none"), module, [noise(0)]).run(*inputs)
+    found = [weights(kind, tmp_path)[layer.weight.shape] for layer in module.children()]
+    first, second, pooled = (torch.from_numpy(q * scale.reshape(-1, 1, 1, 1)) for q, scale in found)
     x = rounded(inputs[0], 2)
     between = functional.conv2d(x, first, module.first.bias, padding=1).relu()
     assert between.max() > 4
@@ -136,59 +109,45 @@ def test_activations_are_rounded_on_the_ranges_of_trtexec(kind: Kind, tmp_path: 
     assert (got[1] - want).abs().max() < step + 1e-5
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_weights_are_those_of_int8_on_frames(kind: Kind, tmp_path: Path) -> None:
+def test_weights_are_those_of_int8_on_frames(kind: Kind, build: Build, tmp_path: Path) -> None:
     found = {}
     for calibration in ("frames", "none"):
-        built(kind, layers(), [noise(0)], tmp_path / calibration, calibration)
+        build(kind("int8", calibration), Layers(), [noise(0)], calibration)
         found[calibration] = weights(kind, tmp_path / calibration)
-    assert len(found["none"]) == 6
-    for some, others in zip(found["none"], found["frames"], strict=True):
-        assert np.array_equal(some, others)
-    if kind is TensorRt:  # every channel is scaled by its largest weight
-        module = layers()
-        largest = {
-            tuple(layer.weight.shape): layer.weight.abs().amax((1, 2, 3)).numpy()
-            for layer in (module.first, module.second, module.pooled)
-        }
-        for q, scale in zip(found["none"][::2], found["none"][1::2], strict=True):
-            assert np.allclose(127 * scale, largest[q.shape], rtol=1e-6)
+    for layer in Layers().children():
+        q, scale = found["none"][layer.weight.shape]
+        assert all(map(np.array_equal, (q, scale), found["frames"][layer.weight.shape]))
+        if kind is TensorRt:  # every channel is scaled by its largest weight
+            largest = layer.weight.abs().amax((1, 2, 3)).numpy()
+            assert np.allclose(127 * scale, largest, rtol=1e-6)
             assert (np.abs(q.astype(int)).reshape(len(q), -1).max(1) == 127).all()
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_no_number_of_a_frame_is_read(kind: Kind, tmp_path: Path) -> None:
-    samples = (noise(0), (9 * noise(1)[0],))
+def test_no_number_of_a_frame_is_read(kind: Kind, build: Build) -> None:
+    samples = {"once": noise(0), "again": (9 * noise(1)[0],)}
     once, again = (
-        built(kind, layers(), [some], tmp_path / str(place))(*noise(2))
-        for place, some in enumerate(samples)
+        build(kind("int8", "none"), Layers(), [some], folder).run(*noise(2))
+        for folder, some in samples.items()
     )
     for a, b in zip(once, again, strict=True):
         assert torch.equal(a, b)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("network", [lean, unet])
-def test_networks_are_computed_within_half_a_step(
-    network: Callable[[], tuple[Network, list[Inputs]]], kind: Kind, tmp_path: Path
-) -> None:
-    module, inputs = network()
-    run = built(kind, module, inputs[:1], tmp_path)
+@pytest.mark.parametrize("make", [lean, unet])
+def test_networks_are_computed_within_half_a_step(make: Make, kind: Kind, build: Build) -> None:
+    module, inputs = make()
+    run = build(kind("int8", "none"), module, inputs[:1]).run
     for got, want in zip(run(*inputs[0]), module(*inputs[0]), strict=True):
         assert (got - want).square().mean().sqrt() < 4 / 127 / 2
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("network", [lean, unet])
-def test_no_more_frames_are_needed_than_without_int8(
-    network: Callable[[], tuple[Network, list[Inputs]]], kind: Kind
-) -> None:
-    module, _ = network()
+@pytest.mark.parametrize("make", [lean, unet])
+def test_no_more_frames_are_needed_than_without_int8(make: Make, kind: Kind) -> None:
+    module, _ = make()
     assert kind("int8", "none").samples(module) == kind("fp32", "frames").samples(module)
     assert kind("int8", "frames").samples(module) == CALIBRATION
 
 
-@pytest.mark.parametrize("kind", KINDS)
 def test_only_int8_depends_on_the_calibration(kind: Kind) -> None:
     assert kind("int8", "none").key() != kind("int8", "frames").key()
     assert kind("int8", "none").computed(CPU) == "int8 uncalibrated+fp32"

@@ -1,4 +1,4 @@
-"""Pixels of the training pictures: which rays they have, and which are drawn."""
+"""Pixels of the training pictures: their rays, which are drawn, and where the error is."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ import torch
 
 from bench.cameras import cast
 from bench.types import Scene, Split
-from methods.instant_ngp.pixels import STRIP, PixelBatches
+from methods.instant_ngp.pixels import RUN, STRIP, UNSEEN, ErrorMap, PixelBatches
+
+CPU = torch.device("cpu")
 
 
 def test_rays_go_through_the_pixels_whose_colours_they_carry(ball_scene: Scene) -> None:
-    batches = PixelBatches(ball_scene.splits["train"], torch.device("cpu"))
+    batches = PixelBatches(ball_scene.splits["train"], CPU)
     rays, colours = batches.draw(500, torch.Generator().manual_seed(0))
     towards = torch.nn.functional.normalize(rays.directions, dim=-1)
     offset = 0.5 - rays.origins
@@ -34,7 +36,7 @@ def test_rays_of_pictures_of_several_sizes_are_those_of_their_cameras(ball_scene
     )
     pairs = zip(cameras, split.images, strict=False)
     images = [image[: camera.height, : camera.width] for camera, image in pairs]
-    batches = PixelBatches(Split(cameras, images, split.names[:3]), torch.device("cpu"))
+    batches = PixelBatches(Split(cameras, images, split.names[:3]), CPU)
     rays, colours = batches.at(torch.arange(len(batches)))
     expected = [cast(camera) for camera in cameras]
     for found, of_pixels in (
@@ -49,13 +51,13 @@ def test_rays_of_pictures_of_several_sizes_are_those_of_their_cameras(ball_scene
 
 
 def test_every_pixel_is_drawn_once_if_as_many_are_drawn_as_there_are(ball_scene: Scene) -> None:
-    batches = PixelBatches(ball_scene.splits["train"], torch.device("cpu"))
+    batches = PixelBatches(ball_scene.splits["train"], CPU)
     drawn = batches.choose(len(batches), torch.Generator().manual_seed(0))
     assert torch.equal(drawn, torch.arange(len(batches)))
 
 
 def test_any_pixel_can_be_drawn(ball_scene: Scene) -> None:
-    batches = PixelBatches(ball_scene.splits["train"], torch.device("cpu"))
+    batches = PixelBatches(ball_scene.splits["train"], CPU)
     generator = torch.Generator().manual_seed(0)
     # Each has a chance of 1/4: one of N is missed 200 times with a probability below 1e-20 N.
     drawn = torch.cat([batches.choose(len(batches) // 4, generator) for _ in range(200)])
@@ -66,8 +68,32 @@ def test_an_opaque_picture_among_transparent_ones_is_opaque(ball_scene: Scene) -
     split = ball_scene.splits["train"]
     images = [split.images[0][..., :3], split.images[1]]
     mixed = Split(split.cameras[:2], images, split.names[:2])
-    _, colours = PixelBatches(mixed, torch.device("cpu")).draw(
-        4000, torch.Generator().manual_seed(0)
-    )
+    _, colours = PixelBatches(mixed, CPU).draw(4000, torch.Generator().manual_seed(0))
     transparent = (split.images[1][..., 3] == 0).float().mean().item() / 2
     assert (colours[:, 3] == 0).float().mean().item() == pytest.approx(transparent, abs=0.05)
+
+
+def test_runs_are_drawn_in_proportion_to_the_root_of_their_error() -> None:
+    chances = ErrorMap(3 * RUN, CPU)
+    chances.errors.copy_(torch.tensor([0.04, 0.0, 0.36]))
+    chances.refresh()
+    drawn = chances.draw(400, torch.Generator().manual_seed(0)) // RUN
+    assert torch.equal(drawn, drawn.sort().values)
+    # One from each of 400 equal parts, of which the first 100 belong to the first run.
+    assert torch.bincount(drawn, minlength=3).tolist() == pytest.approx([100, 0, 300], abs=1)
+
+
+def test_all_pixels_of_a_run_can_be_drawn_and_none_beyond_the_last() -> None:
+    pixels = RUN + 3
+    chances = ErrorMap(pixels, CPU)
+    drawn = chances.draw(100 * RUN, torch.Generator().manual_seed(0))
+    assert torch.equal(drawn.unique(), torch.arange(pixels))
+
+
+def test_a_new_error_counts_as_much_as_the_estimate() -> None:
+    chances = ErrorMap(2 * RUN, CPU)
+    chances.learn(torch.tensor([0, RUN - 1]), torch.tensor([0.5, 0.3]))
+    first = (UNSEEN + 0.5 + 0.3) / 3
+    assert chances.errors.tolist() == pytest.approx([first, UNSEEN])
+    chances.learn(torch.tensor([1, RUN]), torch.tensor([0.4, 0.0]))
+    assert chances.errors.tolist() == pytest.approx([(first + 0.4) / 2, UNSEEN / 2])

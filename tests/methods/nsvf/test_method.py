@@ -1,4 +1,4 @@
-"""NSVF as a method: its voxels and network, what it learns, that a kill does no harm."""
+"""NSVF as a method: its voxels, its network, and where its embeddings begin."""
 
 from __future__ import annotations
 
@@ -17,13 +17,8 @@ from methods.kernels.encode import encode
 from methods.kernels.types import Occupancy
 from methods.nsvf.field import NsvfField
 from methods.nsvf.method import Nsvf
-from methods.students.networks import NetworkLessons
-from tests.methods.trainings import (
-    EXACT_GRID,
-    EXACT_TEACHER,
-    TAUGHT,
-    TEACHER,
-)
+from methods.students.fields import FieldLessons
+from tests.methods.trainings import EXACT_GRID, EXACT_TEACHER, TAUGHT, TEACHER
 
 BUDGET = replace(TAUGHT, steps=80, renderer_steps=4)
 U = 2.0**-24
@@ -31,17 +26,8 @@ SINES = (torch.sin, torch.cos)
 
 
 def new_method(**options: Any) -> Nsvf:
-    training = NetworkLessons(rate=2e-3)
-    return Nsvf(
-        **{"teacher": EXACT_TEACHER, "training": training, "resolution": 32, "start": "random"}
-        | options
-    )
-
-
-def fitted(scene: Scene, log: Log, steps: int, **options: Any) -> Nsvf:
-    method = new_method(**options)
-    method.fit(scene, replace(BUDGET, renderer_steps=steps), log)
-    return method
+    given = {"teacher": EXACT_TEACHER, "resolution": 32, "start": "random"} | options
+    return Nsvf(training=FieldLessons(rate=2e-3), **given)
 
 
 def two_thirds(backend: str = "reference") -> NsvfField:
@@ -108,7 +94,9 @@ def test_the_network_is_that_of_the_publication() -> None:
 
 
 def test_its_step_is_in_voxels(ball_scene: Scene, shared_log: Log) -> None:
-    assert fitted(ball_scene, shared_log, steps=2).how.step == 0.5 / 32
+    method = new_method()
+    method.fit(ball_scene, replace(BUDGET, renderer_steps=2), shared_log)
+    assert method.how.step == 0.5 / 32
     assert new_method(step=0.25).sampling(BUDGET).step == 0.25 / 32
 
 

@@ -11,11 +11,8 @@ from tests.pretended_gpu import PretendedGpu
 MASK = torch.tensor([False, True, True, False, True])
 
 
-def test_on_a_cpu_what_is_worth_computing_is_listed() -> None:
+def test_a_gpu_computes_all_and_waits_for_nothing_a_cpu_what_is_worth_it(gpu: PretendedGpu) -> None:
     assert kept_indices(MASK).tolist() == [1, 2, 4]
-
-
-def test_on_a_gpu_all_is_computed_and_nothing_is_waited_for(gpu: PretendedGpu) -> None:
     mask = MASK.to("cuda")
     with device_waits() as waits:
         found = kept_indices(mask)
@@ -30,7 +27,4 @@ def test_the_places_of_many_masks_are_waited_for_once(gpu: PretendedGpu) -> None
         found = indices_where(there)
     assert [place.tolist() for place in found] == [[1, 2, 4], [0, 3], [], []]
     assert waits.total() == 1
-
-
-def test_no_masks_have_no_places() -> None:
     assert indices_where([]) == []

@@ -1,4 +1,4 @@
-"""Which rays of a frame are rendered, and what stands in its pixels."""
+"""Which rays of a frame are rendered, how, and what stands in its pixels."""
 
 from __future__ import annotations
 
@@ -12,17 +12,16 @@ from bench.types import EMPTY_ALPHA, NullProbe
 from methods.instant_ngp.field import HashField
 from methods.kernels.march import march
 from methods.kernels.types import Occupancy
-from methods.rendering.frame import everywhere, rays_at_matter, render_frame
+from methods.rendering import frame as rendering
+from methods.rendering.batch import render_batch
+from methods.rendering.frame import everywhere, rays_at_matter, render_frame, render_rays
 from methods.rendering.occupancy import STEP
-from methods.rendering.rays import render_rays
-from methods.rendering.sampling import Sampling
-from tests.methods.conftest import Work, look_at_the_middle
+from methods.rendering.sampling import FAINT, Sampling
+from tests.methods.conftest import GRID, Cloud, Work, look_at_the_middle
 
 
 @pytest.mark.parametrize(("turn", "lift"), [(0.0, 0.0), (0.13, 0.7), (0.6, -1.2)])
-def test_no_ray_that_has_samples_is_left_out(
-    cloud: tuple[HashField, Occupancy], turn: float, lift: float
-) -> None:
+def test_no_ray_that_has_samples_is_left_out(cloud: Cloud, turn: float, lift: float) -> None:
     occupancy = Occupancy(cloud[1].cells.cpu())
     camera = look_at_the_middle(turn, lift)
     pixels, rays = rays_at_matter(camera, occupancy)
@@ -43,7 +42,7 @@ def test_a_camera_inside_the_matter_sees_it_in_all_pixels() -> None:
     assert len(pixels) == camera.width * camera.height
 
 
-def test_a_frame_is_its_rays_on_the_background(cloud: tuple[HashField, Occupancy]) -> None:
+def test_a_frame_is_its_rays_on_the_background(cloud: Cloud) -> None:
     field, occupancy = cloud
     camera = replace(place_camera(look_at_the_middle(0.1, 0.4), field.device), width=20)
     background, work = torch.tensor((0.25, 0.5, 1.0), device=field.device), Work()
@@ -64,7 +63,7 @@ def test_a_frame_is_its_rays_on_the_background(cloud: tuple[HashField, Occupancy
     assert work.done["rays"] == len(rays_at_matter(camera, occupancy)[0]) < 32 * 20
 
 
-def test_a_window_is_that_of_its_pixel(cloud: tuple[HashField, Occupancy]) -> None:
+def test_a_window_is_that_of_its_pixel(cloud: Cloud) -> None:
     """Half of the pixels may look nowhere, though `render_frame` asks for some pixels only."""
     field, occupancy = cloud
     camera = place_camera(look_at_the_middle(0.1, 0.4), field.device)
@@ -78,3 +77,86 @@ def test_a_window_is_that_of_its_pixel(cloud: tuple[HashField, Occupancy]) -> No
     assert whole.alpha[:, :16].any()
     assert not half.alpha[:, :16].any()
     torch.testing.assert_close(half.alpha[:, 16:], whole.alpha[:, 16:], rtol=0, atol=1e-6)
+
+
+def test_rounds_render_what_one_go_renders(cloud: Cloud, device: str) -> None:
+    field, occupancy = cloud
+    rays = cast(place_camera(look_at_the_middle(0.1, 0.4), device))
+    half = torch.full((len(rays.origins),), 0.5, device=device)
+    with torch.no_grad():
+        whole, _ = render_batch(field, rays, occupancy, Sampling(), jitter=half)
+    rounds = render_rays(field, rays, occupancy, NullProbe(), Sampling())
+    assert whole.alpha.max() > 0.5
+    # Both end a ray at the same transmittance; sums are added up in another grouping.
+    torch.testing.assert_close(rounds.values, whole.values, rtol=0, atol=1e-4)
+    torch.testing.assert_close(rounds.depth_sum, whole.depth_sum, rtol=0, atol=3e-4)
+    torch.testing.assert_close(rounds.alpha, whole.alpha, rtol=0, atol=1e-4)
+
+
+def test_at_once_rays_look_as_in_rounds(
+    cloud: Cloud, device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    field, occupancy = cloud
+    rays = cast(place_camera(look_at_the_middle(0.1, 0.4), device))
+    window = torch.tensor((0.0, 1.7), device=device).expand(len(rays.origins), 2)
+    found = []
+    for compacts, chunk in ((True, 10_000), (False, 10_000), (False, 100)):
+        monkeypatch.setattr(rendering, "compacts", lambda device, compacts=compacts: compacts)
+        monkeypatch.setattr(rendering, "CHUNK_RAYS", chunk)
+        found.append(render_rays(field, rays, occupancy, NullProbe(), Sampling(window=window)))
+    rounds, once, chunks = found
+    assert 0.2 < rounds.alpha.max() < 1
+    for name in ("values", "depth_sum", "alpha"):
+        # As in `test_rounds_render_what_one_go_renders`.
+        a, b, c = (getattr(pixels, name) for pixels in (rounds, once, chunks))
+        torch.testing.assert_close(a, b, rtol=0, atol=3e-4)
+        torch.testing.assert_close(b, c, rtol=0, atol=1e-6)
+
+
+def test_samples_behind_the_early_stop_are_hardly_evaluated() -> None:
+    field = HashField(GRID, precision="fp32", generator=torch.Generator().manual_seed(0))
+    field.density = lambda positions: (  # type: ignore[method-assign]
+        torch.full((len(positions),), 1e5),
+        torch.zeros(len(positions), 16),
+    )
+    occupancy = Occupancy(torch.ones(32, 32, 32, dtype=torch.bool))
+    rays, work = cast(look_at_the_middle(0.0, 0.0)), Work()
+    pixels = render_rays(field, rays, occupancy, work, Sampling())
+    hit = int((pixels.alpha > 0).sum())
+    assert hit > 0
+    assert work.done["samples"] <= field.round_samples * hit  # one round for each ray that hits
+
+
+@pytest.mark.parametrize("compacts", [True, False])
+def test_faint_samples_are_black_and_not_looked_at_in_rounds(
+    cloud: Cloud, compacts: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rendering, "compacts", lambda device: compacts)
+    field, occupancy = cloud
+    rays = cast(place_camera(look_at_the_middle(0.1, 0.4), field.device))
+    stop, work = 0.01, Work()
+    rendered = render_rays(field, rays, occupancy, work, Sampling(stop=stop))
+    assert work.done["shaded_samples"] > 0
+    assert (work.done["shaded_samples"] < work.done["samples"]) == compacts
+    # Of a field whose features are 1 everywhere, what is shown is the sum of the weights seen.
+    field.features = lambda geometry, directions: torch.ones(  # type: ignore[method-assign]
+        len(geometry), field.channels, device=geometry.device
+    )
+    seen = render_rays(field, rays, occupancy, NullProbe(), Sampling(stop=stop))
+    torch.testing.assert_close(seen.alpha, rendered.alpha, rtol=0, atol=0)
+    missing = seen.alpha - seen.values[:, 0]
+    samples = march(rays, occupancy, STEP).offsets.diff()
+    assert missing.min() > -1e-5
+    assert (missing <= samples * FAINT * stop + 1e-5).all()
+    assert missing.max() > 0
+
+
+@pytest.mark.parametrize("compacts", [True, False])
+def test_an_empty_grid_renders_nothing(compacts: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rendering, "compacts", lambda device: compacts)
+    field = HashField(GRID, generator=torch.Generator().manual_seed(0))
+    occupancy = Occupancy(torch.zeros(16, 16, 16, dtype=torch.bool))
+    camera = look_at_the_middle(0.0, 0.0)
+    rendered = render_rays(field, cast(camera), occupancy, NullProbe(), Sampling())
+    assert len(rendered.alpha) == camera.width * camera.height
+    assert not rendered.alpha.any()

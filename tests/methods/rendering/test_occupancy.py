@@ -7,60 +7,29 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
 from methods.rendering.occupancy import (
     DECAY,
     INITIAL,
     RESOLUTION,
-    STEP,
     THRESHOLD,
     DensityGrid,
     learnable_cells,
 )
 from tests.methods.conftest import look_at_the_middle
+from tests.methods.solids import Solid, slab
 
 UNIT_CUBE = torch.tensor([[0.0] * 3, [1.0] * 3])
 WHOLE = torch.ones(RESOLUTION, RESOLUTION, RESOLUTION, dtype=torch.bool)
 AROUND = [look_at_the_middle(turn / 4, lift) for turn in range(4) for lift in (-0.5, 0.5)]
 
 
-class Slab:
-    """A field of density `sigma` where x < 1/4, nothing elsewhere."""
-
-    def __init__(self, sigma: float) -> None:
-        self.sigma = sigma
-
-    def density(self, positions: Tensor) -> tuple[Tensor, None]:
-        return self.sigma * (positions[:, 0] < 0.25).float(), None
-
-
 GENERATOR = torch.Generator().manual_seed(0)
 
 
-def test_the_threshold_is_an_opacity_of_one_percent_a_step() -> None:
-    assert abs(THRESHOLD * STEP - 0.01) < 1e-12
-
-
-def swept(grid: DensityGrid, field: Slab, sweeps: int = 8) -> DensityGrid:
-    """Visit each cell `sweeps` times and more; one in e^sweeps is left out."""
-    for _ in range(sweeps):
-        grid.update(field, GENERATOR, samples=2 * grid.density.numel())
-    return grid
-
-
-def test_visits_find_the_matter_and_nothing_else() -> None:
-    cells = swept(DensityGrid(WHOLE), Slab(100.0)).occupancy.cells
-    assert cells[: RESOLUTION // 4].all()
-    assert cells[RESOLUTION // 4 :].float().mean() < 10 * math.exp(-8)
-
-
-def test_cells_that_may_not_be_occupied_stay_empty() -> None:
-    allowed = WHOLE.clone()
-    allowed[:, RESOLUTION // 2 :] = False
-    cells = swept(DensityGrid(allowed), Slab(100.0)).occupancy.cells
-    assert cells[: RESOLUTION // 4, : RESOLUTION // 2].all()
-    assert not cells[:, RESOLUTION // 2 :].any()
+def quarter(sigma: float) -> Solid:
+    """A field of density `sigma` where x < 1/4, nothing elsewhere."""
+    return Solid(slab(-1.0, 0.25), density=sigma)
 
 
 def test_cells_outside_the_bounds_cannot_be_learnt() -> None:
@@ -92,7 +61,7 @@ def test_cells_at_a_camera_cannot_be_learnt() -> None:
 
 def test_a_cell_is_occupied_until_it_was_visited_and_keeps_its_value_in_between() -> None:
     grid = DensityGrid(WHOLE)
-    grid.update(Slab(0.0), GENERATOR, samples=4096)
+    grid.update(quarter(0.0), GENERATOR, samples=4096)
     visited = grid.density < INITIAL
     assert 0 < visited.sum() <= 4096
     torch.testing.assert_close(
@@ -104,20 +73,16 @@ def test_a_cell_is_occupied_until_it_was_visited_and_keeps_its_value_in_between(
 def test_a_density_that_is_not_a_number_is_as_good_as_none() -> None:
     grid, other = DensityGrid(WHOLE), DensityGrid(WHOLE)
     for one, sigma in ((grid, math.nan), (other, 0.0)):
-        one.update(Slab(sigma), torch.Generator().manual_seed(1), samples=4096)
+        one.update(quarter(sigma), torch.Generator().manual_seed(1), samples=4096)
     assert torch.equal(grid.density, other.density)
 
 
 @pytest.mark.slow
 def test_matter_that_is_thin_everywhere_is_kept_where_it_is_denser_than_the_mean() -> None:
-    thin = Slab(0.1 * THRESHOLD)
-    cells = swept(DensityGrid(WHOLE), thin, sweeps=24).occupancy.cells  # 1.2 * 0.8^24 < 0.1
+    thin = quarter(0.1 * THRESHOLD)
+    grid = DensityGrid(WHOLE)
+    for _ in range(24):  # 1.2 * 0.8^24 < 0.1
+        grid.update(thin, GENERATOR, samples=2 * grid.density.numel())
+    cells = grid.occupancy.cells
     assert cells[: RESOLUTION // 4].all()
     assert cells[RESOLUTION // 4 :].float().mean() < 0.5
-
-
-def test_a_restored_grid_is_the_same_grid() -> None:
-    grid, restored = DensityGrid(WHOLE), DensityGrid(WHOLE)
-    grid.update(Slab(100.0), GENERATOR, samples=1 << 16)
-    restored.restore(grid.density)
-    assert torch.equal(restored.occupancy.cells, grid.occupancy.cells)

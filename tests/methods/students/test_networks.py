@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from methods.kernels import multiplies_bf16
-from methods.students.networks import Dense, density_of, positional, positional_channels
+from methods.students.networks import Dense, density_of, positional
 
 U = 2.0**-24
 
@@ -19,7 +19,7 @@ U = 2.0**-24
 def test_positional_encoding_is_its_formula(frequencies: int, identity: bool, scale: float) -> None:
     values = 2 * torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) - 1
     found = positional(values, frequencies, identity=identity, scale=scale)
-    assert found.shape == (300, positional_channels(3, frequencies, identity=identity))
+    assert found.shape == (300, 3 * (2 * frequencies + identity))
     exact = values.double()
     waves = [f(scale * 2.0**k * exact) for k in range(frequencies) for f in (torch.sin, torch.cos)]
     wanted = torch.cat([exact, *waves] if identity else waves, dim=1)

@@ -23,17 +23,10 @@ from methods.nsvf.method import Nsvf
 from methods.plenoctree.method import PlenOctree
 from methods.plenoctree.start import Extraction
 from methods.plenoctree.training import OctreeLessons
+from methods.students.fields import FieldLessons
 from methods.students.method import Student
-from methods.students.networks import NetworkLessons
 from methods.training import loop
-from sweeps.overrides import composed
-from tests.methods.trainings import (
-    EXACT_TEACHER,
-    TAUGHT,
-    TEACHER,
-    goes_on_after_a_kill,
-    quality,
-)
+from tests.methods.trainings import EXACT_TEACHER, TAUGHT, TEACHER, goes_on_after_a_kill, quality
 
 LEAVES = {"resolution": 128, "degree": 1, "rays": 20_000, "points": 2, "directions": 8}
 SMALL: dict[str, Callable[..., Student]] = {
@@ -43,13 +36,9 @@ SMALL: dict[str, Callable[..., Student]] = {
     "kilonerf": partial(
         KiloNerf, teacher=TEACHER, training=KiloLessons(points_each=64, rate=1e-2), networks=4
     ),
-    "nerf": partial(Nerf, teacher=EXACT_TEACHER, training=NetworkLessons()),
+    "nerf": partial(Nerf, teacher=EXACT_TEACHER, training=FieldLessons()),
     "nsvf": partial(
-        Nsvf,
-        teacher=EXACT_TEACHER,
-        training=NetworkLessons(rate=2e-3),
-        resolution=32,
-        start="random",
+        Nsvf, teacher=EXACT_TEACHER, training=FieldLessons(rate=2e-3), resolution=32, start="random"
     ),
     "plenoctree": partial(
         PlenOctree,
@@ -114,55 +103,35 @@ def test_by_triton_there_is_none(name: str) -> None:
         SMALL[name](teacher=replace(EXACT_TEACHER, backend="gpu"))
 
 
-@names
-def test_a_step_of_the_full_budget_has_the_rays_of_the_release(name: str) -> None:
-    assert composed([f"method={name}", "budget=full"]).method.training.max_rays == 16_384
-
-
-REFUSED: list[tuple[str, dict[str, Any]]] = [
-    *((name, {"stop": 1.0}) for name in SMALL),
-    *((name, {"steps": 0}) for name in SMALL),
-    ("diver", {"resolution": 100}),
-    ("diver", {"resolution": 1024}),
-    ("diver", {"stored": "int8"}),
-    ("diver", {"faint": 1.0}),
-    ("kilonerf", {"networks": 0}),
-    ("kilonerf", {"networks": 33}),
-    ("nsvf", {"resolution": 40}),
-    ("nsvf", {"step": 0.0}),
-    ("nsvf", {"start": "zero"}),
-    ("plenoctree", {"stored": "fp8"}),
+REFUSED: list[tuple[Callable[..., Any], str, Any]] = [
+    *((make, "stop", 1.0) for make in SMALL.values()),
+    *((make, "steps", 0) for make in SMALL.values()),
+    *((SMALL["diver"], "resolution", x) for x in (100, 1024)),
+    (SMALL["diver"], "stored", "int8"),
+    (SMALL["diver"], "faint", 1.0),
+    *((SMALL["kilonerf"], "networks", x) for x in (0, 33)),
+    (SMALL["nsvf"], "resolution", 40),
+    (SMALL["nsvf"], "step", 0.0),
+    (SMALL["nsvf"], "start", "zero"),
+    (SMALL["plenoctree"], "stored", "fp8"),
+    (DiverLessons, "corner_rate", 0.0),
+    (DiverLessons, "prune_at", 2.0),
+    (DiverLessons, "prune_below", 1.0),
+    *((FieldLessons, "share", x) for x in (0.0, 1.5)),
+    (FieldLessons, "points", 2.0),
+    (KiloLessons, "points_each", 0),
+    (KiloLessons, "view_cost", -1.0),
+    (OctreeLessons, "density_rate", -1.0),
+    (OctreeLessons, "samples", 0),
+    *((partial(Extraction, **LEAVES), "resolution", x) for x in (100, 4096)),
+    (partial(Extraction, **LEAVES), "degree", 4),
+    (partial(Extraction, **LEAVES), "directions", 3),
+    (partial(Extraction, **LEAVES), "rays", 0),
+    (partial(Extraction, **LEAVES), "least_weight", float("nan")),
 ]
 
 
-@pytest.mark.parametrize(("name", "wrong"), REFUSED, ids=str)
-def test_wrong_settings_are_refused(name: str, wrong: dict[str, Any]) -> None:
-    (setting,) = wrong
-    with pytest.raises(ValueError, match=f"{setting}: expected"):
-        SMALL[name](**wrong)
-
-
-@pytest.mark.parametrize(
-    ("kind", "wrong"),
-    [
-        (DiverLessons, {"corner_rate": 0.0}),
-        (DiverLessons, {"prune_at": 2.0}),
-        (DiverLessons, {"prune_below": 1.0}),
-        (KiloLessons, {"points_each": 0}),
-        (KiloLessons, {"view_cost": -1.0}),
-        (KiloLessons, {"points": 2.0}),
-        (NetworkLessons, {"share": 0.0}),
-        (NetworkLessons, {"share": 1.5}),
-        (OctreeLessons, {"density_rate": -1.0}),
-        (OctreeLessons, {"samples": 0}),
-        (Extraction, LEAVES | {"resolution": 100}),
-        (Extraction, LEAVES | {"resolution": 4096}),
-        (Extraction, LEAVES | {"degree": 4}),
-        (Extraction, LEAVES | {"directions": 3}),
-        (Extraction, LEAVES | {"rays": 0}),
-        (Extraction, LEAVES | {"least_weight": float("nan")}),
-    ],
-)
-def test_wrong_lessons_are_refused(kind: Any, wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="expected"):
-        kind(**wrong)
+@pytest.mark.parametrize(("make", "setting", "value"), REFUSED)
+def test_wrong_settings_are_refused(make: Callable[..., Any], setting: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=f"^{setting}: expected"):
+        make(**{setting: value})
