@@ -35,8 +35,7 @@ from methods.kernels import availability, multiplies_bf16
 from methods.kernels.encode import HashGrid
 from methods.kernels.march import longest_ray
 from methods.kilonerf.field import KiloField
-from methods.kilonerf.method import KiloNerf
-from methods.kilonerf.training import KiloLessons
+from methods.kilonerf.method import KiloLessons, KiloNerf
 from methods.nerf.field import NerfField
 from methods.nerf.method import Nerf
 from methods.nsvf.field import NsvfField

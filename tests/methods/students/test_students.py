@@ -16,8 +16,7 @@ from bench.types import Budget, Log, NullProbe, Scene, Unavailable
 from methods.diver.method import Diver
 from methods.diver.training import DiverLessons
 from methods.instant_ngp.stage1 import train_field
-from methods.kilonerf.method import KiloNerf
-from methods.kilonerf.training import KiloLessons
+from methods.kilonerf.method import KiloLessons, KiloNerf
 from methods.nerf.method import Nerf
 from methods.nsvf.method import Nsvf
 from methods.plenoctree.method import PlenOctree

@@ -5,12 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from methods.kilonerf.kernels.grouped_mlp import (
-    Groups,
-    Networks,
-    composed_colours,
-    composed_densities,
-)
+from methods.kilonerf.kernels.grouped_mlp import Networks, composed_colours, composed_densities
 
 
 def locate(positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
@@ -22,11 +17,10 @@ def locate(positions: Tensor, cubes: Tensor, corner: Tensor, side: Tensor) -> tu
     return torch.where(inside, cubes[x, y, z], -1), 2 * (scaled - cell) - 1
 
 
-def order(networks: Tensor, count: int) -> Groups:
+def order(networks: Tensor, count: int) -> tuple[Tensor, Tensor]:
     sorted_, permutation = networks.long().sort(stable=True)
-    numbers = torch.arange(count + 1, device=networks.device)
-    offsets = torch.searchsorted(sorted_, numbers)
-    return Groups(permutation[int(offsets[0]) :], offsets - offsets[0])
+    offsets = torch.searchsorted(sorted_, torch.arange(count + 1, device=networks.device))
+    return permutation[int(offsets[0]) :], offsets - offsets[0]
 
 
 def encode_frequencies(inputs: Tensor, frequencies: int) -> Tensor:
