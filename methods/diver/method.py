@@ -10,8 +10,7 @@ from torch import Tensor
 
 from bench.study import Axis, Study, Variant, turned
 from bench.types import Budget, Probe, Rays, Scene
-from methods.diver.decoder import Decoder
-from methods.diver.model import CornerModel
+from methods.diver.model import CornerModel, Decoder
 from methods.diver.rendering import Baked, Stored
 from methods.diver.training import DiverLessons, DiverTraining
 from methods.instant_ngp.stage1 import TrainedField
@@ -27,13 +26,8 @@ FINEST = 512
 
 @dataclass(kw_only=True, eq=False)
 class Diver(Student):
-    """Corner features of sparse voxels, integrated along rays and decoded by a small network.
-
-    Attributes:
-        resolution: voxels along the unit cube, a multiple of 16, at most 512.
-        stored: "bf16" or "fp32", the precision of the corners' features when rendering.
-        faint: weight below which a segment has an opacity but no colour.
-    """
+    """Corner features of sparse voxels, integrated along rays and decoded by a small network; its
+    settings are explained in `sweeps/configs/method/diver.yaml`."""
 
     training: DiverLessons
     name: str = "diver"

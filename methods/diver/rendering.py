@@ -8,9 +8,8 @@ import torch
 from torch.nn import functional
 
 from bench.types import Probe, Rays
-from methods.diver.decoder import Merged
-from methods.diver.kernels.segments import Corners, render_segments
-from methods.diver.model import CornerModel
+from methods.diver.kernels.segments import Corners, Layers, render_segments
+from methods.diver.model import CHANNELS, DIRECTION_CHANNELS, CornerModel, encode_directions
 from methods.kernels.corner_gather import CORNERS
 from methods.kernels.types import Occupancy, Pixels
 from methods.rendering.compaction import to_host
@@ -19,29 +18,40 @@ Stored = Literal["bf16", "fp32"]
 
 
 class Baked:
-    """A trained model as it is rendered: the first layer of the decoder is already applied to the
-    corners, and its layers around the direction are merged.
+    """A trained model as it is rendered, with features of the corners in the type `stored`.
 
-    Args:
-        model: the trained model.
-        stored: type of the corners' features.
+    Integration is linear and its weights add up to 1, so the first layer of the decoder may come
+    before it: it is already applied to the corners. No ReLU separates the 32 outputs of the third
+    layer from the layer of the directions: the two are merged.
     """
 
     @torch.no_grad()
     def __init__(self, model: CornerModel, stored: Stored) -> None:
-        first = model.decoder.first
-        table = functional.linear(model.table, first.weight, first.bias)
+        decoder = model.decoder
+        table = functional.linear(model.table, decoder.first.weight, decoder.first.bias)
         table = table.to(torch.bfloat16 if stored == "bf16" else torch.float32)
-        self.corners = Corners(model.corners, table)
-        self.model, self.merged = model, Merged.of(model.decoder)
+        self.model, self.corners = model, Corners(model.corners, table)
         self.occupancy = Occupancy.at(model.voxels.coordinates, model.resolution)
+        along, across = decoder.view.weight.split((CHANNELS, DIRECTION_CHANNELS), dim=1)
+        third, bias = decoder.third.weight, decoder.third.bias
+        self.layers = Layers(
+            hidden=decoder.second.weight.detach(),
+            hidden_bias=decoder.second.bias.detach(),
+            density=third[:1],
+            density_bias=bias[:1],
+            geometry=along @ third[1:],
+            colour=decoder.colour.weight.detach(),
+            colour_bias=decoder.colour.bias.detach(),
+        )
+        self.across, self.view_bias = across.clone(), decoder.view.bias + along @ bias[1:]
 
     def sizes(self) -> dict[str, int]:
         """Bytes of the features, of a bit per cell that marks voxels, and of the decoder."""
+        decoder = (*vars(self.layers).values(), self.across, self.view_bias)
         return {
             "corners": self.corners.table.numel() * self.corners.table.element_size(),
             "voxels": self.occupancy.cells.numel() // 8,
-            "decoder": 4 * self.merged.numel(),
+            "decoder": 4 * sum(part.numel() for part in decoder),
         }
 
     @torch.no_grad()
@@ -52,17 +62,18 @@ class Baked:
             stop: transmittance at which a ray ends.
             faint: weight below which a segment has an opacity but no colour.
         """
-        model, layers = self.model, self.merged.layers
+        layers = self.layers
         with probe.stage("segments"):
+            encoded = encode_directions(rays.directions)
             pixels, crossed, shaded = render_segments(
                 rays,
-                model.voxels,
+                self.model.voxels,
                 self.corners,
                 layers,
-                self.merged.towards(rays.directions),
+                functional.linear(encoded, self.across, self.view_bias),
                 stop=stop,
                 faint=faint,
-                backend=model.backend,
+                backend=self.model.backend,
             )
         segments, colours = map(int, to_host([crossed.sum(), shaded.sum()]))
         probe.count("segments", segments)
@@ -70,6 +81,6 @@ class Baked:
         probe.count("table_reads", CORNERS * segments)
         density = layers.hidden.numel() + layers.density.numel()
         colour = layers.geometry.numel() + layers.colour.numel()
-        directions = self.merged.across.numel() * len(rays.origins)
+        directions = self.across.numel() * len(rays.origins)
         probe.count("products", segments * density + colours * colour + directions)
         return pixels

@@ -55,9 +55,8 @@ def test_sparsity_draws_a_negative_density_back_to_zero(
     """Its slope is 4 s / (1 + 2 s^2) of the mean, of the first `count` densities alone."""
     training = method_of().begin(teacher, ball_scene, TAUGHT)
     raw = torch.tensor([-2.0, 0.0, 0.5, 3.0], requires_grad=True)
-    shown = raw * 1.0
-    training._push_to_sparsity(shown, 3)
-    shown.relu().mul(0).sum().backward()
+    training._push_to_sparsity(raw, 3)
+    raw.relu().mul(0).sum().backward()
     wanted = LESSONS.sparsity / 3 * torch.tensor([-8 / 9, 0, 4 / 3, 0])
     torch.testing.assert_close(raw.grad, wanted)
 
@@ -94,5 +93,5 @@ def test_a_teacher_with_more_features_than_a_corner_is_refused(
     ball_scene: Scene, shared_log: Log
 ) -> None:
     setup = replace(TEACHER, grid=replace(GRID, levels=17))
-    with pytest.raises(ValueError, match="expected a hash grid of at most"):
+    with pytest.raises(ValueError, match="expected at most the 32 channels of a corner"):
         fitted(ball_scene, shared_log, replace(TAUGHT, steps=1), teacher=setup)

@@ -11,7 +11,7 @@ BOUNDS = torch.tensor([[0.1, 0.2, 0.1], [0.9, 0.8, 0.7]])
 
 
 def occupied(*cells: tuple[int, int, int]) -> Occupancy:
-    return Occupancy.at(torch.tensor(cells).view(-1, 3), 32)
+    return Occupancy.at(torch.tensor(cells).reshape(len(cells), 3), 32)
 
 
 def test_networks_are_where_matter_is() -> None:

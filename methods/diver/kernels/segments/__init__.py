@@ -22,37 +22,25 @@ from methods.kernels.voxel_walk import Crossings, Voxels
 
 @dataclass(frozen=True)
 class Corners:
-    """What the V voxels of a grid have at their corners.
+    """What the V voxels of a grid have at their corners, in the order of `corner_gather`."""
 
-    Attributes:
-        rows: [V, 8] int32 rows of `table`, the corners of each voxel in the order of
-            `corner_gather`. They are not checked.
-        table: [C, F] features, float32 or bfloat16.
-    """
-
-    rows: Tensor
-    table: Tensor
+    rows: Tensor  # [V, 8] int32 rows of the table. Not checked.
+    table: Tensor  # [C, F] features, float32 or bfloat16
 
 
 @dataclass(frozen=True)
 class Layers:
-    """From F features of a segment, behind a ReLU, to its density and its colour.
+    """From F features of a segment, behind a ReLU, to its density and its colour: a ReLU follows
+    every layer but the last, which a sigmoid follows. To the output of `geometry`, of the hidden
+    layer, the direction of the ray is added."""
 
-    Attributes:
-        hidden, hidden_bias: [H, F], [H]; a ReLU follows.
-        density, density_bias: [1, H], [1]; a ReLU follows.
-        geometry: [H, H], from the hidden layer; the direction of the ray is added to its output,
-            and a ReLU follows.
-        colour, colour_bias: [3, H], [3]; a sigmoid follows.
-    """
-
-    hidden: Tensor
-    hidden_bias: Tensor
-    density: Tensor
-    density_bias: Tensor
-    geometry: Tensor
-    colour: Tensor
-    colour_bias: Tensor
+    hidden: Tensor  # [H, F]
+    hidden_bias: Tensor  # [H]
+    density: Tensor  # [1, H]
+    density_bias: Tensor  # [1]
+    geometry: Tensor  # [H, H]
+    colour: Tensor  # [3, H]
+    colour_bias: Tensor  # [3]
 
 
 def segment_weights(

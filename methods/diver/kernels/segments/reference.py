@@ -42,32 +42,20 @@ def render_segments(
     faint: float,
 ) -> tuple[Pixels, Tensor, Tensor]:
     """Evaluates all segments, also those behind the end of a ray, whose weight is 0."""
-    count = len(rays.origins)
-    chunks = [slice(first, first + CHUNK_RAYS) for first in range(0, max(count, 1), CHUNK_RAYS)]
-    parts = [
-        _together(rays.take(some), voxels, corners, layers, towards[some], stop, faint)
-        for some in chunks
-    ]
-    *pixels, crossed, shaded = map(torch.cat, zip(*parts, strict=True))
-    return Pixels(*pixels), crossed, shaded
-
-
-def _together(
-    rays: Rays,
-    voxels: Voxels,
-    corners: Corners,
-    layers: Layers,
-    towards: Tensor,
-    stop: float,
-    faint: float,
-) -> tuple[Tensor, ...]:
-    """Values, depth sums and opacities of `rays`; numbers of segments crossed and shaded."""
+    if len(towards) > CHUNK_RAYS:
+        parts = (
+            render_segments(rays.take(some), voxels, corners, layers, towards[some], stop, faint)
+            for first in range(0, len(towards), CHUNK_RAYS)
+            for some in [slice(first, first + CHUNK_RAYS)]
+        )
+        columns = ((*vars(pixels).values(), *counts) for pixels, *counts in parts)
+        *joined, crossed, shaded = map(torch.cat, zip(*columns, strict=True))
+        return Pixels(*joined), crossed, shaded
     crossings = walk(rays, voxels, backend="reference")
     ray = crossings.ray.long()
     mean = segment_weights(rays, crossings, voxels)
-    features = corner_gather(
-        corners.table, corners.rows, crossings.voxel, mean, backend="reference"
-    )
+    given = corners.table, corners.rows, crossings.voxel, mean
+    features = corner_gather(*given, backend="reference")
     hidden = linear(features.to(towards).relu(), layers.hidden, layers.hidden_bias).relu()
     density = linear(hidden, layers.density, layers.density_bias).relu().squeeze(1)
     # Integrated already: every length is 1.
@@ -81,4 +69,4 @@ def _together(
     shaded = torch.zeros(len(towards), dtype=torch.int32, device=towards.device)
     shaded.index_add_(0, ray, seen.int())
     crossed, _ = visible(density, intervals, stop=stop, backend="reference")
-    return pixels.values, pixels.depth_sum, pixels.alpha, crossed.int(), shaded
+    return pixels, crossed.int(), shaded

@@ -49,20 +49,11 @@ def test_rays_that_are_rendered_in_chunks_have_the_same_pixels(
 
 
 def test_a_cpu_refuses_what_it_has_no_code_for() -> None:
-    rays, *rest = given()
+    rays, voxels, corners, layers, towards = given()
     wide = Rays(rays.origins.double(), rays.directions.double())
     with pytest.raises(ValueError, match="computes with float32"):
-        render_segments(wide, *rest, stop=0.0, backend="cpu")
-    narrow = Layers(
-        torch.zeros(8, 32),
-        torch.zeros(8),
-        torch.zeros(1, 8),
-        torch.zeros(1),
-        torch.zeros(8, 8),
-        torch.zeros(3, 8),
-        torch.zeros(3),
-    )
-    voxels, corners, _, towards = rest
+        render_segments(wide, voxels, corners, layers, towards, stop=0.0, backend="cpu")
+    narrow = Layers(*map(torch.zeros, ((8, 32), 8, (1, 8), 1, (8, 8), (3, 8), 3)))
     with pytest.raises(ValueError, match=r"multiples of 16, got \[8, 32\]"):
         render_segments(rays, voxels, corners, narrow, towards[:, :8], stop=0.0, backend="cpu")
 
