@@ -1,4 +1,4 @@
-"""A scene as 3D Gaussians, and its pictures (Kerbl et al. 2023)."""
+"""A scene as 3D Gaussians, its pictures (Kerbl et al. 2023), and how it is stored in few bytes."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ from methods.kernels.types import Pixels
 
 Y00 = 1 / math.sqrt(4 * math.pi)
 """The first spherical harmonic, a constant."""
+
+OUTLIERS = 1e-3
+"""Share of the harmonics, at either end, that is clipped: a few outliers make all steps coarse."""
 
 
 class Gaussians(nn.Module):
@@ -79,14 +82,8 @@ class Gaussians(nn.Module):
         """
         with probe.stage("project"):
             opacities = self.opacities
-            ellipses = project_gaussians(
-                self.means,
-                self.log_scales.exp(),
-                self.rotations,
-                opacities,
-                camera,
-                backend=backend,
-            )
+            shape = self.means, self.log_scales.exp(), self.rotations
+            ellipses = project_gaussians(*shape, opacities, camera, backend=backend)
         probe.count("gaussians", (ellipses.extents[:, 0] > 0).sum(), len(self))
         with probe.stage("shade"):
             towards = functional.normalize(self.means.detach() - camera.c2w[:, 3], dim=1)
@@ -95,3 +92,42 @@ class Gaussians(nn.Module):
         with probe.stage("blend"):
             size = camera.width, camera.height
             return blend(ellipses, opacities, colours, *size, stop=stop, backend=backend)
+
+
+def rounded(gaussians: Gaussians) -> Gaussians:
+    """Gaussians as they come back from storage: means in 16 bits, everything else in 8.
+
+    Levels are spread evenly from the least to the largest value of a column. Opacities are stored
+    as they are, scales as logarithms, rotations normalised.
+    """
+    opacities = _levels(gaussians.opacities, 8).clamp(1e-6, 1 - 1e-6)
+    return Gaussians(
+        _levels(gaussians.means, 16),
+        _levels(gaussians.log_scales, 8),
+        _levels(functional.normalize(gaussians.rotations, dim=1), 8),
+        opacities.logit(),
+        _levels(gaussians.base, 8, OUTLIERS),
+        _levels(gaussians.view, 8, OUTLIERS),
+    )
+
+
+def stored_bytes(gaussians: Gaussians) -> int:
+    """Bytes of rounded parameters, and of the two extremes of each column."""
+    total = 0
+    for name, values in gaussians.named_parameters():
+        width = 2 if name == "means" else 1
+        total += (len(values) * width + 2 * 4) * (values.numel() // len(values))
+    return total
+
+
+def _levels(values: Tensor, bits: int, outliers: float = 0.0) -> Tensor:
+    """`values` [N, ...], each column rounded to 2^bits levels between its extremes."""
+    columns = values.detach().reshape(len(values), math.prod(values.shape[1:]))
+    if not columns.numel():
+        return values.detach().clone()
+    skipped = int(outliers * len(columns))
+    low = columns.kthvalue(1 + skipped, dim=0).values
+    high = columns.kthvalue(len(columns) - skipped, dim=0).values
+    step = ((high - low) / (2**bits - 1)).clamp(min=torch.finfo(columns.dtype).tiny)
+    level = ((columns.clamp(low, high) - low) / step).round()
+    return (low + level * step).view_as(values)

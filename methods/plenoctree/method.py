@@ -15,8 +15,7 @@ from methods.instant_ngp.pixels import PixelBatches
 from methods.instant_ngp.stage1 import TrainedField
 from methods.kernels.types import Occupancy, Pixels, expect
 from methods.plenoctree.kernels.voxel_light import render_voxels
-from methods.plenoctree.octree import Octree
-from methods.plenoctree.start import Extraction, extract
+from methods.plenoctree.octree import Extraction, Octree, extract
 from methods.plenoctree.training import OctreeLessons, OctreeTraining
 from methods.rendering.compaction import to_host
 from methods.rendering.frame import Render
@@ -27,12 +26,7 @@ from methods.students.method import Student
 @dataclass(kw_only=True, eq=False)
 class PlenOctree(Student):
     """A sparse grid of densities and spherical harmonics, extracted from a trained field and
-    fine-tuned on the photos.
-
-    Attributes:
-        extraction: which leaves there are, and their initial values.
-        stored: "fp16" or "fp32", precision of the values in a file, at which they are also
-            rendered.
+    fine-tuned on the photos; its settings are explained in `sweeps/configs/method/plenoctree.yaml`.
     """
 
     training: OctreeLessons
@@ -75,27 +69,23 @@ class PlenOctree(Student):
 
     def restore(self, tensors: Mapping[str, Tensor]) -> None:
         """Load the leaves that show anything, as they are stored."""
-        octree = Octree.of(tensors, self.teacher.device)
-        self.octree = octree.rounded() if self.stored == "fp16" else octree.visible()
+        self.octree = Octree.of(tensors, self.teacher.device).visible(self.stored)
 
     def renderer(self, probe: Probe) -> tuple[Occupancy, Render]:
         """The cells that hold leaves, and one pass through them."""
-        octree = self.octree
+        octree, stop, backend = self.octree, self.stop, self.teacher.backend
+        faint = Sampling(stop=stop).least_weight
 
         def render(_: Tensor, rays: Rays) -> Pixels:
+            given = rays, octree.voxels, octree.light
             with probe.stage("render"):
                 pixels, crossed, shaded = render_voxels(
-                    rays,
-                    octree.voxels,
-                    octree.light,
-                    stop=self.stop,
-                    faint=Sampling(stop=self.stop).least_weight,
-                    backend=self.teacher.backend,
+                    *given, stop=stop, faint=faint, backend=backend
                 )
                 samples, shown = to_host([crossed.sum(), shaded.sum()])
             probe.count("samples", samples)
             probe.count("shaded_samples", shown, samples)
-            return opaque_at_end(pixels, self.stop)
+            return opaque_at_end(pixels, stop)
 
         return octree.occupancy, render
 
@@ -112,8 +102,5 @@ def opaque_at_end(pixels: Pixels, stop: float) -> Pixels:
     their values are scaled to an opacity of 1."""
     ended = 1 - pixels.alpha <= stop
     scale = torch.where(ended, 1 / pixels.alpha, 1)
-    return Pixels(
-        pixels.values * scale[:, None],
-        pixels.depth_sum * scale,
-        torch.where(ended, 1, pixels.alpha),
-    )
+    alpha = torch.where(ended, 1, pixels.alpha)
+    return Pixels(pixels.values * scale[:, None], pixels.depth_sum * scale, alpha)

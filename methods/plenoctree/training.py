@@ -21,13 +21,9 @@ from methods.plenoctree.octree import Octree
 
 @dataclass(frozen=True)
 class OctreeLessons(PixelOptions):
-    """How to train leaves; `rate` is that of the harmonics. There is no density grid, and no step.
-
-    Attributes:
-        density_rate: initial learning rate of the density, as optical thickness of a leaf.
-        samples: leaves that a step aims to learn from; more than the samples of a field, each of
-            which changes the whole network.
-    """
+    """How to train leaves, as `sweeps/configs/method/plenoctree.yaml` explains. `rate` is that of
+    the harmonics; `samples` are more than those of a field, each of which changes the whole
+    network."""
 
     rate: float = 1e-2
     density_rate: float = 0.03
@@ -42,11 +38,7 @@ class OctreeLessons(PixelOptions):
 
 
 class OctreeTraining(PixelTraining):
-    """Trains the densities and harmonics of the leaves that rays see; the set of leaves is fixed.
-
-    Attributes:
-        visited: [S] int32 leaves that the rays of the last step saw.
-    """
+    """Trains the leaves that rays see; their set is fixed."""
 
     options: OctreeLessons
 
@@ -76,12 +68,11 @@ class OctreeTraining(PixelTraining):
         # `jitter` moves samples; where a ray crosses a voxel is fixed.
         light, backend = self.octree.light, self.backend
         crossings = walk(rays, self.octree.voxels, backend=backend)
-        with torch.no_grad():
-            sigma = light.density[crossings.voxel].relu()
-            counts, _ = visible(sigma, crossings, stop=STOP, backend=backend)
+        sigma = light.density[crossings.voxel].relu()
+        counts, _ = visible(sigma, crossings, stop=STOP, backend=backend)
         crossings = crossings.front(counts)
         self._sigma = light.density[crossings.voxel].requires_grad_()
-        self.visited = crossings.voxel
+        self.visited = crossings.voxel  # [S] int32
         colours = shade_voxels(
             light.harmonics,
             crossings.voxel,
@@ -102,23 +93,19 @@ class OctreeTraining(PixelTraining):
         rates = {"harmonics": rate, "density": rate / self.options.rate}
         rates["density"] *= self.options.density_rate / width
         for name, table in self.tables.items():
-            sparse_adam_(
-                table, self.gradients[name], self.moments[name], rates[name], backend=self.backend
-            )
+            given = table, self.gradients[name], self.moments[name], rates[name]
+            sparse_adam_(*given, backend=self.backend)
 
     def watched(self) -> dict[str, Tensor]:
-        """Densities and harmonics."""
         return self.tables
 
     def result(self) -> dict[str, Tensor]:
-        """The octree."""
         return self.octree.tensors()
 
     def restore_result(self, tensors: Mapping[str, Tensor]) -> None:
         self._take(Octree.of(tensors, self.octree.light.density.device))
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, float]]:
-        """Moments, random numbers, number of rays."""
         tensors, figures = super().state()
         for name, adam in self.moments.items():
             tensors |= adam.tensors(f"{name}.")

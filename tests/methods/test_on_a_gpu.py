@@ -41,7 +41,7 @@ from methods.nerf.method import Nerf
 from methods.nsvf.field import NsvfField
 from methods.nsvf.method import Nsvf
 from methods.plenoctree.method import PlenOctree
-from methods.plenoctree.start import Extraction
+from methods.plenoctree.octree import Extraction
 from methods.plenoctree.training import OctreeLessons
 from methods.rendering import field, rays
 from methods.rendering.occupancy import EVERY, STEP

@@ -20,7 +20,7 @@ from methods.kilonerf.method import KiloLessons, KiloNerf
 from methods.nerf.method import Nerf
 from methods.nsvf.method import Nsvf
 from methods.plenoctree.method import PlenOctree
-from methods.plenoctree.start import Extraction
+from methods.plenoctree.octree import Extraction
 from methods.plenoctree.training import OctreeLessons
 from methods.students.method import Student
 from methods.students.networks import NetworkLessons

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
 
 import torch
@@ -82,42 +81,37 @@ SHADE = Operation(
 
 def cases() -> list[Case]:
     """Rays of every kind of light; no, one and many samples of all degrees."""
-    return [*_rendered(), *_shaded()]
-
-
-def _rendered() -> Iterator[Case]:
-    for name, rays, kind in (
-        ("one ray", 1, "cloud"),
-        ("no ray", 0, "cloud"),
-        ("cloud", 129, "cloud"),
-        ("mist", 129, "mist"),
-        ("stone", 129, "stone"),
-        ("voxels without density", 129, "clear"),
-        ("no voxel", 129, "nothing"),
-    ):
-        yield from RENDER.cases(name, partial(_scene, 24, rays, kind, 0.0, 0.0))
-    yield from RENDER.cases("stop and faint", partial(_scene, 24, 129, "cloud", 1e-4, 1e-5))
-    many = 1 << 13
-    frame = partial(_scene, 128, many, "cloud", 1e-4, 1e-5)
-    yield from RENDER.cases("a frame of 128^3", frame, items=many)
-
-
-def _scene(size: int, rays: int, kind: str, stop: float, faint: float) -> Given:
-    """Voxels in a thick shell, every second one, of random density and light."""
-    coordinates = cells("empty" if kind == "nothing" else "porous shell", size).nonzero()
-    generator = torch.Generator().manual_seed(size)
-    scale = {"clear": 0.0, "mist": 2.0, "stone": 1e4}.get(kind, 20.0)
-    density = scale * torch.rand(len(coordinates), generator=generator)
-    harmonics = torch.randn(len(coordinates), 9, 3, generator=generator).clamp(-6, 6)
-    light, voxels = Light(density, harmonics), Voxels(coordinates, size)
-    return {"rays": some_rays(rays), "voxels": voxels, "light": light, "stop": stop, "faint": faint}
-
-
-def _shaded() -> Iterator[Case]:
+    found, many = [], 1 << 13
+    for name, given in {
+        "one ray": (24, 1, 20.0),
+        "no ray": (24, 0, 20.0),
+        "cloud": (24, 129, 20.0),
+        "mist": (24, 129, 2.0),
+        "stone": (24, 129, 1e4),
+        "voxels without density": (24, 129, 0.0),
+        "no voxel": (24, 129, None),
+        "stop and faint": (24, 129, 20.0, 1e-4, 1e-5),
+        "a frame of 128^3": (128, many, 20.0, 1e-4, 1e-5),
+    }.items():
+        items = many if many in given else None
+        found += RENDER.cases(name, partial(_scene, *given), items=items)
     for count in (0, 1, 300, 1 << 16):
         for size in (1, 4, 9, 16) if count == 300 else (9,):
             name, items = f"{count:,} of {size} harmonics", count if count > 300 else None
-            yield from SHADE.cases(name, partial(_samples, count, size), items=items)
+            found += SHADE.cases(name, partial(_samples, count, size), items=items)
+    return found
+
+
+def _scene(
+    size: int, rays: int, densest: float | None, stop: float = 0.0, faint: float = 0.0
+) -> Given:
+    """Voxels in a thick shell, every second one, of random density and light; or none at all."""
+    coordinates = cells("empty" if densest is None else "porous shell", size).nonzero()
+    generator = torch.Generator().manual_seed(size)
+    density = (densest or 0.0) * torch.rand(len(coordinates), generator=generator)
+    harmonics = torch.randn(len(coordinates), 9, 3, generator=generator).clamp(-6, 6)
+    light, voxels = Light(density, harmonics), Voxels(coordinates, size)
+    return {"rays": some_rays(rays), "voxels": voxels, "light": light, "stop": stop, "faint": faint}
 
 
 def _samples(count: int, size: int) -> Given:
