@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -82,7 +83,7 @@ SHADE = Operation(
 def cases() -> list[Case]:
     """Rays of every kind of light; no, one and many samples of all degrees."""
     found, many = [], 1 << 13
-    for name, given in {
+    scenes: dict[str, tuple[Any, ...]] = {
         "one ray": (24, 1, 20.0),
         "no ray": (24, 0, 20.0),
         "cloud": (24, 129, 20.0),
@@ -92,7 +93,8 @@ def cases() -> list[Case]:
         "no voxel": (24, 129, None),
         "stop and faint": (24, 129, 20.0, 1e-4, 1e-5),
         "a frame of 128^3": (128, many, 20.0, 1e-4, 1e-5),
-    }.items():
+    }
+    for name, given in scenes.items():
         items = many if many in given else None
         found += RENDER.cases(name, partial(_scene, *given), items=items)
     for count in (0, 1, 300, 1 << 16):
