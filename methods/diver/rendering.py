@@ -30,7 +30,7 @@ class Baked:
         decoder = model.decoder
         table = functional.linear(model.table, decoder.first.weight, decoder.first.bias)
         table = table.to(torch.bfloat16 if stored == "bf16" else torch.float32)
-        self.model, self.corners = model, Corners(model.corners, table)
+        self.corners, self.backend = Corners(model.voxels, model.corners, table), model.backend
         self.occupancy = Occupancy.at(model.voxels.coordinates, model.resolution)
         along, across = decoder.view.weight.split((CHANNELS, DIRECTION_CHANNELS), dim=1)
         third, bias = decoder.third.weight, decoder.third.bias
@@ -65,16 +65,9 @@ class Baked:
         layers = self.layers
         with probe.stage("segments"):
             encoded = encode_directions(rays.directions)
-            pixels, crossed, shaded = render_segments(
-                rays,
-                self.model.voxels,
-                self.corners,
-                layers,
-                functional.linear(encoded, self.across, self.view_bias),
-                stop=stop,
-                faint=faint,
-                backend=self.model.backend,
-            )
+            towards = functional.linear(encoded, self.across, self.view_bias)
+            given, how = (rays, self.corners, layers, towards), {"stop": stop, "faint": faint}
+            pixels, crossed, shaded = render_segments(*given, **how, backend=self.backend)
         segments, colours = map(int, to_host([crossed.sum(), shaded.sum()]))
         probe.count("segments", segments)
         probe.count("shaded_segments", colours, segments)

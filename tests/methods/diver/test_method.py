@@ -11,6 +11,7 @@ from bench.types import EMPTY_ALPHA, Budget, Log, NullProbe, Scene
 from methods.diver.method import Diver
 from methods.diver.training import DiverLessons
 from methods.instant_ngp.stage1 import TrainedField
+from methods.students.voxels import corners_of
 from tests.methods.trainings import GRID, TAUGHT, TEACHER, quality
 
 LESSONS = DiverLessons(prune_rays=1 << 13)
@@ -80,7 +81,7 @@ def test_pruning_leaves_what_shows(ball_scene: Scene, teacher: TrainedField) -> 
 
 def test_sizes_are_those_of_what_is_stored(ball_scene: Scene, shared_log: Log) -> None:
     half, single = (fitted(ball_scene, shared_log, stored=kind) for kind in ("bf16", "fp32"))
-    corners = len(half.baked.model.vertices)
+    corners = len(corners_of(half.baked.corners.voxels.coordinates)[1])
     merged = 32 * 32 + 32 + 32 + 1 + 32 * 32 + 32 * 27 + 32 + 3 * 32 + 3
     assert half.sizes() == {"corners": corners * 64, "voxels": 32**3 // 8, "decoder": 4 * merged}
     assert single.sizes()["corners"] == 2 * half.sizes()["corners"]

@@ -24,8 +24,9 @@ from methods.kernels.voxel_walk import Crossings, Voxels
 
 @dataclass(frozen=True)
 class Corners:
-    """What the V voxels of a grid have at their corners, in the order of `corner_gather`."""
+    """V voxels, and what they have at their corners, in the order of `corner_gather`."""
 
+    voxels: Voxels
     rows: Tensor  # [V, 8] int32 rows of the table. Not checked.
     table: Tensor  # [C, F] features, float32 or bfloat16
 
@@ -60,7 +61,6 @@ def segment_weights(
 
 def render_segments(
     rays: Rays,
-    voxels: Voxels,
     corners: Corners,
     layers: Layers,
     towards: Tensor,
@@ -80,8 +80,8 @@ def render_segments(
         faint: weight up to which a segment has an opacity but no colour.
     """
     check_stop(stop)
-    count, (hidden, features) = check_rays(rays), layers.hidden.shape
-    check_shape("rows", corners.rows, len(voxels), CORNERS)
+    hidden, features = layers.hidden.shape
+    check_shape("rows", corners.rows, len(corners.voxels), CORNERS)
     check_shape("table", corners.table, None, features)
     check_shape("hidden_bias", layers.hidden_bias, hidden)
     check_shape("density", layers.density, 1, hidden)
@@ -89,6 +89,6 @@ def render_segments(
     check_shape("geometry", layers.geometry, hidden, hidden)
     check_shape("colour", layers.colour, 3, hidden)
     check_shape("colour_bias", layers.colour_bias, 3)
-    check_shape("towards", towards, count, hidden)
+    check_shape("towards", towards, check_rays(rays), hidden)
     kernel = implementation(__name__, backend, rays.origins.device)
-    return kernel.render_segments(rays, voxels, corners, layers, towards, stop, faint)
+    return kernel.render_segments(rays, corners, layers, towards, stop, faint)

@@ -68,7 +68,7 @@ def _pixels(given: Given, backend: str) -> tuple[Tensor, ...]:
 def _light(given: Given) -> float:
     """How far the opacity of a ray may be off: its n segments' densities, rounding; a weight beside
     `stop` or `faint` may count on one side only, and few lie beside a `faint` of 1e-2."""
-    longest, faint = 3 * given["voxels"].resolution, given["faint"]
+    longest, faint = 3 * given["corners"].voxels.resolution, given["faint"]
     rounding = longest * (468 * DENSEST + 4) * U32
     return rounding + given["stop"] + (longest * faint if faint < 1e-3 else 2 * faint)
 
@@ -196,8 +196,7 @@ def scene(side: int, count: int, dtype: torch.dtype, stop: float, faint: float) 
     )
     return {
         "rays": some_rays(count),
-        "voxels": Voxels(cells, side),
-        "corners": Corners(rows.int(), table),
+        "corners": Corners(Voxels(cells, side), rows.int(), table),
         "layers": layers,
         "towards": between(-0.5, 0.5, count, HIDDEN),
         "stop": stop,
@@ -213,7 +212,7 @@ def _nan_error(backend: str, device: str, precision: str) -> float:
     row = corners.rows[len(corners.rows) // 2, 0]
     corners.table[row] = math.nan
     spoilt, _, _ = render_segments(**given, backend=backend)
-    crossings = walk(given["rays"], given["voxels"], backend="reference")
+    crossings = walk(given["rays"], corners.voxels, backend="reference")
     touched = torch.zeros(len(whole.alpha), dtype=torch.bool, device=device)
     at_corner = (corners.rows == row).any(dim=1)
     touched[crossings.ray[at_corner[crossings.voxel.long()]].long()] = True

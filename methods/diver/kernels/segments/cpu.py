@@ -47,13 +47,7 @@ def segment_weights(rays: Rays, crossings: Crossings, voxels: Voxels) -> Tensor:
 
 
 def render_segments(
-    rays: Rays,
-    voxels: Voxels,
-    corners: Corners,
-    layers: Layers,
-    towards: Tensor,
-    stop: float,
-    faint: float,
+    rays: Rays, corners: Corners, layers: Layers, towards: Tensor, stop: float, faint: float
 ) -> tuple[Pixels, Tensor, Tensor]:
     parts = [
         layers.hidden.T,
@@ -62,26 +56,23 @@ def render_segments(
         layers.geometry.T,
         *_whole_lanes(layers.colour, layers.colour_bias),
     ]
-    given = rays.origins, rays.directions, towards
-    check_float32(*given, *parts)
+    given, table, voxels = (rays.origins, rays.directions, towards), corners.table, corners.voxels
+    if table.dtype == torch.bfloat16:
+        check_float32(*given, *parts)
+        table = table.view(torch.uint16)
+    else:
+        check_float32(*given, *parts, table)
     if any(size % LANES for size in layers.hidden.shape):
         raise ValueError(
             f"backend 'cpu' has layers of multiples of {LANES}, got {list(layers.hidden.shape)}: "
             "use backend='reference'"
         )
-    if corners.table.dtype == torch.bfloat16:
-        (words,) = arrays(corners.table.detach().contiguous().view(torch.int16))
-        table = words.view(np.uint16)
-    else:
-        check_float32(corners.table)
-        (table,) = arrays(corners.table)
-    count = len(rays.origins)
-    pixels = Pixels.blank(count, 3)
-    crossed, shaded = (torch.zeros(count, dtype=torch.int32) for _ in range(2))
+    pixels = Pixels.blank(len(towards), 3)
+    crossed, shaded = torch.zeros(2, len(towards), dtype=torch.int32)
     _render(
         tuple(arrays(*given)),
         maps_of(voxels),
-        (*arrays(voxels.coordinates, corners.rows), table),
+        tuple(arrays(voxels.coordinates, corners.rows, table)),
         f32(voxels.resolution),
         tuple(arrays(*parts)),
         (f64(f32(stop)), f64(f32(faint))),

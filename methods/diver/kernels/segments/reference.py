@@ -33,27 +33,21 @@ def segment_weights(rays: Rays, crossings: Crossings, voxels: Voxels) -> Tensor:
 
 @torch.no_grad()
 def render_segments(
-    rays: Rays,
-    voxels: Voxels,
-    corners: Corners,
-    layers: Layers,
-    towards: Tensor,
-    stop: float,
-    faint: float,
+    rays: Rays, corners: Corners, layers: Layers, towards: Tensor, stop: float, faint: float
 ) -> tuple[Pixels, Tensor, Tensor]:
     """Evaluates all segments, also those behind the end of a ray, whose weight is 0."""
     if len(towards) > CHUNK_RAYS:
         parts = (
-            render_segments(rays.take(some), voxels, corners, layers, towards[some], stop, faint)
+            render_segments(rays.take(some), corners, layers, towards[some], stop, faint)
             for first in range(0, len(towards), CHUNK_RAYS)
             for some in [slice(first, first + CHUNK_RAYS)]
         )
         columns = ((*vars(pixels).values(), *counts) for pixels, *counts in parts)
         *joined, crossed, shaded = map(torch.cat, zip(*columns, strict=True))
         return Pixels(*joined), crossed, shaded
-    crossings = walk(rays, voxels, backend="reference")
+    crossings = walk(rays, corners.voxels, backend="reference")
     ray = crossings.ray.long()
-    mean = segment_weights(rays, crossings, voxels)
+    mean = segment_weights(rays, crossings, corners.voxels)
     given = corners.table, corners.rows, crossings.voxel, mean
     features = corner_gather(*given, backend="reference")
     hidden = linear(features.to(towards).relu(), layers.hidden, layers.hidden_bias).relu()

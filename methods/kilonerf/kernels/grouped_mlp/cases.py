@@ -63,14 +63,6 @@ ENCODE = Operation(
 )
 
 
-def _sums(inputs: Tensor, weights: Tensor, biases: Tensor, offsets: Tensor) -> Tensor:
-    """How far a layer's outputs may be off by its own roundings, for exact inputs: a sum of I
-    products and a bias by I + 1 u of the sum of their sizes, by both."""
-    values, factors, added = (x.double().abs() for x in (inputs, weights, biases))
-    total = grouped_linear(values, factors, added, offsets, backend="reference")
-    return 2 * (weights.shape[1] + 1) * U32 * total
-
-
 def _of_network(given: Given) -> Tensor:
     """How far sums over the samples of each network may be off, [N, 1]."""
     counts = given["offsets"].diff().double()[:, None]
@@ -87,8 +79,8 @@ LINEAR = Operation(
     lambda given, backend: (grouped_linear(**given, backend=backend),),
     {
         "outputs": Bound(
-            "a sum of I products and a bias, I + 1 u of the sum of their sizes, by both",
-            lambda given: _sums(*(given[x] for x in ("inputs", "weights", "biases", "offsets"))),
+            "I products below 1 / 8 and a bias of at most 16, by both: 2 (I + 1) (I / 8 + 16) u",
+            lambda given: 2 * (1 + (i := given["weights"].shape[1])) * (i / 8 + 16) * U32,
         )
     },
     {
@@ -102,63 +94,40 @@ LINEAR = Operation(
 )
 
 
-def _grown(given: Given, first: Tensor, off: float, names: tuple[str, ...]) -> Tensor:
-    """How far the outputs of the last of some layers may be off, one after the other, if the inputs
-    `first` of the first one are `off`: each passes the errors of its inputs on, times the sizes of
-    its weights, and adds its own."""
-    networks: Networks = given["networks"]
-    numbers = given["numbers"] if "numbers" in given else given["geometry"][:, HIDDEN].int()
-    place, offsets = order(numbers, len(networks["in"][0]), backend="reference")
-    x = first[place].double()
-    error = torch.full_like(x, off)
+def _grown(off: float, *names: str) -> float:
+    """How far the outputs of the last of some layers may be off, one after the other, whose inputs
+    of at most 1 are `off`; weights and biases are at most 1 / 8. Each layer passes the errors of
+    its inputs on, times its weights, and adds I + 1 u of the sum of their sizes, by both."""
+    size = 1.0
     for name in names:
-        weights, biases = (tensor.double() for tensor in networks[name])
-        if name == "direction":
-            seen = given["encoded"][place].double()
-            x, error = torch.cat((x, seen), dim=1), torch.cat((error, 0 * seen), dim=1)
-        sizes, relu = (weights.abs(), 0 * biases, offsets), name in ("in", "mid", "direction")
-        passed = grouped_linear(error, *sizes, backend="reference")
-        error = passed + _sums(x, weights, biases, offsets)
-        x = grouped_linear(x, weights, biases, offsets, relu=relu, backend="reference")
-    return error.new_zeros(len(first), error.shape[1]).index_copy(0, place, error)
+        inputs, _ = SHAPES[name]
+        most = (inputs * size + 1) / 8
+        off, size = inputs / 8 * off + 2 * (inputs + 1) * U32 * most, most
+    return off
 
 
-def _off_densities(given: Given, *names: str) -> Tensor:
-    encoded = encode_frequencies(given["positions"], POSITION_FREQUENCIES, backend="reference")
-    return _grown(given, encoded, ANGLES, names)
-
-
-def _off_geometry(given: Given) -> Tensor:
-    hidden = _off_densities(given, "in", "mid")
-    return torch.cat((hidden, 0 * hidden[:, :1]), dim=1)  # the number is exact
-
-
-def _off_colours(given: Given) -> Tensor:
-    hidden, names = given["geometry"][:, :HIDDEN], ("feature", "direction", "colour")
-    return _grown(given, hidden, 0.0, names) / 4 + 8 * U32
-
-
-GROWN = (
-    "each layer passes the errors of its inputs on, times the sizes of its weights, and adds "
-    "I + 1 u of the sum of the sizes, by both"
-)
 DENSITIES = Operation(
     "densities of networks",
     served(__package__),
     lambda given, backend: densities(**given, backend=backend),
     {
         "densities": Bound(
-            f"angles off by 188 u; {GROWN}",
-            lambda given: _off_densities(given, "in", "mid", "density").squeeze(1),
+            "three layers, as `_grown` says, of angles off by 188 u",
+            _grown(ANGLES, "in", "mid", "density"),
         ),
-        "geometry": Bound("the same, of two layers", _off_geometry),
+        "geometry": Bound("the same, of two layers", _grown(ANGLES, "in", "mid")),
     },
 )
 COLOURS = Operation(
     "colours of networks",
     served(__package__),
     lambda given, backend: (colours(**given, backend=backend),),
-    {"colours": Bound(f"{GROWN}; a sigmoid has a quarter of it and 8 u of its own", _off_colours)},
+    {
+        "colours": Bound(
+            "three layers, as `_grown` says; a sigmoid has a quarter of it and 8 u of its own",
+            _grown(0.0, "feature", "direction", "colour") / 4 + 8 * U32,
+        )
+    },
 )
 
 

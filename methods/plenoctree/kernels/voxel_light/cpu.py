@@ -45,9 +45,8 @@ def render_voxels(
     rays: Rays, voxels: Voxels, light: Light, stop: float, faint: float
 ) -> tuple[Pixels, Tensor, Tensor]:
     check_float32(rays.origins, rays.directions, light.density, light.harmonics)
-    count = len(rays.origins)
-    pixels = Pixels.blank(count, 3)
-    crossed, shaded = (torch.zeros(count, dtype=torch.int32) for _ in range(2))
+    pixels = Pixels.blank(len(rays.origins), 3)
+    crossed, shaded = torch.zeros(2, len(rays.origins), dtype=torch.int32)
     basis = spherical_harmonics(normalize(rays.directions, dim=1), backend="cpu")
     _render(
         tuple(arrays(rays.origins, rays.directions, basis.view(-1))),

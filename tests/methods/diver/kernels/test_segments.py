@@ -15,10 +15,9 @@ RAYS = 40
 
 def given(**layers: torch.Tensor) -> tuple:
     """A small scene with some rays, and `layers` in place of its own."""
-    rays, voxels, corners, own, towards, _, _ = cases.scene(
-        cases.SIDE, RAYS, torch.float32, 0.0, 0.0
-    ).values()
-    return rays, voxels, corners, replace(own, **layers), towards
+    scene = cases.scene(cases.SIDE, RAYS, torch.float32, 0.0, 0.0)
+    own = replace(scene["layers"], **layers)
+    return scene["rays"], scene["corners"], own, scene["towards"]
 
 
 def test_backends_count_the_same_segments() -> None:
@@ -49,13 +48,13 @@ def test_rays_that_are_rendered_in_chunks_have_the_same_pixels(
 
 
 def test_a_cpu_refuses_what_it_has_no_code_for() -> None:
-    rays, voxels, corners, layers, towards = given()
+    rays, corners, layers, towards = given()
     wide = Rays(rays.origins.double(), rays.directions.double())
     with pytest.raises(ValueError, match="computes with float32"):
-        render_segments(wide, voxels, corners, layers, towards, stop=0.0, backend="cpu")
+        render_segments(wide, corners, layers, towards, stop=0.0, backend="cpu")
     narrow = Layers(*map(torch.zeros, ((8, 32), 8, (1, 8), 1, (8, 8), (3, 8), 3)))
     with pytest.raises(ValueError, match=r"multiples of 16, got \[8, 32\]"):
-        render_segments(rays, voxels, corners, narrow, towards[:, :8], stop=0.0, backend="cpu")
+        render_segments(rays, corners, narrow, towards[:, :8], stop=0.0, backend="cpu")
 
 
 @pytest.mark.parametrize("name", ["hidden_bias", "density", "geometry", "colour"])
